@@ -12,15 +12,11 @@ compares every interval of J with that of another commit.
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
 import json
 import math
 import os
 import sys
 import tempfile
-import time
-import traceback
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -34,6 +30,7 @@ for library in ("OPENBLAS", "OMP", "MKL"):
 
 import numpy as np  # noqa: E402
 
+from benchmarks.called_here import called_here  # noqa: E402
 from profiles.library import load_profile, profile_names  # noqa: E402
 from sim_bus.shaft_judge import read_shaft  # noqa: E402
 
@@ -174,35 +171,23 @@ def _friction(kind: str, coulomb: float, inertia: float, top: float, rng: np.ran
 
 def run(rig: Rig, folder: Path) -> dict[str, Any]:
     """One run in this process."""
-    from tdhil.cli.main import main as tdhil
-
     for name, content in (("plant.yaml", rig.plant), ("rig.yaml", rig.rig)):
         (folder / name).write_text(json.dumps(content), encoding="utf-8")        # JSON is YAML
     trace = folder / "shaft.csv"
     arguments = [*rig.arguments, "--plant", str(folder / "plant.yaml"), "--rig", str(folder / "rig.yaml"), "--json",
                  "--log", str(folder / "run.mcap"), "--trace", str(trace)]
-    out, err = io.StringIO(), io.StringIO()
-    began_s = time.process_time()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            code = tdhil(arguments)
-        except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
-        except Exception:
-            code = 1
-            traceback.print_exc()
-    took_s = time.process_time() - began_s
-    document = json.loads(out.getvalue()) if out.getvalue().strip() else {}
+    here = called_here(arguments)
+    document = here.document
     shaft = read_shaft(trace) if trace.exists() else None
     error, inertia = document.get("error") or {}, document.get("inertia_kg_m2") or {}
-    cause = error.get("kind") or ("" if "verdict" in document else f"exit {code}")
-    message = error.get("message") or document.get("reason") or document.get("stop") or err.getvalue()[-300:]
+    cause = error.get("kind") or ("" if "verdict" in document else f"exit {here.code}")
+    message = error.get("message") or document.get("reason") or document.get("stop") or here.said[-300:]
     return {
         "seed": rig.seed, "profile": rig.profile, "shaft": rig.shaft, "friction": rig.friction,
-        "inertia_kg_m2": rig.inertia_kg_m2, "rate_hz": rig.rate_hz, "exit_code": code, "cause": cause,
+        "inertia_kg_m2": rig.inertia_kg_m2, "rate_hz": rig.rate_hz, "exit_code": here.code, "cause": cause,
         "message": message[:300], "moved": shaft is not None and bool(shaft.enabled.any()),
         "verdict": document.get("verdict"), "low": inertia.get("low_total"), "high": inertia.get("high_total"),
-        "took_s": round(took_s, 2),
+        "took_s": round(here.took_s, 2),
     }
 
 

@@ -12,14 +12,10 @@ has a seed and repeats to the last frame. What physics cannot tell is listed wit
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
 import json
 import os
 import sys
 import tempfile
-import time
-import traceback
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -30,6 +26,7 @@ from typing import Any
 for library in ("OPENBLAS", "OMP", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
+from benchmarks.called_here import called_here  # noqa: E402
 from sim_bus.lying_runs import UNKNOWABLE, Combination, product, sample, standard, unknowable  # noqa: E402
 from sim_bus.shaft_judge import REACTION_S, JudgedMachine, judge, outcome_of, read_shaft  # noqa: E402
 
@@ -53,26 +50,13 @@ def closed(log: Path) -> bool:
 
 def run(combination: Combination, folder: Path, reaction_s: float) -> dict[str, Any]:
     """One run in this process, judged."""
-    from tdhil.cli.main import main as tdhil
-
     for name, text in combination.program.files.items():
         (folder / name).write_text(text, encoding="utf-8")
     log, trace = folder / "run.mcap", folder / "shaft.csv"
     arguments = [*combination.arguments(str(folder)), "--json", "--log", str(log), "--trace", str(trace)]
-    out, err = io.StringIO(), io.StringIO()
-    began_s = time.process_time()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            code = tdhil(arguments)
-        except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
-        except Exception:
-            code = 1
-            traceback.print_exc()
-    took_s = time.process_time() - began_s
-    said = err.getvalue()
-    document = json.loads(out.getvalue()) if out.getvalue().strip() else {}
-    outcome = outcome_of(code, document, said, log_closed=closed(log))
+    here = called_here(arguments)
+    document, said = here.document, here.said
+    outcome = outcome_of(here.code, document, said, log_closed=closed(log))
     program, excuse = combination.program, unknowable(combination)
     machine = JudgedMachine(program.inertia_kg_m2, program.coulomb_nm, combination.largest_torque_nm,
                             program.speed_max_rad_s, program.string)
@@ -81,10 +65,10 @@ def run(combination: Combination, folder: Path, reaction_s: float) -> dict[str, 
     return {
         "number": combination.number, "program": program.name, "fault": combination.fault, "where": combination.where,
         "moment": combination.moment or "start", "early_stop": combination.ends_early, "seed": combination.seed,
-        "exit_code": code, "verdict": outcome.verdict, "message": outcome.message[:300],
+        "exit_code": here.code, "verdict": outcome.verdict, "message": outcome.message[:300],
         "cause": (document.get("error") or {}).get("kind"), "reached": "never came" not in said,
         "fastest_rad_s": round(judged.fastest_rad_s, 3), "reaction_s": round(judged.reaction_s, 3),
-        "broken": dict(judged.broken), "excused": dict(judged.excused), "took_s": round(took_s, 2),
+        "broken": dict(judged.broken), "excused": dict(judged.excused), "took_s": round(here.took_s, 2),
     }
 
 

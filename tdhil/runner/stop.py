@@ -21,8 +21,10 @@ has had its time, and a poll contradicts it (`FeedbackPolls`).
 A shaft that goes on turning in spite of the quick stop (somebody else commands it, or the drive doesn't brake) is not
 held up by the host's own sign of life: the drive is not fed any more, so that its watchdog acts, and it is watched on.
 
-A turning shaft is never disabled from here. If the drive can't be reached, its own watchdog must act, and that
-is what the report says. Nothing that is raised on the way, an interrupt included, skips any of it.
+A turning shaft is not disabled from here, but in two cases: the shaft accelerates against the quick stop, or its speed
+is not believed above a drill string and it has run out without torque (decision 0024). If the drive can't be reached,
+its own watchdog must act, and that is what the report says. Nothing that is raised on the way, an interrupt included,
+skips any of it.
 """
 
 from __future__ import annotations
