@@ -1,15 +1,15 @@
-"""The motor shaft's angle as one number that goes on counting: a drive's counter starts over, this doesn't."""
+"""The motor shaft's angle as one unwrapped number, although the drive's counter wraps."""
 
 from __future__ import annotations
 
 import math
 
 OVERSPEED = 2.0
-"""Times the speed limit: a shaft that turns faster than this may turn by more than half a wrap unnoticed."""
+"""Multiple of the speed limit. A shaft above this speed may turn by more than half a wrap undetected."""
 
 
 def longest_gap_s(wraps_rad: float | None, limit_rad_s: float) -> float:
-    """Return the longest time between two readings that leaves no doubt about the turns, s; inf: any."""
+    """Return the longest time between two readings with a known number of turns, s; inf if there is no limit."""
     if wraps_rad is None or limit_rad_s <= 0.0:
         return math.inf
     return 0.5 * wraps_rad / (OVERSPEED * limit_rad_s)
@@ -18,9 +18,9 @@ def longest_gap_s(wraps_rad: float | None, limit_rad_s: float) -> float:
 class Unwrapped:
     """The angle since the first reading, rad.
 
-    Between two readings the shaft turns by less than half of ``wraps_rad`` (None: the counter never starts over). After
-    a gap longer than `longest_gap_s` the turns are not known: that reading gives None, and the angle goes on from it,
-    right but for whole wraps.
+    Between two readings the shaft turns by less than half of ``wraps_rad`` (None: the counter never wraps). After a gap
+    longer than `longest_gap_s` the number of turns is unknown: that reading gives None, and the angle continues from
+    it, correct except for whole wraps.
     """
 
     def __init__(self, wraps_rad: float | None, limit_rad_s: float) -> None:
@@ -30,7 +30,9 @@ class Unwrapped:
         self._angle_rad = 0.0
 
     def take(self, time_s: float, counted_rad: float) -> float | None:
-        """One reading, at control time; the angle, or None where the turns since the reading before are not known."""
+        """Take one reading at control time. Return the angle, or None if the turns since the last reading are
+        unknown.
+        """
         if not math.isfinite(counted_rad):
             return None
         last, self._last = self._last, (time_s, counted_rad)

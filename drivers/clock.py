@@ -1,7 +1,7 @@
-"""Control time, as every loop above the drive sees it.
+"""Control time, for every loop above the drive.
 
-Two clocks: the wall's monotonic one, and one that the bus steps by a period a cycle (a simulated drive
-advances its plant by as much), so that a protocol of minutes takes seconds and repeats.
+Two clocks exist: the computer's monotonic clock, and one that the bus advances by a period per cycle. A simulated drive
+advances its plant by the same time, so that a run of minutes takes seconds and is repeatable.
 """
 
 import math
@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from drivers.errors import CommunicationLost
+from profiles import MessageCode
 
 
 class Clock(Protocol):
@@ -24,7 +25,7 @@ class Clock(Protocol):
 
 
 def _boot_time_s() -> float:
-    """Monotonic, and it goes on while a laptop sleeps: a loop that slept through must notice that it did."""
+    """Return monotonic time that includes sleep: a loop must detect that the laptop slept."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
@@ -32,7 +33,7 @@ _now_s = _boot_time_s if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic
 
 
 class MonotonicClock:
-    """The machine's monotonic clock, time asleep included; its zero is the moment it was made."""
+    """The computer's monotonic clock, time asleep included. It starts at zero."""
 
     stepped = False
 
@@ -51,7 +52,7 @@ class MonotonicClock:
 
 
 class SteppedClock:
-    """Moves only when told to: a wait is over at once, and it is then exactly the time waited for."""
+    """Advances only on request: a wait returns at once, exactly at the requested time."""
 
     stepped = True
 
@@ -67,26 +68,26 @@ class SteppedClock:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The beat of the cycle: when each one begins, which began late, and whether this loop itself stood still.
+# Ticks of the cycle: the start of each cycle, its delay, and delays of this loop itself.
 
 
 LOWER_THE_RATE = "Lower --rate, or give --real-time-priority"
-"""What to do where this computer, or its adapter, doesn't keep up."""
+"""Advice if this computer, or its adapter, is too slow."""
 
 RECENT = 1000
-"""So many cycles are looked at when it is asked how late they were."""
+"""Number of cycles in the statistics of delays."""
 LATE_SHARE = 0.02
-"""Of those: so many late ones are an ordinary scheduler's."""
+"""Share of late cycles that an ordinary scheduler causes."""
 RATES_HZ = (1000.0, 500.0, 250.0, 200.0, 125.0, 100.0, 50.0, 25.0, 20.0)
-"""What is tried below a profile's rate, where this computer doesn't hold that one; a watchdog wants five cycles."""
+"""Rates, Hz, below a profile's rate, for a computer that does not hold that rate; a watchdog needs five cycles."""
 STALL_S, STALL_CYCLES = 0.05, 3.0
-"""Whoever was away for longer than both has stood still."""
+"""Limits of a stall, s and cycles: a loop that was delayed by more than both has stalled."""
 
 
 def how_late(late_s: Iterable[float], period_s: float) -> str:
-    """`host or adapter late (n of m cycles, p99 …)`, or nothing where few of these cycles were.
+    """Return `host or adapter late (n of m cycles, p99 …)`, or an empty text if few of these cycles were late.
 
-    ``late_s``: by how much each cycle began late, or each answer came after its cycle, s.
+    ``late_s``: delay of the start of each cycle, or of each answer after its cycle, s.
     """
     ordered = sorted(late_s)
     late = sum(one > 0.5 * period_s for one in ordered)
@@ -97,12 +98,12 @@ def how_late(late_s: Iterable[float], period_s: float) -> str:
 
 
 def quantile(ordered: list[float], share: float) -> float:
-    """The smallest of these, in order, that so large a share doesn't exceed."""
+    """Return the smallest of these ordered values that this share of them does not exceed."""
     return ordered[max(0, math.ceil(share * len(ordered)) - 1)] if ordered else 0.0
 
 
 class Ticks:
-    """A tick every ``period_s``. ``longest_stall_s``: standing still for longer is an error; 0: it never is."""
+    """A tick every ``period_s``. ``longest_stall_s``: a longer delay is an error; 0: no delay is an error."""
 
     def __init__(self, clock: Clock, period_s: float, longest_stall_s: float = 0.0) -> None:
         self._clock = clock
@@ -111,16 +112,16 @@ class Ticks:
         self._ended_s = self._began_s = clock.now_s()
         self._next_s = self._ended_s + period_s
         self.overruns = 0
-        self.late_s: deque[float] = deque(maxlen=RECENT)       # by how much the last cycles began late
-        self._stalls: deque[tuple[float, float]] = deque(maxlen=RECENT)    # when this loop was back, how long away
+        self.late_s: deque[float] = deque(maxlen=RECENT)       # delay of the start of the last cycles
+        self._stalls: deque[tuple[float, float]] = deque(maxlen=RECENT)    # time of return, duration of the stall
 
     def wait(self, until: Callable[[float], None] | None = None) -> None:
-        """Until the next tick; ``until`` waits for a control time, s, in its own way.
+        """Wait until the next tick; ``until`` waits for a control time, s, in its own way.
 
-        Raises CommunicationLost if the loop comes back far too late, once for each time.
+        Raises CommunicationLost if the loop returns far too late, once for each time.
 
-        A tick that was overslept is not caught up with: the line would carry two cycles in a row without a pause, and
-        what a SYNC measures would be one instant twice.
+        A missed tick is not made up for: the line would carry two cycles without a pause, and two SYNCs would measure
+        nearly the same instant.
         """
         clock, due_s = self._clock, self._next_s
         (until or clock.wait_until)(due_s)
@@ -130,11 +131,11 @@ class Ticks:
             self.overruns += 1
         self._next_s = max(due_s + self._period_s, now_s + 0.5 * self._period_s)
         self._began_s = now_s
-        # Waiting for a reply that didn't come isn't standing still: that is told by its own error.
+        # Waiting for a missing reply is not a stall; it has its own error.
         self._refuse_stall(now_s - max(due_s, self._ended_s), now_s)
 
     def check(self) -> None:
-        """Just before a setpoint goes out: a process can be frozen anywhere, also between the tick and here.
+        """Check for a stall just before a setpoint is sent: a process can be frozen anywhere, also after the tick.
 
         Raises CommunicationLost like `wait`.
         """
@@ -142,7 +143,7 @@ class Ticks:
         self._refuse_stall(now_s - self._began_s, now_s)
 
     def check_end(self) -> None:
-        """When the cycle's frames are in: whoever was frozen in waiting for them must not judge the drive's silence.
+        """Check for a stall when the cycle's frames are in: a loop that was frozen can't judge the drive's silence.
 
         Raises CommunicationLost like `wait`.
         """
@@ -150,7 +151,7 @@ class Ticks:
         self._refuse_stall(now_s - self._began_s, now_s, "")
 
     def stood_still_s(self, within_s: float) -> float:
-        """The longest that this loop was away for and came back from within the last ``within_s``, s; 0: never."""
+        """Return the longest stall that ended within the last ``within_s``, s; 0 if there was none."""
         since_s = self._clock.now_s() - within_s
         return max((away_s for back_s, away_s in self._stalls if back_s >= since_s), default=0.0)
 
@@ -166,12 +167,15 @@ class Ticks:
                 f"the control loop stood still for {stood_still_s:.2f} s{then}",
                 where="host",
                 next_step="Was the laptop asleep, the process frozen? The drive's watchdog may have stopped the shaft",
+                entry=MessageCode.HOST_LATE,
             )
 
     def done(self) -> None:
-        """The talk of one cycle on the line is over."""
+        """Note that the transactions of one cycle have ended."""
         self._ended_s = self._clock.now_s()
 
     def put_off(self) -> None:
-        """Time was well spent on something else: the next tick is due now at the earliest, nothing was overslept."""
+        """Postpone the next tick to now at the earliest after other planned work; it does not count as a missed
+        tick.
+        """
         self._next_s = max(self._next_s, self._clock.now_s())

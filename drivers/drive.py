@@ -1,12 +1,12 @@
-"""The contract between a drive, of whatever make and bus, and everything above it.
+"""The contract between a drive, of any make and bus, and all rooms above it.
 
-All quantities are SI at the motor shaft; torque positive drives speed positive. Nothing above `drivers`
-knows of objects, registers, per-mille or rpm. A caller goes down the list once:
+All quantities are SI at the motor shaft; positive torque drives positive speed. No room above `drivers` uses objects,
+registers, per-mille or rpm. A caller follows this list once:
 
     connect → preflight → enable(mode) → exchange(command) … → quick_stop → exchange … → disable → close
 
-`enable`, `quick_stop` and `disable` only say what is wanted; the drive's state machine moves during the
-`exchange` calls that follow, one a cycle, so that every cycle is seen, recorded and guarded alike.
+`enable`, `quick_stop` and `disable` only set the request. The drive's state machine moves during the `exchange` calls
+that follow, one step a cycle. So every cycle is seen, recorded and guarded alike.
 """
 
 import math
@@ -19,14 +19,14 @@ from drivers.clock import Clock
 
 
 class Mode(Enum):
-    """What the drive regulates."""
+    """Quantity that the drive controls."""
 
     SPEED = "speed"
     TORQUE = "torque"
 
 
 class PowerState(Enum):
-    """The drive's state machine as far as a caller needs it (CiA 402, figure of the state machine)."""
+    """State of the drive as far as a caller needs it (CiA 402, figure of the state machine)."""
 
     NOT_READY = "not ready"
     OFF = "off"                    # switch on disabled: no torque
@@ -34,7 +34,7 @@ class PowerState(Enum):
     ENABLED = "enabled"            # operation enabled: setpoints act
     QUICK_STOP = "quick stop"      # decelerating or holding after a quick stop
     FAULT = "fault"                # fault reaction active, or fault
-    UNKNOWN = "no valid state"     # the status word is none that the drive can show: nothing is known of it
+    UNKNOWN = "no valid state"     # the status word is invalid: the state is unknown
 
 
 class PowerRequest(Enum):
@@ -46,10 +46,10 @@ class PowerRequest(Enum):
 
 
 class Command(NamedTuple):
-    """One cycle's wish: the mode, and the setpoint of each mode (the other one seeds a later switch).
+    """Request of one cycle: the mode, and the setpoint of each mode (the other one is used at a later switch).
 
-    ``torque_offset_nm`` is added by the drive to what its speed loop asks for; only where `DriveLimits.torque_offset`
-    was asked for, in speed mode, and while it is to be enabled: with anything else asked for it goes out as zero.
+    The drive adds ``torque_offset_nm`` to the output of its speed loop. It acts only if `DriveLimits.torque_offset` was
+    set, in speed mode, and with an enable request; otherwise zero is sent.
     """
 
     mode: Mode
@@ -61,9 +61,9 @@ class Command(NamedTuple):
 class Sample(NamedTuple):
     """One cycle's feedback, torque and speed of one instant.
 
-    ``time_s`` is control time of the SYNC (of the middle of the transaction on Modbus, give or take
-    ``half_width_s``); ``age_s`` says how long after it the feedback arrived. ``fresh`` is False when the
-    cycle brought none: the values are then those of the cycle before.
+    ``time_s`` is control time of the SYNC (on Modbus: of the middle of the transaction, with the uncertainty
+    ``half_width_s``). ``age_s`` is the delay of the feedback after it. ``fresh`` is False if the cycle brought no
+    feedback: the values are then those of the cycle before.
 
     ``position_rad`` is the motor shaft's angle at ``time_s``, counted by the drive apart from its speed, and unwrapped
     since the first reading (`drivers.angle`). None where the cycle brought none. In a sample that was polled for
@@ -77,9 +77,9 @@ class Sample(NamedTuple):
     speed_rad_s: float
     torque_nm: float
     torque_demand_nm: float | None
-    mode: Mode | None              # as the drive displays it; None while it displays another one
+    mode: Mode | None              # displayed mode; None for any other one
     state: PowerState
-    standstill: bool               # as the drive says, where it says so
+    standstill: bool               # as reported by the drive, if it reports it
     limit_active: bool             # internal limit active (statusword bit 11)
     status: int                    # raw statusword, for the log
     position_rad: float | None = None
@@ -99,7 +99,7 @@ FrameTap = Callable[[RawFrame], None]
 
 @dataclass(frozen=True)
 class Identity:
-    """Who is at the other end. ``simulated`` is decided by the simulator's marker alone."""
+    """Identity of the peer. Only the simulator's marker decides ``simulated``."""
 
     vendor: int
     product: int
@@ -111,23 +111,23 @@ class Identity:
 
 @dataclass(frozen=True)
 class DriveLimits:
-    """What the caller wants the drive itself to enforce, written to it and read back in preflight."""
+    """Limits that the drive itself must enforce; preflight writes them and reads them back."""
 
     speed_rad_s: float
     torque_nm: float
     quick_stop_rad_s2: float
     watchdog_s: float
-    accept_no_watchdog: bool = False   # by the operator, by name: a drive whose watchdog is off and stays off
+    accept_no_watchdog: bool = False   # override of the operator: the watchdog is off and stays off
     accept_wider: frozenset[str] = frozenset()     # of `drivers.own_limits.NAMES`: own limits that may be made wider
-    accept_shared_watchdog: bool = False   # by the operator, by name: one that any client's requests feed
-    temperature_c: float | None = None     # °C; above it the run is stopped, where the drive tells a temperature
-    torque_offset: bool = False            # will `Command.torque_offset_nm` be used? refused where the drive has none
-    string: bool = False                   # does a drill string hang on the shaft? one that is held is refused
+    accept_shared_watchdog: bool = False   # override of the operator: any client feeds the watchdog
+    temperature_c: float | None = None     # °C; limit of a reported temperature
+    torque_offset: bool = False            # `Command.torque_offset_nm` is used; refused without one
+    string: bool = False                   # a drill string is attached; trapped torque is refused
 
 
 @dataclass(frozen=True)
 class ReportingFilters:
-    """First-order lags that the drive puts on what it reports, where it tells them; None = not told."""
+    """First-order lags of the reported signals, s; None if the drive does not report them."""
 
     speed_lag_s: float | None = None
     torque_lag_s: float | None = None
@@ -135,7 +135,7 @@ class ReportingFilters:
 
 
 class Outcome(Enum):
-    """How a preflight check went."""
+    """Result of a preflight check."""
 
     OK = "ok"
     NOTE = "note"                  # worth a line, no obstacle
@@ -156,32 +156,32 @@ class Check:
 
 @dataclass(frozen=True)
 class Preflight:
-    """What was found before anything moved."""
+    """Findings before motion."""
 
     identity: Identity
     checks: tuple[Check, ...]
     modes: frozenset[Mode]
     switch_while_enabled: bool
-    quick_stop_in_torque_mode: bool    # does a quick stop decelerate under speed control from torque mode?
+    quick_stop_in_torque_mode: bool    # quick stop from torque mode decelerates under speed control
     rated_torque_nm: float
     torque_resolution_nm: float
     speed_resolution_rad_s: float
     watchdog_s: float                  # 0: none is armed
-    safe_action: str                   # what the drive does by itself when the host falls silent
+    safe_action: str                   # reaction of the drive to a silent host
     filters: ReportingFilters = ReportingFilters()
     torque_setpoint: str = "torque setpoint"     # object or register that takes it
     torque_offset_resolution_nm: float = 0.0     # one count of the torque offset; 0: not asked for, or there is none
-    kept_torque_nm: float | None = None          # the drive's own limit, where it was tighter than asked and stayed
+    kept_torque_nm: float | None = None          # the drive's own limit, if it was tighter and stayed
     kept_speed_rad_s: float | None = None        # (`drivers.own_limits`)
-    quick_stop_holds: bool | None = None   # after a quick stop: held by the drive, let go of; None: nobody knows
-    fed_by_any_client: bool = False    # requests of any other client keep the watchdog from acting, as far as is known
+    quick_stop_holds: bool | None = None   # the drive holds the shaft after a quick stop; None: unknown
+    fed_by_any_client: bool = False    # any other client feeds the watchdog, as far as is known
     position_resolution_rad: float = 0.0   # one count of the motor's angle; 0: the drive reports none
-    position_period_s: float | None = None     # so far apart at most it comes with the cycle; None: `Positioned` alone
-    position_gap_s: float = math.inf       # after a longer gap the turns are not known (`drivers.angle.Unwrapped`)
+    position_period_s: float | None = None     # longest interval in the cycle; None: `Positioned` only
+    position_gap_s: float = math.inf       # after a longer gap the turns are unknown (`drivers.angle.Unwrapped`)
 
     @property
     def watched(self) -> bool:
-        """Does the drive stop by itself when the host falls silent? If not, it was refused, or accepted by name."""
+        """True if the drive stops by itself when the host is silent. If not, the operator has accepted it by name."""
         return self.watchdog_s > 0.0
 
     @property
@@ -191,22 +191,22 @@ class Preflight:
 
 @dataclass(frozen=True)
 class Counters:
-    """What went wrong on the bus so far."""
+    """Errors on the bus since the start."""
 
     cycles: int = 0
     missed: int = 0                # cycles without feedback
     late: int = 0                  # feedback that came after its cycle
     overruns: int = 0              # cycles that began late by more than half a period
-    wall_offset_s: float | None = None     # stamps of frames minus control time; None where they bear no wall clock
-    error_frames: int = 0          # that the adapter told of
-    passive: int = 0               # how often it said that it is error-passive
-    wall_jumps: int = 0            # how often that offset jumped: somebody set the wall clock
+    wall_offset_s: float | None = None     # frame stamps minus control time; None without wall clock
+    error_frames: int = 0          # reported by the adapter
+    passive: int = 0               # error-passive reports of the adapter
+    wall_jumps: int = 0            # jumps of that offset: the wall clock was set
 
 
 class Drive(Protocol):
     """One drive on one bus. Every method may raise `drivers.errors.TdhilError`.
 
-    ``close`` gives changed settings back and returns, a line each, those that it couldn't.
+    ``close`` restores changed settings and returns, one line each, those that could not be restored.
 
     A drive may also be `Polled`, `Telling`, `Positioned`, `Paced`, `KeptAlive`, `Rehearsed` and `Timed`, and one that
     `StopsFeeding`.
@@ -240,10 +240,10 @@ class Drive(Protocol):
 
 @runtime_checkable
 class Polled(Protocol):
-    """A drive that can also be asked for one sample beside the cycle, while a stop gets no feedback from that.
+    """A drive that can also be polled for one sample beside the cycle, for a stop without cyclic feedback.
 
-    ``poll`` takes a part of the watchdog's time at most, and asks once more for what `quick_stop` or `disable` asked
-    for; it never enables. None without an answer; it may raise TdhilError, too.
+    ``poll`` takes at most a part of the watchdog's time, and repeats the request of `quick_stop` or `disable`. It never
+    enables. It returns None without an answer, and may raise TdhilError.
     """
 
     def poll(self) -> Sample | None: ...
@@ -251,10 +251,10 @@ class Polled(Protocol):
 
 @runtime_checkable
 class Telling(Protocol):
-    """A drive that notices what others do on its bus and what doesn't end a run.
+    """A drive that detects foreign traffic on its bus that does not end a run.
 
-    ``remarks`` gives what was noticed since it was asked last; ``summary`` what there is to say of all of the run.
-    A line each, cheap to ask for in every cycle.
+    ``remarks`` returns the remarks since the last call; ``summary`` returns those on the whole run. One line each; a
+    call in every cycle is cheap.
     """
 
     def remarks(self) -> tuple[str, ...]: ...
@@ -264,11 +264,11 @@ class Telling(Protocol):
 
 @runtime_checkable
 class StopsFeeding(Protocol):
-    """A drive that a stop can leave to its own watchdog while it goes on being watched.
+    """A drive that a stop can leave to its own watchdog while its feedback is still read.
 
-    After ``stop_feeding`` nothing goes out that the watchdog takes for the host's sign of life: `exchange` goes on with
-    what doesn't feed it, be it by listening alone, and so does `Polled.poll`. There is no way back but `close`. Called
-    only where a watchdog is armed; it may raise TdhilError, and a second call does nothing.
+    After ``stop_feeding`` no frame is sent that feeds the watchdog. `exchange` and `Polled.poll` continue without such
+    frames, if necessary by listening only. Only `close` ends this state. It is called only with an armed watchdog, may
+    raise TdhilError, and does nothing the second time.
     """
 
     def stop_feeding(self) -> None: ...
@@ -276,10 +276,10 @@ class StopsFeeding(Protocol):
 
 @runtime_checkable
 class RemovesTorque(Protocol):
-    """A drive whose `disable` brakes a shaft that still turns, and that can also be told not to.
+    """A drive whose `disable` brakes a shaft that still turns, and that can also disable without braking.
 
-    ``remove_torque`` moves towards disabled in the cycles that follow, whatever the reported speed is: for a shaft that
-    the drive itself accelerates against a quick stop.
+    ``remove_torque`` moves towards disabled in the following cycles at any reported speed: for a shaft that the drive
+    itself accelerates against a quick stop.
     """
 
     def remove_torque(self) -> None: ...
@@ -287,32 +287,32 @@ class RemovesTorque(Protocol):
 
 @runtime_checkable
 class KeptAlive(Protocol):
-    """A drive whose peer, in stepped time, must hear of a host that reckons for a while; no time passes by it."""
+    """A drive whose peer, in stepped time, needs a sign of life during long computations; no time passes by it."""
 
     def keep_alive(self) -> None: ...
 
 
 @runtime_checkable
 class Rehearsed(Protocol):
-    """A drive that tells a simulated peer which stage begins: scripted faults wait for that."""
+    """A drive that sends the stage of the run to a simulated peer, whose scripted faults wait for it."""
 
     def announce(self, stage: str) -> None: ...
 
 
 @runtime_checkable
 class Timed(Protocol):
-    """A drive that knows whether this computer has been late; in words then, and empty else."""
+    """A drive that detects delays of this computer; ``host_late`` describes them, empty if there is none."""
 
     def host_late(self) -> str: ...
 
 
 @runtime_checkable
 class Paced(Protocol):
-    """A drive whose cycles keep time by this computer's clock, at a rate that nobody has named.
+    """A drive whose cycles follow this computer's clock, at a rate that the operator has not fixed.
 
-    ``rates_hz`` are those it may be given, the highest first; empty where the rate stands. `set_rate` is for after
-    preflight and before anything is enabled; with ``measuring`` a loop that stands still for long is no error.
-    ``began_late_s``: by how much the last cycle began late, s.
+    ``rates_hz`` are the possible rates, the highest first; empty if the rate is fixed. `set_rate` is called after
+    preflight and before anything is enabled; with ``measuring`` a long delay is no error. ``began_late_s``: delay of
+    the start of the last cycle, s.
     """
 
     @property
@@ -327,8 +327,8 @@ class Paced(Protocol):
 class PositionReading(NamedTuple):
     """The motor shaft's angle, counted by the drive independently of the unit of its speed.
 
-    ``time_s`` is control time of the reading, give or take ``half_width_s``. The angle starts over after
-    ``wraps_rad`` (None: it never does); its zero means nothing. ``where``: object or register.
+    ``time_s`` is control time of the reading, with the uncertainty ``half_width_s``. The angle wraps at ``wraps_rad``
+    (None: never); its zero has no meaning. ``where``: object or register.
     """
 
     time_s: float
@@ -340,10 +340,10 @@ class PositionReading(NamedTuple):
 
 @runtime_checkable
 class Positioned(Protocol):
-    """A drive that may also tell the angle of its motor shaft, apart from its speed.
+    """A drive that may also report the angle of its motor shaft, independent of its speed.
 
-    ``read_position`` is called after `preflight`, between two cycles, in speed mode at a steady speed or a gentle ramp;
-    it takes a part of the watchdog's time at most. None: the drive has no angle to tell, or gave no answer.
+    ``read_position`` is called after `preflight`, between two cycles, in speed mode at a steady speed or on a slow
+    ramp. It takes at most a part of the watchdog's time. None: the drive has no angle, or did not answer.
     """
 
     def read_position(self) -> PositionReading | None: ...

@@ -1,4 +1,4 @@
-"""The error tree of everything that talks to a drive.
+"""The error tree of all rooms that talk to a drive.
 
 ::
 
@@ -14,11 +14,10 @@
     ├── StopNotConfirmed            the shaft was not seen at rest after the stop sequence
     └── CommandRejected             a NaN or out-of-range setpoint; never reached the bus
 
-Those of one bus only are leaves of these (`drivers.modbus.pdu`). `tdhil.errors` says which of them ends with which
-exit code.
+Errors of a single bus are leaves of these (`drivers.modbus.pdu`). `tdhil.errors` assigns the exit codes.
 """
 
-from profiles import DataFileError, Problem, TdhilError
+from profiles import DataFileError, MessageCode, Problem, TdhilError
 
 __all__ = [
     "CommandRejected",
@@ -39,34 +38,52 @@ __all__ = [
 class PreflightRefused(TdhilError):
     """Refused before the shaft has moved: identity, limits, watchdog, mode or confirmation."""
 
+    entry = MessageCode.PREFLIGHT_REFUSED
+
 
 class ObjectRefused(PreflightRefused):
     """The drive aborted the transfer of an object; objects are read and written before the shaft moves only."""
 
+    entry = MessageCode.OBJECT_REFUSED
+
 
 class CommunicationLost(TdhilError):
-    """The drive can't be heard or reached any more."""
+    """The drive can't be reached, or its frames are not received."""
+
+    entry = MessageCode.COMMUNICATION_LOST
 
 
 class DriveFault(TdhilError):
-    """The drive itself reports a fault or leaves the state it was asked to hold."""
+    """The drive itself reports a fault or leaves the requested state."""
+
+    entry = MessageCode.DRIVE_FAULT
 
 
 class ModeNotConfirmed(DriveFault):
-    """The drive did not take over the mode of operation it was asked for."""
+    """The drive did not confirm the requested mode of operation."""
+
+    entry = MessageCode.MODE_NOT_CONFIRMED
 
 
 class ReportsContradict(DriveFault):
-    """Two reports of the drive cannot both be true of one shaft."""
+    """Two reports of the drive can't both be true for one shaft."""
+
+    entry = MessageCode.REPORTS_CONTRADICT
 
 
 class LimitHit(TdhilError):
-    """A limit of the rig (speed window, torque, time) was reached or is about to be."""
+    """A limit of the rig (speed window, torque, time) was reached or will be."""
+
+    entry = MessageCode.LIMIT_HIT
 
 
 class StopNotConfirmed(TdhilError):
-    """The stop sequence ran, but the shaft was not seen at rest."""
+    """The stop sequence ran, but standstill was not confirmed."""
+
+    entry = MessageCode.STOP_NOT_CONFIRMED
 
 
 class CommandRejected(TdhilError):
     """A setpoint that must not reach the bus: not finite, or outside the limits."""
+
+    entry = MessageCode.COMMAND_REJECTED

@@ -1,11 +1,11 @@
-"""The drive's own limits stay as tight as they were found, unless the operator takes a wider one by name.
+"""The drive's own limits stay as tight as they were found, unless the operator accepts a wider one by name.
 
-Somebody set the drive for its motor, its gear, or for a test before this one; and a host that dies leaves behind what
-it wrote. So a torque or speed limit is lowered to rig.yaml's unasked and never raised, and a quick stop's ramp is made
-steeper and never gentler. Where the drive is tighter, its limit stays and the run keeps within it
-(`Preflight.kept_torque_nm`, `Preflight.kept_speed_rad_s`); a quick stop that brakes harder just stays.
+They were set for the motor, the gear, or an earlier test; and a host that dies leaves its own values. So a torque or
+speed limit is lowered to rig.yaml's and never raised, and a quick-stop ramp is made steeper and never gentler. If the
+drive is tighter, its limit stays and the run keeps within it (`Preflight.kept_torque_nm`,
+`Preflight.kept_speed_rad_s`); a quick stop that brakes harder stays too.
 
-A simulated drive is no exception: it leaves its factory as wide as it goes.
+This also holds for a simulated drive, whose factory limits are wide.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ WIDER_FLAG = "--accept-wider-limit"
 TORQUE, SPEED, QUICK_STOP = "torque", "speed", "quick-stop"
 NAMES = (TORQUE, SPEED, QUICK_STOP)
 _SLACK = 1e-6
-"""Of a value: what a 32-bit float or half a count of rounding may differ by without being wider."""
+"""Relative difference from 32-bit rounding, or from half a count, that does not count as wider."""
 
 
 class OwnLimits:
-    """Decides limit by limit, and keeps what stayed: ``kept`` by name, N·m, rad/s or rad/s², the tightest of each."""
+    """Decides limit by limit. ``kept``: the tightest limit that stayed, by name, N·m, rad/s or rad/s²."""
 
     def __init__(self, accepted: Collection[str]) -> None:
         self._accepted = frozenset(accepted)
         self.kept: dict[str, float] = {}
 
     def stays(self, limit: str, wanted: float, found: float) -> bool:
-        """Is the one ``found`` in the drive tighter, and not to be touched? Both in one unit, whatever their sign."""
+        """Return whether the limit ``found`` in the drive is tighter and must stay. Both in one unit, with any sign."""
         return self.wider(limit, wanted, found) and limit not in self._accepted
 
     def keep(
         self, table: PreflightTable, limit: str, title: str, wanted: str, found: str, found_si: float, where: str
     ) -> None:
-        """The row of one that stays."""
+        """Add the row of a limit that stays."""
         self.kept[limit] = min(abs(found_si), self.kept.get(limit, abs(found_si)))
         effect = "it brakes harder" if limit == QUICK_STOP else "the run keeps within it"
         text = f"{found}, kept: tighter than rig.yaml's, {effect}"
@@ -46,7 +46,7 @@ class OwnLimits:
         self, table: PreflightTable, limit: str, title: str, wanted: str, now: str, before: str, good: bool, where: str,
         mend: str = "", *, wider: bool = False,
     ) -> bool:
-        """The row of one that was written, with what stood there before; whether it reads back as wanted."""
+        """Add the row of a written limit, with its former value. Return whether it reads back as wanted."""
         changed = "" if before == now else f" (was {before})"
         if wider and good:
             text = f"{now} (was {before}: wider, accepted by {WIDER_FLAG} {limit})"
@@ -56,7 +56,7 @@ class OwnLimits:
 
     @staticmethod
     def wider(limit: str, wanted: float, found: float) -> bool:
-        """Would writing ``wanted`` over ``found`` widen the drive's own limit?"""
+        """Return whether writing ``wanted`` over ``found`` would widen the drive's own limit."""
         wanted, found = abs(wanted), abs(found)
         if limit == QUICK_STOP:
             return wanted < found * (1.0 - _SLACK)

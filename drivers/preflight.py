@@ -1,4 +1,4 @@
-"""The preflight table while it is being filled in, whatever the bus."""
+"""The preflight table, for any bus."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from drivers.errors import CommandRejected, PreflightRefused
 
 
 class PreflightTable:
-    """Collects the rows. One that fails doesn't hide those after it: an engineer wants the whole list."""
+    """Collects the rows. A failed row does not end the table: the engineer sees the whole list."""
 
     def __init__(self) -> None:
         self.checks: list[Check] = []
 
     def row(self, title: str, wanted: str, found: str, good: bool, where: str = "", next_step: str = "") -> bool:
-        """A row that is right or refused; whether it is right."""
+        """Add a row that is right or refused. Return whether it is right."""
         outcome = Outcome.OK if good else Outcome.REFUSED
         self.checks.append(Check(title, wanted, found, outcome, where, "" if good else next_step))
         return good
 
     def note(self, title: str, found: str, where: str = "", next_step: str = "") -> None:
-        """A row that is worth a line and no obstacle."""
+        """Add a row that is no obstacle."""
         self.checks.append(Check(title, "", found, Outcome.NOTE, where, next_step))
 
     def attempt(
         self, title: str, wanted: str, where: str, work: Callable[[], tuple[str, bool]], mend: str = ""
     ) -> bool:
-        """A row whose work the drive may refuse: that refusal is then the row."""
+        """Add a row whose work the drive may refuse: that refusal is then the row."""
         try:
             found, good = work()
         except (PreflightRefused, CommandRejected) as error:
@@ -39,10 +39,10 @@ class PreflightTable:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A drive whose watchdog is not armed, or can't be: refused, unless the operator has accepted just that by name.
+# A drive whose watchdog is not armed, or can't be: refused, unless the operator has accepted exactly that by name.
 #
-# Accepted is a watchdog that is *off*. One that is on and reads back otherwise than it was set stays refused: nobody
-# knows when it would act, and on whom.
+# Accepted is a watchdog that is *off*. A watchdog that is on and reads back another value stays refused: it is unknown
+# when it would trip, and for which host.
 
 
 NO_WATCHDOG_FLAG = "--accept-no-watchdog"
@@ -59,10 +59,10 @@ _NOT_OFF = f"{NO_WATCHDOG_FLAG} takes a watchdog that is off, not one that is se
 
 
 def settle(table: PreflightTable, tried: PreflightTable, accepted: bool, is_off: Callable[[], bool]) -> bool:
-    """Take over the rows that arming gave; whether the watchdog is armed.
+    """Add the rows of arming the watchdog. Return whether it is armed.
 
-    ``is_off`` is asked only where a row was refused and the operator has accepted a drive without: then they become
-    notes that say so. A refusal that stands names the way out.
+    ``is_off`` is called only if a row was refused and the operator has accepted a missing watchdog; the rows then
+    become notes. A refusal that stays names the option.
     """
     refused = [check for check in tried.checks if check.outcome is Outcome.REFUSED]
     if refused and accepted and is_off():
@@ -75,7 +75,7 @@ def settle(table: PreflightTable, tried: PreflightTable, accepted: bool, is_off:
 
 
 def spare(table: PreflightTable, title: str, wanted: str, found: str, where: str) -> None:
-    """A row about the watchdog's own parameter that would be refused, were a watchdog that is off not accepted."""
+    """Add a row about the watchdog's own parameter: refused, unless the operator accepted a watchdog that is off."""
     table.checks.append(_noted(Check(title, wanted, found, Outcome.REFUSED, where)))
 
 
@@ -91,33 +91,33 @@ def _hinted(check: Check, hint: str) -> Check:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A drill string that an earlier stop has left wound up: the drive holds it, and preparing the drive disables that.
+# Trapped torque of a drill string after an earlier stop: the drive holds it, and preparing the drive would release it.
 
 
 HELD_SHARE, HELD_COUNTS = 0.02, 5.0
-"""Of the torque limit, or so many counts of the reported torque: less than both is nothing."""
+"""Noise of the reported torque: share of the torque limit, or number of counts, the larger of both."""
 
 
 def check_nothing_held(table: PreflightTable, held_nm: float | None, limit_nm: float, count_nm: float,
                        where: str) -> bool:
-    """A row of what a drive in quick stop holds, N·m; None: it doesn't tell. Whether the shaft may be let go."""
+    """Add a row of the torque held in quick stop, N·m; None: not reported. Return whether the shaft may be released."""
     most_nm = max(HELD_SHARE * limit_nm, HELD_COUNTS * count_nm)
     found = "not told" if held_nm is None else f"{held_nm:.4g} N·m"
     return table.row(
         "torque held in quick stop", f"at most {most_nm:.3g} N·m", found,
         held_nm is not None and abs(held_nm) <= most_nm, where,
-        "A drill string is wound up, and the run would let go of it at once: bring its torque down with the rig's own"
-        " control, then disable the drive there",
+        "The drive holds trapped torque of a drill string, and the run would release it at once. Reduce the torque with"
+        " the rig's own control, then disable the drive there",
     )
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The rated torque, which the drive and rig.yaml may both know: one row of the preflight table, whatever the bus.
+# The rated torque, from the drive and from rig.yaml: one row of the preflight table, for any bus.
 
 
 def agreed_rated_torque(table: PreflightTable, from_drive_nm: float | None, rig_nm: float | None,
                         where: str) -> float | None:
-    """N·m; rig.yaml's, and the drive's where the rig has none. None, and refused, where neither tells.
+    """Return rig.yaml's rated torque, N·m, or the drive's if the rig has none. None, and refused, without both.
 
     ``where`` names the object or the register.
     """

@@ -1,8 +1,8 @@
-"""A quick stop from outside of any run: best effort, on a drive of which nothing was prepared. No emergency stop.
+"""A quick stop outside of any run: best effort, on a drive that was not prepared. It is no emergency stop.
 
-Asks first and looks afterwards, again and again while the drive still follows somebody else's setpoints, until the
-shaft is at rest, or nothing is heard, or it gets no slower. Nothing is ever disabled here: a shaft that still turns
-would coast, and one at rest may be holding something.
+It first sends the request and then reads the state, repeatedly while the drive still follows another master's
+setpoints, until standstill, or no answer comes, or the shaft gets no slower. It never disables the drive: a turning
+shaft would coast, and a shaft at standstill may hold a load.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from drivers.drive import PowerState
 from drivers.errors import CommunicationLost, TdhilError
 
 QUIET_S, QUIET_UNSAID_S = 1.5, 3.0
-"""Standstill must last so long: where the drive says so too, and where it doesn't."""
+"""Least duration of standstill, s: if the drive reports it too, and if it does not."""
 PAUSE_S = 0.02
 SILENT_S = 3.0
 NO_SLOWER_S, SLOWER = 10.0, 0.99
@@ -26,7 +26,7 @@ _NO_TORQUE = (PowerState.OFF, PowerState.READY, PowerState.NOT_READY, PowerState
 
 
 class Ended(Enum):
-    """How it ended."""
+    """Result of a quick stop."""
 
     AT_REST = "at rest"
     TURNING = "still turning"
@@ -38,34 +38,34 @@ BLANK_WORDS = (0x0000, 0xFFFF)
 
 @dataclass(frozen=True)
 class Seen:
-    """One look. ``speed`` in rad/s, or in counts where the drive's unit isn't known; ``unit`` says which."""
+    """One reading. ``speed`` in rad/s, or in counts if the drive's unit is unknown; see ``unit``."""
 
     state: PowerState
     text: str                          # the state in the drive's own terms, with its status word
     speed: float
     unit: str
     near_zero: bool
-    standstill: bool                   # as the drive says
+    standstill: bool                   # as reported by the drive
     follows: bool                      # setpoints still act
     blank: bool = False                # the status word is all zeros or all ones: a gateway without its drive
 
 
 class Target(Protocol):
-    """A drive as far as stopping it needs it. Both methods may raise TdhilError."""
+    """Interface of a drive that a quick stop needs. Both methods may raise TdhilError."""
 
     def ask(self, attempt: int) -> None:
-        """Ask for the quick stop; a later attempt may go further than an earlier one."""
+        """Send the quick stop; a later attempt may use stronger means than an earlier one."""
 
     def poll(self) -> Seen:
-        """What the drive shows now."""
+        """Read the state of the drive."""
 
     def remarks(self) -> tuple[str, ...]:
-        """What a reader should know: another master, what was changed, a line each."""
+        """Return remarks: another master, and changes in the drive, one line each."""
 
 
 @dataclass(frozen=True)
 class BareStopReport:
-    """What was asked for and seen."""
+    """Requests sent and states read."""
 
     ended: Ended
     first: Seen | None
@@ -76,7 +76,7 @@ class BareStopReport:
 
 
 def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_S) -> BareStopReport:
-    """Never raises: what failed is among the remarks."""
+    """Stop the shaft. Never raises: errors are among the remarks."""
     begun_s = heard_s = gained_s = clock.now_s()
     first: Seen | None = None
     last: Seen | None = None
@@ -91,7 +91,7 @@ def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_S) -> Bar
             if follows:
                 asked += 1
                 target.ask(asked)
-        except TdhilError as error:    # the look says whether it helped all the same
+        except TdhilError as error:    # the poll shows whether it helped anyway
             _note(troubles, error)
         now_s = clock.now_s()
         try:

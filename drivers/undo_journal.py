@@ -1,10 +1,10 @@
-"""What a run changes in a drive is written down before it is changed, and struck out once it is given back.
+"""Journal of the settings that a run changes in a drive, written before each change and cleared by the restore.
 
-A host that is killed gives nothing back. What then stands in the file (one for each drive, in the log's folder) is what
-the drive was left with: `tdhil doctor` names it, and the next run gives it back before it looks at the drive's limits,
-so that what a dead run has widened isn't taken for the drive's own.
+A host that is killed restores nothing. The file (one for each drive, in the log's folder) then shows what is left in
+the drive. `tdhil doctor` reports it, and the next run restores it before it reads the drive's limits. So a limit
+widened by a dead run does not count as the drive's own.
 
-Nothing is kept of simulated drives. A file that can't be written refuses the run: nothing has been changed then.
+Simulated drives have no journal. A run is refused if the file can't be written; nothing has been changed then.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from typing import Any
 
 from drivers.drive import Identity
 from drivers.errors import PreflightRefused
+from profiles import MessageCode
 
 PREFIX, SUFFIX = "drive-left-", ".json"
 
 
 @dataclass(frozen=True)
 class Change:
-    """One setting: ``where`` as people call it, what stood there, and what a run put in its place."""
+    """One setting: ``where`` as in messages, the former value, and the value that a run wrote."""
 
     where: str
     before: bytes
@@ -32,13 +33,13 @@ class Change:
 
     @property
     def text(self) -> str:
-        """For people: 6072h is 400, and was 100 before."""
+        """Text for people: 6072h was left at 400, and was 100 before."""
         now, then = (int.from_bytes(data, "little") for data in (self.after, self.before))
         return f"{self.where} was left at {now}, and was {then} before"
 
 
 class UndoJournal:
-    """The file of one drive in ``folder``; `opened` says whose."""
+    """The file of one drive in ``folder``; `opened` selects the drive."""
 
     def __init__(self, folder: Path, address: str) -> None:
         self._folder = folder
@@ -48,7 +49,9 @@ class UndoJournal:
         self._entries: dict[str, Change] = {}
 
     def opened(self, identity: Identity) -> tuple[Change, ...]:
-        """What an earlier run left in this drive. Raises PreflightRefused for a file that can't be understood."""
+        """Return the settings that an earlier run left in this drive. Raises PreflightRefused for an unreadable
+        file.
+        """
         if identity.simulated:
             return ()
         name = f"{PREFIX}{identity.vendor:X}-{identity.product:X}-{identity.serial:X}-{self._address}{SUFFIX}"
@@ -59,14 +62,14 @@ class UndoJournal:
         return tuple(self._entries.values())
 
     def changing(self, where: str, before: bytes, after: bytes) -> None:
-        """A setting is about to be changed; what first stood there stays what stood there."""
+        """Record a setting before it is changed; the first former value is kept."""
         if self._path is not None:
             known = self._entries.get(where)
             self._entries[where] = Change(where, known.before if known is not None else before, after)
             self._save()
 
     def given_back(self, where: str) -> None:
-        """It stands as it stood, or isn't ours any more."""
+        """Clear a setting that was restored, or changed by another tool."""
         if self._path is not None and self._entries.pop(where, None) is not None:
             with suppress(PreflightRefused):       # too much in the file does no harm: it is compared with the drive
                 self._save()
@@ -94,11 +97,12 @@ class UndoJournal:
             raise PreflightRefused(
                 f"what the run changes in the drive can't be written down: {error}", where=str(self._path),
                 next_step="Give the log a folder that can be written to, with --log",
+                entry=MessageCode.UNDO_FILE_PROBLEM,
             ) from error
 
 
 def read(path: Path) -> tuple[str, tuple[Change, ...]]:
-    """The drive as people know it, and what was left in it. Raises PreflightRefused for a file that isn't one."""
+    """Return the drive's name and the settings left in it. Raises PreflightRefused for an invalid file."""
     try:
         document: Any = json.loads(path.read_text(encoding="utf-8"))
         entries = tuple(
@@ -110,4 +114,5 @@ def read(path: Path) -> tuple[str, tuple[Change, ...]]:
         raise PreflightRefused(
             f"what a run left in a drive can't be read: {error}", where=str(path),
             next_step="Compare the drive's settings with its documents, and remove the file",
+            entry=MessageCode.UNDO_FILE_PROBLEM,
         ) from error

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
         load_modbus_profile as load_modbus_profile, load_profile as load_profile, matching_names as matching_names,
         parse_profile as parse_profile, profile_names as profile_names, profile_text as profile_text,
     )
+    from profiles.messages import (
+        CodedText as CodedText, MessageCode as MessageCode, entry_of as entry_of, message_of as message_of,
+        with_code as with_code,
+    )
     from profiles.model import (
         DataModel as DataModel, Finding as Finding, NonNegative as NonNegative, Positive as Positive,
         Validated as Validated, one_of as one_of, refuse_if as refuse_if,

@@ -1,7 +1,7 @@
-"""What a profile says of a CANopen drive: which objects it has, in which units, and how sure we are of it.
+"""Schema of a CANopen drive's profile: its objects, their units, and the confidence in each entry.
 
-Data only. Scalings are "so many <unit> for one count"; None says that the drive does not have the object.
-Each section carries its ``source`` and its ``confidence``, for a profile is only as good as where it came from.
+Data only. Scalings are "so many <unit> for one count"; None means that the drive does not have the object. Each section
+carries its ``source`` and its ``confidence``, because a profile is only as good as its sources.
 """
 
 import re
@@ -30,7 +30,7 @@ SetTo = Literal["speed_limit", "speed_limit_reverse", "torque_limit", "torque_li
 
 
 class ObjectAt(DataModel):
-    """Where a number stands in the object dictionary."""
+    """Place of a number in the object dictionary."""
 
     index: Index
     sub: SubIndex = 0
@@ -116,7 +116,7 @@ class Modes(ProfileEntry):
 
 
 class QuickStop(ProfileEntry):
-    """What controlword bit 2 does."""
+    """Effect of controlword bit 2."""
 
     option_code: I16 | None = Field(
         description="written to 605Ah in preflight and read back; 6 = quick-stop ramp, then stay; null = not written"
@@ -168,11 +168,11 @@ class Position(ProfileEntry):
 
 
 STANDARD_POSITION = Position(source="CiA 402-2, 6064h and 608Fh, where the drive has them", confidence="verified")
-"""What is looked for in a drive whose profile says nothing of it."""
+"""Default for a drive whose profile does not state a position object."""
 
 
 class TorqueActual(ObjectAt):
-    """Where the torque is reported, of one instant with the speed, and in which unit."""
+    """Object of the reported torque, of one instant with the speed, and its unit."""
 
     per_lsb: Positive
     unit: Literal["rated", "nm"] = Field(description="share of the rated torque, or N·m")
@@ -222,7 +222,7 @@ class TorqueOffset(ProfileEntry):
 
 
 class Watchdog(ProfileEntry):
-    """What stops the drive when the host falls silent."""
+    """Means that stops the drive when the host is silent."""
 
     kind: Literal["heartbeat", "node_guarding", "none"] = Field(
         description="heartbeat: the drive watches the host's heartbeat; node_guarding: it watches the host's questions "
@@ -358,5 +358,5 @@ class CanopenProfile(DriveProfile):
 
     @property
     def rated_torque_by_hand(self) -> bool:
-        """Does rig.yaml have to say what 100 % torque is?"""
+        """True if rig.yaml must state the torque of 100 %."""
         return self.torque.rated_torque_nm_per_lsb is None

@@ -1,7 +1,7 @@
-"""Begins a CANopen profile from an EDS or DCF: what the file says stands in it, what it can't know is unverified.
+"""Starts a CANopen profile from an EDS or DCF; entries that the file can't know are marked unverified.
 
-Names and numbers are the maker's, every other word is ours. What is safer is written where the file leaves it open: no
-change of mode while enabled, speed mode before a quick stop, a drive that coasts where nothing says that it brakes.
+Names and numbers come from the maker, all other words are ours. If the file leaves a point open, the safer value is
+written: no change of mode while enabled, speed mode before a quick stop, and a drive that coasts.
 """
 
 import math
@@ -17,7 +17,7 @@ from profiles.errors import DataFileError, Problem
 from profiles.yaml_loader import parse_model
 
 SPEED_MODES, TORQUE_MODES = (9, 3), (10, 4)
-"""Of 6060h, those that this program knows, the preferred one first."""
+"""Codes of 6060h that tdhil supports, the preferred one first."""
 _MUST = {
     0x6040: ("controlword", "u16"), 0x6041: ("statusword", "u16"), 0x60FF: ("target velocity", "i32"),
     0x606C: ("velocity actual", "i32"),
@@ -25,7 +25,7 @@ _MUST = {
 _MUST_VL = {key: _MUST[key] for key in (0x6040, 0x6041)} | {
     0x6042: ("vl target velocity", "i16"), 0x6044: ("vl velocity actual", "i16"),
 }
-"""Of a drive that has velocity mode (vl, 2) instead."""
+"""Entries of a drive that has velocity mode (vl, 2) instead."""
 _ROTATIONS = {0xB4: 1.0, 0x10: 1.0 / (2.0 * math.pi), 0x41: 1.0 / 360.0}
 _TIMES_S = {0x03: 1.0, 0x47: 60.0}
 """Turns and seconds in the units of 60A9h, by their numbers in CiA 303-2 (B4h: a revolution, of CiA 402)."""
@@ -34,7 +34,7 @@ _KEEP_MODE = "CiA 402-2 leaves open whether 6060h may change while the drive is 
 
 @dataclass(frozen=True)
 class Begun:
-    """A profile as text, and what it is once read."""
+    """A profile as text and as the parsed model."""
 
     text: str
     profile: CanopenProfile
@@ -74,7 +74,7 @@ def _modes_told(eds: EdsFile) -> int | None:
 
 
 def _only_vl(eds: EdsFile) -> bool:
-    """Is velocity mode (2) the one speed mode? By 6502h, else by what there is."""
+    """Return whether velocity mode (2) is the only speed mode, by 6502h or else by the objects in the file."""
     if eds.get(0x6042) is None:
         return False
     bits = _modes_told(eds)
@@ -100,7 +100,7 @@ class _Writer:
             f"Begun from {self._file} by `tdhil profiles import`. What an EDS can't know is marked unverified, with "
             "what to look for in the drive's manual: correct it, then change its confidence to verified and its "
             "source to the manual's page. A wrong unit here is a wrong moment of inertia later. "
-            "The keys are explained in profiles/generic/cia402.yaml and docs/profiles.md."
+            "The keys are explained in profiles/generic/cia402.yaml and docs/reference/profiles.md."
         )
         yield ""
         yield f"name: {_slug(vendor) or 'vendor'}/{_slug(product) or _slug(self._file.rpartition('.')[0]) or 'drive'}"
@@ -289,7 +289,7 @@ class _Writer:
         return self._rpm_text() if self._si_unit() is not None and self._writable(index, "u32") is not None else None
 
     def _counted(self) -> bool:
-        """Has it an encoder resolution that speeds may be counted in?"""
+        """Return whether there is an encoder resolution for the unit of speed."""
         one = self._eds.get(0x608F, 1)
         return not _only_vl(self._eds) and one is not None and one.type == "u32" and one.readable
 
@@ -328,7 +328,7 @@ class _Writer:
         return name
 
     def _factors(self) -> Iterator[str]:
-        """What the file has of the factor group, for whoever looks the unit up."""
+        """Yield the file's factor group, to help find the unit."""
         for index, said in ((0x6090, "velocity encoder resolution"), (0x6091, "gear ratio"), (0x6092, "feed constant"),
                             (0x6094, "velocity encoder factor"), (0x6095, "velocity factor 1"),
                             (0x6096, "velocity factor"), (0x604C, "vl dimension factor"),
@@ -457,5 +457,5 @@ def _quoted(text: str) -> str:
 
 
 def _slug(text: str) -> str:
-    """What a profile's name may hold."""
+    """Return the text reduced to the characters that a profile's name may have."""
     return re.sub(r"[^a-z0-9]+", "-", text.lower().encode("ascii", "ignore").decode()).strip("-")[:40].strip("-")

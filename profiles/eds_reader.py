@@ -66,17 +66,17 @@ class EdsObject:
 
     @property
     def stands(self) -> float | None:
-        """What it reads: as set in the DCF, else as delivered; None where the file doesn't tell."""
+        """The value of the object: as set in the DCF, else the default; None if the file has none."""
         return self.default if self.value is None else self.value
 
     def takes(self, number: float) -> bool:
-        """Is the number within the file's limits?"""
+        """Return whether the number is within the file's limits."""
         return (self.low is None or number >= self.low) and (self.high is None or number <= self.high)
 
 
 @dataclass(frozen=True)
 class EdsFile:
-    """What an EDS or DCF says, as far as a profile can use it. Texts are the file's own, not cleaned."""
+    """Content of an EDS or DCF, as far as a profile can use it. Texts are the file's own, not cleaned."""
 
     name: str                          # of the file, without its folder
     vendor_name: str
@@ -201,7 +201,7 @@ class _Reader:
         self.check()
 
     def _listed(self, section: _Section) -> None:
-        """An object that is listed and not described: nobody can say whether the drive has it."""
+        """Report an object that is listed but not described: it is unknown whether the drive has it."""
         for key, value in section.values.items():
             if key.isdigit() and re.fullmatch(r"0x[0-9A-Fa-f]{4}", value) and value[2:].upper() not in self._sections:
                 self.refuse(section.lines[key], f"lists {value}, which no section [{value[2:]}] describes")
@@ -275,7 +275,7 @@ class _Reader:
 
 
 def read_eds(path: Path) -> EdsFile:
-    """What an EDS or DCF says. DataFileError with every problem and its line, for a file that can't be trusted."""
+    """Return the content of an EDS or DCF. Raises DataFileError with every problem and its line."""
     reader = _Reader(path)
     reader.split(reader.text(path))
     reader.check()
@@ -312,7 +312,7 @@ def _pair(key: str, value: str) -> str:
 
 
 def _rank(name: str) -> int:
-    """Where a section goes; 4 = not handed on."""
+    """Return the rank of a section; 4 = not used."""
     if name in _KEPT:
         return 0
     if match := _OBJECT.fullmatch(name):

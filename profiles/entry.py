@@ -1,4 +1,4 @@
-"""What every section of a profile carries: where it comes from, and how sure we are of it."""
+"""Fields of every section of a profile: its source, and the confidence in it."""
 
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from profiles.model import DataModel, refuse_if
 
 
 class Require(DataModel):
-    """What a parameter must read; in its unit."""
+    """Value that a parameter must have, in its unit."""
 
     equals: float | None = None
     one_of: tuple[float, ...] | None = None
@@ -44,7 +44,7 @@ class ProfileEntry(DataModel):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The speed controller's own parameters, for whoever types gains into the drive. No run reads or writes them.
+# The speed controller's own parameters, for an engineer who types gains into the drive. No run reads or writes them.
 
 
 class ControllerGain(ProfileEntry):
@@ -67,7 +67,7 @@ class ControllerIntegral(ProfileEntry):
 
 
 class SpeedControllerParameters(DataModel):
-    """What to type where, of gains that `tdhil tune` finds; by hand, never by this program."""
+    """Entries for typing the gains of `tdhil tune` into the drive; tdhil never writes them."""
 
     gain: ControllerGain
     integral: ControllerIntegral
@@ -77,7 +77,7 @@ class SpeedControllerParameters(DataModel):
 # ---------------------------------------------------------------------------------------------------------------------
 
 class DriveProfile(DataModel):
-    """What every profile says, whatever its bus; each bus has its own below this, in a module of its name."""
+    """Common part of every profile; the schema of each bus is in a module of its name."""
 
     name: ProfileName = Field(description="vendor/model, as in --profile")
     title: str = Field(min_length=3, description="one line for tables and reports")
@@ -107,7 +107,7 @@ class DriveProfile(DataModel):
 
     @property
     def rated_torque_by_hand(self) -> bool:
-        """Does rig.yaml have to say what 100 % torque is?"""
+        """True if rig.yaml must state the torque of 100 %."""
         raise NotImplementedError
 
     @property

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
+from profiles.messages import MessageCode, with_code
 from profiles.visible_text import visible
 
 _FLAG: Final = re.compile(r"(?<![\w-])--?[a-z][a-z-]*(?![\w-])")
@@ -20,15 +21,24 @@ class TdhilError(Exception):
 
     ``what`` happened, ``where`` (file:line, object, register, stage) and ``next_step``, what to do about it. Options
     stand in them by their flags; ``spelling``: what whoever reads it calls those, flag by flag, where not so.
+    ``entry``: the entry of the table of messages; without one, that of the class.
     """
 
     spelling: Mapping[str, str] = MappingProxyType({})
+    entry: MessageCode = MessageCode.INTERNAL_ERROR
 
-    def __init__(self, what: str, *, where: str = "", next_step: str = "") -> None:
+    def __init__(self, what: str, *, where: str = "", next_step: str = "", entry: MessageCode | None = None) -> None:
         super().__init__(what)
         self.what = what
         self.where = where
         self.next_step = next_step
+        if entry is not None:
+            self.entry = entry
+
+    @property
+    def coded(self) -> str:
+        """The text for a person, followed by its code."""
+        return with_code(str(self), self.entry.code)
 
     def __str__(self) -> str:
         text = f"{self.where}: {self.what}" if self.where else self.what
@@ -55,6 +65,8 @@ class Problem:
 class DataFileError(TdhilError):
     """A YAML, EDS or other data file that can't be used; carries every problem found, not only the first."""
 
-    def __init__(self, problems: tuple[Problem, ...]) -> None:
-        super().__init__("\n".join(str(problem) for problem in problems))
+    entry = MessageCode.DATA_FILE_WRONG
+
+    def __init__(self, problems: tuple[Problem, ...], *, entry: MessageCode | None = None) -> None:
+        super().__init__("\n".join(str(problem) for problem in problems), entry=entry)
         self.problems = problems

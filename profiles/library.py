@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, ConfigDict
 
 from profiles.canopen import CanopenProfile
 from profiles.errors import DataFileError, Problem
+from profiles.messages import MessageCode
 from profiles.modbus import ModbusProfile
 from profiles.model import DataModel, one_of
 from profiles.yaml_loader import parse_model, read_text
@@ -19,7 +20,7 @@ Profile = CanopenProfile | ModbusProfile
 _ROOT = Path(__file__).parent
 _SUFFIXES = (".yaml", ".yml")
 SCHEMAS: dict[str, type[CanopenProfile] | type[ModbusProfile]] = {"canopen": CanopenProfile, "modbus": ModbusProfile}
-"""What a profile says, by the bus that it names."""
+"""Schema of a profile, by its bus."""
 
 
 def _known_bus(value: Any) -> Any:
@@ -65,7 +66,7 @@ def profile_path(name_or_path: str) -> Path:
     names = profile_names()
     if name_or_path in names:
         return _ROOT / f"{name_or_path}.yaml"
-    raise DataFileError((Problem("profile", 0, _unknown(name_or_path, names)),))
+    raise DataFileError((Problem("profile", 0, _unknown(name_or_path, names)),), entry=MessageCode.PROFILE_UNKNOWN)
 
 
 def load_profile(name_or_path: str, bus: str | None = None) -> Profile:
@@ -76,7 +77,8 @@ def load_profile(name_or_path: str, bus: str | None = None) -> Profile:
     path = profile_path(name_or_path)
     profile = _parsed(read_text(path), str(path))
     if bus is not None and profile.bus != bus:
-        raise DataFileError((Problem(name_or_path, 0, f"is a profile for {profile.bus}, and --drive says {bus}"),))
+        raise DataFileError((Problem(name_or_path, 0, f"is a profile for {profile.bus}, and --drive says {bus}"),),
+                            entry=MessageCode.PROFILE_OTHER_BUS)
     return profile
 
 
@@ -97,14 +99,14 @@ def _parsed(text: str, name: str) -> Profile:
 
 
 def load_canopen_profile(name_or_path: str) -> CanopenProfile:
-    """As `load_profile`; DataFileError for a profile of another bus."""
+    """Do the same as `load_profile`; DataFileError for a profile of another bus."""
     profile = load_profile(name_or_path, "canopen")
     assert isinstance(profile, CanopenProfile)
     return profile
 
 
 def load_modbus_profile(name_or_path: str) -> ModbusProfile:
-    """As `load_profile`; DataFileError for a profile of another bus."""
+    """Do the same as `load_profile`; DataFileError for a profile of another bus."""
     profile = load_profile(name_or_path, "modbus")
     assert isinstance(profile, ModbusProfile)
     return profile

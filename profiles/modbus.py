@@ -1,7 +1,7 @@
-"""What a profile says of a drive on Modbus: registers, words, states, scales, what must be set, and how sure we are.
+"""Schema of a Modbus drive's profile: registers, words, states, scales, required settings, and their confidence.
 
-Data only; the arithmetic stands in `drivers.modbus`, and once more, apart, in `sim_bus`. Addresses are those on the
-wire, counted from 0; ``reference`` repeats the manual's own way of writing them. A value in its unit is
+Data only; the arithmetic is in `drivers.modbus`, and independently in `sim_bus`. Addresses are those on the wire,
+counted from 0; ``reference`` repeats the manual's own notation. A value in its unit is
 
     raw x per_lsb [x value of the parameter named in ``times``]
 
@@ -24,7 +24,7 @@ Unit = Literal["rpm", "rpm_s", "nm", "rated", "s", "hz", "kw", "none"]
 
 
 class Register(DataModel):
-    """Where a number stands. 32 bit: two registers, their order is `BusLine.word_order`."""
+    """Place of a number. 32 bit: two registers, their order is `BusLine.word_order`."""
 
     address: Address = Field(description="on the wire, counted from 0")
     type: Literal["u16", "i16", "u32", "i32"] = Field(default="i16", description="how its bits are read")
@@ -104,7 +104,7 @@ class Control(ProfileEntry):
 
 
 class ModeDisplay(DataModel):
-    """Where the drive says what it regulates."""
+    """Register in which the drive displays its mode."""
 
     register_: Register = Field(alias="register")
     mask: Word = 0xFFFF
@@ -138,7 +138,7 @@ class ModeSwitch(ProfileEntry):
 
 
 class QuickStop(ProfileEntry):
-    """What the quick-stop word does."""
+    """Effect of the quick-stop word."""
 
     decelerates_in_torque_mode: bool = Field(description="false: the host asks for speed mode at zero speed first")
     ends: Literal["quick_stop", "off"] = Field(description="the state in which the drive is left once at rest")
@@ -188,7 +188,7 @@ class Parameter(ProfileEntry):
 
 
 class ModbusWatchdog(ProfileEntry):
-    """What stops the drive when the host falls silent."""
+    """Means that stops the drive when the host is silent."""
 
     kind: Literal["timeout", "none"]
     parameter: Name | None = Field(default=None, description="the time-out; a parameter with set_to: watchdog, or one "
@@ -221,7 +221,7 @@ class ModbusWatchdog(ProfileEntry):
 
     @property
     def fed_by_us_alone(self) -> bool:
-        """Does this host's silence make it act, whatever other clients send?"""
+        """True if silence of this host trips the watchdog, even if other clients send requests."""
         return self.fed_by.endswith("_of_this_connection") and self.fed_by_confidence != "unverified"
 
 
@@ -263,7 +263,7 @@ class Echo(ProfileEntry):
 
 
 class Temperature(ProfileEntry):
-    """Where the drive tells that something gets hot: warning bits, or a number with a limit."""
+    """A temperature that the drive reports: warning bits, or a number with a limit."""
 
     title: str = Field(min_length=3, description="the manual's number and name")
     register_: Register = Field(alias="register")
@@ -424,7 +424,7 @@ class ModbusProfile(DriveProfile):
 
     @property
     def rated_torque_by_hand(self) -> bool:
-        """Does rig.yaml have to say what 100 % torque is?"""
+        """True if rig.yaml must state the torque of 100 %."""
         return self.rated_torque is None
 
     @property

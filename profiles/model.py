@@ -38,14 +38,14 @@ class DataModel(BaseModel):
     )
 
     never_here: ClassVar[Mapping[str, str]] = {}
-    """Keys that no file of this kind takes, and what is said of each instead of 'unknown key'."""
+    """Keys that no file of this kind accepts, with the message for each instead of 'unknown key'."""
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """What is wrong across several keys.
+        """Return errors that involve several keys.
 
-        ``values``: by the fields' names, those that are right by themselves, defaults included; sections are mappings
-        likewise. What is missing or wrong is not in it, so that a check runs as far as there is something to check.
+        ``values`` holds the fields that are valid by themselves, by name, defaults included; sections are mappings
+        likewise. Missing and invalid fields are not in it, so that each check runs as far as possible.
         """
         return []
 

@@ -182,7 +182,7 @@ def known(unit: Unit) -> tuple[str, ...]:
 
 
 def key_ending(key: str) -> tuple[str, Unit] | None:
-    """What the key of a quantity is without its unit, and the unit: ``speed_max_rpm`` → (speed_max, rpm)."""
+    """Return a quantity's key without its unit, and the unit: ``speed_max_rpm`` → (speed_max, rpm)."""
     parts = key.split("_")
     for start in range(len(parts)):
         if (unit := _ENDINGS.get("_".join(parts[start:]))) is not None:

@@ -25,7 +25,7 @@ MARKER_STAGE_REGISTER = MARKER_REGISTER + MARKER_REGISTERS + 1
 """Modbus: the holding register, behind that of stepped time, that takes the stage (function 6 or 16)."""
 
 STAGE_NUMBERS = {"setup": 1, "speed": 2, "torque": 3, "hold": 4, "acquire": 5}
-"""The five stages as a peer is told of them."""
+"""The five stages as sent to a simulated peer."""
 
 CYCLE_ID = 0x6FE
 """Frames about the cycles of stepped time, between a host and a simulated drive only: in stepped time nothing is late,

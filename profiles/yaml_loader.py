@@ -22,6 +22,7 @@ from pydantic import BaseModel, ValidationError
 
 from profiles import quantities, yaml_tree
 from profiles.errors import DataFileError, Problem
+from profiles.messages import MessageCode
 from profiles.model import CROSS_FIELD, DataModel, values_of
 from profiles.quantities import Unit
 from profiles.yaml_tree import KeyPath, Tree, hint
@@ -48,7 +49,7 @@ _WANTED = {
     "none_required": "nothing",
 }
 _NOT_THE_VALUE = {CROSS_FIELD, "missing", "extra_forbidden"}
-"""What is said of a section, not of a value in it."""
+"""Kinds of error of a section, not of a value in it."""
 _BOUNDS = {
     "greater_than": ("gt", "greater than"),
     "greater_than_equal": ("ge", "at least"),
@@ -98,7 +99,7 @@ def _long_enough(item: dict[str, Any], value: Any) -> bool:
 def _contradictions(
     model: type[BaseModel], data: Any, at: KeyPath, wrong: Collection[KeyPath]
 ) -> list[tuple[KeyPath, str]]:
-    """What pydantic checks once every key is right: here as far as keys are right, of a model and its sections."""
+    """Run pydantic's checks across keys, as far as the keys are valid, for a model and its sections."""
     if not (isinstance(model, type) and issubclass(model, DataModel) and isinstance(data, dict)):
         return []
     found: list[tuple[KeyPath, str]] = []
@@ -328,14 +329,14 @@ class Conversion:
         return f"{self.written} = {quantities.shown(self.value, self.unit)}"
 
     def refused(self, file: str) -> Problem:
-        """Where nobody would see what became of it."""
+        """Return the problem for a caller that would not show the conversion."""
         key = _key_path(self.path)
         return Problem(file, self.line, f"{key}: '{self.written}' is {self.value:.12g} {self.unit.symbol}; write {key} "
                                         "as a bare number in that unit")
 
 
 def settle(tree: Tree, error: ValidationError, model: type[BaseModel]) -> tuple[Conversion, ...]:
-    """What of the refused values and keys can be converted, put into ``tree``; contradictions become its problems."""
+    """Convert the refused values and keys that can be converted, in ``tree``; contradictions become its problems."""
     found: list[Conversion] = []
     seen: set[KeyPath] = set()
     for item in error.errors(include_url=False, include_context=False):
@@ -447,7 +448,7 @@ class Loaded(Generic[M]):
     file: str
     lines: MappingProxyType[yaml_tree.KeyPath, int]
     conversions: tuple[Conversion, ...] = ()
-    """What stood there with a unit of its own."""
+    """Values that had a unit of their own."""
 
 
 def load_model(path: Path, model: type[M]) -> M:
@@ -461,12 +462,12 @@ def parse_model(text: str, name: str, model: type[M]) -> M:
 
 
 def load_with_lines(path: Path, model: type[M], *, convert: bool = False) -> Loaded[M]:
-    """As `load_model`, with the line of each key besides."""
+    """Do the same as `load_model`, and return the line of each key."""
     return parse_with_lines(read_text(path), str(path), model, convert=convert)
 
 
 def parse_with_lines(text: str, name: str, model: type[M], *, convert: bool = False) -> Loaded[M]:
-    """As `parse_model`, with the line of each key besides. ``convert``: the caller shows ``conversions`` to people."""
+    """Do the same as `parse_model`, and return each key's line. ``convert``: the caller shows ``conversions``."""
     if len(text) > MAX_BYTES:
         raise _one(name, 0, f"larger than {MAX_BYTES // 1024} KiB; this is no file of this program")
     tree = yaml_tree.read_tree(text, name)
@@ -500,7 +501,7 @@ def read_text(path: Path) -> str:
         with path.open("rb") as stream:
             raw = stream.read(MAX_BYTES + 1)
     except FileNotFoundError:
-        raise _one(name, 0, "no such file") from None
+        raise _one(name, 0, "no such file", MessageCode.FILE_NOT_FOUND) from None
     except IsADirectoryError:
         raise _one(name, 0, "is a directory; name the file in it") from None
     except PermissionError:
@@ -516,8 +517,8 @@ def read_text(path: Path) -> str:
         raise _one(name, line, "not UTF-8 text; save the file in UTF-8") from None
 
 
-def _one(name: str, line: int, message: str) -> DataFileError:
-    return DataFileError((Problem(name, line, message),))
+def _one(name: str, line: int, message: str, entry: MessageCode | None = None) -> DataFileError:
+    return DataFileError((Problem(name, line, message),), entry=entry)
 
 
 def _all(problems: list[Problem]) -> DataFileError:

@@ -99,7 +99,7 @@ def _leading_zero(text: str, sign: str, digits: str) -> str:
 
 
 def hint(text: str) -> str:
-    """What the writer of ``text`` may have meant where a number or a truth value is wanted; '' if unknown."""
+    """Return the probable meaning of ``text`` where a number or a truth value is required; '' if unknown."""
     if text.lower() in _TRUTH_WORDS:
         return f"write {_TRUTH_WORDS[text.lower()]}"
     if re.fullmatch(r"[-+]?[0-9][0-9_]*_[0-9_]*(\.[0-9_]*)?", text):
@@ -114,7 +114,7 @@ def hint(text: str) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# PyYAML's syntax errors in the words of somebody who edits the file.
+# PyYAML's syntax errors in the words of a person who edits the file.
 
 
 _WORDS = (

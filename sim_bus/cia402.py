@@ -54,7 +54,7 @@ RAMP_SHARE, RAMP_TOLERANCE, RAMP_STEPS, RAMP_GAP_S = 0.35, 0.015, 16, 0.2
 stage goes so far down along a line. Every step lies on the line within 1.5 % of the fall, which a sine does not."""
 
 TURNING_SHARE = 0.05
-"""Of the speed limit: a shaft that turns, for a stop that a script waits for. A sign probe stays below it."""
+"""Share of the speed limit above which a shaft counts as turning, for a scripted stop. A sign probe stays below."""
 
 
 class State(Enum):
@@ -71,7 +71,7 @@ class State(Enum):
 
 
 class DeviceCommand(Enum):
-    """What a controlword's bits 0 to 3 ask for."""
+    """Request in bits 0 to 3 of a controlword."""
 
     SHUTDOWN = "shutdown"
     SWITCH_ON = "switch on"
@@ -123,7 +123,7 @@ def decode(controlword: int) -> DeviceCommand:
 
 
 def next_state(state: State, command: DeviceCommand, quick_stop_option: int) -> State:
-    """Where ``command`` leads; ``state`` itself where it is not allowed. 16 needs an option code 605Ah of 5 to 8."""
+    """Return the state after ``command``; ``state`` itself if not allowed. 16 needs an option code 605Ah of 5 to 8."""
     if state is State.QUICK_STOP and command is DeviceCommand.ENABLE and quick_stop_option < 5:
         return state
     return TRANSITIONS.get((state, command), state)
@@ -189,7 +189,7 @@ class Application:
         self.keeps_mode = False        # scripted: 6060h is taken and not followed
         self.on_event: Callable[[str], None] = _ignore
         self.on_fault_reset: Callable[[], None] = lambda: None
-        self.on_stop: Callable[[], None] | None = None      # scripted: the drive is told to come to rest, once
+        self.on_stop: Callable[[], None] | None = None      # scripted: a stop is requested, once
         self._after_stop: State | None = None       # where a stop under way ends
         self._stop_option = 0                       # and the ramp it uses
         self._own_stop = False                      # quick stop begun by the drive itself
@@ -287,7 +287,7 @@ class Application:
 
     @property
     def halted(self) -> bool:
-        """Halt is asked for in operation enabled."""
+        """True if halt is requested in operation enabled."""
         return self.state is State.ENABLED and bool(self.controlword & HALT)
 
     @property

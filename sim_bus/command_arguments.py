@@ -1,4 +1,4 @@
-"""What the commands of all simulated drives share: options, signals, and the one line that a user's mistake costs."""
+"""Common parts of the commands of all simulated drives: options, signals, and one line for an error of use."""
 
 import argparse
 import contextlib
@@ -29,15 +29,22 @@ def add_rig_arguments(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--plant", metavar="FILE", type=Path, help="YAML with other parameters of the rig")
     group.add_argument("--gains", metavar=("P", "I"), nargs=2, type=_gain,
                        help="of its speed loop, N·m·s/rad and N·m/rad at the motor, over those of --plant")
+    group.add_argument("--torque-scale", metavar="RATIO", type=_scale,
+                       help="torque in the drive's own unit over true torque, over that of --plant")
+    group.add_argument("--speed-scale", metavar="RATIO", type=_scale,
+                       help="speed in the drive's own unit over true speed, over that of --plant")
+    group.add_argument("--added-inertia", metavar="J", type=_gain,
+                       help="body of known inertia on the motor's shaft, kg·m², over that of --plant")
     group.add_argument("--seed", metavar="N", type=_seed, default=0, help="seed of all noise (default 0)")
     group.add_argument("--trace", metavar="FILE", type=Path, help="write what the true shaft does to this CSV file")
 
 
 def rig_of(namespace: argparse.Namespace) -> "RigParams":
-    """The rig of ``--plant``, with the gains of ``--gains``. DataFileError for a file that can't be used."""
+    """The rig of ``--plant``, with what other options say over it. DataFileError for a file that can't be used."""
     from sim_bus.params import RigParams, load_rig
 
     params = load_rig(namespace.plant) if namespace.plant is not None else RigParams()
+    params = params.with_scales(namespace.torque_scale, namespace.speed_scale, namespace.added_inertia)
     if namespace.gains is None:
         return params
     gain, integral = namespace.gains
@@ -52,7 +59,7 @@ def add_fault_argument(group: argparse._ArgumentGroup, such_as: str) -> None:
 
 
 def until_stopped(simulate: Callable[[threading.Event], None]) -> int:
-    """Runs ``simulate`` until SIGINT or SIGTERM; the exit code. What the user can cause ends with one line."""
+    """Run ``simulate`` until SIGINT or SIGTERM. Return the exit code. An error of use ends with one line."""
     stop = threading.Event()
     try:
         with _signals(stop):
@@ -64,12 +71,12 @@ def until_stopped(simulate: Callable[[threading.Event], None]) -> int:
 
 
 def ready(text: str) -> None:
-    """Tells whoever started the simulator how to reach it."""
+    """Print how to reach the simulator."""
     print(f"ready: {text}", flush=True)  # noqa: T201
 
 
 def never_came(faults: Iterable[str]) -> None:
-    """Tells, at the end, which scripted faults had nobody to happen to."""
+    """Print, at the end, the scripted faults that never happened."""
     for fault in faults:
         print(f"simulate: the fault {fault} never came: its moment was not reached", file=sys.stderr)  # noqa: T201
 
@@ -98,6 +105,16 @@ def _gain(text: str) -> float:
         if math.isfinite(value) and value >= 0.0:
             return value
     raise argparse.ArgumentTypeError(f"{text[:40]!r} is not a gain: a number from 0")
+
+
+def _scale(text: str) -> float:
+    from sim_bus.params import SCALES
+
+    with contextlib.suppress(ValueError):
+        value = float(text)
+        if SCALES[0] <= value <= SCALES[1]:
+            return value
+    raise argparse.ArgumentTypeError(f"{text[:40]!r} is not a ratio from {SCALES[0]:g} to {SCALES[1]:g}")
 
 
 def _seed(text: str) -> int:

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from math import inf
 from typing import Generic, TypeVar
 
-from profiles import STAGE_NUMBERS, TdhilError
+from profiles import STAGE_NUMBERS, MessageCode, TdhilError
 
 STOP = max(STAGE_NUMBERS.values()) + 1
-"""The number of a moment that no host announces: the drive is told to come to rest while its shaft turns."""
+"""Number of the moment at which a stop is requested while the shaft turns; no host announces it."""
 
 _MOMENTS = {**STAGE_NUMBERS, "stop": STOP}
 _NUMBER = r"\d+(?:\.\d+)?"
@@ -29,7 +29,9 @@ _WHEN = re.compile(rf"(?:(?P<stage>[a-z]+)(?:\+(?P<after>{_NUMBER}m?s))?|(?P<tim
 
 
 class FaultRefused(TdhilError):
-    """What was written is no fault that can be scripted."""
+    """The text is not a fault that can be scripted."""
+
+    entry = MessageCode.FAULT_SCRIPT_WRONG
 
     exit_code = 2
 
@@ -104,7 +106,7 @@ F = TypeVar("F", bound=Passing)
 
 
 class Cast(Generic[F]):
-    """The faults of a script, in its order, and those that are going on; ``note`` is told of each change."""
+    """The faults of a script, in its order, and the active ones; ``note`` is called for each change."""
 
     def __init__(self, script: tuple[Scripted, ...], make: Callable[[Scripted], F]) -> None:
         self._script = script
@@ -168,14 +170,14 @@ def _seconds(text: str) -> float:
 
 
 M = TypeVar("M")
-"""What a fault of the bus in question is."""
+"""Type of a fault on the bus in question."""
 
 
 @dataclass(frozen=True)
 class FaultKind(Generic[M]):
     """``value``: the default, '' where the fault takes none. ``make`` may raise ValueError."""
 
-    row: int                           # of docs/faults.md; 0: none of its own
+    row: int                           # of docs/reference/faults.md; 0: none of its own
     summary: str
     make: Callable[[str], M]
     value: str = ""
@@ -199,20 +201,20 @@ def seconds(text: str) -> float:
 
 
 def factor(text: str) -> float:
-    """What a reported quantity may be multiplied by. Raises ValueError."""
+    """Return the factor of a reported quantity. Raises ValueError."""
     if not 0.01 <= float(text) <= 100.0:
         raise ValueError("a factor from 0.01 to 100")
     return float(text)
 
 
 def plain(make: Callable[[], M]) -> Callable[[str], M]:
-    """Of a fault that takes no value."""
+    """Make a fault that has no value."""
     return lambda _value: make()
 
 
 @dataclass(frozen=True)
 class KnownFault:
-    """A fault that can be scripted. ``row`` of docs/faults.md (0: none); ``takes``: what its value is, '' for none.
+    """A fault that can be scripted. ``row`` of docs/reference/faults.md (0: none); ``takes``: its value, '' for none.
 
     ``from_start``: so is the drive, from the start and for good.
     """
@@ -229,7 +231,7 @@ class Kinds(dict[str, FaultKind[M]]):
     """The faults of one bus by their names."""
 
     def make(self, fault: Scripted) -> M:
-        """What a scripted fault does. Raises FaultRefused for a name or a value that there isn't."""
+        """Return the effect of a scripted fault. Raises FaultRefused for an unknown name or value."""
         kind = self.get(fault.name)
         where = f"--fault {fault.text or fault.name}"
         if kind is None:

@@ -6,6 +6,9 @@
                                                                    │                     │
                                                         reporting: lags, noise, quanta ◄─┘
 
+The drive's own units of torque and speed may be wrong (`ReportingParams`). All its torques, commanded, demanded and
+reported, share the wrong unit, and so do commanded and reported speed; the position counts true turns.
+
 Owns no clock and no thread: whoever calls `step` says how much time goes by.
 """
 
@@ -68,7 +71,7 @@ class Disturbance:
 
 
 class BottomLoad:
-    """What the bit of a string scatters by: a load that wanders, of a stream of its own."""
+    """Random load at the bit of a string, with a random stream of its own."""
 
     def __init__(self, params: NoiseParams, rng: np.random.Generator) -> None:
         self._params = params
@@ -161,7 +164,7 @@ class Reporting:
 
 
 class Regulation(Enum):
-    """What is regulated."""
+    """Controlled quantity."""
 
     OFF = "off"
     SPEED = "speed"
@@ -171,7 +174,7 @@ class Regulation(Enum):
 
 @dataclass(slots=True)
 class LoopLimits:
-    """What the loops must not exceed; torque both ways is given positive."""
+    """Limits of the loops; the torque of each direction is positive."""
 
     torque_forward_nm: float
     torque_reverse_nm: float
@@ -225,7 +228,7 @@ class Controller:
         self._reference_gain = lag_gain(dt_s, self._params.reference_filter_s)
 
     def off(self) -> None:
-        """No torque; the shaft coasts."""
+        """Set torque to zero; the shaft coasts."""
         if self.regulation is not Regulation.OFF:
             self.regulation = Regulation.OFF
             self.demand_nm = self._integral = self._overspeed = 0.0
@@ -268,7 +271,7 @@ class Controller:
 
     @property
     def at_rest_reference(self) -> bool:
-        """Speed control is asked for zero and the ramp has come down."""
+        """True if speed control has a setpoint of zero and the ramp has ended."""
         return self.regulation in {Regulation.SPEED, Regulation.STOP} and self.reference == 0.0 == self._target
 
     def step(self, measured_rad_s: float, dt_s: float) -> float:
@@ -358,8 +361,8 @@ class Inverter:
     """Control, power stage and shaft of one simulated drive."""
 
     __slots__ = (
-        "_bottom_load", "_disturbance", "_dt_s", "_lagged_nm", "_move", "_normals", "_torque_gain", "control",
-        "lies", "params", "reporting", "state", "torque_nm",
+        "_bottom_load", "_disturbance", "_dt_s", "_lagged_nm", "_move", "_normals", "_speed_scale", "_torque_gain",
+        "_torque_scale", "control", "lies", "params", "reporting", "state", "torque_nm",
     )
 
     def __init__(self, params: RigParams, rng: np.random.Generator) -> None:
@@ -377,6 +380,7 @@ class Inverter:
         self._normals = normals(rng)
         self._bottom_load = BottomLoad(params.noise, rng.spawn(1)[0]) if params.noise.bottom_load_nm > 0.0 else None
         self._lagged_nm = 0.0
+        self._torque_scale, self._speed_scale = params.reporting.torque_scale, params.reporting.speed_scale
         self._dt_s = 0.0
         self._torque_gain = 1.0
 
@@ -403,21 +407,24 @@ class Inverter:
         disturbance, lies = self._disturbance, self.lies
         speed, angle = self.state.speed_rad_s, self.state.angle_rad
         offset = disturbance.sensor_sd_rad_s * sensor
-        measured = lies.measured(speed, offset, dt_s) if lies.of_sensor else speed + offset
+        scale = self._speed_scale
+        measured = scale * lies.measured(speed, offset, dt_s) if lies.of_sensor else scale * speed + offset
         demand = self.control.step(measured, dt_s)
         if self.control.regulation is Regulation.OFF:
             torque = believed = self._lagged_nm = 0.0
         else:
             self._lagged_nm += self._torque_gain * (demand - self._lagged_nm)
-            torque, believed = lies.torque(self._lagged_nm + disturbance.torque_sd_nm * ripple,
-                                           stopping=self.control.regulation is Regulation.STOP)
+            torque = believed = self._lagged_nm + disturbance.torque_sd_nm * ripple
+            if lies.of_stage:
+                torque, believed = lies.torque(torque, stopping=self.control.regulation is Regulation.STOP)
+            torque /= self._torque_scale
         self.torque_nm = torque
         at_motor = disturbance.wander(load)
         if self._bottom_load is None:
             self.state = state = self._move(self.state, torque, dt_s, at_motor)
         else:
             self.state = state = self._move(self.state, torque, dt_s, at_motor, self._bottom_load.wander(dt_s))
-        mean = 0.5 * (speed + state.speed_rad_s) + offset
+        mean = 0.5 * scale * (speed + state.speed_rad_s) + offset
         if lies.of_sensor:
             mean = measured
             lies.turned(state.angle_rad - angle, dt_s)

@@ -17,7 +17,7 @@ import numpy as np
 from sim_bus.reports import LIES
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Programs: the rig as tdhil is told of it, and the plant that turns.
+# Programs: the rig as described to tdhil, and the plant that turns.
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ _TUNING = json.dumps({
         "critical_rpm": {"cure": _interval(57.0, 56.0, 59.0)},
     }],
 })
-"""As `tdhil tune --json` writes it for this string below this top drive, as far as `tdhil evaluate` reads it."""
+"""Document of `tdhil tune --json` for this string below this top drive, as far as `tdhil evaluate` reads it."""
 
 _IDENTIFY = ("identify", "--simulate")
 _PLANT, _RIG = ("--plant", "{folder}/plant.yaml"), ("--rig", "{folder}/rig.yaml")
@@ -240,12 +240,12 @@ class Combination:
 
     @property
     def seed(self) -> int:
-        """Of the simulated rig."""
+        """Seed of the simulated rig."""
         return 1 + self.number % 9973
 
     @property
     def fault(self) -> str:
-        """As the fault script has it."""
+        """The fault as the script writes it."""
         when, value = self.moment and f"@{self.moment}", self.told.text(self.program)
         return f"{self.told.name}{when}" + (f"={value}" if value else "")
 
@@ -270,7 +270,7 @@ class Combination:
 
     @property
     def largest_torque_nm(self) -> float:
-        """What the power stage may put on the shaft."""
+        """Largest torque of the power stage on the shaft, N·m."""
         share = float(self.told.value) if self.told.name == "torque-constant" else 1.0
         return self.program.torque_nm * max(1.0, share)
 
@@ -291,7 +291,7 @@ class Unknowable:
 
 @dataclass(frozen=True)
 class Blind:
-    """Where no arithmetic on the reports can find a lie: lies by their names' beginnings, moments, and the load."""
+    """Cases in which no arithmetic on the reports can detect a lie: starts of names, moments, and the load."""
 
     lies: tuple[str, ...]
     unknowable: Unknowable
@@ -307,7 +307,7 @@ class Blind:
         return " and ".join(name.rstrip("-") for name in self.lies) + load + when
 
     def holds(self, told: LieWithValue, moment: str, program: CommandLine) -> bool:
-        """Whether a combination is one of these."""
+        """Return whether a combination is one of these."""
         known = program.torque_mode or program.demand
         return (
             told.name.startswith(self.lies)
@@ -345,7 +345,7 @@ UNKNOWABLE: tuple[Blind, ...] = (
         "the reports are those of a lost encoder and a torque that pushes the shaft on: the torque is removed",
         frozenset("a")), _IN_STOP, string=False),
 )
-"""Each is named in `docs/stop.md`. Later in a run than stated each of them is a change, which can be found."""
+"""`docs/explanation/stop.md` names each. Later in a run than stated each of them is a change, which can be found."""
 
 
 def unknowable(combination: Combination) -> Unknowable | None:

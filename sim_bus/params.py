@@ -13,6 +13,9 @@ from profiles import NonNegative, Positive, Validated, refuse_if
 from sim_bus.plant import AnyPlantParams
 from sim_bus.plant import Params as PlantParams
 
+SCALES = (0.1, 10.0)
+"""Least and greatest ratio of a drive's own unit to the true one."""
+
 
 class DriveParams(Validated):
     """The inverter's own ratings and loops."""
@@ -32,7 +35,7 @@ class DriveParams(Validated):
 
 
 class ReportingParams(Validated):
-    """What happens to speed and torque between the drive's inside and its bus."""
+    """Processing of speed and torque between the drive's inside and its bus."""
 
     speed_lag_s: NonNegative = 0.40
     torque_lag_s: NonNegative = 0.15
@@ -40,7 +43,11 @@ class ReportingParams(Validated):
     torque_noise_nm: NonNegative = 2.0
     speed_quantum_rpm: NonNegative = 0.1
     torque_quantum_permille: NonNegative = 1.0
-    """Of rated torque."""
+    """Resolution of the torque, ‰ of rated torque."""
+    torque_scale: float = Field(default=1.0, ge=SCALES[0], le=SCALES[1])
+    """Torque in the drive's own unit over true torque: commanded, demanded and reported torque share it."""
+    speed_scale: float = Field(default=1.0, ge=SCALES[0], le=SCALES[1])
+    """Speed in the drive's own unit over true speed, commanded and reported. The position counts true turns."""
 
 
 class NoiseParams(Validated):
@@ -51,7 +58,7 @@ class NoiseParams(Validated):
     load_nm: NonNegative = 3.0
     load_correlation_s: Positive = 0.5
     bottom_load_nm: NonNegative = 0.0
-    """At the bottom of a string: what its bit scatters by."""
+    """Random load at the bit of a string, N·m."""
     bottom_correlation_s: Positive = 0.5
 
 
@@ -69,9 +76,20 @@ class RigParams(Validated):
         refuse_if([("noise.bottom_load_nm", "needs a plant with a bottom: kind two_mass or string")] * rigid)
         return self
 
+    def with_scales(
+        self, torque_scale: float | None, speed_scale: float | None, added_inertia_kg_m2: float | None
+    ) -> Self:
+        """The same rig with these, as the models of their sections have them; None: as it is."""
+        told = {"torque_scale": torque_scale, "speed_scale": speed_scale}
+        scales = {name: value for name, value in told.items() if value is not None}
+        body = {} if added_inertia_kg_m2 is None else {"added_inertia_kg_m2": added_inertia_kg_m2}
+        return self.model_copy(update={
+            "reporting": self.reporting.model_copy(update=scales), "plant": self.plant.model_copy(update=body),
+        })
+
 
 QUIET = NoiseParams(speed_sensor_rad_s=0.0, torque_nm=0.0, load_nm=0.0)
-"""No disturbance at all."""
+"""Noise parameters without any disturbance."""
 
 FAITHFUL = ReportingParams(
     speed_lag_s=0.0, torque_lag_s=0.0, speed_noise_rad_s=0.0, torque_noise_nm=0.0,

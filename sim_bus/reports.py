@@ -27,7 +27,7 @@ from sim_bus.fault_script import FaultKind, M, factor, seconds, share
 
 
 class Feedback(Enum):
-    """What the drive's feedback says."""
+    """Signal of the drive's feedback."""
 
     SPEED = "speed"
     TORQUE = "torque"
@@ -112,7 +112,7 @@ class Slipping(Distortion):
 
 
 SLIP_PERIOD_S = 1.0
-"""As long as the shaft of the default rig takes for half a turn at its usual speed."""
+"""Time of half a turn of the default rig's shaft at its usual speed, s."""
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -131,7 +131,7 @@ class Word:
 
 
 class Zero(Word):
-    """No bit is set."""
+    """The word is zero."""
 
     def number(self, read: Read, ones: float, other: Callable[[Feedback], float]) -> float:
         return 0
@@ -175,9 +175,9 @@ class PowerStage:
     """The torque on the shaft, and what the drive takes it for."""
 
     factor: float = 1.0
-    """Of the torque that the drive believes in: a wrong torque constant, or motor phases exchanged (−1)."""
+    """Factor on the torque that the drive assumes: a wrong torque constant, or motor phases exchanged (−1)."""
     in_stop: float = 1.0
-    """Of the torque while the drive brings the shaft to rest; the drive measures what it does."""
+    """Factor on the torque while the drive stops the shaft; the drive measures the real torque."""
     stuck_nm: float | None = None
     """The torque while the power stage is on, whatever control wants; the drive measures it."""
 
@@ -203,18 +203,15 @@ class Lies:
         self._readers: dict[Feedback, Read] = {}
         self._told: dict[Feedback, float] = {}
         self._clean_rad_s = self._slipped_rad = 0.0
-
-    @property
-    def of_values(self) -> bool:
+        # Plain attributes: every step of the plant looks at them.
+        self.of_values = False
         """A quantity is reported wrong."""
-        return bool(self._values)
+        self.of_sensor = False
+        """The sensor is wrong."""
+        self.of_stage = False
+        """The power stage is wrong."""
 
     # -- for the inverter ----------------------------------------------------------------------------------
-
-    @property
-    def of_sensor(self) -> bool:
-        """The sensor is wrong."""
-        return bool(self._sensor)
 
     def measured(self, speed_rad_s: float, noise_rad_s: float, dt_s: float) -> float:
         """Speed as a wrong sensor measures it."""
@@ -238,7 +235,7 @@ class Lies:
         return true, believed
 
     def told(self, signal: Feedback, value: float, dt_s: float) -> float:
-        """What the drive reports for a quantity, a step later. Each signal's is asked for once a step."""
+        """Return the reported value of a quantity, one step later. It is called once a step for each signal."""
         chain = self._values.get(signal)
         if chain:
             for one in chain:
@@ -257,7 +254,7 @@ class Lies:
         return self.last(Feedback.POSITION, self.counted_rad(true_rad))
 
     def last(self, signal: Feedback, true: float) -> float:
-        """What was reported last of a quantity, the true one where nothing distorts it."""
+        """Return the last reported value of a quantity; the true one without distortion."""
         return self._told.get(signal, true)
 
     def word(self, signal: Feedback, read: Read, ones: float = -1) -> Read:
@@ -278,6 +275,7 @@ class Lies:
     def add_value(self, signal: Feedback, one: Distortion) -> None:
         """A quantity is distorted from now on."""
         self._values.setdefault(signal, []).append(one)
+        self.of_values = True
 
     def remove_value(self, signal: Feedback, one: Distortion) -> None:
         """And no more."""
@@ -285,6 +283,7 @@ class Lies:
         if not self._values[signal]:
             del self._values[signal]
             self._told.pop(signal, None)
+        self.of_values = bool(self._values)
 
     def add_word(self, signal: Feedback, one: Word) -> None:
         """A word is distorted from now on; the last one that was added acts."""
@@ -297,18 +296,22 @@ class Lies:
     def add_sensor(self, pair: tuple[Distortion, Distortion]) -> None:
         """The sensor is wrong from now on: in its angle, and in its speed."""
         self._sensor.append(pair)
+        self.of_sensor = True
 
     def remove_sensor(self, pair: tuple[Distortion, Distortion]) -> None:
         """And right again; the angle that was missed stays missed."""
         self._sensor.remove(pair)
+        self.of_sensor = bool(self._sensor)
 
     def add_stage(self, stage: PowerStage) -> None:
         """The power stage is wrong from now on."""
         self._stages.append(stage)
+        self.of_stage = True
 
     def remove_stage(self, stage: PowerStage) -> None:
         """And right again."""
         self._stages.remove(stage)
+        self.of_stage = bool(self._stages)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -393,7 +396,7 @@ class ReportFault:
     value: str = ""
     takes: str = ""
     row: int = 0
-    """Of docs/faults.md; 0: none of its own."""
+    """Row of docs/reference/faults.md; 0: none."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a run did to the true shaft, held against what it said: the five rules of a run with a lying drive. Pure.
+"""The true shaft's motion compared with the run's statements: five rules for a run with wrong reports. Pure.
 
 a  The host never disables a drive whose shaft turns. Excepted: no string hangs on it, the shaft accelerates against
    the quick stop, and the outcome says that the torque was removed.
@@ -26,7 +26,7 @@ TURNING_RAD_S = 0.2
 """A shaft that is faster is not at rest."""
 
 SPEED_SHARE = 1.1
-"""Of the speed limit, that the true speed may always have."""
+"""Multiple of the speed limit that the true speed may always have."""
 
 REACTION_S = 1.0
 """For how long the drive's torque may act before it is noticed, unless stated otherwise."""
@@ -35,10 +35,10 @@ ACCELERATES_RAD_S = 0.3
 """A shaft that gets faster by so much in a stop accelerates against it."""
 
 BEFORE_S = 3.0
-"""In a release above a string no quick stop has been asked for yet: it is compared with the speed of so long before."""
+"""Before the quick stop of a release above a string: the comparison uses the speed of this time before, s."""
 
 EXIT_CODES = frozenset({0, 3, 4, 5, 6, 7, 8, 9, 130, 143})
-"""As `tdhil.errors` has them, but for 1 (a mistake of tdhil's own) and 2 (what was asked for can't be)."""
+"""Exit codes of `tdhil.errors`, except 1 (an internal error) and 2 (an impossible request)."""
 
 _REMOVED = "torque removed"
 _STANDS = ("valid", "valid_wide")
@@ -63,7 +63,7 @@ class TrueShaft:
         return abs(float(np.interp(time_s, self.time_s, self.speed_rad_s))) if len(self.time_s) else 0.0
 
     def reversed_at(self, time_s: float) -> bool:
-        """Whether it turns the other way than when the stop began: the drive has accelerated it past standstill."""
+        """Return whether the shaft has reversed since the stop began: the drive accelerated it past standstill."""
         then, now = (float(np.interp(at_s, self.time_s, self.speed_rad_s)) for at_s in (self.stop_s, time_s))
         return then * now < 0.0
 
@@ -106,7 +106,7 @@ class ProcessOutcome:
 
 
 def outcome_of(code: int, document: Mapping[str, Any] | None, said: str, *, log_closed: bool) -> ProcessOutcome:
-    """From exit code, JSON document and what stood on stderr."""
+    """Make the outcome from exit code, JSON document and stderr."""
     document = document or {}
     words = " ".join(said.split())
     inertia, error = document.get("inertia_kg_m2") or {}, document.get("error") or {}
@@ -120,7 +120,7 @@ def outcome_of(code: int, document: Mapping[str, Any] | None, said: str, *, log_
 
 @dataclass(frozen=True)
 class JudgedMachine:
-    """What the judge knows of the rig. ``torque_nm``: what the power stage may put on the shaft."""
+    """The judge's knowledge of the rig. ``torque_nm``: largest torque of the power stage on the shaft."""
 
     inertia_kg_m2: float
     coulomb_nm: float

@@ -1,4 +1,4 @@
-"""The shaft trace: what the true shaft did, for tests and for whoever wants to see behind the reported values.
+"""The shaft trace: motion of the true shaft, for tests and for a comparison with the reported values.
 
 ::
 
@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Self
 
-from profiles import TdhilError
+from profiles import MessageCode, TdhilError
 
 HEADER = "time_s,speed_rad_s,torque_nm,state,event\n"
 ROW_PERIOD_US = 10_000
@@ -23,6 +23,8 @@ _FLUSH_S = 0.25
 
 class NotATrace(TdhilError):
     """The file that a trace is to be written to holds something else."""
+
+    entry = MessageCode.TRACE_NOT_OURS
 
     exit_code = 2
 
@@ -52,7 +54,7 @@ class ShaftTrace:
 
     @property
     def active(self) -> bool:
-        """There is a file."""
+        """True if there is a file."""
         return self._file is not None
 
     def row(self, time_s: float, speed_rad_s: float, torque_nm: float, state: str, event: str = "") -> None:

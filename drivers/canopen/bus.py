@@ -1,8 +1,8 @@
 """One thread on one CAN bus: every frame in and out passes here, in order.
 
-There is no Notifier and no other thread. Whoever waits, for a TPDO or for an SDO response, pulls frames off
-the bus himself and hands on those meant for others; so an error of the bus surfaces in the control loop
-that caused it, and nothing is ever sent behind the loop's back.
+There is no Notifier and no other thread. The caller that waits for a TPDO or an SDO response takes frames off the bus
+itself and passes each one to its handler. So an error of the bus appears in the control loop that caused it, and no
+other code sends a frame.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ from typing import TYPE_CHECKING, Final
 from drivers.clock import Clock
 from drivers.drive import FrameTap, RawFrame
 from drivers.errors import CommunicationLost
-from profiles import CYCLE_ANSWER, CYCLE_ASKED, CYCLE_ID
+from profiles import CYCLE_ANSWER, CYCLE_ASKED, CYCLE_ID, MessageCode
 
 if TYPE_CHECKING:
     import can
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The stamps that frames bear, mapped to control time: only to know where the two stand, nothing is timed by them.
+# Offset between the time stamps of the frames and control time. It is a diagnostic only: no timing depends on it.
 #
-# SocketCAN stamps with the wall clock, which somebody may set while a run goes on. A sample's time is the control time
-# of its SYNC, its age is control time too; so a jump changes nothing, but it is noticed, for whoever lays a candump
-# beside the log.
+# SocketCAN stamps frames with the wall clock, which may be set during a run. The time of a sample is the control time
+# of its SYNC, and its age is control time too, so a jump of the wall clock does not affect them. Jumps are counted
+# because they matter when a candump is compared with the log.
 
 
 WINDOW_S: Final = 0.5
 WINDOW_FRAMES: Final = 4
 JUMP_S: Final = 0.1
 _EPOCH_S: Final = 1e9
-"""Stamps below it count from a start of the adapter's (or there are none: 0); they are no wall clock's."""
+"""Smaller stamps count from the start of the adapter, or are absent (0). They are not wall-clock times."""
 
 
 class FrameStamps:
-    """``offset_s`` is wall clock minus control time; None as long as it isn't known.
+    """Offset between wall clock and control time.
 
-    A frame that waited in a buffer looks as if the offset were smaller. So of each half second the largest counts:
-    a burst that was taken late is over long before.
+    ``offset_s`` is wall clock minus control time; None while it is unknown. A frame that waited in a buffer makes the
+    offset look smaller. So the largest offset of each half second counts: a burst that was read late is shorter.
     """
 
     def __init__(self) -> None:
@@ -53,7 +53,7 @@ class FrameStamps:
         self._begun_s = 0.0
 
     def take(self, stamp_s: float, now_s: float) -> None:
-        """One received frame: its stamp, and the control time at which it was taken off the bus."""
+        """Use one received frame: its stamp, and the control time at which it was read from the bus."""
         if stamp_s < _EPOCH_S:
             return
         offset_s = stamp_s - now_s
@@ -70,10 +70,10 @@ class FrameStamps:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What the adapter says of the bus: SocketCAN's error frames, and a transmit queue that is full.
+# State of the bus as the adapter reports it: SocketCAN's error frames, and a full transmit queue.
 #
-# An error frame's identifier holds classes, its second byte the controller's state (Linux, `linux/can/error.h`). Other
-# interfaces send error frames without either: those are counted only.
+# The identifier of an error frame holds classes, its second byte the state of the controller (Linux,
+# `linux/can/error.h`). Error frames of other interfaces hold neither; those are only counted.
 
 
 CONTROLLER, BUS_OFF = 0x04, 0x40
@@ -83,7 +83,7 @@ _FULL = ("buffer full", "queue full", "no buffer space")
 
 
 class Condition(Enum):
-    """What one error frame means for the run."""
+    """Meaning of one error frame for the run."""
 
     ERROR = "an error on the bus"
     PASSIVE = "the adapter is error-passive"
@@ -91,7 +91,7 @@ class Condition(Enum):
 
 
 def condition(identifier: int, data: bytes) -> Condition:
-    """Of one error frame."""
+    """Return the condition that one error frame reports."""
     if identifier & BUS_OFF:
         return Condition.OFF
     if identifier & CONTROLLER and len(data) > 1 and data[1] & _PASSIVE:
@@ -100,7 +100,7 @@ def condition(identifier: int, data: bytes) -> Condition:
 
 
 def queue_is_full(error: BaseException) -> bool:
-    """Did a frame not go out because those before it are still waiting?"""
+    """Return whether a frame was not sent because the transmit queue is full."""
     numbers = getattr(error, "error_code", None), getattr(error, "errno", None)
     return errno.ENOBUFS in numbers or any(text in str(error).lower() for text in _FULL)
 
@@ -109,19 +109,19 @@ def queue_is_full(error: BaseException) -> bool:
 
 Handler = Callable[[bytes], None]
 LONGEST_DRAIN_S = 0.25
-"""Of wall time. A cycle must not be held up for ever by a bus on which something babbles."""
+"""Longest time for one drain, s of wall time. A flooded bus must not block a cycle."""
 PEER_DEAD_S = 4.0
-"""In stepped time a peer that has answered no question for so long, of wall time, is dead; nothing else ends a wait."""
+"""Time limit in stepped time: a peer without an answer for this wall time, s, is dead. No other limit ends the wait."""
 PEER_STILL_DEAD_S = 0.05
-"""A dead one is given so long from then on, until it is heard again."""
+"""Wait for a dead peer, s, until a frame from it arrives again."""
 ASK_S, ASK_SOON_S, ASK_AGAIN_S = 0.05, 0.002, 0.25
-"""It is asked after so long in which what is waited for didn't come; sooner if that was so the last time."""
+"""Waiting time before tdhil asks the peer whether it has finished, s: first, after a failed wait, and repeated."""
 BABBLE_FRAMES = 2000
-"""More than a bus of 1 Mbit/s carries in that time: with fewer it was this computer that stood still."""
+"""More frames than a 1 Mbit/s bus carries in `LONGEST_DRAIN_S`. With fewer, this computer was delayed."""
 
 
 class CanLink:
-    """Sends and receives on a python-can bus; ``tap`` sees every frame, ``handlers`` those of their identifier."""
+    """Sends and receives on a python-can bus. ``tap`` gets every frame, ``handlers`` the frames of their identifier."""
 
     def __init__(self, bus: can.BusABC, clock: Clock, tap: FrameTap | None = None) -> None:
         from can import Message
@@ -131,20 +131,22 @@ class CanLink:
         self._clock = clock
         self._tap = tap
         self.handlers: dict[int, Handler] = {}
-        self.remote_handlers: dict[int, Handler] = {}      # of remote frames, which carry no data
-        self._shut = ""                # why nothing is sent any more
+        self.remote_handlers: dict[int, Handler] = {}      # for remote frames, which carry no data
+        self._shut = ""                # why transmission has ended
         self.error_frames = 0
-        self.passive = 0               # how often the adapter said that it is error-passive
+        self.passive = 0               # number of error-passive reports of the adapter
         self.stamps = FrameStamps()
         self.name = str(bus.channel_info)
-        self.asks = False              # the peer is a simulated one in stepped time, and may be asked where a cycle is
+        self.asks = False              # simulated peer in stepped time: it can report its cycle
+        # All frames that a frame makes the peers send are in the queue when `send` returns: an empty queue stays empty.
+        self._answers_at_once: bool = getattr(bus, "answers_at_once", False)
         self._question = 0
         self._answered = self._in_vain = self._dead = False
 
     def send(self, identifier: int, data: bytes, last_check: Callable[[], None] | None = None) -> None:
         """Put one frame on the bus. Raises CommunicationLost if the bus doesn't take it.
 
-        ``last_check`` is called when nothing but sending is left to be done, and may raise to prevent it.
+        ``last_check`` is called immediately before the frame is sent, and may raise to prevent it.
         """
         message = self._message(arbitration_id=identifier, data=data, is_extended_id=False, check=False)
         if last_check is not None:
@@ -164,9 +166,10 @@ class CanLink:
     def _put(self, message: can.Message) -> None:
         if self._shut:
             raise CommunicationLost(
-                f"{self._shut}: nothing is sent any more",
+                f"{self._shut}: transmission has ended",
                 where=self.name,
-                next_step="Mend the bus and start anew; the drive's own watchdog stops the shaft",
+                next_step="Repair the bus and start again. The drive's own watchdog stops the shaft",
+                entry=MessageCode.BUS_FAILED,
             )
         try:
             self._bus.send(message)
@@ -174,20 +177,24 @@ class CanLink:
             if queue_is_full(error):
                 self._shut_up(f"the transmit queue is full ({error})")
             raise CommunicationLost(
-                f"the bus did not take a frame: {error}",
+                f"the bus did not accept a frame: {error}",
                 where=self.name,
-                next_step="Check adapter and cable; the drive's own watchdog stops the shaft",
+                next_step="Check adapter and cable. The drive's own watchdog stops the shaft",
+                entry=MessageCode.BUS_FAILED,
             ) from error
 
     def receive(self, timeout_s: float) -> tuple[int, bytes] | None:
-        """The next frame as (identifier, data), already handed on; None after ``timeout_s`` of wall time."""
+        """Return the next frame as (identifier, data) after its handler has run; None after ``timeout_s`` of wall
+        time.
+        """
         try:
             message = self._bus.recv(timeout_s)
         except Exception as error:  # see send
             raise CommunicationLost(
-                f"nothing can be received any more: {error}",
+                f"no frame can be received: {error}",
                 where=self.name,
-                next_step="Check adapter and cable; the drive's own watchdog stops the shaft",
+                next_step="Check adapter and cable. The drive's own watchdog stops the shaft",
+                entry=MessageCode.BUS_FAILED,
             ) from error
         if message is None:
             return None
@@ -197,19 +204,19 @@ class CanLink:
         if not self._clock.stepped:
             self.stamps.take(message.timestamp, self._clock.now_s())
         identifier, data = message.arbitration_id, bytes(message.data)
-        if identifier == CYCLE_ID and data[:1] == CYCLE_ANSWER:     # no part of the run: it may come or not
+        if identifier == CYCLE_ID and data[:1] == CYCLE_ANSWER:     # no part of the run: optional
             self._answered |= data[1:] == bytes((self._question,))
             return identifier, data
         if self._tap is not None:
             self._tap(RawFrame(self._clock.now_s(), False, identifier, data))
-        # A remote frame (another master's node guarding) carries no state; 29-bit identifiers are no CANopen of ours.
+        # A remote frame (node guarding by another master) carries no state. tdhil uses no 29-bit identifiers.
         handler = (self.remote_handlers if message.is_remote_frame else self.handlers).get(identifier)
         if handler is not None and not message.is_extended_id:
             handler(data)
         return identifier, data
 
     def _error_frame(self, message: can.Message) -> None:
-        """Raises CommunicationLost for a bus-off, from which the adapter may come back: not in this run."""
+        """Count an error frame. Raises CommunicationLost for bus-off: the adapter may recover, but not in this run."""
         self.error_frames += 1
         found = condition(message.arbitration_id, bytes(message.data))
         if found is Condition.PASSIVE:
@@ -219,38 +226,42 @@ class CanLink:
             raise CommunicationLost(
                 "the adapter went bus-off: too many errors on the bus",
                 where=self.name,
-                next_step="Check bit rate, termination and cable; the drive's own watchdog stops the shaft",
+                next_step="Check bit rate, termination and cable. The drive's own watchdog stops the shaft",
+                entry=MessageCode.BUS_FAILED,
             )
 
     def _shut_up(self, why: str) -> None:
-        """What waits in a queue is old by the time it goes out, and so is what would be put behind it."""
+        """End transmission and empty the queue: a queued setpoint is out of date when it is sent."""
         self._shut = why
-        with contextlib.suppress(Exception):       # not every interface can
+        with contextlib.suppress(Exception):       # not every interface supports it
             self._bus.flush_tx_buffer()
 
     def try_again(self) -> None:
-        """Send all the same: for a stop of a drive that no watchdog stops, where an old setpoint is no worse."""
+        """Allow transmission again, to stop a drive that has no watchdog. An old setpoint does no additional harm
+        then.
+        """
         self._shut = ""
 
     def drain(self) -> None:
-        """Handle all that has arrived, without waiting. Raises CommunicationLost if there is no end of it."""
+        """Handle all frames that have arrived, without waiting. Raises CommunicationLost if frames keep coming."""
         deadline_s, taken = time.monotonic() + LONGEST_DRAIN_S, 0
         while self.receive(0.0) is not None:
             taken += 1
             if taken > BABBLE_FRAMES and time.monotonic() > deadline_s:
                 raise CommunicationLost(
-                    "frames come faster than they can be taken",
+                    "frames arrive faster than this computer can read them",
                     where=self.name,
-                    next_step="Something babbles on the bus: look with candump, check bit rate and termination",
+                    next_step="A node floods the bus. Find it with candump; check bit rate and termination",
+                    entry=MessageCode.BUS_FLOODED,
                 )
 
     def await_answer(self, done: Callable[[], bool], timeout_s: float) -> bool:
-        """Handle frames until ``done()``, or until it is clear that what is waited for was lost; whether it was done.
+        """Handle frames until ``done()`` is true or the expected frame is lost. Return whether ``done()`` was true.
 
-        In real time that is so after ``timeout_s``; with a peer that may be asked (`asks`), as soon as it says that it
-        has nothing more to say: no clock decides then, but whether it is dead.
+        In real time the frame is lost after ``timeout_s``. A peer that can report its cycle (`asks`) reports that it
+        has nothing more to send. No clock decides then, except about a dead peer.
         """
-        if not self.asks:
+        if not self.asks or self._answers_at_once:
             return self.pump_until(done, timeout_s)
         waited_s, limit_s = 0.0, PEER_STILL_DEAD_S if self._dead else PEER_DEAD_S
         ask_s = ASK_SOON_S if self._in_vain else ASK_S
@@ -267,13 +278,22 @@ class CanLink:
                 ask_s = waited_s + ASK_AGAIN_S
             wait_s, begun_s = min(ask_s, limit_s) - waited_s, time.monotonic()
             self.receive(wait_s)
-            # Whoever was frozen meanwhile has heard nobody: what he missed is there, and no wait counts for more.
+            # After a freeze of this computer the missed frames are in the buffer. So no wait counts for more than its
+            # length.
             waited_s += min(time.monotonic() - begun_s, wait_s)
         self._in_vain = self._dead = False
         return True
 
     def pump_until(self, done: Callable[[], bool], timeout_s: float) -> bool:
-        """Handle frames until ``done()`` or until ``timeout_s`` of wall time has passed; whether it was done."""
+        """Handle frames until ``done()`` is true or ``timeout_s`` of wall time has passed. Return whether it was true.
+
+        A stepped peer that answers at once needs no wait: after the last frame in the queue no other frame comes.
+        """
+        if self.asks and self._answers_at_once:
+            while not done():
+                if self.receive(0.0) is None:
+                    return False
+            return True
         deadline_s = time.monotonic() + timeout_s
         while not done():
             left_s = deadline_s - time.monotonic()
@@ -283,6 +303,6 @@ class CanLink:
         return True
 
     def close(self) -> None:
-        """Shut the bus down; its errors no longer matter."""
+        """Shut the bus down and ignore its errors."""
         with contextlib.suppress(Exception):
             self._bus.shutdown()

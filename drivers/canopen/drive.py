@@ -1,16 +1,16 @@
-"""A CiA 402 drive on a CAN bus, as `drivers.drive.Drive` asks for it.
+"""A CiA 402 drive on a CAN bus, with the interface of `drivers.drive.Drive`.
 
-One cycle, all of it sent by this loop and nothing by any other thread or by the kernel::
+One cycle; this loop sends all of it, no other thread and not the kernel::
 
     tick ─ heartbeat (when due) ─ RPDO2 (when the mode changes) ─ RPDO1 ─ SYNC ─► TPDO1 (─ TPDO2)
            700h+host              6060h                         6040h 6071h 60FFh   6041h 6077h 606Ch
                                                                                    (6061h 6074h 6064h)
 
-Both RPDOs are synchronous: what is sent before a SYNC acts at it, and the TPDO shows that same instant. A mode
-switch and the torque target that seeds it therefore act together. Where a torque offset is used (60B2h) it goes out in
-RPDO2 with every cycle, as zero from the cycle on in which a stop is asked for. A drive that knows no heartbeat consumer
-is asked by node guarding instead (remote frame 700h+node); what else the frames of a drive hold differently is in
-`Shape`.
+Both RPDOs are synchronous: data sent before a SYNC acts at that SYNC, and the TPDO shows the same instant. So a mode
+switch and the torque target that belongs to it act together. If a torque offset is used (60B2h), RPDO2 carries it in
+every cycle; it is zero from the cycle on in which a stop is requested. A drive without a heartbeat consumer is
+supervised by node guarding instead (remote frame 700h+node). `shape_of` describes all other differences between the
+frames of drives.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, Pr
 from drivers.own_limits import OwnLimits
 from drivers.preflight import PreflightTable
 from drivers.undo_journal import UndoJournal
-from profiles import CYCLE_ID, MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS
+from profiles import CYCLE_ID, MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS, MessageCode
 from profiles.canopen import CanopenProfile
 
 if TYPE_CHECKING:
@@ -90,30 +90,30 @@ START, ENTER_PRE_OPERATIONAL = 0x01, 0x80
 NMT_COMMANDS = {START: "start", 0x02: "stop", ENTER_PRE_OPERATIONAL: "enter pre-operational", 0x81: "reset node",
                 0x82: "reset communication"}
 LOCAL_CYCLES = 3
-"""A bit that is missing for so many cycles is no accident of one frame."""
+"""A missing bit counts after this number of cycles; one damaged frame does not matter."""
 FIRST_ANSWERS, FIRST_ANSWER_S = 3, 0.05
-"""The first SYNCs, at standstill, are given so long: how soon this drive answers is then known, and what is late."""
+"""The first SYNCs, at standstill, get this waiting time, s. It shows the response time of the drive."""
 QUICK_STOP_OPTION = 0x605A
 DRIVE_SILENT_S = 0.5
-"""After so long without its heartbeat the drive counts as lost."""
+"""A drive counts as lost after this time without its heartbeat, s."""
 MODE_STALE_S, MODE_STALE_TIMES = 0.5, 10
-"""A mode that was displayed for the last time so long ago, and so many frames of it ago, isn't known any more."""
+"""The displayed mode counts as unknown after this time, s, and this number of frame periods without a display."""
 THIN_S, THIN_CYCLES, THIN_SHARE = 1.0, 10, 0.5
-"""Feedback that is missing in more than this share of the cycles within this time (so many cycles at least) is too
-little to guard a shaft by. A bus that loses every tenth frame is far from it."""
+"""Limit for missing feedback: more than this share of the cycles within this time (at least this number of cycles).
+With less feedback the shaft cannot be guarded. A bus that loses every tenth frame is far below the limit."""
 TPDO_COMMUNICATION, TPDO_MAPPING = 0x1800, 0x1A00
 _NO_WORD = b""
 _DISABLED = (State.SWITCH_ON_DISABLED, State.FAULT)
 _OUT_OF_OPERATION = (State.QUICK_STOP_ACTIVE, State.FAULT, State.FAULT_REACTION_ACTIVE)
 _REPEAT_MODE_CYCLES = 25
-"""A mode that isn't displayed yet is asked for again after so many cycles: one lost frame must not end a run."""
+"""A mode that is not displayed is requested again after this number of cycles: one lost frame must not end a run."""
 
 
 class Cia402Drive:
-    """One node. ``rated_torque_nm`` overrides or replaces what the drive says; ``tap`` sees every frame;
-    ``journal`` keeps what is changed in the drive, for whoever comes after a host that died.
+    """One node. ``rated_torque_nm`` overrides or replaces the value that the drive reports. ``tap`` gets every frame.
+    ``journal`` records the settings that are changed in the drive, for restoring them after the host has died.
 
-    ``stepped`` asks a simulated peer to let each SYNC advance its time; a real one is refused it.
+    In stepped time a simulated peer advances its time with each SYNC; for a real drive it is refused.
     """
 
     def __init__(
@@ -157,9 +157,9 @@ class Cia402Drive:
         self._rpdo2_id, self._tpdo2_id = 0x300 + node, 0x280 + node
         self._link.handlers[self._tpdo2_id] = self._on_slow_feedback
         self._identity: Identity | None = None
-        self._stage = ""               # as announced
+        self._stage = ""               # last stage sent to a simulated peer
         self._taken = False
-        self._remapped = False         # what the TPDOs carry was changed: no frame of theirs is believed any more
+        self._remapped = False         # the TPDO mapping was changed: their frames are ignored
         self._units = Units(1.0, 1.0)
         self._codes: dict[Mode, int] = {}
         self._modes: dict[int, Mode] = {}
@@ -179,9 +179,9 @@ class Cia402Drive:
         self._wish = PowerRequest.OFF
         self._removes_torque = False
         self._in_operation = False     # enabled, and seen enabled since
-        self._was_remote, self._local = False, 0       # bit 9: was it set in operation, and for how long not since
+        self._was_remote, self._local = False, 0       # bit 9: was set in operation; cycles without it
         self._ever_asked = False       # to be enabled
-        self._armed = True             # its watchdog, or nobody knows yet
+        self._armed = True             # the drive's watchdog; true while unknown
         self._reported = Reported()
         self._sent_code = 0
         self._since_mode_sent = 0
@@ -205,7 +205,7 @@ class Cia402Drive:
         return SlowFeedback(carried, 1 if self._wide else slow_syncs(self.period_s))
 
     def _angle_coming(self) -> checks.AngleComing:
-        """How the motor's angle will come, at whichever rate this drive is given."""
+        """Return how the motor's angle arrives, at any rate that this drive may get."""
         if self._angle is None or self._unwrapped is None:
             return checks.AngleComing()
         periods_s = (self.period_s, *(1.0 / rate for rate in self.rates_hz))
@@ -215,10 +215,10 @@ class Cia402Drive:
         return checks.AngleComing(self._angle.rad_per_count, apart_s if comes else None, gap_s)
 
     def host_late(self) -> str:
-        """How late this computer or its adapter has been of late, in words; empty where it keeps up."""
+        """Return the recent delay of this computer or its adapter, in words; empty if there is none."""
         begun = list(self._ticks.late_s)
         since_s = self.clock.now_s() - len(begun) * self.period_s
-        # What an answer was late by comes in place of the cycle's own beginning, which was in time most often.
+        # The delay of an answer replaces the delay of the start of its cycle, which is usually zero.
         answered = [self.period_s + late_s for late_s in self._feedback.late_since(since_s)]
         late_s = answered + begun[: max(0, len(begun) - len(answered))]
         return self._stood_still() or how_late(late_s, self.period_s)
@@ -229,7 +229,7 @@ class Cia402Drive:
 
     @property
     def counters(self) -> Counters:
-        """What went wrong on the bus so far."""
+        """Errors on the bus since the start."""
         stamps = self._link.stamps
         return Counters(
             self._cycles, self._missed, self._late + self._feedback.second + self._feedback.older,
@@ -241,7 +241,7 @@ class Cia402Drive:
     # -- before motion ---------------------------------------------------------------------------------------
 
     def connect(self) -> Identity:
-        """Find the node, put it into pre-operational, read who it is (1018h) and whether it is simulated."""
+        """Find the node, put it into pre-operational, read its identity (1018h) and the simulator's marker."""
         find_free_node(self._objects)
         self._taken = True
         self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
@@ -252,9 +252,9 @@ class Cia402Drive:
         return self._identity
 
     def announce(self, stage: str) -> None:
-        """Tell a simulated peer that a stage of the protocol begins (5FFEh:4); a real drive is told nothing.
+        """Send a stage of the run to a simulated peer (5FFEh:4). Nothing is sent to a real drive.
 
-        An expedited SDO download (CiA 301) whose answer nobody waits for.
+        It is an expedited SDO download (CiA 301); tdhil does not wait for the answer.
         """
         self._stage = stage
         if self._identity is not None and self._identity.simulated and stage in STAGE_NUMBERS:
@@ -262,7 +262,7 @@ class Cia402Drive:
             self._link.send(0x600 + self._node, request)
 
     def preflight(self, limits: DriveLimits) -> Preflight:
-        """Set and read back limits, watchdog and PDOs; leaves the node operational, disabled, and watched."""
+        """Set and read back limits, watchdog and PDOs. The node is then operational, disabled, and supervised."""
         if self._identity is None:
             raise PreflightRefused("preflight before connect", where="driver")
         table, objects, scaling = PreflightTable(), self._objects, PreflightTable()
@@ -326,7 +326,7 @@ class Cia402Drive:
 
     @property
     def rates_hz(self) -> tuple[float, ...]:
-        """The profile's rate and lower ones; none in stepped time, or where a rate was named."""
+        """The profile's rate and lower ones; none in stepped time, or if a rate was given."""
         if self._rate_is_named or self.clock.stepped:
             return ()
         highest, lowest = self._profile.cyclic.rate_hz, arming.LEAST_CYCLES / (self._watchdog_s or math.inf)
@@ -334,19 +334,19 @@ class Cia402Drive:
 
     @property
     def began_late_s(self) -> float:
-        """By how much the last cycle began late, s."""
+        """Delay of the start of the last cycle, s."""
         return self._ticks.late_s[-1] if self._ticks.late_s else 0.0
 
     def set_rate(self, rate_hz: float, *, measuring: bool = False) -> None:
-        """Another rate, after preflight and before anything is enabled: 1006h is written in pre-operational.
+        """Change the rate after preflight and before the drive is enabled. 1006h is written in pre-operational.
 
-        With ``measuring`` a loop that stands still is no error, as nothing can move.
+        With ``measuring`` a delayed loop is no error, because nothing can move.
         """
         self.period_s = round(1e6 / rate_hz) * 1e-6
         self._watch.stop()
         self._life.feed()
         self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
-        with suppress(ObjectRefused):  # it follows the SYNC alone then
+        with suppress(ObjectRefused):  # then it follows the SYNC alone
             arming.set_period(self._objects, self._profile, self.period_s)
         with suppress(ObjectRefused):
             self._read_back.stands(0x1801, 2, arming.set_slow_syncs(self._objects, self.period_s))
@@ -358,7 +358,7 @@ class Cia402Drive:
         self._start(0.0 if measuring else 0.5)
 
     def _watch_settings(self, watchdog_s: float, frames: Sequence[tuple[str, int, int, bytes]]) -> None:
-        """What preflight set stays as it is in motion: it is read back there."""
+        """List the settings that preflight made, for reading them back during motion."""
         watchdog, back = self._profile.watchdog, self._read_back
         back.clear()
         reaction = watchdog.reaction_index, watchdog.reaction_sub
@@ -385,11 +385,12 @@ class Cia402Drive:
             back.watch_setpoint("the torque offset", self._shape.offset[0])
 
     def _start(self, stall_share: float = 0.5) -> None:
-        """Operational from now on, and watched. Standing still for this share of the watchdog's time is an error."""
+        """Start the node and its supervision. A delay above this share of the watchdog's time is an error."""
         try:
-            self._watch.check()        # nothing moves yet: what is wrong already is a refusal
+            self._watch.check()        # nothing moves yet: an error becomes a refusal
         except CommunicationLost as error:
-            raise PreflightRefused(error.what, where=error.where, next_step=error.next_step) from error
+            raise PreflightRefused(error.what, where=error.where, next_step=error.next_step,
+                                   entry=MessageCode.NO_FEEDBACK) from error
         self._link.send(NMT, bytes((START, self._node)))
         self._link.drain()
         self._ticks = Ticks(self.clock, self.period_s, stall_share * self._watchdog_s)
@@ -397,7 +398,7 @@ class Cia402Drive:
         self._watch.start(self._allowed_silence_s)
 
     def _pause(self) -> None:
-        """A short wait of wall time for a drive that needs it between two SDOs; feeds the watchdog if it is armed."""
+        """Wait a short wall time between two SDOs for a drive that needs it. Feeds the watchdog if it is armed."""
         if self._watchdog_s:
             self._life.feed()
         self._link.pump_until(lambda: False, 0.01)
@@ -405,47 +406,50 @@ class Cia402Drive:
     # -- the cycle -------------------------------------------------------------------------------------------
 
     def enable(self, mode: Mode) -> None:
-        """From the next cycle on move towards operation enabled in ``mode``."""
+        """Move towards operation enabled in ``mode``, from the next cycle on."""
         if mode not in self._codes:
-            raise PreflightRefused(f"the drive has no {mode.value} mode", where="6502h", next_step="Use --mode speed")
+            raise PreflightRefused(f"the drive has no {mode.value} mode", where="6502h", next_step="Use --mode speed",
+                                   entry=MessageCode.NO_TORQUE_MODE)
         self._foreign_traffic.refuse_shared()
         self._wish, self._in_operation, self._ever_asked = PowerRequest.ENABLED, False, True
 
     def quick_stop(self) -> None:
-        """From the next cycle on quick stop (controlword bit 2); it isn't ended by enabling.
+        """Send quick stop (controlword bit 2) from the next cycle on. Enabling does not end it.
 
-        Its option (605Ah) goes before it: somebody may have set that to coasting since it was read back last.
+        The quick-stop option (605Ah) is restored first: another master may have set it to coasting since the last
+        read-back.
         """
         if self._wish is PowerRequest.ENABLED and self._fed:
-            with suppress(CommunicationLost):      # the cycle that follows says so
+            with suppress(CommunicationLost):      # the following cycle reports it
                 self._read_back.put_back(QUICK_STOP_OPTION, 0)
         self._wish = PowerRequest.QUICK_STOP
 
     def disable(self) -> None:
-        """From the next cycle on towards switch on disabled."""
+        """Move towards switch on disabled, from the next cycle on."""
         self._wish = PowerRequest.OFF
 
     def remove_torque(self) -> None:
-        """From the next cycle on disable voltage (transition 9 or 12); see `drivers.drive.RemovesTorque`."""
+        """Send disable voltage (transition 9 or 12) from the next cycle on; see `drivers.drive.RemovesTorque`."""
         self._wish, self._removes_torque = PowerRequest.OFF, True
 
     def reset_fault(self) -> None:
-        """One rising edge of controlword bit 7, by SDO, between connect and preflight; only on an operator's word.
+        """Reset a fault by a rising edge of controlword bit 7, by SDO, between connect and preflight.
 
-        Nothing is written to a drive that isn't in fault: the edge's low word would let go of a shaft that it holds.
+        It needs the operator's request. Nothing is written to a drive without a fault: the low word before the edge
+        would release a shaft that it holds.
         """
         if decode(self._objects.read(0x6041)) is not State.FAULT:
             return
-        # Low first, so that the drive sees an edge whatever stood there before.
+        # The low word first gives the drive an edge from any former value.
         for word in (DISABLE_VOLTAGE, FAULT_RESET, DISABLE_VOLTAGE):
             self._objects.write(0x6040, 0, word, 16)
             self._pause()
 
     def exchange(self, command: Command) -> Sample:
-        """One cycle: wait for the tick, send, SYNC, take the feedback.
+        """Run one cycle: wait for the tick, send the setpoints and SYNC, read the feedback.
 
-        Raises CommunicationLost (bus, heartbeat, foreign NMT command, a loop that was frozen), DriveFault (EMCY,
-        restart) and CommandRejected; each trouble of the drive once, so that a stop can go on exchanging.
+        Raises CommunicationLost (bus, heartbeat, foreign NMT command, delayed loop), DriveFault (EMCY, restart) and
+        CommandRejected. Each error of the drive is raised once, so that a stop can continue to exchange.
         """
         if command.mode not in self._codes:
             raise CommandRejected(f"the drive was not prepared for {command.mode.value} mode", where="6060h")
@@ -457,7 +461,7 @@ class Cia402Drive:
         self._ticks.wait(self._listen_after_all)
         if self._wish is not PowerRequest.ENABLED and not self._armed:
             self._link.try_again()
-        # What came since the last cycle is looked at before this cycle's setpoint goes out.
+        # Frames that came since the last cycle are checked before this cycle's setpoint is sent.
         self._check()
         now_s = self.clock.now_s()
         self._life.feed_when_due(now_s)
@@ -489,9 +493,9 @@ class Cia402Drive:
         return sample
 
     def _exchange_without_setpoints(self, now_s: float) -> Sample:
-        """Of a drive whose RPDOs were switched off, or which is left to its own watchdog.
+        """Run one cycle for a drive whose RPDOs are switched off, or that is left to its own watchdog.
 
-        Then nothing goes out but, in stepped time, the SYNC that moves time on.
+        In the second case no frame is sent. In stepped time SYNC is still sent, because it advances time.
         """
         if self._fed:
             self._standing.push(self._reported.state, self._wish)
@@ -499,20 +503,22 @@ class Cia402Drive:
 
     @property
     def _others_drive(self) -> bool:
-        """Were setpoints of somebody else heard under our own RPDOs' identifiers?"""
+        """True if setpoints of another master were received under the identifiers of our RPDOs."""
         foreign = self._watch.foreign
         return any(foreign[rpdo_kind(n, 0x100 * (1 + n) + self._node)] for n in (1, 2))
 
     def _stand(self) -> None:
-        """The quick stop is undone by somebody, or not taken: by SDO, then, and without any RPDO in the drive."""
+        """Send quick stop by SDO and switch all RPDOs off: another master reversed it, or the drive did not execute
+        it.
+        """
         done = self._standing.take_over(self._watchdog_s, self._life.feed)
         self._foreign_traffic.tell(
-            f"the quick stop did not stand: {done} RPDOs were switched off in the drive, and it was asked for by SDO"
+            f"the quick stop was reversed or not executed: {done} RPDOs were switched off, and it was sent by SDO"
         )
         self._ticks.put_off()
 
     def _finish(self, now_s: float, sync: bool = True) -> Sample:
-        """The SYNC, and what comes back for it."""
+        """Send SYNC and read the feedback that belongs to it."""
         feedback = self._feedback
         feedback.begin(now_s, sync=sync)
         if sync:
@@ -538,40 +544,39 @@ class Cia402Drive:
         self._check()
         hidden_s = now_s - self._shown_s
         if hidden_s > MODE_STALE_S and hidden_s > MODE_STALE_TIMES * slow_syncs(self.period_s) * self.period_s:
-            self._reported.shown_code = 0      # whatever it was, nobody knows any more
+            self._reported.shown_code = 0      # the mode is unknown now
         counts = self._slow.counts if fresh and sync else None
         return self._sample(now_s, age_s, fresh, None if counts is None else self._turned(now_s, counts))
 
     def _turned(self, time_s: float, counts: float) -> float | None:
-        """The motor's angle since the first reading, rad; None where it is not known."""
+        """Return the motor's angle since the first reading, rad; None if it is unknown."""
         if self._angle is None or self._unwrapped is None:
             return None
         return self._unwrapped.take(time_s, counts * self._angle.rad_per_count)
 
     def _count(self, fresh: bool) -> None:
-        """Notice feedback that comes too seldom to guard a shaft by."""
+        """Detect feedback that is too rare to guard a shaft."""
         recent = self._recent
         if not (self._in_operation and self._wish is PowerRequest.ENABLED):
             recent.clear()
             return
         recent.append(fresh)
-        # Where nothing comes at all, the guard's age limit and the drive's heartbeat say so.
+        # If no feedback comes at all, the guard's age limit and the drive's heartbeat detect it.
         if fresh and (missed := recent.count(False)) > THIN_SHARE * (recent.maxlen or 0):
             self._watch.thin_feedback(missed, len(recent), self.period_s, f"TPDO1, {self._tpdo1_id:03X}h")
             with suppress(CommunicationLost):      # for the stop that follows
                 self._read_back.put_back(TPDO_COMMUNICATION, 2)
 
     def _check(self) -> None:
-        """Raise what is wrong with the drive; a sign of life that hasn't been read yet isn't missing."""
+        """Raise the errors of the drive. A heartbeat that is still unread does not count as missing."""
         if self._watch.overdue:
             self._link.drain()
         self._watch.check()
 
     def poll(self) -> Sample | None:
-        """Status, speed, torque and angle by SDO, for a stop whose cyclic feedback is not to be had; None without an
-        answer.
+        """Read status, speed, torque and angle by SDO, for a stop without cyclic feedback; None without an answer.
 
-        Once something else than enabling was asked for, that goes out by SDO (6040h) too. Raises CommunicationLost.
+        After a request other than enabling, the controlword (6040h) is sent by SDO too. Raises CommunicationLost.
         """
         if self._watch.nmt_state == STOPPED:
             self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
@@ -592,7 +597,7 @@ class Cia402Drive:
         return self._sample(begun_s + half_s, half_s, True, position_rad)._replace(half_width_s=half_s)
 
     def _poll_angle(self) -> float | None:
-        """The angle by SDO, behind all that a stop needs more."""
+        """Read the angle by SDO, after everything that a stop needs more urgently."""
         if self._angle is None or self._unwrapped is None:
             return None
         found = self._angle.read(self._objects, self.clock, self._watchdog_s)
@@ -600,7 +605,9 @@ class Cia402Drive:
         return None if found is None else self._unwrapped.take(found.time_s, found.position_rad)
 
     def read_position(self) -> PositionReading | None:
-        """The motor's angle by one SDO between two cycles; None where the drive has none, or didn't answer in time."""
+        """Read the motor's angle by one SDO between two cycles; None if the drive has none or did not answer in
+        time.
+        """
         if self._angle is None:
             return None
         self._life.feed_when_due(self.clock.now_s())
@@ -609,11 +616,12 @@ class Cia402Drive:
         return found
 
     def _follow_state(self) -> None:
-        """A drive that fell out of operation stays out until it is asked in again: whoever resets it isn't us.
+        """Keep a drive that left operation out of operation until it is enabled again, even if another master resets
+        it.
 
-        Some drives leave by fault, some by quick stop, and some are simply found switched off, once their own watchdog
-        has brought the shaft to rest. Quick stop keeps each of them where it is, and does no harm to one that is still
-        in operation because the frame that said otherwise wasn't its own.
+        Some drives leave operation by a fault, some by quick stop, and some are simply off after their own watchdog has
+        stopped the shaft. Quick stop keeps each of them in its state. It also does no harm to a drive that is still in
+        operation, if a foreign frame reported otherwise.
         """
         if self._wish is not PowerRequest.ENABLED:
             return
@@ -623,7 +631,7 @@ class Cia402Drive:
             self._wish = PowerRequest.QUICK_STOP
 
     def _follow_remote(self, status: int) -> None:
-        """In operation bit 9 of the statusword stays set, where it has been: else another place has taken control."""
+        """Check bit 9 (remote) of the statusword in operation: if it was set and clears, another place took control."""
         if not (self._in_operation and self._wish is PowerRequest.ENABLED):
             self._local = 0
         elif status & REMOTE:
@@ -634,25 +642,27 @@ class Cia402Drive:
                 self._watch.interference(
                     f"the bus no longer controls the drive: bit 9 (remote) of the statusword {status:04X}h is 0",
                     f"node {self._node}, 6041h",
-                    "Was the drive switched to its panel or to another fieldbus? Give control back, and start anew",
+                    "Was the drive switched to its panel or to another fieldbus? Return control to the bus",
                     kind="remote",
                 )
 
     def _on_nmt(self, data: bytes) -> None:
-        """An NMT command that another master sent: to this drive, or to all nodes (CiA 301)."""
+        """Handle an NMT command of another master to this drive, or to all nodes (CiA 301)."""
         if len(data) < 2 or data[1] not in (0, self._node):
             return
         name = NMT_COMMANDS.get(data[0], f"command {data[0]:02X}h")
-        self._foreign_traffic.tell(f"somebody else sent NMT {name} to {'all nodes' if data[1] == 0 else 'the drive'}")
+        self._foreign_traffic.tell(f"another master sent NMT {name} to {'all nodes' if data[1] == 0 else 'the drive'}")
         state = {0x02: "stopped", ENTER_PRE_OPERATIONAL: "pre-operational"}.get(data[0])
-        if state is not None and self._watch.expect_operational:       # after a reset its boot-up message says so
+        if state is not None and self._watch.expect_operational:       # a reset is detected by the boot-up message
             self._watch.interference(
-                f"somebody put the drive into NMT state {state}, by a command", f"node {self._node}",
-                "Is a second master on the bus? Take it off and start anew", kind="nmt",
+                f"another master put the drive into NMT state {state}", f"node {self._node}",
+                "Disconnect the second master from the bus, and start again", kind="nmt",
             )
 
     def _listen_after_all(self, tick_s: float) -> None:
-        """The same, where this loop may have stood still: then that comes before what it finds on the bus."""
+        """Listen until the tick. If this loop may have been delayed, report the delay before errors found on the
+        bus.
+        """
         away_s = self.clock.now_s() - tick_s
         try:
             self._listen_until(tick_s)
@@ -660,12 +670,13 @@ class Cia402Drive:
             if away_s <= max(STALL_S, STALL_CYCLES * self.period_s):
                 raise
             raise CommunicationLost(
-                f"this computer was late: its control loop stood still for {away_s:.2f} s; after that: {error.what}",
+                f"this computer was late: its control loop stood still for {away_s:.2f} s. After that: {error.what}",
                 where=f"host; {error.where}", next_step=error.next_step,
+                entry=MessageCode.HOST_LATE,
             ) from error
 
     def _listen_until(self, tick_s: float) -> None:
-        """Wait for the next tick, and take what comes meanwhile; feedback among it is late."""
+        """Wait for the next tick and handle frames meanwhile. Feedback among them is late."""
         clock, feedback = self.clock, self._feedback
         before = feedback.arrived - feedback.older
         if clock.stepped:
@@ -679,11 +690,11 @@ class Cia402Drive:
         self._late += feedback.arrived - feedback.older > before
 
     def _await_feedback(self, sync_s: float) -> float:
-        """Take frames until TPDO1 is there; its age in seconds of control time."""
+        """Handle frames until TPDO1 has come. Return its age in seconds of control time."""
         clock = self.clock
         link = self._link
         if clock.stepped:
-            # In stepped time nothing is late, it is lost.
+            # In stepped time a missing frame is lost, never late.
             if link.await_answer(lambda: self._feedback.done, PEER_DEAD_S) and self._slow.due:
                 self._slow.wait()
                 link.await_answer(lambda: self._feedback.over or not self._slow.due, PEER_DEAD_S)
@@ -695,7 +706,7 @@ class Cia402Drive:
         while not feedback.done and (left_s := deadline_s - clock.now_s()) > 0.0:
             link.receive(left_s)
         if not feedback.done:
-            link.drain()               # a loop that comes back late finds in time what came in time
+            link.drain()               # after a delay of this loop: frames that came in time count
             feedback.settle()
         age_s = clock.now_s() - sync_s
         if feedback.done and self._slow.due:
@@ -707,32 +718,35 @@ class Cia402Drive:
         return age_s
 
     def stop_feeding(self) -> None:
-        """No sign of life, setpoint or controlword any more; see `drivers.drive.StopsFeeding`."""
+        """Send no heartbeat, setpoint or controlword any more; see `drivers.drive.StopsFeeding`."""
         self._fed = False
         self._life.end()
 
     def remarks(self) -> tuple[str, ...]:
-        """What others did on the bus since this was asked last; see `drivers.drive.Telling`."""
+        """Return what other masters sent since the last call; see `drivers.drive.Telling`."""
         return self._foreign_traffic.remarks()
 
     def summary(self) -> tuple[str, ...]:
-        """What others wrote to the drive in all of the run."""
+        """Return what other masters wrote to the drive during the whole run."""
         return self._foreign_traffic.summary()
 
     def keep_alive(self) -> None:
-        """A sign of life between two cycles, without a SYNC: in stepped time a peer takes a silent host for a dead one.
+        """Send a heartbeat between two cycles, without a SYNC: in stepped time a simulated peer treats silence as a
+        dead host.
 
         The heartbeats that are due in control time stay due.
         """
         self._life.feed_between()
 
     def _on_write(self, index: int, sub: int) -> None:
-        """Somebody else wrote an object of the drive."""
+        """Handle a write to an object of the drive by another master."""
         self._mode_overwritten |= index == 0x6060
         self._read_back.soon(index, sub)
 
     def _on_changed(self, index: int, sub: int) -> None:
-        """Somebody else changed what is read back: a frame whose mapping isn't ours says nothing that is known."""
+        """Handle a change of a supervised object by another master. A frame with a foreign mapping cannot be
+        decoded.
+        """
         self._remapped |= index in (TPDO_MAPPING, TPDO_MAPPING + 1)
 
     def _on_slow_feedback(self, data: bytes) -> None:
@@ -743,7 +757,7 @@ class Cia402Drive:
             self._feedback.on_status(data[:2])
             data = data[2:]
         if len(data) == size:
-            # A wide drive's two TPDOs come in whichever order, with each SYNC: the two of one are put together.
+            # The two TPDOs of a wide drive come in any order with each SYNC; the two of one SYNC are combined.
             shown = self._slow.take(data, self._wide or bool(self._feedback.data))
             if shown is not None:
                 self._show(shown)
@@ -758,11 +772,11 @@ class Cia402Drive:
     # -- afterwards ------------------------------------------------------------------------------------------
 
     def close(self) -> tuple[str, ...]:
-        """Give the drive its former settings back and let go of the bus; targets stay at zero.
+        """Restore the drive's former settings and close the bus; targets stay at zero. Return what could not be
+        restored.
 
-        Only of a drive that is known to be disabled, which one that was enabled and shows no state since isn't:
-        otherwise its watchdog stays armed and the silence that follows makes it act. What could not be given back is
-        returned.
+        Settings are restored only if the drive is known to be disabled. A drive that was enabled and has shown no state
+        since is not known to be. Its watchdog stays armed then, and the silence that follows triggers it.
         """
         self._watch.stop()
         left: tuple[str, ...] = ()
@@ -780,5 +794,5 @@ class Cia402Drive:
 
 
 def rpdo_kind(number: int, identifier: int) -> str:
-    """An RPDO of the drive, as it is named in messages."""
+    """Return the name of an RPDO of the drive, as used in messages."""
     return f"setpoints (RPDO{number}, {identifier:03X}h)"

@@ -15,32 +15,32 @@ from profiles import Require
 from profiles.canopen import CanopenProfile, Parameter
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Settings of the drive that the profile names: read, held against what they must be, and used as scales.
+# Settings of the drive that the profile names: read, compared with the required values, and used as scales.
 
 
 _UNITS = {"rpm": " rpm", "rpm_s": " rpm/s", "nm": " N·m", "rated": " x rated torque", "s": " s", "hz": " Hz"}
 
 
 class DriveSettings:
-    """The drive's settings by name, in their units, read when they are asked for."""
+    """The drive's settings by name, in their units, read on request."""
 
     def __init__(self, objects: Objects, profile: CanopenProfile) -> None:
         self._objects = objects
         self._profile = profile
 
     def value(self, wanted: str) -> float:
-        """In its unit. Raises ObjectRefused."""
+        """Return the setting in its unit. Raises ObjectRefused."""
         one = self._profile.parameter(wanted)
         where = name(one.index, one.sub)
         raw = decode_value(one.type, self._objects.read_bytes(one.index, one.sub), where)
         if one.scale == "power_of_two":
             if not 0 <= raw <= 64:
-                raise ObjectRefused(f"{raw:g} is no number of bits", where=where)
+                raise ObjectRefused(f"{raw:g} is not a number of bits from 0 to 64", where=where)
             return float(2.0**raw)
         return raw * self.per_lsb(one)
 
     def per_lsb(self, one: Parameter) -> float:
-        """Units for one count. Raises ObjectRefused, also for a scale of zero."""
+        """Return the units for one count. Raises ObjectRefused, also for a scale of zero."""
         factor = 1.0 if one.times is None else self.value(one.times)
         if factor == 0.0 and one.times is not None:
             scale = self._profile.parameter(one.times)
@@ -49,7 +49,7 @@ class DriveSettings:
 
 
 def check_parameters(table: PreflightTable, objects: Objects, profile: CanopenProfile) -> None:
-    """One row for each setting that must stand by hand; this program writes none of them."""
+    """Add one row for each setting that the operator must set; tdhil writes none of them."""
     settings = DriveSettings(objects, profile)
     for one in profile.parameters:
         if one.require is None:
@@ -62,12 +62,12 @@ def check_parameters(table: PreflightTable, objects: Objects, profile: CanopenPr
 
         table.attempt(
             one.title, wanted_text(one.require, unit), name(one.index, one.sub), work,
-            one.advice or "Set it at the drive, by hand: this program does not",
+            one.advice or "Set it at the drive; tdhil does not write it",
         )
 
 
 def fulfils(require: Require, value: float) -> bool:
-    """Does ``value`` do, give or take the last bits of a 32-bit float?"""
+    """Return whether ``value`` meets the requirement, within the rounding of a 32-bit float."""
     slack = 1e-6 * abs(value)
     exact = [wanted for wanted in (require.equals,) if wanted is not None] + list(require.one_of or ())
     return (
@@ -78,7 +78,7 @@ def fulfils(require: Require, value: float) -> bool:
 
 
 def wanted_text(require: Require, unit: str) -> str:
-    """The demand in words."""
+    """Return the requirement in words."""
     parts = []
     if require.equals is not None:
         parts.append(f"{require.equals:.10g}{unit}")
@@ -108,23 +108,23 @@ def set_limits(
     table: PreflightTable, objects: Objects, profile: CanopenProfile, limits: DriveLimits, rated_nm: float,
     own: OwnLimits
 ) -> None:
-    """The drive's own torque limit, speed limit and quick stop, written and read back; ``own`` says which may be."""
+    """Write the drive's own torque limit, speed limit and quick stop and read them back, where ``own`` permits it."""
     elsewhere = {one.set_to for one in profile.parameters}
     torque_lsb = profile.torque.max_torque_rated_per_lsb
     if torque_lsb is not None:
         lsb = torque_lsb * rated_nm
         _limit(table, objects, own, TORQUE, "torque limit", 0x6072, limits.torque_nm, lsb, 16, "N·m", math.floor)
     elif "torque_limit" not in elsewhere:
-        table.note("torque limit", "the drive has no 6072h: the host alone limits it, by the guard and the setpoint")
+        table.note("torque limit", "the drive has no 6072h; only the guard and the setpoint of the host limit torque")
     speed_lsb = profile.speed.max_motor_speed_rpm_per_lsb
     if speed_lsb is not None:
         lsb = speed_lsb * RPM
         _limit(table, objects, own, SPEED, "speed limit", 0x6080, limits.speed_rad_s, lsb, 32, "rad/s", math.ceil)
     elif "speed_limit" not in elsewhere:
-        table.note("speed limit", "the drive has no 6080h: set its own speed limit by hand")
+        table.note("speed limit", "the drive has no 6080h; set its own speed limit at the drive")
     settings = DriveSettings(objects, profile)
     for one in profile.parameters:
-        # What a ramp begins at is itself a limit: it has to stand before the ramp is worked out.
+        # The speed that a ramp starts from is itself a limit, so it is set before the ramp is computed.
         if one.set_to is not None and one.from_speed is None:
             _set(table, objects, settings, one, limits, rated_nm, own)
     for one in profile.parameters:
@@ -142,13 +142,13 @@ def set_limits(
 
 
 def note_temperature(table: PreflightTable, limit_c: float | None) -> None:
-    """CiA 402 has no object for one: nobody watches it here, and a limit would not be held."""
+    """Add the temperature row. CiA 402 has no temperature object, so a limit cannot be enforced."""
     if limit_c is None:
-        text = "nobody watches it: CiA 402 has no object for one; the drive itself reports it by an EMCY"
+        text = "not supervised by tdhil: CiA 402 has no object for it; the drive reports overheating by an EMCY"
         table.note("temperature", text, "profile")
     else:
-        table.row("temperature limit", f"{limit_c:g} °C", "CiA 402 has no object for a temperature", False,
-                  "limits.temperature_c", "Take it out of rig.yaml: it would not be held on CANopen")
+        table.row("temperature limit", f"{limit_c:g} °C", "not supervised: CiA 402 has no temperature object", False,
+                  "limits.temperature_c", "Remove it from rig.yaml: it has no effect on CANopen")
 
 
 def _set(
@@ -156,7 +156,7 @@ def _set(
     rated_nm: float,
     own: OwnLimits
 ) -> None:
-    """One parameter of the profile that holds a limit; the row's numbers are in the parameter's unit."""
+    """Write one parameter of the profile that holds a limit; the row's numbers are in the parameter's unit."""
     where, mend = name(one.index, one.sub), one.advice or ""
     limit, title = _LIMIT[one.set_to or ""], _TITLES[one.set_to or ""]
     unit = {"rpm": " rpm", "rpm_s": " rpm/s", "nm": " N·m", "rated": " x rated torque", "s": " s"}.get(one.unit, "")
@@ -173,7 +173,7 @@ def _set(
             return decode_value(one.type, data, where) * per_lsb
 
         def braking(value: float) -> float:
-            """A time that a ramp takes → its deceleration; a time of 0 is no ramp at all."""
+            """Convert the time of a ramp to its deceleration; a time of 0 means no ramp."""
             if one.from_speed is None:
                 return value * (RPM if limit is QUICK_STOP else 1.0)
             return RPM * settings.value(one.from_speed) / value if value > 0.0 else math.inf
@@ -195,7 +195,7 @@ def _set(
 
 
 def _count(settings: DriveSettings, one: Parameter, limits: DriveLimits, rated_nm: float) -> float:
-    """The limit in the parameter's unit, rounded to its counts: torque down, speed and braking up."""
+    """Return the limit in the parameter's unit, rounded to its counts: torque down, speed and braking up."""
     per_lsb = settings.per_lsb(one)
     nm = 1.0 if one.unit == "nm" else 1.0 / rated_nm
     if one.set_to == "torque_limit":
@@ -217,8 +217,8 @@ def _rounded(one: Parameter, value: float, per_lsb: float, rounding: Callable[[f
         return value
     counts = rounding(value / per_lsb * (1.0 + (1e-9 if rounding is math.floor else -1e-9)))
     if counts > 0xFFFF_FFFF:
-        raise ObjectRefused(f"{value:g} is out of its range", where=name(one.index, one.sub))
-    if counts < 1 and _LIMIT[one.set_to or ""] == TORQUE:      # one count would be a wider limit than was asked for
+        raise ObjectRefused(f"{value:g} is above the range of the object", where=name(one.index, one.sub))
+    if counts < 1 and _LIMIT[one.set_to or ""] == TORQUE:      # one count would be a wider limit than requested
         raise ObjectRefused(f"{value:g} is less than one count, {per_lsb:g}", where=name(one.index, one.sub))
     counts = max(1, counts)
     return counts * per_lsb
@@ -237,14 +237,14 @@ def _limit(
     unit: str,
     rounding: Callable[[float], int],
 ) -> None:
-    # One part in 10^9 of slack: a limit that is a whole number of LSB must not lose one to the last bit.
+    # Slack of 1e-9: a limit of a whole number of LSB must not lose one LSB to rounding.
     slack = 1e-9 if rounding is math.floor else -1e-9
     counts = rounding(value / per_lsb * (1.0 + slack))
     raw = max(1, counts)
     wanted, where = f"{raw * per_lsb:.6g} {unit}", name(index)
-    if counts < 1 and limit == TORQUE:     # one count would be a wider limit than was asked for
+    if counts < 1 and limit == TORQUE:     # one count would be a wider limit than requested
         table.row(title, f"{value:g} {unit}", f"one count is {per_lsb:g} {unit}", False, where,
-                  "The drive can't hold so low a limit: is the unit in the profile right, and the limit in rig.yaml?")
+                  "The limit is below one count. Check the unit in the profile and the limit in rig.yaml")
         return
     try:
         data = objects.read_bytes(index)

@@ -1,15 +1,15 @@
-"""Somebody else on the bus: a node that bears the host's number, another master's frames, a tool's SDO.
+"""Foreign frames on the bus: a node with the host's number, frames of another master, SDO requests of a tool.
 
-What only this host sends to this drive, and comes in all the same, isn't ours::
+Only this host may send these frames to this drive. If one is received, another node sent it::
 
-    700h + host      a heartbeat that would go on feeding the drive's watchdog (1016h) when this computer has died
-    700h + node      remote frame: so would another master's question, where the drive is watched by node guarding
+        700h + host      heartbeat: it would feed the drive's watchdog (1016h) after this computer has died
+        700h + node      remote frame: the same, for a drive that is supervised by node guarding
     080h             SYNC
     RPDOs            setpoints
-    600h + node      SDO requests: a tool reads, which does no harm, or writes
+        600h + node      SDO requests: a tool that reads does no harm; one that writes may
 
-A frame or two by mistake is told (`remarks`); the second of a kind, however late in the run, ends it (`NodeWatch`). A
-tool that writes what drives the shaft (6040h, 6060h, 6071h, 60FFh) again and again is a second master too.
+A single frame is reported (`remarks`). The second frame of a kind, at any time in the run, ends the run (`NodeWatch`).
+A tool that writes driving objects (6040h, 6060h, 6071h, 60FFh) repeatedly is a second master too.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ from drivers.canopen.supervision import NodeWatch
 from drivers.clock import Clock
 from drivers.errors import PreflightRefused
 from drivers.preflight import PreflightTable
+from profiles import MessageCode
 
 LISTEN_S = 3.0
-"""Before motion the bus is listened to for so long: heartbeats come every second, or sooner."""
+"""Time of listening to the bus before motion, s. Heartbeats usually come at least once a second."""
 HIGHEST_NODE = 127
 FOREIGN_WRITES = 3
-"""So many writes of what drives the shaft, in one run, are a second master's."""
+"""This number of writes to driving objects in one run shows a second master."""
 DRIVING = frozenset({0x6040, 0x6042, 0x6060, 0x6071, 0x60FF})
 _MOST_REMARKS = 20
 _DOWNLOAD, _EXPEDITED, _SIZED = 1, 0x02, 0x01
 
 
 class ForeignTraffic:
-    """Listens from the beginning. ``number`` is the host's node number; ``on_write`` is told of written objects."""
+    """Listens from the start. ``number`` is the host's node number; ``on_write`` is called for each foreign write."""
 
     def __init__(self, link: CanLink, watch: NodeWatch, clock: Clock, *, node: int, number: int) -> None:
         self._link = link
@@ -51,7 +52,7 @@ class ForeignTraffic:
         self._said: set[str] = set()
         self._armed = False
         self.number = number
-        self.feeds_by_heartbeat = True             # does the drive's watchdog wait for one?
+        self.feeds_by_heartbeat = True             # the drive's watchdog consumes a heartbeat
         self.on_write: Callable[[int, int], None] = lambda index, sub: None
         for other in range(1, HIGHEST_NODE + 1):
             if other != node:
@@ -59,7 +60,7 @@ class ForeignTraffic:
         link.handlers[0x600 + node] = self._on_request
 
     def own(self, identifier: int, kind: str, then: Handler | None = None) -> None:
-        """Frames of this identifier are ours to send; ``then`` sees those of others too."""
+        """Register an identifier that only this host sends; ``then`` gets foreign frames with it too."""
 
         def take(data: bytes) -> None:
             if then is not None:
@@ -69,17 +70,17 @@ class ForeignTraffic:
         self._link.handlers[identifier] = take
 
     def own_questions(self) -> None:
-        """The drive is asked by node guarding, and the questions are ours."""
+        """Register that the drive is supervised by node guarding, with requests from this host."""
         self.feeds_by_heartbeat = False
         self._link.remote_handlers[0x700 + self._node] = lambda data: self._foreign("questions of node guarding")
 
     # -- the host's number -----------------------------------------------------------------------------------
 
     def settle_number(self, table: PreflightTable) -> int:
-        """Listen until it has been long enough, and take a number that nobody bears; the number.
+        """Listen for `LISTEN_S` and choose a node number that no other node uses. Return the number.
 
-        In stepped time none goes by while nothing is sent: there what has come so far decides, and what comes later is
-        found before motion (`refuse_shared`) and in it. Raises PreflightRefused where no number is free.
+        In stepped time no time passes without a transmission. There the frames received so far decide; later ones are
+        found before motion (`refuse_shared`) and during it. Raises PreflightRefused if no number is free.
         """
         left_s = self._since_s + LISTEN_S - self._clock.now_s()
         if not self._clock.stepped and left_s > 0.0:
@@ -90,26 +91,28 @@ class ForeignTraffic:
             free = [n for n in range(HIGHEST_NODE, 0, -1) if n != self._node and not self._beats[n]]
             if not free:
                 raise PreflightRefused(
-                    "every node number has a heartbeat already: none is left for this host", where="701h to 77Fh",
-                    next_step="Take a node off the bus",
+                    "heartbeats were received from all node numbers: none is free for this host", where="701h to 77Fh",
+                    next_step="Disconnect a node from the bus",
+                    entry=MessageCode.NODE_ID_CONFLICT,
                 )
             self.number = free[0]
             table.note(
                 "host's node number",
-                f"{self.number}, since another node bears {wanted}: its heartbeat ({0x700 + wanted:03X}h) was heard"
-                f" {heard} time{'s' * (heard > 1)}, and would feed the drive's watchdog for a dead host",
+                f"{self.number}, because another node uses {wanted}: its heartbeat ({0x700 + wanted:03X}h) was received"
+                f" {heard} time{'s' * (heard > 1)}; it would feed the drive's watchdog after a failure of this host",
                 f"{0x700 + wanted:03X}h",
             )
         self._armed = True
         return self.number
 
     def refuse_shared(self) -> None:
-        """Before motion: has anybody else's heartbeat come under the host's number? Raises PreflightRefused."""
+        """Refuse motion if another node sends heartbeats under the host's number. Raises PreflightRefused."""
         if self._beats[self.number] and self.feeds_by_heartbeat:
             raise PreflightRefused(
-                f"another node bears this host's number {self.number}: its heartbeat would feed the drive's watchdog",
+                f"another node uses this host's number {self.number}: its heartbeat would feed the drive's watchdog",
                 where=f"{0x700 + self.number:03X}h",
-                next_step="Give that node another number, or take it off the bus, and start anew",
+                next_step="Give that node another number or disconnect it, and start again",
+                entry=MessageCode.NODE_ID_CONFLICT,
             )
 
     def _on_beat(self, number: int, data: bytes) -> None:
@@ -117,18 +120,18 @@ class ForeignTraffic:
         if self._armed and number == self.number:
             kind = f"a heartbeat under this host's number {number} ({0x700 + number:03X}h)"
             if self.feeds_by_heartbeat:
-                self._foreign(kind, f"another node sends {kind}: it would feed the drive's watchdog for a dead host")
+                self._foreign(kind, f"another node sends {kind}: it would feed the drive's watchdog if this host fails")
             else:
                 self.tell(f"another node sends {kind}")
 
     def _foreign(self, kind: str, why: str = "") -> None:
-        self.tell(f"{kind} came from somebody else")
+        self.tell(f"{kind} came from another master")
         self._watch.on_foreign(kind, why)
 
     # -- a tool's SDO ------------------------------------------------------------------------------------------
 
     def _on_request(self, data: bytes) -> None:
-        """A request to this drive that isn't ours; downloads alone change anything (CiA 301, initiate download)."""
+        """Handle a foreign SDO request. Only downloads change anything (CiA 301, initiate download)."""
         if len(data) != 8 or data[0] >> 5 != _DOWNLOAD:
             return
         index, sub = int.from_bytes(data[1:3], "little"), data[3]
@@ -139,39 +142,39 @@ class ForeignTraffic:
             size = 4 - (data[0] >> 2 & 3) if data[0] & _SIZED else 4
             value = int.from_bytes(data[4 : 4 + size], "little")
         self._last[key] = value
-        self.tell(f"somebody else wrote {_shown(index, sub, value)} by SDO")
+        self.tell(f"another master wrote {_shown(index, sub, value)} by SDO")
         self.on_write(index, sub)
         driving = sum(count for (one, _), count in self._writes.items() if one in DRIVING)
         if index in DRIVING and driving >= FOREIGN_WRITES:
             self._watch.interference(
                 f"a second master writes setpoints by SDO: {driving} times, last {_shown(index, sub, value)}",
                 f"node {self._node}, {name(index, sub)}",
-                "Take it off the bus and start anew", kind="sdo setpoints",
+                "Disconnect it from the bus and start again", kind="sdo setpoints",
             )
 
-    # -- what is told -----------------------------------------------------------------------------------------
+    # -- remarks ---------------------------------------------------------------------------------------------------
 
     def tell(self, text: str) -> None:
-        """Once for each text."""
+        """Add a remark; each text once."""
         if text not in self._said and len(self._said) < _MOST_REMARKS:
             self._said.add(text)
             self._told.append(text)
 
     def remarks(self) -> tuple[str, ...]:
-        """What was noticed since this was asked last, a line each."""
+        """Return the remarks since the last call, one line each."""
         if not self._told:
             return ()
         told, self._told = tuple(self._told), []
         return told
 
     def summary(self) -> tuple[str, ...]:
-        """For the end of the run: what others wrote, and how often."""
+        """Return what other masters sent during the run, with the count."""
         written = [
-            f"{_shown(*key, self._last[key])} was written by somebody else, {count} time{'s' * (count > 1)}"
+            f"{_shown(*key, self._last[key])} was written by another master, {count} time{'s' * (count > 1)}"
             for key, count in sorted(self._writes.items())
         ]
         heard = [
-            f"{kind} came from somebody else, {count} time{'s' * (count > 1)}"
+            f"{kind} came from another master, {count} time{'s' * (count > 1)}"
             for kind, count in sorted(self._watch.foreign.items())
         ]
         return (*written, *heard)

@@ -1,9 +1,9 @@
-"""What the cyclic frames of a drive hold, where it departs from CiA 402's usual objects.
+"""Content of the cyclic frames of a drive, where it differs from the usual CiA 402 objects.
 
-- A drive without torque mode is sent 6040h and 60FFh only; where its 6060h can't be mapped, there is no RPDO2.
-- One whose speed mode is vl (2) is told its speed in 6042h and tells it in 6044h, 16 bits each.
-- Torque may be reported in a manufacturer's object. One of 32 bits leaves no room for the statusword beside the
-  speed: then TPDO1 is torque and speed, and TPDO2 brings the statusword with every SYNC.
+- A drive without torque mode receives only 6040h and 60FFh. If its 6060h can't be mapped, there is no RPDO2.
+- In velocity mode (vl, 2) the speed setpoint is 6042h and the reported speed 6044h, 16 bits each.
+- Torque may be reported in a manufacturer's object. A 32-bit torque leaves no room for the statusword beside the
+  speed: then TPDO1 holds torque and speed, and TPDO2 brings the statusword with every SYNC.
 """
 
 from __future__ import annotations
@@ -41,8 +41,7 @@ from profiles.canopen import CanopenProfile, ObjectType, Position
 #     RPDO2  6060h modes of operation i8 [| 60B2h torque offset i16 ‰, then in every cycle]
 #     TPDO2  6061h modes of operation display i8 [| 6074h torque demand i16 ‰] [| 6064h angle of the motor i32]
 #
-# ‰ is of the rated torque (6076h); the velocity's LSB is the profile's. What a drive has differently is in
-# `FrameShape`.
+# ‰ is of the rated torque (6076h); the velocity's LSB is the profile's. `FrameShape` holds the differences of a drive.
 
 
 RPDO1 = struct.Struct("<Hhi")
@@ -66,7 +65,7 @@ TORQUE_DEMAND = (0x6074, 0, 16)
 TORQUE_ACTUAL = (0x6077, 0, 16)
 TARGET_VELOCITY = (0x60FF, 0, 32)
 VL_TARGET, VL_ACTUAL = (0x6042, 0, 16), (0x6044, 0, 16)
-"""Velocity mode (vl): target velocity, and what CiA 402-2 calls vl velocity actual value (or control effort)."""
+"""Velocity mode (vl): target velocity, and vl velocity actual value (or control effort) of CiA 402-2."""
 
 MODE_NAMES = {2: "velocity mode", 3: "profile velocity", 4: "profile torque", 9: "cyclic sync velocity",
               10: "cyclic sync torque"}
@@ -75,31 +74,31 @@ MODE_NAMES = {2: "velocity mode", 3: "profile velocity", 4: "profile torque", 9:
 
 @dataclass(frozen=True)
 class Units:
-    """What one LSB means on this drive: of the speed both ways, of the reported torque, of the target torque 6071h."""
+    """Value of one LSB on this drive: speed in both directions, reported torque, target torque 6071h, torque offset."""
 
     speed_rad_s_per_lsb: float
     torque_nm_per_lsb: float
-    target_nm_per_lsb: float | None = None      # None: as reported
-    offset_nm_per_lsb: float = 0.0              # of the torque offset, where one is used
+    target_nm_per_lsb: float | None = None      # None: as the reported torque
+    offset_nm_per_lsb: float = 0.0              # 0: no torque offset in use
 
 
 def encode_speed(speed_rad_s: float, units: Units, target: tuple[int, int, int] = TARGET_VELOCITY) -> int:
-    """Rad/s at the motor shaft → 60FFh, or 6042h. Raises CommandRejected outside of it or if not finite."""
+    """Convert rad/s at the motor shaft to 60FFh or 6042h. Raises CommandRejected out of range or if not finite."""
     index, _, bits = target
     return _encode(speed_rad_s, units.speed_rad_s_per_lsb, bits - 1, f"target velocity {index:04X}h", "rad/s")
 
 
 def encode_torque(torque_nm: float, units: Units) -> int:
-    """N·m at the motor shaft → 6071h. Raises CommandRejected outside i16 or if not finite."""
+    """Convert N·m at the motor shaft to 6071h. Raises CommandRejected outside i16 or if not finite."""
     per_lsb = units.target_nm_per_lsb or units.torque_nm_per_lsb
     return _encode(torque_nm, per_lsb, 15, "target torque 6071h", "N·m")
 
 
 def encode_torque_offset(torque_nm: float, units: Units) -> int:
-    """N·m at the motor shaft → 60B2h. Raises CommandRejected outside i16, if not finite, or where none is mapped."""
+    """Convert N·m at the motor shaft to 60B2h. Raises CommandRejected outside i16, if not finite, or if not mapped."""
     if not units.offset_nm_per_lsb:
         if torque_nm != 0.0:
-            raise CommandRejected("a torque offset was not prepared for", where="60B2h")
+            raise CommandRejected("a torque offset was commanded, but none is mapped", where="60B2h")
         return 0
     return _encode(torque_nm, units.offset_nm_per_lsb, 15, "torque offset 60B2h", "N·m")
 
@@ -109,34 +108,34 @@ def _encode(value: float, per_lsb: float, bits: int, where: str, unit: str) -> i
         raise CommandRejected(f"setpoint {value} {unit} is not finite", where=where)
     raw = round(value / per_lsb)
     if not -(1 << bits) <= raw < 1 << bits:
-        raise CommandRejected(f"setpoint {value:g} {unit} doesn't fit into the object", where=where)
+        raise CommandRejected(f"setpoint {value:g} {unit} is outside the range of the object", where=where)
     return raw
 
 
 def mapping_entry(mapped: tuple[int, int, int]) -> int:
-    """Object → the u32 of a PDO mapping parameter (CiA 301: index, subindex, length in bits)."""
+    """Convert an object to the u32 of a PDO mapping parameter (CiA 301: index, subindex, length in bits)."""
     index, subindex, bits = mapped
     return index << 16 | subindex << 8 | bits
 
 
 def consumer_heartbeat(node: int, time_ms: int) -> int:
-    """The u32 of 1016h: node-ID in bits 16 to 23, time in ms below."""
+    """Return the u32 of 1016h: node-ID in bits 16 to 23, time in ms below."""
     return node << 16 | time_ms
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a drive reported last, in its own counts, and the Sample in SI at the motor shaft that is made of it.
+# Values that a drive reported last, in its own counts, and the Sample in SI at the motor shaft made from them.
 
 
 _PROFILE_VELOCITY = 3
 
 
 class Reported:
-    """As TPDOs or single answers brought it; what hasn't come yet is zero."""
+    """Last reported values, from TPDOs or single answers; zero before the first."""
 
     def __init__(self) -> None:
         self.state = State.NOT_READY
-        self._started = False          # has it shown another state than not ready since its start?
+        self._started = False          # it has shown a state other than not ready since its start
         self.shown_code = 0            # 6061h
         self._status = 0
         self._speed_raw = 0
@@ -144,7 +143,9 @@ class Reported:
         self._demand_raw: int | None = None
 
     def take(self, status: int, speed_raw: int, torque_raw: float | None) -> None:
-        """6041h, 606Ch and 6077h (or the manufacturer's object) of one instant; None: the torque stays as it was."""
+        """Take 6041h, 606Ch and 6077h (or the manufacturer's object) of one instant; torque None keeps the last
+        value.
+        """
         self._status, self._speed_raw = status, speed_raw
         self._torque_raw = self._torque_raw if torque_raw is None else torque_raw
         self.state = decode_after(status) if self._started else decode(status)
@@ -155,14 +156,14 @@ class Reported:
         self._started = False
 
     def take_slow(self, shown_code: int, demand_raw: int | None) -> None:
-        """6061h, and 6074h where the drive has it."""
+        """Take 6061h, and 6074h if the drive has it."""
         self.shown_code, self._demand_raw = shown_code, demand_raw
 
     def sample(
         self, time_s: float, age_s: float, fresh: bool, units: Units, modes: Mapping[int, Mode],
         position_rad: float | None = None,
     ) -> Sample:
-        """``time_s`` and ``age_s`` in control time; ``modes`` by their codes of 6061h."""
+        """Return the sample; ``time_s`` and ``age_s`` in control time, ``modes`` by their codes of 6061h."""
         status = self._status
         power = power_state(self.state)
         reached = bool(status & TARGET_REACHED) and power is PowerState.QUICK_STOP
@@ -196,27 +197,27 @@ _LAYOUTS: dict[str, Struct] = {
 
 
 def decode_value(kind: ObjectType, data: bytes, where: str) -> float:
-    """Bytes → the number in them. Raises ObjectRefused for too few bytes, or what is no finite number."""
+    """Return the number in the bytes. Raises ObjectRefused for too few bytes or a number that is not finite."""
     layout = _LAYOUTS[kind]
     if len(data) < layout.size:
         raise ObjectRefused(f"{len(data)} bytes where {layout.size} were expected", where=where)
     value = float(layout.unpack_from(data)[0])
     if not math.isfinite(value):
-        raise ObjectRefused(f"{value} is no number to work with", where=where)
+        raise ObjectRefused(f"{value} is not a finite number", where=where)
     return value
 
 
 def bits_of(kind: ObjectType) -> int:
-    """How long an object of this type is, bits."""
+    """Return the length of an object of this type, bits."""
     return 8 * _LAYOUTS[kind].size
 
 
 def encode_value(kind: ObjectType, value: float, where: str) -> bytes:
-    """A number → its bytes, whole numbers for whole types. Raises ObjectRefused where it doesn't fit."""
+    """Return the bytes of a number, rounded for integer types. Raises ObjectRefused if it is out of range."""
     try:
         return _LAYOUTS[kind].pack(value if kind == "f32" else round(value))
     except (error, OverflowError, ValueError) as trouble:
-        raise ObjectRefused(f"{value:g} doesn't fit into the object ({kind})", where=where) from trouble
+        raise ObjectRefused(f"{value:g} is outside the range of the object ({kind})", where=where) from trouble
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -236,14 +237,14 @@ _FEEDBACK_VL = {"i16": Struct("<Hhh"), "i32": Struct("<Hih"), "f32": Struct("<Hf
 
 @dataclass(frozen=True)
 class FrameShape:
-    """Which frames a drive is sent and sends."""
+    """Frames that a drive receives and sends."""
 
-    target_torque: bool = True                         # is 6071h in RPDO1?
-    mode: bool = True                                  # is there an RPDO2 with 6060h?
+    target_torque: bool = True                         # 6071h is in RPDO1
+    mode: bool = True                                  # there is an RPDO2 with 6060h
     torque: tuple[int, int, int] = TORQUE_ACTUAL       # index, subindex, bits of the reported torque
-    vl: bool = False                                   # is the speed told in 6042h and shown in 6044h?
+    vl: bool = False                                   # speed setpoint in 6042h, reported speed in 6044h
     offset: tuple[int, int, int] | None = None         # index, subindex, bits of a torque offset that RPDO2 carries
-    feedback: Struct = TPDO1                           # statusword, torque, speed; wide: of both TPDOs, put together
+    feedback: Struct = TPDO1                           # statusword, torque, speed; wide: both TPDOs combined
 
     @property
     def target_speed(self) -> tuple[int, int, int]:
@@ -261,7 +262,7 @@ class FrameShape:
         return self.torque[2] == 32
 
     def setpoints(self, word: int, torque_raw: int, speed_raw: int) -> bytes:
-        """RPDO1. In velocity mode an enabled drive follows its setpoint only where the word releases it."""
+        """Return RPDO1. In velocity mode an enabled drive follows its setpoint only if the word releases it."""
         if self.target_torque:
             return RPDO1.pack(word, torque_raw, speed_raw)
         if self.vl:
@@ -270,27 +271,27 @@ class FrameShape:
 
     @property
     def second(self) -> tuple[tuple[int, int, int], ...]:
-        """What RPDO2 carries; () where there is none."""
+        """Objects in RPDO2; () if there is none."""
         return (MODE,) * self.mode + (() if self.offset is None else (self.offset,))
 
     def slow_setpoints(self, code: int, offset_raw: int) -> bytes:
-        """RPDO2."""
+        """Return RPDO2."""
         if self.offset is None:
             return RPDO2.pack(code)
         return RPDO2_MODE_OFFSET.pack(code, offset_raw) if self.mode else RPDO2_OFFSET.pack(offset_raw)
 
     def data_size(self) -> int:
-        """Bytes of TPDO1."""
+        """Return the bytes of TPDO1."""
         return self.feedback.size - 2 if self.wide else self.feedback.size
 
 
 
 @dataclass(frozen=True)
 class Slow:
-    """What TPDO2 carries behind the mode display, and behind the statusword in a wide shape.
+    """Objects in TPDO2 behind the mode display, and behind the statusword in a wide shape.
 
-    ``position`` is what counts the motor's angle. Where there is no room for both, the demand is left out: the angle
-    is the only signal that does not come from the drive's speed or torque.
+    ``position`` counts the motor's angle. If there is no room for both, the demand is left out: only the angle comes
+    from another source than the drive's speed and torque.
     """
 
     demand: bool = False
@@ -299,7 +300,7 @@ class Slow:
 
     @classmethod
     def fitting(cls, demand: bool, position: Position | None, shape: FrameShape) -> Slow:
-        """Return what fits into the frame."""
+        """Return the objects that fit into the frame."""
         whole = cls(demand, position, shape.wide)
         return whole if whole.size + 2 * shape.wide <= PDO_BYTES else cls(False, position, shape.wide)
 
@@ -317,12 +318,12 @@ class Slow:
 
     @cached_property
     def layout(self) -> Struct:
-        """Mode display, demand and angle, as far as they are there."""
+        """Mode display, demand and angle, if present."""
         angle = "" if self.position is None else _LAYOUTS[self.position.type].format.lstrip("<")
         return Struct("<b" + "h" * self.demand + angle)
 
     def unpack(self, data: bytes) -> tuple[int, int | None, float | None]:
-        """Mode display, demand, angle in counts; None for what isn't carried."""
+        """Return mode display, demand, angle in counts; None for a value that is not carried."""
         values = self.layout.unpack(data)
         return (
             values[0], values[1] if self.demand else None, None if self.position is None else float(values[-1]),
@@ -333,7 +334,7 @@ STANDARD = FrameShape()
 
 
 def shape_of(profile: CanopenProfile) -> FrameShape:
-    """What the profile says of it."""
+    """Return the frame shape that the profile describes."""
     torque, target, vl = profile.torque.actual, bool(profile.modes.torque), profile.speed.vl
     feedback = _FEEDBACK_VL if vl else _FEEDBACK
     if torque is None:
@@ -343,34 +344,35 @@ def shape_of(profile: CanopenProfile) -> FrameShape:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What comes back for each SYNC: one TPDO1, the drive's own, and how it is told from others that bear its identifier.
+# Feedback of each SYNC: one TPDO1 of the drive, and how it is distinguished from foreign frames with its identifier.
 #
-# A drive answers a SYNC once, and in the order in which they came. So there are never more answers than SYNCs, ours
-# and those of others; one more is a frame that was doubled on its way, or sent by somebody else: a duplicate node-ID,
-# a recording that is played back. The first of a cycle is then taken; which of the two is the drive's can't be told,
-# and while a shaft is being stopped none of several counts (`PdoFeedback.doubted`): old frames of a shaft at rest must
-# not end a stop. One too many that says something else than the first contradicts it.
+# A drive answers each SYNC once, in order. So there are never more answers than SYNCs, ours and foreign ones together.
+# One more answer is a duplicated or a foreign frame: a duplicate node-ID, or a recording that is played back. tdhil
+# then takes the first of a cycle, because it can't know which one came from the drive. While a shaft is being stopped
+# none of several counts (`PdoFeedback.doubted`): old frames of a standstill must not end a stop. A surplus frame that
+# differs from the first contradicts it.
 #
-# A host or an adapter that was late finds a burst: the answers of all the SYNCs that went out meanwhile. In stepped
-# time, and where a cycle is longer than anything is late, an answer that didn't come within its cycle was lost. In
-# real time it may still come, and the next answer is not the next SYNC's: answers are given to SYNCs in their order,
-# and a cycle's own is the last one. Where a cycle ends with fewer answers than SYNCs, one of them was lost or all are
-# late, and nobody knows which SYNC the last one belongs to: no sample of that cycle. A single one that came as soon
-# after this cycle's SYNC as answers do shows that an older one was lost; should that one come yet, in the next cycle,
-# neither counts.
+# A delayed host or adapter finds a burst: the answers to all SYNCs that were sent meanwhile. In stepped time, and if a
+# cycle is longer than any delay, an answer that did not come within its cycle is lost. In real time it may still come,
+# and the next answer does not belong to the next SYNC: answers are assigned to SYNCs in order, and the last one belongs
+# to this cycle. If a cycle ends with fewer answers than SYNCs, one answer was lost or all are late. The last answer
+# then cannot be assigned, and the cycle gets no sample. A single answer at the usual time after this cycle's SYNC shows
+# that an older one was lost. If the older one still comes in the next cycle, neither counts.
 
 
 _NO_WORD = b""
 ANSWER_WITHIN_S = 0.5
-"""What hasn't been answered for so long was lost: the host gives up a drive that says nothing for half as long."""
+"""An answer counts as lost after this time, s. The host gives up a silent drive after half of it."""
 LONGEST_LATE_S = 0.05
-"""An adapter isn't late by more than a cycle that is longer than this."""
+"""Longest delay of an adapter, s. With a longer cycle, a late answer counts as lost."""
 _USUAL_SHARE, _QUICKEST_SHARE = 0.25, 0.5
 _RECENT = 1000
 
 
 class PdoFeedback:
-    """Of the cycle under way; `begin` starts the next. ``now_s``: control time, in real time; None: nothing is late."""
+    """Feedback of the current cycle; `begin` starts the next. ``now_s``: control time in real time; None: nothing is
+    late.
+    """
 
     def __init__(self, shape: FrameShape, now_s: Callable[[], float] | None = None, period_s: float = 0.0) -> None:
         self._wide = shape.wide
@@ -378,28 +380,28 @@ class PdoFeedback:
         self._now_s = now_s
         self._period_s = period_s
         self._waits = now_s is not None and period_s < LONGEST_LATE_S
-        self._half: tuple[float, bool, bytes] | None = None    # when, is it the status, what
+        self._half: tuple[float, bool, bytes] | None = None    # time, whether it is the status, data
         self._due: deque[float] = deque()      # SYNCs whose answers may come yet, in order; the last is this cycle's
-        self._given_up: deque[float] = deque() # answers that count as lost, and are nobody else's should they come
+        self._given_up: deque[float] = deque() # answers that count as lost, but may still come
         self._begun_s = 0.0
         self._here = 0                 # answers since `begin`
-        self._last_s = 0.0             # when the last one came
-        self._spoiled = False          # one of another length has come since `begin`
-        self._doubtful = False         # an answer was given up in the cycle before: it may come in this one
+        self._last_s = 0.0             # time of the last one
+        self._spoiled = False          # a frame of another length has come since `begin`
+        self._doubtful = False         # an answer of the previous cycle was given up; it may come in this one
         self._quickest_s: float | None = None
-        self._usual_s = 0.0            # from a SYNC to its answer
-        self._extra = False            # since `doubted` was asked last
-        self._ends_cycles = False      # a simulated peer says where a cycle ends
+        self._usual_s = 0.0            # time from a SYNC to its answer
+        self._extra = False            # since the last call of `doubted`
+        self._ends_cycles = False      # a simulated peer reports the end of a cycle
         self.data = _NO_WORD           # statusword, torque, speed; as `FrameShape.feedback` packs them
-        self.over = False              # the peer said so of this cycle
-        self.arrived = 0               # TPDO1s, all told
-        self.second = 0                # of them, a second one of a cycle that the peer had not ended yet
-        self.older = 0                 # of them, those of a SYNC before this cycle's
-        self.contradictions = 0        # of them, those that can't be the drive's if the first was
-        self._late_s: deque[tuple[float, float]] = deque(maxlen=_RECENT)   # when one came, how long after its cycle
+        self.over = False              # the peer reported the end of this cycle
+        self.arrived = 0               # all TPDO1s
+        self.second = 0                # second ones in a cycle that the peer had not ended
+        self.older = 0                 # answers to a SYNC before this cycle's
+        self.contradictions = 0        # frames that contradict the first one of their cycle
+        self._late_s: deque[tuple[float, float]] = deque(maxlen=_RECENT)   # time of arrival, delay after its cycle
 
     def begin(self, now_s: float = 0.0, *, sync: bool = True) -> None:
-        """A SYNC is about to go out; without ``sync`` none is, in this cycle."""
+        """Start a cycle, before its SYNC is sent; without ``sync`` the cycle has no SYNC."""
         if not self._waits:
             self._given_up += self._due
             self._due.clear()
@@ -417,42 +419,42 @@ class PdoFeedback:
         self.over = False
 
     def doubted(self) -> bool:
-        """Has more than one TPDO1 come for a SYNC since this was asked last?"""
+        """Return whether more than one TPDO1 came for a SYNC since the last call."""
         extra, self._extra = self._extra, False
         return extra
 
     def on_foreign_sync(self) -> None:
-        """Somebody else's: the drive answers that one too."""
+        """Count a SYNC of another master: the drive answers that one too."""
         self._given_up.append(self._begun_s)
 
     def late_since(self, since_s: float) -> list[float]:
-        """By how much answers came after their cycles, s; those that came since then."""
+        """Return the delays of answers after their cycles, s, for answers since ``since_s``."""
         return [late_s for came_s, late_s in self._late_s if came_s >= since_s]
 
     @property
     def done(self) -> bool:
-        """Nothing more is waited for in this cycle."""
+        """True if no more frames are expected in this cycle."""
         if self._now_s is None:
             return self.over or (bool(self.data) and not self._ends_cycles)
         return bool(self.data) and not self._doubtful
 
     def settle(self) -> None:
-        """In real time: this cycle's time is up."""
+        """End the cycle's waiting time, in real time."""
         if self._doubtful:
             self._doubtful = False
-            if self._here > 1:         # the one that was given up has come: then the first was not this cycle's
+            if self._here > 1:         # the answer given up has come, so the first was not this cycle's
                 self.data = _NO_WORD
             return
         if self.data or not self._due:
             return
         self._doubtful = self._here == 1 and self._came_as_usual()
-        # A drive that has never answered wasn't listening yet.
+        # A drive that has never answered was not yet listening.
         if self._doubtful or not self.arrived or (self._spoiled and not self._here):
             self._given_up += self._due
             self._due.clear()
 
     def on_tpdo1(self, data: bytes) -> None:
-        """180h + node. A frame of another length says nothing; if no other comes, it was the answer."""
+        """Handle 180h + node. A frame of another length is not decoded; if no other comes, it was the answer."""
         if len(data) != self._size:
             self._spoiled = True
         elif self._wide:
@@ -461,11 +463,11 @@ class PdoFeedback:
             self._take(data)
 
     def on_status(self, status: bytes) -> None:
-        """The statusword in a wide drive's TPDO2; its two TPDOs of one SYNC come in whichever order."""
+        """Handle the statusword in a wide drive's TPDO2; its two TPDOs of one SYNC come in any order."""
         self._join(True, status)
 
     def on_cycle_end(self, data: bytes) -> None:
-        """Of a simulated peer with scripted faults, in stepped time (`profiles.simulator_marker.CYCLE_ID`)."""
+        """Handle the cycle end of a simulated peer with scripted faults, in stepped time (`CYCLE_ID`)."""
         self._ends_cycles = data != LAST_CYCLE_OVER
         self.over = data != CYCLES_END
 
@@ -473,7 +475,7 @@ class PdoFeedback:
         now_s = 0.0 if self._now_s is None else self._now_s()
         half, self._half = self._half, None
         if half is not None and self._waits and now_s - half[0] > 0.5 * self._period_s:
-            half = None                # its other half was lost: the two come together
+            half = None                # the other half was lost, since both come together
         if half is None or half[1] is is_status:
             self._half = (now_s, is_status, data)
         else:

@@ -1,8 +1,8 @@
 """PDO mapping and communication parameters, written by SDO (CiA 301, 1400h…1A03h).
 
-Real drives map 6040h alone, or 6040h with 60FFh, into their first RPDOs and none maps 6071h, so mapping is
-always written, in the order that the standard asks for: disable the PDO, empty the mapping, fill it, set the
-transmission type, enable.
+Real drives map 6040h alone, or 6040h with 60FFh, into their first RPDOs, and none maps 6071h. So tdhil always writes
+the mapping, in the order of the standard: disable the PDO, empty the mapping, fill it, set the transmission type,
+enable.
 """
 
 from dataclasses import dataclass
@@ -18,20 +18,20 @@ from drivers.canopen.pdo import (
 )
 from drivers.canopen.sdo import Objects, name
 from drivers.errors import PreflightRefused
+from profiles import MessageCode
 
 DISABLED = 1 << 31
 SLOW_SYNCS, SLOW_S = 5, 0.1
-"""The second TPDO (mode display, torque demand, angle) comes with every fifth SYNC: people, mode switches and
-the guard look at it, not the control, and the bus is short. On a slow cycle it comes sooner: a mode that was lost, and
-an angle, must show within a tenth of a second, or a cycle."""
+"""TPDO2 (mode display, torque demand, angle) comes with every fifth SYNC: the control loop does not need it, and the
+bus load is limited. With a slow cycle it comes more often: a lost mode, and an angle, must show within 0.1 s or a
+cycle."""
 _LEAST_RPDOS, _MOST_RPDOS = 8, 64
-"""RPDOs that a drive is asked for: the first ones in any case, since some numbers may be left out, then while there are
-more."""
+"""RPDOs that are read: the first eight in any case, because numbers may be missing; then as long as there are more."""
 
 
 @dataclass(frozen=True)
 class PdoMapping:
-    """One PDO as it shall be: ``number`` counts from 1, ``sync_type`` is its transmission type (1 = every SYNC)."""
+    """Required state of one PDO: ``number`` counts from 1, ``sync_type`` is its transmission type (1 = every SYNC)."""
 
     receive: bool                  # as the drive sees it
     number: int
@@ -47,17 +47,19 @@ class PdoMapping:
         return (0x1600 if self.receive else 0x1A00) + self.number - 1
 
     def identifier(self, node: int) -> int:
-        """COB-ID of the predefined connection set (CiA 301): RPDO1 200h, TPDO1 180h, and 100h on for each further."""
+        """Return the COB-ID of the predefined connection set (CiA 301): RPDO1 200h, TPDO1 180h, each further 100h
+        more.
+        """
         return (0x200 if self.receive else 0x180) + 0x100 * (self.number - 1) + node
 
 
 def slow_syncs(period_s: float) -> int:
-    """With every how many SYNCs the second TPDO comes."""
+    """Return the number of SYNCs between two TPDO2."""
     return max(1, min(SLOW_SYNCS, round(SLOW_S / period_s)))
 
 
 def layout(carried: Slow, shape: FrameShape = STANDARD, slow: int = SLOW_SYNCS) -> tuple[PdoMapping, ...]:
-    """RPDO1, TPDO1, RPDO2 (`FrameShape.second`), TPDO2 with what is ``carried``; ``slow``: see `slow_syncs`."""
+    """Return RPDO1, TPDO1, RPDO2 (`FrameShape.second`), TPDO2 with the ``carried`` objects; ``slow``: `slow_syncs`."""
     targets = (TARGET_TORQUE, shape.target_speed) if shape.target_torque else (shape.target_speed,)
     first = (STATUSWORD,) * (not shape.wide) + (shape.torque, shape.actual_speed)
     modes = (PdoMapping(True, 2, 1, shape.second),) if shape.second else ()
@@ -68,14 +70,14 @@ def layout(carried: Slow, shape: FrameShape = STANDARD, slow: int = SLOW_SYNCS) 
 
 
 def written(pdo: PdoMapping) -> str:
-    """The objects in it, as people write them: 6040+6071+60FF."""
+    """Return the objects in the PDO, as manuals write them: 6040+6071+60FF."""
     return "+".join(f"{index:04X}:{sub}" if sub else f"{index:04X}" for index, sub, _ in pdo.mapped)
 
 
 def write_pdo(objects: Objects, node: int, pdo: PdoMapping) -> None:
-    """Map one PDO and read it back; `Objects.restore` gives the former mapping back.
+    """Map one PDO and read it back; `Objects.restore` restores the former mapping.
 
-    Raises ObjectRefused, or PreflightRefused if it doesn't read back.
+    Raises ObjectRefused, or PreflightRefused if another mapping reads back.
     """
     identifier = pdo.identifier(node)
     wanted = [mapping_entry(mapped) for mapped in pdo.mapped]
@@ -87,7 +89,8 @@ def write_pdo(objects: Objects, node: int, pdo: PdoMapping) -> None:
         raise PreflightRefused(
             f"the PDO mapping reads back as {[f'{entry:08X}h' for entry in found]}",
             where=name(pdo.mapping),
-            next_step="Some drives fix their mapping: this one can't be driven with torque and speed of one instant",
+            next_step="The mapping of this drive may be fixed. Then tdhil can't get torque and speed of one instant",
+            entry=MessageCode.PDO_NOT_POSSIBLE,
         )
     # Bits 11 to 30 are the drive's own (bit 30: no remote frames).
     cob_id, sync_type = objects.read(pdo.communication, 1), objects.read(pdo.communication, 2)
@@ -96,14 +99,15 @@ def write_pdo(objects: Objects, node: int, pdo: PdoMapping) -> None:
             f"the PDO reads back with COB-ID {cob_id:08X}h and transmission type {sync_type}",
             where=name(pdo.communication),
             next_step=f"It must be {identifier:X}h, enabled, and of type {pdo.sync_type} (synchronous)",
+            entry=MessageCode.PDO_NOT_POSSIBLE,
         )
 
 
 def switch_off_others(objects: Objects, ours: tuple[PdoMapping, ...]) -> dict[int, int]:
-    """Every enabled RPDO that isn't ours is switched off (bit 31 of its COB-ID), and comes back with the rest.
+    """Switch off every enabled RPDO that is not ours (bit 31 of its COB-ID). Return former COB-IDs by RPDO number.
 
-    Its number and the COB-ID that it had. Through it another master's setpoints would act beside ours (CiA 301, 1400h).
-    Raises ObjectRefused or PreflightRefused where it can't be switched off.
+    The setpoints of another master would act through it beside ours (CiA 301, 1400h). `Objects.restore` enables it
+    again. Raises ObjectRefused or PreflightRefused if it can't be switched off.
     """
     found: dict[int, int] = {}
     own = {pdo.number for pdo in ours if pdo.receive}
@@ -116,15 +120,16 @@ def switch_off_others(objects: Objects, ours: tuple[PdoMapping, ...]) -> dict[in
             continue
         if not objects.change(index, 1, cob_id | DISABLED, 32) & DISABLED:
             raise PreflightRefused(
-                f"RPDO{number} (COB-ID {cob_id & 0x7FF:X}h) stays on: another master's setpoints could act through it",
-                where=name(index, 1), next_step="Switch it off at the drive, by its own tool",
+                f"RPDO{number} (COB-ID {cob_id & 0x7FF:X}h) stays on; setpoints of another master could act through it",
+                where=name(index, 1), next_step="Switch it off with the manufacturer's tool",
+                entry=MessageCode.ANOTHER_MASTER,
             )
         found[number] = cob_id
     return found
 
 
 def _entries(objects: Objects, pdo: PdoMapping) -> list[int]:
-    """What is mapped; entries beyond the count are nobody's business."""
+    """Return the mapped entries; entries beyond the count are ignored."""
     return [objects.read(pdo.mapping, 1 + k) for k in range(objects.read(pdo.mapping, 0))]
 
 

@@ -1,6 +1,6 @@
-"""What is checked and set on a CiA 402 drive before its shaft may move: each line with what was read back.
+"""Checks and settings of a CiA 402 drive before its shaft may move; each row shows the value read back.
 
-A line that fails does not hide those after it: the whole table is worth more to an engineer than its first row.
+A failed row does not end the table: the engineer sees all rows.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.own_limits import SPEED, TORQUE
 from drivers.preflight import PreflightTable, agreed_rated_torque, check_nothing_held
 from drivers.undo_journal import UndoJournal
-from profiles import MARKER_INDEX, MARKER_TEXT, visible
+from profiles import MARKER_INDEX, MARKER_TEXT, MessageCode, visible
 from profiles.canopen import CanopenProfile, ReportingFilter
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The smoothing that a drive puts on what it reports, read from the objects its profile names.
+# Filters on the reported signals of a drive, read from the objects that its profile names.
 
 
 _FORMATS = {"u8": "<B", "u16": "<H", "u32": "<I", "i8": "<b", "i16": "<h", "i32": "<i", "f32": "<f"}
 
 
 def read_filters(note: Callable[[str, str, str], None], objects: Objects, profile: CanopenProfile) -> ReportingFilters:
-    """First-order lags in seconds, None where the drive doesn't tell; each is noted in the preflight table."""
+    """Return first-order lags in seconds, None if the drive does not report one; add each to the preflight table."""
     lags: dict[str, float] = {}
     sources = []
     for entry in profile.filters:
@@ -48,7 +48,7 @@ def read_filters(note: Callable[[str, str, str], None], objects: Objects, profil
         try:
             lag_s = lag_seconds(entry, objects.read_bytes(entry.index, entry.sub))
         except ObjectRefused:
-            note(f"{entry.signal} filter", "the drive does not tell", where)
+            note(f"{entry.signal} filter", "not reported by the drive", where)
             continue
         note(f"{entry.signal} filter", f"{lag_s * 1000.0:.4g} ms", where)
         lags[entry.signal] = lag_s
@@ -57,20 +57,20 @@ def read_filters(note: Callable[[str, str, str], None], objects: Objects, profil
 
 
 def lag_seconds(entry: ReportingFilter, data: bytes) -> float:
-    """Raw bytes of the object → time constant. A cut-off frequency f_c is a lag of 1/(2π f_c); 0 means no filter."""
+    """Convert the object's bytes to a time constant. A cut-off frequency f_c is a lag of 1/(2π f_c); 0: no filter."""
     layout = struct.Struct(_FORMATS[entry.type])
     if len(data) < layout.size:
         raise ObjectRefused(f"{len(data)} bytes where {layout.size} were expected", where=name(entry.index, entry.sub))
     value = float(layout.unpack_from(data)[0]) * entry.per_lsb
     if not math.isfinite(value) or value < 0.0:
-        raise ObjectRefused(f"{value} is no filter setting", where=name(entry.index, entry.sub))
+        raise ObjectRefused(f"{value} is not a valid filter setting", where=name(entry.index, entry.sub))
     if entry.quantity == "time_constant_s":
         return value
     return 1.0 / (2.0 * math.pi * value) if value > 0.0 else 0.0
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What one count of speed and torque means on this drive: from the drive where it has it, else from the rig.
+# Value of one count of speed and torque on this drive: from the drive if it reports it, else from the rig.
 
 
 SI_UNIT_VELOCITY = 0x60A9
@@ -79,10 +79,10 @@ SI_UNIT_VELOCITY = 0x60A9
 def find_units(
     table: PreflightTable, objects: Objects, profile: CanopenProfile, rated_torque_nm: float | None
 ) -> tuple[Units, float]:
-    """Scaling of speed and torque; and the rated torque, N·m."""
+    """Return the scaling of speed and torque, and the rated torque, N·m."""
     where = name(profile.torque.rated.index, profile.torque.rated.sub)
     agreed_nm = agreed_rated_torque(table, _told(objects, profile), rated_torque_nm, where)
-    rated_nm = 1.0 if agreed_nm is None else agreed_nm       # refused, and the rows after it still want a scale
+    rated_nm = 1.0 if agreed_nm is None else agreed_nm       # refused; the following rows still need a scale
     speed = speed_unit(table, objects, profile)
     target = profile.torque.rated_per_lsb * rated_nm
     actual = profile.torque.actual
@@ -92,7 +92,7 @@ def find_units(
 
 
 def _told(objects: Objects, profile: CanopenProfile) -> float | None:
-    """The rated torque that the drive tells, N·m; None where it doesn't, or says 0."""
+    """Return the rated torque that the drive reports, N·m; None if it reports none or 0."""
     place, per_lsb = profile.torque.rated, profile.torque.rated_torque_nm_per_lsb
     if per_lsb is None:
         return None
@@ -104,7 +104,7 @@ def _told(objects: Objects, profile: CanopenProfile) -> float | None:
 
 
 def speed_unit(table: PreflightTable, objects: Objects, profile: CanopenProfile) -> float:
-    """Rad/s for one count. A drive whose unit can be set is believed only where it reads back what it is set to."""
+    """Return rad/s for one count. If the unit can be set, it must read back as required."""
     speed = profile.speed
     if speed.si_unit is not None:
         wanted = speed.si_unit
@@ -115,7 +115,7 @@ def speed_unit(table: PreflightTable, objects: Objects, profile: CanopenProfile)
 
         table.attempt(
             "unit of speed", f"{wanted:08X}h", name(SI_UNIT_VELOCITY), same,
-            f"Every speed would be scaled wrongly: set 60A9h to {wanted:08X}h, as profile {profile.name} has it",
+            f"Every speed would be scaled wrongly. Set 60A9h to {wanted:08X}h, as in profile {profile.name}",
         )
     per_lsb = speed.rpm_per_lsb * RPM
     if not (speed.times or speed.over):
@@ -136,7 +136,7 @@ def speed_unit(table: PreflightTable, objects: Objects, profile: CanopenProfile)
     scales = [profile.parameter(scale) for scale in (*speed.times, *speed.over)]
     table.attempt(
         "unit of speed", "known", ", ".join(name(one.index, one.sub) for one in scales), work,
-        "Without it no speed can be scaled. " + " ".join(dict.fromkeys(one.advice for one in scales if one.advice)),
+        "The speed can't be scaled without it. " + " ".join(dict.fromkeys(one.advice for one in scales if one.advice)),
     )
     return found
 
@@ -150,14 +150,14 @@ def _nonzero(value: float, scale: str) -> float:
 # ---------------------------------------------------------------------------------------------------------------------
 
 _HOLDS_FROM, _LAST_OPTION = 5, 8
-"""CiA 402-2, 605Ah: codes after which quick stop active is kept; above the second they are reserved."""
+"""CiA 402-2, 605Ah: from code 5 on the drive stays in quick stop active; codes above 8 are reserved."""
 
 STILL_LSB, STILL_RAD_S = 5, 0.05
-"""Velocity counts, or speed where a count is less, that are the noise of a shaft at rest."""
+"""Noise of the velocity at standstill: counts, or rad/s if a count is smaller."""
 
 
 def check_identity(table: PreflightTable, identity: Identity, profile: CanopenProfile) -> None:
-    """Vendor, product and revision (1018h) against the profile's; None there = not checked."""
+    """Check vendor, product and revision (1018h) against the profile; None there means not checked."""
     wanted = profile.identity
     pairs = (
         ("vendor", wanted.vendor, identity.vendor),
@@ -178,12 +178,12 @@ def check_identity(table: PreflightTable, identity: Identity, profile: CanopenPr
             f"{have:X}h",
             want == have,
             "1018h",
-            f"This is not the drive of profile {profile.name}: choose its own with --profile",
+            f"This is not the drive of profile {profile.name}: choose the right profile with --profile",
         )
 
 
 def restore_from(table: PreflightTable, objects: Objects, journal: UndoJournal, identity: Identity) -> None:
-    """What an earlier run has left in the drive, since its host died: given back where it still stands so."""
+    """Restore the settings that an earlier run left in the drive because its host died, if they are unchanged."""
     given, others = [], []
     for one in journal.opened(identity):
         index, sub = place(one.where)
@@ -195,20 +195,20 @@ def restore_from(table: PreflightTable, objects: Objects, journal: UndoJournal, 
                 others.append(one.where)
             journal.given_back(one.where)
         except ObjectRefused as error:
-            table.note("left by an earlier run", f"{one.text}; {error.what}", one.where, "Set it at the drive, by hand")
+            table.note("left by an earlier run", f"{one.text}; {error.what}", one.where, "Set it at the drive")
     if given:
-        table.note("left by an earlier run", f"{', '.join(given)}: given back now", "log's folder")
+        table.note("left by an earlier run", f"{', '.join(given)}: restored now", "log's folder")
     if others:
-        table.note("left by an earlier run", f"{', '.join(others)}: changed by somebody since, left alone", "")
+        table.note("left by an earlier run", f"{', '.join(others)}: changed since by another tool, not restored", "")
     objects.journal = journal
 
 
 def check_state(
     table: PreflightTable, objects: Objects, units: Units, profile: CanopenProfile, limits: DriveLimits
 ) -> bool:
-    """A drive in fault is refused, and never reset silently; so is one that still brakes after an earlier stop.
+    """Refuse a drive in fault (it is never reset silently), and one that still brakes after an earlier stop.
 
-    Whether anything may be written to it: not while it brakes, nor while it holds a drill string that is wound up.
+    Return whether settings may be written: not while it brakes, nor while it holds a drill string with trapped torque.
     """
     state = decode(objects.read(0x6041))
     faulty = state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
@@ -216,40 +216,41 @@ def check_state(
     found = state.value + (f", error code {code:04X}h" if faulty and code is not None else "")
     braking, still = state is State.FAULT_REACTION_ACTIVE, True
     if state is State.QUICK_STOP_ACTIVE:
-        # Disabling would let it coast: it must have come to rest under its own quick stop.
+        # Disabling would let it coast: it must first reach standstill by its own quick stop.
         speed_lsb = objects.read((VL_ACTUAL if profile.speed.vl else VELOCITY_ACTUAL)[0], signed=True)
         braking = abs(speed_lsb) > max(STILL_LSB, STILL_RAD_S / units.speed_rad_s_per_lsb)
         found += f", velocity {speed_lsb}"
-    mend = "Clear the fault's cause, then start with --reset-fault" if faulty else "Wait until the shaft is at rest"
+    mend = "Clear the fault's cause, then start with --reset-fault" if faulty else "Wait for standstill"
     if state is State.UNKNOWN:
-        mend = "Check the drive behind a gateway, and that --profile is this drive's"
+        mend = "Check the drive behind a gateway, and whether --profile fits this drive"
     known = not faulty and not braking and state is not State.UNKNOWN
-    table.row("state", "no fault, at rest", found, known, "6041h", mend)
+    table.row("state", "no fault, standstill", found, known, "6041h", mend)
     if state is State.QUICK_STOP_ACTIVE and not braking and limits.string:
         counts = reported_torque(objects, profile)
         held_nm = None if counts is None else counts * units.torque_nm_per_lsb
         still = check_nothing_held(table, held_nm, limits.torque_nm, units.torque_nm_per_lsb, "6077h")
     if braking or not still:
-        table.note("settings", "nothing was written to the drive: it brakes or holds the shaft", "driver")
+        table.note("settings", "nothing was written to the drive, because it brakes or holds the shaft", "driver")
     return still and not braking
 
 
 def refuse_if_driven(objects: Objects) -> None:
-    """Before anything is sent that could change what a turning shaft does. Raises PreflightRefused."""
+    """Refuse an enabled drive before a frame could change a turning shaft's motion. Raises PreflightRefused."""
     if decode(objects.read(0x6041)) is State.OPERATION_ENABLED:
         raise PreflightRefused(
-            "the drive is enabled already: another master drives it",
+            "the drive is already enabled by another master",
             where="6041h",
-            next_step="Take that master off the bus, or disable the drive there; nothing was written to it",
+            next_step="Disconnect that master, or disable the drive there. Nothing was written to the drive",
+            entry=MessageCode.ANOTHER_MASTER,
         )
 
 
 def choose_modes(
     table: PreflightTable, objects: Objects, profile: CanopenProfile, with_offset: bool = False
 ) -> dict[Mode, int]:
-    """The first of the profile's modes that the drive says it supports (6502h), for speed and for torque.
+    """Choose the first of the profile's modes that the drive supports (6502h), for speed and for torque.
 
-    ``with_offset``: of the speed modes, those alone in which the drive adds a torque offset.
+    With ``with_offset``, only speed modes in which the drive adds a torque offset are used.
     """
     supported = objects.read_if_there(0x6502)
     chosen: dict[Mode, int] = {}
@@ -269,7 +270,7 @@ def choose_modes(
 
 
 def check_mode_display(table: PreflightTable, objects: Objects, code: int, wait: Callable[[], None]) -> None:
-    """6060h is written while nothing is enabled; 6061h must follow."""
+    """Write 6060h while the drive is disabled; 6061h must follow."""
 
     def work() -> tuple[str, bool]:
         objects.change(0x6060, 0, code, 8)
@@ -282,17 +283,17 @@ def check_mode_display(table: PreflightTable, objects: Objects, code: int, wait:
         return str(shown), shown == code
 
     table.attempt(
-        f"mode display for {code}", str(code), "6061h", work, "The drive doesn't take this mode over; see its manual"
+        f"mode display for {code}", str(code), "6061h", work, "The drive does not accept this mode; see its manual"
     )
 
 
 def clear_targets(table: PreflightTable, objects: Objects, profile: CanopenProfile) -> None:
-    """No setpoint of an earlier run may act when the drive is enabled."""
+    """Set the targets to zero: a setpoint of an earlier run must not act when the drive is enabled."""
     index, _, bits = VL_TARGET if profile.speed.vl else TARGET_VELOCITY
     targets = ((0x6071, 16), (index, bits)) if profile.modes.torque else ((index, bits),)
     offset = profile.torque_offset
     if offset is not None and objects.read_if_there(offset.index, offset.sub):
-        targets = (*targets, (offset.index, 16))       # what a host that died has left there
+        targets = (*targets, (offset.index, 16))       # left by a host that died
 
     def work() -> tuple[str, bool]:
         for index, bits in targets:
@@ -305,12 +306,12 @@ def clear_targets(table: PreflightTable, objects: Objects, profile: CanopenProfi
 def find_torque_offset(
     table: PreflightTable, objects: Objects, profile: CanopenProfile, rated_nm: float
 ) -> tuple[tuple[int, int, int], float] | None:
-    """Index, subindex and bits of the torque offset, and N·m for one count; None: refused, with the reason."""
+    """Return index, subindex and bits of the torque offset, and N·m per count; None if refused, with the reason."""
     entry = profile.torque_offset
     if entry is None:
         table.row(
             "torque offset", "there", f"profile {profile.name} has none", False, "profile, torque_offset",
-            "The drive's own impedance can be measured from its speed reference instead (--impedance reference)",
+            "Measure the drive's impedance from its speed reference instead (--impedance reference)",
         )
         return None
     where = name(entry.index, entry.sub)
@@ -325,10 +326,10 @@ def find_torque_offset(
 
 
 def quick_stop_holds(objects: Objects, profile: CanopenProfile) -> bool | None:
-    """Does the drive hold the shaft once a quick stop has brought it to rest? By the profile, and by 605Ah.
+    """Return whether the drive holds the shaft after a quick stop, by the profile and 605Ah.
 
     CiA 402-2, 605Ah: with 5 to 8 it stays in quick stop active, with 0 to 4 it switches its torque off; negative codes
-    are the manufacturer's. None: neither the drive nor the profile tells.
+    are the manufacturer's. None if neither the drive nor the profile states it.
     """
     entry = profile.quick_stop
     if entry.ends == "off":
@@ -340,7 +341,7 @@ def quick_stop_holds(objects: Objects, profile: CanopenProfile) -> bool | None:
 
 
 class AngleComing(NamedTuple):
-    """One count of the motor's angle, how far apart it comes with the cycle, and how far apart it may."""
+    """Resolution of the motor's angle, its period at the cycle in use, and the longest permitted period."""
 
     resolution_rad: float = 0.0
     period_s: float | None = None
@@ -359,7 +360,7 @@ def report(
     kept: Mapping[str, float],
     angle: AngleComing,
 ) -> Preflight:
-    """The table and what goes with it."""
+    """Return the table with the properties of the drive."""
     filters = read_filters(table.note, objects, profile)
     return Preflight(
         identity=identity,
@@ -385,24 +386,25 @@ def report(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Who is at a node-ID: found, read out (CiA 301: 1000h, 1018h, 1008h), and refused where it is in doubt.
+# Identity of the node (CiA 301: 1000h, 1018h, 1008h), refused if it is ambiguous.
 
 
 DOUBLED_ANSWERS = 3
-"""So many answers that came twice are no accident; `Cia402Drive.connect` asks some ten questions."""
+"""This number of doubled answers shows two nodes with one node-ID; `Cia402Drive.connect` sends about ten requests."""
 
 
 def find_free_node(objects: Objects) -> None:
-    """Somebody answers, and nobody else drives it. Nothing is written. Raises PreflightRefused."""
+    """Check that the node answers and that no other master drives it. Writes nothing. Raises PreflightRefused."""
     try:
         objects.read(0x1000)
     except CommunicationLost as error:
-        raise PreflightRefused(error.what, where=error.where, next_step=error.next_step) from error
+        raise PreflightRefused(error.what, where=error.where, next_step=error.next_step,
+                               entry=MessageCode.NO_DRIVE_FOUND) from error
     refuse_if_driven(objects)
 
 
 def read_identity(objects: Objects) -> Identity:
-    """Vendor, product, revision and serial number (0 where there is none), name, and whether it is simulated."""
+    """Return vendor, product, revision and serial number (0 if absent), name, and whether it is simulated."""
     vendor, product, revision, serial = (objects.read_if_there(0x1018, sub) or 0 for sub in (1, 2, 3, 4))
     try:
         title = visible(objects.read_bytes(0x1008).decode("ascii", "replace").rstrip("\0 "))
@@ -412,18 +414,20 @@ def read_identity(objects: Objects) -> Identity:
 
 
 def refuse_in_doubt(objects: Objects, identity: Identity, node: int, stepped: bool) -> None:
-    """A real drive in stepped time, and two nodes with one node-ID. Raises PreflightRefused."""
+    """Refuse a real drive in stepped time, and two nodes with one node-ID. Raises PreflightRefused."""
     if stepped and not identity.simulated:
         raise PreflightRefused(
-            "stepped time was asked for, but the peer does not bear the simulator's marker",
+            "stepped time was requested, but the peer does not have the simulator's marker",
             where=name(MARKER_INDEX, 1),
-            next_step="Leave --stepped out: a real shaft moves in real time",
+            next_step="Remove --stepped: a real shaft moves in real time",
+            entry=MessageCode.NOT_THE_SIMULATOR,
         )
     if objects.doubled >= DOUBLED_ANSWERS:
         raise PreflightRefused(
-            "every question is answered twice: two nodes have the same node-ID",
+            "requests are answered twice: two nodes have the same node-ID",
             where=f"node {node}",
-            next_step="Take one of them off the bus, or give each a node-ID of its own",
+            next_step="Disconnect one of them, or give each its own node-ID",
+            entry=MessageCode.NODE_ID_CONFLICT,
         )
 
 

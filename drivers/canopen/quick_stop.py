@@ -1,13 +1,13 @@
 """The bare quick stop of a CiA 402 drive (`drivers.quick_stop`): controlword 6040h, bit 2 low.
 
-By SDO, which needs no mapping and no SYNC. Another master that goes on sending enable operation in its RPDO undoes that
-with its next frame (transition 16 of the state machine). Then the same word goes out in that RPDO too, in a burst, so
-that one of them stands in the drive when the SYNC comes; a master that watches the state sees the stop and gives up.
-Where even that is undone, the RPDO that carries 6040h is switched off in the drive (bit 31 of 1400h:1).
+It is sent by SDO, which needs no mapping and no SYNC. Another master that continues to send enable operation in its
+RPDO reverses it with its next frame (transition 16 of the state machine). Then the same word is sent in that RPDO too,
+in a burst, so that one of them is in the drive when the SYNC comes. A master that watches the state sees the stop and
+gives up. If even that is reversed, the RPDO that carries 6040h is switched off in the drive (bit 31 of 1400h:1).
 
-A drive whose quick stop is set to coast (605Ah = 0) gets another one first, or the halt bit if it refuses that. One
-that is in torque mode, and whose profile doesn't say that a quick stop decelerates there, gets speed mode at zero
-first, as a run does it: its quick stop would let a turning shaft go.
+If the quick stop of the drive is set to coast (605Ah = 0), another option is written first; if the drive refuses it,
+the halt bit is used. In torque mode the drive gets speed mode at zero first, as in a run, unless the profile states
+that its quick stop decelerates in torque mode. Otherwise the quick stop could release a turning shaft.
 """
 
 from __future__ import annotations
@@ -44,23 +44,23 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A quick stop that somebody else undoes, made to stand.
+# Enforcing a quick stop that another master reverses.
 #
-# Another master that goes on sending enable operation in an RPDO takes the drive out of its quick stop with its next
-# frame (CiA 402-2, transition 16). Where that is seen, every RPDO is switched off in the drive (1400h:1 and on, bit
-# 31), ours too, and from then on the controlword goes out by SDO, with setpoints of zero beside it; feedback stays as
-# it is. Nobody waits for those answers: a cycle is a cycle. What can't be made to stand even so is left to the
-# drive's watchdog (`drivers.drive.StopsFeeding`).
+# Another master that continues to send enable operation in an RPDO takes the drive out of its quick stop with its next
+# frame (CiA 402-2, transition 16). If that is detected, every RPDO of the drive is switched off (1400h:1 and on, bit
+# 31), including ours. From then on the controlword and setpoints of zero are sent by SDO; the feedback stays as it is.
+# tdhil does not wait for those answers, so the cycle keeps its length. If even this fails, the drive is left to its
+# watchdog (`drivers.drive.StopsFeeding`).
 
 
 UNDONE_S, UNDONE_CYCLES = 0.3, 5
-"""A drive that is in operation for so long, and so many cycles, after a quick stop was asked for does not follow it."""
+"""A drive that is in operation for this time, s, and this number of cycles after a quick stop does not follow it."""
 _EXPEDITED_2, _EXPEDITED_4 = 0x2B, 0x23
 _LEFT_ALONE = frozenset(State) - {State.OPERATION_ENABLED, State.UNKNOWN}
 
 
 class Standing:
-    """``rpdos``: number of each RPDO that acts or could, and its COB-ID."""
+    """``rpdos``: number and COB-ID of each RPDO that acts or could act."""
 
     def __init__(
         self, objects: Objects, link: CanLink, node: int, period_s: float,
@@ -74,18 +74,18 @@ class Standing:
         self._since_s: float | None = None
         self._turn = 0
         self.rpdos: dict[int, int] = {}
-        self.offset: tuple[int, int, int] | None = None    # index, subindex, bits of a torque offset that is in use
+        self.offset: tuple[int, int, int] | None = None    # index, subindex, bits of a torque offset in use
         self.by_sdo = False
 
     def set_period(self, period_s: float) -> None:
-        """A cycle takes so long."""
+        """Set the cycle period, s."""
         self._patience_s = max(UNDONE_S, UNDONE_CYCLES * period_s)
         self._period_s = period_s
 
     def undone(self, now_s: float, state: State, others: bool) -> bool:
-        """After a quick stop, once a cycle: is it time to take over? ``others``: somebody else's RPDOs were heard."""
+        """Return whether to take over, once per cycle after a quick stop. ``others``: RPDOs of another master came."""
         if state is not State.OPERATION_ENABLED:
-            # While they are there it may be enabled in between unseen, and so may one that shows no valid state.
+            # With such frames the drive may be enabled in between unseen; so may one that shows no valid state.
             if not others and state is not State.UNKNOWN:
                 self._since_s = None
             return False
@@ -95,7 +95,7 @@ class Standing:
         return not self.by_sdo and now_s - self._since_s >= wait_s - 1e-9
 
     def take_over(self, watchdog_s: float, feed: Callable[[], None]) -> int:
-        """Switch every RPDO off; how many there were that it worked for. Raises nothing."""
+        """Switch every RPDO off. Return the number of RPDOs switched off. Raises nothing."""
         self.by_sdo = True
         done = 0
         with self._objects.answered_within(min(ANSWER_S, WATCHDOG_SHARE * watchdog_s) if watchdog_s else ANSWER_S):
@@ -107,9 +107,9 @@ class Standing:
         return done
 
     def push(self, state: State, wish: PowerRequest) -> None:
-        """Towards ``wish`` by SDO, one request a cycle: the controlword, and zero setpoints in between.
+        """Send one SDO request per cycle towards ``wish``: the controlword, and setpoints of zero in between.
 
-        A torque offset goes first, whatever the state.
+        A torque offset is cleared first, in any state.
         """
         if self.offset is not None and self._turn == 0:
             self._turn = 1
@@ -138,11 +138,11 @@ class Standing:
 
 HALT = 0x0100
 BY_SDO_TRIES, BY_RPDO_TRIES = 3, 6
-"""So many attempts by SDO alone, then so many with a burst of RPDOs, then the RPDO is switched off."""
+"""Attempts by SDO alone, then attempts with a burst of RPDOs; after them the RPDO is switched off."""
 BURST, BURST_PAUSE_S = 200, 0.0005
 NEAR_ZERO_RAD_S, NEAR_ZERO_LSB = 0.05, 3
 MODE_S, MODE_PAUSE_S = 0.5, 0.01
-"""A drive may take so long to change to speed mode, and is asked again after the second."""
+"""Time for the change to speed mode, s, and interval between two queries, s."""
 _RPDOS = 4
 _CONTROLWORD = 0x6040
 _COAST, _BRAKE_AND_HOLD = 0, 6
@@ -171,9 +171,10 @@ class Cia402Target:
         self._link.handlers[0x080] = self._on_sync
 
     def ask(self, attempt: int) -> None:
-        """SDO; then RPDOs; then without the other master's RPDO. Raises CommunicationLost, ObjectRefused or DriveFault.
+        """Send the quick stop by SDO, then also in RPDOs, then with the other master's RPDO switched off.
 
-        Whatever of that the drive refuses, the word itself is written.
+        The controlword itself is written even if the drive refuses the rest. Raises CommunicationLost, ObjectRefused or
+        DriveFault.
         """
         if not self._prepared:
             self._prepare()
@@ -191,11 +192,11 @@ class Cia402Target:
             raise refused
 
     def poll(self) -> Seen:
-        """6041h and 606Ch."""
+        """Read 6041h and 606Ch."""
         status = self._objects.read(0x6041)
         raw = self._objects.read(self._speed_at, signed=True)
         state = decode(status)
-        if self._rad_s_per_lsb is None:                # where the drive's own settings scale it, from there
+        if self._rad_s_per_lsb is None:                # scaled by the drive's own settings, if any
             self._rad_s_per_lsb = speed_unit(PreflightTable(), self._objects, self._profile)
         speed = raw * self._rad_s_per_lsb
         enabled = power_state(state) is PowerState.ENABLED
@@ -211,25 +212,25 @@ class Cia402Target:
         )
 
     def identity(self) -> Identity:
-        """1018h, for after the stop: is it the drive that was meant? Raises TdhilError."""
+        """Read 1018h after the stop, to check that it was the intended drive. Raises TdhilError."""
         return read_identity(self._objects)
 
     def remarks(self) -> tuple[str, ...]:
-        """Another master, and what was changed in the drive."""
+        """Return remarks on another master, and on changes made in the drive."""
         heard: tuple[str, ...] = ()
         if self._foreign or self._syncs:
-            heard = (f"another master is there: {self._foreign} of its frames to node {self._node} and {self._syncs}"
-                     " SYNC were heard; stop it too",)
+            heard = (f"another master is on the bus: {self._foreign} frames to node {self._node} and {self._syncs}"
+                     " SYNC were received. Stop it too",)
         return (*heard, *self._said)
 
     def close(self) -> None:
-        """Let go of the bus."""
+        """Close the bus."""
         self._link.close()
 
     def _prepare(self) -> None:
         offset = self._profile.torque_offset
         if offset is not None and self._objects.read_if_there(offset.index, offset.sub):
-            with suppress(ObjectRefused):          # of a host that died, perhaps; it goes first
+            with suppress(ObjectRefused):          # possibly left by a host that died; cleared first
                 self._objects.write(offset.index, offset.sub, 0, 16)
         option = self._objects.read_if_there(0x605A, signed=True)
         self._prepared = True
@@ -243,9 +244,9 @@ class Cia402Target:
         self._keep_time()
 
     def _leave_torque_mode(self) -> None:
-        """Speed mode at zero (60FFh, then 6060h), and a moment for 6061h to follow; nothing where it isn't needed.
+        """Switch to speed mode at zero (60FFh, then 6060h) and wait up to `MODE_S` for 6061h; only if needed.
 
-        A drive that doesn't follow gets the quick stop all the same: there is nothing better to be had over the bus.
+        A drive that does not follow gets the quick stop anyway: the bus offers nothing better.
         """
         profile = self._profile
         if profile.quick_stop.decelerates_in_torque_mode or self._stays_in_torque_mode:
@@ -276,7 +277,7 @@ class Cia402Target:
         return supported is None or code < 1 or bool(supported >> code - 1 & 1)
 
     def _keep_time(self) -> None:
-        """A simulated drive whose time a host used to step goes on by itself, or it would never come to rest."""
+        """Let a simulated drive in stepped time advance by itself; otherwise it would never reach standstill."""
         try:
             stepped = self._objects.read_if_there(MARKER_INDEX, 2)
             self._link.pump_until(lambda: self._syncs > 0, 0.2 if stepped else 0.0)
@@ -298,19 +299,19 @@ class Cia402Target:
             self._link.pump_until(lambda: False, BURST_PAUSE_S)
 
     def _packed(self, offset: int, length: int) -> bytes:
-        """An RPDO of zeros with the word in its place; offset and length in bits."""
+        """Return an RPDO of zeros with the controlword in its place; offset and length in bits."""
         return (self._word << offset).to_bytes(length // 8, "little")
 
     def _switch_off_rpdos(self) -> None:
         for index, cob_id, _, _ in self._rpdos():
             self._objects.write(index, 1, cob_id | DISABLED, 32)
             self._said.append(
-                f"the other master's word was switched off: {name(index, 1)} = {cob_id | DISABLED:08X}h;"
-                " restart the drive, or start a run, to have it back"
+                f"the RPDO of the other master was switched off: {name(index, 1)} = {cob_id | DISABLED:08X}h;"
+                " to enable it again, restart the drive or start a run"
             )
 
     def _rpdos(self) -> list[tuple[int, int, int, int]]:
-        """(1400h…, COB-ID, bit offset of 6040h, length in bits) of every enabled RPDO that carries it."""
+        """Return (1400h…, COB-ID, bit offset of 6040h, length in bits) of every enabled RPDO that carries 6040h."""
         found = []
         for number in range(_RPDOS):
             cob_id = self._objects.read_if_there(0x1400 + number, 1)

@@ -1,7 +1,7 @@
 """Reading and writing of objects by SDO, over `CanLink`.
 
-canopen's client does the transfers (CiA 301, SDO upload and download, expedited and segmented); only its
-waiting is replaced: it pulls frames off the link instead of sleeping on a queue that another thread fills.
+The SDO client of the canopen package does the transfers (CiA 301, SDO upload and download, expedited and segmented).
+Only its waiting is replaced: it takes frames off the link instead of sleeping on a queue that another thread fills.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
 from drivers.canopen.bus import CanLink
 from drivers.errors import CommunicationLost, ObjectRefused
 from drivers.undo_journal import UndoJournal
+from profiles import MessageCode
 
 
 class _LinkNetwork(canopen.Network):  # type: ignore[misc]
-    """A canopen network without a bus of its own: what it sends goes out by the link."""
+    """A canopen network without a bus of its own: it transmits through the link."""
 
     def __init__(self, link: CanLink) -> None:
         super().__init__()
@@ -37,7 +38,7 @@ _ABORT = 0x80
 
 
 def is_answer(request: bytes, response: bytes) -> bool:
-    """Does this frame answer that request? Another client's answers and late ones must not pass for it."""
+    """Return whether the frame answers the request. Late answers and answers to other clients do not."""
     if len(response) != 8:
         return False
     command = request[0] >> 5
@@ -48,7 +49,7 @@ def is_answer(request: bytes, response: bytes) -> bool:
 
 
 class _PumpingClient(SdoClient):  # type: ignore[misc]
-    """Waits for a response by pulling frames off the link."""
+    """Waits for a response by taking frames off the link."""
 
     RESPONSE_TIMEOUT = 0.5
     MAX_RETRIES = 3
@@ -58,13 +59,13 @@ class _PumpingClient(SdoClient):  # type: ignore[misc]
         self.network = _LinkNetwork(link)
         self._link = link
         self._asked = bytes(8)
-        self._answers = 0              # to the request at hand
-        self.doubled = 0               # answers to one that was answered already
+        self._answers = 0              # to the current request
+        self.doubled = 0               # answers to a request that was already answered
         self.aside: Callable[[bytes], None] = lambda data: None
         link.handlers[self.tx_cobid] = self._take
 
     def send_request(self, request: bytes) -> None:
-        self._link.drain()  # what still lies on the bus answers an older request, whose time is over
+        self._link.drain()  # frames in the buffer answer an older request
         self.responses: queue.Queue[bytes] = queue.Queue()
         self._asked = bytes(request)
         self._answers = 0
@@ -95,21 +96,21 @@ class Objects:
         self._node = node
         self._undo: list[Callable[[], None]] = []
         self._changed: set[tuple[int, int]] = set()
-        self.journal: UndoJournal | None = None        # where changes are written down before they are made
-        self.stands: dict[tuple[int, int], bytes] = {}     # what `change` last read back, or was found right and left
+        self.journal: UndoJournal | None = None        # records each change before it is made
+        self.stands: dict[tuple[int, int], bytes] = {}     # last value read back, or found right
 
     def on_answer(self, take: Callable[[bytes], None]) -> None:
-        """Have ``take`` see every SDO answer of the drive, also those that nobody here waits for."""
+        """Have ``take`` see every SDO answer of the drive, including answers to other clients."""
         self._client.aside = take
 
     @property
     def doubled(self) -> int:
-        """How many requests were answered twice."""
+        """Number of requests that were answered twice."""
         return self._client.doubled
 
     @contextmanager
     def answered_within(self, answer_s: float) -> Iterator[None]:
-        """Ask once only, and wait no longer than ``answer_s`` of wall time: a shaft may be turning meanwhile."""
+        """Send each request once and wait at most ``answer_s`` of wall time: a shaft may be turning meanwhile."""
         client = self._client
         usual = client.RESPONSE_TIMEOUT, client.MAX_RETRIES
         client.RESPONSE_TIMEOUT, client.MAX_RETRIES = answer_s, 1
@@ -122,7 +123,7 @@ class Objects:
         try:
             return bytes(self._client.upload(index, subindex))
         except SdoAbortedError as error:
-            raise ObjectRefused(f"the drive did not give the object: {error}", where=name(index, subindex)) from error
+            raise ObjectRefused(f"the drive refused the read request: {error}", where=name(index, subindex)) from error
         except SdoCommunicationError as error:
             raise self._silent(index, subindex) from error
 
@@ -130,7 +131,7 @@ class Objects:
         return int.from_bytes(self.read_bytes(index, subindex), "little", signed=signed)
 
     def read_if_there(self, index: int, subindex: int = 0, *, signed: bool = False) -> int | None:
-        """The value, or None where the drive hasn't the object."""
+        """Return the value, or None if the drive does not have the object."""
         try:
             return self.read(index, subindex, signed=signed)
         except ObjectRefused:
@@ -140,18 +141,18 @@ class Objects:
         self.write_bytes(index, subindex, _encoded(value, bits, name(index, subindex)), str(value))
 
     def write_bytes(self, index: int, subindex: int, data: bytes, shown: str = "") -> None:
-        """``shown`` is the value as people read it."""
+        """Write raw bytes. ``shown`` is the value for messages."""
         try:
             self._client.download(index, subindex, data)
         except SdoAbortedError as error:
             raise ObjectRefused(
-                f"the drive did not take {shown or data.hex(' ')} for the object: {error}", where=name(index, subindex)
+                f"the drive refused the value {shown or data.hex(' ')}: {error}", where=name(index, subindex)
             ) from error
         except SdoCommunicationError as error:
             raise self._silent(index, subindex) from error
 
     def change(self, index: int, subindex: int, value: int, bits: int) -> int:
-        """Write, remember what stood there before, and read back what stands there now."""
+        """Write a value, remember the former one, and return the value read back."""
         signed = value < 0
         before = self.read_bytes(index, subindex)
         if int.from_bytes(before, "little", signed=signed) != value:
@@ -162,7 +163,7 @@ class Objects:
         return int.from_bytes(back, "little", signed=signed)
 
     def change_bytes(self, index: int, subindex: int, data: bytes) -> bytes:
-        """As `change`, for an object of any type."""
+        """Do the same as `change`, for an object of any type."""
         before = self.read_bytes(index, subindex)
         if before != data:
             self._note_change(index, subindex, before, data)
@@ -171,7 +172,7 @@ class Objects:
         return back
 
     def _note_change(self, index: int, subindex: int, before: bytes, after: bytes) -> None:
-        """How it will be given back; and, for whoever comes after a host that died, what stood there."""
+        """Register the restore, and record the former value in case this host dies."""
         where = name(index, subindex)
         if (index, subindex) not in self._changed:
             self._changed.add((index, subindex))
@@ -189,7 +190,7 @@ class Objects:
         self._undo.append(undo)
 
     def restore(self) -> tuple[str, ...]:
-        """Undo every change, the last one first; what could not be given back."""
+        """Undo every change, the last one first. Return the changes that could not be restored."""
         failed = []
         self._changed.clear()
         while self._undo:
@@ -204,9 +205,10 @@ class Objects:
 
     def _silent(self, index: int, subindex: int) -> CommunicationLost:
         return CommunicationLost(
-            f"node {self._node} does not answer",
+            f"node {self._node} does not answer SDO requests",
             where=name(index, subindex),
             next_step="Check that the drive is powered, its node-ID and bit rate, the cable and its termination",
+            entry=MessageCode.NODE_SILENT,
         )
 
 
@@ -214,15 +216,15 @@ def _encoded(value: int, bits: int, where: str) -> bytes:
     try:
         return value.to_bytes(bits // 8, "little", signed=value < 0)
     except OverflowError as error:
-        raise ObjectRefused(f"{value} doesn't fit into {bits} bits", where=where) from error
+        raise ObjectRefused(f"{value} is outside the range of {bits} bits", where=where) from error
 
 
 def place(where: str) -> tuple[int, int]:
-    """What `name` wrote → (index, subindex). Raises ValueError."""
+    """Return (index, subindex) of a name written by `name`. Raises ValueError."""
     index, _, subindex = where.partition(":")
     return int(index.removesuffix("h"), 16), int(subindex or 0)
 
 
 def name(index: int, subindex: int = 0) -> str:
-    """How an object is written in messages: 6040h, 1016h:1."""
+    """Return an object's name for messages: 6040h, 1016h:1."""
     return f"{index:04X}h:{subindex}" if subindex else f"{index:04X}h"

@@ -1,9 +1,9 @@
-"""TPDO2, which comes with every few SYNCs, and the SYNC that its angle belongs to.
+"""TPDO2, which comes once in several SYNCs, and the SYNC that its angle belongs to.
 
-A drive answers a SYNC with TPDO1 and then, where it is due, with TPDO2. So a TPDO2 that comes behind this cycle's TPDO1
-is of the same SYNC, and its angle is of the same instant as speed and torque. From one that has come it is known when
-the next is due: a cycle that is due waits for it. An angle that comes at any other moment is dropped, since the sample
-that it belongs to has been given away; the mode display and the torque demand count whenever they come.
+A drive answers a SYNC with TPDO1 and then, if it is due, with TPDO2. So a TPDO2 after this cycle's TPDO1 belongs to the
+same SYNC, and its angle to the same instant as speed and torque. Each TPDO2 shows when the next is due, and a cycle in
+which it is due waits for it. An angle that comes at any other moment is dropped, because its sample was already
+returned. Mode display and torque demand count at any time.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ from typing import NamedTuple
 from drivers.canopen.pdo import Slow
 
 FORGOTTEN = 3
-"""After so many that were due and didn't come nobody waits for the next: it is not known when that would be."""
+"""After this number of missing ones tdhil stops waiting: the time of the next is unknown."""
 
 
 class ModeAndDemand(NamedTuple):
-    """Mode display 6061h, and the torque demand 6074h in counts where it is carried."""
+    """Mode display 6061h, and the torque demand 6074h in counts if it is carried."""
 
     code: int
     demand: int | None
 
 
 class SlowFeedback:
-    """What came; ``every``: TPDO2 comes with every so many SYNCs."""
+    """Content of TPDO2; ``every``: number of SYNCs between two TPDO2."""
 
     def __init__(self, carried: Slow, every: int) -> None:
         self.carried = carried
         self._every = every
-        self._syncs = 0                # that went out
+        self._syncs = 0                # sent so far
         self._came_at: int | None = None           # the SYNC that the last one belongs to
         self._counts: float | None = None          # of the angle, of this cycle's SYNC
         self._waited_for = False
@@ -42,20 +42,21 @@ class SlowFeedback:
 
     @property
     def due(self) -> bool:
-        """Is one to be waited for, in this cycle?"""
+        """True if to wait for one in this cycle."""
         if self.carried.position is None or self._came_at is None:
             return False
         since = self._syncs - self._came_at
         return since > 0 and since % self._every == 0 and since <= FORGOTTEN * self._every
 
     def wait(self) -> None:
-        """From now on this cycle waits for nothing else; what comes is shown with the next cycle."""
+        """Note that this cycle now waits for TPDO2 alone; its content is shown with the next cycle."""
         self._waited_for = True
 
     def take(self, data: bytes, behind_feedback: bool) -> ModeAndDemand | None:
-        """Take one frame, without a wide shape's statusword; what is to be shown at once.
+        """Take one frame, without a wide shape's statusword. Return the values to show at once.
 
-        ``behind_feedback``: this cycle's TPDO1 has come, so it is of the same SYNC; otherwise it is of the one before.
+        ``behind_feedback``: this cycle's TPDO1 has come, so the frame belongs to the same SYNC; otherwise to the one
+        before.
         """
         code, demand, counts = self.carried.unpack(data)
         self._came_at = self._syncs if behind_feedback else self._syncs - 1
@@ -68,12 +69,12 @@ class SlowFeedback:
         return shown
 
     def end(self) -> ModeAndDemand | None:
-        """End the cycle; what came while it was waited for, and is to be shown now."""
+        """End the cycle. Return the values that came during the wait and are shown now."""
         shown, self._held = self._held, None
         self._waited_for = False
         return shown
 
     @property
     def counts(self) -> float | None:
-        """The angle in counts, of this cycle's SYNC; None where it didn't come."""
+        """The angle in counts at this cycle's SYNC; None if it did not come."""
         return self._counts

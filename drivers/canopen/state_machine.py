@@ -16,7 +16,7 @@ from drivers.drive import PowerRequest, PowerState
 
 
 class State(Enum):
-    """The states of the standard's figure."""
+    """States of the figure in the standard."""
 
     NOT_READY = "not ready to switch on"
     SWITCH_ON_DISABLED = "switch on disabled"
@@ -26,7 +26,7 @@ class State(Enum):
     QUICK_STOP_ACTIVE = "quick stop active"
     FAULT_REACTION_ACTIVE = "fault reaction active"
     FAULT = "fault"
-    UNKNOWN = "no valid state"     # no pattern of the standard's: a gateway without its drive, or a dead TPDO
+    UNKNOWN = "no valid state"     # no pattern of the standard: a gateway without its drive, or a dead TPDO
 
 
 # Statusword bits (6041h).
@@ -78,17 +78,17 @@ def decode(statusword: int) -> State:
 
 
 def decode_after(statusword: int) -> State:
-    """Return the same for a drive that has shown another state since it started.
+    """Return the state for a drive that has shown another state since it started.
 
-    A drive leaves not ready to switch on by itself (transitions 0 and 1), and comes back to it by a restart alone:
-    zeros that come later are no state.
+    A drive leaves not ready to switch on by itself (transitions 0 and 1) and returns to it only by a restart. Later
+    zeros are not a state.
     """
     state = decode(statusword)
     return State.UNKNOWN if state is State.NOT_READY else state
 
 
 def power_state(state: State) -> PowerState:
-    """What callers above the driver see of it."""
+    """Return the state as callers above the driver see it."""
     return _POWER[state]
 
 
@@ -99,20 +99,20 @@ _TOWARDS_ENABLED = {
     State.OPERATION_ENABLED: ENABLE_OPERATION,
 }
 _TOWARDS_OFF = {
-    # Disable operation first, which ramps down (605Ch): without voltage a shaft that still turns would coast.
+    # Disable operation first, which ramps down (605Ch): without voltage a turning shaft would coast.
     State.OPERATION_ENABLED: SWITCH_ON,
 }
 
 
 def controlword_towards(state: State, wish: PowerRequest) -> int:
-    """The controlword that brings the drive one transition nearer to the wish.
+    """Return the controlword that brings the drive one transition nearer to ``wish``.
 
-    A fault is never reset here, and a quick stop never ended by enabling again: both must be asked for, and
-    until then the word is the harmless one.
+    It never resets a fault and never ends a quick stop by enabling. Both need a request of their own; until then the
+    word is harmless.
 
-    Quick stop is the same word in every state: where the drive is not in operation it switches off or does nothing
-    (transitions 7 and 10), and where it is after all, since the state shown is old or another node's, the shaft stops.
-    So it is also the word for a drive that shows no valid state, whatever the wish: disabling could let a shaft coast.
+    Quick stop is the same word in every state. A drive that is not in operation switches off or does nothing
+    (transitions 7 and 10). If the shown state is old or another node's and the drive is in operation, the shaft stops.
+    So it is also the word for a drive that shows no valid state, for any ``wish``: disabling could let a shaft coast.
     """
     if state is State.UNKNOWN:
         return QUICK_STOP

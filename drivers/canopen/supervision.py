@@ -1,7 +1,7 @@
-"""What the drive says unasked: heartbeat, boot-up and emergency messages.
+"""Supervision of the drive during a run: heartbeat, boot-up, emergency messages, and read-back of its settings.
 
-Each kind of trouble is kept until it has been raised, once, in the order in which they came; a stop sequence that
-goes on exchanging is then not disturbed by it again.
+Each kind of error is kept until it was raised once, in the order of occurrence. So it does not disturb a stop sequence
+that continues to exchange.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from drivers.canopen.bus import CanLink
 from drivers.canopen.sdo import name
 from drivers.clock import LOWER_THE_RATE, Clock
 from drivers.errors import CommunicationLost, DriveFault, TdhilError
+from profiles import MessageCode
 from profiles.canopen import CanopenProfile
 
 BOOT_UP = 0x00
@@ -25,23 +26,23 @@ PRE_OPERATIONAL = 0x7F
 _NMT_NAMES = {STOPPED: "stopped", OPERATIONAL: "operational", PRE_OPERATIONAL: "pre-operational"}
 
 FOREIGN_FRAMES, FOREIGN_S = 3, 1.0
-"""So many frames within this time that only the drive sends, besides its own, are another drive's."""
+"""This number of foreign frames within this time, s, with an identifier that only the drive sends: another drive."""
 FOREIGN_IN_A_RUN = 2
-"""So many frames of one kind that only we send (SYNC, the drive's RPDOs, our heartbeat) are another node's, however far
-apart: CAN's checksum lets no frame become another one by accident. Before the start it takes `FOREIGN_FRAMES`, for what
-another run left in a queue is then still under way."""
+"""This number of frames of one kind that only we send (SYNC, the drive's RPDOs, our heartbeat) shows another node, at
+any distance in time: CAN's checksum excludes an accident. Before the start it takes `FOREIGN_FRAMES`, because frames
+from the queue of another run may still arrive."""
 
 START_GRACE_S = 0.5
-"""A heartbeat that was under way when the node was started still says pre-operational."""
+"""A heartbeat that was in transit when the node was started still reports pre-operational."""
 
 HOST_LOST = 0x8130
-"""EMCY of a drive that lost its host: life guard or heartbeat error (CiA 301)."""
+"""EMCY of a drive that lost its host: life guard error or heartbeat error (CiA 301)."""
 
 HOST_SILENT = "host silent"
 THIN = "thin feedback"
 OF_A_LATE_HOST = (HOST_SILENT, THIN)
 OF_A_SILENT_HOST = ("heartbeat", "nmt", *OF_A_LATE_HOST)
-"""Kinds of trouble that a host which was away brings about, or takes for the drive's."""
+"""Kinds of error that a delay of this host causes, or that it mistakes for errors of the drive."""
 
 # EMCY error code classes (CiA 301) and the CiA 402 codes a field engineer meets first.
 _EMCY_CLASSES = {
@@ -74,15 +75,15 @@ _EMCY_CLASSES = {
 
 
 def emcy_text(code: int) -> str:
-    """What an EMCY error code means, by its class."""
+    """Return the meaning of an EMCY error code, by its class."""
     meaning = _EMCY_CLASSES.get(code >> 8) or _EMCY_CLASSES.get(code >> 8 & 0xF0) or "manufacturer specific"
     return f"EMCY {code:04X}h, {meaning}"
 
 
 class NodeWatch:
-    """Follows one node. ``allowed_silence_s`` is how long its heartbeat may fail to come (0 = not watched).
+    """Follows one node. ``allowed_silence_s`` is the longest time without a heartbeat (0 = not supervised).
 
-    Where the drive is guarded instead, `Guarding` hands on its answers as if they were heartbeats.
+    With node guarding, `Guarding` passes the answers on as if they were heartbeats.
     """
 
     def __init__(self, node: int, clock: Clock) -> None:
@@ -92,23 +93,23 @@ class NodeWatch:
         self._troubles: list[tuple[str, TdhilError]] = []
         self._raised: set[str] = set()
         self._foreign_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
-        self.foreign: Counter[str] = Counter()     # frames of somebody else since the start, by their kind
+        self.foreign: Counter[str] = Counter()     # foreign frames since the start, by kind
         self._contradicted_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
         self._started_s = 0.0
         self._operational = False
         self.allowed_silence_s = 0.0
         self.expect_operational = False
         self.emcy_code = 0
-        self.nmt_state: int | None = None      # as the drive last told it; None before
+        self.nmt_state: int | None = None      # last reported by the drive; None before
         self.on_boot_up: Callable[[], None] = lambda: None
         self.sign_of_life: Callable[[], tuple[str, str]] = lambda: ("heartbeat has been missing", "1017h")
         self.host_stood_still: Callable[[], str] = lambda: ""
-        """What is to be said of this host first, where it was away itself; empty: it wasn't."""
+        """Returns the delay of this host, in words, to report before the error; empty if there was none."""
         self.host_late: Callable[[], str] = lambda: ""
-        """The same, where it was away or late again and again: what a drive's watchdog acts on."""
+        """The same for repeated short delays, on which a drive's watchdog acts."""
 
     def on_heartbeat(self, data: bytes) -> None:
-        """700h + node: the NMT state, or 0 for boot-up."""
+        """Handle 700h + node: the NMT state, or 0 for boot-up."""
         if not data:
             return
         state = data[0] & 0x7F
@@ -122,9 +123,10 @@ class NodeWatch:
             self._keep(
                 "boot-up",
                 DriveFault(
-                    "the drive restarted in the middle of the run (boot-up message)",
+                    "the drive restarted during the run (boot-up message)",
                     where=f"node {self._node}",
-                    next_step="It is not enabled again by itself. Find out why it restarted, then start anew",
+                    next_step="tdhil does not enable it again. Find the cause of the restart, then start again",
+                    entry=MessageCode.DRIVE_RESTARTED,
                 ),
             )
         elif state == OPERATIONAL:
@@ -133,14 +135,15 @@ class NodeWatch:
             self._keep(
                 "nmt",
                 CommunicationLost(
-                    f"somebody put the drive into NMT state {_NMT_NAMES.get(state, state)}",
+                    f"another master put the drive into NMT state {_NMT_NAMES.get(state, state)}",
                     where=f"node {self._node}",
-                    next_step="Is a second master on the bus? Take it off and start anew",
+                    next_step="Disconnect the second master from the bus, and start again",
+                    entry=MessageCode.FOREIGN_MASTER,
                 ),
             )
 
     def on_emcy(self, data: bytes) -> None:
-        """080h + node: error code u16, error register u8, manufacturer's bytes; code 0 = all errors gone."""
+        """Handle 080h + node: error code u16, error register u8, manufacturer's bytes; code 0 = no error left."""
         if len(data) < 2:
             return
         code = int.from_bytes(data[:2], "little")
@@ -149,9 +152,10 @@ class NodeWatch:
             self._keep(
                 HOST_SILENT,
                 CommunicationLost(
-                    f"the drive's watchdog has acted: {emcy_text(code)}",
-                    where=f"host or bus, as node {self._node} tells it",
+                    f"the drive's watchdog has tripped: {emcy_text(code)}",
+                    where=f"host or bus, reported by node {self._node}",
                     next_step="This host was silent for too long (frozen, asleep, overloaded) or its frames were lost",
+                    entry=MessageCode.WATCHDOG_ACTED,
                 ),
             )
         elif code and self.expect_operational:
@@ -161,14 +165,14 @@ class NodeWatch:
                 DriveFault(
                     emcy_text(code) + (f" (manufacturer's bytes {extra})" if any(data[3:]) else ""),
                     where=f"node {self._node}",
-                    next_step="See the drive's own fault list, mend the cause, then start with --reset-fault",
+                    next_step="See the drive's fault list, remove the cause, then start with --reset-fault",
                 ),
             )
 
     def on_foreign(self, kind: str, why: str = "") -> None:
-        """A frame of a kind that we send came in: somebody else drives this drive, or is about to.
+        """Handle a frame of a kind that only this host sends: another master drives this drive, or is about to.
 
-        ``kind``: as people call it; ``why`` it matters, where it isn't a master's.
+        ``kind``: name for messages; ``why``: its effect, if it is not a master's frame.
         """
         self.foreign[kind] += 1
         if self.expect_operational:
@@ -177,41 +181,43 @@ class NodeWatch:
             certain = self._no_accident(self._foreign_s)
         if certain:
             self.interference(
-                why or f"a second master is on the bus: it sends {kind} of its own",
+                why or f"a second master is on the bus: it sends {kind}",
                 f"node {self._node}",
-                "Take it off the bus, or give it other identifiers, and start anew",
+                "Disconnect it from the bus, or give it other identifiers, and start again",
                 kind="master",
             )
 
     def interference(self, what: str, where: str, next_step: str, *, kind: str) -> None:
-        """Somebody else changes this drive or drives it; raised by `check`, once for each ``kind``."""
+        """Record that another master changes or drives this drive; `check` raises it once for each ``kind``."""
         self._keep(kind, CommunicationLost(what, where=where, next_step=next_step))
 
     def thin_feedback(self, missed: int, cycles: int, period_s: float, where: str) -> None:
-        """So many of the last cycles brought no feedback."""
+        """Record that ``missed`` of the last cycles brought no feedback."""
         self._keep(
             THIN,
             CommunicationLost(
                 f"{missed} of the last {cycles} cycles ({cycles * period_s:.2g} s) brought no feedback",
                 where=f"node {self._node}, {where}",
-                next_step="Did a tool change the TPDO's transmission type or mapping? Else check bus load and cable",
+                next_step="Check the TPDO's transmission type and mapping, the bus load and the cable",
+                entry=MessageCode.FEEDBACK_LOST,
             ),
         )
 
     def on_contradiction(self) -> None:
-        """A frame of feedback that the drive can't have sent, if it sent the one before it for the same SYNC."""
+        """Handle a feedback frame that contradicts an earlier one for the same SYNC: one of them is foreign."""
         if self._no_accident(self._contradicted_s):
             self._keep(
                 "feedback",
                 CommunicationLost(
-                    "feedback comes more than once for a SYNC, and says different things: somebody else sends it too",
+                    "several different feedback frames come for one SYNC: another node sends them too",
                     where=f"node {self._node}, TPDO1 ({0x180 + self._node:03X}h)",
-                    next_step="Is the node-ID given twice, or a recording being played back? Mend it and start anew",
+                    next_step="Check for a duplicate node-ID, or a recording that is played back; start again",
+                    entry=MessageCode.FOREIGN_MASTER,
                 ),
             )
 
     def check(self) -> None:
-        """Raise the oldest trouble not raised yet."""
+        """Raise the oldest error that was not raised yet."""
         if self.overdue and self._heard_s is not None:
             missing, where = self.sign_of_life()
             self._keep(
@@ -219,7 +225,8 @@ class NodeWatch:
                 CommunicationLost(
                     f"the drive's {missing} for {self._clock.now_s() - self._heard_s:.2f} s",
                     where=f"node {self._node}, {where}",
-                    next_step="Check the drive's supply and the bus; the drive's own watchdog stops the shaft",
+                    next_step="Check the drive's supply and the bus. The drive's own watchdog stops the shaft",
+                    entry=MessageCode.FEEDBACK_LOST,
                 ),
             )
         if self._troubles:
@@ -228,23 +235,24 @@ class NodeWatch:
 
     @property
     def overdue(self) -> bool:
-        """Has the drive's sign of life been missing for too long, as far as its frames have been read?"""
+        """True if the drive's heartbeat has been missing for too long, in the frames read so far."""
         silent_s = 0.0 if self._heard_s is None else self._clock.now_s() - self._heard_s
         return 0.0 < self.allowed_silence_s < silent_s
 
     def _of_host(self, kind: str, trouble: TdhilError) -> TdhilError:
-        """The same, where this host was away: that comes first, and may be all there is to it.
+        """Return the error with the delay of this host in front, if there was one: the delay may be its only cause.
 
-        The drive's watchdog also acts on many cycles that are late, of which none is long.
+        The drive's watchdog also trips on many cycles that are each only a little late.
         """
         away = self.host_late() if kind in OF_A_LATE_HOST else self.host_stood_still()
         if not away:
             return trouble
         where = trouble.where if kind == HOST_SILENT else f"host; {trouble.where}"
-        return CommunicationLost(f"{away}; after that: {trouble.what}", where=where, next_step=LOWER_THE_RATE)
+        return CommunicationLost(f"{away}. After that: {trouble.what}", where=where, next_step=LOWER_THE_RATE,
+                                 entry=MessageCode.HOST_LATE)
 
     def start(self, allowed_silence_s: float) -> None:
-        """From now on silence, boot-up, EMCY and foreign NMT commands are trouble."""
+        """Treat silence, boot-up, EMCY and foreign NMT commands as errors from now on."""
         self._heard_s = self._started_s = self._clock.now_s()
         self._operational = False
         self.foreign.clear()
@@ -252,12 +260,12 @@ class NodeWatch:
         self.expect_operational = True
 
     def stop(self) -> None:
-        """Nothing is trouble any more."""
+        """End the supervision."""
         self.expect_operational = False
         self.allowed_silence_s = 0.0
 
     def _no_accident(self, seen_s: deque[float]) -> bool:
-        """One more now; have there been so many within the time?"""
+        """Count one more event. Return whether `FOREIGN_FRAMES` came within `FOREIGN_S`."""
         now_s = self._clock.now_s()
         seen_s.append(now_s)
         return len(seen_s) == FOREIGN_FRAMES and now_s - seen_s[0] <= FOREIGN_S
@@ -269,20 +277,20 @@ class NodeWatch:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Node guarding, the host's side (CiA 301): the watchdog of drives that know no heartbeat consumer.
+# Node guarding, the host's side (CiA 301): the watchdog of drives without a heartbeat consumer.
 #
 # ::
 #
 #     host   700h + node, remote frame     ─►  the drive restarts its life time (100Ch x 100Dh)
 #     drive  700h + node, toggle | state   ─►  bit 7 changes with every answer, bits 0 to 6 are the NMT state
 #
-# The questions are asked by the control loop itself, so that a frozen or dead host falls silent and the drive acts.
-# An answer that doesn't toggle is no answer: it is an old one come again, or another station's. The state goes to
-# `NodeWatch`, which knows what it may be and how long it may fail to come.
+# The control loop itself sends the requests, so that a frozen or dead host is silent and the drive's watchdog trips. An
+# answer without a toggle does not count: it is an old frame, or another station's. `NodeWatch` checks the state and the
+# longest time without one.
 
 
 class Guarding:
-    """``ask`` puts the remote frame on the bus."""
+    """Node guarding by this host; ``ask`` puts the remote frame on the bus."""
 
     def __init__(self, watch: NodeWatch, ask: Callable[[], None]) -> None:
         self._watch = watch
@@ -292,12 +300,12 @@ class Guarding:
         watch.sign_of_life = self._missing
 
     def feed(self) -> None:
-        """One question."""
+        """Send one request."""
         self.asked += 1
         self._ask()
 
     def on_frame(self, data: bytes) -> None:
-        """700h + node, from the drive."""
+        """Handle 700h + node from the drive."""
         if not data:
             return
         state, toggle = data[0] & 0x7F, data[0] >> 7
@@ -319,38 +327,37 @@ class Guarding:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What preflight set is read back all through the run, two objects a second beside the cycle.
+# Read-back of the settings that preflight made: two objects a second, beside the cycle, during the whole run.
 #
-# A tool, the drive's own panel or another fieldbus may change the watchdog, its reaction, the quick stop or a limit
-# while the shaft turns; nothing on the bus need show it. So a question goes out once a cycle's feedback is in, nobody
-# waits for the answer, and it is looked at when it comes (SDO upload, expedited, CiA 301). Watchdog and quick stop
-# have every third turn, limits and setpoints another, and what is in the feedback's frames (mapping, transmission
-# type, COB-ID of the TPDOs) the third. So a change shows within 0.5 s times three times the number of its group; one
-# that a tool writes on this bus is looked at in the next cycle.
+# A tool, the drive's panel or another fieldbus may change the watchdog, its reaction, the quick stop or a limit while
+# the shaft turns, without any frame on this bus. So a request is sent after a cycle's feedback; tdhil does not wait for
+# the answer and checks it when it comes (SDO upload, expedited, CiA 301). Watchdog and quick stop have every third
+# turn, limits and setpoints another, and the content of the feedback frames (mapping, transmission type, COB-ID of the
+# TPDOs) the third. So a change shows within 0.5 s times three times the number of objects in its group. An object that
+# a tool writes on this bus is checked in the next cycle.
 #
-# Setpoints and mode (6071h, 60FFh, 6060h) are asked for too: they must be what this host sent last. A drive counts as
-# one that echoes them once it has given back a value of ours other than zero; only then is another value somebody
-# else's.
+# Setpoints and mode (6071h, 60FFh, 6060h) are read too: they must be the values that this host sent last. A drive
+# echoes them if it has returned a value of ours other than zero. Only then does another value come from another master.
 #
-# An answer that differs is asked for again at once, and believed the second time (a setpoint the third). What was
-# changed is written back, once, before the stop that follows: that may rest on it (605Ah). A drive that answers no
-# such question from the beginning is let be, and that is told; one that answered and then falls silent for `LOST`
-# turns has been lost.
+# An answer that differs is requested again at once, and counts the second time (a setpoint the third time). The changed
+# value is written back once before the stop, because the stop may depend on it (605Ah). Some drives do not answer SDO
+# requests while running; tdhil reports this and continues. If a drive stops answering after it has answered before,
+# `LOST` missed replies count as a lost connection.
 
 
 READ_BACK_EVERY_S = 0.5
 READ_BACK_ANSWER_S = 0.5
-"""Control time for an answer."""
+"""Control time for an answer, s."""
 GIVE_UP, LOST = 5, 10
-"""So many questions in a row without an answer: of a drive that never answered, and of one that did."""
+"""Unanswered requests in a row: limit for a drive that never answered, and for one that did."""
 TRIES = 2
 REMEMBERED = 8
-"""Cycles: an answer may show any setpoint that was sent so lately."""
+"""Number of cycles whose setpoints an answer may show."""
 _UPLOAD, _ABORT = 2, 4
 
 
 class Group(Enum):
-    """What takes its turn together."""
+    """Objects that are read back in the same turn."""
 
     SAFETY = "watchdog, its reaction, quick stop"
     REST = "limits, setpoints, RPDOs"
@@ -359,7 +366,7 @@ class Group(Enum):
 
 @dataclass(eq=False)
 class _WatchedObject:
-    """``data``: what must stand there; None: one of the setpoints sent last."""
+    """``data``: required value; None: one of the setpoints sent last."""
 
     index: int
     sub: int
@@ -380,8 +387,8 @@ class ReadBack:
         self._node = node
         self._groups: dict[Group, list[_WatchedObject]] = {group: [] for group in Group}
         self.on_changed: Callable[[int, int], None] = lambda index, sub: None
-        """Index and sub-index of what was changed by somebody else, before that is raised."""
-        self._next: deque[_WatchedObject] = deque()      # before their turn
+        """Called with index and sub-index of an object that another master changed, before the error is raised."""
+        self._next: deque[_WatchedObject] = deque()      # to read before their turn
         self._turn = 0
         self._asked: _WatchedObject | None = None
         self._asked_s = 0.0
@@ -392,14 +399,14 @@ class ReadBack:
         self._sent: dict[int, deque[int]] = {}
 
     def clear(self) -> None:
-        """Nothing is watched."""
+        """Remove all objects."""
         for group in self._groups.values():
             group.clear()
         self._sent.clear()
         self._next.clear()
 
     def watch(self, title: str, index: int, sub: int, data: bytes, group: Group) -> None:
-        """One object that must stay as it is."""
+        """Add an object that must keep its value."""
         self._groups[group].append(_WatchedObject(index, sub, title, data))
 
     def stands(self, index: int, sub: int, data: bytes) -> None:
@@ -409,30 +416,32 @@ class ReadBack:
                 one.data = data
 
     def watch_setpoint(self, title: str, index: int) -> None:
-        """One object that must show what was sent (`sent`)."""
+        """Add an object that must show the setpoint sent (`sent`)."""
         self._sent[index] = deque(maxlen=REMEMBERED)
         self._groups[Group.REST].append(_WatchedObject(index, 0, title, None))
 
     def sent(self, index: int, value: int) -> None:
-        """A setpoint went out in this cycle."""
+        """Record a setpoint that was sent in this cycle."""
         if index in self._sent:
             self._sent[index].append(value)
 
     def soon(self, index: int, sub: int) -> None:
-        """Somebody wrote this object: ask for it before its turn."""
+        """Read this object before its turn, because another master wrote it."""
         for one in self._all():
             if (one.index, one.sub) == (index, sub) and one not in self._next:
                 self._next.append(one)
 
     def put_back(self, index: int, sub: int) -> None:
-        """Write what must stand in a watched object, and wait for no answer (SDO download, expedited)."""
+        """Write the required value into a supervised object, without waiting for an answer (SDO download,
+        expedited).
+        """
         for one in self._all():
             if (one.index, one.sub) == (index, sub) and one.data is not None:
                 command = 0x23 | (4 - len(one.data)) << 2
                 self._ask(bytes((command,)) + self._head(one) + one.data.ljust(4, b"\0"))
 
     def step(self, now_s: float) -> None:
-        """After a cycle's feedback."""
+        """Send the next request, after a cycle's feedback."""
         if self._over or not any(self._groups.values()):
             return
         if self._asked is not None:
@@ -449,7 +458,7 @@ class ReadBack:
             self._ask(bytes((_UPLOAD << 5,)) + self._head(self._asked) + bytes(4))
 
     def take(self, data: bytes) -> None:
-        """An SDO answer of the drive, whosever question it is."""
+        """Handle an SDO answer of the drive, to this or another client."""
         one = self._asked
         if one is None or len(data) != 8 or data[1:4] != self._head(one):
             return
@@ -458,7 +467,7 @@ class ReadBack:
             self._asked, self._silent = None, 0
             one.refused += 1
             if one.refused == GIVE_UP:
-                self._tell(f"the drive refuses to give {name(one.index, one.sub)} in motion: it is not read back")
+                self._tell(f"the drive refuses to read {name(one.index, one.sub)} in motion; it is not supervised")
                 self._drop(one)
         elif command == _UPLOAD and data[0] & 0x02:
             self._asked, self._silent, self._answered = None, 0, True
@@ -491,20 +500,20 @@ class ReadBack:
         if one.differs < TRIES + (one.data is None):
             self._next.appendleft(one)
         elif one.data is not None:
-            self.put_back(one.index, one.sub)      # before the stop that follows, which may rest on it
+            self.put_back(one.index, one.sub)      # before the stop, which may depend on it
             self.on_changed(one.index, one.sub)
             self._watch.interference(
-                f"{one.title} was changed by somebody else in the run: {_shown(one.data)} was set, {_shown(found)}"
-                " stands there now",
+                f"{one.title} was changed by another master during the run: {_shown(one.data)} was set,"
+                f" {_shown(found)} is there now",
                 f"node {self._node}, {name(one.index, one.sub)}",
-                "Find the tool, panel or master that writes to this drive, take it off, and start anew",
+                "Find the tool, panel or master that writes to this drive, disconnect it, and start again",
                 kind=f"changed {one.index:04X}:{one.sub}",
             )
         else:
             self._watch.interference(
-                f"{one.title} is not what this host sent: {_shown(found)} stands there, and {sent[-1]} was sent",
+                f"{one.title} is not what this host sent: {_shown(found)} is there, {sent[-1]} was sent",
                 f"node {self._node}, {name(one.index, one.sub)}",
-                "Is a second master, a panel or another fieldbus driving it? Take it off and start anew",
+                "A second master, a panel or another fieldbus may drive it. Disconnect it and start again",
                 kind="setpoint",
             )
 
@@ -512,13 +521,13 @@ class ReadBack:
         self._silent += 1
         if not self._answered and self._silent >= GIVE_UP:
             self._over = True
-            self._tell("the drive answers no SDO while it runs: watchdog and limits were not read back in motion")
+            self._tell("the drive answers no SDO requests in motion: watchdog and limits were not read back")
         elif self._answered and self._silent >= LOST:
             self._over = True
             self._watch.interference(
-                f"the drive left {LOST} questions in a row unanswered: watchdog and limits can't be read back any more",
+                f"the drive did not answer {LOST} SDO requests in a row: watchdog and limits can't be read back",
                 f"node {self._node}, SDO",
-                "Is a gateway between, or the drive overloaded? Look at the log's frames", kind="read back",
+                "Check a gateway in between and the load of the drive; see the frames in the log", kind="read back",
             )
 
     def _drop(self, one: _WatchedObject) -> None:
@@ -537,19 +546,19 @@ def _shown(data: bytes) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The host's sign of life, which the drive's watchdog waits for: a heartbeat, or a question of the node guarding.
+# The host's sign of life for the drive's watchdog: a heartbeat, or a request of node guarding.
 #
-# Sent by whoever calls, and by nothing else: neither a thread nor the kernel, which would outlive a frozen loop.
+# Only the control loop sends it, neither a thread nor the kernel, which would outlive a frozen loop.
 
 
 HEARTBEAT_S = 0.1
-"""Both ways; the host's comes faster where the watchdog is shorter than five of them."""
+"""Heartbeat period in both directions, s. The host's is shorter if the watchdog is shorter than five of them."""
 ANSWER_S = 0.2
-"""Wall time that the drive may take to answer the first question of the node guarding."""
+"""Wall time for the answer to the first request of node guarding, s."""
 
 
 class SignOfLife:
-    """Of ``host_node`` towards ``node``; the answers of a guarded drive are taken from the link too."""
+    """Sends heartbeats of ``host_node``, or guards ``node`` and takes its answers from the link."""
 
     def __init__(
         self, link: CanLink, watch: NodeWatch, clock: Clock, profile: CanopenProfile, *, node: int, host_node: int
@@ -566,11 +575,11 @@ class SignOfLife:
 
     @property
     def asks(self) -> bool:
-        """The drive is asked by node guarding, so it must answer; else the host's heartbeat goes out."""
+        """True if the drive is supervised by node guarding, so that it must answer; else the host sends a heartbeat."""
         return self._asks
 
     def feed(self) -> None:
-        """One now; the next is due a while later."""
+        """Send one now; the next is due one period later."""
         if self._ended:
             return
         if self._guarding is not None and self._asks:
@@ -580,32 +589,32 @@ class SignOfLife:
         self._next_s = self._clock.now_s() + self._every_s
 
     def end(self) -> None:
-        """None any more: the drive's watchdog is to act."""
+        """Send none any more: the drive's watchdog is to trip."""
         self._ended = True
 
     def feed_when_due(self, now_s: float) -> None:
-        """Called in every cycle."""
+        """Send one if it is due; called in every cycle."""
         if now_s >= self._next_s:
             self.feed()
 
     def feed_between(self) -> None:
-        """One more between two cycles: those that are due in control time stay due."""
+        """Send one more between two cycles. The ones due in control time stay due."""
         due_s = self._next_s
         self.feed()
         self._next_s = due_s
 
     def pace(self, every_s: float) -> None:
-        """One every so often, at least."""
+        """Set the longest period, s."""
         self._every_s = min(HEARTBEAT_S, every_s)
 
     def keep_to(self, feed_s: float) -> None:
-        """The watchdog is armed and wants one so often; 0: it isn't armed."""
-        if not feed_s:                 # nobody is asked who may not hear it: not every adapter carries remote frames
+        """Set the period of the armed watchdog, s; 0: it is not armed."""
+        if not feed_s:                 # not every adapter carries remote frames
             self._asks = False
         self.pace(feed_s or HEARTBEAT_S)
 
     def answered(self) -> bool:
-        """Waits for the first answer of a guarded drive."""
+        """Wait for the first answer of a guarded drive. Return whether it came."""
         guarding = self._guarding
         return guarding is None or self._link.await_answer(lambda: guarding.answers > 0, ANSWER_S)
 

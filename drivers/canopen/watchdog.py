@@ -1,4 +1,4 @@
-"""PDOs, timing and the drive's watchdog: what preflight sets last, since the watchdog wants to be fed from then on."""
+"""PDOs, timing and the watchdog: the last settings of preflight, because the watchdog must be fed after them."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from drivers.canopen.pdo_mapping import layout, slow_syncs, switch_off_others, w
 from drivers.canopen.sdo import Objects, name
 from drivers.errors import ObjectRefused, PreflightRefused
 from drivers.preflight import DIES, PreflightTable, settle
-from profiles import MARKER_INDEX
+from profiles import MARKER_INDEX, MessageCode
 from profiles.canopen import CanopenProfile, Position, Watchdog
 
 GUARD_TIME, LIFE_TIME_FACTOR = 0x100C, 0x100D
 LEAST_CYCLES = 5
-"""The watchdog must not bite on account of a lost frame or two."""
+"""The watchdog must not trip because of one or two lost frames."""
 
 
 def map_pdos(
     table: PreflightTable, objects: Objects, node: int, profile: CanopenProfile, shape: FrameShape, period_s: float,
     position: Position | None,
 ) -> tuple[Slow, dict[int, int]]:
-    """Map both pairs of PDOs, and switch off what other RPDOs the drive has.
+    """Map both pairs of PDOs, and switch off the drive's other RPDOs.
 
-    What the second TPDO carries: the torque demand 6074h and the angle ``position``, where the drive has them and lets
-    them be mapped; and the COB-IDs that were switched off, by the RPDO's number.
+    Return the content of the second TPDO: the torque demand 6074h and the angle ``position``, if the drive has them and
+    they can be mapped. Also return the COB-IDs that were switched off, by RPDO number.
     """
     with_demand = profile.torque.has_demand and objects.read_if_there(0x6074) is not None
     carried = Slow.fitting(with_demand, position, shape)
     *pdos, slow = layout(carried, shape, slow_syncs(period_s))
     others: dict[int, int] = {}
-    taken: list[Slow] = []             # by the drive
+    taken: list[Slow] = []             # accepted by the drive
 
     def work() -> tuple[str, bool]:
         for pdo in pdos:
@@ -43,7 +43,7 @@ def map_pdos(
                 raise
             less = Slow(with_demand, None, shape.wide)
             write_pdo(objects, node, layout(less, shape, slow_syncs(period_s))[-1])
-            table.note("angle in the cycle", f"not mapped ({error.what}); it is read on request alone", error.where)
+            table.note("angle in the cycle", f"not mapped ({error.what}); it is read on request only", error.where)
             taken.append(less)
             return "as wanted, without the angle", True
         taken.append(carried)
@@ -61,17 +61,17 @@ def map_pdos(
 
 
 def set_period(objects: Objects, profile: CanopenProfile, period_s: float) -> int:
-    """Cycle period 1006h; what it then reads, µs. Raises ObjectRefused where the drive has none."""
+    """Write the cycle period 1006h. Return the value read back, µs. Raises ObjectRefused if the drive has none."""
     if not profile.cyclic.has_period:
         raise ObjectRefused("not in the profile", where="1006h")
     return objects.change(0x1006, 0, round(period_s * 1e6), 32)
 
 
 def feedback_frames(objects: Objects) -> list[tuple[str, int, int, bytes]]:
-    """Title, index, sub-index and bytes of all that says what the two TPDOs carry and when they come.
+    """Return title, index, sub-index and bytes of the objects that define content and timing of the two TPDOs.
 
-    COB-ID, transmission type, inhibit time and event timer (1800h:1, 2, 3, 5), where the drive has them; and the
-    mapping (1A00h), as far as it is used.
+    These are COB-ID, transmission type, inhibit time and event timer (1800h:1, 2, 3, 5), if the drive has them; and the
+    used part of the mapping (1A00h).
     """
     found = []
     for number in (0, 1):
@@ -86,11 +86,11 @@ def feedback_frames(objects: Objects) -> list[tuple[str, int, int, bytes]]:
 
 
 def set_slow_syncs(objects: Objects, period_s: float) -> bytes:
-    """With every how many SYNCs the second TPDO comes (1801h:2), at another rate; what then stands there.
+    """Set the number of SYNCs between two TPDO2 (1801h:2) for another rate. Return the bytes read back.
 
     Raises ObjectRefused.
     """
-    if objects.read(0x1801, 2) > 1:            # with every SYNC anyway where it carries the statusword
+    if objects.read(0x1801, 2) > 1:            # 1: it carries the statusword, with every SYNC
         objects.write(0x1801, 2, slow_syncs(period_s), 8)
     return objects.read_bytes(0x1801, 2)
 
@@ -98,27 +98,29 @@ def set_slow_syncs(objects: Objects, period_s: float) -> bytes:
 def set_timing(
     table: PreflightTable, objects: Objects, profile: CanopenProfile, period_s: float, heartbeat_s: float, stepped: bool
 ) -> bool:
-    """Cycle period 1006h, stepped time of a simulated peer, heartbeat 1017h; whether the drive produces one."""
+    """Set cycle period 1006h, stepped time of a simulated peer, heartbeat 1017h. Return whether there is a
+    heartbeat.
+    """
     period_us = round(period_s * 1e6)
     try:
         back = set_period(objects, profile, period_s)
         table.row("cycle", f"{period_us} µs", f"{back} µs", back == period_us, "1006h")
     except ObjectRefused:
-        table.note("cycle", f"{period_us} µs; the drive has no 1006h and follows the SYNC alone", "1006h")
+        table.note("cycle", f"{period_us} µs; the drive has no 1006h and follows SYNC only", "1006h")
     if stepped:
         if not profile.cyclic.has_period:
             back = objects.change(MARKER_INDEX, 3, period_us, 32)
             table.row("simulator's cycle", f"{period_us} µs", f"{back} µs", back == period_us, name(MARKER_INDEX, 3))
         on = objects.change(MARKER_INDEX, 2, 1, 8)
         table.row("stepped time", "on", "on" if on else "off", on == 1, name(MARKER_INDEX, 2))
-    # CiA 301 allows a node one of the two: while it produces a heartbeat it is not guarded.
+    # CiA 301 allows a node one of the two: a node with a heartbeat is not guarded.
     time_ms = 0 if profile.watchdog.kind == "node_guarding" else round(heartbeat_s * 1000)
     try:
         back = objects.change(0x1017, 0, time_ms, 16)
     except ObjectRefused:
         if time_ms:
             table.note(
-                "drive's heartbeat", "the drive produces none: its silence shows in missing feedback only", "1017h"
+                "drive's heartbeat", "none: a lost drive shows only by missing feedback", "1017h"
             )
         return False
     good = table.row("drive's heartbeat", f"{time_ms} ms", f"{back} ms", back == time_ms, "1017h")
@@ -137,10 +139,10 @@ def arm_watchdog(
     answered: Callable[[], bool],
     accept_none: bool,
 ) -> float:
-    """The drive's watchdog and its reaction, written and read back; how often the host must feed it, in seconds.
+    """Write and read back the drive's watchdog and its reaction. Return the period at which the host must feed it, s.
 
-    Supervision begins with the first ``beat`` (heartbeat, or question of the node guarding), so one is sent before the
-    read-back; ``answered`` waits for the drive's answer to a question. 0 where it is not armed: refused, unless
+    Supervision begins with the first ``beat`` (heartbeat, or request of node guarding), so one is sent before the
+    read-back; ``answered`` waits for the drive's answer to a request. 0 if it is not armed: refused, unless
     ``accept_none`` and it is known to be off.
     """
     tried = PreflightTable()
@@ -161,7 +163,7 @@ def arm_watchdog(
         table.checks += tried.checks
         table.row(
             "watchdog time", f"{LEAST_CYCLES} cycles to 65 s", f"{time_ms} ms", False, "limits.watchdog_s",
-            f"Give it at least {LEAST_CYCLES * period_s:g} s, or a higher rate",
+            f"Set it to at least {LEAST_CYCLES * period_s:g} s, or use a higher rate",
         )
         return 0.0
     if entry.kind == "node_guarding":
@@ -174,7 +176,7 @@ def arm_watchdog(
 def _arm_heartbeat(
     table: PreflightTable, objects: Objects, entry: Watchdog, host_node: int, time_ms: int, beat: Callable[[], None]
 ) -> float:
-    """The consumer heartbeat time, 1016h in the standard: the drive acts where the host's heartbeat isn't heard."""
+    """Arm the consumer heartbeat time, 1016h in the standard: the drive reacts if the host's heartbeat is missing."""
     value = consumer_heartbeat(host_node, time_ms)
 
     def arm() -> tuple[str, bool]:
@@ -193,18 +195,21 @@ def _arm_guarding(
     table: PreflightTable, objects: Objects, time_ms: int, factor: int, ask: Callable[[], None],
     answered: Callable[[], bool]
 ) -> float:
-    """100Ch guard time in ms x 100Dh factor = life time (CiA 301): the drive acts where it isn't asked for so long."""
+    """Arm guard time 100Ch in ms x 100Dh factor = life time (CiA 301): the drive reacts without a request for so
+    long.
+    """
     factor = min(factor, time_ms)
     guard_ms = time_ms // factor
 
     def arm() -> tuple[str, bool]:
-        # 100Dh is one byte in the standard and two on some drives: it is written as long as it is read.
+        # 100Dh is one byte in the standard and two on some drives: it is written with the length that was read.
         length = len(objects.read_bytes(LIFE_TIME_FACTOR))
         objects.change_bytes(LIFE_TIME_FACTOR, 0, factor.to_bytes(length, "little"))
         objects.change(GUARD_TIME, 0, guard_ms, 16)
         ask()
         if not answered():
-            raise PreflightRefused("no answer to the remote frame of node guarding", where="node guarding")
+            raise PreflightRefused("no answer to the remote frame of node guarding", where="node guarding",
+                                   entry=MessageCode.WATCHDOG_NOT_ARMED)
         found = objects.read(GUARD_TIME), objects.read(LIFE_TIME_FACTOR)
         return f"{found[0]} ms x {found[1]}, answered", found == (guard_ms, factor)
 
@@ -217,10 +222,10 @@ def _arm_guarding(
 
 
 def _is_off(objects: Objects, entry: Watchdog) -> bool:
-    """Does the drive supervise nobody? So where the object isn't there, or a node or time of 0 in it (CiA 301).
+    """Return whether the drive supervises no host: the object is missing, or holds a node or time of 0 (CiA 301).
 
-    A guard time that was written although no question gets through would stop the shaft some time later: it is taken
-    back first.
+    A guard time that was written although no request reaches the drive would stop the shaft later. So it is reset
+    first.
     """
     if entry.kind == "node_guarding":
         with suppress(ObjectRefused):

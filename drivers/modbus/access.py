@@ -1,4 +1,4 @@
-"""One drive's registers over a `Link`: requests with their retries, and changes that can be given back."""
+"""One drive's registers over a `Link`: requests with their retries, and changes that can be restored."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from drivers.modbus.pdu import BUSY, BadReply, NoReply, RegisterRefused
 from profiles.modbus import Register
 
 SETTING_TIMEOUT_S = 1.0
-"""For a reply before motion: a drive may take its time over a parameter (SINAMICS p2024 allows 1 s)."""
+"""Time for a reply before motion, s: a drive may be slow with a parameter (SINAMICS p2024 allows 1 s)."""
 TRIES = 3
-"""Of a request before motion that brought no reply, or none that could be trusted."""
+"""Attempts of a request before motion without a valid reply."""
 BUSY_TRIES, BUSY_PAUSE_S = 5, 0.05
-"""Of a request that the drive put off with exception 6, and the pause in between."""
+"""Attempts of a request that the drive delayed with exception 6, and the pause between them, s."""
 
 
 class RegisterAnswer(NamedTuple):
-    """The registers that a request brought, and when it was under way (control time)."""
+    """The registers in a reply, and the control times of request and reply."""
 
     words: tuple[int, ...]
     sent_s: float
@@ -53,7 +53,7 @@ class RegisterAccess:
         return self._link.clock
 
     def once(self, pdu: bytes, timeout_s: float, where: str = "") -> RegisterAnswer:
-        """One transaction, as it comes."""
+        """Run one transaction, without retries."""
         if self._tap is not None:
             self._tap(RawFrame(self.clock.now_s(), True, self._unit, pdu))
         self.asked += 1
@@ -63,7 +63,7 @@ class RegisterAccess:
         return RegisterAnswer(requests.words_of(pdu, reply.pdu, where), reply.sent_s, reply.received_s)
 
     def ask(self, pdu: bytes, where: str = "") -> tuple[int, ...]:
-        """A request before motion: silence and garbage are asked again, and so is a drive that is busy."""
+        """Send a request before motion; repeat it after silence, a damaged reply, or a busy drive."""
         silent = busy = 0
         while True:
             try:
@@ -79,12 +79,12 @@ class RegisterAccess:
                 self.clock.wait_until(self.clock.now_s() + BUSY_PAUSE_S)
 
     def read_words(self, table: str, address: int, count: int, where: str = "") -> tuple[int, ...]:
-        """Neighbouring registers, in one request."""
+        """Read neighbouring registers, in one request."""
         function = requests.READ_HOLDING if table == "holding" else requests.READ_INPUT
         return self.ask(requests.read(function, address, count), where or f"register {address}")
 
     def read(self, register: Register) -> int:
-        """The number in a register, in counts."""
+        """Return the number in a register, in counts."""
         words = self.read_words(register.table, register.address, register.count, register_name(register))
         return from_words(words, register.type, self._order)
 
@@ -93,11 +93,11 @@ class RegisterAccess:
         self.write_words(register.address, to_words(counts, register.type, self._order), register_name(register))
 
     def write_words(self, address: int, words: tuple[int, ...], where: str = "") -> None:
-        """Neighbouring registers, in one request where the drive knows a function for that."""
+        """Write neighbouring registers, in one request if the drive has a function for it."""
         self.ask(self.write_request(address, words), where)
 
     def write_request(self, address: int, words: tuple[int, ...]) -> bytes:
-        """The PDU that writes neighbouring registers."""
+        """Return the PDU that writes neighbouring registers."""
         if len(words) == 1 and requests.WRITE_ONE in self._functions:
             return requests.write_one(address, words[0])
         if requests.WRITE_MANY in self._functions or requests.READ_WRITE not in self._functions:
@@ -105,9 +105,9 @@ class RegisterAccess:
         return requests.read_write(address, len(words), address, words)
 
     def change(self, register: Register, counts: int) -> int:
-        """Write, remember what stood there before, and read back what stands there now.
+        """Write a value, remember the former one, and return the value read back.
 
-        What stands there already is left alone: many drives keep every write in a memory that wears out.
+        An equal value is not written again: many drives save every write in a memory with limited write cycles.
         """
         before = self.read(register)
         if before == counts:
@@ -117,18 +117,18 @@ class RegisterAccess:
         return self.read(register)
 
     def press(self, register: Register, counts: int, before: int, timeout_s: float) -> None:
-        """Write in a cycle, asked once; ``before`` is given back like any change."""
+        """Write once in a cycle; ``before`` is restored like any change."""
         self._undo.setdefault((register.table, register.address), lambda: self.write(register, before))
         words = to_words(counts, register.type, self._order)
         self.once(self.write_request(register.address, words), timeout_s, register_name(register))
 
     @property
     def changed(self) -> tuple[str, ...]:
-        """Registers that stand otherwise than before."""
+        """Registers that differ from their former value."""
         return tuple(f"register {address}" for _, address in self._undo)
 
     def restore(self) -> tuple[str, ...]:
-        """Undo every change, the last one first; what could not be given back, a line each."""
+        """Undo every change, the last one first. Return the changes that could not be restored, a line each."""
         failed: list[str] = []
         while self._undo:
             _, undo = self._undo.popitem()

@@ -15,7 +15,7 @@ from drivers.errors import CommandRejected
 from profiles.modbus import CyclicSignal, Echo, ModbusProfile, Parameter, Register
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What one count means, in SI at the motor shaft: parameters' values first, then every signal's scale. Pure.
+# Value of one count, in SI at the motor shaft: parameters' values first, then the scale of every signal. Pure.
 
 
 RPM = 2.0 * math.pi / 60.0
@@ -34,7 +34,7 @@ class Scales:
 
 
 def per_count(parameter: Parameter, values: Mapping[str, float]) -> float | None:
-    """The parameter's unit for one count; None while the parameter that multiplies it isn't known."""
+    """Return the parameter's unit for one count; None while the parameter that multiplies it is unknown."""
     if parameter.factor is None:
         return parameter.per_lsb
     factor = values.get(parameter.factor)
@@ -42,7 +42,7 @@ def per_count(parameter: Parameter, values: Mapping[str, float]) -> float | None
 
 
 def settle(profile: ModbusProfile, counts: Mapping[str, int], given: Mapping[str, float]) -> dict[str, float]:
-    """Every parameter's value in its own unit, as far as it can be told: what was read, else what rig.yaml states."""
+    """Return the known values of the parameters in their own units: read from the drive, else given in rig.yaml."""
     values = {name: value for name, value in given.items() if name not in counts}
     open_ones = [parameter for parameter in profile.parameters if parameter.name in counts]
     while open_ones:
@@ -60,14 +60,14 @@ def settle(profile: ModbusProfile, counts: Mapping[str, int], given: Mapping[str
 
 
 def si_per_count(signal: CyclicSignal | Echo, values: Mapping[str, float], rated_nm: float) -> float:
-    """Rad/s or N·m for one count. Raises KeyError if a parameter that it needs isn't known."""
+    """Return rad/s or N·m for one count. Raises KeyError if a parameter that it needs is unknown."""
     unit = {"rpm": RPM, "nm": 1.0, "rated": rated_nm}[signal.unit]
     factor = values[signal.times] if signal.times is not None else 1.0
     return signal.per_lsb * factor * unit
 
 
 def find_scales(profile: ModbusProfile, values: Mapping[str, float], rated_nm: float) -> Scales | None:
-    """All of the cycle's scales; None if a parameter that one of them needs is unknown, zero or not finite."""
+    """Return all scales of the cycle; None if a parameter that one of them needs is unknown, zero or not finite."""
     cycle = profile.cycle
     found = []
     for signal in (cycle.speed_setpoint, cycle.torque_setpoint, cycle.speed, cycle.torque, cycle.torque_demand):
@@ -94,7 +94,7 @@ RANGES: dict[str, tuple[int, int]] = {
 
 
 def to_words(number: int, kind: RegisterType, order: WordOrder) -> tuple[int, ...]:
-    """A whole number → its registers, lowest address first. Raises CommandRejected outside the type's range."""
+    """Return the registers of a whole number, lowest address first. Raises CommandRejected outside the type's range."""
     low, high = RANGES[kind]
     if not low <= number <= high:
         raise CommandRejected(f"{number} doesn't fit into {kind} ({low} to {high})")
@@ -105,7 +105,7 @@ def to_words(number: int, kind: RegisterType, order: WordOrder) -> tuple[int, ..
 
 
 def from_words(words: Sequence[int], kind: RegisterType, order: WordOrder) -> int:
-    """Registers, lowest address first → the whole number."""
+    """Return the whole number in registers, lowest address first."""
     if kind in ("u16", "i16"):
         (number,) = words
         bits = 16
@@ -141,6 +141,6 @@ def to_counts(
 
 
 def register_name(register: Register) -> str:
-    """How a register is written in messages: its wire address, and the manual's way where the profile has it."""
+    """Return a register's name for messages: its wire address, and the manual's name if the profile has it."""
     name = f"{'register' if register.table == 'holding' else 'input register'} {register.address}"
     return f"{name} ({register.reference})" if register.reference else name

@@ -13,18 +13,19 @@ from drivers.modbus import pdu
 from drivers.modbus.access import RegisterAccess, RegisterAnswer
 from drivers.modbus.codec import Scales, WordOrder, from_words, register_name, to_counts, to_words
 from drivers.modbus.pdu import BUSY, NoisyReply, RegisterRefused
+from profiles import MessageCode
 from profiles.modbus import ModbusProfile, Position, Register
 
 # ---------------------------------------------------------------------------------------------------------------------
-# From a profile's registers to the fewest transactions a cycle, pure.
+# Planning of the fewest transactions per cycle from a profile's registers, pure.
 #
-# Writes never cover a register that nobody asked for; reads may take along up to `largest_gap` others. Setpoints go
-# out before the control word or together with it. With function 23 a write and a read share a transaction (the drive
-# writes first); without it each block has one of its own. Speed and torque are read last, in one transaction where
-# they can be, else in two that follow each other.
+# Writes never cover a register that was not requested; reads may include up to `largest_gap` others. Setpoints are sent
+# before the control word or together with it. With function 23 a write and a read share a transaction (the drive writes
+# first); without it each block has its own. Speed and torque are read last, in one transaction if possible, else in two
+# consecutive ones.
 #
-# What isn't needed every cycle (mode register and display, torque demand, the motor's angle) rides along where that
-# costs no transaction; the angle only beside speed or torque, so that it is of the same moment.
+# Values that are not needed every cycle (mode register and display, torque demand, the motor's angle) are included if
+# that costs no transaction; the angle only beside speed or torque, so that it belongs to the same moment.
 
 
 Words = Mapping[tuple[str, int], int]
@@ -39,7 +40,7 @@ class RegisterSpan(NamedTuple):
     length: int
 
     def covers(self, register: Register) -> bool:
-        """Does the register stand in it, as a whole?"""
+        """Return whether the span contains the whole register."""
         end = register.address + register.count
         return register.table == self.table and self.address <= register.address and end <= self.address + self.length
 
@@ -52,7 +53,7 @@ class Transaction(NamedTuple):
     read: RegisterSpan | None
 
     def request(self, image: Mapping[int, int]) -> bytes:
-        """The PDU; ``image`` has the word of every holding register that is written."""
+        """Return the PDU; ``image`` has the word of every holding register that is written."""
         words = [] if self.write is None else [image[self.write.address + k] for k in range(self.write.length)]
         if self.write is None:
             assert self.read is not None
@@ -72,7 +73,7 @@ class Transaction(NamedTuple):
 
 @dataclass(frozen=True)
 class CyclePlan:
-    """What goes over the line: ``cycle`` each time, the others when the mode changes or must be looked at."""
+    """Transactions on the line: ``cycle`` in each cycle, the others for a mode switch or its check."""
 
     cycle: tuple[Transaction, ...]
     mode_writes: tuple[Transaction, ...]
@@ -82,9 +83,9 @@ class CyclePlan:
 
 
 def plan_cycle(profile: ModbusProfile, *, position: bool = False) -> CyclePlan:
-    """The cheapest plan; ``position``: the drive is known to give the profile's angle.
+    """Return the cheapest plan; ``position``: the drive is known to give the profile's angle.
 
-    Raises PreflightRefused where the profile's functions can't do it.
+    Raises PreflightRefused if the profile's functions do not suffice.
     """
     cycle, modes = profile.cycle, profile.modes
     setpoints = [cycle.speed_setpoint.register_]
@@ -113,7 +114,7 @@ def plan_cycle(profile: ModbusProfile, *, position: bool = False) -> CyclePlan:
             feedback += extra
             if extra is mode_reads:
                 mode_reads = []
-    # Speed and torque last and side by side, so that they are as much of one moment as can be.
+    # Speed and torque last and side by side, so that their moments are as close as possible.
     moving = (cycle.speed.register_, cycle.torque.register_)
     has_position = False
     if position and profile.position is not None:
@@ -136,7 +137,7 @@ def plan_cycle(profile: ModbusProfile, *, position: bool = False) -> CyclePlan:
 
 
 def only_reads(transactions: Sequence[Transaction], functions: frozenset[int]) -> tuple[Transaction, ...]:
-    """What these transactions read, without any writing; () where the drive knows no function for that."""
+    """Return the reads of these transactions without any write; () if the drive has no function for that."""
     found = []
     for span in (one.read for one in transactions if one.read is not None and one.read != one.write):
         function = pdu.READ_HOLDING if span.table == "holding" else pdu.READ_INPUT
@@ -147,7 +148,7 @@ def only_reads(transactions: Sequence[Transaction], functions: frozenset[int]) -
 
 
 def spans(registers: Iterable[Register], gap: int, most: int) -> list[RegisterSpan]:
-    """Registers gathered into as few spans as possible, none cut in two. Raises PreflightRefused if one is too long."""
+    """Combine registers into as few spans as possible, none split. Raises PreflightRefused if one is too long."""
     found: list[RegisterSpan] = []
     for register in sorted(registers, key=lambda one: (one.table, one.address, one.count)):
         if register.count > most:
@@ -155,6 +156,7 @@ def spans(registers: Iterable[Register], gap: int, most: int) -> list[RegisterSp
                 f"a 32-bit number in register {register.address} can't be sent or read in one piece",
                 where="profile, cycle.functions",
                 next_step="Its two halves would act one after the other; the drive needs function 16 or 23 for it",
+                entry=MessageCode.MODBUS_FUNCTIONS_MISSING,
             )
         end = register.address + register.count
         if found:
@@ -169,7 +171,7 @@ def spans(registers: Iterable[Register], gap: int, most: int) -> list[RegisterSp
 
 def _pair(writes: Sequence[RegisterSpan], reads: Sequence[RegisterSpan],
           functions: frozenset[int]) -> tuple[Transaction, ...]:
-    """One transaction for a write and a read where function 23 is known; the order of the writes is kept."""
+    """Combine a write and a read into one transaction if function 23 is known. The order of the writes is kept."""
     pairable = [span for span in reads if span.table == "holding"] if pdu.READ_WRITE in functions else []
     fit = [span.length <= pdu.MOST_WRITTEN_WITH_READ for span in writes]
     pairs = min(len(writes), len(pairable)) if all(fit) else 0
@@ -190,7 +192,7 @@ def _write(span: RegisterSpan, functions: frozenset[int]) -> Transaction:
     if pdu.WRITE_MANY in functions:
         return Transaction(pdu.WRITE_MANY, span, None)
     if pdu.READ_WRITE in functions:
-        # What was written is read along: the function can't go without a read.
+        # The written span is read too: the function can't go without a read.
         return Transaction(pdu.READ_WRITE, span, span)
     raise _unable("written", span)
 
@@ -207,19 +209,20 @@ def _unable(verb: str, span: RegisterSpan) -> PreflightRefused:
         f"register {span.address} can't be {verb}: the profile names no function for it",
         where="profile, cycle.functions",
         next_step="Say there which function codes the drive knows: 3 reads, 6, 16 or 23 write",
+        entry=MessageCode.MODBUS_FUNCTIONS_MISSING,
     )
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# One round of the cycle's transactions over the line, and when speed and torque were under way.
+# One round of the cycle's transactions on the line, with the time interval of speed and torque.
 
 
 BUSY_TRIES, BUSY_PAUSE_S = 3, 0.002
-"""Of a transaction in the cycle that the drive put off with exception 6; then the cycle counts as missed."""
+"""Attempts and pause, s, of a transaction that the drive delayed with exception 6; then the cycle counts as missed."""
 
 
 class Round(NamedTuple):
-    """What the registers read were, and the control times that bound the transactions with speed and torque."""
+    """Registers read in a round, and the control times that bound the transactions with speed and torque."""
 
     words: Mapping[tuple[str, int], int]
     sent_s: float
@@ -235,9 +238,9 @@ def go_round(
     moving: Sequence[Register],
     again_until_s: float = -math.inf,
 ) -> Round:
-    """Run them one after the other; the first that fails ends the round.
+    """Run the transactions one after the other; the first that fails ends the round.
 
-    A reply that noise has damaged is asked for once more, up to ``again_until_s`` (control time): the same words.
+    A reply damaged by noise is requested once more, until ``again_until_s`` (control time).
 
     Raises CommunicationLost (NoReply, BadReply, LinkLost) and RegisterRefused.
     """
@@ -277,7 +280,7 @@ def _patiently(access: RegisterAccess, pdu: bytes, timeout_s: float, what: str, 
 # ---------------------------------------------------------------------------------------------------------------------
 
 class Setpoints(NamedTuple):
-    """A command in the drive's own counts. ``reverse``: the speed's sign, where its register has none."""
+    """A command in the drive's own counts. ``reverse``: sign of the speed, if its register has none."""
 
     speed: int
     torque: int | None
@@ -285,14 +288,14 @@ class Setpoints(NamedTuple):
 
 
 class CycleFeedback(NamedTuple):
-    """What a cycle read, in SI at the motor shaft. ``mode_word``: None where the display wasn't read along."""
+    """Values read in a cycle, in SI at the motor shaft. ``mode_word``: None if the display was not read."""
 
     status: int
     speed_rad_s: float
     torque_nm: float
     torque_demand_nm: float | None
     mode_word: int | None
-    position_rad: float | None = None          # as counted; None where the angle wasn't read along
+    position_rad: float | None = None          # as counted; None if it was not read
 
 
 class Codec:
@@ -310,7 +313,7 @@ class Codec:
         self.scales = scales
 
     def setpoints(self, command: Command) -> Setpoints:
-        """The command's counts. Raises CommandRejected for what isn't finite or doesn't fit."""
+        """Return the command's counts. Raises CommandRejected for values that are not finite or out of range."""
         entry = self._cycle.speed_setpoint
         reverse = self._signless and command.speed_rad_s < 0.0
         speed_rad_s = -command.speed_rad_s if reverse else command.speed_rad_s
@@ -326,9 +329,9 @@ class Codec:
         return Setpoints(speed, torque, reverse)
 
     def image(self, controlword: int, setpoints: Setpoints, mode: Mode) -> dict[int, int]:
-        """Every register that a cycle may write, by its address.
+        """Return every register that a cycle may write, by its address.
 
-        Where both setpoints share a register, the one of the mode that is asked for stands in it.
+        If both setpoints share a register, it holds the one of the requested mode.
         """
         image: dict[int, int] = {}
         numbers: list[tuple[Register, int]] = [(self._cycle.speed_setpoint.register_, setpoints.speed)]
@@ -346,7 +349,7 @@ class Codec:
         return image
 
     def feedback(self, words: Words) -> CycleFeedback:
-        """What was read. Raises KeyError if a register is missing."""
+        """Return the values read. Raises KeyError if a register is missing."""
         demand = self._cycle.torque_demand if self._has_demand else None
         display, position = self._modes.display, self._position
         return CycleFeedback(
@@ -364,12 +367,12 @@ class Codec:
 
 
 def rad_per_count(position: Position) -> float:
-    """One count of the motor's angle."""
+    """Return rad per count of the motor's angle."""
     return 2.0 * math.pi / position.counts_per_turn
 
 
 def shown_mode(profile: ModbusProfile, word: int) -> Mode | None:
-    """The mode that the drive displays; None for another one, or where it doesn't tell."""
+    """Return the mode that the drive displays; None for another one, or if it displays none."""
     display = profile.modes.display
     if display is None:
         return None

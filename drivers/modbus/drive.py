@@ -1,12 +1,12 @@
-"""A drive on Modbus, as `drivers.drive.Drive` asks for it.
+"""A drive on Modbus, with the interface of `drivers.drive.Drive`.
 
 One cycle, sent by this loop and nothing else::
 
     tick ─ setpoints (─ control word) ─ read status, speed, torque   (one transaction where the drive has function 23)
 
-A sample's time is the middle of the transactions that brought speed and torque, give or take half of what they took.
-A cycle without a good reply is retried by the next one, with fresh setpoints; when half of the drive's watchdog time
-has gone by like that, the drive counts as lost.
+The time of a sample is the middle of the transactions that brought speed and torque, with half their duration as
+uncertainty. The next cycle retries a cycle without a valid reply, with fresh setpoints. Without a valid reply for half
+of the drive's watchdog time the drive counts as lost.
 """
 
 from __future__ import annotations
@@ -65,28 +65,29 @@ from drivers.modbus.temperature import Heat
 from drivers.modbus.watchdog import arm_watchdog, check_who_feeds, measure_pace
 from drivers.own_limits import SPEED, TORQUE, OwnLimits
 from drivers.preflight import PreflightTable
+from profiles import MessageCode
 from profiles.modbus import ModbusProfile, Register, StatusState
 
 REPEAT_MODE_CYCLES = 25
-"""A mode that isn't displayed yet is asked for again after so many cycles: one lost write must not end a run."""
+"""A mode that is not displayed is requested again after this number of cycles: one lost write must not end a run."""
 READ_MODE_CYCLES = 20
-"""How often the mode display is read where it costs a transaction of its own."""
+"""Cycles between two readings of the mode display, if it costs a transaction of its own."""
 RESET_PAUSE_S = 0.1
-"""Between the words of a fault reset, for drives that look at their field bus every few ten milliseconds."""
+"""Pause between the words of a fault reset, s: some drives read their field bus only every few ten milliseconds."""
 BUDGET_SHARE = 0.5
-"""Of the watchdog time that may go by without a good reply, or with this loop standing still."""
+"""Share of the watchdog time that may pass without a valid reply, or with a delay of this loop."""
 
 LOCAL_CYCLES = 3
-"""A bit that is missing in so many cycles is no accident of one reply."""
+"""A missing bit counts after this number of cycles; one damaged reply does not matter."""
 SETTLED_CYCLES = 5
-"""Without an enabled drive, after which one that is enabled again wasn't enabled by this run."""
+"""Cycles without an enabled drive; a drive that is enabled after them was not enabled by this run."""
 INSIST_SHARE = 0.8
-"""Of a period, that the stop's words are repeated in against somebody who goes on commanding the drive."""
+"""Share of a period in which the words of the stop are repeated against another master."""
 SILENT_TIMES = 1.5
-"""Of the watchdog's time, that a drive whose watchdog is to act is not even read, where reading feeds it."""
+"""Multiple of the watchdog's time without any read, if reading feeds the watchdog that must trip."""
 
 PRESS_EVERY_S = 0.1
-"""How often the drive's own speed limit is lowered against another master."""
+"""Interval at which the drive's own speed limit is lowered against another master, s."""
 
 _NO_SETPOINTS = Setpoints(0, 0, False)
 _NOTHING_YET = CycleFeedback(0, 0.0, 0.0, None, None)
@@ -99,8 +100,8 @@ _NONE_YET = (PowerState.NOT_READY, PowerState.UNKNOWN)
 class ModbusDrive:
     """One unit on a link.
 
-    ``rated_torque_nm`` replaces what the drive doesn't say, ``given`` the values of parameters that can't be
-    read over the bus (in the profile's units); ``tap`` sees every PDU.
+    ``rated_torque_nm`` replaces a value that the drive does not report. ``given`` holds the values of parameters that
+    can't be read over the bus (in the profile's units). ``tap`` gets every PDU.
     """
 
     def __init__(
@@ -158,14 +159,14 @@ class ModbusDrive:
 
     @property
     def counters(self) -> Counters:
-        """What went wrong on the line so far."""
+        """Errors on the line since the start."""
         late = late_replies(self._link) - self._late_before
         return Counters(self._cycles, self._missed, late, self._ticks.overruns)
 
     # -- before motion ---------------------------------------------------------------------------------------
 
     def connect(self) -> Identity:
-        """Find the drive and tell whether it is simulated. Writes nothing."""
+        """Find the drive and detect whether it is simulated. Writes nothing."""
         refuse_if_driven(self._access, self._profile, self._where)
         marker = read_marker(self._access)
         if self.clock.stepped:
@@ -175,13 +176,13 @@ class ModbusDrive:
         return self._identity
 
     def announce(self, stage: str) -> None:
-        """Tell a simulated peer that a stage of the protocol begins; a real drive is told nothing."""
+        """Send a stage of the run to a simulated peer. Nothing is sent to a real drive."""
         self._stage = stage
         if self._identity is not None and self._identity.simulated:
             tell_stage(self._access, stage)
 
     def preflight(self, limits: DriveLimits) -> Preflight:
-        """Check, set and read back; leaves the drive disabled, with setpoints of zero, and watched."""
+        """Check, set and read back. The drive is then disabled, with setpoints of zero, and supervised."""
         if self._identity is None:
             raise PreflightRefused("preflight before connect", where="driver")
         table, access, profile = PreflightTable(), self._access, self._profile
@@ -262,31 +263,33 @@ class ModbusDrive:
         return controlword_towards(self._profile.control, None, PowerRequest.OFF, Mode.SPEED)
 
     def _idle_round(self) -> Round:
-        """A whole cycle that asks for nothing: disabled, setpoints of zero; with the mode display's own read."""
+        """Run a whole cycle without a request: disabled, setpoints of zero; with the mode display's own read."""
         image = self._codec.image(self._off_word(), _NO_SETPOINTS, Mode.SPEED)
         return go_round(self._access, (*self._plan.cycle, *self._plan.mode_reads), image, 1.0, self._moving)
 
     # -- the cycle -------------------------------------------------------------------------------------------
 
     def enable(self, mode: Mode) -> None:
-        """From the next cycle on move towards operation enabled in ``mode``."""
+        """Move towards operation enabled in ``mode``, from the next cycle on."""
         if mode not in self._modes:
             raise PreflightRefused(
                 f"the drive has no {mode.value} mode, or was not prepared for it", where="profile, modes",
                 next_step="Use --mode speed",
+                entry=MessageCode.NO_TORQUE_MODE,
             )
         self._wish, self._was_enabled, self._told_fault = PowerRequest.ENABLED, False, False
         self._ever_asked = True
 
     def quick_stop(self) -> None:
-        """From the next cycle on the profile's quick-stop word; it isn't ended by enabling."""
+        """Send the profile's quick-stop word from the next cycle on. Enabling does not end it."""
         self._wish = PowerRequest.QUICK_STOP
 
     def stop_feeding(self) -> None:
-        """See `drivers.drive.StopsFeeding`; where reading feeds the watchdog, nothing is asked until it had its time.
+        """Stop feeding the watchdog; see `drivers.drive.StopsFeeding`. If reading feeds it, nothing is sent until it
+        tripped.
 
-        Raises CommandRejected where another master commands the drive and so feeds it, too: silence would leave the
-        shaft to that one alone, so the quick stop goes on being repeated.
+        Raises CommandRejected if another master commands the drive and feeds the watchdog too. Silence would leave the
+        shaft to that master, so the quick stop is repeated.
         """
         if self._other.seen and not self._profile.watchdog.fed_by_us_alone:
             raise CommandRejected(
@@ -298,17 +301,18 @@ class ModbusDrive:
             self._silent_since_s = self.clock.now_s()
 
     def disable(self) -> None:
-        """From the next cycle on off; a shaft that still turns under power is braked first."""
+        """Move towards off from the next cycle on. A shaft that turns under power is braked first."""
         self._wish = PowerRequest.OFF
 
     def remove_torque(self) -> None:
-        """From the next cycle on off, whatever the reported speed is; see `drivers.drive.RemovesTorque`."""
+        """Move towards off from the next cycle on at any reported speed; see `drivers.drive.RemovesTorque`."""
         self._wish, self._removes_torque = PowerRequest.OFF, True
 
     def reset_fault(self) -> None:
-        """The profile's words one after the other, between connect and preflight; only on an operator's word.
+        """Write the profile's reset words one after the other, between connect and preflight, at the operator's
+        request.
 
-        Nothing is written to a drive that isn't in fault: such words could let go of a shaft that it holds.
+        Nothing is written to a drive without a fault: such words could release a shaft that it holds.
         """
         control = self._profile.control
         status = self._access.read(self._profile.cycle.status.register_) & 0xFFFF
@@ -319,12 +323,11 @@ class ModbusDrive:
             self.clock.wait_until(self.clock.now_s() + RESET_PAUSE_S)
 
     def exchange(self, command: Command) -> Sample:
-        """One cycle: wait for the tick, write, read.
+        """Run one cycle: wait for the tick, write, read.
 
-        Raises CommunicationLost (no good reply within half the watchdog time, line gone, a loop that was frozen,
-        somebody else who commands the drive or changes what the run rests on), LimitHit (too hot),
-        DriveFault (fault state, a refused request) and CommandRejected; each trouble of the drive once, so that a stop
-        can go on exchanging.
+        Raises CommunicationLost (no valid reply within half the watchdog time, line lost, delayed loop, another master
+        that commands the drive or changes its settings), LimitHit (temperature), DriveFault (fault state, a refused
+        request) and CommandRejected. Each error of the drive is raised once, so that a stop can continue to exchange.
         """
         if command.mode not in self._modes:
             raise CommandRejected(f"the drive was not prepared for {command.mode.value} mode", where="driver")
@@ -338,7 +341,7 @@ class ModbusDrive:
         if self._wish is PowerRequest.ENABLED:
             self._heat.poll(self._timeout_s)
         turning = not self._standstill.near(self._feedback.speed_rad_s)
-        # Nothing is disabled that was enabled and shows no valid state: it is braked, whatever its speed is said to be.
+        # A drive that was enabled and shows no valid state is not disabled: it is braked at any reported speed.
         unknown = self._ever_enabled and power_state(self._state) is PowerState.UNKNOWN
         word = controlword_towards(
             self._profile.control, self._state, self._wish, command.mode, reverse=self._reverse,
@@ -373,7 +376,7 @@ class ModbusDrive:
         return self._sample(got.sent_s + half_s, half_s, half_s, fresh=True)
 
     def _poll_other_masters(self) -> None:
-        """Raises CommunicationLost once; the stop that follows goes on exchanging."""
+        """Check for another master. Raises CommunicationLost once; the stop that follows continues to exchange."""
         if self._other.seen and self._wish is not PowerRequest.ENABLED:
             return                     # known, and the line is needed for the stop
         try:
@@ -388,7 +391,7 @@ class ModbusDrive:
                 raise
 
     def _insist(self, got: Round, setpoints: Setpoints, mode: Mode, begun_s: float) -> Round:
-        """Against somebody who goes on commanding: the stop's words again, as often as the period has room for."""
+        """Repeat the words of the stop against another master, as often as the period permits."""
         until_s = begun_s + INSIST_SHARE * self.period_s
         self._press_speed_limits(begun_s)
         took_s = 0.0
@@ -403,19 +406,19 @@ class ModbusDrive:
                     self._moving,
                 )
             except (CommunicationLost, RegisterRefused):
-                break                  # the next cycle tells of it
+                break                  # the next cycle reports it
             self._feedback = self._codec.feedback(got.words)
             self._state = self._decoded(self._feedback.status)
             took_s = self.clock.now_s() - sent_s
-            if took_s <= 0.0:          # a line that takes no time has no end of room
+            if took_s <= 0.0:          # a line without delay would never leave this loop
                 break
         self._ticks.done()
         return got
 
     def _press_speed_limits(self, now_s: float) -> None:
-        """A quick stop that is ended again and again begins its ramp anew each time and never gets anywhere.
+        """Lower the drive's own speed limit along the quick-stop ramp, against any setpoint; `close` restores it.
 
-        So the drive's own speed limit goes down along that ramp, whoever's setpoint acts; `close` gives it back.
+        A quick stop that is ended repeatedly starts its ramp anew each time and makes no progress.
         """
         recently = self._pressed_s is not None and now_s < self._pressed_s + PRESS_EVERY_S
         if recently or power_state(self._state) not in _DRIVEN:
@@ -430,13 +433,13 @@ class ModbusDrive:
                 self._access.press(register, counts if before >= 0 else -counts, before, self._timeout_s)
 
     def _may_write(self) -> bool:
-        """Not once the drive is left to its watchdog; but a shaft at rest that nothing drives may be disabled."""
+        """True if this cycle may write: not after feeding has ended, except to disable a shaft at a safe standstill."""
         if self._silent_since_s is None:
             return True
         return self._wish is PowerRequest.OFF and self._at_rest and power_state(self._state) not in _MAY_DRIVE
 
     def _watch(self) -> Sample:
-        """A cycle that only reads, or not even that while reading feeds the watchdog."""
+        """Run a cycle that only reads, or not even that while reading feeds the watchdog."""
         begun_s = self.clock.now_s()
         self._cycles += 1
         sample = self.poll()
@@ -454,9 +457,10 @@ class ModbusDrive:
             raise
 
     def poll(self) -> Sample | None:
-        """Plain reads, for a stop whose cycles fail: a drive that refuses to be written to may still report how it is.
+        """Read without writing, for a stop whose cycles fail: a drive that refuses writes may still report its state.
 
-        While it shows itself enabled the quick-stop word is written by itself, once each time. The angle comes last.
+        While the drive shows itself enabled, the quick-stop word is written alone, once each time. The angle comes
+        last.
         """
         if not self._reads or self._must_be_silent():
             return None
@@ -480,14 +484,14 @@ class ModbusDrive:
         return self._sample(got.sent_s + half_s, half_s, half_s, fresh=True)
 
     def _must_be_silent(self) -> bool:
-        """Would reading keep the watchdog from acting that is to act?"""
+        """True if a read would feed a watchdog that must trip."""
         entry = self._profile.watchdog
         by_reading = entry.fed_by_any_client or entry.fed_by == "requests_of_this_connection"
         since_s = self._silent_since_s
         return since_s is not None and by_reading and self.clock.now_s() - since_s < SILENT_TIMES * self._watchdog_s
 
     def read_position(self) -> PositionReading | None:
-        """The motor's angle, in one transaction between two cycles; None where there is none, or no good reply."""
+        """Read the motor's angle in one transaction between two cycles; None if there is none, or no valid reply."""
         if self._angle is None:
             return None
         found = self._angle.read(self._access, self._timeout_s)
@@ -496,7 +500,7 @@ class ModbusDrive:
         return found
 
     def _push(self) -> None:
-        """The control word of a quick stop alone, in the shortest request that the drive knows."""
+        """Write the control word of a quick stop alone, in the shortest request that the drive supports."""
         control = self._profile.cycle.control.register_
         word = controlword_towards(
             self._profile.control, self._state, PowerRequest.QUICK_STOP, self._sent_mode, reverse=self._reverse
@@ -504,10 +508,12 @@ class ModbusDrive:
         try:
             self._access.once(self._access.write_request(control.address, (word,)), self._timeout_s)
         except (CommunicationLost, RegisterRefused):
-            return                     # the next look sees what became of it
+            return                     # the next poll shows the result
 
     def _transactions(self, mode: Mode) -> tuple[Transaction, ...]:
-        """The plan's, with those that only a mode switch needs: the mode after its setpoint, then its display."""
+        """Return the plan's transactions, with those of a mode switch: the mode after its setpoint, then its
+        display.
+        """
         plan, found = self._plan, self._plan.cycle
         self._since_mode_sent += 1
         self._since_mode_read += 1
@@ -522,7 +528,7 @@ class ModbusDrive:
         return found
 
     def _fail(self, error: CommunicationLost | RegisterRefused, begun_s: float) -> None:
-        """A cycle without feedback: raise what must be, each once."""
+        """Handle a cycle without feedback; each error is raised once."""
         if isinstance(error, LinkLost):
             self._stay_out()
             raise error
@@ -542,10 +548,13 @@ class ModbusDrive:
                 f"no good reply for {silent_s:.2f} s, last: {error.what}",
                 where=self._where,
                 next_step="Check cable, supply and termination; the drive's own watchdog stops the shaft",
+                entry=MessageCode.FEEDBACK_LOST,
             ) from error
 
     def _stay_out(self) -> None:
-        """Whatever comes back on the line must not find an enable and a setpoint: a new enable is needed."""
+        """End the enable request: a line that recovers must not carry an enable and a setpoint without a new
+        request.
+        """
         if self._wish is PowerRequest.ENABLED:
             self._wish = PowerRequest.QUICK_STOP
 
@@ -567,7 +576,7 @@ class ModbusDrive:
         self._at_rest = known and (at_zero if said is None else seen(said, feedback.status))
 
     def _follow_state(self) -> None:
-        """A drive that fell out of operation stays out until it is asked in again. Raises DriveFault, once."""
+        """Keep a drive that left operation out of it until it is enabled again. Raises DriveFault, once."""
         power = power_state(self._state)
         if power is PowerState.FAULT:
             asked, self._wish = self._wish, PowerRequest.OFF
@@ -582,7 +591,7 @@ class ModbusDrive:
             out, self._out_of_operation = self._out_of_operation, self._out_of_operation + 1
             if power is PowerState.ENABLED:
                 self._out_of_operation = 0
-                # What was sent just before the wish changed may still take effect.
+                # A request sent just before this one may still take effect.
                 self._other.seen = self._other.seen or out >= SETTLED_CYCLES
                 if out >= SETTLED_CYCLES and not self._told_other:
                     self._told_other = True
@@ -591,6 +600,7 @@ class ModbusDrive:
                         f" {self._feedback.status:04X}h: somebody else commands it",
                         where=f"{self._where}, {register_name(self._profile.cycle.control.register_)}",
                         next_step="Take the other master off the drive (PLC, panel, gateway)",
+                        entry=MessageCode.FOREIGN_MASTER,
                     )
         elif self._wish is PowerRequest.ENABLED:
             if power is PowerState.ENABLED:
@@ -600,7 +610,7 @@ class ModbusDrive:
                 self._wish = PowerRequest.QUICK_STOP       # it may be in operation after all: one word can be wrong
 
     def _follow_remote(self) -> None:
-        """Raises CommunicationLost, once, where the bus has lost control of an enabled drive."""
+        """Check remote control. Raises CommunicationLost, once, if the bus has lost control of an enabled drive."""
         remote, status = self._profile.control.remote, self._feedback.status
         if remote is None or seen(remote, status):
             self._was_remote, self._local = remote is not None, 0
@@ -611,6 +621,7 @@ class ModbusDrive:
                 f"the bus no longer controls the drive: its status {status:04X}h does not show remote control",
                 where=f"{self._where}, {register_name(self._profile.cycle.status.register_)}",
                 next_step="Was the drive switched to its panel or another source? Give control back, and start anew",
+                entry=MessageCode.FOREIGN_MASTER,
             )
 
     def _sample(self, time_s: float, age_s: float, half_width_s: float, *, fresh: bool) -> Sample:
@@ -635,11 +646,10 @@ class ModbusDrive:
     # -- afterwards ------------------------------------------------------------------------------------------
 
     def close(self) -> tuple[str, ...]:
-        """Give the drive its former settings back and let go of the line; setpoints stay at zero.
+        """Restore the drive's former settings and close the line; setpoints stay at zero. Return what was not restored.
 
-        Only of a drive that is known to be disabled, which one that was enabled and shows no state since isn't:
-        otherwise its watchdog stays armed and the silence that follows makes it act. What could not be given back is
-        returned.
+        Settings are restored only if the drive is known to be disabled. A drive that was enabled and has shown no state
+        since is not known to be. Its watchdog stays armed then, and the silence that follows triggers it.
         """
         left: tuple[str, ...] = ()
         power = power_state(self._state)

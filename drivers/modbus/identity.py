@@ -1,4 +1,4 @@
-"""Who is at the other end: whether it bears the simulator's marker, and in whose time it lives."""
+"""Identity of the peer: whether it has the simulator's marker, and whether its time is stepped."""
 
 from __future__ import annotations
 
@@ -18,19 +18,20 @@ from profiles import (
     MARKER_STAGE_REGISTER,
     MARKER_TEXT,
     STAGE_NUMBERS,
+    MessageCode,
 )
 from profiles.modbus import ModbusProfile
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Telling a simulated peer which stage of the protocol begins: its scripted faults wait for it.
+# Sending the stage of the run to a simulated peer: its scripted faults wait for it.
 
 
 _LONGEST_S = 0.05
-"""For the reply, in the middle of a run: a rehearsal must not cost the run its beat."""
+"""Longest wait for the reply during a run, s: a rehearsal must not delay the cycle."""
 
 
 def tell_stage(access: RegisterAccess, stage: str) -> None:
-    """One request, asked once; whether it gets through is the peer's concern. Anything but a stage is not told."""
+    """Send one request, without retries and without a check of the reply. Only stages are sent."""
     number = STAGE_NUMBERS.get(stage)
     if number is None:
         return
@@ -42,14 +43,14 @@ def tell_stage(access: RegisterAccess, stage: str) -> None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 class Marker(NamedTuple):
-    """``stepped`` only of a simulated peer."""
+    """``stepped`` is true only for a simulated peer."""
 
     simulated: bool
     stepped: bool
 
 
 def read_marker(access: RegisterAccess) -> Marker:
-    """The marker block and the register after it. A drive that refuses these addresses, or is silent there, is real."""
+    """Read the marker block and the register after it. A drive that refuses these addresses, or is silent, is real."""
     where = f"register {MARKER_REGISTER}"
     try:
         words = access.read_words("holding", MARKER_REGISTER, MARKER_REGISTERS + 1, where)
@@ -61,7 +62,7 @@ def read_marker(access: RegisterAccess) -> Marker:
 
 
 def refuse_if_driven(access: RegisterAccess, profile: ModbusProfile, where: str) -> None:
-    """Before anything is sent that could change what a turning shaft does. Raises PreflightRefused."""
+    """Refuse an enabled drive before a request could change a turning shaft's motion. Raises PreflightRefused."""
     register = profile.cycle.status.register_
     where = f"{where}, {register_name(register)}"
     try:
@@ -71,22 +72,24 @@ def refuse_if_driven(access: RegisterAccess, profile: ModbusProfile, where: str)
             f"no drive answers: {error.what}",
             where=where,
             next_step="Check that it is powered, its unit number (--unit), and on a serial line baud rate, parity and "
-            "the two wires' polarity",
+            "the two wires' polarity", entry=MessageCode.NO_DRIVE_FOUND,
         ) from error
     if power_state(decode(profile.control, status)) is PowerState.ENABLED:
         raise PreflightRefused(
             f"the drive is enabled already (status {status:04X}h): another master drives it",
             where=where,
             next_step="Take that master off the bus, or disable the drive there; nothing was written to it",
+            entry=MessageCode.ANOTHER_MASTER,
         )
 
 
 def refuse_unless_stepped(marker: Marker) -> None:
-    """Stepped time is for a simulated peer that steps along. Raises PreflightRefused."""
+    """Refuse stepped time for a peer that is not in stepped time. Raises PreflightRefused."""
     if not marker.stepped:
         what = "lives in its own time" if marker.simulated else "does not bear the simulator's marker"
         raise PreflightRefused(
             f"stepped time was asked for, but the peer {what}",
             where=f"register {MARKER_REGISTER}",
             next_step="Leave --stepped out: a real shaft moves in real time",
+            entry=MessageCode.NOT_THE_SIMULATOR,
         )

@@ -1,7 +1,7 @@
-"""What a Modbus line must do for the driver: one request, one reply, and the two moments that bound it.
+"""Interface of a Modbus line for the driver: one request, one reply, and the two times that bound the transaction.
 
-Frames are pymodbus's, the transaction is our own: its client connects anew by itself, and can't tell a foreign reply, a
-wrong CRC and silence apart (docs/decisions/0008).
+pymodbus makes the frames; the transaction is our own. Its client reconnects by itself, and can't distinguish a foreign
+reply, a wrong CRC and silence (docs/decisions/0008).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from drivers.modbus.pdu import NoReply
 
 
 class Reply(NamedTuple):
-    """A reply PDU. ``sent_s``: the request began to be sent; ``received_s``: the reply was complete (control time)."""
+    """A reply PDU. ``sent_s``: start of sending the request; ``received_s``: end of the reply (control time)."""
 
     pdu: bytes
     sent_s: float
@@ -24,7 +24,7 @@ class Reply(NamedTuple):
 class Link(Protocol):
     """A line with drives on it, one transaction at a time.
 
-    A link may also have ``late``: how many replies came after their time and were dropped (`late_replies`).
+    A link may also have ``late``: the number of replies that came after their time and were dropped (`late_replies`).
     """
 
     @property
@@ -34,7 +34,7 @@ class Link(Protocol):
     def description(self) -> str: ...
 
     def transact(self, unit: int, pdu: bytes, timeout_s: float) -> Reply:
-        """One request PDU (function code and data) and its reply PDU; exception replies are replies too.
+        """Send one request PDU (function code and data) and return its reply PDU; exception replies are replies too.
 
         Raises `drivers.modbus.pdu`: NoReply, BadReply, LinkLost.
         """
@@ -44,20 +44,20 @@ class Link(Protocol):
 
 
 def late_replies(link: Link) -> int:
-    """How many late replies a link has dropped so far; 0 where it doesn't count them."""
+    """Return the number of late replies that a link has dropped; 0 if it does not count them."""
     return int(getattr(link, "late", 0))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A line to a drive in the same process and the same time: no socket, no thread; waiting is what moves the drive on.
+# A line to a drive in the same process and time: no socket, no thread; waiting advances the drive.
 
 
 Serve = Callable[[int, bytes, float], tuple[bytes | None, float]]
-"""(unit, request PDU, control time) → the reply PDU, None where nobody answers, and when it is complete."""
+"""(unit, request PDU, control time) → the reply PDU, None without an answer, and the time when it is complete."""
 
 
 class EmbeddedLink:
-    """Hands each request to ``serve`` and waits, on its clock, until the reply would have come over a real line."""
+    """Passes each request to ``serve`` and waits, on its clock, until the reply would have come over a real line."""
 
     def __init__(
         self, serve: Serve, clock: Clock, *, description: str = "embedded simulator",
@@ -70,7 +70,7 @@ class EmbeddedLink:
         self._on_close = on_close
 
     def transact(self, unit: int, pdu: bytes, timeout_s: float) -> Reply:
-        """Raises NoReply where nobody answers in time; a reply that is complete later is dropped."""
+        """Raise NoReply without an answer in time; a reply that is complete later is dropped."""
         sent_s = self.clock.now_s()
         reply, complete_s = self._serve(unit, pdu, sent_s)
         if reply is None or complete_s > sent_s + timeout_s:
@@ -84,5 +84,5 @@ class EmbeddedLink:
         return Reply(reply, sent_s, complete_s)
 
     def close(self) -> None:
-        """Tell the other side, if it wants to know."""
+        """Notify the other side, if it has registered for it."""
         self._on_close()

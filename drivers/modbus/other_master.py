@@ -1,9 +1,9 @@
-"""Somebody else who writes to the drive during a run: words in its registers that aren't ours, settings that changed.
+"""Detection of another master that writes to the drive during a run: foreign words, and changed settings.
 
-Now and then, just before a cycle writes, what the cycle writes is read: control word and setpoints must be some that
-this host has sent within the last half second (an adapter's process image may lag). A register is believed once it has
-read back a number other than zero: not every drive shows its words again. In between, the settings that a run rests on
-(watchdog and reaction, limits, what preflight requires, what scales the signals) must read as they did at its end.
+From time to time, just before a cycle writes, the registers that the cycle writes are read. Control word and setpoints
+must be values that this host has sent within the last half second (an adapter's process image may lag). A register
+counts once it has returned a number other than zero, because some drives do not show their words. In between, the
+settings of the run (watchdog and reaction, limits, requirements of preflight, scales of the signals) must be unchanged.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from drivers.modbus.codec import from_words, per_count, register_name, si_per_co
 from drivers.modbus.cycle import CyclePlan, RegisterSpan, spans
 from drivers.modbus.parameters import show
 from drivers.modbus.pdu import LinkLost, RegisterRefused
+from profiles import MessageCode
 from profiles.modbus import CyclicSignal, ModbusProfile, Parameter, Register
 
 REMEMBERED_S = 0.5
 EVERY_S, EVERY_TIGHT_S = 0.1, 0.5
-"""Between two looks on an average: where the line has room for them, and where it has none."""
+"""Mean interval between two checks, s: with room on the line, and without."""
 SETTINGS_EVERY, SETTINGS_EVERY_TIGHT = 8, 2
-"""Of so many looks one is at the settings."""
+"""One of this number of checks reads the settings."""
 GOLDEN = 0.6180339887498949
-"""Looks at even intervals would miss for ever somebody who writes in step with them."""
+"""Golden ratio: it spreads the checks, so that they never stay in step with another master's writes."""
 ROOM = 0.8
-"""Of the period that a cycle with a look may take."""
+"""Share of the period that a cycle with a check may take."""
 _TAKE_OFF = "Take the other master off the drive (PLC, panel, commissioning tool, gateway)"
 
 
@@ -43,7 +44,7 @@ class _WrittenRegister(NamedTuple):
 
 
 class OtherMaster:
-    """Knows what this host has sent and what the settings were; `poll` is to be called before a cycle writes."""
+    """Records what this host has sent and the settings; `poll` must be called before a cycle writes."""
 
     def __init__(self, access: RegisterAccess, profile: ModbusProfile, plan: CyclePlan) -> None:
         self._access = access
@@ -60,15 +61,15 @@ class OtherMaster:
         self._keep = self._polls = self._settings_polls = 0
         self._tight = False
         self._next_s = 0.0
-        self.seen = False              # somebody else has commanded, at some time
+        self.seen = False              # another master has commanded the drive
 
     def prepare(
         self, read_back: Collection[str], values: Mapping[str, float], rated_nm: float, period_s: float,
         round_s: float, transactions: int, feed: Callable[[], object],
     ) -> None:
-        """At the end of preflight: the settings as they stand. ``read_back``: setpoints ('speed') known to show again.
+        """Record the settings at the end of preflight. ``read_back``: setpoints ('speed') that are known to read back.
 
-        ``round_s``: what a cycle of so many ``transactions`` takes. ``feed`` keeps the watchdog quiet meanwhile.
+        ``round_s``: duration of a cycle of so many ``transactions``. ``feed`` feeds the watchdog meanwhile.
         """
         self._values = values
         words = _words_of(self._profile, values, rated_nm)
@@ -87,22 +88,22 @@ class OtherMaster:
             try:
                 found = self._access.read_words(span.table, span.address, span.length)
             except RegisterRefused:
-                if len(inside) > 1:    # one of them, or what lies between: each by itself, then
+                if len(inside) > 1:    # one of them, or a register between: read each alone
                     registers = [one.register_ for one in inside if one.register_ is not None]
                     open_ones += [RegisterSpan(one.table, one.address, one.count) for one in registers]
-                continue               # what the drive doesn't show was told, or refused, where it was needed
+                continue               # a missing register was noted or refused earlier
             self._settings.append((span, [(one, self._number(one.register_, span, found)) for one in inside]))
         self._next_s = self._access.clock.now_s()
 
     def sent(self, image: Mapping[int, int]) -> None:
-        """These words go out, and may reach the drive."""
+        """Record the words of a cycle before they are sent."""
         for address, word in image.items():
             self._sent.setdefault(address, deque(maxlen=self._keep or None)).append(word)
 
     def poll(self, timeout_s: float) -> None:
-        """One read, if it is time. Raises CommunicationLost, naming what somebody else has written.
+        """Read once if it is due. Raises CommunicationLost with the value that another master has written.
 
-        A look without an answer is none: the cycle tells of a bad line.
+        A check without an answer is ignored: the cycle reports a bad line.
         """
         now_s = self._access.clock.now_s()
         if now_s < self._next_s - 1e-9 or not self._keep:
@@ -150,6 +151,7 @@ class OtherMaster:
                     f" wrote {word.shown(last)}",
                     where=register_name(register),
                     next_step=f"{_TAKE_OFF}; one master only may write control word and setpoints",
+                    entry=MessageCode.FOREIGN_MASTER,
                 )
 
     def _compare_settings(self, span: RegisterSpan, found: tuple[int, ...],
@@ -164,10 +166,11 @@ class OtherMaster:
                     f" {self._shown(parameter, before)}, and is {self._shown(parameter, now)}",
                     where=register_name(register),
                     next_step=f"{_TAKE_OFF}; see to this setting before the next run",
+                    entry=MessageCode.FOREIGN_MASTER,
                 )
 
     def _matters(self, parameter: Parameter) -> bool:
-        """Does the run's safety or its result rest on it?"""
+        """Return whether the safety or the result of the run depends on the parameter."""
         watchdog, cycle = self._profile.watchdog, self._profile.cycle
         signals = (cycle.speed_setpoint, cycle.torque_setpoint, cycle.speed, cycle.torque)
         scaling = {signal.times for signal in signals if signal is not None} | {self._profile.rated_torque}
@@ -192,7 +195,7 @@ class OtherMaster:
 
 
 def _words_of(profile: ModbusProfile, values: Mapping[str, float], rated_nm: float) -> list[_WrittenRegister]:
-    """Control word and setpoints, shown in SI."""
+    """Return control word and setpoints, with text in SI."""
     cycle = profile.cycle
 
     def in_si(signal: CyclicSignal, unit: str) -> Callable[[int], str]:

@@ -1,6 +1,6 @@
-"""The drive's parameters as preflight reads them: values, what they must be, scales, name plate, filters.
+"""The drive's parameters in preflight: values, requirements, scales, name plate, filters.
 
-Nothing is written here: what is wrong with addresses, word order, sign or scale is to show before the first write.
+Nothing is written here: a wrong address, word order, sign or scale must show before the first write.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ UNITS = {"rpm": "rpm", "rpm_s": "rpm/s", "nm": "N·m", "rated": "of rated torque
 
 @dataclass(frozen=True)
 class Parameters:
-    """What the drive and rig.yaml told: counts as read, values in their own units."""
+    """Parameters from the drive and rig.yaml: counts as read, values in their own units."""
 
     counts: Mapping[str, int]
     values: Mapping[str, float]
@@ -34,9 +34,9 @@ def read_parameters(
     table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, given: Mapping[str, float],
     spared: Collection[str] = (),
 ) -> Parameters:
-    """Read every parameter that has a register; what is needed and can't be told is a refused row.
+    """Read every parameter that has a register. A needed value that is not available is a refused row.
 
-    ``spared``: the watchdog's own, where it is off and the operator has accepted that.
+    ``spared``: parameters of the watchdog, if it is off and the operator has accepted that.
     """
     counts: dict[str, int] = {}
     for parameter in profile.parameters:
@@ -72,7 +72,7 @@ def read_parameters(
 
 
 def needed(profile: ModbusProfile, parameter: Parameter) -> bool:
-    """Does anything rest on this parameter's value?"""
+    """Return whether anything depends on this parameter's value."""
     if parameter.require is not None or parameter.set_to is not None:
         return True
     cycle, watchdog, plate = profile.cycle, profile.watchdog, profile.name_plate
@@ -88,7 +88,7 @@ def needed(profile: ModbusProfile, parameter: Parameter) -> bool:
 def check_required(
     table: PreflightTable, profile: ModbusProfile, found: Parameters, spared: Collection[str] = ()
 ) -> None:
-    """The checklist: parameters that must stand as the profile says; they are set at the drive, never from here."""
+    """Check the parameters that the profile requires; they are set at the drive, never by tdhil."""
     for parameter in profile.parameters:
         require, value = parameter.require, found.values.get(parameter.name)
         if require is None:
@@ -106,7 +106,7 @@ def check_required(
 
 
 def satisfied(require: Require, value: float, lsb: float) -> bool:
-    """Within half a count of what is required."""
+    """Return whether the value is within half a count of the requirement."""
     half = 0.5 * lsb
     return (
         (require.equals is None or abs(value - require.equals) <= half)
@@ -119,7 +119,7 @@ def satisfied(require: Require, value: float, lsb: float) -> bool:
 def find_rated_torque(
     table: PreflightTable, profile: ModbusProfile, found: Parameters, rated_torque_nm: float | None
 ) -> float | None:
-    """N·m that are 100 %: rig.yaml's, which the drive must not contradict, else its own; None where neither tells."""
+    """Return the N·m of 100 %: rig.yaml's, which the drive must confirm, else the drive's; None if both are missing."""
     name = profile.rated_torque
     from_drive = found.values.get(name) if name is not None else None
     where = "profile, rated_torque" if name is None else where_of(profile.parameter(name))
@@ -132,7 +132,7 @@ def find_rated_torque(
 
 
 def check_name_plate(table: PreflightTable, profile: ModbusProfile, found: Parameters, rated_nm: float) -> None:
-    """P = T·ω: a wrong address, scale, sign or word order in one of the three doesn't fit."""
+    """Check P = T·ω: a wrong address, scale, sign or word order in one of the three gives a mismatch."""
     plate = profile.name_plate
     if plate is None:
         table.note("name plate", "this profile names no power, speed and torque that must fit each other", "profile")
@@ -155,7 +155,7 @@ def check_name_plate(table: PreflightTable, profile: ModbusProfile, found: Param
 
 
 def find_filters(table: PreflightTable, profile: ModbusProfile, found: Parameters) -> ReportingFilters:
-    """First-order lags of the reported signals; None where the drive doesn't tell. A cut-off f_c is 1/(2π f_c)."""
+    """Return first-order lags of the reported signals; None if not reported. A cut-off f_c is 1/(2π f_c)."""
     lags: dict[str, float] = {}
     sources = []
     for entry in profile.filters:
@@ -177,18 +177,18 @@ def find_filters(table: PreflightTable, profile: ModbusProfile, found: Parameter
 
 
 def where_of(parameter: Parameter) -> str:
-    """Its register, or its name where it has none."""
+    """Return the register's name, or the parameter's name if it has no register."""
     return register_name(parameter.register_) if parameter.register_ is not None else parameter.name
 
 
 def show(value: float, parameter: Parameter) -> str:
-    """A value with its unit."""
+    """Return a value with its unit."""
     plain = f"{value:.0f}" if parameter.unit == "none" and value.is_integer() else f"{value:.6g}"
     return f"{plain} {UNITS.get(parameter.unit, '')}".strip()
 
 
 def wanted_text(require: Require, parameter: Parameter) -> str:
-    """A requirement in words."""
+    """Return a requirement in words."""
     parts = []
     if require.equals is not None:
         parts.append(show(require.equals, parameter))
@@ -202,7 +202,7 @@ def wanted_text(require: Require, parameter: Parameter) -> str:
 
 
 def fits(parameter: Parameter, counts: int) -> bool:
-    """Do these counts fit into its register?"""
+    """Return whether these counts fit into the register."""
     if parameter.register_ is None:
         return False
     low, high = RANGES[parameter.register_.type]
@@ -220,19 +220,19 @@ def _close(one: float, other: float, lsb: float) -> bool:
 # ---------------------------------------------------------------------------------------------------------------------
 # Limits of rig.yaml written into the drive's own parameters (`set_to`), and read back.
 #
-# A limit that the drive has tighter stays so, unless the operator takes a wider one by name (`drivers.own_limits`).
+# A tighter limit of the drive stays, unless the operator accepts a wider one by name (`drivers.own_limits`).
 #
-# Speed and quick-stop limits are rounded up to a count (too low a limit would act before ours), torque down. A ramp
-# up is set as steep as the quick stop and no steeper, for it stays in the drive where a run dies; ramps down are left
-# alone, since a drive's own stops rest on them.
+# Speed and quick-stop limits are rounded up to a count (too low a limit would act before ours), torque down. The
+# acceleration ramp is set as steep as the quick stop and no steeper, because it stays in the drive if a run dies.
+# Deceleration ramps are not changed, because the drive's own stops use them.
 
 
 _SLACK = 1e-9
-"""One part in 10^9: a limit that is a whole number of counts must not lose or gain one to the last bit."""
+"""Slack of 1e-9: a limit of a whole number of counts must not lose or gain one to rounding."""
 
 
 class RegisterSetting(NamedTuple):
-    """Counts that are to stand in a parameter's register, and the unit for one count."""
+    """Required counts in a parameter's register, and the unit for one count."""
 
     counts: int
     per_count: float
@@ -247,7 +247,7 @@ _LIMIT = {
 def set_limits(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, limits: DriveLimits,
                rated_nm: float,
                found: Parameters, own: OwnLimits) -> None:
-    """Every parameter with `set_to` but the watchdog, which comes last of all; a row each. ``own``: which may be."""
+    """Write every parameter with `set_to` except the watchdog, which comes last; a row each. ``own``: which may be."""
     kinds = set()
     for parameter in profile.parameters:
         if parameter.set_to is None or parameter.set_to == "watchdog":
@@ -270,7 +270,7 @@ def _write_limit(
     values: Mapping[str, float],
     own: OwnLimits,
 ) -> None:
-    """One of the drive's own limits: left alone where it is the tighter one, unless that may be widened."""
+    """Write one of the drive's own limits, unless the drive's is tighter and may not be widened."""
     register, where, limit = parameter.register_, where_of(parameter), _LIMIT[parameter.set_to or ""]
     assert register is not None
     try:
@@ -281,7 +281,7 @@ def _write_limit(
         return
 
     def bound(counts: int) -> float:
-        """What the counts allow, in one unit; a time that a ramp takes is its deceleration, of 0 none at all."""
+        """Return the limit that the counts mean, in one unit: a ramp time as deceleration, 0 as no ramp."""
         value = counts * setting.per_count
         if parameter.set_to != "quick_stop_time":
             return value
@@ -312,7 +312,7 @@ def _write_limit(
 
 
 def own_speed_limits(profile: ModbusProfile, found: Parameters) -> list[tuple[Register, float, int]]:
-    """The drive's own speed limits that may be set in motion: register, rad/s for one count, counts as found."""
+    """Return the drive's own speed limits that may be set in motion: register, rad/s per count, counts as found."""
     limits = []
     for parameter in profile.parameters:
         register, before = parameter.register_, found.counts.get(parameter.name)
@@ -327,7 +327,7 @@ def write_setting(
     table: PreflightTable, access: RegisterAccess, parameter: Parameter, limits: DriveLimits, rated_nm: float,
     values: Mapping[str, float],
 ) -> bool:
-    """Write one parameter and read it back; whether it stands as wanted."""
+    """Write one parameter and read it back. Return whether it has the required value."""
     register, where = parameter.register_, where_of(parameter)
     assert register is not None
     try:
@@ -350,7 +350,7 @@ def write_setting(
 
 def wanted_setting(parameter: Parameter, limits: DriveLimits, rated_nm: float,
                    values: Mapping[str, float]) -> RegisterSetting:
-    """The counts that say what rig.yaml wants. Raises CommandRejected where the unit or the register can't hold it."""
+    """Return the counts for rig.yaml's limit. Raises CommandRejected if the unit or the register can't hold it."""
     register, kind, where = parameter.register_, parameter.set_to, where_of(parameter)
     assert register is not None
     lsb = per_count(parameter, values)
@@ -379,17 +379,17 @@ def wanted_setting(parameter: Parameter, limits: DriveLimits, rated_nm: float,
         rounding = math.floor
     slack = _SLACK if rounding is math.floor else -_SLACK
     counts = to_counts(value * (1.0 + slack), lsb, register, where, rounding)
-    if counts < 1 and _LIMIT.get(kind or "") == TORQUE:        # one count would be a wider limit than was asked for
+    if counts < 1 and _LIMIT.get(kind or "") == TORQUE:        # one count would be a wider limit than requested
         raise CommandRejected(
             f"{show(value, parameter)} is less than one count, {show(lsb, parameter)}", where=where,
             next_step="The drive can't hold so low a limit: is its scale right, and the limit in rig.yaml?",
         )
-    # A limit of no count at all would switch it off on many drives.
+    # A limit of zero counts would switch it off on many drives.
     return RegisterSetting(int(sign) * max(1, counts), lsb)
 
 
 def _unit(parameter: Parameter, known: Mapping[str, float]) -> float:
-    """SI for the parameter's unit. Raises CommandRejected for a unit that such a limit can't have."""
+    """Return SI for the parameter's unit. Raises CommandRejected for a unit that such a limit can't have."""
     if parameter.unit not in known:
         raise CommandRejected(
             f"a limit in '{parameter.unit}' can't be set for {parameter.set_to}: {' or '.join(known)} can",

@@ -9,9 +9,10 @@ import struct
 from collections.abc import Sequence
 
 from drivers.errors import CommunicationLost, DriveFault, ObjectRefused
+from profiles import MessageCode
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What can go wrong on a Modbus line, as leaves of the one error tree (`drivers.errors`).
+# Errors on a Modbus line, as leaves of the one error tree (`drivers.errors`).
 #
 # ::
 #
@@ -54,19 +55,25 @@ _STEPS = {
 
 
 class NoReply(CommunicationLost):
-    """The time for a reply is over."""
+    """The time for a reply has passed."""
+
+    entry = MessageCode.NO_REPLY
 
 
 class BadReply(CommunicationLost):
-    """Something came, but no reply to this request that could be trusted."""
+    """Data came, but no valid reply to this request."""
+
+    entry = MessageCode.BAD_REPLY
 
 
 class NoisyReply(BadReply):
-    """A reply to this request, damaged on its way; the drive has most probably acted."""
+    """A damaged reply to this request; the drive has most probably executed it."""
 
 
 class LinkLost(CommunicationLost):
-    """The line itself is gone: connection reset, closed by the drive, adapter unplugged."""
+    """The line itself is lost: connection reset, closed by the drive, adapter unplugged."""
+
+    entry = MessageCode.LINK_LOST
 
 
 class RegisterRefused(ObjectRefused):
@@ -90,7 +97,7 @@ class CycleRefused(DriveFault):
 
 
 def exception_text(code: int) -> str:
-    """Number and name of an exception code."""
+    """Return number and name of an exception code."""
     return f"exception {code}, {EXCEPTION_NAMES.get(code, 'of the manufacturer')}"
 
 
@@ -98,35 +105,35 @@ def exception_text(code: int) -> str:
 
 READ_HOLDING, READ_INPUT, WRITE_ONE, DIAGNOSTICS, WRITE_MANY, READ_WRITE = 3, 4, 6, 8, 16, 23
 REQUESTS_SO_FAR = 0x000E
-"""Sub-function of 8: how many requests were addressed to this server since it was switched on, modulo 65536."""
+"""Sub-function of 8: number of requests to this server since it was switched on, modulo 65536."""
 EXCEPTION = 0x80
 MOST_READ, MOST_WRITTEN, MOST_WRITTEN_WITH_READ = 125, 123, 121
 
 
 def read(function: int, address: int, count: int) -> bytes:
-    """Functions 3 and 4."""
+    """Return a request of function 3 or 4."""
     _within(address, count, MOST_READ)
     return struct.pack(">BHH", function, address, count)
 
 
 def write_one(address: int, word: int) -> bytes:
-    """Function 6."""
+    """Return a request of function 6."""
     return struct.pack(">BHH", WRITE_ONE, address, word)
 
 
 def count_requests() -> bytes:
-    """Function 8, server message count."""
+    """Return a request of function 8, server message count."""
     return struct.pack(">BHH", DIAGNOSTICS, REQUESTS_SO_FAR, 0)
 
 
 def write_many(address: int, words: Sequence[int]) -> bytes:
-    """Function 16."""
+    """Return a request of function 16."""
     _within(address, len(words), MOST_WRITTEN)
     return struct.pack(f">BHHB{len(words)}H", WRITE_MANY, address, len(words), 2 * len(words), *words)
 
 
 def read_write(read_address: int, read_count: int, write_address: int, words: Sequence[int]) -> bytes:
-    """Function 23: the drive writes first, then reads."""
+    """Return a request of function 23: the drive writes first, then reads."""
     _within(read_address, read_count, MOST_READ)
     _within(write_address, len(words), MOST_WRITTEN_WITH_READ)
     return struct.pack(
@@ -136,9 +143,9 @@ def read_write(read_address: int, read_count: int, write_address: int, words: Se
 
 
 def words_of(request: bytes, reply: bytes, where: str = "") -> tuple[int, ...]:
-    """The registers in the reply to this request; none for a write.
+    """Return the registers in the reply to this request; none for a write.
 
-    Raises RegisterRefused for an exception reply, BadReply for what is no reply to this request.
+    Raises RegisterRefused for an exception reply, BadReply if it is not a reply to this request.
     """
     function = request[0]
     if len(reply) == 2 and reply[0] == function | EXCEPTION:
@@ -162,12 +169,12 @@ def words_of(request: bytes, reply: bytes, where: str = "") -> tuple[int, ...]:
 
 
 def answers(request: bytes, reply: bytes) -> bool:
-    """Could this PDU be the reply to that request, by its function? Exceptions are replies too."""
+    """Return whether this PDU can be the reply to that request, by its function. Exceptions are replies too."""
     return bool(reply) and reply[0] & ~EXCEPTION == request[0]
 
 
 def reply_length(head: bytes) -> int | None:
-    """How long the reply PDU is that begins with ``head``; None if that can't be told from its function."""
+    """Return the length of the reply PDU that begins with ``head``; None if its function does not define it."""
     if not head:
         return None
     function = head[0]

@@ -1,4 +1,4 @@
-"""The motor shaft's angle as a drive on Modbus counts it, apart from the unit of its speed."""
+"""The motor shaft's angle as a drive on Modbus counts it, independent of the unit of its speed."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ class AngleRegister(NamedTuple):
 
     @property
     def wraps_rad(self) -> float:
-        """The angle after which it starts over, rad."""
+        """The angle at which the count wraps, rad."""
         return (self.entry.wrap_counts or float(1 << _WIDTHS[self.entry.register_.type])) * self.rad_per_count
 
     def read(self, access: RegisterAccess, timeout_s: float) -> PositionReading | None:
-        """One transaction; None without a good reply."""
+        """Read the angle in one transaction; None without a valid reply."""
         register = self.entry.register_
         function = pdu.READ_HOLDING if register.table == "holding" else pdu.READ_INPUT
         where = register_name(register)
         try:
             answer = access.once(pdu.read(function, register.address, register.count), timeout_s, where)
         except (CommunicationLost, RegisterRefused):
-            return None                # the next cycle tells of a line that is gone
+            return None                # the next cycle reports a lost line
         half_s = 0.5 * (answer.received_s - answer.sent_s)
         counts = from_words(answer.words, register.type, self.order)
         return PositionReading(answer.sent_s + half_s, half_s, counts * self.rad_per_count, self.wraps_rad, where)
 
 
 def find_angle(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile) -> AngleRegister | None:
-    """The profile's register, where the drive gives it; a note says what there is."""
+    """Return the profile's angle register if the drive gives it; add a note in any case."""
     entry = profile.position
     if entry is None:
         table.note(_TITLE, f"not told by this drive: {_ASKED}", "profile, position")

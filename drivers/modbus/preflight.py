@@ -1,6 +1,6 @@
-"""What is checked on a Modbus drive before its shaft may move, in the order in which it can do harm.
+"""Checks and settings of a Modbus drive before its shaft may move, in the order of possible harm.
 
-First only reading: parameters, scales, the checklist, name plate, state. Whatever is wrong there ends it: with a wrong
+First only reads: parameters, scales, the checklist, name plate, state. An error there ends preflight: with a wrong
 address even a limit would be written to the wrong place. Then setpoints, limits, echoes, mode, rate, watchdog.
 """
 
@@ -21,20 +21,19 @@ from drivers.preflight import PreflightTable, check_nothing_held
 from profiles.modbus import CyclicSignal, Echo, ModbusProfile
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Setpoints written at standstill, disabled, and read again: from their own registers and where the drive echoes them.
+# Setpoints written at standstill, disabled, and read back from their own registers and from the drive's echo.
 #
-# A wrong word order, sign, scale or address, and a write that is taken but not applied, show here before anything
-# moves.
+# A wrong word order, sign, scale or address, and a write that is accepted but not applied, show here before motion.
 
 
 SHARES = (0.25, -0.5, 0.75, -1.0 / 3.0)
-"""Of the limit: of both signs, none a multiple of another's wrong scale, and each with two different halves."""
+"""Shares of the limit: both signs, no ratio that a wrong scale could produce, and two different halves each."""
 ECHO_POLLS, ECHO_POLL_S = 12, 0.05
-"""At an echo: drives renew what they display every few ten milliseconds, field bus adapters more slowly still."""
+"""Polls of an echo, and their interval, s: drives update displayed values every few ten ms, adapters more slowly."""
 
 
 def clear_setpoints(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, off: int) -> bool:
-    """The control word's off and setpoints of zero: no word of an earlier run may act when the drive is enabled."""
+    """Write the off word and setpoints of zero: no word of an earlier run may act when the drive is enabled."""
     cycle = profile.cycle
     entries = [entry for entry in (cycle.speed_setpoint, cycle.torque_setpoint) if entry is not None]
     if not profile.modes.torque:
@@ -54,9 +53,9 @@ def check_setpoints(
     table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, scales: Scales, rated_nm: float,
     values: Mapping[str, float], limits: DriveLimits,
 ) -> frozenset[str]:
-    """A row for each setpoint: several values written, read back, and compared with the drive's echo if any.
+    """Add a row for each setpoint: several values written, read back, and compared with the drive's echo if any.
 
-    The setpoints ('speed', 'torque') whose own registers showed what was written.
+    Return the setpoints ('speed', 'torque') whose own registers read back the written values.
     """
     read_back = set[str]()
     cycle = profile.cycle
@@ -68,7 +67,7 @@ def check_setpoints(
     for name, signal, lsb, limit, unit in pairs:
         tests = [share * limit for share in SHARES]
         if RANGES[signal.register_.type][0] == 0:
-            tests = [abs(value) for value in tests]     # its sign stands in the control word, if anywhere
+            tests = [abs(value) for value in tests]     # its sign is in the control word, if anywhere
         echoes = [one for one in profile.echoes if one.setpoint == name]
         if name in profile.unseen:
             text = "this drive doesn't show it: its scale and sign can be seen in motion only"
@@ -89,7 +88,7 @@ def _check_one(
     seen_lsb = lsb if echo is None else si_per_count(echo, values, rated_nm)
     title = f"{name} setpoint " + ("reads back" if echo is None else "as the drive understood it")
     where = f"{register_name(register)} → {register_name(seen_in)}"
-    # Half a count of the echo for its rounding, and one more: a drive may cut off instead.
+    # Half a count of the echo for its rounding, and one more because a drive may truncate instead.
     slack = 0.0 if echo is None else 1.5 * seen_lsb
     if slack > 0.5 * max(map(abs, tests)):
         table.note(f"{title}, how finely", f"{seen_lsb:.3g} {unit} a count: too coarse for these limits to tell", where)
@@ -127,9 +126,9 @@ def _check_one(
 # ---------------------------------------------------------------------------------------------------------------------
 
 STILL_COUNTS, STILL_SHARE = 5, 0.005
-"""What counts as a shaft at rest before motion: so many counts, or this share of the speed limit if that is more."""
+"""Noise of a standstill before motion: this number of counts, or this share of the speed limit if that is more."""
 COARSEST_SHARE = 0.05
-"""Of a limit, that one count may be worth."""
+"""Largest value of one count, as a share of the limit."""
 MODE_POLLS, MODE_POLL_S = 20, 0.05
 
 
@@ -138,7 +137,7 @@ def read_only_checks(
     rated_torque_nm: float | None,
     speed_limit_rad_s: float, torque_limit_nm: float, accept_no_watchdog: bool = False, *, string: bool = False,
 ) -> tuple[Parameters, Scales | None, float]:
-    """All that can be known without writing; no scales where something is refused."""
+    """Run all checks that need no write. Scales are None if a row is refused."""
     spared = watchdogs_own(access, profile, given) if accept_no_watchdog else frozenset()
     found = read_parameters(table, access, profile, given, spared)
     rated_nm = find_rated_torque(table, profile, found, rated_torque_nm)
@@ -163,9 +162,9 @@ def read_only_checks(
 
 
 def watchdogs_own(access: RegisterAccess, profile: ModbusProfile, given: Mapping[str, float]) -> frozenset[str]:
-    """Parameters that don't matter where the operator accepts a drive without a watchdog, and this one's is off.
+    """Return the watchdog parameters that need not be right, if the operator accepts a missing watchdog and it is off.
 
-    None where it can be armed from here: that is tried, and what it needs must be right.
+    The set is empty if tdhil can arm the watchdog: then it tries, and the parameters must be right.
     """
     entry = profile.watchdog
     if entry.kind == "none" or entry.parameter is None:
@@ -181,7 +180,7 @@ def watchdogs_own(access: RegisterAccess, profile: ModbusProfile, given: Mapping
 def check_resolution(
     table: PreflightTable, profile: ModbusProfile, scales: Scales, speed_limit_rad_s: float, torque_limit_nm: float
 ) -> None:
-    """Counts far too coarse for the limits: a parameter that scales them was read in the wrong order or place."""
+    """Refuse counts that are too coarse for the limits: the scale was read in the wrong order or place."""
     cycle = profile.cycle
     pairs = (
         ("speed", cycle.speed, scales.speed, speed_limit_rad_s, "rad/s"),
@@ -199,9 +198,9 @@ def check_resolution(
 
 def check_state(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, scales: Scales,
                 speed_limit_rad_s: float) -> None:
-    """A drive in fault is refused, and never reset silently.
+    """Refuse a drive in fault (it is never reset silently).
 
-    So is a shaft that still turns, and a drive that the field bus has no say over.
+    Also refuse a turning shaft, and a drive that the field bus does not control.
     """
     control, cycle = profile.control, profile.cycle
     register = cycle.status.register_
@@ -228,7 +227,7 @@ def check_state(table: PreflightTable, access: RegisterAccess, profile: ModbusPr
 
 def check_string(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, scales: Scales,
                  torque_limit_nm: float) -> None:
-    """A drive that holds a wound-up drill string after an earlier stop is refused: `off` would let go of it."""
+    """Refuse a drive that holds trapped torque of a drill string after an earlier stop: `off` would release it."""
     cycle = profile.cycle
     if power_state(decode(profile.control, access.read(cycle.status.register_) & 0xFFFF)) is PowerState.QUICK_STOP:
         register = cycle.torque.register_
@@ -237,9 +236,9 @@ def check_string(table: PreflightTable, access: RegisterAccess, profile: ModbusP
 
 
 def check_modes(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile) -> None:
-    """The mode is written while nothing is enabled, and its display must follow; left in speed mode.
+    """Write each mode while the drive is disabled; its display must follow. The drive stays in speed mode.
 
-    A drive that switches by bits of its control word is only looked at: many show the mode while they run only.
+    A drive that switches by bits of its control word is only read: many show the mode only while they run.
     """
     modes = profile.modes
     display, register = modes.display, modes.register_

@@ -1,8 +1,8 @@
-"""The bare quick stop of a Modbus drive (`drivers.quick_stop`): the profile's quick-stop word, again while it follows.
+"""The bare quick stop of a Modbus drive (`drivers.quick_stop`): the profile's quick-stop word, repeated as needed.
 
-Where a quick stop does not decelerate from torque mode, the drive is put into speed mode at zero speed first, as a run
-does; with torque off it would let the shaft coast. Nothing else of the drive is set or checked. The speed is told in
-rad/s where its scale can be read, else in counts.
+If a quick stop does not decelerate from torque mode, the drive gets speed mode at zero speed first, as in a run; with
+torque off the shaft would coast. Nothing else of the drive is set or checked. The speed is in rad/s if its scale can be
+read, else in counts.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from profiles.modbus import ModbusProfile, StatusState
 
 NEAR_ZERO_RAD_S, NEAR_ZERO_COUNTS = 0.05, 5
 NEAR_ZERO_SHARE = 0.005
-"""Of the first speed that was seen, where its unit isn't known."""
+"""Share of the first speed, if its unit is unknown."""
 MODE_S, MODE_UNTOLD_S = 1.0, 0.3
-"""So long the drive may take over the change to speed mode; where it doesn't show its mode it is given so long."""
+"""Longest time for the change to speed mode, s: with a mode display, and without."""
 _POWERED = (PowerState.ENABLED, PowerState.QUICK_STOP, PowerState.READY)
 
 
@@ -44,13 +44,13 @@ class ModbusTarget:
         self._stayed_in_torque = False
 
     def ask(self, attempt: int) -> None:
-        """The quick-stop word under speed control, where there is power to brake with. Raises TdhilError."""
+        """Write the quick-stop word under speed control, if there is power to brake with. Raises TdhilError."""
         control = self._profile.control
         status = self._access.read(self._profile.cycle.status.register_) & 0xFFFF
-        state = decode(control, status) if status else None        # zeros may be a gateway's
+        state = decode(control, status) if status else None        # zeros may come from a gateway
         power = power_state(state)
         if state is not None and power not in _POWERED:
-            return                     # but one that shows what the profile doesn't know may be under power
+            return                     # but an unknown state may be under power
         if power is PowerState.ENABLED and state is not None and not self._in_speed_mode(state):
             return
         self._stops += 1
@@ -58,7 +58,9 @@ class ModbusTarget:
         self._access.write(self._profile.cycle.control.register_, control.quick_stop | self._speed_bits())
 
     def _in_speed_mode(self, state: StatusState) -> bool:
-        """Is it time for the quick stop? Else speed mode has been asked for; a drive that refuses it gets a while."""
+        """Return whether to send the quick stop now. Otherwise speed mode was requested; a refusal gets `MODE_S` of
+        time.
+        """
         try:
             if self._stop_would_brake():
                 return True
@@ -73,7 +75,7 @@ class ModbusTarget:
             return True
 
     def _stop_would_brake(self) -> bool:
-        """Is it time for the quick stop: nothing to change, in speed mode now, or never to be?"""
+        """Return whether a quick stop would brake: nothing to change, in speed mode now, or it never changes."""
         modes, stop = self._profile.modes, self._profile.quick_stop
         if not modes.torque or stop.decelerates_in_torque_mode or not modes.switch_while_enabled:
             return True
@@ -86,7 +88,7 @@ class ModbusTarget:
         return shown is Mode.SPEED or self._stayed_in_torque
 
     def _ask_for_speed_mode(self, state: StatusState) -> None:
-        """Setpoints of zero first, then the mode, in its register or by bits of an enabling control word."""
+        """Write setpoints of zero, then the mode, in its register or by bits of an enabling control word."""
         cycle, modes = self._profile.cycle, self._profile.modes
         if self._switching_since_s is None:
             self._switching_since_s = self._access.clock.now_s()
@@ -97,7 +99,7 @@ class ModbusTarget:
             self._access.write(cycle.control.register_, state.onward | self._speed_bits())
 
     def _speed_bits(self) -> int:
-        """Of the control word; with the direction that stands in it, where that is a bit."""
+        """Return the speed bits of the control word, with its direction bit if it has one."""
         control = self._profile.control
         if self._reverse is None and control.reverse_bits is not None:
             with suppress(PreflightRefused):
@@ -106,10 +108,10 @@ class ModbusTarget:
         return control.speed_bits | ((control.reverse_bits or 0) if self._reverse else 0)
 
     def poll(self) -> Seen:
-        """Status word and speed.
+        """Read status word and speed.
 
-        While the shaft still turns under power the quick-stop word is written again: the drive's watchdog may be one
-        that lets go of it, and nobody else may be feeding that any more.
+        While the shaft turns under power the quick-stop word is repeated: the drive's watchdog may release the shaft,
+        and no other master may be feeding it.
         """
         cycle, control = self._profile.cycle, self._profile.control
         status = self._access.read(cycle.status.register_) & 0xFFFF
@@ -135,7 +137,7 @@ class ModbusTarget:
         )
 
     def remarks(self) -> tuple[str, ...]:
-        """What to know."""
+        """Return remarks on the stop."""
         said = []
         if self._switching_since_s is not None:
             said.append("a quick stop doesn't decelerate from torque mode: speed mode at zero was asked for first")

@@ -1,11 +1,11 @@
-"""Modbus over a serial line (RTU): one master, frames told apart by length, CRC and silence.
+"""Modbus over a serial line (RTU): one master, frames separated by length, CRC and silence.
 
-pymodbus frames the requests and reckons the CRC. Its synchronous client is not used: it drops a reply with a wrong CRC
-without a word, takes a reply of any function for the one it waits for, and doesn't wait for a late one
-(`FramerRTU.decode`, `FramerBase.handleFrame`, 3.16).
+pymodbus makes the frames and computes the CRC. Its synchronous client is not used: it drops a reply with a wrong CRC
+silently, accepts a reply of any function, and does not wait for a late one (`FramerRTU.decode`,
+`FramerBase.handleFrame`, 3.16).
 
-RTU has no transaction id. So after a reply that failed to come, the line is listened to before the next request, and a
-reply after that is believed only when no second one follows it.
+RTU has no transaction id. So after a missing reply tdhil listens to the line before the next request, and accepts the
+next reply only if no second one follows it.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ from drivers.clock import Clock
 from drivers.errors import PreflightRefused
 from drivers.modbus.link import Reply
 from drivers.modbus.pdu import BadReply, LinkLost, NoisyReply, NoReply, answers, reply_length
+from profiles import MessageCode
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Why a serial device could not be opened, and the exact command that mends it.
+# Reason why a serial device could not be opened, and the command that repairs it.
 
 
 _CANDIDATES = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyS[0-3]")
 
 
 def refusal(device: str, error: OSError | ValueError) -> PreflightRefused:
-    """What pyserial raised, as an error with a next step."""
+    """Convert an error of pyserial to an error with a next step."""
     code = getattr(error, "errno", None)
     if code is None and error.__context__ is not None and error.__context__.args:
         code = error.__context__.args[0]        # termios.error, which pyserial wraps without its number
@@ -47,11 +48,12 @@ def refusal(device: str, error: OSError | ValueError) -> PreflightRefused:
         what, step = "it is no serial device", _there()
     else:
         what, step = str(error), "Check device, baud rate and parity"
-    return PreflightRefused(f"can't open the serial line: {what}", where=device, next_step=step)
+    return PreflightRefused(f"can't open the serial line: {what}", where=device, next_step=step,
+                            entry=MessageCode.SERIAL_LINE_REFUSED)
 
 
 def permission_command(device: str) -> str:
-    """The command that gives this user the device's own group."""
+    """Return the command that adds this user to the device's group."""
     group = "dialout"
     try:
         import grp
@@ -74,11 +76,11 @@ def _there() -> str:
 CHARACTER_BITS = 11
 SILENT_CHARACTERS = 3.5
 LEAST_SILENCE_S = 0.00175
-"""Between frames, above 19,200 baud (Modbus over serial line V1.02, section 2.5.1.1)."""
+"""Least silence between frames, s, above 19,200 baud (Modbus over serial line V1.02, section 2.5.1.1)."""
 QUIET_S = 0.02
-"""A line on which nothing has come for so long has finished what it was saying; adapters hand over in lumps."""
+"""A line without data for this time, s, has finished; adapters deliver data in blocks."""
 LISTEN_SHARE, LONGEST_LISTEN_S = 0.5, 0.25
-"""How long a late reply is waited for before the next request: a share of the time that it had, and at most so much."""
+"""Wait for a late reply before the next request: share of its time-out, and upper limit, s."""
 SLICE_S = 0.005
 UNIT_AND_CRC = 3
 
@@ -98,13 +100,14 @@ class RtuLink:
         self._quiet_from_s = 0.0
         self._listen_s = 0.0        # before the next request; 0: the line is in step
         self._owed = False          # a reply is outstanding that may yet come
-        self._usual_s = 0.0         # the longest that a good reply took
+        self._usual_s = 0.0         # longest time of a valid reply
         self._lost = ""
         try:
             serial: Any = importlib.import_module("serial")
         except ImportError as error:
             raise PreflightRefused(
-                "serial lines need pyserial, which isn't installed", where=device, next_step="pip install pyserial"
+                "serial lines need pyserial, which isn't installed", where=device, next_step="pip install pyserial",
+                entry=MessageCode.SERIAL_LINE_REFUSED,
             ) from error
         try:
             self._port: Any = serial.Serial(
@@ -115,7 +118,7 @@ class RtuLink:
             raise refusal(device, error) from error
 
     def transact(self, unit: int, pdu: bytes, timeout_s: float) -> Reply:
-        """One request and its reply; a reply that comes too late is dropped before the next request, and counted."""
+        """Send one request and return its reply. A late reply is dropped before the next request, and counted."""
         if self._lost:
             raise self._gone(self._lost)
         self._come_into_step()
@@ -133,7 +136,7 @@ class RtuLink:
                 reply, received_s = self._doubt(reply, received_s, unit, pdu)
         except (NoReply, BadReply) as error:
             self._owed = isinstance(error, NoReply)
-            # A damaged reply that came as a whole leaves nothing outstanding: the line is in step once it is quiet.
+            # A complete damaged reply leaves nothing outstanding: the line is in step once it is quiet.
             whole = isinstance(error, NoisyReply)
             self._listen_s = QUIET_S if whole else min(max(LISTEN_SHARE * timeout_s, QUIET_S), LONGEST_LISTEN_S)
             raise
@@ -143,7 +146,7 @@ class RtuLink:
         return Reply(reply, sent_s, received_s)
 
     def close(self) -> None:
-        """Let go of the device; what hasn't been sent yet is thrown away."""
+        """Close the device and discard unsent data."""
         with contextlib.suppress(Exception):
             self._port.reset_output_buffer()
         with contextlib.suppress(Exception):
@@ -153,7 +156,7 @@ class RtuLink:
     # -- frames ----------------------------------------------------------------------------------------------
 
     def _await(self, unit: int, pdu: bytes, deadline_s: float) -> bytes:
-        """The reply PDU. Raises NoReply, BadReply and LinkLost."""
+        """Return the reply PDU. Raises NoReply, BadReply and LinkLost."""
         frame = b""
         while True:
             wanted = self._length(frame)
@@ -166,7 +169,7 @@ class RtuLink:
                     return reply
                 if not self._owed:
                     raise self._bad(f"a reply of unit {frame[0]}, function {reply[0]} to unit {unit}, {pdu[0]}")
-                # Sound, but to another request: the one whose time is over.
+                # Valid, but to the earlier request whose time has passed.
                 self._owed = False
                 self.late += 1
                 frame = frame[wanted:]
@@ -183,7 +186,7 @@ class RtuLink:
             frame += self._read()
 
     def _doubt(self, reply: bytes, received_s: float, unit: int, pdu: bytes) -> tuple[bytes, float]:
-        """One reply is outstanding: was this it? Then the right one follows within the usual time."""
+        """Wait for a second reply while one is outstanding. If one follows, it is the right one."""
         until_s = received_s + max(self._usual_s, QUIET_S)
         try:
             second = self._await(unit, pdu, until_s)
@@ -197,7 +200,7 @@ class RtuLink:
         return second, self.clock.now_s()
 
     def _come_into_step(self) -> None:
-        """Throw away what came after its time, and wait for it where it may yet come."""
+        """Discard late data, and wait for a reply that may still come."""
         late = bool(self._port_waiting())
         if not late and not self._listen_s:
             return
@@ -228,7 +231,7 @@ class RtuLink:
             raise self._gone(str(error)) from error
 
     def _read(self) -> bytes:
-        """What has come, or within a slice of time does."""
+        """Return the data received within one time slice."""
         try:
             return bytes(self._port.read(max(1, int(self._port.in_waiting))))
         except Exception as error:      # see transact
@@ -248,5 +251,5 @@ class RtuLink:
 
 
 def _shown(frame: bytes) -> str:
-    """For a message: a line that babbles fills no screen."""
+    """Return the start of a frame for a message."""
     return f"{frame[:16].hex(' ')}{' …' if len(frame) > 16 else ''}"

@@ -1,4 +1,4 @@
-"""The power states of a drive as its profile tells them, pure: status word in, control word out."""
+"""The power states of a drive from its profile, pure: status word in, control word out."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from drivers.drive import Mode, PowerRequest, PowerState
 from profiles.modbus import Bits, Control, StatusState
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Standstill told from the reported speed, for drives whose status word doesn't tell.
+# Standstill from the reported speed, for drives whose status word does not show it.
 
 
 STILL_S = 0.2
 LEAST_SAMPLES = 5
 MOST_GAPS = 2
-"""Single lost replies of a noisy line in a row, which unsay nothing: no shaft gets up and comes to rest meanwhile."""
+"""Lost replies in a row that do not reset the detection: a shaft can't start and stop meanwhile."""
 COUNTS, SHARE = 5, 0.005
-"""No sample beyond so many counts, or this share of the speed limit if that is more …"""
+"""Limit of each sample: this number of counts, or this share of the speed limit if that is more."""
 MEAN_COUNTS, MEAN_SHARE = 1, 0.001
-"""… and their mean within this: noise averages out, a shaft that still creeps doesn't."""
+"""Limit of the mean: noise averages out, a creeping shaft does not."""
 
 
 class ZeroSpeed:
-    """At rest once the speed has stayed at zero for `STILL_S` and `LEAST_SAMPLES` samples without a longer gap."""
+    """Detects standstill: the speed stays at zero for `STILL_S` and `LEAST_SAMPLES` samples without a longer gap."""
 
     def __init__(self, count_rad_s: float, limit_rad_s: float, period_s: float) -> None:
         self._peak_rad_s = max(COUNTS * count_rad_s, SHARE * limit_rad_s)
@@ -32,17 +32,17 @@ class ZeroSpeed:
         self._last: deque[float] = deque(maxlen=max(LEAST_SAMPLES, math.ceil(STILL_S / period_s)))
 
     def gap(self) -> None:
-        """A cycle brought nothing. After some of these in a row what was seen before them no longer counts."""
+        """Count a cycle without data. After more than `MOST_GAPS` in a row the earlier samples are discarded."""
         self._gaps += 1
         if self._gaps > MOST_GAPS:
             self._last.clear()
 
     def near(self, speed_rad_s: float) -> bool:
-        """Is this one sample no more than the noise of a shaft at rest?"""
+        """Return whether this sample is within the noise of a standstill."""
         return abs(speed_rad_s) <= self._peak_rad_s
 
     def add(self, speed_rad_s: float) -> bool:
-        """One more sample; whether the shaft is at rest."""
+        """Add a sample. Return whether the shaft is at standstill."""
         last, self._gaps = self._last, 0
         last.append(speed_rad_s)
         if len(last) < (last.maxlen or 0) or not self.near(speed_rad_s):
@@ -66,14 +66,14 @@ _ALL_ONES = 0xFFFF
 
 
 def seen(bits: Bits | None, status: int) -> bool:
-    """Does the status word show these bits? False where the profile names none."""
+    """Return whether the status word shows these bits; False if the profile names none."""
     return bits is not None and status & bits.mask == bits.value
 
 
 def decode(control: Control, status: int) -> StatusState | None:
-    """The first state of the profile's list that fits; None where none does, and for FFFFh.
+    """Return the first matching state of the profile's list; None without a match, and for FFFFh.
 
-    No drive shows all bits at once: it would be enabled and in fault. A gateway without its drive does.
+    No drive sets all bits at once: it would be enabled and in fault. A gateway without its drive does.
     """
     if status & _ALL_ONES == _ALL_ONES:
         return None
@@ -81,10 +81,10 @@ def decode(control: Control, status: int) -> StatusState | None:
 
 
 def decode_after(control: Control, status: int) -> StatusState | None:
-    """The same of a drive that has been enabled: from then on 0000h is no state either.
+    """Return the state of a drive that has been enabled: from then on 0000h is not a state either.
 
-    Of the words of each family some bit is set in any state of such a drive (remote, no coast stop, ready). In those of
-    CiA 402 not ready to switch on is over for good, with whatever else in the word.
+    In each family some bit is set in any state of such a drive (remote, no coast stop, ready). In the CiA 402 family
+    the drive has left not ready to switch on for good, whatever the other bits of the word are.
     """
     state = decode(control, status)
     over = state is not None and control.family == "cia402" and state.means == "not_ready"
@@ -92,7 +92,7 @@ def decode_after(control: Control, status: int) -> StatusState | None:
 
 
 def power_state(state: StatusState | None) -> PowerState:
-    """What callers above the driver see of it."""
+    """Return the state as callers above the driver see it."""
     return PowerState.UNKNOWN if state is None else _POWER[state.means]
 
 
@@ -100,11 +100,11 @@ def controlword_towards(
     control: Control, state: StatusState | None, wish: PowerRequest, mode: Mode, *, reverse: bool = False,
     turning: bool = False
 ) -> int:
-    """The control word that brings the drive one step nearer to the wish.
+    """Return the control word that brings the drive one step nearer to ``wish``.
 
-    A fault is never reset here, a quick stop never ended by enabling again, and a shaft that turns under power is
-    never disabled: it is braked instead. So is one whose drive shows no state at all, or none yet: the zeros of a
-    gateway, or a pattern that the profile doesn't know, are no proof that it is off.
+    It never resets a fault, never ends a quick stop by enabling, and never disables a shaft that turns under power;
+    such a shaft is braked. The same holds for a drive without a valid state: zeros from a gateway, or an unknown
+    pattern, do not prove that it is off.
     """
     power = power_state(state)
     under_power = power in (PowerState.ENABLED, PowerState.QUICK_STOP, PowerState.NOT_READY, PowerState.UNKNOWN)
@@ -116,7 +116,7 @@ def controlword_towards(
         else:
             word = control.off
     elif wish is PowerRequest.QUICK_STOP:
-        # Also while it is merely ready: some drives show that while they still brake, and `off` would let them coast.
+        # Also while it is only ready: some drives show that while they still brake, and `off` would let them coast.
         word = control.quick_stop if under_power or power is PowerState.READY else control.off
     else:
         word = control.quick_stop if under_power and turning else control.off

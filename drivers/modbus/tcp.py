@@ -1,11 +1,11 @@
-"""Modbus over TCP: one socket, one request at a time, transaction ids that are believed.
+"""Modbus over TCP: one socket, one request at a time, checked transaction ids.
 
-pymodbus frames the requests. Its synchronous client is not used: it connects anew by itself before a request, which a
-drive that is enabled must not see, reports a foreign transaction id as mere silence, and takes up to twice its time-out
+pymodbus makes the frames. Its synchronous client is not used: it reconnects by itself before a request, which an
+enabled drive must not see, reports a foreign transaction id as silence, and takes up to twice its time-out
 (`ModbusBaseSyncClient.execute`, `TransactionManager.sync_get_response`, 3.16).
 
-What TCP would add by itself is kept away from the drive: requests that a dead connection has not taken are not queued
-up, and closing throws away what is queued, so that no old setpoint arrives when the cable is back.
+TCP must not deliver old data to the drive. So requests are not queued behind a dead connection, and closing discards
+the queue: no old setpoint arrives when the cable is connected again.
 """
 
 from __future__ import annotations
@@ -27,17 +27,18 @@ from drivers.clock import Clock
 from drivers.errors import PreflightRefused
 from drivers.modbus.link import Reply
 from drivers.modbus.pdu import BadReply, LinkLost, NoReply, answers
+from profiles import MessageCode
 
 CONNECT_S = 3.0
 DEAD_AFTER_MS = 1000
-"""Data that the peer doesn't acknowledge for so long ends the connection (TCP_USER_TIMEOUT, where there is one)."""
+"""The connection ends if the peer does not acknowledge data for this time, ms (TCP_USER_TIMEOUT, if available)."""
 HEADER = struct.Struct(">HHHB")
 """Transaction id, protocol id, length of what follows, unit (Modbus Messaging on TCP/IP, section 3.1.3)."""
 _AT_ONCE = struct.pack("hh" if sys.platform == "win32" else "ii", 1, 0)
 MOST_RENEWED, RENEWED_WITHIN_S = 3, 10.0
-"""So often in that time a foreign reply costs the connection; then it is merely dropped."""
+"""Most reconnections because of a foreign reply within this time, s; after that the reply is only dropped."""
 REMEMBERED = 64
-"""Ids of requests whose time is over, or that were answered: their replies are late or said twice, not foreign."""
+"""Number of remembered ids of earlier requests: replies to them are late or duplicated, not foreign."""
 
 
 class TcpLink:
@@ -64,14 +65,14 @@ class TcpLink:
             raise self._unreachable(error) from error
 
     def transact(self, unit: int, pdu: bytes, timeout_s: float) -> Reply:
-        """One request and its reply. A connection that was reset stays lost; nothing is sent twice."""
+        """Send one request and return its reply. A connection that was reset stays lost; nothing is sent twice."""
         deadline_s = self.clock.now_s() + timeout_s
         if self._renew:
             self._reconnect(timeout_s)
         if self._socket is None:
             self._lost("the connection is gone")
         while self._untaken():
-            # The other end hasn't even taken the request before: another one would only queue up behind it.
+            # The other end has not acknowledged the request before: another one would only queue behind it.
             if self.clock.now_s() >= deadline_s:
                 raise self._silent(timeout_s, "the connection takes nothing: half open, or the cable is out")
             self._read(0.005)
@@ -97,7 +98,7 @@ class TcpLink:
                 self._read(left_s)
 
     def close(self) -> None:
-        """Let go at once; what the other end hasn't taken yet is thrown away."""
+        """Close at once and discard unacknowledged data."""
         self._drop()
         if self._opening is not None:
             self._opening.close()
@@ -113,7 +114,7 @@ class TcpLink:
     # -- replies ---------------------------------------------------------------------------------------------
 
     def _frame(self) -> bytes | None:
-        """The next whole frame of what was received. Raises BadReply if that can't be a frame."""
+        """Return the next whole received frame. Raises BadReply if the data is not a frame."""
         if len(self._buffer) < HEADER.size:
             return None
         _, protocol, length, _ = HEADER.unpack_from(self._buffer)
@@ -126,14 +127,14 @@ class TcpLink:
         return frame
 
     def _accepts(self, frame: bytes, unit: int, pdu: bytes) -> bool:
-        """Is this the reply? A late one is dropped; anything else raises BadReply."""
+        """Return whether this is the reply. A late one is dropped; anything else raises BadReply."""
         transaction, _, _, sender = HEADER.unpack_from(frame)
         if transaction in self._given_up:
             self._given_up.remove(transaction)
             self.late += 1
             return False
         if transaction != self._transaction and (transaction in self._answered or not self._may_renew()):
-            self.late += 1             # said twice, or foreign once too often: dropped, its id shows that it isn't ours
+            self.late += 1             # duplicated, or foreign once too often: dropped
             return False
         if transaction != self._transaction:
             raise self._untrusted(f"a reply with transaction id {transaction}, not {self._transaction}")
@@ -144,7 +145,7 @@ class TcpLink:
         return True
 
     def _read(self, timeout_s: float) -> None:
-        """Take what has come, or wait for it. Raises LinkLost at the end of the connection."""
+        """Read received data, or wait for it. Raises LinkLost at the end of the connection."""
         if self._socket is None:
             self._lost("the connection is gone")
         try:
@@ -173,15 +174,15 @@ class TcpLink:
         return connection
 
     def _may_renew(self) -> bool:
-        """Has the connection not been renewed too often of late?"""
+        """Return whether the connection may be renewed: not too often within `RENEWED_WITHIN_S`."""
         since_s = self.clock.now_s() - RENEWED_WITHIN_S
         return sum(at_s >= since_s for at_s in self._renewed_s) < MOST_RENEWED
 
     def _reconnect(self, timeout_s: float) -> None:
-        """After a frame that can't be ours: what follows it on this connection can't be trusted either.
+        """Reconnect after a frame that can't be ours, because later data on this connection can't be trusted either.
 
-        Takes no longer than the reply may: raises NoReply while the new connection isn't open, and goes on with it the
-        next time.
+        It takes at most the reply's time: NoReply is raised while the new connection is not open, and the next call
+        continues.
         """
         now_s = self.clock.now_s()
         if self._opening is None:
@@ -207,7 +208,7 @@ class TcpLink:
             raise self._silent(timeout_s, "a foreign reply came, and the connection opened anew isn't there yet")
 
     def _untaken(self) -> bool:
-        """Has the other end's system not acknowledged all that was sent? Known on Linux only."""
+        """Return whether the other end has not acknowledged all sent data. Known on Linux only."""
         if not sys.platform.startswith("linux") or self._socket is None:
             return False
         import fcntl
@@ -250,4 +251,5 @@ class TcpLink:
             step = f"Check cable and address: is this computer in the drive's network? Try: ping {host}"
         else:
             what, step = str(error), "Check address and port"
-        return PreflightRefused(f"can't connect: {what}", where=self.description, next_step=step)
+        return PreflightRefused(f"can't connect: {what}", where=self.description, next_step=step,
+                                entry=MessageCode.NO_DRIVE_FOUND)

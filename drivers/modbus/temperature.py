@@ -1,4 +1,4 @@
-"""Temperatures that the drive tells: warning bits in every status word, numbers every other second beside the cycle."""
+"""Temperatures that the drive reports: warning bits in every status word, numbers every other second."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from drivers.modbus.codec import from_words, register_name
 from drivers.modbus.pdu import LinkLost, RegisterRefused
 from drivers.modbus.state_machine import seen
 from drivers.preflight import PreflightTable
+from profiles import MessageCode
 from profiles.modbus import ModbusProfile, Temperature
 
 EVERY_S = 2.0
@@ -17,7 +18,7 @@ UNWATCHED = "nobody watches it: this profile names no register for one; the driv
 
 
 class Heat:
-    """Looks at one after the other. Each that is too hot is told once."""
+    """Checks one temperature after the other. Each one that is too hot is reported once."""
 
     def __init__(self, access: RegisterAccess, profile: ModbusProfile) -> None:
         self._access = access
@@ -32,7 +33,7 @@ class Heat:
         self._polls = 0
 
     def prepare(self, table: PreflightTable, limit_c: float | None) -> None:
-        """A row each, as it is now; one that is too hot already is refused. ``limit_c``: rig.yaml's, °C, if any."""
+        """Add a row for each; one that is too hot now is refused. ``limit_c``: the limit in rig.yaml, °C, if any."""
         self._limit_c = limit_c
         if not self._numbers and not self._in_status:
             table.note("temperature", UNWATCHED, "profile, temperatures")
@@ -65,12 +66,12 @@ class Heat:
         assert table.checks[-1].outcome is not Outcome.NOTE
 
     def see(self, status: int) -> None:
-        """The status word of a cycle. Raises LimitHit."""
+        """Check the status word of a cycle. Raises LimitHit."""
         for one in self._in_status:
             self._judge(one, status)
 
     def poll(self, timeout_s: float) -> None:
-        """One read, if it is time; without an answer it is none. Raises LimitHit, and LinkLost."""
+        """Read one value if it is due; a missing answer is ignored. Raises LimitHit, and LinkLost."""
         now_s = self._access.clock.now_s()
         numbers = [one for one in self._watched if one in self._numbers]
         if not numbers or now_s < self._next_s:
@@ -98,6 +99,7 @@ class Heat:
             f"too hot: {one.title}: {_shown(one, counts)}{beyond}. The shaft is being stopped",
             where=register_name(one.register_),
             next_step="Let it cool down; ask for less torque or fewer periods",
+            entry=MessageCode.DRIVE_TOO_HOT,
         )
 
     def _limit_of(self, one: Temperature) -> float | None:

@@ -1,4 +1,4 @@
-"""What preflight does last: measure what the line carries, and arm the watchdog, which wants feeding from then on."""
+"""The last steps of preflight: measure the rate that the line carries, and arm the watchdog, which must then be fed."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from drivers.preflight import ANY_CLIENT, DIES, SHARED_FLAG, PreflightTable, set
 from profiles.modbus import ModbusProfile, Parameter
 
 LEAST_CYCLES = 5
-"""The watchdog must not bite on account of a lost reply or two."""
+"""The watchdog must not trip because of one or two lost replies."""
 MEASURED_ROUNDS = 20
 CARRIES, MARGIN = 1.02, 1.1
-"""The line carries a period that is this much longer than its slowest usual round; where it doesn't carry what was
-asked for, the period is longer by the second."""
+"""The line carries a period that is longer than its slowest usual round by the first factor. If it does not carry the
+requested rate, the period is longer by the second."""
 COUNT_S, COUNT_EVERY_S = 3.0, 0.2
-"""How long a drive that counts its requests is asked for other clients', and how often at least."""
+"""Time of counting other clients' requests, s, and longest interval between two readings, s."""
 LEAST_TIMEOUT_S = 0.05
-"""For a reply in the cycle. A little late is better than lost: the sample then says how uncertain its time is."""
+"""Least time-out of a reply in the cycle, s. A late reply is better than a lost one: its time is just less certain."""
 
 
 @dataclass(frozen=True)
 class CyclePace:
-    """How fast the cycle goes. ``timeout_s`` is for one transaction; ``usual_s`` is what a whole round takes."""
+    """Rate of the cycle. ``timeout_s`` is for one transaction; ``usual_s`` is the duration of a whole round."""
 
     period_s: float
     timeout_s: float
@@ -40,7 +40,7 @@ def measure_pace(
     table: PreflightTable, line: str, asked_hz: float, watchdog_s: float, plan_text: str, go: Callable[[], Round],
     now_s: Callable[[], float],
 ) -> CyclePace:
-    """The longer of the asked period and what the line carries, measured over some rounds as they will be."""
+    """Return the requested period, or the one that the line carries if longer, measured over some rounds."""
     took_s: list[float] = []
     longest_s, failed = 0.0, 0
     while len(took_s) < MEASURED_ROUNDS and failed < MEASURED_ROUNDS // 4:
@@ -57,9 +57,9 @@ def measure_pace(
             "The line is not good enough: check wiring, shielding, termination and baud rate",
         )
         return CyclePace(1.0 / asked_hz, LEAST_TIMEOUT_S, 1.0 / asked_hz)
-    # Four in five are faster: a few hiccups of the host must not slow the whole run down.
+    # 80 % of the rounds are faster: a few delays of the host must not slow the whole run down.
     usual_s = sorted(took_s)[4 * len(took_s) // 5]
-    # To the µs; carried periods are rounded up, so that the line does carry them.
+    # In whole µs; a measured period is rounded up, so that the line carries it.
     asked_us = round(1e6 / asked_hz)
     slower = 1e6 * CARRIES * usual_s > asked_us
     period_s = (math.ceil(1e6 * MARGIN * usual_s - 1e-6) if slower else asked_us) * 1e-6
@@ -77,9 +77,9 @@ def arm_watchdog(
     found: Parameters,
     period_s: float, feed: Callable[[], object],
 ) -> bool:
-    """Set or check the drive's time-out on the host's silence; one feeding write, then it is read back.
+    """Set or check the drive's time-out for a silent host; feed it once, then read it back.
 
-    Whether it is armed. If not, that is refused, unless the operator accepts it and it is known to be off.
+    Return whether it is armed. If not, it is refused, unless the operator accepts that and it is known to be off.
     """
     entry, accepted, tried = profile.watchdog, limits.accept_no_watchdog, PreflightTable()
     if entry.kind == "none":
@@ -119,10 +119,10 @@ def check_who_feeds(
     feed: Callable[[], object], *,
     simulated: bool
 ) -> bool:
-    """A row of what feeds an armed watchdog; whether any other client does.
+    """Add a row on what feeds an armed watchdog. Return whether any other client does.
 
-    Then it is no answer to a dead host, so that is taken by name only: refused otherwise, but of a simulated peer.
-    Where the drive counts its requests, others' are told.
+    Such a watchdog does not detect a dead host. So it needs the operator's acceptance by name; a simulated peer does
+    not. If the drive counts its requests, those of other clients are shown.
     """
     entry = profile.watchdog
     sure = f"{entry.fed_by.replace('_', ' ')} ({entry.fed_by_confidence})"
@@ -155,7 +155,7 @@ def check_who_feeds(
 def _others_requests(
     access: RegisterAccess, profile: ModbusProfile, every_s: float, feed: Callable[[], object]
 ) -> int | None:
-    """How many requests of others came in `COUNT_S`; None where the drive doesn't count them."""
+    """Return the number of foreign requests in `COUNT_S`; None if the drive does not count requests."""
     def count() -> int:
         register = profile.watchdog.request_counter
         return access.read(register) if register is not None else access.once(pdu.count_requests(), 1.0).words[0]
@@ -194,15 +194,15 @@ def _write(
 
 
 def is_off(access: RegisterAccess, parameter: Parameter, told: Mapping[str, float]) -> bool:
-    """Does the time-out stand at 0, which switches it off, or does the drive refuse to tell it at all?
+    """Return whether the time-out is 0, which switches it off, or the drive refuses to report it.
 
-    ``told``: values by name, for a time-out that has no register: a 0 that somebody has stated.
+    ``told``: values by name, for a time-out without a register: a 0 that rig.yaml states.
     """
     return told.get(parameter.name) == 0.0 if parameter.register_ is None else not counts_of(access, parameter)
 
 
 def counts_of(access: RegisterAccess, parameter: Parameter) -> int | None:
-    """What stands in its register; None without one, or where the drive refuses to tell."""
+    """Return the counts in its register; None without one, or if the drive refuses to report it."""
     try:
         return None if parameter.register_ is None else access.read(parameter.register_)
     except PreflightRefused:

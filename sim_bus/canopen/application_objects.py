@@ -54,7 +54,7 @@ class ObjectUnits:
 
 
 def standard_units(drive: DriveParams) -> ObjectUnits:
-    """Of our own EDS: 0.1 rpm, rpm, ‰ of the rated torque, mN·m."""
+    """Return the units of our own EDS: 0.1 rpm, rpm, ‰ of the rated torque, mN·m."""
     tenth_rpm, per_mille = TURN / 600.0, drive.rated_torque_nm / 1000.0
     return ObjectUnits(
         tenth_rpm, tenth_rpm, tenth_rpm, tenth_rpm, TURN / 60.0, per_mille, per_mille, per_mille, per_mille, 0.001,
@@ -63,7 +63,7 @@ def standard_units(drive: DriveParams) -> ObjectUnits:
 
 
 def profile_units(drive: DriveParams, profile: CanopenProfile, scales: dict[str, float]) -> ObjectUnits:
-    """As the profile says; ``scales`` are the values of the parameters it multiplies and divides by."""
+    """Return the units of the profile; ``scales`` are the values of the parameters it multiplies and divides by."""
     usual, speed, torque, offset = standard_units(drive), profile.speed, profile.torque, profile.torque_offset
     turns_per_s = speed.rpm_per_lsb / 60.0
     for name in speed.times:

@@ -1,9 +1,8 @@
-"""Scripted misbehaviour of one simulated drive: what is due begins and ends, and frames pass through what is going on.
+"""Scripted faults of one simulated drive: each fault begins and ends on time, and frames pass through active faults.
 
-All of it in plant time: in stepped time a script repeats to the last frame. In stepped time a SYNC that is lost on its
-way to the drive lets time go on all the same, and the host is told where each cycle ends
-(`profiles.simulator_marker.CYCLE_ID`), from the first one on: also what a fault makes the drive say behind its feedback
-is then in its cycle.
+All times are plant time: in stepped time a script repeats to the last frame. If a SYNC to the drive is lost in stepped
+time, time still advances, and the host is informed of the end of each cycle (`profiles.simulator_marker.CYCLE_ID`),
+from the first cycle on. So a frame that a fault adds after the feedback still belongs to its cycle.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ Frames = Iterable[Frame]
 
 @dataclass(frozen=True)
 class Scene:
-    """Where a fault happens. ``put`` sends a frame past all faults, as another station on the bus would."""
+    """Place of a fault. ``put`` sends a frame past all faults, as another station on the bus would."""
 
     node: Cia402Node
     put: Callable[[int, bytes], None]
@@ -49,11 +48,11 @@ class Misbehaviour(Passing):
     scene: Scene
 
     def outgoing(self, can_id: int, data: bytes) -> Frames:
-        """What becomes of a frame that the drive sends."""
+        """Return the frames that replace a frame sent by the drive."""
         return ((can_id, data),)
 
     def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
-        """What becomes of a frame that comes to the drive."""
+        """Return the frames that replace a frame sent to the drive."""
         return ((can_id, data),)
 
 
@@ -154,7 +153,7 @@ class LimitedTorque(Misbehaviour):
 
 
 class LoadLost(Misbehaviour):
-    """What was coupled comes off: this share of the motor end's inertia and friction is left."""
+    """The coupled load comes off: this share of the motor end's inertia and friction is left."""
 
     def __init__(self, share: float) -> None:
         self._share = share
@@ -177,7 +176,7 @@ class Lying(Misbehaviour):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Faults of the bus: frames that are lost, doubled, late, old, or somebody else's.
+# Faults of the bus: frames that are lost, doubled, late, old, or foreign.
 
 
 SYNC_ID = 0x080
@@ -265,7 +264,9 @@ class FrozenTpdos(Misbehaviour):
 
 
 class Replayed(Misbehaviour):
-    """Somebody plays a recording of this drive, enabled and at rest: old TPDOs go before each of the drive's own."""
+    """A recording of this drive, enabled and at standstill, is played back: old TPDOs precede each of the drive's
+    own.
+    """
 
     def __init__(self, before: int) -> None:
         self._before = before
@@ -311,7 +312,7 @@ class SecondMaster(Misbehaviour):
 
 
 class ForeignHeartbeat(Misbehaviour):
-    """Another node bears the number 127, the host's: its heartbeat comes every so often."""
+    """Another node uses the host's number 127: its heartbeat comes periodically."""
 
     def __init__(self, every_s: float) -> None:
         self._every_us = round(1e6 * every_s)
@@ -388,7 +389,7 @@ class Answers(Misbehaviour):
         self._object = index.to_bytes(2, "little") + bytes((sub,))
 
     def _asked(self, can_id: int, data: bytes | bytearray, *commands: int) -> bool:
-        """Is it the beginning of a transfer of the object (command specifier 1 download, 2 upload; CiA 301)?"""
+        """Return whether a transfer of the object begins (command specifier 1 download, 2 upload; CiA 301)."""
         requested = can_id == _REQUEST + self.scene.node.id and len(data) == 8
         return requested and data[0] >> 5 in commands and bytes(data[1:4]) == self._object
 
@@ -407,7 +408,7 @@ class Aborted(Answers):
 
 
 class Unanswered(Answers):
-    """The drive doesn't answer when it is asked for the object."""
+    """The drive does not answer requests for the object."""
 
     def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
         return () if self._asked(can_id, data, 1, 2) else ((can_id, data),)
@@ -558,7 +559,7 @@ class Faults:
         self._ends_cycles = False          # and the host knows
 
     def attach(self, node: Cia402Node, sender: Sender) -> None:
-        """From now on they happen to this node."""
+        """Let the faults happen to this node from now on."""
         self._node = node
         self._put: Callable[[int, bytes], None] = sender.put
         scene = Scene(node, sender.put, self._rng)

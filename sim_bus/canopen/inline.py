@@ -35,6 +35,9 @@ from sim_bus.params import RigParams
 class InlineBus(can.BusABC):
     """A station on the line of an `InlineSimulator`, which makes it."""
 
+    answers_at_once = True
+    """All that a frame makes the others send lies in their queues when `send` returns. A host reads it by this name."""
+
     def __init__(self, channel: str, stations: "list[InlineBus]", hear: Callable[[can.Message], None]) -> None:
         super().__init__(channel)
         self.channel_info = f"Virtual bus channel {channel}"
@@ -79,7 +82,7 @@ class InlineBus(can.BusABC):
 
 
 class _DrivesEnd(InlineBus):
-    """Where the drive sends. It hears nothing here: a frame is handed to it as it is sent."""
+    """The drive's end for sending. It receives nothing: a frame is passed on when it is sent."""
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """All stations have it; the first one itself, as the drive makes a frame for one sending only."""
@@ -115,7 +118,7 @@ class InlineSimulator(Embedded):
         self.bus = self.station()
 
     def station(self) -> InlineBus:
-        """Another bus to it; what was said before isn't heard there."""
+        """Return another bus on the same line; it does not receive earlier frames."""
         bus = InlineBus(self.channel, self._stations, self._hear)
         self._stations.append(bus)
         return bus

@@ -223,7 +223,7 @@ class TransmitPdo(Pdo):
         return self._struct.pack(*[getter() for getter in self._getters])
 
     def at_sync(self) -> bytes | None:
-        """What to send at this SYNC, if anything."""
+        """Return the frame to send at this SYNC, if any."""
         every = self.transmission
         if every == 1:
             return self.pack()
@@ -240,7 +240,7 @@ class TransmitPdo(Pdo):
         return data
 
     def on_event(self, now_us: int) -> bytes | None:
-        """What to send by event: changed data (not within the inhibit time), or the event timer ran out."""
+        """Return the frame to send by event: changed data (not within the inhibit time), or the event timer ran out."""
         since = now_us - self._sent_us
         if self._sent and since < self.inhibit_us:
             return None
@@ -263,4 +263,4 @@ class TransmitPdo(Pdo):
 
 
 def _discard(_value: int) -> None:
-    """Where a dummy entry's value goes."""
+    """Discard the value of a dummy entry."""

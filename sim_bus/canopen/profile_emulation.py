@@ -60,7 +60,7 @@ class WornSettings:
         return {one.name: self.value(one.name) for one in self._profile.parameters if one.set_to is None}
 
     def value(self, name: str) -> float:
-        """In its unit."""
+        """Return the value in its unit."""
         one = self._profile.parameter(name)
         raw = self.raw[name]
         return float(2 ** int(raw)) if one.scale == "power_of_two" else raw * self._unit(one)
@@ -107,7 +107,9 @@ class WornSettings:
         return one.per_lsb if one.times is None else one.per_lsb * self.value(one.times)
 
     def _delivered(self, one: Parameter) -> float:
-        """What stands in the object: what is required, else the factory's, else what suits the simulated machine."""
+        """Return the object's initial value: as required, else the factory's, else one that suits the simulated
+        machine.
+        """
         wanted = one.require
         if wanted is not None:
             value = wanted.equals if wanted.equals is not None else wanted.one_of[0] if wanted.one_of else one.default
@@ -151,7 +153,7 @@ class _Write:
 # ---------------------------------------------------------------------------------------------------------------------
 
 _REACTIONS = {"none": 0, "fault_reaction": 1, "coast": 2, "quick_stop": 3}
-"""What 6007h would say for each."""
+"""Value of 6007h for each reaction."""
 _QUICK_STOP_RAMP = 2
 
 
@@ -312,7 +314,7 @@ class WornProfile:
         store.live[key_of(position.index, position.sub)] = inverter.lies.word(Feedback.POSITION, counts, ones)
 
     def _filters(self, store: ObjectStore) -> None:
-        """What smooths the reports of the simulated machine, as the profile's drive would tell it."""
+        """Set the filters of the simulated machine's reports, in the objects of the profile's drive."""
         reporting = self._application.inverter.params.reporting
         for entry in self.profile.filters:
             lag_s = reporting.speed_lag_s if entry.signal == "speed" else reporting.torque_lag_s

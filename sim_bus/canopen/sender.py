@@ -6,7 +6,7 @@ import can
 import canopen
 
 BUS_ERRORS = (can.CanError, OSError, ValueError)
-"""What python-can's buses raise when they die; a closed socket gives ValueError in `select`."""
+"""Errors that python-can's buses raise when they fail; a closed socket gives ValueError in `select`."""
 
 
 class Frame(can.Message):
@@ -29,7 +29,7 @@ class Sender:
         self._on_lost = on_lost
         self.lost = False
         self.script: Callable[[int, bytes], Sequence[tuple[int, bytes | bytearray]]] | None = None
-        """What becomes of a frame on its way out, where faults are scripted."""
+        """Replacement of an outgoing frame, if faults are scripted."""
 
     def revive(self) -> None:
         """The bus has been heard again."""
@@ -62,5 +62,5 @@ class PassiveNetwork(canopen.Network):  # type: ignore[misc, unused-ignore]
         self._sender = sender
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """What canopen's servers answer; remote frames are never asked for."""
+        """Send an answer of canopen's servers; they never request remote frames."""
         self._sender.send(can_id, bytes(data))

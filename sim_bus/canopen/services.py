@@ -26,7 +26,7 @@ _HISTORY = 8
 
 
 class Emergency:
-    """What is wrong at present, and what was."""
+    """Present and past errors of the drive."""
 
     def __init__(self, store: ObjectStore, send: Callable[[bytes], None]) -> None:
         self.register = 0
@@ -146,7 +146,7 @@ class HeartbeatProducer:
 
 
 class LifeGuard:
-    """What is set, when the host asked last, and which toggle comes next."""
+    """Life guarding: its settings, the time of the host's last request, and the next toggle."""
 
     def __init__(self) -> None:
         self.guard_ms = 0

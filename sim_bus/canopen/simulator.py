@@ -35,7 +35,7 @@ _AT_REST_RAD_S = 0.02
 
 
 class Simulator:
-    """A simulated drive on a bus that somebody else opens and shuts down."""
+    """A simulated drive on a bus that the caller opens and shuts down."""
 
     def __init__(self, bus: can.BusABC, params: RigParams, *, node_id: int = 1, seed: int = 0,
                  trace: Path | None = None, stepped: bool = False, silence_s: float = 1.0,
@@ -152,7 +152,8 @@ class Simulator:
         if waited_s < 0.5 * timeout_s:
             stop.wait(timeout_s)
             waited_s += timeout_s
-        # Whoever doesn't get the processor himself doesn't know that others are silent: no wait counts for more.
+        # A process that gets no processor time can't know that others are silent: no wait counts for more than its
+        # length.
         self._silent_s += min(waited_s, timeout_s)
         if self._silent_s >= self._silence_s:
             self._run_on("host silent: running on in own time")

@@ -74,7 +74,7 @@ def parse_send(word: str) -> WireFrame | None:
 
 
 def frame_word(frame: WireFrame, time_s: float) -> bytes:
-    """What a client is told of a frame."""
+    """Return the text of a frame for a client."""
     digits = f"{frame.can_id:08X}" if frame.extended else f"{frame.can_id:03X}"
     return f"< frame {digits} {time_s:.6f} {frame.data.hex().upper()} >".encode("ascii")
 
@@ -107,7 +107,7 @@ class Hub:
         self._clients: list[_SocketcandClient] = []
         self._taps: list[Callable[[WireFrame], None]] = []
         self.all_gone = False
-        """The last client has just left; whoever acts on it sets it back."""
+        """True after the last client has left; the code that reacts to it resets it."""
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self._listener = socket.socket(family, socket.SOCK_STREAM)
         try:

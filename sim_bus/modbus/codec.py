@@ -35,7 +35,7 @@ _BITS = {"u16": 16, "i16": 16, "u32": 32, "i32": 32}
 
 @dataclass(frozen=True, slots=True)
 class RegisterLayout:
-    """Where a number stands and how."""
+    """Address and type of a number."""
 
     address: int
     kind: str = "u16"

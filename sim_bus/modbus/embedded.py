@@ -48,7 +48,7 @@ class LineTiming:
     silence_s: float = 0.0
     """Between two frames."""
     turn_around_s: float = 0.0
-    """From the end of a request, as the drive sees it, to the first character of its reply."""
+    """Time from the end of a request at the drive to the first character of its reply, s."""
     latency_s: float = 0.0
     """Each way."""
     jitter_s: float = 0.0
@@ -74,11 +74,13 @@ class LineTiming:
         return cls.rtu(line.baud, line.turn_around_s)
 
     def way_s(self, pdu_bytes: int, chance: float) -> float:
-        """From the first to the last character of a frame, and over the network; ``chance`` in [0, 1) is its jitter."""
+        """Return the time from first to last character of a frame, with the network, s; ``chance`` in [0, 1): its
+        jitter.
+        """
         return (pdu_bytes + _FRAME) * self.character_s + self.latency_s + chance * self.jitter_s
 
     def acts_after_s(self, pdu_bytes: int, chance: float) -> float:
-        """From the first character of a request until the drive acts on it and begins to reply."""
+        """Return the time from the first character of a request until the drive acts and begins to reply, s."""
         return self.way_s(pdu_bytes, chance) + self.silence_s + self.turn_around_s
 
 
@@ -138,11 +140,10 @@ class EmbeddedModbusDrive:
     def serve(
         self, unit: int, pdu: bytes, now_s: float, connection: int = 0
     ) -> tuple[bytes | None, float]:
-        """A request sent at ``now_s``: its reply, and when that is complete; None where nobody answers.
+        """Serve a request sent at ``now_s``. Return its reply and the time when it is complete; None without an answer.
 
-        ``connection`` tells clients apart, where several talk to it.
-
-        The plant has then run up to the moment at which the drive acted. A line that isn't free yet delays the request.
+        ``connection`` distinguishes clients. The plant has then run up to the moment at which the drive acted. A busy
+        line delays the request.
         """
         if unit == self.unit and tells_stage(pdu):     # belongs to the rehearsal: takes no time on the line
             self.run_until(now_s)
@@ -191,5 +192,5 @@ class EmbeddedModbusDrive:
 
 
 def _heard(reply: DriveReply) -> bytes | None:
-    """What a host's receiver passes on."""
+    """Return the reply as a host's receiver passes it on."""
     return None if reply.crc_bits else reply.pdu

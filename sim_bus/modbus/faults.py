@@ -1,7 +1,7 @@
-"""Scripted misbehaviour of one simulated Modbus drive: what is due begins and ends, requests pass through what goes on.
+"""Scripted faults of one simulated Modbus drive: each fault begins and ends on time, requests pass through active ones.
 
-All of it in plant time. That the host says which stage has begun (`profiles.simulator_marker.MARKER_STAGE_REGISTER`)
-belongs to the rehearsal, not to the line: no fault comes between.
+All times are plant time. The host's write of the stage (`profiles.simulator_marker.MARKER_STAGE_REGISTER`) belongs to
+the rehearsal, not to the line: no fault affects it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ Ask = Callable[[bytes], DriveReply]
 
 @dataclass(frozen=True)
 class Scene:
-    """Where a fault happens."""
+    """Place of a fault."""
 
     machine: Machine
     profile: ModbusProfile
@@ -150,9 +150,9 @@ class LostConnection(Misbehaviour):
 
 
 class FrozenReads(Misbehaviour):
-    """What is read of the feedback is what was read of it first: a gateway that repeats its process image.
+    """Feedback reads repeat the first values: a gateway that repeats its process image.
 
-    What is written goes through.
+    Writes pass through.
     """
 
     def __init__(self) -> None:
@@ -260,7 +260,7 @@ def hot(temperature_c: float) -> Act:
 
 
 def load_lost(share: float) -> Act:
-    """What was coupled comes off: this share of the motor end's inertia and friction is left."""
+    """The coupled load comes off: this share of the motor end's inertia and friction is left."""
     return Act(lambda machine: machine.inverter.lose_load(share))
 
 

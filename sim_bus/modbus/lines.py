@@ -1,4 +1,4 @@
-"""What the simulated drive listens on: a TCP port, a serial device, or a pseudo terminal that it makes itself."""
+"""Lines of the simulated drive: a TCP port, a serial device, or a pseudo terminal that it makes itself."""
 
 import os
 import socket
@@ -9,7 +9,7 @@ from contextlib import suppress
 from struct import Struct
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
-from profiles import TdhilError
+from profiles import MessageCode, TdhilError
 from sim_bus.modbus.codec import DriveReply
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -89,7 +89,7 @@ class RtuReceiver:
             yield ReceivedRequest(frame[0], bytes(frame[1:-2]))
 
     def _length(self) -> int:
-        """Of the frame at the beginning; 0 while it isn't there."""
+        """Return the length of the frame at the beginning; 0 while it is incomplete."""
         buffer = self._buffer
         function = buffer[1]
         if function in _FIXED:
@@ -138,7 +138,7 @@ class LateQueue(Generic[To]):
         self._held.append((time.monotonic() + late_s, to, frame))
 
     def due(self) -> list[tuple[To, bytes]]:
-        """What is due by now, in the order in which it was put."""
+        """Return the data that is due now, in order."""
         if not self._held:
             return []
         now_s = time.monotonic()
@@ -187,6 +187,7 @@ class TcpListener:
             raise TdhilError(
                 f"can't listen: {getattr(error, 'strerror', None) or error}", where=f"--tcp {host}:{port}",
                 next_step="Take another port (0 takes any free one), or end what listens there",
+                entry=MessageCode.SIMULATOR_UNUSABLE,
             ) from error
         self._clients: dict[int, tuple[socket.socket, bytearray, int]] = {}
         self._accepted = 0             # so many clients so far: the last one's number
@@ -270,6 +271,7 @@ class RtuListener:
             raise TdhilError(
                 "this system has no serial lines that a program can be at the far end of", where="--rtu",
                 next_step="Use --tcp",
+                entry=MessageCode.SIMULATOR_UNUSABLE,
             ) from error
         try:
             if device is None:
@@ -285,6 +287,7 @@ class RtuListener:
             raise TdhilError(
                 f"can't open: {reason}", where=f"--rtu {device or ''}".rstrip(),
                 next_step="Name a serial device that you may write to, or none to get a pseudo terminal",
+                entry=MessageCode.SIMULATOR_UNUSABLE,
             ) from error
         os.set_blocking(self._fd, False)
         self._receiver = RtuReceiver()
@@ -299,7 +302,8 @@ class RtuListener:
         except BlockingIOError:
             return
         except OSError as error:
-            raise TdhilError(f"the line has gone: {error.strerror}", where=self.reached_by) from error
+            raise TdhilError(f"the line has gone: {error.strerror}", where=self.reached_by,
+                             entry=MessageCode.SIMULATOR_UNUSABLE) from error
         for request in self._requests(data):
             reply = serve(request)
             if reply.pdu is not None:
@@ -324,7 +328,7 @@ class RtuListener:
 
 
 def _write(fd: int, frame: bytes) -> None:
-    with suppress(BlockingIOError):            # nobody reads: the reply is lost, as on a line
+    with suppress(BlockingIOError):            # no reader: the reply is lost, as on a line
         os.write(fd, frame)
 
 

@@ -28,7 +28,7 @@ _OWN = "_of_this_connection"
 
 
 class SimulatedWatchdog:
-    """What feeds it, and for how long it waits."""
+    """Requests that feed the watchdog, and its time-out."""
 
     def __init__(self, watchdog: ModbusWatchdog) -> None:
         self._fed_by = watchdog.fed_by.removesuffix(_OWN)
@@ -60,12 +60,12 @@ class SimulatedWatchdog:
 # ---------------------------------------------------------------------------------------------------------------------
 
 _REACTIONS = {"none": 0, "fault_reaction": 1, "coast": 2, "quick_stop": 3, "ramp_stop": 3}
-"""As 6007h codes them."""
+"""Codes of the reactions, as in 6007h."""
 _SLOW_DOWN_RAMP = 1
 RAMP_RAD_S2 = 1.5
-"""Of a drive for speed only, whose setpoint passes a ramp generator (ATV320 ACC 9001 and DEC 9002, Delta Pr.01-12 and
-01-13, Danfoss 3-41 and 3-42, Lenze 6048h and 6049h): set short, as the profiles' hints ask. From standstill to the
-default rig's speed limit in 14 s. The profiles have no register for it; it acts, and is not told."""
+"""Acceleration of a speed-only drive, whose setpoint passes a ramp generator (ATV320 ACC 9001 and DEC 9002, Delta
+Pr.01-12 and 01-13, Danfoss 3-41 and 3-42, Lenze 6048h and 6049h): set short, as the profiles' hints advise. From
+standstill to the default rig's speed limit in 14 s. The profiles have no register for it, so it is not reported."""
 
 
 class Machine:
@@ -109,7 +109,7 @@ class Machine:
         self._connection = connection
         self._was_told = False
         answer = self._bank.answer(pdu)
-        if not self._was_told:          # the marker isn't the drive's: what is said there feeds no watchdog
+        if not self._was_told:          # a write to the marker feeds no watchdog
             self._fed(answer)
         return answer.pdu
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from math import inf, pi
 
-from profiles import Require, TdhilError
+from profiles import MessageCode, Require, TdhilError
 from profiles.modbus import ModbusProfile, Parameter
 from sim_bus.inverter import RPM
 from sim_bus.modbus.codec import RegisterLayout
@@ -46,10 +46,10 @@ def value_that_meets(require: Require) -> float:
 
 QUICK_STOP_RAD_S2 = 3.0
 _FEWEST_POWER_COUNTS = 400
-"""A name plate's power is told to a fraction of a percent."""
+"""Least counts of a name plate's power: its resolution is a fraction of a percent."""
 _NEAR_ENOUGH = 0.02
 _TIME_OUT_S = 0.5
-"""Of a watchdog that the host can't set."""
+"""Time-out of a watchdog that the host can't set, s."""
 
 
 def start(store: ParameterStore, profile: ModbusProfile, rig: RigParams) -> float:
@@ -79,6 +79,7 @@ def _put_exactly(store: ParameterStore, profile: ModbusProfile, name: str, value
             f"{profile.parameter(name).title} can't tell {value:g}: the nearest is {told:g}",
             where=f"profile {profile.name}, parameter {name}",
             next_step="Simulate a rig that fits this drive (--plant: drive.rated_torque_nm, drive.speed_limit_rpm)",
+            entry=MessageCode.SIMULATOR_UNUSABLE,
         )
 
 
@@ -175,7 +176,7 @@ class ParameterStore:
         return per_lsb * tenth * (self.value(times) if times is not None else 1.0)
 
     def value(self, name: str) -> float:
-        """In the parameter's unit."""
+        """Return the value in the parameter's unit."""
         parameter = self._by_name[name]
         acting = self._acting.get(name, self._stored[name])
         return acting if parameter.register_ is None else acting * self._scale_of(parameter)
@@ -186,12 +187,12 @@ class ParameterStore:
         return {name: value for name, value in self._stored.items() if self._by_name[name].register_ is None}
 
     def number(self, name: str) -> int:
-        """What its register reads."""
+        """Return the number in its register."""
         stored = round(self._stored[name])
         return something_else(stored) if name in self._other else stored
 
     def write(self, name: str, number: int) -> None:
-        """What the host wrote there; kept unless the drive has that wrong."""
+        """Take the value written by the host; it is kept unless the drive's map is wrong there."""
         if not self.keeps or name in self.not_kept:
             return
         if not self._by_name[name].writable_in_operation:

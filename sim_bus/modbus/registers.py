@@ -45,7 +45,7 @@ from sim_bus.reports import Feedback
 
 
 HOT_C = 120.0
-"""What the simulated drive's motor bears."""
+"""Highest temperature of the simulated drive's motor, °C."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ class Map:
         return slots
 
     def _echoes(self) -> list[Slot]:
-        """What the drive has made of a setpoint, in SI, told once more: not the register that the host wrote."""
+        """Return the echoes of setpoints, in SI: not the registers that the host wrote."""
         application = self._application
         targets: dict[str, Callable[[], float]] = {
             "speed": lambda: application.target_speed_rad_s, "torque": lambda: application.target_torque_nm,
@@ -232,7 +232,7 @@ class Map:
         self._on_stage(number)
 
     def _status(self) -> int:
-        """The family's word; over it what the user has wired to it, but on ABB, whose bit 11 is the family's own."""
+        """Return the family's status word with the user's wiring; on ABB bit 11 is the family's own."""
         word, display = self._words.status(), self._profile.modes.display
         status = self._profile.cycle.status.register_
         for one in self._profile.temperatures:
@@ -250,7 +250,7 @@ class Map:
         return (display.torque if self._words.torque else display.speed) & display.mask
 
     def _signed(self, layout: RegisterLayout, number: int) -> int:
-        """As the drive reports it."""
+        """Return the number as the drive reports it."""
         if "sign" in self._wrongs and layout.signed:
             return layout.saturated(-number)
         return number
@@ -304,7 +304,7 @@ class Answer(NamedTuple):
 
 
 class Bank:
-    """What stands at which address, for the functions that the drive knows."""
+    """Content of each address, for the functions that the drive supports."""
 
     def __init__(self, slots: Mapping[tuple[str, int], Slot], functions: tuple[int, ...], written: Callable[[], None],
                  *, largest_read: int, largest_write: int) -> None:

@@ -1,4 +1,4 @@
-"""The simulated Modbus drive in real time: plant and watchdog follow the monotonic clock, also when nobody talks."""
+"""The simulated Modbus drive in real time: plant and watchdog follow the monotonic clock, also without requests."""
 
 import select
 import threading
@@ -12,7 +12,7 @@ from sim_bus.modbus.machine import Machine
 _POLL_S = 0.005
 _BROADCAST = 0
 _ANY_UNIT = 255
-"""What a TCP host names where there is no gateway (messaging guide, section 4.4.1.2)."""
+"""Unit of a TCP host without a gateway (messaging guide, section 4.4.1.2)."""
 
 
 class DriveServer:

@@ -19,7 +19,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from profiles import TdhilError
+from sim_bus.fault_script import FaultRefused
 
 # ---------------------------------------------------------------------------------------------------------------------
 # How the drive refuses a request: a Modbus exception reply (Modbus application protocol, section 7).
@@ -71,21 +71,21 @@ class Wrong:
 
 
 def parse(text: str, parameters: Iterable[str] = ()) -> Wrong:
-    """``scale_10``, or ``reads_back_something_else:time_out``; TdhilError names what there is."""
+    """``scale_10``, or ``reads_back_something_else:time_out``; FaultRefused names what there is."""
     kind, _, of = text.partition(":")
     known = tuple(parameters)
     if kind not in KINDS:
-        raise TdhilError(f"no wrong is named '{kind[:40]}'", where="--wrong",
-                         next_step=f"There are: {', '.join(KINDS)}")
+        raise FaultRefused(f"no wrong is named '{kind[:40]}'", where="--wrong",
+                           next_step=f"There are: {', '.join(KINDS)}")
     if (kind == "reads_back_something_else") != bool(of):
-        raise TdhilError(f"'{text[:60]}' is not complete or says too much", where="--wrong",
-                         next_step="Only reads_back_something_else takes a parameter: reads_back_something_else:NAME")
+        raise FaultRefused(f"'{text[:60]}' is not complete or says too much", where="--wrong",
+                           next_step="Only reads_back_something_else takes a parameter: reads_back_something_else:NAME")
     if of and known and of not in known:
-        raise TdhilError(f"the profile has no parameter '{of[:40]}'", where="--wrong",
-                         next_step=f"It has: {', '.join(known)}")
+        raise FaultRefused(f"the profile has no parameter '{of[:40]}'", where="--wrong",
+                           next_step=f"It has: {', '.join(known)}")
     return Wrong(kind, of or None)  # type: ignore[arg-type]
 
 
 def something_else(raw: int) -> int:
-    """What is read instead of ``raw``."""
+    """Return the value read instead of ``raw``."""
     return raw + abs(raw) // 2 + 1

@@ -43,7 +43,7 @@ _SHORT_PATH = 1e-6
 
 @dataclass(frozen=True)
 class Shafts:
-    """What the shafts are: one entry per run, as `sim_bus.plant.rigid.Params` has one."""
+    """Parameters of the shafts: one entry per run, like `sim_bus.plant.rigid.Params`."""
 
     inertia_kg_m2: FloatArray
     viscous_nm_s_rad: FloatArray
@@ -57,7 +57,7 @@ class Shafts:
         cls, inertia_kg_m2: ArrayLike, viscous_nm_s_rad: ArrayLike, coulomb_nm: ArrayLike,
         dahl_stiffness_nm_rad: ArrayLike, dahl: ArrayLike,
     ) -> Shafts:
-        """From numbers or lists, each spread over as many runs as the longest has."""
+        """Make shafts from numbers or lists, each spread over as many runs as the longest has."""
         numbers = np.broadcast_arrays(
             *(np.atleast_1d(np.asarray(one, dtype=np.float64))
               for one in (inertia_kg_m2, viscous_nm_s_rad, coulomb_nm, dahl_stiffness_nm_rad, dahl))
@@ -137,7 +137,7 @@ class FixedStep:
         return np.where(still, 0.0, end), np.where(still, 0.0, travel)
 
     def _travel(self, begin: FloatArray, end: FloatArray, net: FloatArray, dt_s: FloatArray) -> FloatArray:
-        """Of Coulomb friction between two speeds of one sign: the momentum's balance, or the mean of both speeds."""
+        """Return the travel under Coulomb friction between two speeds of one sign: momentum balance, or mean speed."""
         viscous, inertia = self.shafts.viscous_nm_s_rad, self.shafts.inertia_kg_m2
         light = viscous * dt_s <= _LIGHTLY_DAMPED * inertia
         mean = 0.5 * (begin + end) * dt_s

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from profiles import NonNegative, Positive, refuse_if
-from sim_bus.plant.friction import ShaftParams, advance_of
+from sim_bus.plant.friction import MotorEnd, ShaftParams, advance_of
 from sim_bus.plant.two_mass import Bottom
 
 LONGEST_TICK_S = 0.002
@@ -41,7 +41,7 @@ MOST_CELLS = 20_000
 Wave = NDArray[np.float64]
 
 
-class StringParams(ShaftParams):
+class StringParams(MotorEnd):
     """The motor's end, as a rigid shaft has it, the pipe (5 inch, 19.5 lb/ft), and the bottom."""
 
     kind: Literal["string"] = "string"

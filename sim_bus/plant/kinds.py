@@ -1,10 +1,10 @@
-"""Which plant hangs on the motor: ``kind`` in plant.yaml chooses, and whoever drives one sees only `Plant`.
+"""The plant on the motor: ``kind`` in plant.yaml selects it, and its callers use only `Plant`.
 
 ::
 
     plant = build(params)        state = plant.rest()        state = plant.step(state, torque, dt, load)
 
-A state is an immutable tuple: keeping it is copying it. The motor's speed and angle are in every one.
+A state is an immutable tuple: keeping it is copying it. Each state has the motor's speed and angle.
 """
 
 from collections.abc import Callable
@@ -23,14 +23,14 @@ from sim_bus.plant.two_mass import TwoMassParams
 
 
 class MotorState(Protocol):
-    """What every state tells."""
+    """Values of every state."""
 
     @property
     def speed_rad_s(self) -> float:
-        """Of the motor's shaft."""
+        """Speed of the motor's shaft."""
     @property
     def angle_rad(self) -> float:
-        """Of the motor's shaft."""
+        """Angle of the motor's shaft."""
 
 
 S = TypeVar("S", bound=MotorState)
@@ -63,7 +63,7 @@ class TwoMass:
 
 @dataclass(frozen=True)
 class PlantKind:
-    """Of one ``kind``: the model of its section in plant.yaml, what makes a plant of it, and can it be wound up?"""
+    """Entry of one ``kind``: the model of its section in plant.yaml, its constructor, and whether it can twist."""
 
     params: type[BaseModel]
     plant: Callable[[Any], Plant[Any]]
@@ -79,7 +79,11 @@ PLANTS: dict[str, PlantKind] = {
 
 
 def build(params: Any) -> Plant[Any]:
-    """The plant that ``params``, of one of `PLANTS`, describe."""
+    """The plant that ``params``, of one of `PLANTS`, describe; a body on the motor's shaft is part of its inertia."""
+    body = getattr(params, "added_inertia_kg_m2", 0.0)
+    if body > 0.0:
+        whole = params.inertia_kg_m2 + body
+        params = params.model_copy(update={"inertia_kg_m2": whole, "added_inertia_kg_m2": 0.0})
     return PLANTS[params.kind].plant(params)
 
 

@@ -10,17 +10,17 @@ is in `sim_bus.plant.two_mass` and `sim_bus.plant.drill_string`; `sim_bus.plant.
 
 from typing import Literal, NamedTuple
 
-from sim_bus.plant.friction import ShaftParams, advance_of, torque
+from sim_bus.plant.friction import MotorEnd, advance_of, torque
 
 
-class Params(ShaftParams):
-    """What the shaft is. The defaults are the field-like rig of the identification study."""
+class Params(MotorEnd):
+    """Parameters of the shaft. The defaults are the field-like rig of the identification study."""
 
     kind: Literal["rigid"] = "rigid"
 
 
 class ShaftState(NamedTuple):
-    """Where the shaft is: speed, angle, and the deflection of the bristle (0 without one)."""
+    """State of the shaft: speed, angle, and the deflection of the bristle (0 without one)."""
 
     speed_rad_s: float = 0.0
     angle_rad: float = 0.0

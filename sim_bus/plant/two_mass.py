@@ -23,7 +23,7 @@ from typing import Literal, NamedTuple, Self
 from pydantic import model_validator
 
 from profiles import NonNegative, Positive, refuse_if
-from sim_bus.plant.friction import ShaftParams, advance_of
+from sim_bus.plant.friction import MotorEnd, ShaftParams, advance_of
 
 FASTEST_RAD_S = 1000.0
 """Swings beyond this would take hundreds of pieces per step."""
@@ -31,7 +31,7 @@ _CUT = 0.1
 
 
 class Bottom(ShaftParams):
-    """What turns at the lower end."""
+    """Rotating parts at the lower end."""
 
     inertia_kg_m2: Positive = 374.0
     viscous_nm_s_rad: NonNegative = 4.0
@@ -39,7 +39,7 @@ class Bottom(ShaftParams):
     static_nm: NonNegative = 40.0
 
 
-class TwoMassParams(ShaftParams):
+class TwoMassParams(MotorEnd):
     """The motor's end, as a rigid shaft has it, the spring, and the bottom."""
 
     kind: Literal["two_mass"] = "two_mass"
@@ -51,7 +51,7 @@ class TwoMassParams(ShaftParams):
     @property
     def mobility_1_kg_m2(self) -> float:
         """1/J_r + 1/J_L."""
-        return 1.0 / self.inertia_kg_m2 + 1.0 / self.bottom.inertia_kg_m2
+        return 1.0 / (self.inertia_kg_m2 + self.added_inertia_kg_m2) + 1.0 / self.bottom.inertia_kg_m2
 
     @model_validator(mode="after")
     def _slow_enough(self) -> Self:

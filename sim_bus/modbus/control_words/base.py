@@ -1,9 +1,9 @@
-"""What all families share: a word comes in, the drive's power side obeys, a status word goes out.
+"""Common part of all families: a control word comes in, the power side executes it, a status word goes out.
 
-Underneath every family lies the one power state machine of `sim_bus.cia402`: PROFIdrive's is the same by
-other names, and the start and stop commands of simpler drives are ways through it. A family only translates: its own
-bits into commands, and states into its own bits. What the bits mean is taken from the manuals, not from the profile;
-the profile says only how the drive has been wired by its user (`Wiring`).
+Each family uses the one power state machine of `sim_bus.cia402`: PROFIdrive's is the same with other names, and the
+start and stop commands of simpler drives are paths through it. A family only translates: its own bits into commands,
+and states into its own bits. The bits' meaning comes from the manuals, not from the profile; the profile only states
+how the user has wired the drive (`Wiring`).
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ AT_SETPOINT_RAD_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """How the user has set the drive up, where the family leaves that to him."""
+    """Setup of the drive by its user, where the family permits a choice."""
 
     torque_bits: int = 0
     """Bits of the control word that select torque; 0: the word doesn't select."""
@@ -137,12 +137,12 @@ class ControlWords:
 
     @property
     def state(self) -> State:
-        """Of the power side."""
+        """State of the power side."""
         return self.application.state
 
     @property
     def faulted(self) -> bool:
-        """In fault, or on the way there."""
+        """True in fault, or on the way there."""
         return self.state in {State.FAULT, State.FAULT_REACTION}
 
     @property
@@ -195,7 +195,7 @@ class StartStop(ControlWords):
         self.order(DeviceCommand.QUICK_STOP)
 
     def coast(self) -> None:
-        """No torque at once."""
+        """Remove the torque at once."""
         self._blocked = False
         self.order(DeviceCommand.DISABLE_VOLTAGE)
 

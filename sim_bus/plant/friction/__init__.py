@@ -17,9 +17,9 @@ step::
 from collections.abc import Callable
 
 from sim_bus.plant.friction import coulomb, dahl, lugre, stribeck
-from sim_bus.plant.friction.shaft import ShaftParams
+from sim_bus.plant.friction.shaft import MotorEnd, ShaftParams
 
-__all__ = ["Advance", "ShaftParams", "advance", "advance_of", "torque"]
+__all__ = ["Advance", "MotorEnd", "ShaftParams", "advance", "advance_of", "torque"]
 
 Advance = Callable[[ShaftParams, float, float, float, float], tuple[float, float, float]]
 

@@ -1,4 +1,4 @@
-"""What one inertia is: its moment, its friction, its constant load. A rig has one, or one at each end of a string."""
+"""One inertia: its moment, its friction, its constant load. A rig has one, or one at each end of a string."""
 
 from typing import Literal, Self
 
@@ -36,3 +36,10 @@ class ShaftParams(Validated):
             refuse_if([("static_nm", f"breakaway torque can't be below coulomb_nm ({self.coulomb_nm:g}) "
                                      f"with friction: {self.friction}")])
         return self
+
+
+class MotorEnd(ShaftParams):
+    """The inertia on the motor's shaft."""
+
+    added_inertia_kg_m2: NonNegative = 0.0
+    """A body of known inertia that is bolted to the shaft, beside ``inertia_kg_m2``."""
