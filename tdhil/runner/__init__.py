@@ -1,4 +1,4 @@
-"""A run as it goes: runner, control loop, guard, stop; the stages, the excitations, and the design of the motion."""
+"""A run in motion: runner, control loop, guard, stop, stages, excitations, and the design of the motion."""
 
 from typing import TYPE_CHECKING
 

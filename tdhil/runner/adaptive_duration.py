@@ -1,4 +1,4 @@
-"""Stage 5 with a tolerance: after the pilot and after every extension, is it enough, and if not, how much more?"""
+"""Stage 5 with a tolerance: after the pilot and each extension, decide whether to acquire more, and how much."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from tdhil.runner.design import LOOKS, MARGIN, MOST_BEHIND, Look, Stopping, inte
 from tdhil.runner.excitation import Plan
 
 Snapshot = Callable[[], Recording]
-LEAST_EXTENSION = 2       # periods at each mean speed: fewer are not worth the way back
-_SECOND_SHARE = 0.5       # of what is there, behind an interval: the least that may make another say something else
-_AT_LAST_SHARE = 1.0      # of what is there: the most that one mean speed alone gets; friction's slope needs both
+LEAST_EXTENSION = 2       # periods at each mean speed: fewer do not justify the way back
+_SECOND_SHARE = 0.5       # of the acquired periods: least extension after an interval, for a different next interval
+_AT_LAST_SHARE = 1.0      # of the acquired periods: most at one mean speed alone; the slope of friction needs both
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What a look led to: so many periods more at each mean speed (0: the end), and why.
+    """The result of an interim analysis: number of further periods at each mean speed (0: the end), and the reason.
 
-    ``at_last``: only at the one where the shaft is, which spares the way back and the settling there.
-    ``seen``: how many intervals have been looked at and found too wide; ``working_confidence``: of the interval that
-    comes of whatever is there when the run ends after this decision. ``interval``: the one that was looked at.
+    ``at_last``: only at the present mean speed, which saves the way back and its settling.
+    ``seen``: number of intervals found too wide so far; ``working_confidence``: of the interval that follows if the run
+    ends after this decision. ``interval``: half-width of the checked interval, as a share of J.
     """
 
     periods: int
@@ -37,7 +37,7 @@ class Decision:
     at_last: bool = False
 
     def plain(self) -> dict[str, Any]:
-        """As the run's configuration keeps it."""
+        """Return it as plain data for the run's configuration."""
         seen = None if self.look is None else {
             name: value if not isinstance(value, float) or math.isfinite(value) else None
             for name, value in asdict(self.look).items()
@@ -48,7 +48,7 @@ class Decision:
 
 @dataclass
 class Enough:
-    """Asks, and remembers. ``snapshot`` gives what is recorded so far; ``note`` is told every decision."""
+    """Makes and keeps the decisions. ``snapshot`` returns the recording so far; ``note`` receives every decision."""
 
     stopping: Stopping
     plan: Plan
@@ -57,20 +57,20 @@ class Enough:
     decisions: list[Decision] = field(default_factory=list)
 
     def question(self, spent_s: float) -> Callable[[], Decision]:
-        """The work of one look, to be done in any thread or process; the samples are taken now."""
+        """Return one interim analysis for any thread or process. The samples are taken now."""
         recording, rule = self.snapshot(), self.stopping
         left_s = rule.allowed_s - spent_s
         seen = self.decisions[-1].seen if self.decisions else 0
         return partial(decide, recording, rule, self.plan, left_s, len(self.decisions), seen)
 
     def decided(self, decision: Decision) -> None:
-        """Keep and tell a decision."""
+        """Keep a decision and pass it on."""
         self.decisions.append(decision)
         self.note(decision)
 
 
 def decide(recording: Recording, rule: Stopping, plan: Plan, left_s: float, looks: int, seen: int) -> Decision:
-    """Pure: the decision after ``looks`` extensions, with ``left_s`` seconds left, ``seen`` intervals looked at."""
+    """Return the decision after ``looks`` extensions, ``seen`` checked intervals, and ``left_s`` seconds left. Pure."""
     segments = len(plan.segments)
     periods = [one.reference.period_s for one in plan.segments]
     room = max(0, math.floor((left_s - plan.extension_s(0)) / sum(periods) + 1e-9)) if looks < LOOKS else 0
@@ -84,7 +84,7 @@ def decide(recording: Recording, rule: Stopping, plan: Plan, left_s: float, look
         return look(recording, rule.working(number), rule.tolerance / MARGIN, most, rule.pilot_dof, most_at_last)
 
     def more(found: Look, share: float | None = None) -> tuple[int, str]:
-        """How many, and where. ``share`` of what is there: behind an interval, at least."""
+        """Return how many periods, and where. ``share``: least extension after an interval."""
         at, limit, where = (1, room_at_last, "here") if found.at_last else (segments, room, "at each mean speed")
         wanted = math.ceil((found.scale - 1.0) * found.periods / at - 1e-6)
         least = LEAST_EXTENSION if found.enough else 0
@@ -101,14 +101,14 @@ def decide(recording: Recording, rule: Stopping, plan: Plan, left_s: float, look
         extension, where = more(found)
         if extension >= LEAST_EXTENSION:
             then = f"±{100.0 * found.half_width_then:.3g} %"
-            why = f"the scatter says {now}: {extension} {where} for {then}"
+            why = f"the scatter gives {now}: {extension} {where} for {then}"
             return Decision(extension, why, found, seen, rule.working(seen), at_last=found.at_last)
-        why = f"the scatter says {now} instead of {asked}, and the time that is left would change little"
+        why = f"the scatter gives {now} instead of {asked}, and the remaining time would change little"
         return Decision(0, why, found, seen, rule.working(seen))
     width = interval_of(recording, rule.working(seen))
     interval = f"the interval is ±{100.0 * width:.3g} %" if math.isfinite(width) else "there is no interval"
     if width <= rule.tolerance:
-        return Decision(0, f"{interval}: as tight as {asked}", found, seen, rule.working(seen), width)
+        return Decision(0, f"{interval}: within the requested {asked}", found, seen, rule.working(seen), width)
     again = looked(seen + 1) if max(room, room_at_last) >= LEAST_EXTENSION else None
     extension, where = 0, ""
     if again is not None:
@@ -118,35 +118,37 @@ def decide(recording: Recording, rule: Stopping, plan: Plan, left_s: float, look
             again = replace(again, at_last=room_at_last >= min(share * again.periods, segments * room))
         extension, where = more(again, share)
     if again is None or extension < LEAST_EXTENSION:
-        why = f"{interval} instead of {asked}, and no time or look is left"
+        why = f"{interval} instead of {asked}, and no time or interim analysis is left"
         return Decision(0, why, found, seen, rule.working(seen), width)
     why = f"{interval} instead of {asked}, as other lags are not excluded: {extension} {where}"
     return Decision(extension, why, found, seen + 1, rule.working(seen + 1), width, again.at_last)
 
 
 def _by_interval_alone(recording: Recording, rule: Stopping, periods: float, room: int, seen: int) -> Decision:
-    """Where a rigid shaft with straight friction is not what the scatter is about; ``periods`` at each mean speed.
+    """Decide by the interval alone, if a rigid shaft with linear friction does not explain the scatter.
 
-    Friction that bends, or a shaft that swings, may still have an interval. Each that is looked at costs its share.
+    With nonlinear friction or an oscillating shaft there may still be an interval. Each check costs a share of the
+    confidence. ``periods``: at each mean speed.
     """
     working = rule.working(seen)
     width = interval_of(recording, working)
     if not math.isfinite(width):
-        return Decision(0, "what was acquired can't be judged, and has no interval", None, seen, working)
+        return Decision(0, "the acquired data give no interval and no prediction", None, seen, working)
     asked, now = f"±{100.0 * rule.tolerance:.3g} %", f"the interval is ±{100.0 * width:.3g} %"
     if width <= rule.tolerance:
-        return Decision(0, f"{now}: as tight as {asked}", None, seen, working, width)
+        return Decision(0, f"{now}: within the requested {asked}", None, seen, working, width)
     stricter = normal_quantile(rule.working(seen + 1)) / normal_quantile(working)
     wanted = math.ceil(periods * ((MARGIN * stricter * width / rule.tolerance) ** 2 - 1.0))
     more = min(room, max(LEAST_EXTENSION, min(wanted, math.floor(MOST_BEHIND * periods))))
     if more < LEAST_EXTENSION:
-        return Decision(0, f"{now} instead of {asked}, and no time or look is left", None, seen, working, width)
+        why = f"{now} instead of {asked}, and no time or interim analysis is left"
+        return Decision(0, why, None, seen, working, width)
     why = f"{now} instead of {asked}: {more} more periods at each mean speed"
     return Decision(more, why, None, seen + 1, rule.working(seen + 1), width)
 
 
 def _counted(recording: Recording) -> int:
-    """Whole periods behind settling, of all segments."""
+    """Return the whole periods after settling, of all segments."""
     excitation = recording.excitation
     return 0 if excitation is None else sum(
         max(0, round((one.end_s - one.start_s) / one.period_s) - one.settle_periods) for one in excitation.segments

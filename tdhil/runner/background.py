@@ -1,10 +1,9 @@
-"""Arithmetic beside the control loop: in a process of its own where one stands ready, else in a thread of this one.
+"""Computations beside the control loop: in a worker process if one is ready, else in a thread of this process.
 
-A process has an interpreter and a priority of its own: no cycle waits for what it reckons. It is started and has loaded
-all it needs before the shaft moves, gets its work as pickles through a pipe, and answers through another. It inherits
-neither sockets nor signal handlers nor threads, since it begins as a new program; it ends when its pipe does, which is
-when this process ends, however that comes about; and nobody ever waits for it: where its answer isn't wanted any more
-it is killed.
+A process has its own interpreter and priority: no cycle waits for it. It is started, and has loaded all modules, before
+the shaft moves. It receives work as pickles through a pipe, and answers through another. As a new program it inherits
+neither sockets nor signal handlers nor threads. It ends when its pipe does, thus with this process, for whatever
+reason. Nothing ever waits for it: when its answer is not needed any more, it is killed.
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from tdhil.process_pool import ONE_CORE
 T = TypeVar("T")
 
 SWITCH_S = 0.0005
-"""How long arithmetic in a thread of this process may keep the interpreter to itself."""
+"""Longest time for which a computing thread of this process may keep the interpreter, s."""
 
 NICE = 10
-"""By how much the process is nicer than the control loop. It is no hog, but it must not starve beside one either."""
+"""Nice value of the process above the control loop's. It must not starve beside a busy program either."""
 
 READY_S = 60.0
-"""Wall time that the process gets to load what it needs. It is waited for: loading would disturb what follows."""
+"""Wall time for the process to load its modules, s. tdhil waits, because loading would disturb later steps."""
 
 READY = b"ready"
-_REAPED_S = 1.0           # wall time that a killed process gets to be gone; it is left to itself then
+_REAPED_S = 1.0           # wall time to wait for the end of a killed process, s
 _PROGRAM = (
     "import pickle, sys\n"
     "sys.path[:] = pickle.load(sys.stdin.buffer)\n"
@@ -43,23 +42,23 @@ _PROGRAM = (
 
 
 class Gone(Exception):
-    """The process can't answer: it never began, died, or did not understand what it was asked."""
+    """The process can't answer: it never started, died, or could not read the request."""
 
 
 class WorkerProcess:
-    """A process of its own for arithmetic. ``program`` is what it runs, for tests.
+    """A worker process for computations. ``program`` is what it runs, for tests.
 
-    Raises OSError where it can't be started. Whoever made one calls `end`, and `close` when nothing hurries any more.
+    Raises OSError if it can't be started. The owner calls `end`, and `close` when there is time.
     """
 
     def __init__(self, program: str = _PROGRAM) -> None:
         if not sys.executable:
-            raise FileNotFoundError("where this Python lies is not known")
+            raise FileNotFoundError("the path of the Python interpreter is unknown")
         self._answering = Lock()
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-c", program],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            env=os.environ | ONE_CORE, **_out_of_the_way(),      # the other cores are the control loop's
+            env=os.environ | ONE_CORE, **_out_of_the_way(),      # the other cores are for the control loop
         )
         assert self._process.stdin is not None
         assert self._process.stdout is not None
@@ -71,15 +70,15 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """Return the process id."""
         return self._process.pid
 
     def wait_ready(self, for_s: float) -> bool | None:
-        """Has it loaded all it needs? None: not within ``for_s`` of wall time; False: it never will."""
+        """Return whether it is ready. None: not within ``for_s`` of wall time; False: it never will be."""
         return self._began if self._ready.wait(for_s) else None
 
     def ask(self, work: Callable[[], T]) -> T:
-        """What ``work`` gives, or raises what it raises; as long as it takes. Raises Gone where nothing comes of it.
+        """Return what ``work`` returns, or raise what it raises, however long it takes. Raises Gone without an answer.
 
         ``work`` is pickled: a function of a module, or a `functools.partial` of one with arguments of plain data.
         """
@@ -101,12 +100,12 @@ class WorkerProcess:
         return result
 
     def end(self) -> None:
-        """Kill it, whatever it does; returns at once."""
+        """Kill it in any state; returns at once."""
         with suppress(OSError):
             self._process.kill()
 
     def close(self) -> None:
-        """Kill it, and tidy up behind it: pipes and all. Takes a moment, a second at the very most."""
+        """Kill it and close its pipes. This takes a moment, at most about a second."""
         self.end()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(_REAPED_S)
@@ -122,17 +121,17 @@ class WorkerProcess:
                 pickle.dump(sys.path, self._questions)
                 self._questions.flush()
                 self._began = pickle.load(self._answers) == READY
-            except Exception:       # however that fails: it is not ready
+            except Exception:       # any failure means not ready
                 self._began = False
             finally:
                 self._ready.set()
 
 
 class Background(Generic[T]):
-    """One piece of work, begun at once, that nobody has to wait for: neither a stop nor the process's end.
+    """A computation that starts at once. Nothing has to wait for it: neither a stop nor the end of the process.
 
-    Where ``worker_process`` can't do it, a thread does, and ``instead`` says why. As long as a thread is at it, whoever
-    controls the shaft gets the interpreter sooner than usual, also once the work has been left alone.
+    If ``worker_process`` can't do it, a thread does, and ``instead`` states why. While a thread computes, the control
+    loop gets the interpreter sooner than usual, also after the work was dropped.
     """
 
     def __init__(self, work: Callable[[], T], worker_process: WorkerProcess | None = None) -> None:
@@ -143,17 +142,17 @@ class Background(Generic[T]):
         self._dropped = False
         self._found: list[T] = []
         self._failure: BaseException | None = None
-        # A pool's threads are joined when the interpreter ends; a daemon is not.
+        # A pool's threads are joined when the interpreter ends; a daemon thread is not.
         Thread(target=self._run, name="tdhil-beside", daemon=True).start()
 
     def result(self) -> T:
-        """Once it has ended: what it gave, or raises what it raised."""
+        """Return the result after the end, or raise the error of the work."""
         if self._failure is not None:
             raise self._failure
         return self._found[0]
 
     def drop(self) -> None:
-        """Nobody asks any more; returns at once."""
+        """Drop the work; returns at once."""
         self._dropped = True
         if self._worker_process is not None:
             self._worker_process.end()
@@ -161,7 +160,7 @@ class Background(Generic[T]):
     def _run(self) -> None:
         try:
             self._found.append(self._reckon())
-        except BaseException as error:         # raised where the result is asked for
+        except BaseException as error:         # raised by `result`
             self._failure = error
         finally:
             self.ended.set()
@@ -180,12 +179,12 @@ class Background(Generic[T]):
 
 _in_threads: set[Background[Any]] = set()
 _entering = Lock()
-_usual_s: list[float] = []       # the interpreter's own, while any thread is at it
+_usual_s: list[float] = []       # the interpreter's former value, while any thread computes
 
 
 @contextmanager
 def _in_a_thread(work: Background[Any]) -> Iterator[None]:
-    """The first one in has the interpreter handed over sooner, the last one out gives back what was usual."""
+    """Shorten the interpreter's switch interval with the first thread, and restore it after the last one."""
     with _entering:
         if not _in_threads:
             _usual_s.append(sys.getswitchinterval())
@@ -201,8 +200,8 @@ def _in_a_thread(work: Background[Any]) -> Iterator[None]:
 
 
 def goes_on() -> bool:
-    """Is a thread of this process still at arithmetic that was left alone? Then the process must not end in the usual
-    way: on its way out the C library calls OpenBLAS's end, which has been seen to wait for ever for such a thread.
+    """Return whether a dropped computation still runs in a thread of this process. Then the process must not end in the
+    usual way: on exit the C library ends OpenBLAS, which has been observed to wait forever for such a thread.
     """
     return bool(_in_threads)
 
@@ -210,10 +209,10 @@ def goes_on() -> bool:
 def begin(
     meanwhile: Callable[[], object], stopped: Callable[[], bool], within_s: float = READY_S, program: str = _PROGRAM
 ) -> tuple[WorkerProcess | None, str]:
-    """A process that stands ready, or None and why there is none. Ends sooner, with None, once ``stopped`` says so.
+    """Return a ready process, or None and the reason. Returns None sooner once ``stopped`` returns True.
 
-    Takes as long as Python takes to load what the plan needs: a second or two, more on a busy computer; ``meanwhile``
-    is done beside it.
+    It takes as long as Python loads the modules: a second or two, more on a busy computer. ``meanwhile`` runs beside
+    it.
     """
     try:
         worker_process = WorkerProcess(program)
@@ -237,11 +236,11 @@ def begin(
         worker_process.close()
         raise
     worker_process.close()
-    return None, "a stop was asked for"
+    return None, "a stop was requested"
 
 
 def _out_of_the_way() -> dict[str, Any]:
-    """Ctrl-C at the terminal is for this process alone. The same session: where each is weighed, nice means nothing."""
+    """Keep Ctrl-C from the process. It stays in the same session: across sessions nice values have no effect."""
     if sys.platform == "win32":
         flags = subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW
         return {"creationflags": flags | subprocess.BELOW_NORMAL_PRIORITY_CLASS}

@@ -1,4 +1,4 @@
-"""The program beside the control loop: it loads what a plan needs, then answers one question after another."""
+"""The program of the worker process: it loads what a plan needs, then answers one request after another."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from tdhil.runner.background import NICE, READY
 
 
 def serve() -> None:
-    """Answer one question after the other until the pipe ends; what `WorkerProcess` runs."""
+    """Answer one request after the other until the pipe ends. `WorkerProcess` runs this function."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _take_second_place()
-    # Whatever prints must not come between the answers.
+    # Printed output must not come between the answers.
     answers = os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
@@ -38,7 +38,7 @@ def serve() -> None:
 
 
 def _listen(asked: SimpleQueue[bytes]) -> None:
-    """A thread that always waits: it sees the end of the pipe in the midst of work, too."""
+    """Wait in a thread for requests, and exit at the end of the pipe, also during work."""
     try:
         while True:
             asked.put(pickle.load(sys.stdin.buffer))
@@ -61,12 +61,12 @@ def _answer(question: bytes) -> tuple[str, bytes]:
         answer = pickle.dumps(found)
         pickle.loads(answer)
     except Exception as error:
-        return "unfit", pickle.dumps(f"{type(found).__name__} can't be handed on: {error}")
+        return "unfit", pickle.dumps(f"{type(found).__name__} can't be pickled: {error}")
     return kind, answer
 
 
 def _take_second_place() -> None:
-    """No real-time scheduling, even where it was inherited, and nicer than the control loop."""
+    """Leave inherited real-time scheduling, and take a lower priority than the control loop."""
     with suppress(AttributeError, OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     with suppress(AttributeError, OSError):

@@ -1,4 +1,4 @@
-"""One cycle of a run: guard, drive, guard, log. Every stage goes through here, and nothing goes around it."""
+"""One cycle of a run: guard, drive, guard, log. Every stage uses it, without exception."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from threading import Event
 from typing import TypeVar
 
 from drivers import Command, Drive, DriveFault, KeptAlive, Mode, ModeNotConfirmed, PowerState, Sample, Telling
+from profiles import MessageCode
 from tdhil.recording import RunLog
 from tdhil.runner.background import Background, WorkerProcess
 from tdhil.runner.guard import Guard
@@ -15,21 +16,21 @@ from tdhil.runner.settings import StopRequest
 T = TypeVar("T")
 
 ALIVE_S = 0.2
-"""Wall time between two signs of life in stepped time; a simulated peer gives a host a second."""
+"""Wall time between two keep-alive messages in stepped time, s; a simulated peer waits 1 s for a host."""
 
 SWITCH_CYCLES = 10
-"""A drive on a slow line gets so many cycles for a switch of its mode: asked, done, seen, and some that were lost."""
+"""Least cycles for a mode switch, for slow lines: request, switch, display, and some lost ones."""
 
 
-NO_WORKER_PROCESS = "arithmetic goes on in a thread beside the control loop, not in a process of its own"
-"""Said in the log, with the reason. Cycles may be late meanwhile, and it is no more than that."""
+NO_WORKER_PROCESS = "computations run in a thread beside the control loop, not in their own process"
+"""Logged with the reason. Cycles may be late meanwhile; there is no other effect."""
 
 
 Watcher = Callable[[Command, Sample], None]
 
 
 class ControlLoop:
-    """A drive under guard. ``watch`` sees every cycle (live display); ``stop_request`` is looked at in each."""
+    """A drive under guard. ``watch`` receives every cycle (live display); each cycle checks ``stop_request``."""
 
     def __init__(
         self, drive: Drive, guard: Guard, log: RunLog, stop_request: StopRequest, watch: Watcher | None = None
@@ -41,21 +42,21 @@ class ControlLoop:
         self.stop_side_troubles: list[str] = []
         self.last: Sample | None = None
         self.before: Sample | None = None            # the one before it
-        self.observer: Watcher | None = None         # what a stage does after every cycle, behind the guard
-        self.quiet = False                         # somebody is being asked: the display leaves the terminal alone
-        self.worker_process: WorkerProcess | None = None     # does longer arithmetic in real time; None: a thread does
-        self.remarks: list[str] = []       # what others did on the drive's bus
+        self.observer: Watcher | None = None         # called by a stage after every cycle, after the guard
+        self.quiet = False                         # the operator is being asked: the display stays off the terminal
+        self.worker_process: WorkerProcess | None = None     # long computations in real time; None: a thread
+        self.remarks: list[str] = []       # actions of others on the drive's bus
         self._telling = drive if isinstance(drive, Telling) else None
         self._stop_request = stop_request
         self._watch = watch
 
     @property
     def now_s(self) -> float:
-        """Control time."""
+        """Return the control time, s."""
         return self.drive.clock.now_s()
 
     def cycle(self, command: Command) -> Sample:
-        """One exchange. Raises Interrupted when a stop was asked for, and whatever guard, drive and log raise."""
+        """Do one exchange. Raises Interrupted for a stop request, and the errors of guard, drive and log."""
         self._stop_request.check()
         self.guard.check_command(command)
         sample = self.drive.exchange(command)
@@ -73,7 +74,7 @@ class ControlLoop:
         return sample
 
     def stop_cycle(self, command: Command) -> Sample:
-        """One exchange of the stop sequence: unguarded, and neither log nor display may keep it from going on."""
+        """Do one exchange of the stop sequence: without guard, and no error of log or display interrupts it."""
         sample = self.drive.exchange(command)
         try:
             self.guard.observer.see(command, sample)
@@ -93,15 +94,15 @@ class ControlLoop:
             self.log.event(self.now_s, "bus", line)
 
     def cycles(self, seconds: float) -> int:
-        """How many cycles last that long."""
+        """Return the number of cycles in that time."""
         return max(1, round(seconds / self.period_s))
 
     def hold(self, command: Command, seconds: float) -> list[Sample]:
-        """Keep one command for a time; the samples."""
+        """Keep one command for a time. Return the samples."""
         return [self.cycle(command) for _ in range(self.cycles(seconds))]
 
     def enable(self, mode: Mode, command: Command, timeout_s: float = 3.0) -> Sample:
-        """Enable in a mode and wait until the drive says so."""
+        """Enable in a mode and wait until the drive reports it."""
         self.drive.enable(mode)
         for _ in range(self.cycles(timeout_s)):
             sample = self.cycle(command)
@@ -111,39 +112,39 @@ class ControlLoop:
             if sample.state is PowerState.FAULT:
                 break
         raise DriveFault(
-            f"no {mode.value} mode within {timeout_s:g} s of enabling; the drive shows '{sample.state.value}'",
+            f"{mode.value} mode was not enabled within {timeout_s:g} s; the drive reports '{sample.state.value}'",
             where=f"statusword {sample.status:04X}h",
-            next_step="Look for STO, a missing enable input or a fault on the drive's own panel",
+            next_step="Check STO, the enable input and faults on the drive's own panel",
+            entry=MessageCode.ENABLE_FAILED,
         )
 
     def switch_mode(self, command: Command, timeout_s: float = 0.5) -> Sample:
-        """Go on with ``command.mode`` while enabled; the drive must display the new mode in time, and in ten cycles."""
+        """Switch to ``command.mode`` while enabled. The drive must display it in time, or within ten cycles."""
         for _ in range(max(SWITCH_CYCLES, self.cycles(timeout_s))):
             sample = self.cycle(command)
             if sample.mode is command.mode:
                 return sample
         raise ModeNotConfirmed(
-            f"the drive did not take over {command.mode.value} mode within {timeout_s:g} s",
+            f"the drive did not display {command.mode.value} mode within {timeout_s:g} s",
             where="modes of operation display 6061h",
             next_step="Check in the drive's manual whether the mode may change while enabled; use --mode speed",
         )
 
     def compute(self, work: Callable[[], T], command: Command) -> T:
-        """Do a longer piece of arithmetic while the drive keeps getting one command."""
+        """Run a longer computation while the drive keeps receiving one command."""
         return self.compute_while(work, lambda: self.cycle(command))
 
     def compute_while(self, work: Callable[[], T], cycle: Callable[[], object]) -> T:
-        """Do a longer piece of arithmetic without letting the drive starve of setpoints: ``cycle`` is one of them.
+        """Run a longer computation while the drive keeps receiving setpoints: ``cycle`` sends one of them.
 
-        In stepped time nothing starves, and a number of cycles that depended on the machine's speed would not repeat:
-        there, signs of life that move no time on are all that goes out. In real time a process of its own does it
-        where one stands ready and understands the ``work`` (`background.WorkerProcess.ask`): a thread shares the
-        interpreter, and cycles come late beside it. They may all the same on a computer of one processor, and that
-        alone doesn't end the run.
+        In stepped time the drive does not need them, and a number of cycles that depends on the computer's speed would
+        not repeat. There only keep-alive messages are sent, which do not advance time. In real time a worker process
+        runs the ``work`` if it is ready and accepts it (`background.WorkerProcess.ask`). A thread shares the
+        interpreter, and cycles are late beside it. On a computer with one processor they may be late in any case, and
+        that alone does not end the run.
 
-        Whatever ``cycle`` raises goes out at once: nobody waits for work that is not wanted any more, since a shaft
-        may be turning without a setpoint meanwhile. A process is killed; a thread goes on by itself, beside the stop,
-        and what comes of it is dropped.
+        An error of ``cycle`` is raised at once: a shaft may be turning without a setpoint, so nothing waits for the
+        ``work``. A process is killed. A thread continues beside the stop, and its result is dropped.
         """
         background = Background(work, None if self.drive.clock.stepped else self.worker_process)
         told = False
@@ -167,11 +168,11 @@ class ControlLoop:
         return background.result()
 
     def no_worker_process(self, why: str) -> None:
-        """Note that arithmetic has to share this process with the control loop."""
+        """Log that computations share this process with the control loop."""
         self.log.event(self.now_s, "host", f"{NO_WORKER_PROCESS}: {why}")
 
     def _wait_alive(self, ended: Event) -> None:
-        """Wait for a moment, or until it is done; then the sign of life, of a drive that knows one."""
+        """Wait for a moment, or until it is done; then send a keep-alive message if the drive supports it."""
         self._stop_request.check()
         if not ended.wait(ALIVE_S) and isinstance(self.drive, KeptAlive):
             self.drive.keep_alive()

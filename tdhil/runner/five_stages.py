@@ -1,6 +1,6 @@
-"""Runs the five stages in order, and whatever happens in them, the one stop sequence.
+"""Runs the five stages in order, and after every end the one stop sequence.
 
-The first cause is kept: what goes wrong while stopping is reported beside it, never instead of it.
+The first cause is kept. Errors during the stop are reported beside it, never instead of it.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import asdict, replace
 from functools import partial
 
 from drivers import Command, Drive, DriveLimits, Mode, Outcome, Paced, Preflight, PreflightRefused, Sample, Timed
+from profiles import MessageCode
 from tdhil.config import told_before_echo
 from tdhil.estimation import torque_answer
 from tdhil.recording import Excitation, ImpedanceInput, LagPrior, Ramp, RunLog
@@ -66,7 +67,7 @@ def _nothing(text: str) -> None:
 
 
 class Runner:
-    """One run of one drive. `run` never raises: everything is in the outcome."""
+    """One run of one drive. `run` never raises: errors are in the outcome."""
 
     def __init__(
         self,
@@ -97,7 +98,7 @@ class Runner:
         self._worker_process: WorkerProcess | None = None
 
     def run(self) -> RunOutcome:
-        """Connect, five stages, stop, close."""
+        """Connect, run five stages, stop, close."""
         cause: BaseException | None = None
         report: StopReport | None = None
         try:
@@ -128,7 +129,7 @@ class Runner:
             else:
                 with suppress(Exception):
                     for line in left:
-                        self._log.event(self._drive.clock.now_s(), "left", f"not given back: {line}")
+                        self._log.event(self._drive.clock.now_s(), "left", f"not restored: {line}")
             if self._worker_process is not None:
                 self._worker_process.close()
             if cause is None:
@@ -188,7 +189,7 @@ class Runner:
                 self._log.motion(None, speed.levels, ramps)
         else:
             why = no_torque(task.request.mode, preflight)
-            self._book.skip("torque", f"{why}: no switch, and no second look at the inertia by a drift")
+            self._book.skip("torque", f"{why}: no switch, and no second estimate of the inertia from a drift")
         model = self._model(loop, speed, drifted)
         if task.evaluation is not None and program is not None:
             self._run_virtual_string(task, task.evaluation, program, loop, speed, drifted, resolution)
@@ -217,11 +218,12 @@ class Runner:
             )
 
     def _program(self, task: Task, case: EvaluationCase, loop: ControlLoop, preflight: Preflight) -> SpeedProgram:
-        """The virtual string's course, before anything moves. Raises what refuses it."""
+        """Return the virtual string's speed program, before motion. Raises an error if it is refused."""
         if case.own_loop and preflight.torque_offset_resolution_nm <= 0.0:
             raise PreflightRefused(
-                "the drive has no torque offset that its profile knows of, through which the string could reach it",
-                where="--own-loop", next_step="Leave --own-loop out: the host's controller in torque mode needs none",
+                "the profile names no torque offset of the drive, which --own-loop needs to apply the string's torque",
+                where="--own-loop", next_step="Remove --own-loop: the host's controller in torque mode needs none",
+                entry=MessageCode.VIRTUAL_STRING_REFUSED,
             )
         course = partial(course_of, case, task.limits, loop.period_s, Guard.foresight_s(task.assumptions))
         program = loop.compute(course, Command(Mode.SPEED, 0.0, 0.0))
@@ -232,13 +234,14 @@ class Runner:
         self, task: Task, case: EvaluationCase, program: SpeedProgram, loop: ControlLoop, speed: SpeedResult,
         drifted: TorqueResult | None, resolution_rad_s: float,
     ) -> None:
-        """Stages 4 and 5 with a virtual string."""
+        """Run stages 4 and 5 with a virtual string."""
         limits, assumptions = task.limits, task.assumptions
         refuse_other_rig(case, speed.model)
         if drifted is not None and loop.guard.no_braking:
             raise PreflightRefused(
-                f"a virtual string brakes the shaft: {loop.guard.no_braking}", where="braking probe",
+                f"a virtual string needs braking torque: {loop.guard.no_braking}", where="braking probe",
                 next_step=loop.guard.to_brake,
+                entry=MessageCode.BRAKING_UNCLEAR,
             )
         start = program.start_rad_s * case.rig.gear_ratio
         with self._book.stage("hold", 15.0):
@@ -255,7 +258,7 @@ class Runner:
     def _run_offset(
         self, task: Task, loop: ControlLoop, speed: SpeedResult, ramps: tuple[Ramp, ...], resolution_rad_s: float
     ) -> None:
-        """Stages 4 and 5 of a run that measures the drive's own impedance by its torque offset."""
+        """Run stages 4 and 5 of a measurement of the drive's own impedance with its torque offset."""
         limits, assumptions = task.limits, task.assumptions
         room = Guard.room(limits, assumptions)
         with self._book.stage("hold", 60.0):
@@ -282,7 +285,7 @@ class Runner:
         limits = task.limits
         self._log.learn(**task.facts)
         if self._reset_fault:
-            self._log.event(self._drive.clock.now_s(), "reset", "fault reset, as asked for by the operator")
+            self._log.event(self._drive.clock.now_s(), "reset", "fault reset, requested by the operator")
             self._drive.reset_fault()
         no_worker_process = ""
         if not self._drive.clock.stepped:
@@ -299,7 +302,7 @@ class Runner:
         )
         self._display.preflight(preflight)
         for check in preflight.checks:
-            wanted = f"wanted {check.wanted}, " if check.wanted else ""
+            wanted = f"required {check.wanted}, " if check.wanted else ""
             text = f"{check.name}: {wanted}found {check.found} ({check.outcome.value}) {check.where}"
             self._log.event(self._drive.clock.now_s(), "preflight", text)
         if preflight.refused:
@@ -316,11 +319,11 @@ class Runner:
             self._log.event(self._drive.clock.now_s(), "watchdog", preconditions.SAID_SHARED)
             self._say(preconditions.SAID_SHARED)
         self._choose_rate()
-        # What the line carries is known only now: the driver may have measured it in preflight.
+        # The rate of the line is known only now: the driver may have measured it in preflight.
         period_s = self._drive.period_s
         task = replace(task, assumptions=task.assumptions.at_period(period_s))
         self._log.configure(cycle={"period_s": period_s, "rate_hz": 1.0 / period_s})
-        self._log.event(self._drive.clock.now_s(), "rate", f"{1.0 / period_s:.4g} cycles a second")
+        self._log.event(self._drive.clock.now_s(), "rate", f"{1.0 / period_s:.4g} cycles per second")
         refuse_slow_reference(task.request, period_s)
         if (by := task.request.impedance) is not None:
             count = preflight.torque_offset_resolution_nm if by == "offset" else preflight.speed_resolution_rad_s
@@ -354,14 +357,16 @@ class Runner:
         return task, loop, preflight
 
     def _make_ready(self) -> str:
-        """Load and start whatever would hold the loop up later; why there is no process for arithmetic, if so."""
+        """Load and start what would delay the loop later. Return why there is no worker process; empty if there is
+        one.
+        """
         stop_request = self._stop_request
         self._worker_process, why = begin(quieten, lambda: stop_request.signum is not None)
         stop_request.check()
         return why
 
     def _choose_rate(self) -> None:
-        """Where nobody has named it and this computer's clock is what counts: the highest that holds."""
+        """Choose the highest rate that this computer sustains, if no rate is requested and its clock sets the pace."""
         drive = self._drive
         if not (isinstance(drive, Paced) and drive.rates_hz):
             return
@@ -376,11 +381,11 @@ class Runner:
         self._say(choice.text)
 
     def _model(self, loop: ControlLoop, speed: SpeedResult, drifted: TorqueResult | None) -> RigGuess:
-        """The rough rig: stage 2's, with the drift of stage 3 as a witness."""
+        """Return the rough model of stage 2, and log its ratio to the drift of stage 3."""
         model = speed.model
         if drifted is not None and drifted.rough is not None:
             ratio = drifted.rough.inertia_kg_m2 / model.inertia_kg_m2
-            text = f"rough inertia {model.inertia_kg_m2:.4g} kg·m² from the ramp, {ratio:.2f} of it from the drift"
+            text = f"rough inertia {model.inertia_kg_m2:.4g} kg·m² from the ramp, {ratio:.2f} times that from the drift"
             self._log.event(loop.now_s, "plan", text)
         return model
 
@@ -388,16 +393,16 @@ class Runner:
         return lambda motion: self._log.motion(motion, speed.levels, ramps)
 
     def _note_timing(self, loop: ControlLoop, speed: SpeedResult) -> None:
-        """How far a sample's time may be off; torque and speed may be apart by as much."""
+        """Note the uncertainty of the sample times. Torque and speed may be offset in time by as much."""
         half_s = sum(sample.half_width_s for sample in speed.last) / max(1, len(speed.last))
         if half_s > 0.0:
             self._prior = with_timing(self._prior, half_s)
             self._log.learn(timing_half_width_s=half_s, lag_prior=self._prior)
-            text = f"a sample's time is known to ±{1e3 * half_s:.3g} ms, the half of a transaction"
+            text = f"sample times are known to ±{1e3 * half_s:.3g} ms, half the duration of a transaction"
             self._log.event(loop.now_s, "rate", text)
 
     def _learn_torque_answer(self) -> None:
-        """How the reported torque followed the commanded one: what is told before an echo needs it."""
+        """Record how the reported torque follows the commanded one: the estimate before the echo needs it."""
         if self._before_echo:
             answer = torque_answer(self._log.recording(complete=True), self._log.commanded_nm)
             if answer is not None:
@@ -419,11 +424,11 @@ class Runner:
         try:
             self._log.failure(self._drive.clock.now_s(), error)
         except Exception as also:
-            error.add_note(f"and the log did not take it: {also}")
+            error.add_note(f"and this error could not be logged: {also}")
 
 
 def string_at_motor(task: Task) -> float:
-    """ζ of the string that |r| is told for, at the motor: as asked for, or of rig.yaml's pipe; 0: none is known."""
+    """Return the impedance ζ for the reported |r|, at the motor: requested, or of rig.yaml's pipe; 0: unknown."""
     asked, pipe = task.request.string_nm_s_rad, task.facts.get("pipe")
     if asked is not None:
         return asked / float(task.facts.get("gear_ratio", 1.0)) ** 2
@@ -435,5 +440,7 @@ def _refusal(preflight: Preflight) -> PreflightRefused:
     first = refused[0]
     more = f" (and {len(refused) - 1} more, see the table)" if len(refused) > 1 else ""
     return PreflightRefused(
-        f"{first.name}: wanted {first.wanted}, found {first.found}{more}", where=first.where, next_step=first.next_step
+        f"{first.name}: required {first.wanted}, found {first.found}{more}",
+        where=first.where, next_step=first.next_step,
+        entry=MessageCode.PREFLIGHT_TABLE,
     )

@@ -1,21 +1,20 @@
-"""The guard over every command and every sample. Pure: it looks, and raises.
+"""The guard over every command and every sample. Pure: it checks, and raises.
 
-In torque mode it does not wait for the edge of the speed window to be crossed. What is reported is old: with a
-reporting lag τ and a reaction time t_r the shaft will have reached, before anything the host does can act,
+In torque mode it does not wait until the speed leaves its window, because reports are old. With a reporting lag τ and a
+reaction time t_r the shaft will have reached, before any action of the host can take effect,
 
     ω_pred = ω_reported + T_net / J_min · (t_r + τ_max)        T_net = T − T_c sgn ω − B ω
 
-and it is ω_pred that must stay below the window's upper end (a quantum of speed at 250 Hz is already 2.6 rad/s², so
-differentiating the reported speed instead would see nothing but noise). t_r is what was assumed of loop and drive, and
-three periods of a slow loop. Downwards ω_pred goes through standstill only where the torque overcomes the friction that
-then holds the shaft, and the shaft must not turn backwards (where it may: not faster than the limit). Between there and
-the window's lower end nothing comes to harm: that end is held by the reported speed.
+and ω_pred must stay below the window's upper end. (A quantum of speed at 250 Hz is already 2.6 rad/s², so the
+derivative of the reported speed would be noise only.) t_r is the assumed reaction time of loop and drive, plus three
+periods of a slow loop. Downwards ω_pred passes through standstill only if the torque exceeds the friction that then
+holds the shaft. The shaft must not turn backwards (if it may: not faster than the limit). Speeds between there and the
+window's lower end do no harm: that end is checked with the reported speed.
 
-In speed mode it is the following error that is held, as motion controllers do, by a window and a time. What the shaft
-may be late by is not taken for an error: the window lies about all that the reference was over the longest plausible
-lag, and a shaft that comes nearer, however slowly a heavy one may at its torque limit, is waited for. A torque offset
-moves the shaft away from its reference on purpose: while one may be commanded, the speed window is held instead, at
-both ends.
+In speed mode the guard checks the following error, as motion controllers do, by a window and a time. A plausible lag is
+no error: the window covers all values of the reference over the longest plausible lag. A shaft that comes nearer is
+waited for, however slow a heavy one may be at its torque limit. A torque offset moves the shaft away from its reference
+on purpose: while one may be commanded, the speed window is checked instead, at both ends.
 """
 
 from __future__ import annotations
@@ -38,47 +37,49 @@ from drivers import (
     ReportsContradict,
     Sample,
 )
+from profiles import MessageCode
 from tdhil.runner.excitation import MotionLimits, RigGuess
 from tdhil.runner.observer import AT_LIMIT_SHARE, Observer, Signal
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
 
 LONGEST_AGE_S = 0.25
-"""Feedback may be missing for this long at most; the drive goes on by itself meanwhile, at what it was last told."""
+"""Longest time without feedback, s. Meanwhile the drive continues with the last setpoint."""
 
 LIMITED_S = 0.5
-"""In torque mode the drive's internal limit may act for so long: a torque that is not the commanded one moves the shaft
-to where nobody planned (row 33)."""
+"""Longest time for which the drive's internal limit may act in torque mode, s: the torque is then not the commanded
+one,
+and the motion is not the planned one (row 33)."""
 
 MODE_LOST_S, MODE_SWITCH_S, MODE_CYCLES = 0.25, 1.0, 15
-"""The drive may display another mode than the commanded one for so long, and for so many cycles: since it was seen in
-it, and from a switch on (`Bench.switch_mode` gives up sooner). The display comes every few cycles only, may be lost,
-and a mode that somebody changed is asked for again meanwhile."""
+"""Longest times, s, for which the drive may display another mode than the commanded one, and least number of cycles:
+after it has displayed the mode, and after a switch (`Bench.switch_mode` gives up sooner). The display comes only every
+few cycles and may be lost. Meanwhile the commanded mode is requested again."""
 
 FOLLOW_SHARE, FOLLOW_S, FOLLOW_STRING_S = 0.05, 5.0, 10.0
-"""In speed mode the shaft may stay away from its reference by this share of the speed limit; by more for so long, if it
-comes no nearer. With a drill string on it it may swing meanwhile."""
+"""Permitted following error in speed mode, as a share of the speed limit. A larger one is permitted for this
+long, s, if it comes no nearer; longer with a drill string, which may oscillate."""
 
 NEARER_SHARE = 0.02
-"""Of the speed limit, that the shaft must come nearer by within that time."""
+"""Share of the speed limit by which the shaft must come nearer within that time."""
 
 FOLLOW_MEAN_S, FOLLOW_BLOCK_S = 0.5, 0.1
-"""What is compared is the mean reported speed over the first, with the reference in blocks of the second."""
+"""Averaging time of the compared reported speed, and block length of the reference, s."""
 
 LIGHTEN = (
-    "Lift the bit off bottom, take weight off it, or turn faster (limits.speed_min_rad_s); a wider speed window leaves"
-    " it more room"
+    "Lift the bit off bottom, reduce the weight on bit, or turn faster (limits.speed_min_rad_s). A wider speed window"
+    " also helps"
 )
-"""What helps a shaft that a drill string under load disturbs."""
+"""Advice for a shaft that a drill string under load disturbs."""
 
 PACE_S, LATE_SHARE = 2.0, 0.2
-"""A loop that was late in this share of its cycles over this time can't hold its rate (row 8)."""
+"""Time window, s, and share of late cycles above which a loop counts as too slow (row 8)."""
 
 
 def kept_within(setpoint: float, least: float, most: float) -> float:
-    """What a stage commands instead of a setpoint beyond its limits. NaN stays NaN, which the guard rejects.
+    """Return the setpoint within its limits. NaN stays NaN, which the guard rejects.
 
-    Of two numbers that don't compare, `min` and `max` give the first: the setpoint has to stand there, or a limit would
-    be commanded for what is no number.
+    If two numbers do not compare, `min` and `max` return the first. So the setpoint has to be first; otherwise NaN
+    would become a limit.
     """
     return max(min(setpoint, most), least)
 
@@ -86,7 +87,7 @@ def kept_within(setpoint: float, least: float, most: float) -> float:
 class Guard:
     """Holds the machine's limits over one run.
 
-    ``model``, ``expected``, ``no_braking`` and ``torque_offset_nm`` are set as the stages learn.
+    The stages set ``model``, ``expected``, ``no_braking`` and ``torque_offset_nm``.
     """
 
     def __init__(
@@ -101,12 +102,12 @@ class Guard:
         self._limits = limits
         self._horizon_s = assumptions.reaction_s + assumptions.largest_speed_lag_s
         self._smallest_share = assumptions.smallest_inertia_share
-        # Noise and quantisation about zero are no reverse rotation.
+        # Noise and quantisation near zero do not count as reverse rotation.
         self._speed_noise_rad_s = 5.0 * speed_resolution_rad_s
         self._reverse_rad_s = max(self._speed_noise_rad_s, 0.02 * limits.speed_max_rad_s)
-        # The reported torque is noisy and may overshoot; what was commanded is held exactly.
+        # The reported torque is noisy and may overshoot. The commanded torque is checked exactly.
         self._torque_seen_nm = 1.25 * limits.torque_nm + 10.0 * torque_resolution_nm
-        # Half of what the drive's watchdog grants the host, and never on account of two lost frames.
+        # Half of the drive's watchdog time, but at least three lost frames.
         self._stale_limit = max(3, math.ceil(min(LONGEST_AGE_S, 0.5 * limits.watchdog_s) / period_s))
         self._stale = 0
         self.observer = Observer(limits, period_s, speed_resolution_rad_s, torque_resolution_nm, assumptions)
@@ -115,23 +116,23 @@ class Guard:
         self._following = _Following(limits, period_s, speed_resolution_rad_s, assumptions)
         self._pace_cycles = max(10, round(PACE_S / period_s))
         self._pace_from = Counters()
-        self._pace_left = 0                # so many cycles, at least, before there is something to see
+        self._pace_left = 0                # cycles before the next check
         self._started_s: float | None = None
         self.expected: PowerState | None = None
         self.model: RigGuess | None = None
         self.no_braking = ""
-        """Why no torque below zero may be commanded in torque mode; empty: it may. Set by whoever runs the stages."""
+        """Why torque below zero is not allowed in torque mode; empty: it is allowed. The Runner sets it."""
         self.to_brake = ""
-        """What would change that."""
+        """Advice how to allow it."""
         self.disturbed = ""
-        """What a drill string under load does to the shaft, in words, where it gets no calmer; empty: nothing. Limits
-        stay as they are: it is for the message of whoever meets one."""
+        """Description of a lasting disturbance by a drill string under load; empty: none. It is used in messages only,
+        the limits stay the same."""
         self.torque_offset_nm = 0.0
-        """The largest torque offset that may be commanded, either way; 0: none. Set by the stage that uses one."""
+        """Largest permitted torque offset in either direction, N·m; 0: none. Set by the stage that uses it."""
         self.reckoning = False
-        """Arithmetic goes on beside the loop and makes it late: that alone is no reason to stop."""
+        """A computation beside the loop may make it late: then lateness alone does not stop the run."""
         self.host_late: Callable[[], str] = lambda: ""
-        """How late this computer has been, in words, where it doesn't keep up (`drivers.clock.how_late`)."""
+        """Lateness of this computer in words, if it is late (`drivers.clock.how_late`)."""
 
     def know(self, model: RigGuess) -> None:
         """Take stage 2's rough model, for the prediction of speed and for the observer."""
@@ -139,11 +140,13 @@ class Guard:
         self.observer.know(model)
 
     def allow_torque_offset(self, largest_nm: float) -> None:
-        """Let the stage command a torque offset of up to ``largest_nm`` in speed mode, either way."""
+        """Permit a torque offset of up to ``largest_nm`` in speed mode, in either direction."""
         self.torque_offset_nm = self.observer.swinging_offset_nm = largest_nm
 
     def check_command(self, command: Command) -> None:
-        """Raise CommandRejected for a setpoint that must not reach the bus, LimitHit for a braking torque too soon."""
+        """Raise CommandRejected for a setpoint that must not reach the bus, LimitHit for a braking torque before it is
+        allowed.
+        """
         speed, torque, offset = command.speed_rad_s, command.torque_nm, command.torque_offset_nm
         if not (math.isfinite(speed) and math.isfinite(torque) and math.isfinite(offset)):
             raise CommandRejected(
@@ -151,19 +154,20 @@ class Guard:
             )
         if offset != 0.0 and (command.mode is not Mode.SPEED or abs(offset) > self.torque_offset_nm * (1.0 + 1e-9)):
             raise CommandRejected(
-                f"torque offset {offset:.1f} N·m in {command.mode.value} mode is beyond what this stage may command:"
-                f" {self.torque_offset_nm:g} N·m, in speed mode",
+                f"torque offset {offset:.1f} N·m in {command.mode.value} mode is above the limit of this stage,"
+                f" {self.torque_offset_nm:g} N·m in speed mode",
                 where="guard",
             )
         if abs(torque) > self._limits.torque_nm * (1.0 + 1e-9):
             raise CommandRejected(
-                f"torque setpoint {torque:.1f} N·m is beyond the limit of {self._limits.torque_nm:g} N·m", where="guard"
+                f"torque setpoint {torque:.1f} N·m is above the limit of {self._limits.torque_nm:g} N·m", where="guard"
             )
         if self.no_braking and command.mode is Mode.TORQUE and torque < 0.0:
             raise LimitHit(
-                f"a braking torque of {-torque:.1f} N·m is held back: {self.no_braking}",
+                f"a braking torque of {-torque:.1f} N·m was not sent: {self.no_braking}",
                 where="guard",
                 next_step=self.to_brake,
+                entry=MessageCode.BRAKING_HELD_BACK,
             )
         lowest = -self._limits.speed_max_rad_s if self._limits.allow_reverse else 0.0
         if not lowest <= speed <= self._limits.speed_max_rad_s:
@@ -173,20 +177,20 @@ class Guard:
             )
 
     def start_clock(self, time_s: float) -> None:
-        """The time limit counts from here."""
+        """Start the time limit."""
         self._started_s = time_s
 
     def left_s(self, time_s: float) -> float:
-        """What the time limit leaves, s."""
+        """Return the remaining time of the time limit, s."""
         return self._limits.time_s - (0.0 if self._started_s is None else time_s - self._started_s)
 
     def pace_is_due(self) -> bool:
-        """Is `check_pace` to be called in this cycle? Counters aren't put together for nothing."""
+        """Return whether `check_pace` is due in this cycle, so that counters are collected only when needed."""
         self._pace_left -= 1
         return self._pace_left <= 0 or self.reckoning
 
     def check_pace(self, counters: Counters) -> None:
-        """Raise CommunicationLost when the loop is late again and again: its setpoints then come too late as well."""
+        """Raise CommunicationLost if the loop is late too often: then its setpoints are late, too."""
         if self.reckoning:
             self._pace_from, self._pace_left = counters, self._pace_cycles
             return
@@ -200,40 +204,46 @@ class Guard:
         if late > LATE_SHARE * cycles:
             words = self.host_late()
             raise CommunicationLost(
-                f"the control loop was late in {late} of {cycles} cycles" + (f": {words}" if words else ""),
+                f"the control loop was late in {late} of {cycles} cycles (limit {LATE_SHARE:.0%})"
+                + (f": {words}" if words else ""),
                 where="host",
-                next_step=f"{LOWER_THE_RATE}; or end what else keeps this computer busy",
+                next_step=f"{LOWER_THE_RATE}; or end other programs on this computer",
+                entry=MessageCode.HOST_LATE,
             )
 
     def check_sample(self, command: Command, sample: Sample) -> None:
-        """Raise what the sample shows: CommunicationLost, DriveFault or LimitHit."""
+        """Check a sample. Raises CommunicationLost, DriveFault or LimitHit."""
         self.observer.see(command, sample)
         where = f"guard at {sample.time_s:.3f} s"
         self._check_age(sample, where)
         if self.expected is not None and sample.state is not self.expected:
             raise DriveFault(
-                f"the drive left the state '{self.expected.value}' and shows '{sample.state.value}'",
+                f"the drive left the state '{self.expected.value}' and reports '{sample.state.value}'",
                 where=f"statusword {sample.status:04X}h at {sample.time_s:.3f} s",
-                next_step="Look into the drive's fault list; STO, a fault or a second master may have done it",
+                next_step="Read the drive's fault list. Possible causes are STO, a fault or a second master",
+                entry=MessageCode.STATE_LEFT,
             )
         if not (math.isfinite(sample.speed_rad_s) and math.isfinite(sample.torque_nm)):
             raise DriveFault(
                 f"the feedback is not finite (speed {sample.speed_rad_s}, torque {sample.torque_nm})",
                 where=where,
-                next_step="Do word order and scaling in the profile fit this drive?",
+                next_step="Check word order and scaling in the profile",
+                entry=MessageCode.FEEDBACK_NOT_FINITE,
             )
         self._check_speed(sample.speed_rad_s, where)
         if abs(sample.torque_nm) > self._torque_seen_nm:
             raise LimitHit(
-                f"torque {sample.torque_nm:.1f} N·m is beyond the limit of {self._limits.torque_nm:g} N·m",
+                f"torque {sample.torque_nm:.1f} N·m is above the limit of {self._limits.torque_nm:g} N·m",
                 where=where,
-                next_step="The shaft was stopped. Does the drive's rated torque match rig.yaml?",
+                next_step="The shaft was stopped. Check that rig.yaml has the drive's rated torque",
+                entry=MessageCode.TORQUE_LIMIT,
             )
         if self.left_s(sample.time_s) < 0.0:
             raise LimitHit(
-                f"the run has taken longer than {self._limits.time_s:g} s",
+                f"the run has taken longer than the limit of {self._limits.time_s:g} s",
                 where=where,
-                next_step="Raise limits.time_s in rig.yaml or ask for fewer periods",
+                next_step="The shaft was stopped. Raise limits.time_s in rig.yaml or request fewer periods",
+                entry=MessageCode.TIME_LIMIT,
             )
         self._check_mode(command, sample)
         self._check_reports(where)
@@ -248,29 +258,29 @@ class Guard:
 
     @property
     def least_torque_nm(self) -> float:
-        """What a stage may command at least in torque mode: a slow loop that would ask for less asks for this."""
+        """Return the least torque that a stage may command in torque mode. A control loop is limited to it."""
         return 0.0 if self.no_braking else -self._limits.torque_nm
 
     @staticmethod
     def foresight_s(assumptions: ControlAssumptions) -> float:
-        """What a plan must keep free: the guard adds this times the acceleration to the speed."""
+        """Return the prediction time of the guard, s: a plan keeps free this time multiplied by its acceleration."""
         return (assumptions.reaction_s + assumptions.largest_speed_lag_s) / assumptions.smallest_inertia_share
 
     @staticmethod
     def room(limits: MachineLimits, assumptions: ControlAssumptions, free_rad_s: float = 0.0) -> MotionLimits:
-        """What a plan may use of the limits; ``free_rad_s`` stays free at either end of the speed window."""
+        """Return the part of the limits that a plan may use; ``free_rad_s`` stays free at both ends of the window."""
         low, high = limits.speed_min_rad_s + free_rad_s, limits.speed_max_rad_s - free_rad_s
         return MotionLimits(low, high, limits.torque_nm, Guard.foresight_s(assumptions))
 
     def predicted_speed(self, model: RigGuess, torque_nm: float, speed_rad_s: float) -> float:
-        """Where the shaft may be, rad/s, before the host can act on what it now sees."""
+        """Return the speed that the shaft may reach, rad/s, before a reaction of the host takes effect."""
         inertia = self._smallest_share * model.inertia_kg_m2
         direction = math.copysign(1.0, speed_rad_s or torque_nm)
         rate = (torque_nm - direction * model.coulomb_nm - model.viscous_nm_s_rad * speed_rad_s) / inertia
         ahead = speed_rad_s + rate * self._horizon_s
         if ahead * direction >= 0.0:
             return ahead
-        # Through standstill, from where friction holds against what pushes on.
+        # Through standstill, where friction then opposes the remaining torque.
         push_nm = torque_nm + direction * model.coulomb_nm
         left_s = self._horizon_s + speed_rad_s / rate
         return push_nm / inertia * left_s if push_nm * direction < 0.0 else 0.0
@@ -280,17 +290,19 @@ class Guard:
         if speed_rad_s > limits.speed_max_rad_s or (limits.allow_reverse and speed_rad_s < -limits.speed_max_rad_s):
             raise LimitHit(
                 self._besides(
-                    f"speed {speed_rad_s:.3f} rad/s is beyond the limit of {limits.speed_max_rad_s:g} rad/s"
+                    f"speed {speed_rad_s:.3f} rad/s is above the limit of {limits.speed_max_rad_s:g} rad/s"
                 ),
                 where=where,
                 next_step="The shaft was stopped. "
-                + self._helps("Was the load lost? Check limits.speed_max_rad_s in rig.yaml"),
+                + self._helps("Check whether the load was lost, and limits.speed_max_rad_s in rig.yaml"),
+                entry=MessageCode.SPEED_LIMIT,
             )
         if not limits.allow_reverse and speed_rad_s < -self._reverse_rad_s:
             raise LimitHit(
                 f"the shaft turns backwards ({speed_rad_s:.3f} rad/s) and allow_reverse is false",
                 where=where,
-                next_step="The shaft was stopped. Reverse rotation backs off tool joints",
+                next_step="The shaft was stopped. Reverse rotation unscrews tool joints",
+                entry=MessageCode.TURNED_BACKWARDS,
             )
 
     def _check_window(self, model: RigGuess, command: Command, speed_rad_s: float, where: str) -> None:
@@ -301,16 +313,18 @@ class Guard:
         if predicted > limits.speed_max_rad_s:
             raise LimitHit(
                 self._besides(
-                    f"the speed is about to leave its window: {leads}, beyond {limits.speed_max_rad_s:g} rad/s"
+                    f"the speed is about to leave its window: {leads}, above {limits.speed_max_rad_s:g} rad/s"
                 ),
                 where=where,
                 next_step=f"The shaft was stopped. {self._helps('Lower the amplitude or the offset')}",
+                entry=MessageCode.SPEED_LIMIT,
             )
         if predicted < lowest:
             raise LimitHit(
                 self._besides(f"the shaft is about to turn backwards: {leads}"),
                 where=where,
                 next_step=f"The shaft was stopped. {self._helps('Lower the amplitude or raise the offset')}",
+                entry=MessageCode.TURNED_BACKWARDS,
             )
         self._check_lower_end(speed_rad_s, where)
 
@@ -323,7 +337,8 @@ class Guard:
                 ),
                 where=where,
                 next_step="The shaft was stopped. "
-                + self._helps("Lower the amplitude or raise the offset; did the load grow?"),
+                + self._helps("Lower the amplitude or raise the offset. Check whether the load increased"),
+                entry=MessageCode.SPEED_LIMIT,
             )
 
     def _besides(self, what: str) -> str:
@@ -344,13 +359,14 @@ class Guard:
                 where=f"host, and {where}" if late else where,
                 next_step=LOWER_THE_RATE
                 if late
-                else "Check the drive's supply and the bus; the drive's own watchdog stops the shaft",
+                else "The drive's own watchdog stops the shaft. Check the drive's supply and the bus",
+                entry=MessageCode.FEEDBACK_LOST,
             )
 
     def _check_reports(self, where: str) -> None:
-        """Raise what the observer found.
+        """Raise the contradiction that the observer found.
 
-        CommunicationLost for feedback that repeats, LimitHit for a shaft that became lighter, ReportsContradict else.
+        CommunicationLost for feedback that repeats, LimitHit for a shaft that became lighter, else ReportsContradict.
         """
         doubt = self.observer.doubt
         if doubt is None:
@@ -365,32 +381,32 @@ class Guard:
         if self.expected is not PowerState.ENABLED:
             self._mode = _ModeShown()
         elif sample.fresh and not self._mode.see(command.mode, sample):
-            shown = "none of those that it was prepared for" if sample.mode is None else f"{sample.mode.value} mode"
+            shown = "an unknown mode" if sample.mode is None else f"{sample.mode.value} mode"
             raise ModeNotConfirmed(
-                f"the drive lost its mode: {command.mode.value} mode is commanded, and it displays {shown}",
+                f"the drive left its mode: {command.mode.value} mode is commanded, but it displays {shown}",
                 where=f"mode display (6061h in CiA 402) at {sample.time_s:.3f} s",
-                next_step="The shaft was stopped. Did a second master, a tool or a parameter of the drive change it?",
+                next_step="The shaft was stopped. Check whether another master, a tool or a parameter changed it",
             )
 
     def torque_told(self, torque_nm: float, limit_active: bool, disturbed: bool = False) -> tuple[str, str]:
-        """How a torque stands to its limit, and what would help a shaft that does not get its speed with it.
+        """Return the torque compared with its limit, and advice for a shaft that does not reach its speed with it.
 
-        ``disturbed``: a drill string under load keeps it from that.
+        ``disturbed``: a drill string under load prevents that.
         """
         limit_nm = self._limits.torque_nm
         if limit_active or abs(torque_nm) >= AT_LIMIT_SHARE * limit_nm:
             by = "the drive's internal limit acts" if limit_active else f"at its limit of {limit_nm:g} N·m"
             return (
                 f"torque {torque_nm:.1f} N·m, {by}",
-                "Does a brake or the load hold the shaft? Else it needs a higher torque limit (limits.torque_nm in"
-                " rig.yaml, and the drive's own)",
+                "Check whether a brake or the load holds the shaft. If not, a higher torque limit is needed"
+                " (limits.torque_nm in rig.yaml, and the drive's own)",
             )
         if disturbed or self.disturbed:
             return f"torque {torque_nm:.1f} N·m, not at its limit of {limit_nm:g} N·m", LIGHTEN
         return (
             f"torque {torque_nm:.1f} N·m, not at its limit of {limit_nm:g} N·m",
-            "Does the drive take its speed from elsewhere (panel, another master), hold a speed limit or a ramp of its"
-            " own, or count speed in another unit than the profile says? Else its speed loop is tuned too softly",
+            "Check whether the drive takes its speed setpoint from elsewhere (panel, another master), applies its own"
+            " speed limit or ramp, or uses another unit of speed than the profile. If not, its speed loop is too soft",
         )
 
     def _check_following(self, command: Command, sample: Sample, where: str) -> None:
@@ -401,10 +417,11 @@ class Guard:
             torque, helps = self.torque_told(following.torque_nm, sample.limit_active)
             raise LimitHit(
                 f"the speed does not follow: {command.speed_rad_s:.3f} rad/s commanded,"
-                f" {following.speed_rad_s:.3f} rad/s reported, apart since {following.since_s:.1f} s and no nearer for"
-                f" {following.within_s:g} s; {torque}",
+                f" {following.speed_rad_s:.3f} rad/s reported, deviating since {following.since_s:.1f} s and no nearer"
+                f" for {following.within_s:g} s; {torque}",
                 where=where,
                 next_step=f"The shaft was stopped. {helps}",
+                entry=MessageCode.SETPOINT_NOT_FOLLOWED,
             )
 
     def _check_limited(self, command: Command, sample: Sample) -> None:
@@ -414,24 +431,25 @@ class Guard:
             self._limited_since_s = sample.time_s
         elif sample.time_s - self._limited_since_s >= LIMITED_S:
             raise LimitHit(
-                f"the drive's internal limit has been active in torque mode for {LIMITED_S:g} s:"
+                f"the drive's internal limit has been active in torque mode for the limit of {LIMITED_S:g} s:"
                 " its torque is not the commanded one",
                 where=f"statusword {sample.status:04X}h, bit 11, at {sample.time_s:.3f} s",
-                next_step="Which limit of the drive acts (torque, current, speed, voltage)? Look at its panel",
+                next_step="The shaft was stopped. Check on its panel which limit acts",
+                entry=MessageCode.SETPOINT_NOT_FOLLOWED,
             )
 
 
 class _ModeShown:
-    """The mode that the drive displays beside the commanded one."""
+    """Compares the mode that the drive displays with the commanded one."""
 
     def __init__(self) -> None:
         self._commanded: Mode | None = None
-        self._seen = False                 # in the commanded one, since that was commanded
+        self._seen = False                 # the commanded mode was displayed since it was commanded
         self._other_since_s: float | None = None
         self._others = 0
 
     def see(self, commanded: Mode, sample: Sample) -> bool:
-        """False once another one has been displayed for too long."""
+        """Return False once another mode has been displayed for too long."""
         if commanded is not self._commanded:
             self._commanded, self._seen, self._other_since_s = commanded, False, None
         if sample.mode is commanded:
@@ -445,7 +463,7 @@ class _ModeShown:
 
 
 class _Following:
-    """The reported speed beside the reference of speed mode."""
+    """Compares the reported speed with the reference of speed mode."""
 
     def __init__(
         self, limits: MachineLimits, period_s: float, speed_resolution_rad_s: float, assumptions: ControlAssumptions
@@ -461,23 +479,23 @@ class _Following:
         self.reset()
 
     def reset(self) -> None:
-        """What comes next is seen as the first."""
+        """Start again with the next sample."""
         self._blocks.clear()
-        self._side = 0.0                   # of the reference that the shaft is away on; 0: it is not
+        self._side = 0.0                   # side of the reference on which the shaft is; 0: within the window
         self._anchor_rad_s = self._anchor_s = self.since_s = 0.0
 
     @property
     def speed_rad_s(self) -> float:
-        """Mean reported speed."""
+        """Return the mean reported speed, rad/s."""
         return math.fsum(self._speeds) / len(self._speeds)
 
     @property
     def torque_nm(self) -> float:
-        """Mean reported torque."""
+        """Return the mean reported torque, N·m."""
         return math.fsum(self._torques) / len(self._torques)
 
     def see(self, reference_rad_s: float, sample: Sample) -> bool:
-        """False once the shaft has been away from its reference, and come no nearer, for too long."""
+        """Return False once the shaft has been away from its reference for too long without coming nearer."""
         now_s = sample.time_s
         if not self._blocks or now_s - self._blocks[-1].start_s >= FOLLOW_BLOCK_S:
             self._blocks.append(_Block(now_s, reference_rad_s))
@@ -497,14 +515,14 @@ class _Following:
     def _side_of(self, speed_rad_s: float) -> float:
         latest, window_rad_s = self._blocks[-1], self._window_rad_s
         if latest.lowest - window_rad_s <= speed_rad_s and speed_rad_s - latest.highest <= window_rad_s:
-            return 0.0           # as nearly always; earlier blocks only widen it
+            return 0.0           # the usual case; earlier blocks only widen it
         if speed_rad_s < min(block.lowest for block in self._blocks) - window_rad_s:
             return 1.0
         return -1.0 if speed_rad_s - max(block.highest for block in self._blocks) > window_rad_s else 0.0
 
 
 class _Block:
-    """What the reference was from ``start_s`` on."""
+    """Range of the reference from ``start_s`` on."""
 
     def __init__(self, start_s: float, reference_rad_s: float) -> None:
         self.start_s = start_s

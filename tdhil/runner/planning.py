@@ -1,7 +1,7 @@
-"""The plan of stage 5, and of when it ends: from what is asked for and what stages 2 and 3 have shown. Pure.
+"""The plan of stage 5 and of its end: from the request and the results of stages 2 and 3. Pure.
 
-Without a tolerance the motion is planned for a fixed time. With one, a pilot is planned from what the noise leads to
-expect, and everything after it is decided by its scatter (`design.stopping_rule`).
+Without a tolerance the motion is planned for a fixed time. With one, a pilot is planned from the expected noise, and
+its scatter decides everything after it (`design.stopping_rule`).
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ from tdhil.runner.excitation import (
 from tdhil.runner.settings import ExcitationRequest
 from tdhil.runner.stages import RampCourse, reference_plan
 
-NOT_PREDICTED = "how tight the interval of J will be is not predicted for this motion; it comes from the record itself"
-NOTHING_TO_EXPECT = "no interval of J is to be expected: this motion can't tell the inertia from lags and friction"
-_PILOT_SHARE = 0.6        # of the periods that are expected to be needed: the rest is decided by the pilot's scatter
-_EVER = 1000.0            # times as long: what is open then stays open
+NOT_PREDICTED = "the width of the interval of J is not predicted for this motion; it follows from the recording"
+NOTHING_TO_EXPECT = "no interval of J is expected: this motion can't separate the inertia from lags and friction"
+_PILOT_SHARE = 0.6        # of the expected periods: the pilot's scatter decides about the rest
+_EVER = 1000.0            # times as long: an uncertainty that remains then stays
 
 
 @dataclass(frozen=True)
 class Planned:
-    """The plan (with a stopping rule: its pilot), and the relative half-width of J that may be expected at the end.
+    """The plan (with a stopping rule: its pilot), and the expected relative half-width of J at the end.
 
-    The half-width is infinite where none is to be expected, and not a number where none is predicted.
+    The half-width is infinite if no interval is expected, and NaN if it is not predicted.
     """
 
     plan: Plan | SwingPlan
@@ -65,7 +65,7 @@ class Planned:
     duration_s: float = 0.0
 
     def said(self) -> str:
-        """One line for whoever watches."""
+        """Return one line for the display."""
         if not math.isfinite(self.half_width):
             return NOT_PREDICTED if math.isnan(self.half_width) else NOTHING_TO_EXPECT
         noise = f"noise {self.known.noise.source}"
@@ -73,10 +73,10 @@ class Planned:
         expected = f"expected interval of J: {share} after {self.duration_s:.0f} s (repeatability; {noise})"
         if self.stopping is None or self.stopping.reachable:
             return expected
-        return f"±{100.0 * self.stopping.tolerance:.3g} % is not to be expected: {self.stopping.advice}; {expected}"
+        return f"±{100.0 * self.stopping.tolerance:.3g} % can't be reached: {self.stopping.advice}; {expected}"
 
     def plain(self) -> dict[str, Any]:
-        """As the run's configuration keeps it."""
+        """Return it as plain data for the run's configuration."""
         return {
             "expected_half_width": _finite(self.half_width),
             "usual_half_width": _finite(self.usual_half_width),
@@ -87,7 +87,7 @@ class Planned:
 
 
 def request_of(request: ExcitationRequest, mode: str) -> PlanRequest:
-    """The request as the excitation room takes it. Raises PlanRefused where it isn't periodic."""
+    """Return the request for a periodic plan. Raises PlanRefused if it is not periodic."""
     periodic_kind(request.kind)
     return PlanRequest(
         kind=request.kind,
@@ -100,14 +100,14 @@ def request_of(request: ExcitationRequest, mode: str) -> PlanRequest:
 
 
 def adaptive(request: ExcitationRequest) -> bool:
-    """Does the scatter decide when stage 5 ends? Not with a number of periods given, nor without several lines."""
+    """Return whether the scatter decides the end of stage 5. False with given periods or with one frequency."""
     return request.tolerance is not None and request.periods is None and excitation_kind(request.kind).adaptive
 
 
 def as_followed(
     guess: RigGuess, limits: MotionLimits, course: RampCourse, speed_lag_s: float
 ) -> tuple[RigGuess, MotionLimits]:
-    """Rig and limits as the drive's own speed control leaves them, seen in the ramp of stage 2."""
+    """Return rig and limits with the effect of the drive's own speed control, from the ramp of stage 2."""
     signals = course.time_s, course.setpoint_rad_s, course.reported_rad_s
     ramp = held_back_to(*signals)
     following = fit_following(*signals, speed_lag_s, math.inf if ramp is None else ramp)
@@ -118,7 +118,7 @@ def as_followed(
 def plan_acquisition(
     request: ExcitationRequest, mode: str, limits: MotionLimits, guess: RigGuess, known: DesignKnowledge, left_s: float
 ) -> Planned:
-    """Plan stage 5; ``left_s`` is what the run's time limit leaves. Raises PlanRefused, naming what does not fit."""
+    """Plan stage 5; ``left_s`` remains of the run's time limit. Raises PlanRefused with the reason."""
     if isinstance(excitation_kind(request.kind), SwingKind):
         return _swings(request, mode, limits, guess, known, left_s)
     wish = request_of(request, mode)
@@ -142,15 +142,15 @@ def plan_acquisition(
 
 
 RIGS = ((1.0, 1.0), (0.1, 0.5), (0.01, 0.0), (1.0, 0.0), (10.0, 0.0))
-"""Shares of the inertia and the friction that are assumed: what suits none of these rigs will suit no other."""
+"""Shares of the assumed inertia and friction: a motion that fits none of these rigs fits no other."""
 
 
 def refuse_hopeless(
     request: ExcitationRequest, modes: tuple[str, ...], limits: MotionLimits, guess: RigGuess, known: DesignKnowledge
 ) -> None:
-    """PlanRefused where what is asked for fits no rig, in none of ``modes``: that is known before anything moves.
+    """Raise PlanRefused, before motion, if the requested motion fits no rig in any of ``modes``.
 
-    The words are those of the assumed rig. What depends on the rig is left to be planned once that is known.
+    The message refers to the assumed rig. Everything that depends on the rig is planned once it is known.
     """
     first: PlanRefused | None = None
     swings = isinstance(excitation_kind(request.kind), SwingKind)
@@ -176,17 +176,17 @@ def _reference(
     request: ExcitationRequest, limits: MotionLimits, guess: RigGuess, wish: PlanRequest, known: DesignKnowledge,
     left_s: float,
 ) -> Planned:
-    """The speed reference's lines that the drive's own impedance is measured by."""
+    """Plan the speed reference for the measurement of the drive's own impedance."""
     if request.impedance != "reference":
         raise PlanRefused(
-            "by the torque offset the motion is planned in stage 4, from what a small offset does",
-            "Leave --dry-run out",
+            "with the torque offset the motion is planned in stage 4, from the response to a small offset",
+            "Remove --dry-run",
         )
     plan = reference_plan(limits, guess, wish)
     if plan.duration_s > left_s:
         raise PlanRefused(
-            f"time: it takes {plan.duration_s:.0f} s, and {max(left_s, 0.0):.0f} s are left",
-            "Raise limits.time_s in rig.yaml, or ask for fewer --periods",
+            f"time: the motion takes {plan.duration_s:.0f} s, and {max(left_s, 0.0):.0f} s are left",
+            "Raise limits.time_s in rig.yaml, or request fewer --periods",
         )
     return Planned(plan, known, math.nan, math.nan, None, plan.duration_s)
 
@@ -199,11 +199,11 @@ def _swings(
     known: DesignKnowledge,
     left_s: float,
 ) -> Planned:
-    """From speed to speed: there is no line to predict, and no scatter of periods to stop by."""
+    """Plan changes of speed. They have no spectral lines to predict and no periods for a stopping rule."""
     if request.frequency_hz is not None:
         raise PlanRefused(
             f"{request.kind} has no frequency; use --amplitude, --offset, --periods or --max-time",
-            "Leave --frequency out",
+            "Remove --frequency",
         )
     plan = make_swings(
         request.kind,
@@ -218,7 +218,7 @@ def _swings(
     if plan.duration_s > left_s:
         raise PlanRefused(
             f"time: {request.kind} takes {plan.duration_s:.0f} s, and {max(left_s, 0.0):.0f} s are left",
-            "Raise limits.time_s in rig.yaml, or ask for less with --periods or --max-time",
+            "Raise limits.time_s in rig.yaml, or lower --periods or --max-time",
         )
     return Planned(plan, known, math.nan, math.nan, None, plan.duration_s)
 
@@ -226,9 +226,9 @@ def _swings(
 def _with_pilot(
     request: ExcitationRequest, chosen: Choice, known: DesignKnowledge, allowed_s: float, fewest: int = LEAST_COUNTED
 ) -> Planned:
-    """The pilot: most of what will be needed, so that little is left to chance, and enough to know the scatter."""
+    """Plan the pilot: most of the expected periods, and enough to know the scatter."""
     assert request.tolerance is not None
-    if math.isnan(chosen.half_width):     # a string: a rigid shaft's scatter says nothing of it, beforehand or behind
+    if math.isnan(chosen.half_width):     # a string: the scatter of a rigid shaft gives no prediction for it
         plan = chosen.plan
         stopping = Stopping(
             request.tolerance, request.confidence, pilot_dof(plan), plan.counted, plan.counted, allowed_s, True,
@@ -261,24 +261,24 @@ def _with_pilot(
 
 
 def pilot_dof(plan: Plan) -> float:
-    """Real degrees of freedom of a line's variance: two for every period but the first of each segment."""
+    """Return the degrees of freedom of a line's variance: two per period except the first of each segment."""
     return 2.0 * sum(segment.periods - segment.settle_periods - 1 for segment in plan.segments)
 
 
 def counted_in(plan: Plan, time_s: float) -> int:
-    """How many periods that count at each mean speed fit into a time, with a pilot and one extension."""
+    """Return the evaluated periods per mean speed that fit into a time, with a pilot and one extension."""
     period = sum(one.reference.period_s for one in plan.segments)
     return math.floor((time_s - plan.with_counted(0).duration_s - plan.extension_s(0)) / period + 1e-9)
 
 
 def _advice(evidence: Evidence, confidence: float, tolerance: float, known: DesignKnowledge) -> str:
-    """What would bring the tolerance within reach."""
+    """Return advice how to reach the tolerance."""
     ever = half_width(longer(evidence, _EVER), confidence)
     if ever > tolerance:
         lags = "state the drive's filters on reported speed and torque (drive_data in rig.yaml)"
         known_lags = known.prior.speed_lag_s is not None and known.prior.torque_lag_s is not None
         what = "state them more exactly" if known_lags else lags
-        return f"the lags leave ±{100.0 * ever:.2g} % open however long it takes; {what}, or set both filters equal"
+        return f"the lags leave ±{100.0 * ever:.2g} % for any duration; {what}, or set both filters equal"
     return "allow more time (--max-time, limits.time_s), a wider speed window or more torque"
 
 

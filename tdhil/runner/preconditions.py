@@ -1,4 +1,4 @@
-"""In which mode of the drive a run goes, within which of its limits, and what is refused because of either. Pure."""
+"""The drive mode and the limits of a run, and the refusals that follow from them. Pure."""
 
 from __future__ import annotations
 
@@ -25,29 +25,30 @@ from drivers import (
     quantile,
 )
 from drivers.own_limits import SPEED, TORQUE, WIDER_FLAG
+from profiles import CodedText, MessageCode
 from tdhil.config import DEFAULT_EXCITATION, told_before_echo
 from tdhil.recording import LagPrior
 from tdhil.runner.excitation import ECHOES_S, excitation_kind, tells_before_echo
 from tdhil.runner.settings import ControlAssumptions, ExcitationRequest, MachineLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How many cycles a second: the profile's, or the next lower that this computer, its adapter and the drive hold.
+# The cycle rate: the profile's, or the next lower one that this computer, its adapter and the drive sustain.
 #
-# Tried before anything moves, with the drive disabled, by the cycles themselves: a computer that is busy, a slow
-# adapter and a slow line show alike, in cycles that begin late and in answers that come late or not at all.
+# It is measured before motion, with the drive disabled, by the cycles themselves. A busy computer, a slow adapter and a
+# slow line all show as cycles that begin late and replies that arrive late or not at all.
 
 
 SHARE = 0.999
-"""Of the cycles must be in time by half a period."""
+"""Share of the cycles that must be at most half a period late."""
 CYCLES, LONGEST_S = 1000, 4.0
-"""Tried at each rate: so many, or for so long where that is less."""
+"""Test of each rate: number of cycles, or time in s if that is shorter."""
 WARM_UP = 10
-"""Cycles at each rate before those that count: the first ones load what was never needed before."""
+"""Cycles at each rate before the test: the first ones load modules."""
 
 
 @dataclass(frozen=True)
 class Tried:
-    """One rate: how many cycles it was tried for, how late ``SHARE`` of them were at most, and whether that will do."""
+    """The test of one rate: number of cycles, quantile ``SHARE`` of their lateness, and whether the rate holds."""
 
     rate_hz: float
     cycles: int
@@ -56,13 +57,13 @@ class Tried:
 
     @property
     def text(self) -> str:
-        """As a person reads it."""
+        """Return the result as text."""
         return f"p99.9 of {1e3 * self.late_s:.2g} ms in {self.cycles} cycles"
 
 
 @dataclass(frozen=True)
 class RateChoice:
-    """The rate that is left set, and what was tried before it, the highest first."""
+    """The chosen rate, and the rates tried before it, the highest first."""
 
     tried: tuple[Tried, ...]
 
@@ -72,30 +73,30 @@ class RateChoice:
 
     @property
     def text(self) -> str:
-        """One line for the terminal and the log."""
+        """Return one line for the terminal and the log."""
         taken, first = self.taken, self.tried[0]
         if not taken.holds:
             return (
-                f"{taken.rate_hz:g} cycles a second, though this computer doesn't hold them ({taken.text}, "
-                f"and half a period is {500.0 / taken.rate_hz:.3g} ms). {LOWER_THE_RATE}, or end what keeps it busy"
+                f"{taken.rate_hz:g} cycles per second, although this computer does not sustain them ({taken.text}; "
+                f"the limit is half a period, {500.0 / taken.rate_hz:.3g} ms). {LOWER_THE_RATE}, or end other programs"
             )
         if taken is first:
-            return f"{taken.rate_hz:g} cycles a second: this computer holds them ({taken.text}; --rate overrides)"
+            return f"{taken.rate_hz:g} cycles per second: this computer sustains them ({taken.text}; --rate overrides)"
         return (
-            f"{taken.rate_hz:g} cycles a second ({taken.text}) instead of the profile's {first.rate_hz:g}, which this "
-            f"computer doesn't hold ({first.text}); --rate overrides, --real-time-priority may help"
+            f"{taken.rate_hz:g} cycles per second ({taken.text}) instead of the profile's {first.rate_hz:g}, which"
+            f" this computer does not sustain ({first.text}); --rate overrides, --real-time-priority may help"
         )
 
     def plain(self) -> list[dict[str, Any]]:
-        """As the run's configuration keeps it."""
+        """Return it as plain data for the run's configuration."""
         return [asdict(one) for one in self.tried]
 
 
 def quieten() -> None:
-    """Whatever would hold a control loop up later is done now: before anything is armed, and before it is measured.
+    """Do now what would delay a control loop later: before anything is armed, and before the rate is measured.
 
-    Reading scipy from the disk takes seconds, in pieces that let no other thread run; and looking through all that is
-    loaded, again and again, for garbage that isn't there takes a tenth of one.
+    Reading scipy from the disk takes seconds, in pieces that block all other threads. Each garbage collection over all
+    loaded objects takes a tenth of a second.
     """
     import scipy.optimize
     import scipy.special  # noqa: F401
@@ -107,7 +108,7 @@ def quieten() -> None:
 
 
 def choose_rate(drive: Paced, rates_hz: Sequence[float], cycle: Callable[[], Sample]) -> RateChoice:
-    """Go down ``rates_hz`` until one holds; that one, or the last, is set. Raises whatever a cycle raises."""
+    """Try ``rates_hz`` in turn until one holds, and set it, or the last one. Raises what a cycle raises."""
     tried: list[Tried] = []
     for rate_hz in rates_hz:
         drive.set_rate(rate_hz, measuring=True)
@@ -133,16 +134,16 @@ def _try(drive: Paced, rate_hz: float, cycle: Callable[[], Sample]) -> Tried:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What is known of the lags in what a drive reports: from rig.yaml, the drive's own filters, and timing. Pure.
+# Prior knowledge of the reporting lags: from rig.yaml, the drive's own filters, and timing. Pure.
 
 
 READ_FILTER_SD_SHARE = 0.1
 READ_FILTER_SD_S = 0.001
-"""How exactly a filter setting that the drive tells is the lag that it causes."""
+"""Standard uncertainty of the lag that follows from a filter setting read from the drive (share, and s)."""
 
 
 def with_read_filters(prior: LagPrior, filters: ReportingFilters) -> LagPrior:
-    """What rig.yaml states goes before what the drive tells of itself."""
+    """Return the prior with the drive's filter settings. Values of rig.yaml take precedence."""
     speed, torque = prior.speed_lag_s, prior.torque_lag_s
     sources = [prior.source] if prior.source else []
     if speed is None and filters.speed_lag_s is not None:
@@ -157,37 +158,38 @@ def with_read_filters(prior: LagPrior, filters: ReportingFilters) -> LagPrior:
 
 
 def with_known_lag(assumptions: ControlAssumptions, prior: LagPrior) -> ControlAssumptions:
-    """Reports that are known to lag further than usual are reckoned with by guard, control and stop."""
+    """Extend the assumed reporting lag of guard, control and stop if a longer one is known."""
     known_s = 0.0 if prior.speed_lag_s is None else prior.speed_lag_s + 2.0 * prior.speed_lag_sd_s
     return replace(assumptions, largest_speed_lag_s=max(assumptions.largest_speed_lag_s, known_s))
 
 
 def with_timing(prior: LagPrior, half_width_s: float) -> LagPrior:
-    """A sample's time may be off by so many seconds; torque and speed may be apart by as much."""
+    """Widen the time offset between torque and speed by the uncertainty of the sample times."""
     return replace(prior, skew_sd_s=math.hypot(prior.skew_sd_s, half_width_s))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A run on a drive that is known not to watch its host, or not this one alone, which the operator has accepted by
-# name.
+# A run on a drive whose watchdog does not supervise this host, or not this host alone, accepted by name.
 #
-# Everything else stays as it is: guard, limits and the stop are the host's and the drive's as ever. What changes is
-# what may be said: nobody is to be told that the drive will stop the shaft by itself.
+# Guard, limits and the stop stay the same. Only the texts change: none may state that the drive stops the shaft by
+# itself.
 
 
 SAID = f"no watchdog is armed in the drive, {ACCEPTED_BY}: {NOTHING_STOPS_IT}"
-SAID_SHARED = f"the drive's watchdog is no answer to a dead host, accepted by {SHARED_FLAG}: {ANY_CLIENT}"
-_WARNING_SHARED = (
-    f"the drive's watchdog was fed by any client, accepted by {SHARED_FLAG}: while another one went on asking, it would"
-    " not have stopped by itself had this computer, the program or the cable failed"
+SAID_SHARED = f"the drive's watchdog may not detect a dead host, accepted by {SHARED_FLAG}: {ANY_CLIENT}"
+_WARNING_SHARED = CodedText(
+    f"the drive's watchdog was fed by any client, accepted by {SHARED_FLAG}: if another client had continued to send"
+    " requests, it would not have stopped the shaft after a failure of this computer, the program or the cable",
+    MessageCode.WATCHDOG_SHARED,
 )
 _STEP_SHARED = (
     "If the shaft still turns, use the hard-wired emergency stop now: requests of any other client keep this drive's"
     f" watchdog from acting ({SHARED_FLAG}). Then check supply, cable and adapter"
 )
-_WARNING = (
-    f"no watchdog was armed in the drive, {ACCEPTED_BY}: it would not have stopped by itself had this computer, the"
-    " program or the cable failed"
+_WARNING = CodedText(
+    f"no watchdog was armed in the drive, {ACCEPTED_BY}: it would not have stopped the shaft after a failure of this"
+    " computer, the program or the cable",
+    MessageCode.NO_WATCHDOG_ARMED,
 )
 _STEP = (
     f"If the shaft still turns, use the hard-wired emergency stop now: no watchdog is armed in this drive "
@@ -197,14 +199,14 @@ _STEP = (
 
 
 def configuration(preflight: Preflight) -> dict[str, Any]:
-    """For the log, under `watchdog`; nothing where one is armed that this host alone feeds."""
+    """Return the log's `watchdog` entry; nothing if one is armed that only this host feeds."""
     if preflight.watched and preflight.fed_by_any_client:
         return {"watchdog": {"armed": True, "fed_by_any_client": True, "accepted_by": SHARED_FLAG}}
     return {} if preflight.watched else {"watchdog": {"armed": False, "accepted_by": NO_WATCHDOG_FLAG}}
 
 
 def precondition_warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
-    """For the result, from the log's configuration: the same live and replayed."""
+    """Return the warnings for the result, from the log's configuration: the same live and in replay."""
     found = run.get("watchdog")
     if not isinstance(found, Mapping):
         return ()
@@ -214,7 +216,7 @@ def precondition_warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def correct(error: BaseException, preflight: Preflight | None) -> None:
-    """Whoever can't reach the drive any more says that its watchdog acts; here none does."""
+    """Correct the next step of a lost connection: this drive has no watchdog that will act."""
     if isinstance(error, CommunicationLost) and preflight is not None:
         if not preflight.watched:
             error.next_step = _STEP
@@ -223,76 +225,82 @@ def correct(error: BaseException, preflight: Preflight | None) -> None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a drill string on the shaft forbids, looked at before anything moves (DESIGN.md, Stopping).
+# Refusals with a drill string on the shaft, checked before motion (DESIGN.md, Stopping).
 
 
 _LETS_GO = ("coast", "none", "fault_reaction")
-"""Reactions to a silent host after which nothing holds the string; a drive in fault has its torque off (CiA 402)."""
+"""Watchdog reactions that release the string; a drive in fault switches its torque off (CiA 402)."""
 
 
 def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, lets_go: bool) -> None:
-    """`refuse_with_string`, as far as it can be said with no drive at hand.
+    """Raise PreflightRefused for refusals that need no drive, see `refuse_with_string`.
 
-    ``lets_go``: the drive's profile says that it does after a quick stop.
+    ``lets_go``: the drive is disabled after a quick stop, according to its profile.
     """
     if told_before_echo(request.kind) and limits.wave_impedance_nm_s_rad <= 0.0:
         raise PreflightRefused(
-            f"{request.kind} was asked for, which tells the inertia above a drill string whose pipe is known, and none"
-            " is",
+            f"{request.kind} needs a drill string whose pipe is known, and rig.yaml describes no pipe",
             where="--excitation and load in rig.yaml",
             next_step="Use --excitation multisine, or give load: {kind: string, length_m, outer_diameter_m,"
             " inner_diameter_m}",
+            entry=MessageCode.EXCITATION_NOT_POSSIBLE,
         )
     if told_before_echo(request.kind) and not tells_before_echo(limits.echo_s):
         raise PreflightRefused(
-            f"{request.kind} was asked for, and an echo comes back after {limits.echo_s:.2f} s: it tells those of"
-            f" {ECHOES_S[0]:g} to {ECHOES_S[1]:g} s, of about 1100 to 6000 m of pipe",
+            f"{request.kind} needs an echo after {ECHOES_S[0]:g} to {ECHOES_S[1]:g} s (about 1100 to 6000 m of pipe);"
+            f" the echo of this pipe returns after {limits.echo_s:.2f} s",
             where="load.length_m in rig.yaml",
             next_step="Use --excitation multisine",
+            entry=MessageCode.EXCITATION_NOT_POSSIBLE,
         )
     if not limits.winds_up:
         return
     if not excitation_kind(request.kind).with_string:
         raise PreflightRefused(
-            f"{request.kind} was asked for, and a drill string hangs on the shaft: it would turn the motor back",
+            f"{request.kind} is not possible with a drill string on the shaft: the string would turn the motor back",
             where="--excitation",
             next_step="Use --excitation multisine",
+            entry=MessageCode.EXCITATION_NOT_POSSIBLE,
         )
     if limits.torque_ramp_nm_s <= 0.0:
         raise PreflightRefused(
-            "a drill string hangs on the shaft, and nothing says how fast its trapped torque is let go",
+            "a drill string is on the shaft, and the release rate of its trapped torque is missing",
             where="torque_ramp_nm_s",
-            next_step="Give torque_ramp_nm_s in rig.yaml, such as 50",
+            next_step="Add torque_ramp_nm_s to rig.yaml, such as 50 (N·m/s)",
+            entry=MessageCode.STRING_NOT_SAFE,
         )
     if lets_go:
         _refuse_quick_stop(holds=False)
 
 
 def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, preflight: Preflight) -> None:
-    """PreflightRefused where torque could be lost while a string is wound up, or a string is missed."""
-    refuse_by_plan(limits, request, lets_go=False)      # the drive itself is asked, after its watchdog
+    """Raise PreflightRefused if a twisted string could lose its torque, or if a string is required and missing."""
+    refuse_by_plan(limits, request, lets_go=False)      # the drive's own value is checked below, after its watchdog
     if not limits.winds_up:
         return
     if not preflight.watched:
         raise PreflightRefused(
-            "a drill string hangs on the shaft, and no watchdog is armed in the drive: "
-            f"{NO_WATCHDOG_FLAG} is not for strings",
+            "a drill string is on the shaft, and no watchdog is armed in the drive: "
+            f"{NO_WATCHDOG_FLAG} is not allowed with a string",
             where="load in rig.yaml",
-            next_step="Only the drive's own stop is left for a wound-up string when the host fails: arm its watchdog",
+            next_step="Arm the drive's watchdog: if the host fails, only the drive can stop a twisted string",
+            entry=MessageCode.STRING_NOT_SAFE,
         )
     if preflight.fed_by_any_client and not preflight.identity.simulated:
         raise PreflightRefused(
-            f"a drill string hangs on the shaft, and any client feeds the drive's watchdog: {SHARED_FLAG} is not for"
-            " strings",
+            f"a drill string is on the shaft, and any client feeds the drive's watchdog: {SHARED_FLAG} is not allowed"
+            " with a string",
             where="load in rig.yaml",
             next_step="Use a drive, or a setting of this one, whose watchdog only its commanding host feeds",
+            entry=MessageCode.STRING_NOT_SAFE,
         )
     if preflight.safe_action in _LETS_GO:
         raise PreflightRefused(
-            f"a drill string hangs on the shaft, and the drive's watchdog reaction is '{preflight.safe_action}':"
-            " it would let go of the trapped torque",
+            f"a drill string is on the shaft, and the drive's watchdog reaction is '{preflight.safe_action}':"
+            " it would release the trapped torque at once",
             where="watchdog of the profile",
             next_step="Choose a reaction that brakes and holds: in CiA 402 object 6007h = 3 (quick stop)",
+            entry=MessageCode.STRING_NOT_SAFE,
         )
     if not preflight.quick_stop_holds:
         _refuse_quick_stop(preflight.quick_stop_holds)
@@ -301,21 +309,22 @@ def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, prefli
 def _refuse_quick_stop(holds: bool | None) -> None:
     known = holds is not None
     raise PreflightRefused(
-        "a drill string hangs on the shaft, and "
-        + ("the drive lets go of it after a quick stop" if known
-           else "nobody knows whether the drive holds it after a quick stop"),
+        "a drill string is on the shaft, and "
+        + ("the drive is disabled after a quick stop and would release it" if known
+           else "it is unknown whether the drive holds it after a quick stop"),
         where="quick_stop of the profile",
         next_step="Use a drive that stays in quick stop (605Ah = 5 or 6), or run without the string"
-        if known else "Look it up in the drive's manual, and write quick_stop.ends into a profile of your own",
+        if known else "Look it up in the drive's manual, and set quick_stop.ends in your own profile",
+        entry=MessageCode.STRING_NOT_SAFE,
     )
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 
 def choose_mode(request: ExcitationRequest, limits: MachineLimits, preflight: Preflight) -> Mode:
-    """Torque mode where the drive has it and can enter it while it turns, unless speed mode was asked for.
+    """Return torque mode if the drive can enter it while it turns, unless speed mode is requested.
 
-    Raises PreflightRefused where what was asked for can't be had in a mode of this drive.
+    Raises PreflightRefused if the drive has no mode for the requested motion.
     """
     if request.impedance is not None:
         _refuse_impedance(request, limits, preflight)
@@ -323,65 +332,72 @@ def choose_mode(request: ExcitationRequest, limits: MachineLimits, preflight: Pr
     wanted, can_torque = request.mode, Mode.TORQUE in preflight.modes and preflight.switch_while_enabled
     if wanted == Mode.TORQUE.value and not can_torque:
         raise PreflightRefused(
-            "torque mode was asked for, but this drive has none that can be entered while it turns",
+            "torque mode is requested, but this drive can't enter a torque mode while the shaft turns",
             where="6502h and profile",
             next_step="Use --mode speed",
+            entry=MessageCode.NO_TORQUE_MODE,
         )
     mode = Mode.SPEED if wanted == Mode.SPEED.value or not can_torque else Mode.TORQUE
     kind = excitation_kind(request.kind)
     if not kind.with_string and limits.load != "none":
         raise PreflightRefused(
-            f"{request.kind} was asked for, but a {limits.load} hangs on the shaft and would drive it back",
+            f"{request.kind} is requested, but a {limits.load} is on the shaft and would drive it back",
             where="--excitation and load in rig.yaml",
             next_step="Use --excitation multisine",
+            entry=MessageCode.EXCITATION_NOT_POSSIBLE,
         )
     if kind.needs_torque_mode and mode is Mode.SPEED:
         raise PreflightRefused(
-            f"{request.kind} was asked for, but {no_torque(wanted, preflight)}: {kind.why_torque_mode}",
+            f"{request.kind} is requested, but {no_torque(wanted, preflight)}: {kind.why_torque_mode}",
             where="--excitation",
             next_step="Use --excitation pulses or multisine",
+            entry=MessageCode.EXCITATION_NOT_POSSIBLE,
         )
     return mode
 
 
 def _refuse_impedance(request: ExcitationRequest, limits: MachineLimits, preflight: Preflight) -> None:
-    """The drive's own impedance: in its speed loop, with nothing on the shaft, by a multisine."""
+    """Refuse an impedance measurement outside the speed loop, with a load, or with another excitation."""
     if request.mode == Mode.TORQUE.value:
         raise PreflightRefused(
-            "torque mode was asked for, and the drive's own impedance is that of its speed loop",
-            where="--mode and --impedance", next_step="Leave --mode out",
+            "torque mode is requested, but the drive's own impedance is measured in its speed loop",
+            where="--mode and --impedance", next_step="Remove --mode",
+            entry=MessageCode.IMPEDANCE_NOT_POSSIBLE,
         )
     if limits.load != "none":
         raise PreflightRefused(
-            f"the drive's own impedance is measured with nothing on its shaft, and load is {limits.load}",
-            where="--impedance and load in rig.yaml", next_step="Measure it before the string is below it",
+            f"the drive's own impedance is measured without a load, but load is {limits.load}",
+            where="--impedance and load in rig.yaml", next_step="Measure it before the string is connected",
+            entry=MessageCode.IMPEDANCE_NOT_POSSIBLE,
         )
     if request.kind != DEFAULT_EXCITATION or request.frequency_hz is not None:
         raise PreflightRefused(
-            "the lines that the drive's own impedance is measured at are the measurement's own",
-            where="--impedance", next_step="Leave --excitation and --frequency out",
+            "the measurement of the drive's own impedance chooses its excited frequencies itself",
+            where="--impedance", next_step="Remove --excitation and --frequency",
+            entry=MessageCode.IMPEDANCE_NOT_POSSIBLE,
         )
 
 
 SLOWEST_REFERENCE_S = 0.0125
-"""Cycle above which a command's own delay is open by as much as the filters that are looked for."""
+"""Longest cycle, s. Above it the delay of a setpoint is as uncertain as the filters to be identified."""
 
 
 def refuse_slow_reference(request: ExcitationRequest, period_s: float) -> None:
-    """PreflightRefused where a filter of the reference can't be told from a reference that comes in steps."""
+    """Raise PreflightRefused if the cycle is too slow to identify a filter of the reference."""
     if request.impedance == "reference" and period_s > SLOWEST_REFERENCE_S:
         raise PreflightRefused(
-            f"at {1.0 / period_s:.3g} cycles a second the reference comes in steps whose delay is open by"
-            f" {1e3 * period_s:.0f} ms: a filter of the reference could not be told from it, and nothing would show",
+            f"at {1.0 / period_s:.3g} cycles per second the delay of the reference is uncertain by"
+            f" {1e3 * period_s:.0f} ms: a filter of the reference could not be identified",
             where="--impedance reference",
-            next_step=f"It takes {1.0 / SLOWEST_REFERENCE_S:.0f} cycles a second or more",
+            next_step=f"Use {1.0 / SLOWEST_REFERENCE_S:.0f} cycles per second or more",
+            entry=MessageCode.IMPEDANCE_NOT_POSSIBLE,
         )
 
 
 def keep_within(limits: MachineLimits, request: ExcitationRequest, preflight: Preflight) -> MachineLimits:
-    """The rig's limits, or the drive's own where those were tighter and stayed (`drivers.own_limits`).
+    """Return the rig's limits, or the drive's own if those are tighter and kept (`drivers.own_limits`).
 
-    Raises PreflightRefused where what was asked for, or the speed window itself, has no room in them.
+    Raises PreflightRefused if the requested motion, or the speed window itself, does not fit in them.
     """
     torque_nm, speed_rad_s = preflight.kept_torque_nm, preflight.kept_speed_rad_s
     if torque_nm is not None:
@@ -404,14 +420,15 @@ def keep_within(limits: MachineLimits, request: ExcitationRequest, preflight: Pr
 def _no_room(what: str, limit: str) -> PreflightRefused:
     return PreflightRefused(
         what, where="drive's own limit",
-        next_step=f"Ask for less, raise it at the drive, or let the run widen it: {WIDER_FLAG} {limit}",
+        next_step=f"Request less, raise the limit in the drive, or let the run widen it: {WIDER_FLAG} {limit}",
+        entry=MessageCode.DRIVE_LIMIT_TIGHTER,
     )
 
 
 def no_torque(wanted: str | None, preflight: Preflight) -> str:
-    """Why the run is not in torque mode."""
+    """Return why the run is not in torque mode."""
     if Mode.TORQUE not in preflight.modes:
         return "the drive has no torque mode"
     if not preflight.switch_while_enabled:
         return "the drive can't enter torque mode while it turns"
-    return "speed mode was asked for" if wanted == Mode.SPEED.value else "speed mode was chosen"
+    return "speed mode is requested" if wanted == Mode.SPEED.value else "speed mode was chosen"

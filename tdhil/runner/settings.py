@@ -1,4 +1,4 @@
-"""What a run is allowed to do and asked to do: plain numbers, SI at the motor shaft."""
+"""The limits of a run and its request: plain numbers, SI at the motor shaft."""
 
 import signal
 from dataclasses import dataclass, replace
@@ -9,7 +9,7 @@ from tdhil.errors import Interrupted
 
 @dataclass(frozen=True)
 class MachineLimits:
-    """Limits of the machine, from rig.yaml; the guard holds them, the drive gets them too."""
+    """Limits of the machine, from rig.yaml. The guard enforces them, and the drive receives them too."""
 
     speed_min_rad_s: float             # lower edge of the window in which the excitation stays
     speed_max_rad_s: float             # upper edge; the guard trips on it
@@ -21,27 +21,27 @@ class MachineLimits:
     probe_travel_rad: float = 3.0      # sign probe: how far the shaft may turn
     allow_reverse: bool = False
     load: str = "none"                 # none, string
-    torque_ramp_nm_s: float = 0.0      # with a string: how fast trapped torque is brought down
-    wave_impedance_nm_s_rad: float = 0.0   # of a string's pipe, where its sizes are known; 0: they aren't
-    echo_s: float = 0.0                # 2L/v, where its sizes are known: until a wave comes back
-    temperature_c: float | None = None     # °C; where the drive tells a temperature it is stopped above it
-    accept_no_watchdog: bool = False   # the operator takes a drive that won't stop by itself (--accept-no-watchdog)
+    torque_ramp_nm_s: float = 0.0      # with a string: release rate of trapped torque
+    wave_impedance_nm_s_rad: float = 0.0   # of a string's pipe; 0: its sizes are unknown
+    echo_s: float = 0.0                # round-trip time 2L/v of a wave; 0: unknown
+    temperature_c: float | None = None     # °C; a drive that reports a temperature is stopped above it
+    accept_no_watchdog: bool = False   # the operator accepts a drive that won't stop by itself (--accept-no-watchdog)
     accept_shared_watchdog: bool = False   # … or one that any client feeds (--accept-shared-watchdog)
-    accept_speed_unit: bool = False    # the operator takes the profile's unit of speed unseen (--accept-speed-unit)
+    accept_speed_unit: bool = False    # the operator accepts the unit of speed unchecked (--accept-speed-unit)
     accept_wider: frozenset[str] = frozenset()     # own limits of the drive that the operator lets the run widen
 
     @property
     def winds_up(self) -> bool:
-        """Does a drill string hang on the shaft?"""
+        """Return whether a drill string is on the shaft."""
         return self.load == "string"
 
 
 @dataclass(frozen=True)
 class ExcitationRequest:
-    """What stage 5 shall do; None = the default, scaled to the rig."""
+    """The request for stage 5; None = the default, scaled to the rig."""
 
     kind: str = DEFAULT_EXCITATION     # of `tdhil.config.registry.EXCITATIONS`
-    mode: str | None = None            # torque, speed; None = torque where the drive has it
+    mode: str | None = None            # torque, speed; None = torque if the drive has it
     frequency_hz: float | None = None
     amplitude_rad_s: float | None = None
     offset_rad_s: float | None = None
@@ -50,29 +50,29 @@ class ExcitationRequest:
     tolerance: float | None = None     # acquire until J's relative half-width is this; None = for a fixed time
     max_time_s: float | None = None    # longest stage 5; None = the plan's own, or what the time limit leaves
     impedance: str | None = None       # offset, reference: measure the drive's own impedance, in its speed loop
-    string_nm_s_rad: float | None = None   # ζ of the string that |r| is told for, at the main shaft
-    reference_filter_s: float = 0.0    # smoothing of the speed reference that the drive is known to have
+    string_nm_s_rad: float | None = None   # ζ of the string for the reported |r|, at the main shaft
+    reference_filter_s: float = 0.0    # known filter time of the speed reference, s
 
 
 @dataclass(frozen=True)
 class ControlAssumptions:
-    """What the host's control and guard assume before anything is known of the drive's reporting."""
+    """Assumptions of the host's control and guard before the drive's reporting is known."""
 
     largest_speed_lag_s: float = 0.5   # largest plausible lag of the reported speed
-    reaction_s: float = 0.1            # from a sample to the torque that answers it
+    reaction_s: float = 0.1            # from a sample to the torque that responds to it
     smallest_inertia_share: float = 0.7    # smallest plausible J as a share of the rough J
 
     def at_period(self, period_s: float) -> "ControlAssumptions":
-        """The same where a cycle takes so long: whoever sees a sample answers in the next cycle but one, at worst."""
+        """Return the assumptions for a cycle time. The response to a sample comes two cycles later at worst."""
         return replace(self, reaction_s=max(self.reaction_s, REACTION_CYCLES * period_s))
 
 
 REACTION_CYCLES = 3.0
-"""The sample's own cycle, the one that carries the answer, and one that may be lost."""
+"""The sample's own cycle, the cycle of the response, and one that may be lost."""
 
 
 class StopRequest:
-    """A wish to stop, set from a signal handler or from another thread: one assignment. The first cause stays."""
+    """A stop request, set by a signal handler or another thread in one assignment. The first cause is kept."""
 
     def __init__(self) -> None:
         self.signum: int | None = None
@@ -80,13 +80,13 @@ class StopRequest:
         self.count = 0
 
     def ask(self, signum: int = signal.SIGINT, why: str = "") -> None:
-        """Ask for the stop; the run sees it in its next cycle, and ends as on that signal. ``why``: for people."""
+        """Request the stop. The run reads it in its next cycle, and ends as on that signal. ``why``: text."""
         self.count += 1
         if self.signum is None:
             self.why = why
             self.signum = int(signum)
 
     def check(self, *, next_step: str = "") -> None:
-        """Raises Interrupted where a stop was asked for."""
+        """Raise Interrupted if a stop was requested."""
         if self.signum is not None:
             raise Interrupted(self.signum, self.why, next_step=next_step)

@@ -1,13 +1,13 @@
-"""An independent look at the unit of speed, before stage 2 goes to its second mean speed.
+"""An independent check of the unit of speed, before stage 2 goes to its second mean speed.
 
-All that the host knows of the shaft's speed comes through one number of the profile, the setpoint's size as well. Where
-it is ten times too small the shaft turns ten times as fast as is asked for and reported, and no limit in rad/s
-holds. So on the way to the first mean speed the drive's own angle is read beside the cycle, where it has one. The ramp
-goes on past `slow_speed`, at which a tenfold error does no harm, only while the angle agrees; at the first mean speed
-the ratio of both is taken over the whole level. Where no angle tells, the operator says what he sees.
+The host knows the shaft's speed, and scales its setpoint, through one number of the profile. If it is ten times too
+small, the shaft turns ten times as fast as commanded and reported, and no limit in rad/s holds. So on the way to the
+first mean speed the drive's position is read beside the cycle, if it has one. The ramp continues past `slow_speed`, at
+which a tenfold error does no harm, only while the position agrees. At the first mean speed the ratio of both is taken
+over the whole operating point. Without a position the operator confirms the speed.
 
-What is refused: a ratio off one by more than `TOLERANCE` and what the speed's own count leaves open; either sign.
-Encoders, gears and slip of good rigs are within a few per cent; units that are wrong are off by 2, 4, 2π, 10, 60.
+Refused: a ratio that differs from one, in either direction, by more than `TOLERANCE` plus the resolution of the speed.
+Encoders, gears and slip of good rigs stay within a few per cent; wrong units give factors of 2, 4, 2π, 10 or 60.
 """
 
 from __future__ import annotations
@@ -18,35 +18,36 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, NoReturn
 
 from drivers import Command, Mode, Positioned, PositionReading, PreflightRefused, Sample
+from profiles import CodedText, MessageCode
 from tdhil.config import SPEED_UNIT_TOLERANCE
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
 from tdhil.runner.task import ConfirmSpeed, Say, nobody_sees
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The angle that a drive counts, held against the speed that it reports. Pure: it is shown both, and reckons.
+# The drive's position compared with its reported speed. Pure.
 #
-# Over one stretch the shaft's true way stands in the drive's angle, and in the integral of its reported speed as well,
-# however unsteady it turns. Their ratio is that of the true unit of speed to the one that the profile has. A reported
-# speed that lags is late by the same way at both ends of a stretch whose ends are equally fast.
+# Over one stretch the true travel of the shaft is the change of the drive's position, and also the integral of its
+# reported speed, however unsteady it turns. Their ratio is that of the true unit of speed to the profile's. A lag of
+# the reported speed shifts both ends of a stretch by the same travel if both ends are equally fast.
 
 
 WINDOW_S = 0.25
-"""The angle's own speed is that over so long, at least."""
+"""Shortest time over which the speed of the position is taken, s."""
 LEAST_WINDOW = 3
-"""Readings between which it is taken, at least."""
+"""Least number of readings for it."""
 SEEN_FASTER = 12.0
-"""An angle that starts over is followed up to a shaft so many times faster than it is believed to be."""
+"""A position that wraps is followed up to a shaft this many times faster than believed."""
 EXACT = 0.03
-"""A ratio counts once it is known this well, as a share of itself, …"""
+"""A ratio counts once its half-width is below this share of itself."""
 LEAST_S = 2.0
-"""… over no less time than this."""
+"""Shortest stretch for a ratio, s."""
 STOOD_RAD = 8.2
-"""An angle that hasn't changed over so much reported way (1.3 turns: even a counter of turns would) stands still."""
+"""Reported travel, rad, after which an unchanged position counts as frozen (1.3 turns, for counters of turns)."""
 
 
 class TravelRatio(NamedTuple):
-    """True way over reported way of a stretch, and how far it may be off for counts and time."""
+    """Ratio of true to reported travel of a stretch, and its half-width from counts and time."""
 
     value: float
     half_width: float
@@ -61,28 +62,28 @@ class _AnglePoint:
 
 
 class Angles:
-    """Of one drive over one run; `restart` begins a new stretch."""
+    """The positions of one drive over one run; `restart` begins a new stretch."""
 
     def __init__(self) -> None:
         self.where = ""
-        self.count_rad: float | None = None        # the smallest step seen: one count is no more than that
-        self.blind = False                         # the readings came too seldom for an angle that starts over
+        self.count_rad: float | None = None        # the smallest observed step: an upper limit of one count
+        self.blind = False                         # too few readings for a position that wraps
         self._way_rad = 0.0                        # by the reported speed
         self._before: Sample | None = None
         self._last: _AnglePoint | None = None
         self._raw_rad = 0.0
         self._recent: list[_AnglePoint] = []
         self._first: _AnglePoint | None = None          # of this stretch
-        self._changed: _AnglePoint | None = None        # where the count changed first in this stretch, and last
+        self._changed: _AnglePoint | None = None        # first and last change of the count in this stretch
         self._changed_last: _AnglePoint | None = None
 
     def restart(self) -> None:
-        """A new stretch begins with the next reading; what a count is stays known."""
+        """Begin a new stretch with the next reading. The size of a count stays known."""
         self._first = self._changed = self._changed_last = None
         self.blind = False
 
     def saw(self, sample: Sample) -> None:
-        """One cycle's reported speed."""
+        """Add the reported speed of one cycle."""
         if not sample.fresh:
             return
         if self._before is not None:
@@ -91,7 +92,7 @@ class Angles:
         self._before = sample
 
     def read(self, reading: PositionReading, believed_rad_s: float) -> None:
-        """One reading; ``believed_rad_s``: how fast the shaft would be, were the unit of speed right."""
+        """Add one reading; ``believed_rad_s``: speed of the shaft if the unit of speed is right."""
         self.where = reading.where
         last, angle = self._last, reading.position_rad
         if last is not None:
@@ -116,13 +117,13 @@ class Angles:
             self._changed_last = point
 
     def _way_at(self, time_s: float) -> float:
-        """The reported way at the moment of a reading: a late host reads the angle well after its last sample."""
+        """Return the reported travel at the time of a reading: a late host reads the position after its last sample."""
         if self._before is None:
             return self._way_rad
         return self._way_rad + self._before.speed_rad_s * (time_s - self._before.time_s)
 
     def speed_rad_s(self) -> tuple[float, float] | None:
-        """By the angle alone, how fast the shaft has been just now: at least, at most (magnitudes); None too early."""
+        """Return the least and most speed (magnitudes) by the latest positions alone; None if it is too early."""
         recent = self._recent
         if self.count_rad is None or len(recent) <= LEAST_WINDOW or self.blind:
             return None
@@ -133,7 +134,7 @@ class Angles:
         return max(0.0, turned - self.count_rad) / took_s, (turned + self.count_rad) / took_s
 
     def ratio(self) -> TravelRatio | None:
-        """Of this stretch; None while that is not known well enough."""
+        """Return the ratio of this stretch; None while it is not known well enough."""
         first, last = self._first, self._last
         if first is None or last is None or self.blind or last.time_s - first.time_s < LEAST_S:
             return None
@@ -141,7 +142,7 @@ class Angles:
         count = self.count_rad
         start, end = self._changed, self._changed_last
         if start is None or end is None:
-            # Not one count: standing still, if it ever counted as finely as that, or over the whole of a turn.
+            # No change: the position is frozen if it has counted as finely as that before, or over a whole turn.
             return TravelRatio(0.0,
                                0.0) if way > (STOOD_RAD if count is None else min(STOOD_RAD, 5.0 * count)) else None
         way_rad = end.way_rad - start.way_rad
@@ -149,7 +150,7 @@ class Angles:
         spent_s = end.time_s - start.time_s
         if spent_s < 0.9 * LEAST_S or turned == 0.0 or count is None:
             return None
-        # At a change the angle is known to one count, and to what it moves between two readings.
+        # At a change the position is known to one count, and to the travel between two readings.
         between = abs(turned) * self._every_s() / spent_s
         half = 2.0 * min(count, between) / abs(turned) + (start.half_width_s + end.half_width_s) / spent_s
         if half > EXACT:
@@ -168,36 +169,36 @@ class Angles:
 
 TOLERANCE = SPEED_UNIT_TOLERANCE
 NOTED = 0.02
-"""A difference beyond this is told: the inertia is wrong by as much if it is the speed that is off."""
+"""Difference that is reported: J is wrong by as much if the speed causes it."""
 SLOW_SHARE = 0.05
-"""Of the highest speed, at which a wrong unit is to be found: ten times that is half of it."""
+"""Share of the highest speed at which a wrong unit is detected: ten times this speed is half of the limit."""
 TOO_FAST = 2.0
-"""A shaft whose angle moves so many times faster than was asked for stays where it is until both have been compared."""
+"""Factor over the setpoint above which the ramp waits until position and speed are compared."""
 FASTEST_SHARE = 0.7
-"""Of the highest speed, by the angle: beyond it nothing is compared any more."""
+"""Share of the highest speed, by the position. Above it the run is refused without a comparison."""
 HARMLESS_SHARE = 0.1
 EVERY_S, EVERY_CYCLES, SELDOM_S = 0.05, 3, 0.25
-"""How often the angle is read: this often, or each third cycle of a slower line, or at least so often."""
+"""Reading interval of the position, s; on a slower line each third cycle, at most the last value, s."""
 LEVEL_EVERY_S = 0.25
-"""Of a level, which is longer."""
+"""Reading interval at an operating point, s."""
 TIMED_S = 0.02
-"""A reading that is known less well in time than this, and than is usual on its line, is none: the host was late."""
+"""A reading with a larger time uncertainty (s) than this, and than usual, is dropped: the host was late."""
 SILENT = 5
-"""So many readings in a row without an answer: the drive tells no angle."""
+"""Missed readings in a row after which the drive counts as without a position."""
 SEEN_S = 3.0
-"""What the operator is told of the reported speed is the mean over so long."""
+"""Averaging time of the speed that the operator confirms, s."""
 TURNS_WAITED = 3.2
-"""At the slow speed, for a counter of whole turns."""
+"""Turns to wait for at the slow speed, for a counter of whole turns."""
 LONGEST_WAIT_S = 60.0
 BY_POSITION, BY_OPERATOR, BY_NAME, UNSEEN = "position", "operator", "--accept-speed-unit", "nobody"
 _WHERE = "unit of speed"
 _CHECK = "Check the speed scaling in the profile (unit of the speed's setpoint and of the reported speed)"
-_IF_RIGHT = "; if the speed is right, its position entry (counts per turn), or say position: null there"
+_IF_RIGHT = "; if the speed is right, check its position entry (counts per turn), or set position: null there"
 
 
 @dataclass(frozen=True)
 class SpeedWitness:
-    """Who says what he sees of the shaft where no angle tells. ``accepted``: the operator took the unit by name."""
+    """The operator who confirms the speed if there is no position. ``accepted``: the unit was accepted by name."""
 
     confirm: ConfirmSpeed = nobody_sees
     simulated: bool = False
@@ -206,21 +207,21 @@ class SpeedWitness:
 
 
 def slow_speed(limits: MachineLimits, resolution_rad_s: float) -> float:
-    """Where the first look is taken, rad/s: a whole number of seconds a turn where that is easily watched."""
+    """Return the speed of the first check, rad/s: a whole number of seconds per turn, easy to watch."""
     slow = max(SLOW_SHARE * limits.speed_max_rad_s, 5.0 * resolution_rad_s)
     turn_s = 2.0 * math.pi / slow
     return 2.0 * math.pi / math.floor(turn_s) if turn_s >= 4.0 else slow
 
 
 class _Paused(NamedTuple):
-    """Where the ramp waits, and what for: only until the angle is seen to follow (or for a full comparison)."""
+    """The speed at which the ramp waits: until the position follows, or for a full comparison."""
 
     speed_rad_s: float
     until_compared: bool
 
 
 class SpeedUnitCheck:
-    """Of one run's stage 2: `ramp` to the first mean speed, `level` around its level, `conclude` behind it."""
+    """The check in stage 2: `ramp` to the first mean speed, `level` at this speed, `conclude` after it."""
 
     def __init__(
         self, loop: ControlLoop, limits: MachineLimits, assumptions: ControlAssumptions, resolution_rad_s: float,
@@ -237,20 +238,20 @@ class SpeedUnitCheck:
         self._next_s = -math.inf
         self._every_s = 0.0
         self._silent = 0
-        self._usual_half_s = math.inf              # of a reading's time
-        self._highest_rad_s = 0.0                  # asked for so far
+        self._usual_half_s = math.inf              # time uncertainty of a reading
+        self._highest_rad_s = 0.0                  # highest setpoint so far
         self._done = False
-        self._lost = ""                            # why no angle tells
+        self._lost = ""                            # why there is no position
         self._watching = False
         self._wraps_rad: float | None = None
 
     # -- the three parts -------------------------------------------------------------------------------------
 
     def ramp(self, start_rad_s: float, end_rad_s: float, rate_rad_s2: float) -> None:
-        """To the first mean speed, in speed mode. Raises PreflightRefused for a wrong unit of speed."""
+        """Ramp to the first mean speed, in speed mode. Raises PreflightRefused for a wrong unit of speed."""
         self._begin()
         loop = self._loop
-        if abs(end_rad_s) < self._slow_rad_s:      # so slow that it would show nothing
+        if abs(end_rad_s) < self._slow_rad_s:      # too slow to show anything
             self._pause(_Paused(math.copysign(self._slow_rad_s, end_rad_s or 1.0), True))
         steps = max(1, round(abs(end_rad_s - start_rad_s) / rate_rad_s2 / loop.period_s))
         span = end_rad_s - start_rad_s
@@ -266,13 +267,13 @@ class SpeedUnitCheck:
                 self._pause(_Paused(wanted, True))
 
     def level(self) -> None:
-        """The level at the first mean speed begins: what is compared begins here."""
+        """Begin the operating point at the first mean speed: the comparison starts here."""
         self._angles.restart()
         if not self._wraps_soon():
             self._every_s = max(LEVEL_EVERY_S, self._every_s)
 
     def conclude(self, command: Command) -> None:
-        """Behind the level, before anything faster. Raises PreflightRefused."""
+        """Compare after the operating point, before any faster motion. Raises PreflightRefused."""
         if not self._done:
             ratio = self._angles.ratio() if self._watching and not self._lost else None
             if ratio is None:
@@ -287,7 +288,7 @@ class SpeedUnitCheck:
         self._every_s = max(EVERY_S, min(EVERY_CYCLES * self._loop.period_s, SELDOM_S))
         reading = None if self._drive is None else self._read()
         if reading is None:
-            self._lost = "the drive tells no angle of its shaft"
+            self._lost = "the drive reports no position of its shaft"
             if self._witness.simulated or self._witness.accepted:
                 self._settle_without()
             return
@@ -304,7 +305,7 @@ class SpeedUnitCheck:
         return self._drive.read_position()
 
     def _observe(self, command: Command, sample: Sample) -> None:
-        """After every cycle of the bench, whoever asked for it."""
+        """Read the position after every cycle that is due."""
         angles = self._angles
         angles.saw(sample)
         self._highest_rad_s = max(self._highest_rad_s, abs(command.speed_rad_s))
@@ -315,28 +316,28 @@ class SpeedUnitCheck:
         if reading is None:
             self._silent += 1
             if self._silent >= SILENT:
-                self._lost = "the drive no longer tells the angle of its shaft"
+                self._lost = "the drive no longer reports the position of its shaft"
             return
         self._silent = 0
         self._usual_half_s = min(self._usual_half_s, reading.half_width_s)
         if reading.half_width_s > max(TIMED_S, 2.0 * self._usual_half_s):
-            return                                 # nobody knows well enough when that was: the next one will do
+            return                                 # the time of this reading is too uncertain: use the next one
         angles.read(reading, max(self._highest_rad_s, abs(sample.speed_rad_s)))
         self._wraps_rad = reading.wraps_rad
         self._refuse_fastest(command, sample)
 
     def _wraps_soon(self) -> bool:
-        """Would an angle that starts over be lost track of if it were read less often?"""
+        """Return whether a wrapping position would be lost if it were read less often."""
         low_rad_s = max(self._highest_rad_s, self._slow_rad_s)
         return self._wraps_rad is not None and 0.5 * self._wraps_rad < SEEN_FASTER * low_rad_s * LEVEL_EVERY_S
 
     def _coarse(self) -> bool:
-        """Has the angle not been seen to move yet, or in steps too large to tell a speed?"""
+        """Return whether the position has not moved yet, or moves in steps too large for a speed."""
         count = self._angles.count_rad
         return count is None or count > 0.5 * self._slow_rad_s * WINDOW_S
 
     def _follows(self, wanted_rad_s: float) -> bool:
-        """Does the angle move, and no faster than it should?"""
+        """Return whether the position moves, and no faster than it should."""
         if not self._watching or self._lost or self._angles.blind:
             return False
         seen = self._angles.speed_rad_s()
@@ -355,9 +356,9 @@ class SpeedUnitCheck:
         if seen is None or seen[0] <= fastest or seen[0] <= TOO_FAST * believed:
             return
         self._refuse(
-            f"the shaft's angle moves at {seen[0]:.3g} rad/s or more, where {command.speed_rad_s:.3g} rad/s were asked"
-            f" for and {sample.speed_rad_s:.3g} are reported: the unit of speed is too small by a factor of about"
-            f" {seen[0] / believed:.2g}",
+            f"the position of the shaft moves at {seen[0]:.3g} rad/s or more, where {command.speed_rad_s:.3g} rad/s are"
+            f" commanded and {sample.speed_rad_s:.3g} rad/s reported: the unit of speed is too small by a factor of"
+            f" about {seen[0] / believed:.2g}",
             command,
         )
 
@@ -372,7 +373,7 @@ class SpeedUnitCheck:
             yield
 
     def _pause(self, paused: _Paused) -> None:
-        """Hold a slow speed until both have been compared; where that can't be, ask."""
+        """Hold a slow speed until both are compared. If that is not possible, ask the operator."""
         speed_rad_s, command = paused.speed_rad_s, Command(Mode.SPEED, paused.speed_rad_s, 0.0)
         if self._watching and not self._lost:
             for _ in self._waited(speed_rad_s, self._lag_s):
@@ -389,14 +390,14 @@ class SpeedUnitCheck:
                     self._judge(ratio, command)
                     return
             if self._too_fast(speed_rad_s):
-                self._refuse(f"the shaft's angle moves too fast for the {speed_rad_s:.3g} rad/s asked for", command)
+                self._refuse(f"the position moves too fast for the commanded {speed_rad_s:.3g} rad/s", command)
         self._ask(command)
 
     def _judge(self, ratio: TravelRatio, command: Command) -> None:
-        """Compare with one. Raises PreflightRefused; an angle that stands still is put to the operator."""
+        """Compare the ratio with one. Raises PreflightRefused. For a frozen position ask the operator."""
         value = ratio.value
         if value == 0.0:
-            self._lost = f"the angle in {self._angles.where} doesn't move while the drive reports that the shaft turns"
+            self._lost = f"the position in {self._angles.where} does not move while the drive reports a speed"
             if self._witness.simulated and not self._witness.accepted:
                 self._refuse(self._lost, command)
             self._ask(command)
@@ -408,19 +409,19 @@ class SpeedUnitCheck:
             self._contradicted(value, command)
         else:
             self._seen(BY_POSITION, value, self._angles.where)
-            self._log(f"the angle in {self._angles.where} moves {value:.4f} times as far as the reported speed says")
+            self._log(f"the travel in {self._angles.where} is {value:.4f} times the integral of the reported speed")
             if off > NOTED + open_share:
                 self._witness.say(
-                    f"the angle in {self._angles.where} moves {100.0 * (value - 1.0):+.1f} % as against the reported"
-                    " speed: the inertia is off by as much if the speed is"
+                    f"the travel in {self._angles.where} differs by {100.0 * (value - 1.0):+.1f} % from the reported"
+                    " speed: if the speed is wrong, J is wrong by as much"
                 )
         self._done = True
 
     def _contradicted(self, value: float, command: Command) -> None:
-        """Too fast for the second mean speed: refused in any case; else unless the unit was taken by name."""
+        """Refuse a wrong unit; if it was accepted by name, only when the second mean speed would be too fast."""
         if value < 0.0:
-            what = f"the shaft's angle moves against the reported speed ({value:.3g} of its way): a sign is inverted"
-            step = "Is the sign of speed or position inverted (607Eh, encoder wiring, direction settings)?"
+            what = f"the position moves against the reported speed (ratio {value:.3g}): a sign is inverted"
+            step = "Check the sign of speed and position (607Eh, encoder wiring, direction settings)"
         else:
             way = f"too {'small' if value > 1.0 else 'large'} by a factor of {max(value, 1.0 / value):.3g}"
             what = f"the shaft turns {value:.3g} times as fast as the drive reports: the unit of speed is {way}"
@@ -435,18 +436,19 @@ class SpeedUnitCheck:
         self._witness.say(f"{what}; the unit was accepted by {BY_NAME}")
 
     def _refuse(self, what: str, command: Command, step: str = _CHECK + _IF_RIGHT) -> NoReturn:
-        """Raise PreflightRefused, behind one more cycle, which raises what is wrong with the drive or the host.
+        """Raise PreflightRefused after one more cycle, which first raises a fault of the drive or the host.
 
-        An angle that was read when a frozen host woke up, or of a drive that has stopped by itself since its last
-        sample, says nothing of a unit.
+        A position that was read after a frozen host woke up, or of a drive that has stopped by itself since its last
+        sample, shows nothing about a unit.
         """
         self._loop.observer = None
         self._loop.cycle(command)
-        raise PreflightRefused(what, where=f"{_WHERE}, {self._angles.where}", next_step=step)
+        raise PreflightRefused(what, where=f"{_WHERE}, {self._angles.where}", next_step=step,
+                               entry=MessageCode.SPEED_UNIT_WRONG)
 
     def _ask(self, command: Command) -> None:
-        """The operator says whether the shaft turns as fast as the drive reports. Raises PreflightRefused if not."""
-        loop, why = self._loop, self._lost or "the angle that the drive tells was not fit to be compared"
+        """Ask the operator whether the shaft turns as fast as the drive reports. Raises PreflightRefused if not."""
+        loop, why = self._loop, self._lost or "the position that the drive reports could not be compared"
         self._lost = why
         if self._witness.accepted or self._witness.simulated:
             self._settle_without()
@@ -456,10 +458,10 @@ class SpeedUnitCheck:
         mean_rad_s = sum(sample.speed_rad_s for sample in seen) / len(seen)
         if abs(mean_rad_s) < 0.2 * abs(command.speed_rad_s):
             self._refuse(
-                f"the shaft doesn't follow a speed of {command.speed_rad_s:.3g} rad/s (reported: {mean_rad_s:.3g}), at"
-                f" which its unit could be looked at ({why})",
+                f"the shaft does not follow a speed of {command.speed_rad_s:.3g} rad/s (reported: {mean_rad_s:.3g}"
+                f" rad/s), at which its unit would be checked ({why})",
                 command,
-                f"Does the drive hold so low a speed? If its unit has been seen to be right, take it by {BY_NAME}",
+                f"Check that the drive can hold so low a speed. If its unit is known to be right, add {BY_NAME}",
             )
         self._log(f"{why}: the operator is asked whether the shaft turns at {mean_rad_s:.3f} rad/s")
         loop.quiet = True
@@ -475,9 +477,9 @@ class SpeedUnitCheck:
         self._loop.cycle(command)
 
     def _settle_without(self) -> None:
-        """Nobody looks: a simulated drive, or one whose unit the operator has taken by name."""
+        """Continue without a check: a simulated drive, or a unit that was accepted by name."""
         accepted = self._witness.accepted
-        text = f"{self._lost}: the unit of speed was " + (f"accepted by {BY_NAME}" if accepted else "not looked at")
+        text = f"{self._lost}: the unit of speed was " + (f"accepted by {BY_NAME}" if accepted else "not checked")
         self._log(text)
         self._witness.say(text)
         self._seen(BY_NAME if accepted else UNSEEN, None, "")
@@ -491,16 +493,20 @@ class SpeedUnitCheck:
 
 
 def speed_warnings(run: Any) -> tuple[str, ...]:
-    """For the result, from the log's configuration: the same live and replayed."""
+    """Return the warnings for the result, from the log's configuration: the same live and in replay."""
     found = run.get("speed_unit")
     if not isinstance(found, dict):
         return ()
     by, ratio = found.get("seen_by"), found.get("ratio")
     if by == BY_NAME:
-        return (f"the unit of speed was accepted by {BY_NAME}, not looked at: J is wrong by as much as that unit is",)
+        return (CodedText(
+            f"the unit of speed was accepted by {BY_NAME} without a check: its error is an error of J",
+            MessageCode.SPEED_UNIT_UNSEEN),)
     if isinstance(ratio, int | float) and abs(ratio - 1.0) > NOTED:
         return (
-            f"the drive's angle moves {100.0 * (ratio - 1.0):+.1f} % as against its reported speed: J is off by as much"
-            " if the speed is",
+            CodedText(
+                f"the drive's position differs by {100.0 * (ratio - 1.0):+.1f} % from its reported speed: if the speed"
+                " is wrong, J is wrong by as much",
+                MessageCode.SPEED_UNLIKE_ANGLE),
         )
     return ()

@@ -1,4 +1,4 @@
-"""Keeps the book of the stages: each is announced, shown, judged and written to the log, however it ends."""
+"""Record of the stages: each is announced, shown, rated and logged, however it ends."""
 
 from __future__ import annotations
 
@@ -7,21 +7,22 @@ from contextlib import contextmanager
 from typing import Any
 
 from drivers import Counters, Drive, Preflight, Rehearsed, Telling
+from profiles import CodedText, MessageCode
 from tdhil.recording import RunLog, Stage
 from tdhil.runner import preconditions
 from tdhil.runner.task import Display, Say
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What others did on the drive's bus in a run, for the log, whoever watches, and the result.
+# Actions of others on the drive's bus during a run, for the log, the display and the result.
 
 
 def summary(drive: Drive) -> tuple[str, ...]:
-    """Of all of the run, a line each; nothing of a drive that doesn't notice."""
+    """Return the actions in the whole run, a line each; none if the drive can't detect them."""
     return drive.summary() if isinstance(drive, Telling) else ()
 
 
 def tell(drive: Drive, configure: Callable[..., None], say: Callable[[str], None]) -> None:
-    """At the end: into the log's configuration, and to whoever watches."""
+    """Write them at the end to the log's configuration and to the display."""
     if lines := summary(drive):
         configure(others=list(lines))
         for line in lines:
@@ -29,27 +30,28 @@ def tell(drive: Drive, configure: Callable[..., None], say: Callable[[str], None
 
 
 def stage_warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
-    """For the result, from the log's configuration: the same live and replayed."""
+    """Return the warnings for the result, from the log's configuration: the same live and in replay."""
     found = run.get("others")
-    return tuple(f"on the drive's bus: {line}" for line in found) if isinstance(found, list) else ()
+    lines = found if isinstance(found, list) else ()
+    return tuple(CodedText(f"on the drive's bus: {line}", MessageCode.FOREIGN_TRAFFIC) for line in lines)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How well a stage was seen: from what went wrong on the bus and in the loop while it ran. Pure.
+# The quality of a stage: from errors on the bus and in the loop while it ran. Pure.
 
 
 TOLERATED_LOSS = 0.01
-"""A stage with a larger share of cycles without feedback counts as degraded; a few are an ordinary scheduler's."""
+"""A stage with a larger share of cycles without feedback counts as degraded; a few are normal."""
 
 TOLERATED_LATE = 0.05
-"""The same for cycles that began late, and for feedback that came after its cycle or twice."""
+"""Tolerated share of cycles that began late, or with feedback after its cycle or twice."""
 
 FEW_LATE = 10
-"""So many of these are nothing, in however short a stage."""
+"""Tolerated number of these, also in a short stage."""
 
 
 def stage_quality(before: Counters, after: Counters) -> tuple[str, str]:
-    """(``ok`` or ``degraded``, what there is to say)."""
+    """Return (``ok`` or ``degraded``, text)."""
     cycles = after.cycles - before.cycles
     parts, outcome = [], "ok"
     some_late = max(FEW_LATE, TOLERATED_LATE * cycles)
@@ -73,7 +75,7 @@ def stage_quality(before: Counters, after: Counters) -> tuple[str, str]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 class StageBook:
-    """Of one run. ``stages`` are those that have ended; ``preflight`` is set once there is one."""
+    """The stages of one run. ``stages``: ended ones; ``preflight``: set once there is one."""
 
     def __init__(self, drive: Drive, log: RunLog, display: Display, say: Say) -> None:
         self.stages: list[Stage] = []
@@ -85,7 +87,7 @@ class StageBook:
 
     @contextmanager
     def stage(self, name: str, expected_s: float) -> Iterator[None]:
-        """What runs inside is that stage. Raises what it raises: an aborted stage stays aborted."""
+        """Run the block as this stage. Errors of the block are raised again: an aborted stage stays aborted."""
         start_s = self._now_s()
         before = self._drive.counters
         try:
@@ -97,19 +99,19 @@ class StageBook:
             try:
                 self._end(Stage(name, start_s, self._now_s(), "aborted", _short(error)))
             except Exception as also:  # the first cause stays the cause
-                error.add_note(f"and the end of the stage was not taken: {also}")
+                error.add_note(f"and the end of the stage could not be logged: {also}")
             raise
         after = self._drive.counters
         if after.wall_jumps > before.wall_jumps:
             self._log.event(self._now_s(), "clock",
-                            "the wall clock jumped: stamps on the bus moved, the times in this log did not")
+                            "the wall clock jumped: time stamps on the bus changed, the times in this log did not")
         if after.passive > before.passive:
-            self._tell_bus("the adapter is error-passive: check bit rate, termination and cable")
+            self._tell_bus("the CAN adapter is error-passive. Check bit rate, termination and cable")
         outcome, detail = stage_quality(before, after)
         self._end(Stage(name, start_s, self._now_s(), outcome, detail))
 
     def skip(self, name: str, why: str) -> None:
-        """A stage that this run doesn't need."""
+        """Log a stage that this run does not need."""
         self._display.stage_started(name, 0.0)
         self._end(Stage(name, self._now_s(), self._now_s(), "skipped", why))
 
@@ -121,7 +123,7 @@ class StageBook:
         self._say(text)
 
     def _announce(self, name: str) -> None:
-        """A drive may pass it on to a simulated peer, whose scripted faults wait for it."""
+        """Announce a stage to the drive: a simulated peer triggers its scripted faults by it."""
         if isinstance(self._drive, Rehearsed):
             self._drive.announce(name)
 

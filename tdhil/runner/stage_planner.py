@@ -1,4 +1,4 @@
-"""What stage 5 will do, planned while the shaft turns; told, shown and logged before any of it is done."""
+"""Plans stage 5 while the shaft turns. The plan is shown and logged before it is carried out."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 from drivers import Command, LimitHit, Mode, PreflightRefused
+from profiles import MessageCode
 from tdhil.config import told_before_echo
 from tdhil.estimation import Samples
 from tdhil.recording import FloatArray, LagPrior, RunLog, SteppedSetpoint
@@ -22,14 +23,14 @@ from tdhil.runner.stages import RampCourse, SpeedResult
 from tdhil.runner.task import Display, Say, Task
 
 MOST_WANDER = 0.8
-"""Of the speed window, that may be kept free of the excitation because a string under load takes the shaft there."""
+"""Largest share of the speed window that is reserved for the oscillation of a string under load."""
 
 RESERVE_S = 30.0
-"""Of the run's time limit, kept for stage 4 and the transitions when stage 5 is planned."""
+"""Time reserved for stage 4 and the transitions when stage 5 is planned, s."""
 
 
 class StagePlanner:
-    """Of one run, whose bench it keeps going while it reckons."""
+    """The planner of one run. It keeps the cycles going while it computes."""
 
     def __init__(self, loop: ControlLoop, log: RunLog, display: Display, say: Say) -> None:
         self._loop = loop
@@ -38,14 +39,14 @@ class StagePlanner:
         self._say = say
 
     def plan(self, task: Task, speed: SpeedResult, mode: Mode, prior: LagPrior) -> Planned:
-        """From what stage 2 has shown; the shaft goes on as it turns meanwhile.
+        """Plan from the results of stage 2. Meanwhile the shaft keeps turning.
 
-        Raises LimitHit where no plan fits the shaft within its limits, PreflightRefused where it would have to brake
-        and must not, and whatever a cycle raises.
+        Raises LimitHit if no plan fits the shaft within its limits, PreflightRefused if the plan needs a braking torque
+        that is not allowed, and the errors of a cycle.
         """
         loop = self._loop
         request, limits, model = task.request, task.limits, speed.model
-        # Where its torque is held, a string under load takes the shaft from its mean: that stays free at either end.
+        # At constant torque a string under load moves the shaft from its mean: both ends keep room for that.
         free = speed.wander_rad_s if mode is Mode.TORQUE else 0.0
         width = limits.speed_max_rad_s - limits.speed_min_rad_s
         if 2.0 * free >= MOST_WANDER * width:
@@ -53,9 +54,10 @@ class StagePlanner:
                 f"the speed window of {width:.3g} rad/s leaves no room for an excitation: {loop.guard.disturbed}",
                 where="plan of stage 5",
                 next_step=f"The shaft was stopped. {LIGHTEN}",
+                entry=MessageCode.NO_ROOM_FOR_MOTION,
             )
         room = Guard.room(limits, task.assumptions, free)
-        if speed.swing is not None:     # it may hide how the shaft brakes, which then isn't asked for
+        if speed.swing is not None:     # it may hide the braking, which is then not used
             room = replace(room, least_torque_nm=loop.guard.least_torque_nm)
         course = speed.course if mode is Mode.SPEED else None
         last = loop.last
@@ -71,17 +73,19 @@ class StagePlanner:
             planned = loop.compute(work, keep)
         except PlanRefused as error:
             raise LimitHit(
-                f"no plan of stage 5 fits this shaft, as stages 2 and 3 have shown it: {error}",
+                f"no plan of stage 5 fits the shaft that stages 2 and 3 measured: {error}",
                 where="plan of stage 5",
                 next_step=f"The shaft was stopped. {error.next_step}",
+                entry=MessageCode.NO_ROOM_FOR_MOTION,
             ) from error
         plan = planned.plan
-        # Where the amplitude ends because no braking torque is had, rounding may leave it just below zero.
+        # If a missing braking torque limits the amplitude, rounding may leave it just below zero.
         if mode is Mode.TORQUE and plan.torque_min_nm < -1e-9 * limits.torque_nm and loop.guard.no_braking:
             raise PreflightRefused(
                 f"the plan needs braking torque, down to {plan.torque_min_nm:.0f} N·m: {loop.guard.no_braking}",
                 where="plan of stage 5",
                 next_step=loop.guard.to_brake,
+                entry=MessageCode.BRAKING_UNCLEAR,
             )
         if course is not None:
             self._note_following(plan)
@@ -95,8 +99,8 @@ class StagePlanner:
         self._tell(planned.said())
         if speed.swing is not None and not told_before_echo(request.kind) and tells_before_echo(limits.echo_s):
             self._tell(
-                "the string below will drown some of these lines; --excitation prbs asks only for the time before an"
-                " echo, and tells more of J above a bit"
+                "the string's motion will hide some of these frequencies; --excitation prbs uses only the time before"
+                " an echo, and is more accurate for J above a bit"
             )
         self._log.configure(plan=planned.plain())
         if planned.stopping is not None:
@@ -104,7 +108,7 @@ class StagePlanner:
         return planned
 
     def enough(self, planned: Planned) -> Enough | None:
-        """Asks the scatter, where a tolerance was given; every decision is in the log before it is carried out."""
+        """Return the stopping decision for a given tolerance. Each decision is logged before it is carried out."""
         rule = planned.stopping
         if rule is None:
             return None
@@ -119,12 +123,12 @@ class StagePlanner:
         return Enough(rule, planned.plan, lambda: self._log.recording(complete=True), note)
 
     def _note_following(self, plan: Plan | SwingPlan) -> None:
-        """What slow sampling of a stepped setpoint may do to J is identification's to say; it needs these."""
+        """Log the data that identification needs for the effect of a stepped, slowly sampled setpoint on J."""
         following, ramp = plan.guess.following, plan.limits.acceleration_rad_s2
         if math.isfinite(ramp):
-            self._tell(f"the drive's own speed ramp holds the shaft to {ramp:.3g} rad/s²; stage 5 stays below it")
+            self._tell(f"the drive's own speed ramp limits the shaft to {ramp:.3g} rad/s²; stage 5 stays below it")
         if following is None:
-            self._tell("how the drive follows its setpoint was not clear; stage 5 takes it to follow at once")
+            self._tell("the drive's response to its setpoint is not clear; stage 5 assumes that it follows at once")
             return
         self._log.learn(
             stepped_setpoint=SteppedSetpoint(
@@ -150,7 +154,7 @@ def _reckon(
     left_s: float,
     winds_up: bool,
 ) -> Planned:
-    """The arithmetic: plain data in and out, so that it can be done anywhere."""
+    """Compute the plan: plain data in and out, so that any process can run it."""
     known = DesignKnowledge(measured_noise(steady, theta, assumed), prior, winds_up)
     if course is None:
         return plan_acquisition(request, mode.value, room, model, known, left_s)

@@ -39,7 +39,7 @@ class Standstill:
         return max(self._settle_s, self._observer.blind_s, self._observer.unseen_s)
 
     def quiet(self, sample: Sample) -> bool:
-        """Whether speed and position are zero in this sample, and may be believed."""
+        """Return whether speed and position are zero in this sample, and may be believed."""
         observer = self._observer
         return (
             abs(observer.speed_rad_s(sample)) <= observer.rest_rad_s(self._at_rest_rad_s)

@@ -2,29 +2,28 @@
 
 1. Quick stop under the drive's speed control; where the profile says that a quick stop does not decelerate from
    torque mode, speed mode at zero first.
-2. Wait for standstill, by status word and by speed. The reported speed lags, so it must stay at zero for longer
-   than the largest plausible lag. How long that takes depends on the torque limit and on what swings: as long as the
-   shaft keeps getting slower, it is waited for.
-3. With a drill string, bring trapped torque down under speed control, on the rig's ramp (`string_release`). Since a
-   drive may end a quick stop by switching its torque off, this comes before it: the shaft is brought to standstill in
-   speed mode, at the quick stop's own rate, and yields from there. A drive that does not follow gets the quick stop at
-   once, and is then left holding what it holds: a wound-up string is not let go by disabling.
-4. Only then disable, and confirm: torque off by status word, and the shaft still at rest without it.
+2. Wait for standstill, by status word and by speed. The reported speed lags, so it must stay at zero for longer than
+   the largest plausible lag. The time depends on the torque limit and on torsional vibration: the stop waits as long
+   as the shaft becomes slower.
+3. With a drill string, bring trapped torque down under speed control, on the rig's ramp (`string_release`). A drive may
+   end a quick stop by switching its torque off, so the release comes first: the shaft is brought to standstill in speed
+   mode, at the rate of the quick stop, and yields from there. A drive that does not follow gets the quick stop at once.
+   It then holds the string, and is not disabled.
+4. Disable, and confirm: torque off by status word, and the shaft at standstill without it.
 
-What is judged is the motor's shaft. A string below may go on swinging by itself when the torque at the top has been
-quiet for half a swing (`string_release.QUIET_S`); its motor does not follow, since its friction holds.
+The stop judges the shaft of the motor. A string below may go on swinging once the torque at the top has been quiet for
+half a swing (`string_release.QUIET_S`). The motor does not follow, since its friction holds.
 
-Where the cycle brings no feedback any more (a drive that restarted, a foreign NMT command, lost frames), the drive is
-looked at one question at a time; so it is where the cycle's feedback goes on telling of a turning shaft, once the stop
-has had its time, and a poll contradicts it (`FeedbackPolls`).
+If the cycle brings no feedback any more (a drive that restarted, a foreign NMT command, lost frames), the stop reads
+the drive by single requests. It does so too if the feedback reports a turning shaft after the time of the stop, and a
+poll contradicts it (`FeedbackPolls`).
 
-A shaft that goes on turning in spite of the quick stop (somebody else commands it, or the drive doesn't brake) is not
-held up by the host's own sign of life: the drive is not fed any more, so that its watchdog acts, and it is watched on.
+If the shaft goes on turning in spite of the quick stop (another master commands it, or the drive does not brake), the
+stop ends the host's sign of life, so that the drive's own watchdog acts. It goes on watching the shaft.
 
 A turning shaft is not disabled from here, but in two cases: the shaft accelerates against the quick stop, or its speed
 is not believed above a drill string and it has run out without torque (decision 0024). If the drive can't be reached,
-its own watchdog must act, and that is what the report says. Nothing that is raised on the way, an interrupt included,
-skips any of it.
+its own watchdog must act, and the report says so. No exception on the way, an interrupt included, skips a step.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ from drivers import (
 )
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.guard import kept_within
-from tdhil.runner.observer import Signal
+from tdhil.runner.observer import RUN_OUT_S, Signal
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
 from tdhil.runner.standstill import NO_TORQUE, Standstill
 from tdhil.runner.string_release import MEAN_S, StringRelease, StringReleaseLimits
@@ -111,7 +110,7 @@ class FeedbackPolls:
 
 
 class Slowing:
-    """Does the shaft lose speed? ``within_s``: how long it may take over `SLOWER` of it."""
+    """Test of a shaft that must lose speed: to `SLOWER` of it within ``within_s``."""
 
     def __init__(self, at_rest_rad_s: float, within_s: float = SLOWING_S) -> None:
         self._at_rest_rad_s = at_rest_rad_s
@@ -120,7 +119,7 @@ class Slowing:
         self._speed_rad_s = math.inf
 
     def reset(self) -> None:
-        """What comes next is seen as the first."""
+        """Begin anew with the next sample."""
         self._since_s = None
 
     def see(self, time_s: float, speed_rad_s: float) -> bool:
@@ -205,7 +204,7 @@ MOST_INTERRUPTIONS = 5
 """The sequence begins anew after an exception of its own so many times; a request made twice does no harm."""
 
 POSITION_EVERY_S = 0.25
-"""A position that does not come with the cycle is asked for so often while standstill is watched, s."""
+"""Interval of reading a position that does not come with the cycle, while standstill is watched, s."""
 
 TORQUE_BACK_S = 0.2
 """Before a quick stop whose speed signal is in doubt, zero torque is commanded for so long, s: some cycles, and the
@@ -218,7 +217,7 @@ TORQUE_GONE_S = 2.0
 """The reported torque must have followed zero torque after so long, s."""
 
 REPEAT_S = 1.0
-"""The quick stop is asked for again after so long while the drive shows no valid state, s."""
+"""Interval of repeating the quick stop while the drive shows no valid state, s."""
 
 _STOPPING = (PowerState.QUICK_STOP, *NO_TORQUE)
 _REST = Command(Mode.SPEED, 0.0, 0.0)
@@ -233,7 +232,7 @@ class StopReport:
     at_rest_s: float | None            # control time at which the shaft was seen at rest
     disabled: bool
     trouble: tuple[str, ...] = ()
-    trapped_nm: float = 0.0            # what a drill string held at standstill, before it was let go; signed
+    trapped_nm: float = 0.0            # torque of a drill string at standstill, before its release; signed
 
 
 class StopSequence:
@@ -312,7 +311,7 @@ class StopSequence:
                 stays = disabled and self._stays_at_rest()
                 return StopReport(stays, at_rest_s, disabled, tuple(self._trouble))
         elif self._string is not None and not self._speed_doubted and self._slow_down():
-            self._let_go(self._string)
+            self._release(self._string)
         if self._string is not None and self._speed_doubted and self._run_out(self._string):
             return StopReport(False, None, self._torque_removed, tuple(self._trouble), self._trapped_nm)
         at_rest_s = self._decelerate()
@@ -358,8 +357,8 @@ class StopSequence:
         most = self._limits.speed_max_rad_s
         return kept_within(speed, -most, most)
 
-    def _let_go(self, string: StringReleaseLimits) -> None:
-        """Yield to what the string holds, until nothing is left or the bounds are reached."""
+    def _release(self, string: StringReleaseLimits) -> None:
+        """Yield to the trapped torque until nothing is left or the bounds are reached."""
         going = StringRelease(string, self._at_rest_rad_s, self._loop.period_s)
         command = _REST
         while not (going.done or going.failed or self._speed_doubted):
@@ -370,7 +369,7 @@ class StopSequence:
                     return
                 continue
             if sample.state is not PowerState.ENABLED or sample.mode is not Mode.SPEED:
-                self._trouble.append(f"the drive shows '{sample.state.value}' while trapped torque is let go")
+                self._trouble.append(f"the drive shows '{sample.state.value}' during the release of trapped torque")
                 break
             self._ask_position(sample.time_s)
             if self._loop.guard.observer.runs_away(sample):
@@ -399,7 +398,7 @@ class StopSequence:
         quick_nm_s = abs(torque_nm) / TORQUE_FALLS_S if observer.turned else 0.0
         step_nm = max(string.ramp_nm_s, quick_nm_s) * self._loop.period_s
         waited_s = without_s = 0.0
-        while without_s < observer.run_out_s:
+        while without_s < RUN_OUT_S:
             torque_nm = math.copysign(max(0.0, abs(torque_nm) - step_nm), torque_nm)
             sample = self._exchange(Command(Mode.TORQUE, 0.0, torque_nm))
             waited_s += self._loop.period_s
@@ -418,13 +417,13 @@ class StopSequence:
         why = f" ({observer.doubt.what})" if observer.doubt is not None else ""
         self._trouble.append(
             f"torque removed: the reported speed is not believed{why}. The drive gave no torque for {without_s:.0f} s,"
-            " in which friction stops the shaft; nobody saw it at rest"
+            " in which friction stops the shaft; standstill was not seen"
         )
         self._remove_torque(_NO_TORQUE_ASKED)
         return True
 
     def _wound_up(self) -> bool:
-        """Does the drive hold a torque that disabling would let go at once?"""
+        """Return whether the drive holds a torque that disabling would release at once."""
         last = self._loop.last
         if self._string is None or not self._held or last is None or last.state in NO_TORQUE:
             return False
@@ -496,7 +495,7 @@ class StopSequence:
 
     @property
     def _speed_doubted(self) -> bool:
-        """Whether the drive's speed control cannot be relied on: its report of speed contradicts another."""
+        """Return whether the drive's speed control cannot be relied on: its report of speed contradicts another."""
         return not self._loop.guard.observer.believable
 
     def _see_rest(self, asked: bool) -> float | None:
@@ -600,7 +599,7 @@ class StopSequence:
             return False
         try:
             drive.stop_feeding()
-        except CommandRejected as error:   # it would not help: somebody else feeds the watchdog, too
+        except CommandRejected as error:   # it would not help: another client feeds the watchdog, too
             self._fed = False
             self._note(error)
             return False
@@ -648,14 +647,14 @@ class StopSequence:
                     told = True
                     self._trouble.append(
                         f"the shaft began to turn ({sample.speed_rad_s:.3f} rad/s) once its torque was off:"
-                        " is something wound up, or hanging on it?"
+                        " is torque trapped in the load, or does a weight hang on it?"
                     )
             elif quiet_s >= enough_s:
                 return True
         return False
 
     def _ask(self, request: Callable[[], None]) -> bool:
-        """Whether the drive took a request; one that fails is made again in the next cycle."""
+        """Return whether the drive took a request; one that fails is made again in the next cycle."""
         try:
             request()
         except BaseException as error:  # whatever it is, the stop goes on
@@ -703,7 +702,7 @@ class StopSequence:
         return sample
 
     def _contradicted(self) -> bool:
-        """Does a poll show another drive than the cycle's feedback does? Then only polls are believed from now on."""
+        """Compare a poll with the feedback of the cycle. If they differ, only polls are believed from now on."""
         told = self._loop.last
         try:
             sample = self._polls.ask()

@@ -1,16 +1,16 @@
-"""How a drill string's trapped torque is let go: the speed that the motor yields with. Pure.
+"""Release of a drill string's trapped torque: the speed with which the motor yields. Pure.
 
-A string that was twisted turns back as soon as nobody holds it. So the motor holds it under speed control, and yields:
+A twisted string turns back if the motor does not hold it. So the motor holds it under speed control, and yields:
 
     ω = −(T − T_ref)/Z        T_ref falls from the trapped torque to zero on the rig's ramp
 
-with T the torque that the drive reports, which is what it holds. The host only ever *yields*: ω and T have opposite
-signs, or ω is zero, so no work is done on the string. It is turned backwards no further than its own twist takes it,
-never driven that way, and the torque ends at zero instead of becoming negative: a tool joint is never backed off by it,
-and ``allow_reverse: false`` doesn't forbid it. The same law damps a string that swings: it takes its energy away.
+with T the reported torque of the drive. The host only ever *yields*: ω and T have opposite signs, or ω is zero, so no
+work is done on the string. It turns backwards no further than its own twist takes it, is never driven that way, and the
+torque ends at zero instead of becoming negative. So the release never unscrews a tool joint, and
+``allow_reverse: false`` does not forbid it. The same law damps an oscillating string: it takes energy away.
 
-Z is the torque limit over half the speed limit, which suits a long string. A short and stiff one would answer a late
-report with an oscillation: whenever the torque changes its sign faster than any string swings, Z is doubled.
+Z is the torque limit over half the speed limit, which suits a long string. A short and stiff one would respond to a
+late report with an oscillation: whenever the torque changes its sign faster than any string oscillates, Z is doubled.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ SPEED_SHARE = 0.1
 
 IMPEDANCE_SPEED_SHARE = 0.5
 RESIDUAL_SHARE, RESIDUAL_QUANTA = 0.02, 5.0
-"""Torque is gone when its mean is below this share of the torque limit, or so many quanta of what is reported."""
+"""Torque counts as zero when its mean is below this share of the torque limit, or this many quanta of its report."""
 
 MEAN_S = 0.5
-"""The mean of the reported torque that counts; takes the noise away."""
+"""Averaging time of the reported torque, s; it removes the noise."""
 
 QUIET_S = 6.0
-"""Torque and speed must have been quiet for so long: half a swing of a string that swings in 12 s."""
+"""Time for which torque and speed must be quiet, s: half a period of a string with a period of 12 s."""
 
 FASTEST_SWING_S = 2.0
 STIFFEST = 64.0
@@ -38,7 +38,7 @@ TRAVEL_RAD = 250.0
 """About 40 turns: no string holds more twist below its make-up torque."""
 
 EXTRA_S = 90.0
-"""Beyond the ramp, for a string that swings."""
+"""Time beyond the ramp for an oscillating string, s."""
 
 
 @dataclass(frozen=True)
@@ -49,18 +49,19 @@ class StringReleaseLimits:
     speed_rad_s: float
     ramp_nm_s: float
     torque_resolution_nm: float
-    torque_offset_nm: float = 0.0      # what is reported where nothing flows
+    torque_offset_nm: float = 0.0      # reported torque at zero torque
 
     @property
     def residual_nm(self) -> float:
-        """What counts as nothing."""
+        """Return the torque below which it counts as zero, N·m."""
         return max(RESIDUAL_SHARE * self.torque_nm, RESIDUAL_QUANTA * self.torque_resolution_nm)
 
 
 class _Impedance:
-    """Z, N·m·s/rad: the torque limit over half the speed limit, doubled when the torque swings faster than a string.
+    """Z, N·m·s/rad: the torque limit over half the speed limit, doubled when the torque oscillates faster than a
+    string.
 
-    An oscillation whose half swing is shorter than ``fastest_s`` is the loop's own.
+    An oscillation with half a period below ``fastest_s`` comes from the loop itself.
     """
 
     def __init__(self, torque_limit_nm: float, speed_limit_rad_s: float, residual_nm: float, fastest_s: float) -> None:
@@ -68,11 +69,11 @@ class _Impedance:
         self._stiffest = STIFFEST * self.nm_s_rad
         self._residual_nm = residual_nm
         self._fastest_s = fastest_s
-        self._side = 0.0               # of zero, on which the torque was last seen clear of it
+        self._side = 0.0               # side of zero on which the torque was last clearly
         self._since_side_s = 0.0
 
     def watch(self, torque_nm: float, period_s: float) -> None:
-        """One cycle's torque."""
+        """Use one cycle's torque."""
         self._since_side_s += period_s
         if abs(torque_nm) <= self._residual_nm:
             return
@@ -84,7 +85,7 @@ class _Impedance:
 
 
 class StringRelease:
-    """Fed with every fresh sample; says how fast to yield, and when nothing is left."""
+    """Receives every fresh sample; returns the yielding speed, and reports when the torque is released."""
 
     def __init__(self, limits: StringReleaseLimits, at_rest_rad_s: float, period_s: float) -> None:
         self._limits = limits
@@ -97,32 +98,32 @@ class StringRelease:
         self._quiet_s = 0.0
         self._time_s = 0.0
         self.trapped_nm = 0.0
-        """The torque at the beginning, signed."""
+        """Torque at the beginning, signed, N·m."""
         self.travel_rad = 0.0
-        """How far the shaft has yielded, by what was commanded; signed."""
+        """Commanded travel of the yielding shaft, signed, rad."""
 
     @property
     def torque_nm(self) -> float:
-        """The mean of what is held, N·m."""
+        """Return the mean held torque, N·m."""
         return math.fsum(self._recent) / len(self._recent) if self._recent else 0.0
 
     @property
     def longest_s(self) -> float:
-        """It must be over by then."""
+        """Return the longest duration of the release, s."""
         return 2.0 * abs(self.trapped_nm) / self._limits.ramp_nm_s + EXTRA_S
 
     @property
     def done(self) -> bool:
-        """Quiet for long enough, with no torque left."""
+        """Return whether the torque is released and has been quiet for long enough."""
         return self._quiet_s >= QUIET_S
 
     @property
     def failed(self) -> bool:
-        """Its bounds in time or travel are reached."""
+        """Return whether its limits in time or travel are reached."""
         return self._time_s > self.longest_s or abs(self.travel_rad) > TRAVEL_RAD
 
     def step(self, torque_nm: float, speed_rad_s: float) -> float:
-        """The speed to command next, rad/s, from what was reported last; anything not finite counts as unheard."""
+        """Return the next speed setpoint, rad/s, from the last report; a value that is not finite counts as missing."""
         self._time_s += self._period_s
         if not (math.isfinite(torque_nm) and math.isfinite(speed_rad_s)):
             self._quiet_s = 0.0
@@ -142,24 +143,24 @@ class StringRelease:
 
     def _yielding(self, torque_nm: float) -> float:
         assert self._reference_nm is not None
-        # The ramp belongs to the side on which the torque was trapped; what swings to the other is let go at once.
+        # The ramp belongs to the side on which the torque was trapped; torque of the other sign is released at once.
         same_side = torque_nm * self.trapped_nm > 0.0
         excess_nm = max(0.0, abs(torque_nm) - (self._reference_nm if same_side else 0.0))
         return -math.copysign(min(self._fastest_rad_s, excess_nm / self._impedance.nm_s_rad), torque_nm)
 
 
 MEAN_TORQUE_S = 8.0
-"""What flows on average is a mean over about this time: longer than most strings swing."""
+"""Averaging time of the mean torque, s: longer than the period of most strings."""
 
 SMOOTH_S = 0.2
-"""The torque is smoothed over this time, so that a loop behind late reports stays stable whatever the drive's gain."""
+"""Smoothing time of the torque, s: a loop with late reports then stays stable for any gain of the drive."""
 
 
 class SwingDamper:
-    """Fed with every sample of a turning string; the speed to command next: ω₀ − (T − T̄)/Z, within bounds.
+    """Receives every sample of a turning string; returns the next speed setpoint, ω₀ − (T − T̄)/Z, within bounds.
 
-    T̄ is the mean torque of the last `MEAN_TORQUE_S`, so that friction and bit don't move the mean speed. The bounds:
-    a tenth of the speed limit either way, forward, and below the speed limit.
+    T̄ is the mean torque of the last `MEAN_TORQUE_S`, so friction and bit do not change the mean speed. The bounds:
+    a tenth of the speed limit in both directions, forward, and below the speed limit.
     """
 
     def __init__(self, torque_limit_nm: float, speed_limit_rad_s: float, target_rad_s: float, period_s: float) -> None:
@@ -173,7 +174,7 @@ class SwingDamper:
         self._mean_nm = self._smooth_nm = 0.0
 
     def step(self, torque_nm: float) -> float:
-        """The speed, rad/s; anything not finite counts as unheard."""
+        """Return the speed setpoint, rad/s; a torque that is not finite counts as missing."""
         if not math.isfinite(torque_nm):
             return self._bounded(0.0)
         if self._seen == 0:
@@ -191,4 +192,4 @@ class SwingDamper:
 
 
 LOOP_SWING_S = 0.5
-"""Half a swing shorter than this is no string's lowest mode, which is what is to be damped."""
+"""Shortest half period of a string's lowest mode, s; only that mode is damped."""

@@ -1,4 +1,4 @@
-"""What a run is given, what it asks and tells those around it, and how it went: the types that others share with it."""
+"""Types that a run shares with its callers: its task, its questions and messages, its outcome."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from drivers import Command, Identity, Preflight, PreflightRefused, Sample
+from profiles import MessageCode
 from tdhil.recording import Stage
 from tdhil.runner.settings import ControlAssumptions, ExcitationRequest, MachineLimits
 
-if TYPE_CHECKING:       # whoever only reads of a run in its log has no use for what they load
+if TYPE_CHECKING:       # code that only reads logs does not need these modules
     from tdhil.runner.excitation import Plan, SwingPlan
     from tdhil.runner.stop import StopReport
     from tdhil.soft_torque import EvaluationCase
@@ -18,14 +19,14 @@ if TYPE_CHECKING:       # whoever only reads of a run in its log has no use for 
 STAGES = ("setup", "speed", "torque", "hold", "acquire")
 
 Idle = Callable[[], None]
-"""One cycle of nothing, which keeps the drive's watchdog fed while somebody makes up his mind."""
+"""One idle cycle: it feeds the drive's watchdog while the operator decides."""
 
 Say = Callable[[str], None]
-"""Tells whoever watches one line."""
+"""Shows one line."""
 
 
 class Display(Protocol):
-    """Whoever shows a run as it goes."""
+    """The display of a run in progress."""
 
     def preflight(self, preflight: Preflight) -> None: ...
 
@@ -42,7 +43,7 @@ class Display(Protocol):
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """How a run went: its stages, what ended it (None = it went to its end), and how the stop went."""
+    """The outcome of a run: its stages, the cause of its end (None = completed), and the stop."""
 
     stages: tuple[Stage, ...]
     cause: BaseException | None
@@ -52,7 +53,7 @@ class RunOutcome:
 
 @dataclass(frozen=True)
 class Task:
-    """What to do with a drive. ``facts`` are those of the bench, by their names in Recording."""
+    """The task for a drive. ``facts`` are those of the bench, by their names in Recording."""
 
     limits: MachineLimits
     request: ExcitationRequest
@@ -62,20 +63,21 @@ class Task:
 
 
 MakeTask = Callable[[Identity], Task]
-"""The task for whoever turned out to be at the other end; raises PreflightRefused if he can't have one."""
+"""Returns the task for the identified peer; raises PreflightRefused if there is none for it."""
 
 Confirm = Callable[[Task, Preflight, Idle], None]
 """Asks whether the shaft may be moved; raises PreflightRefused if not."""
 
 ConfirmSpeed = Callable[[float, str, Idle], None]
-"""Asks whether the motor's shaft is seen to turn at this speed, rad/s, and says why nothing else tells; raises
+"""Asks whether the motor shaft visibly turns at this speed, rad/s, and states why no signal shows it; raises
 PreflightRefused if not. `Idle` is one cycle at that speed."""
 
 
 def nobody_sees(speed_rad_s: float, why: str, idle: Idle) -> None:
-    """A `ConfirmSpeed` with nobody there."""
+    """Refuse: a `ConfirmSpeed` without an operator."""
     raise PreflightRefused(
-        f"nobody is there to see whether the shaft turns at {speed_rad_s:.3g} rad/s ({why})",
+        f"no operator can confirm that the shaft turns at {speed_rad_s:.3g} rad/s ({why})",
         where="unit of speed",
-        next_step="Say in the profile where the drive tells its angle (position), or run it at a terminal",
+        next_step="Name the drive's position object in the profile (position), or run it at a terminal",
+        entry=MessageCode.SPEED_UNIT_NOT_SEEN,
     )

@@ -1,4 +1,6 @@
-"""What to ask of the shaft: lines, amplitudes, mean speeds and periods for the tightest interval, and when to stop."""
+"""Design of the excitation: frequencies, amplitudes, mean speeds and periods for the narrowest interval, and the
+stopping rule.
+"""
 
 from tdhil.runner.design.choice import (
     SOON_COUNTED as SOON_COUNTED, Choice as Choice, DesignKnowledge as DesignKnowledge, choose as choose,

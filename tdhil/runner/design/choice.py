@@ -1,7 +1,7 @@
-"""Choose the excitation: of some dozen candidates the one that tells the inertia best in the time there is.
+"""Choose the excitation: of about a dozen candidates the one that gives the narrowest interval of J in the given time.
 
-What the user fixes stays fixed: `make_plan` takes every wish at its word, and what it refuses is no candidate. The
-usual multisine is always one of them, and only a clearly better one replaces it.
+Values that the user sets stay fixed: `make_plan` follows every request exactly, and what it refuses is no candidate.
+The usual multisine is always a candidate, and only a clearly better one replaces it.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ _CERTAIN = 1e-4
 
 
 def relative_sd(plan: Plan, theta: FloatArray, noise: NoiseDensity, prior: LagPrior) -> float:
-    """Least standard deviation of J after the plan, as a share of J; infinite where J can't be told."""
+    """Return the least standard deviation of J after the plan, as a share of J; infinite if J is not identifiable."""
     first = plan.segments[0]
     period = first.reference.period_s
     hertz = np.array(first.reference.lines_hz)
@@ -93,14 +93,14 @@ def relative_sd(plan: Plan, theta: FloatArray, noise: NoiseDensity, prior: LagPr
 
 
 def _tie(plan: Plan, durations: FloatArray, density: float) -> float:
-    """1/sd² of B from the mean torque at the mean speeds."""
+    """Return 1/sd² of B from the mean torque at the mean speeds."""
     speeds = np.array([segment.reference.offset_rad_s for segment in plan.segments])
     centred = speeds - np.sum(durations * speeds) / np.sum(durations)
     return float(np.sum(durations * centred**2) / density)
 
 
 def _known(theta: FloatArray, prior: LagPrior) -> dict[int, float]:
-    """Standard deviations to begin with, of the reports' parameters: stated, or about the bounds of the fit."""
+    """Return the prior standard deviations of the reporting parameters: stated, or about the bounds of the fit."""
     lags = theta[[RIGID.at(SPEED_LAG), RIGID.at(TORQUE_LAG)]]
     longest = max(float(np.max(lags)), 1e-3)
     speed, torque = prior.speed_lag_s is not None, prior.torque_lag_s is not None
@@ -118,7 +118,7 @@ def _known(theta: FloatArray, prior: LagPrior) -> dict[int, float]:
 # Candidate multisines: which lines, how strong, phased so that they fit the most motion into the limits.
 
 
-HIGHEST_TURN = 0.24    # of 1/τ, Hz: the highest line, where τ is the longest lag that must be reckoned with
+HIGHEST_TURN = 0.24    # of 1/τ, Hz: the highest line, τ being the longest plausible lag
 LINES_LIMIT_HZ = (0.1, 2.0)
 """The highest line, Hz: not below the first (a rig would take an hour), not above the second (structure, backlash)."""
 
@@ -132,7 +132,7 @@ _POPULATION, _KEPT, _ROUNDS, _STEP_RAD = 96, 6, 5, 0.8
 
 @dataclass(frozen=True)
 class Proposal:
-    """Lowest line and harmonics, with amplitudes ~ harmonic^−slope."""
+    """Lowest frequency and harmonics, with amplitudes ~ harmonic^−slope."""
 
     lowest_hz: float
     harmonics: tuple[int, ...]
@@ -140,23 +140,25 @@ class Proposal:
 
     @property
     def amplitudes(self) -> tuple[float, ...]:
-        """Relative to the first line's."""
+        """Return the amplitudes relative to the first line's."""
         return tuple(float(harmonic) ** -self.slope for harmonic in self.harmonics)
 
 
 def highest_line_hz(longest_lag_s: float) -> float:
-    """Above a quarter of 1/τ what nobody can know of a lag τ matters too much: the notes of `signal_filters`."""
+    """Return the highest useful frequency, Hz. Above a quarter of 1/τ the unknown structure of a lag τ matters too
+    much.
+    """
     return float(np.clip(HIGHEST_TURN / max(longest_lag_s, 1e-3), *LINES_LIMIT_HZ))
 
 
 def proposals(highest_hz: float, slope: float) -> Iterator[Proposal]:
-    """From few lines in a short period to many in a long one, none above ``highest_hz``."""
+    """Yield proposals from few lines in a short period to many in a long one, none above ``highest_hz``."""
     for harmonics, reach in product(_HARMONICS, _REACHES):
         yield Proposal(reach * highest_hz / harmonics[-1], harmonics, slope)
 
 
 def phased(proposal: Proposal, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> Shape:
-    """The proposal with phases that allow the greatest amplitude within speed window and torque limit, peak 1.
+    """Return the proposal with phases that allow the largest amplitude within the limits, scaled to peak 1.
 
     A search over random phases, narrowed around the best ones; seeded, so that the same rig gets the same motion.
     """
@@ -174,7 +176,7 @@ def phased(proposal: Proposal, limits: MotionLimits, guess: RigGuess, mode: Driv
 
 
 class _AmplitudeRoom:
-    """How much of a proposal fits, by its phases."""
+    """The amplitude of a proposal that fits, by its phases."""
 
     def __init__(self, proposal: Proposal, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> None:
         harmonics, amplitudes = np.array(proposal.harmonics), np.array(proposal.amplitudes)
@@ -193,7 +195,7 @@ class _AmplitudeRoom:
         self._torque_room = max(limits.usable_torque_nm - steady, 1e-9) / guess.torque_swing_factor(mode)
 
     def of(self, phases: FloatArray) -> FloatArray:
-        """The amplitude that fits, (C,), for phases (C, K)."""
+        """Return the amplitude that fits, (C,), for phases (C, K)."""
         turned = np.exp(1j * phases.T)
         speed, ahead, torque = (
             (self._turns @ (weights[:, None] * turned)).real for weights in (self._speed, self._ahead, self._torque)
@@ -213,31 +215,31 @@ _SLACK = 1.02         # of the usual plan's time: a transition may take a second
 
 @dataclass(frozen=True)
 class DesignKnowledge:
-    """What a design rests on besides limits and rough rig."""
+    """Assumptions of a design besides limits and rough rig."""
 
     noise: NoiseDensity
     prior: LagPrior
     winds_up: bool = False    # a drill string hangs on the shaft
 
     def theta(self, guess: RigGuess) -> FloatArray:
-        """The rigid model's parameters to be reckoned with, (8,)."""
+        """Return the assumed parameters of the rigid model, (8,)."""
         return assumed_theta(guess.inertia_kg_m2, guess.viscous_nm_s_rad, self.prior)
 
     @property
     def speed_lag_s(self) -> float:
-        """Stated, else what it may be."""
+        """Return the stated lag, else the assumed one, s."""
         return SPEED_LAG_S if self.prior.speed_lag_s is None else self.prior.speed_lag_s
 
     @property
     def torque_lag_s(self) -> float:
-        """Stated, else what it may be."""
+        """Return the stated lag, else the assumed one, s."""
         return TORQUE_LAG_S if self.prior.torque_lag_s is None else self.prior.torque_lag_s
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The plan, the relative half-width of J to be expected of it, and of the usual excitation in the same time; NaN
-    where none is predicted.
+    """The plan, the expected relative half-width of J, and that of the usual excitation in the same time; NaN
+    if none is predicted.
     """
 
     plan: Plan
@@ -253,11 +255,11 @@ def choose(
     confidence: float,
     time_s: float | None = None,
 ) -> Choice:
-    """The plan with the tightest expected interval of J; raises PlanRefused where nothing fits.
+    """Return the plan with the narrowest expected interval of J. Raises PlanRefused if nothing fits.
 
-    ``time_s``: how long it may take, transitions included; None: as long as the usual plan. The information matrix
-    picks the best for each slope of the amplitudes, and the estimator's own interval has the last word: it also sees
-    where quite another set of lags would explain the lines, which is where amplitudes fall too steeply.
+    ``time_s``: longest duration, transitions included; None: as long as the usual plan. The information matrix selects
+    the best candidate for each slope of the amplitudes, and the estimator's own interval decides. It also shows if a
+    different set of lags would explain the lines, which happens when amplitudes fall too steeply.
     """
     theta = known.theta(guess)
 
@@ -267,16 +269,16 @@ def choose(
     usual = make_plan(limits, guess, wish)
     if told_before_echo(wish.kind):     # the prediction is of a rigid shaft
         return Choice(_in_time(usual, wish, time_s), math.nan, math.nan)
-    if _fixed(wish):
-        usual = _in_time(usual, wish, time_s)
-        found = width(usual)
-        return Choice(usual, found, found)
     allowed_s = _SLACK * usual.duration_s if time_s is None else time_s
-    if known.winds_up:
+    if known.winds_up and _lines_are_free(wish):
         try:
             return Choice(_for_string(limits, guess, wish, allowed_s), math.nan, math.nan)
         except PlanRefused:        # too long for the time there is, say
             pass
+    if _fixed(wish):
+        usual = _in_time(usual, wish, time_s)
+        found = width(usual)
+        return Choice(usual, found, found)
     finalists: list[Plan] = []
     for slope in SLOPES:
         rated = [
@@ -308,11 +310,10 @@ def choose_soonest(
     tolerance: float,
     time_s: float,
 ) -> Plan | None:
-    """The plan that is expected to meet a tolerance soonest if extended as it needs, with few periods at first.
+    """Return the plan that is expected to reach a tolerance soonest if extended as needed, with few periods at first.
 
-    None where no candidate fits into ``time_s``, what the user fixes leaves nothing to choose, or a string asks for
-    lines of its own. As in `choose` the information matrix picks for each slope, and the estimator's own interval has
-    the last word.
+    None if no candidate fits into ``time_s``, if the user's values leave nothing to choose, or if a string needs its
+    own lines. As in `choose` the information matrix selects for each slope, and the estimator's own interval decides.
     """
     if _fixed(wish) or known.winds_up:
         return None
@@ -346,22 +347,27 @@ _QUANTILES = np.array([-1.5, -0.9, -0.5, -0.2, 0.2, 0.5, 0.9, 1.5])     # of a n
 
 
 def _until_s(plan: Plan, width: float, tolerance: float) -> float:
-    """How long it may be expected to take until the tolerance is met, if its half-width is predicted so now."""
+    """Return the expected time until the tolerance is reached, s, for this predicted half-width."""
     counted_s = sum(plan.counted * one.reference.period_s for one in plan.segments)
     ratio = width * np.exp(_SPREAD * _QUANTILES) / tolerance
     missing = np.where(ratio > 1.0, np.maximum(ratio**2 - 1.0, _LEAST_MORE), 0.0)
     return plan.duration_s + counted_s * float(np.mean(missing))
 
 
+def _lines_are_free(wish: PlanRequest) -> bool:
+    """Return whether the request leaves the frequencies open."""
+    return periodic_kind(wish.kind).tuned and wish.frequency_hz is None
+
+
 def _fixed(wish: PlanRequest) -> bool:
-    """Does the wish leave no lines to choose?"""
-    return not periodic_kind(wish.kind).tuned or wish.frequency_hz is not None or wish.periods is not None
+    """Return whether the request fixes the plan: its frequencies, or its number of periods."""
+    return not _lines_are_free(wish) or wish.periods is not None
 
 
 def refuse_unfit(
     limits: MotionLimits, guess: RigGuess, wish: PlanRequest, known: DesignKnowledge, time_s: float | None
 ) -> None:
-    """PlanRefused where `choose` would find nothing, without weighing what it would find."""
+    """Raise PlanRefused if `choose` would find nothing, without comparing candidates."""
     try:
         _in_time(make_plan(limits, guess, wish), wish, time_s)
     except PlanRefused:
@@ -398,7 +404,7 @@ def _candidates(
     for proposal in proposals(highest_line_hz(max(known.speed_lag_s, known.torque_lag_s)), slope):
         period_s = 1.0 / proposal.lowest_hz
         if speeds * (LEAST_COUNTED + settling_periods(period_s, wish.settle_s)) * period_s > time_s:
-            continue                   # too long before it is looked at, which takes its time
+            continue                   # too long: skip the slow evaluation
         shape = phased(proposal, limits, guess, wish.mode)
         for share in OFFSET_SHARES:
             asked = replace(wish, shape=shape, frequency_hz=proposal.lowest_hz, offset_share=share)
@@ -409,7 +415,7 @@ def _candidates(
 
 
 def _in_time(plan: Plan, wish: PlanRequest, time_s: float | None) -> Plan:
-    """As many whole periods as fit; raises PlanRefused if those are too few to know the scatter."""
+    """Return the plan with as many whole periods as fit. Raises PlanRefused if those are too few for the scatter."""
     if time_s is None or wish.periods is not None:
         return plan
     segment = plan.segments[0]
@@ -419,8 +425,8 @@ def _in_time(plan: Plan, wish: PlanRequest, time_s: float | None) -> Plan:
     if counted < LEAST_COUNTED:
         needed = len(plan.segments) * (LEAST_COUNTED + segment.settle_periods) * segment.reference.period_s + between
         raise PlanRefused(
-            f"time: {time_s:.0f} s are too short, this excitation needs {needed:.0f} s",
-            f"Give --max-time {math.ceil(needed)} or more (or leave it out; limits.time_s bounds it, too), or a higher"
+            f"time: {time_s:.0f} s are too short: this excitation needs {needed:.0f} s",
+            f"Give --max-time {math.ceil(needed)} or more (or remove it; limits.time_s is a limit, too), or a higher"
             " --frequency",
         )
     return plan.with_counted(counted)

@@ -1,7 +1,7 @@
-"""The interval that the estimator itself would give: its own fit, on lines as they are expected.
+"""The interval that the estimator itself would give: its own fit, on expected lines.
 
-Everything about how an interval comes to be (lag structures, weights known by estimate, priors) is asked of
-`identify`, here and nowhere else in this room, so that what is predicted is what will be said.
+Everything that forms an interval (lag structures, estimated weights, priors) is taken from `identify`, here and nowhere
+else in this room. So the prediction agrees with the later result.
 
 Lines without noise fit exactly, and would give too narrow an interval: −2 ln L = Σ 2(ν + M) ln(1 + q/ν) has the
 curvature (ν + M)/(ν + q), and q is about M where there is noise, but 0 here. So S is taken (ν + M)/ν times as large.
@@ -44,11 +44,11 @@ from tdhil.runner.excitation import Plan
 RIGID = Model()
 """The model that plans are made with; theta (8,) = (J, B) and the six parameters of the reports."""
 
-LOAD_SHARE = 0.0075        # of the torque limit: sd of the load where nobody has measured it
+LOAD_SHARE = 0.0075        # of the torque limit: sd of the load if it is not measured
 LOAD_TIME_S = 0.5
 SENSOR_SHARE = 0.002       # of the highest speed: sd of the speed sensor in 2 ms
 _SENSOR_STEP_S = 0.002
-SPEED_LAG_S = 0.40         # what a drive's smoothing of its speed, and of its torque, may be where nobody says
+SPEED_LAG_S = 0.40         # assumed lag of the reported speed, and of the torque, if none is stated
 TORQUE_LAG_S = 0.15
 _LOW_LINES = 3             # of a stretch: its lowest lines tell the load
 _HIGH_LINES = 9            # … those behind them, up to this one, what grows with frequency
@@ -66,11 +66,11 @@ class NoiseDensity:
 
     @property
     def load_sd_nm(self) -> float:
-        """Standard deviation of the load disturbance: S_L = 2 sd² τ_L."""
+        """Return the standard deviation of the load disturbance: S_L = 2 sd² τ_L."""
         return math.sqrt(0.5 * self.load_nm2_s / self.load_time_s)
 
     def error_density(self, hertz: FloatArray, theta: FloatArray) -> FloatArray:
-        """S of T − G W, (N·m)²·s, at frequencies (K,); theta (8,) of the rigid model."""
+        """Return S of T − G W, (N·m)²·s, at frequencies (K,); theta (8,) of the rigid model."""
         omega = 2.0 * np.pi * np.asarray(hertz, dtype=np.float64)
         shaft = (theta[0] * omega) ** 2 + theta[1] ** 2
         load = self.load_nm2_s / (1.0 + (omega * self.load_time_s) ** 2)
@@ -80,13 +80,13 @@ class NoiseDensity:
 
 
 def assumed_noise(torque_limit_nm: float, speed_max_rad_s: float, load_sd_nm: float | None = None) -> NoiseDensity:
-    """Shares of what the machine can do, which is what a range of machines show; or a load that somebody states."""
+    """Return noise as typical shares of the machine's limits; or with a stated load disturbance."""
     load = LOAD_SHARE * torque_limit_nm if load_sd_nm is None else load_sd_nm
     return NoiseDensity(2.0 * load**2 * LOAD_TIME_S, (SENSOR_SHARE * speed_max_rad_s) ** 2 * _SENSOR_STEP_S)
 
 
 def assumed_theta(inertia_kg_m2: float, viscous_nm_s_rad: float, prior: LagPrior) -> FloatArray:
-    """(8,): first-order lags, as stated, else what they may be."""
+    """Return the parameters, (8,), with first-order lags: stated, else assumed."""
     theta = np.zeros(RIGID.size)
     theta[:2] = inertia_kg_m2, viscous_nm_s_rad
     theta[RIGID.at(SPEED_LAG)] = SPEED_LAG_S if prior.speed_lag_s is None else prior.speed_lag_s
@@ -95,7 +95,7 @@ def assumed_theta(inertia_kg_m2: float, viscous_nm_s_rad: float, prior: LagPrior
 
 
 def measured_noise(steady: tuple[Samples, ...], theta: FloatArray, fallback: NoiseDensity) -> NoiseDensity:
-    """Densities from stretches of steady speed, at the harmonics of each stretch's own length.
+    """Return densities from stretches of steady speed, at the harmonics of each stretch's own length.
 
     The error's line e = T − G W takes spectra and cross spectrum of the two signals at once, and stays the same under
     whatever regulates the speed: |e|² L/4 is a reading of S with two degrees of freedom. The lowest lines of all
@@ -123,7 +123,7 @@ def measured_noise(steady: tuple[Samples, ...], theta: FloatArray, fallback: Noi
 
 
 def _readings(samples: Samples, theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Frequencies and readings of S, (K,) each, of one stretch; None if it is too short to tell."""
+    """Return frequencies and readings of S, (K,) each, of one stretch; None if it is too short."""
     if len(samples) < 4 * _HIGH_LINES:
         return None
     interval = float(np.median(np.diff(samples.time_s)))
@@ -150,7 +150,7 @@ LEAST_NU = 2.0      # complex degrees of freedom of a line's weight, below which
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a fit rests on: lines, levels, and what is stated of the lags."""
+    """Data of a fit: lines, operating points, and stated lags."""
 
     lines: tuple[SpectralLine, ...]
     levels: Levels
@@ -159,14 +159,14 @@ class Evidence:
 
 @dataclass(frozen=True)
 class FittedRigid:
-    """The rigid model's parameters that the fit settled on, (8,), and J's relative half-width."""
+    """The fitted parameters of the rigid model, (8,), and the relative half-width of J."""
 
     theta: FloatArray
     half_width: float
 
 
 def fit(evidence: Evidence, confidence: float) -> FittedRigid | None:
-    """The estimator's own fit; None where it would refuse."""
+    """Return the estimator's own fit; None if it would refuse."""
     constraint = tie_viscous(evidence.levels)
     lines = tuple(line for line in evidence.lines if line.excited and line.nu >= LEAST_NU)
     priors, held = known_of(evidence.prior, len(lines), constraint)
@@ -184,7 +184,7 @@ def fit(evidence: Evidence, confidence: float) -> FittedRigid | None:
 
 
 def noise_free(evidence: Evidence, fitted: FittedRigid) -> Evidence:
-    """The same with torques that the parameters explain exactly, and scatter enlarged for what is missing."""
+    """Return the data with torques that the parameters explain exactly, and scatter enlarged accordingly."""
     lines = []
     for line in evidence.lines:
         g = complex(RIGID.impedance(fitted.theta, np.array([2j * np.pi * line.hertz]))[0])
@@ -199,9 +199,9 @@ def noise_free(evidence: Evidence, fitted: FittedRigid) -> Evidence:
 
 
 def longer(evidence: Evidence, scale: float, scatter: float = 1.0, at_last: bool = False) -> Evidence:
-    """The same motion ``scale`` times as long, with ``scatter`` times the variance.
+    """Return the data of a motion ``scale`` times as long, with ``scatter`` times the variance.
 
-    ``at_last``: what it is longer by all goes to the last segment.
+    ``at_last``: the whole extension belongs to the last segment.
     """
     lines = []
     for line in evidence.lines:
@@ -220,7 +220,7 @@ def longer(evidence: Evidence, scale: float, scatter: float = 1.0, at_last: bool
 
 
 def _grown(lengths: FloatArray, scale: float, at_last: bool) -> FloatArray:
-    """Lengths of segments, (S,), that add up to ``scale`` times as much."""
+    """Return lengths of segments, (S,), that add up to ``scale`` times the sum."""
     if not at_last:
         return lengths * scale
     grown = lengths.copy()
@@ -229,13 +229,13 @@ def _grown(lengths: FloatArray, scale: float, at_last: bool) -> FloatArray:
 
 
 def half_width(evidence: Evidence, confidence: float) -> float:
-    """J's relative half-width; infinite where the estimator would refuse."""
+    """Return the relative half-width of J; infinite if the estimator would refuse."""
     found = fit(evidence, confidence)
     return math.inf if found is None else found.half_width
 
 
 def safe_half_width(evidence: Evidence, confidence: float) -> float:
-    """The same, as noise leaves it in nine runs of ten.
+    """Return the relative half-width of J that nine runs of ten stay below.
 
     Quite another set of lags may explain the lines nearly as well. Without noise its −2 ln L is D₀ above the best, with
     noise D ~ N(D₀, 4 D₀); it widens the interval where D < t². That stays rarer than one in ten if √D₀ ≥ x + √(x² + t²)
@@ -255,16 +255,16 @@ def safe_half_width(evidence: Evidence, confidence: float) -> float:
 
 
 def whole_periods(lines: Sequence[SpectralLine]) -> float:
-    """Periods that count in all segments together."""
+    """Return the evaluated periods in all segments together."""
     return float(np.sum(lines[0].periods)) if lines else 0.0
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a plan should bring, before it is run: the lines and levels that its motion and the noise lead to.
+# Prediction for a plan: the lines and operating points that follow from its motion and the noise.
 
 
 def predicted(plan: Plan, theta: FloatArray, noise: NoiseDensity, prior: LagPrior) -> Evidence:
-    """Lines without noise and the covariance to be expected of them.
+    """Return lines without noise and their expected covariance.
 
     In torque mode the disturbance shows in speed alone (torque is what the host commands), in speed mode in torque
     alone; either way T − G W has the variance 4 S/L of `noise`.
@@ -293,5 +293,5 @@ def predicted(plan: Plan, theta: FloatArray, noise: NoiseDensity, prior: LagPrio
 
 def expected_half_width(plan: Plan, theta: FloatArray, noise: NoiseDensity, prior: LagPrior,
                         confidence: float) -> float:
-    """Of J, as a share of J, after the plan as it stands, other lags than the true ones allowed for."""
+    """Return the half-width of J, as a share of J, after this plan, with other lags than the true ones allowed."""
     return safe_half_width(predicted(plan, theta, noise, prior), confidence)

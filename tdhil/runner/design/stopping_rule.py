@@ -1,4 +1,4 @@
-"""When is it enough? What deciding by the scatter costs, and what deciding by the interval itself costs.
+"""The stopping rule of stage 5: the cost of deciding by the scatter, and of deciding by the interval itself.
 
 By the scatter. A pilot of n₀ periods at each mean speed is run. Its scatter (never its value of J) says how tight the
 interval will be, and how many periods it takes; so many are run, and it is looked again. Of Gaussian data the means and
@@ -16,14 +16,14 @@ not enough, seldom and with ν doubled: simulated, three of them change P by les
 variance; J rests on several lines and on B, so that the true ν₀ is larger and the correction a little too large.
 
 By the interval. It also depends on how the residuals fell: another set of lags may be excluded, or just not. So when
-the scatter says that it is enough, the interval itself is looked at; if it is too wide all the same, there is one more
-extension, and another look at it. Keeping an interval only where it is narrow is a choice by the data, of whatever
+the scatter suffices, the interval itself is checked; if it is still too wide, there is one more extension, and another
+check. Keeping an interval only where it is narrow is a choice by the data, of whatever
 kind. But the run's interval is one of several; it misses at most as often as any of these does, however the choice is
 made. That any does is P(I₁ misses) + P(I₂ misses and I₁ doesn't) + … , of which the k-th gets α_k = 0.7·0.3^(k − 1) α;
 they add up to α. Where the k-th misses the (k − 1)-th mostly does too, since it holds a share r of the same data: an
 interval misses where the signed root z of its likelihood ratio at the true J is too large, and such roots of data that
 grow have normal increments, so that z_k and z_(k − 1) are correlated with √r (Lan and DeMets' spending). An extension
-behind an interval is at most three times as long as all before it: r ≥ ¼ is reckoned with. Most runs pay a few percent
+behind an interval is at most three times as long as all before it: r ≥ ¼ is assumed. Most runs pay a few percent
 of width for it, those that need a second look a sixth; were it at most as long (r ≥ ½, an eighth), runs whose lags are
 told apart late would need a third look and a fourth, which cost far more.
 """
@@ -62,7 +62,7 @@ from tdhil.runner.design.prediction import (
 )
 
 LOOKS = 4                 # extensions at most
-FIRST_SHARE = 0.7         # of the probability to miss that is left, spent on the next interval that is looked at
+FIRST_SHARE = 0.7         # of the remaining miss probability, spent on the next checked interval
 MOST_BEHIND = 3.0         # of all before, that an extension behind an interval may be long: r ≥ ¼
 AIM = 0.7                 # probability with which one extension is enough; the way back for another costs little
 MARGIN = 1.05             # an interval comes out 4 % (1 sd) wider or narrower than its scatter says, as residuals fall
@@ -74,10 +74,10 @@ _PILOTS, _EXTENSIONS = 128, 32
 
 @dataclass(frozen=True)
 class Stopping:
-    """When stage 5 ends; ``working`` are the confidences of the intervals, so that ``confidence`` holds after looking.
+    """The end of stage 5. ``working``: confidences of the intervals, so that ``confidence`` holds after the analyses.
 
-    ``reachable``: may the tolerance be expected to be met in ``allowed_s``? If not, ``advice`` says what would help.
-    ``by_interval``: the scatter of a rigid shaft says nothing here, and the interval itself is looked at.
+    ``reachable``: the tolerance is expected to be reached in ``allowed_s``. If not, ``advice`` states what would help.
+    ``by_interval``: the scatter of a rigid shaft is no criterion here; the interval itself is checked.
     """
 
     tolerance: float
@@ -91,22 +91,22 @@ class Stopping:
     by_interval: bool = False
 
     def working(self, seen: int) -> float:
-        """Of the interval that is looked at after ``seen`` others."""
+        """Return the confidence of the interval that is checked after ``seen`` others."""
         return interval_confidence(self.confidence, self.pilot_dof, seen)
 
     def plain(self) -> dict[str, Any]:
-        """As the run's configuration keeps it."""
+        """Return it as plain data for the run's configuration."""
         return asdict(self)
 
 
 def interval_confidence(confidence: float, pilot_dof: float, seen: int) -> float:
-    """The confidence to compute the interval with that is looked at after ``seen`` others."""
+    """Return the confidence for computing the interval that is checked after ``seen`` others."""
     return working_confidence(spent_confidence(confidence, seen), pilot_dof)
 
 
 @lru_cache(maxsize=64)
 def spent_confidence(confidence: float, seen: int) -> float:
-    """Of the interval that is looked at after ``seen`` others, were its scatter known (above)."""
+    """Return the confidence of the interval checked after ``seen`` others, for a known scatter (above)."""
     from scipy.special import ndtr, ndtri
 
     spent = FIRST_SHARE * (1.0 - FIRST_SHARE) ** seen * (1.0 - confidence)
@@ -117,7 +117,7 @@ def spent_confidence(confidence: float, seen: int) -> float:
     nodes, weights = np.polynomial.legendre.leggauss(64)
 
     def newly(edge: float) -> float:
-        """How often |z_k| is beyond ``edge`` and |z_(k − 1)| isn't beyond its own."""
+        """Return how often |z_k| is beyond ``edge`` while |z_(k − 1)| is within its own."""
         z = edge + 4.0 * (nodes + 1.0)
         inside = ndtr((before - root * z) / math.sqrt(1.0 - root**2)) - ndtr(
             (-before - root * z) / math.sqrt(1.0 - root**2)
@@ -133,7 +133,7 @@ def spent_confidence(confidence: float, seen: int) -> float:
 
 @lru_cache(maxsize=16)
 def working_confidence(confidence: float, pilot_dof: float) -> float:
-    """The confidence to compute intervals with so that they cover with ``confidence`` after the looks.
+    """Return the confidence for computing intervals so that they cover with ``confidence`` after the analyses.
 
     ``pilot_dof``: real degrees of freedom of a line's variance after the pilot.
     """
@@ -146,7 +146,7 @@ def working_confidence(confidence: float, pilot_dof: float) -> float:
 
 
 def worst_coverage(working: float, pilot_dof: float) -> float:
-    """Least P over the rules above, for intervals computed with the confidence ``working``."""
+    """Return the least P over the rules above, for intervals computed with the confidence ``working``."""
     return _worst(_rules(pilot_dof), working)
 
 
@@ -159,7 +159,7 @@ def _worst(rules: list[tuple[FloatArray, FloatArray]], working: float) -> float:
 
 
 def _rules(dof: float) -> list[tuple[FloatArray, FloatArray]]:
-    """For every r and a: degrees of freedom at the end (PILOTS,), and s/σ (PILOTS, EXTENSIONS)."""
+    """Return, for every r and a, degrees of freedom at the end (PILOTS,), and s/σ (PILOTS, EXTENSIONS)."""
     from scipy.special import gammaincinv
 
     s0 = gammaincinv(0.5 * dof, _equally_likely(_PILOTS)) * 2.0 / dof
@@ -178,7 +178,7 @@ def _equally_likely(count: int) -> FloatArray:
 
 
 def aimed_scatter(dof: float, added: float) -> float:
-    """By how much the pooled variance may still rise, at most with probability AIM: (ν₀ + ν₁ F)/(ν₀ + ν₁)."""
+    """Return the factor by which the pooled variance rises at most with probability AIM: (ν₀ + ν₁ F)/(ν₀ + ν₁)."""
     if added <= 0.0:
         return 1.0
     from scipy.special import fdtri
@@ -187,7 +187,7 @@ def aimed_scatter(dof: float, added: float) -> float:
 
 
 def least_scale(half_width: Callable[[float], float], tolerance: float, most: float) -> tuple[float, float, bool]:
-    """How many times as long the run must be: (scale, half-width then, whether that is enough); 1 ≤ scale ≤ ``most``.
+    """Return how much longer the run must be: (scale, half-width then, whether it suffices); 1 ≤ scale ≤ ``most``.
 
     ``half_width(scale)`` falls about as √(a/scale + b), b being what the lag structure leaves open however long it
     takes. Where time is not enough, the scale at which nearly nothing is left to gain.
@@ -216,7 +216,7 @@ def least_scale(half_width: Callable[[float], float], tolerance: float, most: fl
 
 
 def _between(low: tuple[float, float], high: tuple[float, float], target: float) -> float:
-    """Where √(a/scale + b) through both points meets the target, kept off the ends."""
+    """Return where √(a/scale + b) through both points meets the target, away from the ends."""
     (x0, h0), (x1, h1) = low, high
     share = 0.5
     if math.isfinite(h0) and h0 > h1:
@@ -227,12 +227,12 @@ def _between(low: tuple[float, float], high: tuple[float, float], target: float)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A look at the scatter: how tight is the interval already, and how much longer must it be?
+# Interim analysis of the scatter: the present width of the interval, and the necessary extension.
 
 
 @dataclass(frozen=True)
 class Look:
-    """What the scatter says: J's relative half-width now, and after ``scale`` times as many periods.
+    """Result of an interim analysis: J's relative half-width now, and after ``scale`` times as many periods.
 
     ``enough``: the tolerance is met then (now, if ``scale`` is 1). ``at_last``: all of what is more may be at the mean
     speed where the shaft is, without a way back to the others. None of it knows how J came out but for what the
@@ -255,7 +255,7 @@ def look(
     pilot_dof: float,
     most_at_last: float = 1.0,
 ) -> Look | None:
-    """Look at what has been acquired so far; None where the estimator would refuse it."""
+    """Analyse the data acquired so far; None if the estimator would refuse them."""
     evidence = evidence_of(recording)
     fitted = None if evidence is None else fit(evidence, confidence)
     return None if evidence is None or fitted is None else _look(
@@ -288,13 +288,13 @@ def _look(
 
 
 def interval_of(recording: Recording, confidence: float) -> float:
-    """The relative half-width of the very interval that the run would end with; infinite where there is none."""
+    """Return the relative half-width of the interval with which the run would end; infinite if there is none."""
     found = identify(recording, Options(confidence=confidence)).inertia
     return math.inf if found is None else 0.5 * (found.high - found.low) / found.value
 
 
 def evidence_of(recording: Recording) -> Evidence | None:
-    """Lines and levels as identification will see them; None without enough whole periods."""
+    """Return lines and operating points as identification will use them; None without enough whole periods."""
     excitation = recording.excitation
     if excitation is None or not excitation.segments:
         return None

@@ -1,4 +1,4 @@
-"""What the shaft is asked to do in stage 5: pure numpy, planned before it moves, cheap to evaluate in a cycle."""
+"""The motion of stage 5: pure numpy, planned before the shaft moves, fast to evaluate in a cycle."""
 
 from tdhil.runner.excitation.plan import (
     LEAST_COUNTED as LEAST_COUNTED, PlanRequest as PlanRequest, Plan as Plan,

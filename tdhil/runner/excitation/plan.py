@@ -1,4 +1,4 @@
-"""Scale an excitation to the rig's speed window and torque limit, or refuse it before anything moves."""
+"""Scale an excitation to the rig's speed window and torque limit, or refuse it before motion."""
 
 import math
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ SETTLE_S = 10.0          # at least this long before the first period that count
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """What the user asks for; None means that the plan chooses.
+    """The user's request; None means that the plan chooses.
 
     ``frequency_hz``: lowest line (multisine), tone (sine), square wave (step). ``amplitude_rad_s``: greatest
     deviation of speed from its mean. ``offsets_rad_s``: mean speeds, one segment each. ``periods``: per segment,
@@ -96,11 +96,11 @@ class Plan:
 
     @property
     def start_rad_s(self) -> float:
-        """The mean speed that it begins at."""
+        """Return the first mean speed, rad/s."""
         return self.segments[0].reference.offset_rad_s
 
     def plain(self) -> dict[str, Any]:
-        """Its motion as plain data."""
+        """Return its motion as plain data."""
         return {
             "segments": [
                 {
@@ -117,7 +117,7 @@ class Plan:
         }
 
     def parts(self) -> list[tuple[str, str]]:
-        """(where, what) for people: one for each mean speed."""
+        """Return (place, text) for display: one for each mean speed."""
         return [
             (f"at {one.reference.offset_rad_s:.3g} rad/s",
              f"{one.periods} periods of {one.reference.period_s:.3g} s, {one.settle_periods} to settle")
@@ -125,7 +125,7 @@ class Plan:
         ]
 
     def lines(self) -> list[tuple[float, float]]:
-        """(Hz, rad/s) of every line; the same at each mean speed."""
+        """Return (Hz, rad/s) of every line; the same at each mean speed."""
         reference = self.segments[0].reference
         return list(zip(reference.lines_hz, reference.amplitudes_rad_s, strict=True))
 
@@ -155,7 +155,7 @@ class Plan:
         return between + sum(segment.duration_s for segment in self.segments)
 
     def followed(self, hertz: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """How much of a line of the reference the shaft makes, (K,): all, but for a drive's own speed control."""
+        """Return the ratio of the shaft's motion to the reference, (K,): one, except with the drive's speed control."""
         following = self.guess.following
         if self.mode != "speed" or following is None:
             return np.ones(len(hertz), dtype=np.complex128)
@@ -163,16 +163,16 @@ class Plan:
 
     @property
     def counted(self) -> int:
-        """Periods that count at each mean speed."""
+        """Return the evaluated periods at each mean speed."""
         return self.segments[0].periods - self.segments[0].settle_periods
 
     def with_counted(self, periods: int) -> "Plan":
-        """The same motion with so many periods that count at each mean speed, settling on top."""
+        """Return the same motion with this number of evaluated periods at each mean speed, besides settling."""
         segments = tuple(replace(segment, periods=segment.settle_periods + periods) for segment in self.segments)
         return replace(self, segments=segments)
 
     def extension_s(self, periods: int) -> float:
-        """So many more periods at each mean speed: on from the last one, then back to the others, which settle anew."""
+        """Return the time of further periods at each mean speed, s: the last first, then the others with settling."""
         others = self.segments[:-1]
         again = sum(one.settle_periods * one.reference.period_s for one in others)
         ways = sum(
@@ -182,15 +182,15 @@ class Plan:
         return again + ways + periods * sum(one.reference.period_s for one in self.segments)
 
     def transition(self, from_rad_s: float, index: int) -> Transition:
-        """From a speed to the start of segment ``index``."""
+        """Return the transition from a speed to the start of segment ``index``."""
         to = self.segments[index].reference.start_speed_rad_s
         return make_transition(from_rad_s, to, self.limits, self.guess, self.mode)
 
 
 def make_plan(limits: MotionLimits, guess: RigGuess, wish: PlanRequest | None = None) -> Plan:
-    """A plan that stays within the limits even if the rough inertia is wrong by its stated error.
+    """Return a plan that stays within the limits even if the rough inertia is wrong by its stated error.
 
-    Raises PlanRefused, naming the limit, if what was asked for does not fit.
+    Raises PlanRefused, with the limit, if the request does not fit.
     """
     wish = wish or PlanRequest()
     shape, frequency = _shape_and_frequency(wish)
@@ -271,7 +271,7 @@ class _FittedShape:
         return low, "standstill (as far ahead as the guard looks)"
 
     def _never_backwards(self, offset_rad_s: float, amplitude_rad_s: float) -> bool:
-        """Would the guard see the shaft turn backwards nowhere? As `Guard.predicted_speed`, with the plan's torque."""
+        """Return whether the guard predicts no reverse rotation. As `Guard.predicted_speed`, with the plan's torque."""
         foresight_s, guess = self.limits.foresight_s, self.guess
         swung = amplitude_rad_s * self.swing
         speed = offset_rad_s + swung * self.shape.deviation()
@@ -311,8 +311,8 @@ def _shape_and_frequency(wish: PlanRequest) -> tuple[Shape, float]:
         raise PlanRefused(f"frequency must be positive, not {frequency:g} Hz")
     if told_before_echo(wish.kind) and frequency > kind.frequency_hz:
         raise PlanRefused(
-            f"{wish.kind} with lines {frequency:g} Hz apart can't tell an echo from what was before it",
-            f"Leave --frequency out ({kind.frequency_hz:g} Hz), or give a lower one",
+            f"{wish.kind} with lines {frequency:g} Hz apart can't separate an echo from the time before it",
+            f"Remove --frequency ({kind.frequency_hz:g} Hz), or give a lower one",
         )
     if wish.shape is not None:
         return wish.shape, frequency
@@ -320,15 +320,15 @@ def _shape_and_frequency(wish: PlanRequest) -> tuple[Shape, float]:
 
 
 def periodic_kind(name: str) -> PeriodicKind:
-    """The periodic kind of that name. Raises PlanRefused where it is none."""
+    """Return the periodic kind of that name. Raises PlanRefused if it is not periodic."""
     kind = excitation_kind(name)
     if not isinstance(kind, PeriodicKind):
-        raise PlanRefused(f"{name} is no periodic excitation")
+        raise PlanRefused(f"{name} is not a periodic excitation")
     return kind
 
 
 def settling_periods(period_s: float, settle_s: float = SETTLE_S) -> int:
-    """How many periods go to settling."""
+    """Return the number of settling periods."""
     return max(1, math.ceil(settle_s / period_s - 1e-9))
 
 
@@ -356,18 +356,18 @@ def _amplitude_and_offsets(fit: _FittedShape, wish: PlanRequest) -> tuple[float,
     offsets = wish.offsets_rad_s or _default_offsets(fit, wish)
     largest, limit, where = min((*fit.largest_at(offset), offset) for offset in offsets)
     if largest <= 0.0:
-        raise PlanRefused(f"{limit} leaves no room for any excitation about {where:.3g} rad/s")
+        raise PlanRefused(f"{limit} leaves no room for any excitation at {where:.3g} rad/s")
     amplitude = largest if wish.amplitude_rad_s is None else wish.amplitude_rad_s
     if amplitude > largest * (1.0 + 1e-9):
         raise PlanRefused(
-            f"{limit}: an amplitude of {amplitude:g} rad/s about {where:.3g} rad/s does not fit; "
-            f"{largest:.3g} rad/s would"
+            f"{limit}: an amplitude of {amplitude:g} rad/s at {where:.3g} rad/s does not fit; "
+            f"{largest:.3g} rad/s would fit"
         )
     return amplitude, tuple(offsets)
 
 
 def _default_offsets(fit: _FittedShape, wish: PlanRequest) -> tuple[float, ...]:
-    """Two mean speeds (one where friction's slope isn't asked for), as far apart as the swing allows.
+    """Return two mean speeds (one if the slope of friction is not needed), as far apart as the amplitude allows.
 
     The swing takes at most what the window leaves beside the offsets' least distance, and what the torque limit
     allows at the upper end; whatever it does not need goes to the distance, which is what tells B.

@@ -4,9 +4,9 @@ A pulse is a step of net torque, ΔT for some seconds, up or down; between two p
 speed, so that the momentum from calm to calm can be balanced without knowing any lag. Swings of full height alternate
 with half ones, and strong pulses with weaker ones, which spreads what they say over frequency.
 
-Coast-down lets go of the torque at the upper speed, and friction brings the shaft to the lower one. Of J, B and T_c,
-J dω/dt = −B ω − T_c tells the ratios only: multiply all three by anything, and the shaft coasts alike. What tells J is
-the torque of the way back up, so every coast is paired with a powered ramp, and the ramps differ in steepness.
+Coast-down switches the torque off at the upper speed, and friction brings the shaft to the lower one. Of J, B and T_c,
+J dω/dt = −B ω − T_c gives only the ratios: with all three multiplied by a factor, the shaft coasts the same way. The
+torque of the way back up determines J, so every coast is paired with a powered ramp, and the ramps differ in steepness.
 
 Whatever the rough inertia's error, the swing stays within the window; in torque mode that includes what the guard
 foresees (`Guard.foresight_s`) while the torque pushes.
@@ -37,13 +37,15 @@ _LEAST_S = 0.5
 _SHARES = (1.0, 0.6)      # of the steepest: pulses of two strengths
 _HEIGHTS = (0.0, 1.0, 0.5, 1.0)     # levels between the lowest and the highest speed, in turn
 _TOPS = (1.0, 0.6, 0.8)             # from which it coasts: no two rounds alike for long, or few frequencies are excited
-_SLACK = 1.1              # of what the guard foresees, since reports are noisy
+_SLACK = 1.1              # margin on the prediction of the guard, since reports are noisy
 _TORQUE_SHARE = 0.9       # of the room that the torque limit leaves above friction
 
 
 @dataclass(frozen=True)
 class SpeedChange:
-    """From one steady speed to the next, in ``duration_s``; ``coasting``: without torque, so about so long."""
+    """A change from one steady speed to the next in ``duration_s``; ``coasting``: without torque, an approximate
+    time.
+    """
 
     from_rad_s: float
     to_rad_s: float
@@ -77,7 +79,7 @@ class SwingKind(ExcitationKind):
 
 @dataclass(frozen=True)
 class SwingPlan:
-    """The whole of stage 5's motion: calm at ``start_rad_s``, then every way with the calm behind it."""
+    """The whole motion of stage 5: calm at ``start_rad_s``, then every way with the calm behind it."""
 
     kind: str
     mode: DriveMode
@@ -95,7 +97,7 @@ class SwingPlan:
         return CALM_S + sum(way.duration_s + CALM_S for way in self.ways)
 
     def plain(self) -> dict[str, Any]:
-        """Its motion as plain data."""
+        """Return its motion as plain data."""
         return {
             "segments": [],
             "ways": [
@@ -106,12 +108,12 @@ class SwingPlan:
         }
 
     def parts(self) -> list[tuple[str, str]]:
-        """(where, what) for people."""
+        """Return (place, text) for display."""
         ways = f"{len(self.ways)} ways up and down, each with {CALM_S:g} s of calm behind it"
         return [(f"{self.speed_min_rad_s:.3g} to {self.speed_max_rad_s:.3g} rad/s", ways)]
 
     def lines(self) -> list[tuple[float, float]]:
-        """It has none."""
+        """Return no lines."""
         return []
 
 
@@ -148,8 +150,9 @@ def make_swings(
     if len(ways) < _LEAST_SWINGS:
         needed = CALM_S + sum(way.duration_s + CALM_S for way in islice(_again(ways, endless), _LEAST_SWINGS))
         raise PlanRefused(
-            f"time: {len(ways)} ways up and down are too few to tell the inertia, {_LEAST_SWINGS} take {needed:.0f} s",
-            f"Give --max-time {math.ceil(needed)} or more, --periods {_LEAST_SWINGS} or more, or leave both out",
+            f"time: {len(ways)} ways up and down are too few to identify the inertia, {_LEAST_SWINGS} take "
+            f"{needed:.0f} s",
+            f"Give --max-time {math.ceil(needed)} or more, --periods {_LEAST_SWINGS} or more, or remove both",
         )
     torques = [torque for way in ways if not way.coasting for torque in (way.reference(0.0)[1],
                way.reference(0.999999 * way.duration_s)[1])]
@@ -158,7 +161,7 @@ def make_swings(
 
 
 def swing_kind(name: str) -> SwingKind:
-    """The kind of that name that goes from speed to speed. Raises PlanRefused where it is none."""
+    """Return the kind of that name with changes of speed. Raises PlanRefused if it is not one."""
     kind = excitation_kind(name)
     if not isinstance(kind, SwingKind):
         raise PlanRefused(f"{name} is a periodic excitation")
@@ -193,13 +196,13 @@ def _coasts(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[S
 
 
 def coasting_s(from_rad_s: float, to_rad_s: float, guess: RigGuess) -> float:
-    """How long friction alone takes from one speed to a lower one: (J/B) ln(T(ω₀)/T(ω₁)), (J/T_c) Δω for B → 0.
+    """Return the time that friction takes from one speed to a lower one: (J/B) ln(T(ω₀)/T(ω₁)), (J/T_c) Δω for B → 0.
 
     Raises PlanRefused where there is next to no friction.
     """
     upper, lower = guess.steady_torque_nm(from_rad_s), guess.steady_torque_nm(to_rad_s)
     if not (lower > 0.0 and upper > 0.0):
-        raise PlanRefused("coast-down: there is no friction to slow the shaft down; use --excitation pulses")
+        raise PlanRefused("coast-down: the friction is too low to slow the shaft down; use --excitation pulses")
     mean = upper if math.isclose(upper, lower, rel_tol=1e-9) else (upper - lower) / math.log(upper / lower)
     return guess.inertia_kg_m2 * (from_rad_s - to_rad_s) / mean
 
@@ -233,7 +236,7 @@ class _SpeedRoom:
                 "that a plan may use"
             )
         rate = min(torque / self._guess.inertia_kg_m2, 0.9 * self._limits.acceleration_rad_s2)
-        # What the guard foresees may take a fifth of the window at either end; a shaft that light is pushed less.
+        # The prediction of the guard may take a fifth of the window at either end. A shaft that light gets less torque.
         rate = min(rate, (high - low) / 5.0 / self._foresight_s) if self._foresight_s > 0.0 else rate
         ahead = _SLACK * rate * self._foresight_s
         largest = (high - low - 2.0 * ahead) / (1.0 + 2.0 * self._beyond)
@@ -244,12 +247,12 @@ class _SpeedRoom:
         least, most = low + ahead + span * self._beyond, high - ahead - span * (1.0 + self._beyond)
         if least > most * (1.0 + 1e-9) + 1e-9:
             raise PlanRefused(
-                f"speed window: an amplitude of {0.5 * span:g} rad/s does not fit; {0.5 * largest:.3g} rad/s would"
+                f"speed window: an amplitude of {0.5 * span:g} rad/s does not fit; {0.5 * largest:.3g} rad/s would fit"
             )
         bottom = least if offset_rad_s is None else offset_rad_s - 0.5 * span
         if not least - 1e-9 <= bottom <= most + 1e-9:
             raise PlanRefused(
-                f"speed window: swings of {0.5 * span:.3g} rad/s about {offset_rad_s:g} rad/s do not fit; "
-                f"about {least + 0.5 * span:.3g} to {most + 0.5 * span:.3g} rad/s they would"
+                f"speed window: changes of {0.5 * span:.3g} rad/s about {offset_rad_s:g} rad/s do not fit; "
+                f"about {least + 0.5 * span:.3g} to {most + 0.5 * span:.3g} rad/s they would fit"
             )
         return bottom, bottom + span, rate

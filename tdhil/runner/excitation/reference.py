@@ -1,4 +1,4 @@
-"""What an excitation must stay within, and what is known of the rig when it is planned."""
+"""The limits of an excitation, and the knowledge of the rig when it is planned."""
 
 import math
 from dataclasses import dataclass, field
@@ -17,9 +17,9 @@ USUAL_STEP = "Change --amplitude, --offset, --frequency or the limits"
 
 
 class PlanRefused(ValueError):
-    """The wished motion doesn't fit; the message names the limit, what was needed, and what there is.
+    """The requested motion does not fit. The message names the limit, the required and the available value.
 
-    ``next_step``: which option would change that.
+    ``next_step``: the option that would change that.
     """
 
     def __init__(self, what: str, next_step: str = USUAL_STEP) -> None:
@@ -29,11 +29,11 @@ class PlanRefused(ValueError):
 
 @dataclass(frozen=True)
 class ExcitationKind:
-    """What there is to know of an excitation before it is planned; `tdhil.config.registry` lists them by name.
+    """The properties of an excitation before it is planned; `tdhil.config.registry` lists them by name.
 
     A kind is one of two families: `PeriodicKind` has lines, `SwingKind` goes from one steady speed to another.
-    ``needs_torque_mode``: it can't be had under the drive's speed control, and ``why_torque_mode`` says why in words.
-    ``with_string``: may it be run with a drill string on the shaft?
+    ``needs_torque_mode``: it is not possible under the drive's speed control; ``why_torque_mode`` is the reason.
+    ``with_string``: it is permitted with a drill string on the shaft.
     """
 
     needs_torque_mode: bool = False
@@ -42,23 +42,23 @@ class ExcitationKind:
 
     @property
     def adaptive(self) -> bool:
-        """Can a tolerance end it, by the scatter from period to period?"""
+        """Return whether a tolerance can end it, by the scatter from period to period."""
         return False
 
 
 def excitation_kind(name: str) -> ExcitationKind:
-    """The kind of that name. Raises PlanRefused where there is none."""
+    """Return the kind of that name. Raises PlanRefused if there is none."""
     if name not in EXCITATIONS:
-        raise PlanRefused(f"unknown excitation {name!r}; there are {', '.join(EXCITATIONS)}")
+        raise PlanRefused(f"unknown excitation {name!r}; choose one of {', '.join(EXCITATIONS)}")
     found: ExcitationKind = load(EXCITATIONS, name)
     return found
 
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """What a planned motion may use: the window that the shaft must not leave, rad/s, and the greatest torque, N·m.
+    """Limits of a planned motion: the window that the shaft must not leave, rad/s, and the largest torque, N·m.
 
-    The machine's own, which the guard holds, are `tdhil.runner.settings.MachineLimits`.
+    The machine's own limits, which the guard enforces, are `tdhil.runner.settings.MachineLimits`.
 
     ``foresight_s``: in torque mode the guard holds speed + foresight·acceleration below the window's upper end, since
     what is reported is old; the plan must keep that free too. ``acceleration_rad_s2``: what the drive's own speed ramp
@@ -124,15 +124,15 @@ class RigGuess:
             raise PlanRefused(f"relative error of the rough inertia must be in [0, 0.9): {self.inertia_rel_error:g}")
 
     def steady_torque_nm(self, speed_rad_s: float) -> float:
-        """Torque that holds a steady speed, N·m."""
+        """Return the torque that holds a steady speed, N·m."""
         return self.coulomb_nm + self.viscous_nm_s_rad * speed_rad_s
 
     def speed_swing_factor(self, mode: DriveMode) -> float:
-        """Real swing of speed over the planned one, at worst: in torque mode a lighter shaft swings further."""
+        """Return the worst ratio of real to planned speed amplitude: in torque mode a lighter shaft moves further."""
         return 1.0 / (1.0 - self.inertia_rel_error) if mode == "torque" else 1.05
 
     def torque_swing_factor(self, mode: DriveMode) -> float:
-        """Real swing of torque over the planned one, at worst: in speed mode a heavier shaft needs more."""
+        """Return the worst ratio of real to planned torque amplitude: in speed mode a heavier shaft needs more."""
         return 1.0 if mode == "torque" else 1.0 / (1.0 - self.inertia_rel_error)
 
 
@@ -176,16 +176,16 @@ class PeriodicReference:
 
     @property
     def mean_torque_nm(self) -> float:
-        """Feed-forward torque that holds the mean speed, N·m."""
+        """Return the feed-forward torque that holds the mean speed, N·m."""
         return self._mean_torque_nm
 
     @property
     def start_speed_rad_s(self) -> float:
-        """Speed at t = 0, where a transition must have brought the shaft."""
+        """Return the speed at t = 0, the end of a transition."""
         return self.reference(0.0)[0]
 
     def reference(self, t_s: float) -> tuple[float, float]:
-        """Speed (rad/s) and feed-forward torque (N·m), ``t_s`` seconds after the segment's start."""
+        """Return speed (rad/s) and feed-forward torque (N·m), ``t_s`` seconds after the segment's start."""
         speed = self.offset_rad_s
         torque = self._mean_torque_nm
         for omega, phase, amplitude, in_phase, quadrature in self._lines:
@@ -197,11 +197,11 @@ class PeriodicReference:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# From one speed to another without a step of acceleration, with its feed-forward torque.
+# A transition between two speeds without a step of acceleration, with its feed-forward torque.
 
 
 _SHORTEST_S = 2.0
-_TORQUE_SHARE = 0.5   # of what the limit leaves above friction: a transition is in no hurry
+_TORQUE_SHARE = 0.5   # of the torque above friction: a transition is slow
 
 
 @dataclass(frozen=True)
@@ -228,15 +228,15 @@ class Transition:
 def make_transition(
     from_rad_s: float, to_rad_s: float, limits: MotionLimits, guess: RigGuess, mode: DriveMode = "torque"
 ) -> Transition:
-    """The quickest calm transition: at most half of the torque that friction leaves, and never under 2 s.
+    """Return the quickest calm transition: at most half of the torque above friction, and at least 2 s.
 
-    Raises PlanRefused if friction alone takes the torque.
+    Raises PlanRefused if friction alone needs the whole torque.
     """
     friction = max(abs(guess.steady_torque_nm(from_rad_s)), abs(guess.steady_torque_nm(to_rad_s)))
     room = _TORQUE_SHARE * (limits.usable_torque_nm - friction) / guess.torque_swing_factor(mode)
     if room <= 0.0:
         raise PlanRefused(
-            f"torque limit: friction takes {friction:g} N·m of the {limits.usable_torque_nm:g} N·m that a plan may use"
+            f"torque limit: friction needs {friction:g} N·m of the {limits.usable_torque_nm:g} N·m that a plan may use"
         )
     needed = math.pi * abs(to_rad_s - from_rad_s) * guess.inertia_kg_m2 / (2.0 * room)
     if mode == "speed":

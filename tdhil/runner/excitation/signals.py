@@ -26,11 +26,11 @@ class Shape:
     phases_rad: tuple[float, ...]
 
     def deviation(self, phase_rad: float = 0.0) -> NDArray[np.float64]:
-        """(1024,) deviation over one period; every line turned on by ``phase_rad`` of its own argument."""
+        """Return the deviation over one period, (1024,); every line turned on by ``phase_rad`` of its own argument."""
         return self._wave(np.asarray(self.amplitudes, dtype=np.complex128), phase_rad)
 
     def foreseen_deviation(self, period_s: float, foresight_s: float) -> NDArray[np.float64]:
-        """(1024,) deviation + foresight·its rate over one period: Re Σ (1 + jω_k t_f) a_k e^(j(ω_k t + φ_k))."""
+        """Return deviation + foresight·its rate over a period, (1024,): Re Σ (1 + jω_k t_f) a_k e^(j(ω_k t + φ_k))."""
         omega = 2.0 * np.pi * np.asarray(self.harmonics, dtype=np.float64) / period_s
         return self._wave((1.0 + 1j * omega * foresight_s) * np.asarray(self.amplitudes), 0.0)
 
@@ -40,7 +40,7 @@ class Shape:
         return self._wave((viscous_nm_s_rad + 1j * omega * inertia_kg_m2) * np.asarray(self.amplitudes), 0.0)
 
     def followed(self, period_s: float, following: SpeedFollowing) -> "Shape":
-        """What the shaft makes of it, as a setpoint under the drive's speed control."""
+        """Return the motion of the shaft for it as a setpoint under the drive's speed control."""
         gains = following.shaft(np.asarray(self.harmonics, dtype=np.float64) / period_s)
         return Shape(
             self.harmonics,
@@ -49,11 +49,11 @@ class Shape:
         )
 
     def steepness(self, period_s: float) -> NDArray[np.float64]:
-        """(1024,) acceleration over one period, 1/s: rad/s² per rad/s of peak speed."""
+        """Return the acceleration over one period, (1024,), 1/s: rad/s² per rad/s of peak speed."""
         return self.torque_deviation(period_s, 1.0, 0.0)
 
     def shifted(self, share: float) -> "Shape":
-        """The same motion begun ``share`` of a period later."""
+        """Return the same motion begun ``share`` of a period later."""
         turned = tuple(
             float((phase + 2.0 * np.pi * harmonic * share) % (2.0 * np.pi))
             for harmonic, phase in zip(self.harmonics, self.phases_rad, strict=True)
@@ -69,7 +69,7 @@ class Shape:
 def _turned(
     harmonics: tuple[int, ...], phases_rad: tuple[float, ...], phase_rad: float
 ) -> NDArray[np.complex128]:
-    """(1024, K) the lines of peak 1; kept: speed, rate and torque of one shape are asked for one after another."""
+    """(1024, K) the lines of peak 1; kept: speed, rate and torque of one shape are needed one after another."""
     turns = 2.0 * np.pi * np.arange(_GRID) / _GRID
     arguments = np.outer(turns, harmonics) + np.asarray(phases_rad) + phase_rad
     lines: NDArray[np.complex128] = np.exp(1j * arguments)
@@ -79,9 +79,9 @@ def _turned(
 
 @dataclass(frozen=True)
 class PeriodicKind(ExcitationKind):
-    """The same motion again and again about a mean speed, or two.
+    """A periodic motion around one mean speed, or two.
 
-    ``shape``: makes its lines. ``frequency_hz``: of the first of them where nobody asks for another.
+    ``shape``: makes its lines. ``frequency_hz``: of the first of them if no other is requested.
     ``at_one_speed_s``: friction's slope isn't asked for, so that it has one mean speed, as many periods as that time
     holds, and its scatter decides nothing; 0: two mean speeds. ``tuned``: the design may choose other lines, fitted to
     the shaft's noise and lags.
@@ -98,13 +98,13 @@ class PeriodicKind(ExcitationKind):
 
 
 def unit_peak(shape: Shape) -> Shape:
-    """The shape scaled so that its greatest deviation is 1."""
+    """Return the shape scaled so that its greatest deviation is 1."""
     peak = float(np.max(np.abs(shape.deviation())))
     return Shape(shape.harmonics, tuple(a / peak for a in shape.amplitudes), shape.phases_rad)
 
 
 def begun_at_rest(shape: Shape, period_s: float, inertia_kg_m2: float, viscous_nm_s_rad: float) -> Shape:
-    """The same motion begun where its torque passes its mean.
+    """Return the same motion begun where its torque passes its mean.
 
     A ramp that ends there without acceleration hands over without a step of torque: next to nothing has to settle.
     """
@@ -136,7 +136,7 @@ DEFAULT_PERIODS = 11         # at each mean speed, the first of them for settlin
 
 
 def multisine_shape() -> Shape:
-    """Harmonics 1 to 4, peak deviation 1."""
+    """Return harmonics 1 to 4, peak deviation 1."""
     return unit_peak(
         Shape(
             harmonics=(1, 2, 3, 4),
@@ -160,7 +160,7 @@ SINE_FREQUENCY_HZ = 0.1   # lowest tone of the paper's field test (section 5.2)
 
 
 def sine_shape() -> Shape:
-    """One line, amplitude 1; a sine is a cosine that is a quarter late."""
+    """Return one line, amplitude 1; a sine is a cosine delayed by a quarter."""
     return Shape(harmonics=(1,), amplitudes=(1.0,), phases_rad=(1.5 * math.pi,))
 
 
@@ -181,7 +181,7 @@ _HARMONICS = (1, 3, 5, 7, 9)
 
 
 def step_shape() -> Shape:
-    """Odd harmonics of a square wave, peak deviation 1 (half of A₁ − A₀)."""
+    """Return odd harmonics of a square wave, peak deviation 1 (half of A₁ − A₀)."""
     taper = [math.pi * m / (_HARMONICS[-1] + 2) for m in _HARMONICS]
     return unit_peak(
         Shape(
@@ -196,8 +196,8 @@ STEP = PeriodicKind(shape=step_shape, frequency_hz=STEP_FREQUENCY_HZ)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Pseudo-random torque, for a drill string: lines so dense that the time before its echo can be told from what comes
-# later (`estimation.frequency_domain.before_echo`).
+# Pseudo-random torque, for a drill string: lines so dense that the time before its echo can be separated from the time
+# after it (`estimation.frequency_domain.before_echo`).
 #
 # The binary sequence of greatest length 63 (x⁶ + x⁵ + 1), one element lasting a 63rd of the period of 20 s, moved the
 # motor by its torque alone; its lines up to 1.5 Hz, since what a drive reports of faster ones is mostly its filters.
@@ -206,19 +206,19 @@ STEP = PeriodicKind(shape=step_shape, frequency_hz=STEP_FREQUENCY_HZ)
 
 PRBS_FREQUENCY_HZ = 0.05
 ECHOES_S = (0.7, 3.8)
-"""What comes back earlier hardly lets the fastest line turn once, and what comes back later is not over in a period."""
+"""Range of usable echo times, s. An earlier echo leaves the fastest line no cycle; a later one outlasts a period."""
 
 _ORDER, _TAPS = 6, (6, 5)
 _PRBS_LINES = 30
 
 
 def tells_before_echo(echo_s: float) -> bool:
-    """Does what comes back after ``echo_s`` leave this excitation time to tell J, and die away in time?"""
+    """Return whether an echo after ``echo_s`` leaves enough time to identify J, and decays in time."""
     return ECHOES_S[0] <= echo_s <= ECHOES_S[1]
 
 
 def prbs_shape() -> Shape:
-    """Harmonics 1 to 30, peak deviation of speed 1."""
+    """Return harmonics 1 to 30, peak deviation of speed 1."""
     register, sequence = [1] * _ORDER, []
     for _ in range(2**_ORDER - 1):
         sequence.append(2.0 * register[-1] - 1.0)
@@ -238,5 +238,5 @@ def prbs_shape() -> Shape:
 
 PRBS = PeriodicKind(
     shape=prbs_shape, frequency_hz=PRBS_FREQUENCY_HZ, at_one_speed_s=600.0, needs_torque_mode=True,
-    why_torque_mode="a stiff speed loop leaves nothing of a torque that is as quick as the echo",
+    why_torque_mode="a stiff speed loop suppresses a torque as quick as the echo",
 )

@@ -25,7 +25,7 @@ _HELD_BACK = 1.12         # times the commanded time from a fifth to four fifths
 
 @dataclass(frozen=True)
 class SpeedFollowing:
-    """Of setpoint to the shaft's speed; behind ``speed_lag_s`` it is reported."""
+    """Response of the shaft's speed to its setpoint; the report adds ``speed_lag_s``."""
 
     zero_s: float
     first_s: float
@@ -33,13 +33,13 @@ class SpeedFollowing:
     speed_lag_s: float = 0.0
 
     def reported(self, hertz: FloatArray) -> NDArray[np.complex128]:
-        """Complex gain to the reported speed, (K,)."""
+        """Return the complex gain to the reported speed, (K,)."""
         s = 2j * np.pi * np.asarray(hertz, dtype=np.float64)
         gain: NDArray[np.complex128] = self.shaft(hertz) / (1.0 + self.speed_lag_s * s)
         return gain
 
     def shaft(self, hertz: FloatArray) -> NDArray[np.complex128]:
-        """Complex gain to the shaft's speed, (K,)."""
+        """Return the complex gain to the shaft's speed, (K,)."""
         s = 2j * np.pi * np.asarray(hertz, dtype=np.float64)
         gain: NDArray[np.complex128] = (1.0 + self.zero_s * s) / (1.0 + self.first_s * s + self.second_s2 * s * s)
         return gain
@@ -52,7 +52,7 @@ def fit_following(
     speed_lag_s: float = 0.0,
     ramp_rad_s2: float = math.inf,
 ) -> SpeedFollowing | None:
-    """From one change of setpoint that begins and ends steadily, (N,) each; None where the model does not fit.
+    """Fit one change of setpoint that begins and ends steadily, (N,) each; None if the model does not fit.
 
     ``ramp_rad_s2``: of the drive's own ramp, which the setpoint passes first.
     """
@@ -84,7 +84,7 @@ def fit_following(
 def held_back_to(
     time_s: FloatArray, setpoint_rad_s: FloatArray, reported_rad_s: FloatArray
 ) -> float | None:
-    """The acceleration that the drive's own ramp lets through, rad/s²; None where it kept up with the setpoint."""
+    """Return the acceleration limit of the drive's own ramp, rad/s²; None if it kept up with the setpoint."""
     begin, change = float(setpoint_rad_s[0]), float(setpoint_rad_s[-1] - setpoint_rad_s[0])
     if change == 0.0:
         return None
@@ -102,7 +102,7 @@ def held_back_to(
 
 
 def _ramped(wanted: FloatArray, rate: float) -> FloatArray:
-    """A setpoint on the grid behind a ramp, per second."""
+    """Return a setpoint on the grid after a ramp."""
     if math.isinf(rate):
         return wanted
     found, now = np.empty_like(wanted), float(wanted[0])
@@ -113,7 +113,7 @@ def _ramped(wanted: FloatArray, rate: float) -> FloatArray:
 
 
 def _response(wanted: FloatArray, zero: float, first: float, second: float, lag: float) -> FloatArray:
-    """Of H and the lag on the grid, by the bilinear transform.
+    """Return the response of H and the lag on the grid, by the bilinear transform.
 
     Two filters in the transposed direct form II, as scipy.signal's, which takes a second to load.
     """

@@ -1,6 +1,6 @@
 """Stage 5, acquire: the planned excitation, in torque mode or in speed mode.
 
-In torque mode the feed-forward of the plan moves the shaft and a slow host loop keeps its mean where it belongs;
+In torque mode the feed-forward of the plan moves the shaft and a slow host loop keeps its mean speed;
 in speed mode the reference goes to the drive's own loop.
 """
 
@@ -20,29 +20,29 @@ from tdhil.runner.settings import ControlAssumptions, MachineLimits
 from tdhil.runner.stages.hold import MeanSpeedControl
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A slow small motion beside the excitation of speed mode, where the drive reports speed in coarse steps. Pure.
+# A slow small motion added to the excitation in speed mode, if the drive reports speed in coarse steps. Pure.
 #
-# Under speed control one period repeats the last, and so does the rounding of its reports to whole rpm, say: a
-# pattern that adds up on the excited lines instead of averaging out, and that no scatter between periods shows. A
-# triangle of a count or two, whose period has no whole ratio to the excitation's, makes every period round elsewhere.
+# Under speed control each period repeats the last, and so does the rounding of its reports, such as to whole rpm. This
+# pattern adds up at the excited frequencies instead of averaging out, and the scatter between periods does not show it.
+# A triangle of a count or two, with a period unrelated to the excitation's, makes each period round differently.
 
 
 COUNTS = 2.0              # peak of the triangle, in counts of the reported speed
 COARSE_SHARE = 0.002      # of the window: finer counts than this need none
 MOST_SHARE = 0.015        # of the window: half of the margin that a plan keeps free at either end
 PERIODS = (math.sqrt(5.0) - 1.0) / 2.0
-"""Of the excitation's period: the golden ratio is the farthest from every whole ratio."""
+"""Period of the triangle over the excitation's: the golden ratio is the farthest from every whole ratio."""
 
 
 def dither_peak(resolution_rad_s: float, window_rad_s: float) -> float:
-    """Peak of the triangle, rad/s; 0 where the reported speed is fine enough."""
+    """Return the peak of the triangle, rad/s; 0 if the reported speed is fine enough."""
     if resolution_rad_s < COARSE_SHARE * window_rad_s:
         return 0.0
     return min(COUNTS * resolution_rad_s, MOST_SHARE * window_rad_s)
 
 
 def dither(time_s: float, period_s: float, peak_rad_s: float) -> float:
-    """What is added to the speed setpoint, rad/s; begins at zero."""
+    """Return the addition to the speed setpoint, rad/s. It begins at zero."""
     turn = (time_s / (PERIODS * period_s) + 0.25) % 1.0
     return peak_rad_s * (1.0 - 4.0 * abs(turn - 0.5))
 
@@ -54,7 +54,7 @@ Announce = Callable[[Excitation], None]
 
 
 class Follower:
-    """Follows a reference for a while, one command a cycle."""
+    """Follows a reference for a time, one command per cycle."""
 
     def __init__(
         self,
@@ -75,19 +75,19 @@ class Follower:
         self.wanted_rad_s = self.reported_rad_s
 
     def follow(self, reference: Reference, duration_s: float) -> float:
-        """Run ``reference`` for a duration from the next cycle on; the control time at which it began."""
+        """Run ``reference`` for a duration from the next cycle on. Return the control time of its start."""
         start_s = self.time_s + self._loop.period_s
-        # By time, not by a number of cycles: a slow line keeps its period on average at best.
+        # By time, not by a number of cycles: a slow line keeps its period only on average.
         self.follow_until(reference, start_s, start_s + max(duration_s, self._loop.period_s))
         return start_s
 
     def follow_until(self, reference: Reference, start_s: float, end_s: float) -> None:
-        """Go on with a reference that began at ``start_s`` up to the last cycle before ``end_s``."""
+        """Continue a reference that began at ``start_s`` up to the last cycle before ``end_s``."""
         while self.time_s + 1.5 * self._loop.period_s < end_s:
             self.step(reference, start_s)
 
     def step(self, reference: Reference, start_s: float) -> None:
-        """One cycle of a reference that began at ``start_s``."""
+        """Run one cycle of a reference that began at ``start_s``."""
         self._step(*reference(self.time_s + self._loop.period_s - start_s))
 
     def _step(self, speed_rad_s: float, torque_nm: float) -> None:
@@ -102,7 +102,7 @@ class Follower:
         self.saw(self._loop.cycle(Command(self._mode, wanted, torque_nm)), wanted)
 
     def saw(self, sample: Sample, wanted_rad_s: float) -> None:
-        """Where the shaft is, after a cycle in which it was to have this speed."""
+        """Note the reported speed after a cycle with this setpoint."""
         self.time_s, self.reported_rad_s, self.wanted_rad_s = sample.time_s, sample.speed_rad_s, wanted_rad_s
 
 
@@ -115,11 +115,11 @@ def run_acquire(
     enough: Enough | None = None,
     speed_resolution_rad_s: float = 0.0,
 ) -> None:
-    """Every segment of the plan, with its transitions. ``announce`` is told the excitation as it grows.
+    """Run every segment of the plan, with its transitions. ``announce`` receives the excitation as it grows.
 
     A segment is announced with its planned end when it begins, so that a log which ends in it can be read. With
-    ``enough`` the plan is a pilot: once it is through, the last segment goes on while the scatter is looked at, and if
-    more is wanted so many periods more at its mean speed and then, unless that is enough, settled anew at the others.
+    ``enough`` the plan is a pilot: after it the last segment continues during the interim analysis. If more is needed,
+    that many periods follow at its mean speed and then, unless that is enough, at the others after settling.
     In speed mode a coarse ``speed_resolution_rad_s`` is dithered (`dither`).
     """
     begun_s = loop.now_s
@@ -147,7 +147,7 @@ def _dither_of(plan: Plan, resolution_rad_s: float, begun_s: float) -> Callable[
 
 
 class _SegmentCourse:
-    """Where stage 5 is: the segments that are done, and the one that the shaft is in."""
+    """The progress of stage 5: finished segments, and the present one."""
 
     def __init__(self, loop: ControlLoop, plan: Plan, follower: Follower, announce: Announce) -> None:
         self._loop, self._plan, self._follower, self._announce = loop, plan, follower, announce
@@ -158,11 +158,11 @@ class _SegmentCourse:
 
     @property
     def excitation(self) -> Excitation:
-        """What has been run."""
+        """Return the excitation that has been run."""
         return Excitation(self._plan.kind, self._plan.mode, tuple(self._done))
 
     def go_to(self, index: int, counted: int | None = None) -> None:
-        """To another mean speed, and through its segment: as planned, or with so many periods that count."""
+        """Go to another mean speed and run its segment: as planned, or with ``counted`` evaluated periods."""
         segment, follower = self._plan.segments[index], self._follower
         if counted is not None:
             segment = replace(segment, periods=segment.settle_periods + counted)
@@ -174,13 +174,13 @@ class _SegmentCourse:
         self._done.append(self._recorded())
 
     def ask(self, work: Callable[[], Decision]) -> Decision:
-        """What has been run is announced; then the segment goes on for as long as the look takes (real time)."""
+        """Announce what has been run, then continue the segment during the interim analysis (real time)."""
         self._announce(self.excitation)
         reference = self._segment.reference.reference
         return self._loop.compute_while(work, lambda: self._follower.step(reference, self._start_s))
 
     def go_on(self, periods: int) -> None:
-        """So many periods more where the shaft is."""
+        """Run more periods at the present mean speed."""
         self._done.pop()
         segment = self._segment = replace(self._segment, periods=self._segment.periods + periods)
         self._tell(segment.recorded(self._start_s))
@@ -188,7 +188,7 @@ class _SegmentCourse:
         self._done.append(self._recorded())
 
     def others(self) -> list[int]:
-        """The other mean speeds, the one before first."""
+        """Return the other mean speeds, the previous one first."""
         return [index for index in reversed(range(len(self._plan.segments))) if index != self._index]
 
     def _tell(self, planned: Segment) -> None:
@@ -200,13 +200,14 @@ class _SegmentCourse:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Stage 5 with torque pulses or coast-down: every way of the plan, and the calm behind each.
+# Stage 5 with torque pulses or coast-down: every speed change of the plan, and the calm after each.
 #
-# A powered way follows its reference like any other motion. Coasting is zero torque until the shaft, by what the
-# reports may be late, is about to reach its lower speed; time alone would have to trust the rough friction.
+# A powered change follows its reference like any other motion. Coasting is zero torque until the shaft is about to
+# reach
+# its lower speed, with an allowance for late reports. A time alone would rely on the rough friction.
 
 
-_LONGEST = 2.0            # times the planned coasting, at most: friction may have been taken too high
+_LONGEST = 2.0            # times the planned coasting, at most: the friction may be overestimated
 
 
 def run_swings(
@@ -217,7 +218,7 @@ def run_swings(
     assumptions: ControlAssumptions,
     announce: Announce,
 ) -> None:
-    """All of it. Raises what the bench raises. The slow loop stands still while the shaft coasts."""
+    """Run the whole plan. Raises what the bench raises. The slow loop is frozen while the shaft coasts."""
     announce(Excitation(plan.kind, plan.mode))
     follower = Follower(loop, limits, Mode(plan.mode), control)
     follower.follow(_calm(plan.start_rad_s, plan.guess), CALM_S)
@@ -235,9 +236,9 @@ def _calm(speed_rad_s: float, guess: RigGuess) -> Callable[[float], tuple[float,
 
 
 def _coast(loop: ControlLoop, way: SpeedChange, follower: Follower, assumptions: ControlAssumptions) -> None:
-    """Zero torque down to the lower speed."""
+    """Command zero torque down to the lower speed."""
     command = Command(Mode.TORQUE, way.to_rad_s, 0.0)
-    # The report comes late, so that the shaft is slower already: by half of the longest plausible lag, say.
+    # Reports are late, so the shaft is already slower: half of the longest plausible lag is assumed.
     late_s = 0.5 * assumptions.largest_speed_lag_s + loop.period_s
     stop_at = way.to_rad_s + late_s * way.guess.steady_torque_nm(way.to_rad_s) / way.guess.inertia_kg_m2
     end_s = follower.time_s + _LONGEST * way.duration_s

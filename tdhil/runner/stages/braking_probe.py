@@ -1,10 +1,10 @@
 """The braking probe: one small braking torque at low speed, before any motion in torque mode depends on its sign.
 
-The sign probe of stage 1 only ever pushes forward. A drive (or a profile) that takes a torque setpoint below zero for
-one above it passes that, and would speed the shaft up where it is to brake it. Stage 2 ends at its lower speed; there,
-at the beginning of stage 3, a pulse is tried whose worst is known beforehand (`plan_pulse`), and the answer awaited
-(`BrakingListener`). Before it has been given, and in the whole run where there is no safe pulse, the guard lets no
-torque below zero through in torque mode.
+The sign probe of stage 1 only pushes forward. A drive (or a profile) that reads a torque setpoint below zero as one
+above it passes that, and would accelerate the shaft where it should brake. Stage 2 ends at its lower speed. There, at
+the beginning of stage 3, a pulse is tried whose worst effect is known in advance (`plan_pulse`), and the response
+awaited (`BrakingListener`). Before that, and in the whole run if there is no safe pulse, the guard lets no torque below
+zero through in torque mode.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from enum import Enum
 import numpy as np
 
 from drivers import Command, Mode, PreflightRefused, Sample
+from profiles import MessageCode
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.guard import LIGHTEN
@@ -26,72 +27,72 @@ from tdhil.runner.stages.speed import SpeedResult, mean_speeds, ramp_speed
 from tdhil.runner.stages.steady import CALM_S, WINDOW_S, calm_string, swing_of, trace, wait_until_steady, widest
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The braking probe's pulse: how strong, how long, and what it would do on a drive that takes it the wrong way. Pure.
+# The pulse of the braking probe: its torque, duration and worst effect on a drive that inverts it. Pure.
 #
-# A drive that reads its signed torque setpoint as unsigned takes every braking torque for full torque forward. So one
-# braking torque is tried at low speed, for a time that is fixed before it begins: nothing that the drive reports has
-# to come in time for it to end. With
+# A drive that reads its signed torque setpoint as unsigned turns every braking torque into full torque forward. So one
+# braking torque is tried at low speed, for a time that is fixed before it begins: its end does not depend on any report
+# of the drive. With
 #
-#     ω_0 the speed, T_f the torque that flows (friction), T_b the braking torque, t_p how long it is asked for,
+#     ω_0 the speed, T_f the flowing torque (friction), T_b the braking torque, t_p its duration,
 #     t_r the reaction time, from a setpoint to the torque that follows it (a lost frame included), J_min the smallest
-#     inertia that the rough one leaves open, T_lim the torque limit that the drive has confirmed in preflight,
+#     plausible inertia from the rough one, T_lim the torque limit that the drive has confirmed in preflight,
 #
-# the most that a misreading can do is T_lim forward from the first braking setpoint until the one behind the last has
-# acted, with no friction at all, and that must stay well below the speed limit:
+# the worst effect of a misreading is T_lim forward, without friction, from the first braking setpoint until the one
+# after the last has acted, and that must stay well below the speed limit:
 #
 #     ω_0 + T_lim / J_min · (t_p + t_r)  ≤  ω_0 + 0.8 (ω_max − ω_0)                                            (up)
 #
-# On a drive that takes it rightly the shaft must stay in its window, and turn forward; t_c is a cycle, which may be
+# On a drive that reads it correctly the shaft must stay in its window, and turn forward; t_c is a cycle, which may be
 # lost:
 #
 #     ω_0 − (T_f + T_b) / J_min · (t_p + t_c)  ≥  ω_0 − 0.6 (ω_0 − ω_min)                                      (down)
 #
-# and the guard, which looks t_r and the longest reporting lag τ ahead, must not see it turn back: T_b is what
-# friction holds at standstill, or less than would take the shaft there in t_r + τ. The change by which the answer is
-# known, (T_f + T_b) t_p / J, must stand out of the noise. A shaft for which that can't be had gets no braking torque
-# at all, in the whole run.
+# and the guard, which looks t_r and the longest reporting lag τ ahead, must not predict reverse rotation: T_b is below
+# the friction at standstill, or too small to stop the shaft within t_r + τ. The change that shows the response,
+# (T_f + T_b) t_p / J, must exceed the noise clearly. If that is impossible, the shaft gets no braking torque in the
+# whole run.
 #
-# With a drill string the torque comes down and up again on ramps, of torque_ramp_nm_s or, where friction would bring
-# the shaft to rest meanwhile, as slow as half a second each allows. That ramp is for letting go of trapped torque for
-# good; here the string keeps its twist, since the shaft neither stops nor turns back.
+# With a drill string the torque comes down and up again on ramps, of torque_ramp_nm_s or, where friction would stop the
+# shaft meanwhile, at most half a second each. That ramp is meant for releasing trapped torque completely; here the
+# string keeps its twist, since the shaft neither stops nor turns back.
 #
-# A string that swings pushes and brakes on its own. It is damped beforehand; what is left of its swing, at its worst
-# for all of the pulse, counts as noise of the speed, and where that hides the answer there is no pulse.
+# An oscillating string pushes and brakes by itself. It is damped first. Its remaining oscillation, at its worst for the
+# whole pulse, counts as noise of the speed. If that hides the response, there is no pulse.
 
 
 UP_SHARE, DOWN_SHARE = 0.8, 0.6
 SEEN_SHARE = 0.06
-"""The change of speed that is aimed at, as a share of the speed limit, where noise asks for no more."""
+"""Intended change of speed, as a share of the speed limit, unless noise requires more."""
 
 LEAST_SHARE = 0.15
-"""Of the torque limit, that the braking torque should have at least; else it is as strong as what flows."""
+"""Least braking torque as a share of the torque limit, unless the flowing torque is larger."""
 
 LEAST_FLOWING_SHARE = 0.5
-"""Of what flows. With less, a drive that takes the size without the sign would slow down almost as much."""
+"""Share of the flowing torque. Below it, a drive that ignores the sign would slow down almost as much."""
 
 HELD_SHARE = 0.9
-"""Of the friction that holds the shaft at standstill."""
+"""Share of the friction that holds the shaft at standstill."""
 
 LONGEST_S = 1.0
 STRING_EDGE_S = 0.5
 CLEAR, WANTED_CLEAR = 2.0, 6.0
-"""The change must be, and should be, so many times what counts as noise."""
+"""Required and preferred ratio of the change to the noise."""
 
 STRING_CLEAR = 4.0
-"""The change of torque must be so many times what the string swings by: until the answer is heard, it pushes for about
-twice as long as the pulse."""
+"""Required ratio of the change of torque to the string's oscillation: the string pushes for about twice the duration of
+the pulse until the response is known."""
 
 
 CLEAR_WANDER, WANTED_WANDER = 1.25, 2.0
-"""As `CLEAR` and `WANTED_CLEAR`, of what a restless string takes the shaft from its mean by while nobody holds it:
-noise of the report is gone in a cycle, and this goes on until the answer is heard."""
+"""The ratios `CLEAR` and `WANTED_CLEAR` for the deviation that an oscillating string causes at constant torque: noise
+of the report lasts one cycle, but this lasts until the response is known."""
 
 
 @dataclass(frozen=True)
 class Pulse:
     """``torque_nm`` is the braking torque, below zero. ``cycles`` at it, and the ``edge_cycles`` of each ramp.
 
-    ``slowing_rad_s``: by how much it slows the shaft. ``highest_rad_s``: what the wrong reading would come to at worst.
+    ``slowing_rad_s``: expected loss of speed. ``highest_rad_s``: highest speed if the drive inverts it.
     """
 
     flowing_nm: float
@@ -102,7 +103,7 @@ class Pulse:
     highest_rad_s: float
 
     def setpoints_nm(self) -> list[float]:
-        """One a cycle, from the first below what flows to the one that is what flows again."""
+        """Return one setpoint per cycle, from the first below the flowing torque back to the flowing torque."""
         step_nm = (self.torque_nm - self.flowing_nm) / (self.edge_cycles + 1)
         edge = [self.flowing_nm + step_nm * (n + 1) for n in range(self.edge_cycles)]
         return [*edge, *[self.torque_nm] * self.cycles, *reversed(edge), self.flowing_nm]
@@ -110,7 +111,7 @@ class Pulse:
 
 @dataclass(frozen=True)
 class NoPulse:
-    """Why there is none that is safe and can be seen, and what would help."""
+    """Why no pulse is safe and detectable, and what would help."""
 
     why: str
     next_step: str
@@ -118,10 +119,10 @@ class NoPulse:
 
 @dataclass(frozen=True)
 class Before:
-    """The steady rotation that it starts from: what flows (less its offset), and what counts as noise of a report.
+    """The steady rotation before the pulse: flowing torque (without its offset), and noise of the reported speed.
 
-    ``swing_nm``: what a drill string on it may push with meanwhile, either way; ``wander_rad_s``: how far it takes the
-    shaft from its mean.
+    ``swing_nm``: torque amplitude of an oscillating drill string; ``wander_rad_s``: the deviation of the shaft from its
+    mean speed that the string causes.
     """
 
     speed_rad_s: float
@@ -134,7 +135,7 @@ class Before:
 def plan_pulse(
     limits: MachineLimits, model: RigGuess, assumptions: ControlAssumptions, before: Before, period_s: float
 ) -> Pulse | NoPulse:
-    """The pulse for this shaft on this line (``period_s`` a cycle)."""
+    """Return the pulse for this shaft with cycles of ``period_s``."""
     lightest = assumptions.smallest_inertia_share * model.inertia_kg_m2
     reaction_s = assumptions.reaction_s
     room_up = UP_SHARE * (limits.speed_max_rad_s - before.speed_rad_s)
@@ -155,8 +156,8 @@ def plan_pulse(
     if up_s < period_s:
         bearable_nm = room_up * lightest / (reaction_s + period_s)
         return NoPulse(
-            f"{limits.torque_nm:g} N·m, the torque limit, could speed a shaft of {model.inertia_kg_m2:.3g} kg·m² up to "
-            f"its limit within {reaction_s + period_s:.2g} s, should the drive take a braking torque the wrong way",
+            f"if the drive inverts a braking torque, the torque limit of {limits.torque_nm:g} N·m could accelerate a "
+            f"shaft of {model.inertia_kg_m2:.3g} kg·m² to its speed limit within {reaction_s + period_s:.2g} s",
             f"Lower limits.torque_nm to {bearable_nm:.2g} N·m or less, if that moves the shaft; else use --mode speed",
         )
     if down_s < period_s:
@@ -171,32 +172,32 @@ def plan_pulse(
     wanted_s = wanted_rad_s * model.inertia_kg_m2 / change_nm
     longest_s = min(max(wanted_s, period_s), LONGEST_S, up_s, down_s)
     edge = _edge_cycles(limits, change_nm, min(up_s, down_s), period_s)
-    # Both edges together change as much as the full torque would in the time of one, and both may be misread.
+    # Both ramps together act like the full torque for the time of one, and both may be misread.
     cycles = max(1, min(_whole(longest_s, period_s) - edge, _whole(up_s, period_s) - 2 * edge))
     slowing = change_nm * (cycles + edge) * period_s / model.inertia_kg_m2
     if slowing < CLEAR * before.speed_noise_rad_s or braking_nm < LEAST_FLOWING_SHARE * before.flowing_nm:
         return NoPulse(
-            f"{braking_nm:.3g} N·m would slow the shaft by {slowing:.2g} rad/s, too little to tell",
+            f"{braking_nm:.3g} N·m would slow the shaft by {slowing:.2g} rad/s, too little to detect",
             "Use --mode speed, or raise limits.probe_torque_nm",
         )
     exposed_s = (cycles + 2 * edge) * period_s + reaction_s
     if change_nm < STRING_CLEAR * before.swing_nm:
         return NoPulse(
-            f"the string swings by ±{before.swing_nm:.3g} N·m, which would hide what {change_nm:.3g} N·m do to it",
-            "Use --mode speed, or let the string come to rest: lift the bit off bottom, or take weight off it",
+            f"the string's oscillation of ±{before.swing_nm:.3g} N·m would hide the effect of {change_nm:.3g} N·m",
+            "Use --mode speed, or let the string come to rest: lift the bit off bottom, or reduce the weight on bit",
         )
     if slowing < CLEAR_WANDER * before.wander_rad_s:
         return NoPulse(
-            f"the string takes the shaft ±{before.wander_rad_s:.2g} rad/s from its mean, which would hide the"
-            f" {slowing:.2g} rad/s that {braking_nm:.3g} N·m would slow it by",
-            f"{LIGHTEN}; a lower limits.torque_nm would allow a longer one; or use --mode speed",
+            f"the string moves the shaft ±{before.wander_rad_s:.2g} rad/s from its mean speed, which would hide the"
+            f" {slowing:.2g} rad/s by which {braking_nm:.3g} N·m would slow it",
+            f"{LIGHTEN}. A lower limits.torque_nm would allow a longer pulse. Or use --mode speed",
         )
     highest = before.speed_rad_s + limits.torque_nm / lightest * exposed_s
     return Pulse(before.flowing_nm, -braking_nm, cycles, edge, slowing, highest)
 
 
 def _edge_cycles(limits: MachineLimits, change_nm: float, longest_s: float, period_s: float) -> int:
-    """Cycles of a ramp down or up, none without a string; both, and a cycle between, take ``longest_s`` at most."""
+    """Return the cycles of a ramp, none without a string; both ramps and a cycle take at most ``longest_s``."""
     if not limits.winds_up:
         return 0
     wanted_s = change_nm / limits.torque_ramp_nm_s if limits.torque_ramp_nm_s > 0.0 else STRING_EDGE_S
@@ -205,51 +206,51 @@ def _edge_cycles(limits: MachineLimits, change_nm: float, longest_s: float, peri
 
 
 def _whole(time_s: float, period_s: float) -> int:
-    """Whole cycles in a time."""
+    """Return the whole cycles in a time."""
     return math.floor(time_s / period_s + 1e-9)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a shaft answers to a braking torque: slower, faster or nothing. Pure; fed with one sample a cycle.
+# The response of a shaft to a braking torque: slower, faster or none. Pure; it receives one sample per cycle.
 #
-# The reported speed decides, since it is the shaft itself: whichever comes first, half of the expected change
-# downwards or as much upwards. Reported torque and torque demand are quicker: should either clearly rise, it is over
-# at once. That they fall proves nothing about the shaft, and is no condition.
+# The reported speed decides, since it is the shaft itself: whichever comes first, half of the expected change downwards
+# or as much upwards. Reported torque and torque demand are quicker: if either clearly rises, the probe ends at once. A
+# falling torque proves nothing about the shaft, and is no condition.
 #
-# A demand that is reported may still be that of the speed loop when torque mode has just been displayed: it counts once
-# it has followed the switch, or would have had to.
+# A reported demand may still be that of the speed loop when torque mode has just been displayed. It counts once it has
+# followed the switch, or should have.
 
 
 MEAN_S = 0.05
-"""What is looked at is a mean over this time, or one sample where that is longer."""
+"""Averaging time, s; one sample if a cycle is longer."""
 
 SPEED_SHARE, ANSWER_TORQUE_SHARE = 0.5, 0.3
-"""Of the expected change, that counts as one."""
+"""Share of the expected change that counts as a response."""
 
 NOISE_SD, NOISE_QUANTA = 3.0, 1.5
-"""Standard deviations, or quanta, that don't count as a change."""
+"""Standard deviations, or quanta, that do not count as a change."""
 
 
 class BrakingAnswer(Enum):
-    """Which way the shaft went."""
+    """The direction of the response."""
 
     SLOWER = "slower"
     FASTER = "faster"
 
 
 def speed_noise_rad_s(steady: Sequence[Sample], resolution_rad_s: float) -> float:
-    """What counts as noise of the reported speed, rad/s, from samples of steady rotation."""
+    """Return the noise of the reported speed, rad/s, from samples of steady rotation."""
     return max(NOISE_SD * float(trace(steady).speed_rad_s.std()), NOISE_QUANTA * resolution_rad_s)
 
 
 class BrakingListener:
-    """Compares what comes with the steady rotation before; ``why`` says in words what was seen last."""
+    """Compares new samples with the steady rotation before; ``why`` describes the last change."""
 
     def __init__(
         self, pulse: Pulse, steady: Sequence[Sample], period_s: float, reaction_s: float = 0.0,
         demand_nm: float | None = None,
     ) -> None:
-        """``steady``: in speed mode; ``demand_nm``: what was seen last of the drive's demand, in torque mode."""
+        """Start with ``steady`` samples of speed mode; ``demand_nm``: the drive's last torque demand in torque mode."""
         before = trace(steady)
         self.before_rad_s = self.speed_rad_s = float(before.speed_rad_s.mean())
         self.before_nm = self.torque_nm = self.lowest_nm = float(before.torque_nm.mean())
@@ -263,7 +264,7 @@ class BrakingListener:
         self.why = ""
 
     def hear(self, sample: Sample) -> BrakingAnswer | None:
-        """None as long as it isn't clear."""
+        """Return the response; None while it is not clear."""
         if not sample.fresh:
             return None
         self._recent.append((sample.speed_rad_s, sample.torque_nm))
@@ -278,7 +279,7 @@ class BrakingListener:
             return BrakingAnswer.FASTER
         demand = sample.torque_demand_nm
         risen = demand is not None and demand >= self._pulse.flowing_nm + self._rise_nm
-        # Deaf at most until the reaction time is over, and no longer than until the demand has once been what flows.
+        # Ignore the demand at most for the reaction time, and only until it has once equalled the flowing torque.
         self._demand_deaf = self._demand_deaf - 1 if risen or demand is None else 0
         if risen and self._demand_deaf <= 0:
             self.why = f"the drive's torque demand went from {self._pulse.flowing_nm:.1f} to {demand:.1f} N·m"
@@ -291,21 +292,21 @@ class BrakingListener:
 # ---------------------------------------------------------------------------------------------------------------------
 
 NOT_YET = "no braking torque has been tried yet"
-"""Why the guard lets none through until then."""
+"""Reason of the guard until the probe."""
 
 TRIES = 2
 STEADY_S = 1.0
 RAMP_S = 5.0
-"""Slowing down over the whole window takes so long, or longer on a heavy shaft."""
+"""Time to slow down over the whole window, s; longer for a heavy shaft."""
 
 TORQUE_SHARE = 0.25
-"""Of the torque limit, that slowing down may take."""
+"""Share of the torque limit that slowing down may use."""
 
 
 def slow_speed(limits: MachineLimits, wander_rad_s: float = 0.0) -> float:
-    """The speed of the probe, rad/s: the lower one of stage 2 if the shaft turns forward there.
+    """Return the speed of the probe, rad/s: the lower one of stage 2 if the shaft turns forward there.
 
-    Above a string that takes the shaft ``wander_rad_s`` from its mean so much faster, up to the middle of the window.
+    It is raised by ``wander_rad_s``, the deviation that a string causes, up to the middle of the window.
     """
     low_rad_s, high_rad_s = mean_speeds(limits)
     if low_rad_s <= 0.0:
@@ -318,10 +319,10 @@ def slow_down(
     loop: ControlLoop, limits: MachineLimits, speed: SpeedResult, assumptions: ControlAssumptions,
     speed_resolution_rad_s: float,
 ) -> tuple[tuple[Sample, ...], SpeedResult]:
-    """Down to the probe's speed in speed mode; the samples of steady rotation there, and what is known by now.
+    """Slow down to the probe's speed in speed mode. Return the steady samples there, and the updated result of stage 2.
 
-    Of a drill string so many samples that its swing shows in them, and averages out where it gets no calmer. Where it
-    swings further than it did before, the probe is tried so much faster. LimitHit if there is no steady rotation.
+    With a drill string the samples cover its oscillation, and average it out if it does not decay. If it oscillates
+    more than before, the probe speed is raised. Raises LimitHit if there is no steady rotation.
     """
     tolerance = max(2.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
     target = _ramp_to(loop, limits, speed, speed.high.speed_rad_s)
@@ -342,7 +343,7 @@ def slow_down(
 
 
 def _ramp_to(loop: ControlLoop, limits: MachineLimits, speed: SpeedResult, from_rad_s: float) -> float:
-    """To the probe's speed, in speed mode; that speed, rad/s."""
+    """Ramp to the probe's speed, in speed mode. Return that speed, rad/s."""
     target = slow_speed(limits, speed.wander_rad_s)
     span = limits.speed_max_rad_s - max(0.0, limits.speed_min_rad_s)
     rate = min(span / RAMP_S, TORQUE_SHARE * limits.torque_nm / speed.model.inertia_kg_m2)
@@ -355,14 +356,15 @@ def probe_braking(
     steady: Sequence[Sample],
     flowing_nm: float, speed_resolution_rad_s: float, where: str, wander_rad_s: float = 0.0,
 ) -> list[Sample]:
-    """Try it, in torque mode, at ``flowing_nm`` and the speed of ``steady``; its samples, none if no pulse is safe.
+    """Try the pulse in torque mode, at ``flowing_nm`` and the speed of ``steady``. Return its samples; none if not
+    safe.
 
-    Where neither slower nor faster is clear it is tried once more. Raises PreflightRefused, naming ``where``, on any
-    answer but a slower shaft; and what the bench raises.
+    It is tried once more if the response is not clear. Raises PreflightRefused, with ``where``, for any response but a
+    slower shaft, and the errors of the bench.
     """
     samples: list[Sample] = []
     unclear = ""
-    # Under speed control the torque shows what the string does; behind the switch it is what is commanded.
+    # Under speed control the torque shows the string; after the switch it is the commanded torque.
     swing_nm = swing_of(steady, loop.period_s).torque_nm if limits.winds_up else 0.0
     steady = steady[-loop.cycles(STEADY_S) :]
     for _ in range(TRIES):
@@ -379,10 +381,11 @@ def probe_braking(
         samples += seen
         if answer is BrakingAnswer.FASTER:
             raise PreflightRefused(
-                f"the drive takes a negative torque for a positive one: on {pulse.torque_nm:.1f} N·m {listener.why}",
+                f"the drive inverts a negative torque setpoint: on {pulse.torque_nm:.1f} N·m {listener.why}",
                 where=f"braking probe, {where}",
-                next_step="Is the setpoint signed there as the profile says, in two's complement, and does no direction"
-                " bit turn it round? Correct the profile or the drive's settings",
+                next_step="Check that the setpoint is signed in the drive as in the profile (two's complement), and"
+                " that no direction bit inverts it. Correct the profile or the drive's settings",
+                entry=MessageCode.BRAKING_UNCLEAR,
             )
         if answer is BrakingAnswer.SLOWER:
             loop.log.event(
@@ -395,20 +398,21 @@ def probe_braking(
     raise PreflightRefused(
         f"a braking torque does not slow the shaft: {unclear}",
         where=f"braking probe, {where}",
-        next_step="Does the drive take the size of the setpoint without its sign, or does a ramp or limit of its own"
-        " hold the torque back? Check type and direction in the profile and the drive's manual",
+        next_step="Check type and direction of the setpoint in the profile and the drive's manual: the drive may ignore"
+        " its sign, or its own ramp or limit may hold the torque back",
+        entry=MessageCode.BRAKING_UNCLEAR,
     )
 
 
 def _try(
     loop: ControlLoop, pulse: Pulse, listener: BrakingListener, speed_rad_s: float, assumptions: ControlAssumptions
 ) -> tuple[BrakingAnswer | None, list[Sample]]:
-    """The pulse in full, then what flowed before it until the reports have caught up; cut short by a faster shaft."""
+    """Send the whole pulse, then the flowing torque until the reports have caught up; stop at a faster shaft."""
     loop.log.event(
         loop.now_s, "probe",
         f"braking torque tried at {speed_rad_s:.2f} rad/s: {pulse.torque_nm:.1f} N·m for"
-        f" {pulse.cycles * loop.period_s:.2g} s (taken for full torque forward it would lead to"
-        f" {pulse.highest_rad_s:.2f} rad/s at most)",
+        f" {pulse.cycles * loop.period_s:.2g} s (if the drive inverted it, the speed would reach at most"
+        f" {pulse.highest_rad_s:.2f} rad/s)",
     )
     loop.guard.no_braking = ""
     answer: BrakingAnswer | None = None

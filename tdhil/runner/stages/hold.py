@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from drivers import Command, LimitHit, Mode
+from profiles import MessageCode
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.guard import LIGHTEN, kept_within
@@ -13,7 +14,7 @@ from tdhil.runner.settings import ControlAssumptions, MachineLimits
 # ---------------------------------------------------------------------------------------------------------------------
 # The host's slow control of the mean speed in torque mode. Pure: time and speed are handed in.
 #
-# A host loop as fast as a drive's own would ring or diverge behind a reported-speed lag τ_w of 0.4 s. With the
+# A host loop as fast as a drive's own would oscillate or diverge behind a reported-speed lag τ_w of 0.4 s. With the
 # plant 1/(J s + B), the lag 1/(1 + τ_w s) and
 #
 #     T = K_p e + K_i ∫e dt        K_p = J ω_b,  K_i = K_p ω_b / 4,  ω_b = 0.2 / τ_w
@@ -23,7 +24,7 @@ from tdhil.runner.settings import ControlAssumptions, MachineLimits
 
 
 class MeanSpeedControl:
-    """PI with clamping anti-windup; the torque it may add is bounded by ``authority_nm``."""
+    """PI control with clamping anti-windup; its torque is limited to ``authority_nm``."""
 
     def __init__(self, model: RigGuess, authority_nm: float, assumptions: ControlAssumptions) -> None:
         bandwidth_rad_s = 0.2 / assumptions.largest_speed_lag_s
@@ -33,7 +34,7 @@ class MeanSpeedControl:
         self._integral_nm = 0.0
 
     def update(self, error_rad_s: float, dt_s: float) -> float:
-        """Torque to add, N·m, for the speed error (wanted minus reported) of this cycle."""
+        """Return the torque to add, N·m, for the speed error (setpoint minus reported) of this cycle."""
         integral = self._integral_nm + self._ki * error_rad_s * dt_s
         torque = self._kp * error_rad_s + integral
         if abs(torque) > self._authority_nm:
@@ -51,7 +52,7 @@ WINDOW_SHARE = 0.02
 SETTLED_S = 3.0
 MEAN_S = 1.0
 TIMEOUT_S = 90.0
-"""Beyond the ramp, which takes a heavy shaft long."""
+"""Longest settling after the ramp, s."""
 
 
 def run_hold(
@@ -66,9 +67,9 @@ def run_hold(
 ) -> None:
     """Bring the mean speed into a window of 2 % and keep it there for 3 s, in torque mode.
 
-    ``wander_rad_s``: how far a drill string under load takes it from there anyhow, which is as near as it gets.
+    ``wander_rad_s``: deviation that a drill string under load causes; the window is at least this wide.
 
-    The wanted speed is ramped from where the shaft is, at a rate that takes a quarter of the torque limit.
+    The setpoint is ramped from the present speed, at a rate that needs a quarter of the torque limit.
     """
     tolerance_rad_s = max(3.0 * speed_resolution_rad_s, WINDOW_SHARE * target_rad_s, wander_rad_s)
     recent: deque[float] = deque(maxlen=loop.cycles(MEAN_S))
@@ -98,5 +99,6 @@ def run_hold(
         where="stage hold",
         next_step=LIGHTEN
         if loop.guard.disturbed
-        else "Does the load change by itself, or does a brake drag? Look at speed and torque in the log",
+        else "Check in the log whether the load changes or a brake drags",
+        entry=MessageCode.NOT_SETTLED,
     )

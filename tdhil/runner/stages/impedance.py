@@ -1,9 +1,9 @@
-"""Stages 4 and 5 of a run that measures the drive's own impedance: small at first, then as much as there is room for.
+"""Stages 4 and 5 of a measurement of the drive's own impedance: a small pilot first, then the full amplitude.
 
-The drive stays in its speed loop. By the *reference* it follows a multisine as in any run in speed mode (`acquire`). By
-the *torque offset* its reference stands, and a multisine of torque is added to its loop's: how far the shaft then goes
-nobody knows beforehand, since that is what is measured. So stage 4 is a pilot, with a twentieth of the torque limit;
-what speed and torque do in it scales stage 5. The guard holds offset, speed window and torque all the while.
+The drive stays in its speed loop. With the *reference* it follows a multisine as in any run in speed mode (`acquire`).
+With the *torque offset* its reference is constant, and a multisine of torque is added to its loop's. The resulting
+motion is unknown in advance, since it is measured. So stage 4 is a pilot with a twentieth of the torque limit; its
+speed and torque scale stage 5. The guard limits offset, speed window and torque all the time.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import Command, LimitHit, Mode, Sample
+from profiles import MessageCode
 from tdhil.recording import Excitation, Segment
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import (
@@ -38,25 +39,25 @@ from tdhil.runner.stages.steady import trace, wait_until_steady
 HARMONICS = (1, 2, 3, 5, 7, 10, 14, 20, 30)
 PHASES_RAD = (0.4081, 5.3094, 1.6031, 0.07, 3.2103, 0.7969, 5.0826, 4.208, 5.651)
 """Equal lines with them have a crest of 1.75: found by a search with growing p-norms."""
-PERIOD_S = 20.0            # lines of 0.05 to 1.5 Hz: where strings swing, and where speed loops end
-COUNTED, SETTLE = 24, 2    # periods; the offset is faded in over the first of those that settle
-DRAWS, SHARPNESS = 400, 1.0   # of phases, of which the best is taken; how much the lines follow what |r| hangs on
+PERIOD_S = 20.0            # lines of 0.05 to 1.5 Hz: from string modes to the bandwidth of speed loops
+COUNTED, SETTLE = 24, 2    # periods; the offset is faded in over the first settling period
+DRAWS, SHARPNESS = 400, 1.0   # random sets of phases, the best is used; weight of the lines that determine |r|
 
 LARGEST_SHARE = 0.4
-"""Of the torque limit, that an offset may be at most; the rest is the speed loop's."""
+"""Largest offset as a share of the torque limit; the rest is for the speed loop."""
 PILOT_SHARE, PILOT_PERIODS = 0.05, 2
-ROOM_SHARE = 0.9           # of the room in speed and torque, that is planned for
+ROOM_SHARE = 0.9           # share of the room in speed and torque that a plan uses
 FADE_S = 2.0               # at the end
 LEAST_COUNTED = 6
-RESERVE_S = 10.0           # of the time limit, beside what stage 5 is planned for
+RESERVE_S = 10.0           # s; reserved of the time limit, beside stage 5
 DITHER_COUNTS, DITHER_TURNS = 3.0, 6.0 * 1.0103
-"""A small sine on the reference, in counts of the reported speed and turns a period: no whole number, and far from
-every line. Without it a stiff loop's few counts of speed are rounded alike in every period."""
+"""A small sine on the reference: amplitude in counts of the reported speed, and cycles per period (no whole number, far
+from every line). Without it a stiff loop's few counts of speed are rounded alike in every period."""
 
 
 @dataclass(frozen=True)
 class OffsetPlan:
-    """``plan`` is what the shaft is expected to do, for people and the log; the torque's lines are the command."""
+    """``plan`` is the expected motion, for display and log; the lines of torque are the command."""
 
     plan: Plan
     torque_amplitudes_nm: tuple[float, ...]
@@ -64,7 +65,7 @@ class OffsetPlan:
 
     @property
     def phases_rad(self) -> tuple[float, ...]:
-        """Of the torque's lines."""
+        """Return the phases of the torque's lines, rad."""
         return self.segment.reference.phases_rad
 
     @property
@@ -76,14 +77,14 @@ Announce = Callable[[Excitation], None]
 
 
 def largest_offset_nm(limits: MachineLimits) -> float:
-    """What a torque offset may be at most, N·m."""
+    """Return the largest torque offset, N·m."""
     return LARGEST_SHARE * limits.torque_nm
 
 
 def reference_plan(limits: MotionLimits, guess: RigGuess, wish: PlanRequest) -> Plan:
-    """The multisine of the speed reference: lines that take about equal torque, about one mean speed.
+    """Return the multisine of the speed reference: lines of about equal torque, at one mean speed.
 
-    Raises PlanRefused where it doesn't fit.
+    Raises PlanRefused if it does not fit.
     """
     omega = 2.0 * math.pi * np.asarray(HARMONICS) / PERIOD_S
     shape = unit_peak(Shape(HARMONICS, tuple(1.0 / np.hypot(1.0, omega)), PHASES_RAD))
@@ -104,9 +105,9 @@ def run_pilot(
     string_nm_s_rad: float,
     speed_resolution_rad_s: float,
 ) -> OffsetPlan:
-    """Stage 4: to the mean speed, the pilot there, and the plan of stage 5. Raises what the bench raises, and LimitHit.
+    """Run stage 4: go to the mean speed, run the pilot, and plan stage 5. Raises what the bench raises, and LimitHit.
 
-    ``string_nm_s_rad``: ζ at the motor, 0 where none is known. The guard takes offsets from here until the run ends.
+    ``string_nm_s_rad``: ζ at the motor, 0 if unknown. The guard permits offsets from here until the run ends.
     """
     middle = 0.5 * (limits.speed_min_rad_s + limits.speed_max_rad_s)
     mean = wish.offsets_rad_s[0] if wish.offsets_rad_s else middle
@@ -130,7 +131,7 @@ def run_pilot(
 
 
 def run_offset(loop: ControlLoop, plan: OffsetPlan, announce: Announce, speed_resolution_rad_s: float) -> None:
-    """Stage 5 by the torque offset, which is faded in and at the end faded out."""
+    """Run stage 5 with the torque offset, which is faded in, and faded out at the end."""
     segment = plan.segment
     sizes, mean = np.asarray(plan.torque_amplitudes_nm), segment.reference.offset_rad_s
     drive = _WaveSender(loop, _ExcitationWave(sizes, plan.phases_rad, mean, speed_resolution_rad_s))
@@ -173,12 +174,12 @@ _GRID = np.exp(2j * np.pi * np.outer(np.arange(1024), HARMONICS) / 1024)
 
 
 def _peak(lines: NDArray[Any], phases_rad: Sequence[float]) -> float:
-    """Largest magnitude over a period of Σ Re a_k e^(j(ω_k t + φ_k)), of complex a_k."""
+    """Return the largest magnitude over a period of Σ Re a_k e^(j(ω_k t + φ_k)), with complex a_k."""
     return float(np.max(np.abs((_GRID @ (lines * np.exp(1j * np.asarray(phases_rad)))).real)))
 
 
 class _WaveSender:
-    """Sends a wave, cycle by cycle, counted from its beginning."""
+    """Sends a wave, cycle by cycle, timed from its beginning."""
 
     def __init__(self, loop: ControlLoop, wave: _ExcitationWave) -> None:
         self._loop, self._wave = loop, wave
@@ -187,7 +188,7 @@ class _WaveSender:
         self._start_s = self.time_s + loop.period_s
 
     def run(self, duration_s: float, fade_in_s: float) -> list[Sample]:
-        """So long from the start, a share of the offset while it is faded in."""
+        """Send the wave for a duration from its start, fading the offset in. Return the samples."""
         end_s, samples = self._start_s + duration_s, []
         while self.time_s + 1.5 * self._loop.period_s < end_s:
             at_s = self.time_s + self._loop.period_s - self._start_s
@@ -195,7 +196,7 @@ class _WaveSender:
         return samples
 
     def fade_out(self, fade_s: float) -> None:
-        """To no offset; it goes on until then."""
+        """Fade the offset out while the wave continues."""
         begun_s = self.time_s
         while self.time_s - begun_s < fade_s:
             at_s = self.time_s + self._loop.period_s
@@ -214,7 +215,7 @@ class _WaveSender:
 
 
 def _answer(samples: list[Sample]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Lines of the reported speed and torque over the pilot's last period, for offset lines of phase 0, (K,)."""
+    """Return the lines of speed and torque over the pilot's last period, for offset lines of phase 0, (K,)."""
     seen = trace(samples)
     omega = 2.0 * np.pi * np.asarray(HARMONICS) / PERIOD_S
     table = np.exp(-1j * (np.outer(seen.time_s - seen.time_s[0], omega) + np.asarray(PHASES_RAD)))
@@ -236,16 +237,16 @@ def _planned(
     largest_nm: float,
     most_periods: int,
 ) -> OffsetPlan:
-    """Stage 5, all of it in proportion to the pilot. What is reported is smaller than what is, by the longest lag.
+    """Plan stage 5 in proportion to the pilot. The reported motion is smaller than the true one because of the lag.
 
-    Of some phases drawn (always the same ones) those are taken with which the largest offset fits.
+    Of some random sets of phases (always the same ones) the one with the largest possible offset is used.
     """
     omega = 2.0 * np.pi * np.asarray(HARMONICS) / PERIOD_S
     speed = answer[0] / pilot_nm * np.hypot(1.0, omega * largest_lag_s)
     torque = np.where(np.abs(answer[1]) > pilot_nm, answer[1] / pilot_nm, 1.0)
     z = 1.0 / np.maximum(np.abs(speed), 1e-9)
     zeta = string_nm_s_rad or float(np.min(z))
-    # where |r| hangs most on Z the offset is largest: |dr/d ln Z| = 2ζ|Z|/|Z + ζ|²
+    # the offset is largest where |r| depends most on Z: |dr/d ln Z| = 2ζ|Z|/|Z + ζ|²
     shares = (2.0 * zeta * z / (z**2 + zeta**2)) ** SHARPNESS
     steady = guess.steady_torque_nm(mean_rad_s)
     speed_room = min(mean_rad_s - room.usable_low_rad_s, room.usable_high_rad_s - mean_rad_s)
@@ -265,15 +266,17 @@ def _planned(
             scale, phases_rad = fits, drawn
     if not scale > 0.0:
         raise LimitHit(
-            f"no room for a torque offset about {mean_rad_s:.2f} rad/s", where="plan of stage 5",
-            next_step="The shaft was stopped. It needs a wider speed window, or more of limits.torque_nm",
+            f"the limits leave no room for a torque offset at {mean_rad_s:.2f} rad/s", where="plan of stage 5",
+            next_step="The shaft was stopped. Widen the speed window, or raise limits.torque_nm",
+            entry=MessageCode.NO_ROOM_FOR_MOTION,
         )
     periods = min(wish.periods or SETTLE + COUNTED, most_periods)
     if periods < SETTLE + LEAST_COUNTED:
         raise LimitHit(
-            f"{periods} periods of {PERIOD_S:g} s are too few: {SETTLE} settle, and {LEAST_COUNTED} must be left",
+            f"{periods} periods of {PERIOD_S:g} s are too few: {SETTLE} settle, and {LEAST_COUNTED} must follow",
             where="--periods, and limits.time_s in rig.yaml",
-            next_step=f"The shaft was stopped. It takes {SETTLE + LEAST_COUNTED} or more",
+            next_step=f"The shaft was stopped. Use {SETTLE + LEAST_COUNTED} or more",
+            entry=MessageCode.NO_ROOM_FOR_MOTION,
         )
     swing, pull, peak = (_peak(scale * lines, phases_rad) for _, lines in limits)
     reference = PeriodicReference(

@@ -1,8 +1,8 @@
 """Stage 1, setup: offsets at standstill, and the sign probe. Connecting and preflight come before it.
 
-The probe ramps torque until the shaft moves or the probe limit is reached, forward only and over a bounded
-travel: a drive whose torque and speed disagree in sign would run away in torque mode, and this is where it shows
-at walking pace.
+The probe ramps torque until the shaft moves or the probe limit is reached, forward only and over a limited
+travel. A drive whose torque and speed disagree in sign would run away in torque mode; the probe detects this
+at very low speed.
 """
 
 from __future__ import annotations
@@ -10,32 +10,35 @@ from __future__ import annotations
 from collections import deque
 
 from drivers import Command, LimitHit, Mode, PreflightRefused
+from profiles import MessageCode
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.settings import MachineLimits
 from tdhil.runner.stages.steady import trace
 
 STANDSTILL_S = 1.0
 RAMP_S = 5.0
-"""The probe torque is reached after this long, if nothing moves before."""
+"""Time to reach the probe torque, if nothing moves before, s."""
 TORQUE_SEEN_S = 0.5
-"""A torque beyond the probe's, in speed mode, ends it after so long; and the torque is off again after so long, s."""
+"""Time, s, after which a torque above the probe's ends the probe in speed mode; time of zero torque at its end."""
 
 
 def measure_offsets(loop: ControlLoop, limits: MachineLimits) -> tuple[float, float]:
-    """Mean reported speed and torque at standstill. Raises PreflightRefused if the shaft turns."""
+    """Return the mean reported speed and torque at standstill. Raises PreflightRefused if the shaft turns."""
     held = trace(loop.hold(Command(Mode.SPEED, 0.0, 0.0), STANDSTILL_S))
     if len(held.time_s) == 0:
-        raise PreflightRefused("no feedback from the drive", where="TPDO1", next_step="Is the node operational?")
+        raise PreflightRefused("no feedback from the drive", where="TPDO1",
+                               next_step="Check that the node is operational", entry=MessageCode.NO_FEEDBACK)
     speed = float(held.speed_rad_s.mean())
     if abs(speed) > 0.01 * limits.speed_max_rad_s:
         raise PreflightRefused(
-            f"the shaft already turns at {speed:.3f} rad/s", where="setup", next_step="Let it come to rest first"
+            f"the shaft already turns at {speed:.3f} rad/s", where="setup", next_step="Bring it to standstill first",
+            entry=MessageCode.SHAFT_TURNS,
         )
     return speed, float(held.torque_nm.mean())
 
 
 def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resolution_rad_s: float) -> float | None:
-    """Move the shaft a little; the torque at which it moved (None in speed mode).
+    """Move the shaft a little. Return the torque at which it moved (None in speed mode).
 
     Raises PreflightRefused when it turns the wrong way, or not at all.
     """
@@ -67,7 +70,7 @@ def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resol
             raise _wrong_way(mean_rad_s)
         if mean_rad_s > threshold_rad_s:
             return torque_nm if mode is Mode.TORQUE else None
-        # In speed mode the drive itself raises the torque: no further than the probe may go.
+        # In speed mode the drive raises the torque itself: at most to the probe's limit.
         if mode is Mode.SPEED and abs(sample.torque_nm) > limits.probe_torque_nm > 0.0:
             strained = strained + 1
             if strained >= loop.cycles(TORQUE_SEEN_S):
@@ -75,23 +78,26 @@ def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resol
         if abs(travel_rad) > limits.probe_travel_rad:
             _end_torque(loop, mode)
             raise PreflightRefused(
-                f"the shaft travelled {travel_rad:.2f} rad without a clear direction", where="sign probe",
-                next_step="Is the speed signal noisy, or its scale wrong?",
+                f"the shaft moved {travel_rad:.2f} rad without a clear direction, the limit is"
+                f" {limits.probe_travel_rad:g} rad", where="sign probe",
+                next_step="Check the speed signal for noise and wrong scale",
+                entry=MessageCode.SIGN_NOT_CLEAR,
             )
     _end_torque(loop, mode)
     raise PreflightRefused(
-        f"the shaft did not move up to {limits.probe_torque_nm:g} N·m"
+        f"the shaft did not move up to the limit of {limits.probe_torque_nm:g} N·m"
         if mode is Mode.TORQUE
         else f"the shaft did not follow a speed of {speed_rad_s:.3f} rad/s",
         where="sign probe",
-        next_step="Is the brake released? Else raise limits.probe_torque_nm in rig.yaml"
+        next_step="Check that the brake is released, or raise limits.probe_torque_nm in rig.yaml"
         if mode is Mode.TORQUE
-        else "Is the brake released, the drive's enable there, and its lowest speed below this one?",
+        else "Check the brake, the drive's enable input, and that its lowest speed is below this one",
+        entry=MessageCode.SHAFT_DID_NOT_MOVE,
     )
 
 
 def _end_torque(loop: ControlLoop, mode: Mode) -> None:
-    """Command zero torque before the stop: its speed control would go on with the torque that flows."""
+    """Command zero torque before the stop: its speed control would continue with the flowing torque."""
     if mode is Mode.TORQUE:
         loop.hold(Command(Mode.TORQUE, 0.0, 0.0), TORQUE_SEEN_S)
 
@@ -100,4 +106,5 @@ def _wrong_way(speed_rad_s: float) -> PreflightRefused:
     return PreflightRefused(
         f"the shaft turned backwards ({speed_rad_s:.3f} rad/s) on a forward command", where="sign probe",
         next_step="The sign of speed or torque is inverted: check encoder wiring and the drive's direction settings",
+        entry=MessageCode.DIRECTION_WRONG,
     )

@@ -1,7 +1,7 @@
 """Stage 2, speed: to n0 under the drive's own speed control, settle; then a second mean speed.
 
-The mean torque at two steady speeds gives Coulomb and viscous friction free of every lag, and the ramp between
-them a rough inertia by its balance of momentum, in which a lag cancels since both ends are steady.
+The mean torque at two steady speeds gives Coulomb and viscous friction without any lag. The ramp between them gives a
+rough inertia by its momentum balance, in which a lag cancels because both ends are steady.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers import Command, DriveFault, Mode, Sample
+from profiles import MessageCode
 from tdhil.estimation import (
     RoughFriction,
     RoughInertia,
@@ -39,43 +40,45 @@ from tdhil.runner.string_release import SwingDamper
 
 LEVEL_S = 6.0
 RESTLESS_LEVEL_S = 24.0
-"""Of a string that gets no calmer: some swings, over which they average out."""
+"""Duration of an operating point with a string that keeps oscillating, s: some periods, to average them out."""
 
 FIRST_RAMP_S = 8.0
-"""The first ramp takes this long over the whole window; a rig too light to show in it is ramped faster."""
+"""Duration of the first ramp over the whole window, s; a light rig is then ramped faster."""
 
 GOOD_ENOUGH = 0.2
-"""Relative uncertainty of the rough inertia that is good enough to plan with."""
+"""Relative uncertainty of the rough inertia that is sufficient for planning."""
 
 STRING_ERROR = 0.75
-"""Relative uncertainty of the rough inertia of a drill string's shaft: what the motor feels at a frequency is anything
-from its own inertia to all of the string's. A plan has to leave room for it, and a harder ramp tells no more."""
+"""Relative uncertainty of the rough inertia with a drill string: depending on frequency the motor feels anything from
+its
+own inertia to that of the whole string. A plan must leave room for it, and a harder ramp gives no better value."""
 
 ECHO_SHARE, BEFORE_RAMPS_S = 0.75, (6.0, 7.3, 5.2, 8.1, 6.7, 5.6)
-"""Of a string that gets no calmer: ramps between the speeds, each over this share of the time before its echo, so long
-after the one before, which differs so that what they leave swinging adds up to nothing."""
+"""With a string that keeps oscillating: ramps between the speeds, each over this share of the time before its echo, and
+the times between them, s. These differ so that the remaining oscillations add up to nothing."""
 
 RESTLESS_ERROR = 0.5
-"""As `STRING_ERROR`, of a shaft whose own inertia is known by what it did before an echo: where the string swings
-along, the motor still moves further than by its inertia alone."""
+"""The same as `STRING_ERROR`, if the shaft's own inertia follows from the time before an echo: the motor then
+moves further than by its inertia alone, because the string oscillates along."""
 
 WANDER = 1.25
-"""Under torque alone a restless shaft goes so many times as far as the furthest that it was seen to go under a speed
-control that yields."""
+"""Ratio of the deviation at constant torque to the largest deviation under a yielding speed control, with an
+oscillating
+string."""
 
 TRIES = 4
 NOBODY = SpeedWitness()
 
-_WRONG_TORQUE = "Is the sign or the scale of the torque right? A wider speed window gives a better ramp"
+_WRONG_TORQUE = "Check sign and scale of the torque. A wider speed window gives a better ramp"
 _TOO_RESTLESS = (
-    "What the string swings by hides the ramp: a wider speed window gives a better one; or lift the bit off bottom, or"
-    " take weight off it"
+    "The string's oscillation hides the ramp. Widen the speed window, lift the bit off bottom, or reduce the weight on"
+    " bit"
 )
 
 
 @dataclass(frozen=True)
 class RampCourse:
-    """Setpoint and reported speed of the ramp between the levels, with the calm at both ends, (N,) each."""
+    """Setpoint and reported speed of the ramp between the operating points, with both steady ends, (N,) each."""
 
     time_s: FloatArray
     setpoint_rad_s: FloatArray
@@ -84,26 +87,26 @@ class RampCourse:
 
 @dataclass(frozen=True)
 class SpeedResult:
-    """Torque at two speeds, and the model that the rest is planned with."""
+    """Torque at two speeds, and the model for further planning."""
 
     low: SteadyLevel
     high: SteadyLevel
     model: RigGuess
     rough: RoughInertia
     ramp: Ramp
-    last: tuple[Sample, ...]           # the steady samples at the higher speed: what flows before the switch
-    steady: tuple[Samples, ...] = ()   # both levels, torque less its offset: what disturbs the motion
+    last: tuple[Sample, ...]           # the steady samples at the higher speed, before the switch
+    steady: tuple[Samples, ...] = ()   # both operating points, torque without its offset: the disturbances
     course: RampCourse | None = None       # how the drive followed the ramp
-    swing: Swing | None = None         # of a drill string that gets no calmer
+    swing: Swing | None = None         # of a drill string that keeps oscillating
 
     @property
     def wander_rad_s(self) -> float:
-        """How far a restless string takes the shaft from its mean speed, either way, where its torque is held."""
+        """Return the deviation from the mean speed that an oscillating string causes at constant torque, rad/s."""
         return 0.0 if self.swing is None else WANDER * self.swing.speed_rad_s
 
     @property
     def disturbed(self) -> str:
-        """For the guard: what disturbs the shaft, in words; empty where nothing does."""
+        """Return a description of the disturbance for the guard; empty if there is none."""
         return "" if self.swing is None else self.swing.told
 
     @property
@@ -112,7 +115,7 @@ class SpeedResult:
 
 
 def mean_speeds(limits: MachineLimits) -> tuple[float, float]:
-    """The two mean speeds of the friction level, rad/s."""
+    """Return the two mean speeds of the operating points, rad/s."""
     span = limits.speed_max_rad_s - limits.speed_min_rad_s
     return limits.speed_min_rad_s + 0.25 * span, limits.speed_min_rad_s + 0.7 * span
 
@@ -125,9 +128,9 @@ def run_speed(
     torque_offset_nm: float,
     witness: SpeedWitness = NOBODY,
 ) -> SpeedResult:
-    """Both levels and the ramp between them.
+    """Run both operating points and the ramp between them.
 
-    Raises what the bench raises, LimitHit if a speed doesn't settle, PreflightRefused if the unit of speed is wrong.
+    Raises what the bench raises, LimitHit if a speed does not settle, PreflightRefused if the unit of speed is wrong.
     """
     low_rad_s, high_rad_s = mean_speeds(limits)
     tolerance_rad_s = max(2.0 * speed_resolution_rad_s, 0.01 * high_rad_s)
@@ -143,7 +146,7 @@ def run_speed(
     for _ in range(TRIES):
         ramped = ramp_speed(loop, low_rad_s, high_rad_s, rate)
         high_held = _settle_and_hold(loop, limits, high_rad_s, tolerance_rad_s, assumptions)
-        # What scatters may be calm at one level for a while, and no string at both.
+        # A disturbance may be calm at one operating point for a time, but a string is not at both.
         swing = widest(swing, high_held.swing)
         low_samples, between, high_samples = low_held.level, [*ramped, *high_held.settling], high_held.level
         low, high = steady_level(low_samples), steady_level(high_samples)
@@ -169,9 +172,10 @@ def run_speed(
     if rough is None or not rough.inertia_kg_m2 > 0.0:
         found = "none" if rough is None else f"{rough.inertia_kg_m2:.3g} kg·m²"
         raise DriveFault(
-            f"no plausible inertia could be read off the speed ramp ({found})",
+            f"the speed ramp gives no plausible inertia ({found})",
             where="stage speed",
             next_step=_TOO_RESTLESS if limits.winds_up else _WRONG_TORQUE,
+            entry=MessageCode.NO_PLAUSIBLE_INERTIA,
         )
     friction = rough.friction.opposing(0.5 * (low.speed_rad_s + high.speed_rad_s))
     model = RigGuess(
@@ -199,7 +203,7 @@ def run_speed(
 def _before_echo(
     loop: ControlLoop, limits: MachineLimits, speeds_rad_s: tuple[float, float], friction: RoughFriction | None
 ) -> RoughInertia | None:
-    """Of a restless string whose pipe is known: from quick ramps between the levels, begun and ended at the upper."""
+    """Estimate the inertia above an oscillating string with a known pipe from quick ramps before the echo."""
     if friction is None:
         return None
     rate = abs(speeds_rad_s[1] - speeds_rad_s[0]) / (ECHO_SHARE * limits.echo_s)
@@ -222,7 +226,7 @@ def _damper(loop: ControlLoop, limits: MachineLimits, speed_rad_s: float) -> Swi
 
 @dataclass(frozen=True)
 class _Held:
-    """Settling and level at a speed; ``setpoints_rad_s``, one a sample of both."""
+    """Settling and operating point at a speed; ``setpoints_rad_s``: one per sample of both."""
 
     settling: list[Sample]
     level: list[Sample]
@@ -253,7 +257,7 @@ def _in_torque(loop: ControlLoop) -> bool:
 
 
 def ramp_speed(loop: ControlLoop, start_rad_s: float, end_rad_s: float, rate_rad_s2: float) -> list[Sample]:
-    """A straight ramp of the setpoint in speed mode; the samples."""
+    """Ramp the setpoint linearly in speed mode. Return the samples."""
     steps = loop.cycles(abs(end_rad_s - start_rad_s) / rate_rad_s2)
     span = end_rad_s - start_rad_s
     return [loop.cycle(Command(Mode.SPEED, start_rad_s + span * step / steps, 0.0)) for step in range(1, steps + 1)]
@@ -267,7 +271,7 @@ def _settle_and_hold(
     assumptions: ControlAssumptions,
     before_level: Callable[[], None] = lambda: None,
 ) -> _Held:
-    """Settle, let the reporting lags run out, then the level. The top of a drill string yields all the while."""
+    """Settle, wait for the reporting lags, then hold the operating point. With a drill string the top yields."""
     lags_s = 2.0 * assumptions.largest_speed_lag_s
     if limits.winds_up:
         calmed = calm_string(loop, limits, speed_rad_s, tolerance_rad_s)

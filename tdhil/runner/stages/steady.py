@@ -1,4 +1,4 @@
-"""When a speed counts as steady, and what is then read off it."""
+"""Steady speed: when a speed counts as steady, and the means at it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers import Command, LimitHit, Mode, Sample
+from profiles import MessageCode
 from tdhil.estimation import STICK_SLIP_REGULAR, STICK_SLIP_SHARE, repeats
 from tdhil.recording import FloatArray, Level
 from tdhil.runner.control_loop import ControlLoop
@@ -37,14 +38,14 @@ class SampleTrace:
 
 
 def trace(samples: Iterable[Sample]) -> SampleTrace:
-    """Arrays of the fresh samples."""
+    """Return arrays of the fresh samples."""
     rows = [(sample.time_s, sample.speed_rad_s, sample.torque_nm) for sample in samples if sample.fresh]
     table = np.array(rows, dtype=np.float64).reshape(-1, 3)
     return SampleTrace(table[:, 0].copy(), table[:, 1].copy(), table[:, 2].copy())
 
 
 def steady_level(samples: Sequence[Sample]) -> SteadyLevel:
-    """What a stretch of steady speed says."""
+    """Return the means over a stretch of steady speed."""
     held = trace(samples)
     return SteadyLevel(
         Level(float(held.time_s[0]), float(held.time_s[-1])),
@@ -64,7 +65,7 @@ def wait_until_steady(
 ) -> list[Sample]:
     """Hold a command until the mean speed of four half-second blocks in a row is at the target.
 
-    Raises LimitHit when that doesn't happen in time.
+    Raises LimitHit if that takes longer than ``timeout_s``.
     """
     seen: list[Sample] = []
     good = 0
@@ -82,36 +83,36 @@ def wait_until_steady(
         f" {torque}",
         where=f"at {loop.now_s:.1f} s",
         next_step=helps,
+        entry=MessageCode.NOT_SETTLED,
     )
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A drill string is steady when it swings no more, not when the shaft has its speed: behind a stiff speed loop waves run
-# up and down for minutes while the top hardly shows it. So the top yields (`SwingDamper`) until the torque is calm. A
-# string under load is never quite calm: its bit disturbs. Once yielding takes nothing more away, what is left is taken
-# for what there is, unless it is a swing that feeds itself: a bit that sticks and slips, on which nothing can be
-# measured.
+# A drill string is steady when it no longer oscillates, not when the shaft has its speed: behind a stiff speed loop
+# waves run up and down for minutes while the top hardly shows it. So the top yields (`SwingDamper`) until the torque is
+# calm. A string under load is never quite calm: its bit disturbs it. Once yielding reduces the oscillation no further,
+# the rest is accepted, unless the oscillation sustains itself: with stick-slip nothing can be measured.
 
 
 CALM_SHARE = 0.02
-"""Of the torque limit, within which the torque of a calm string swings, either way of its mean."""
+"""Share of the torque limit within which the torque of a calm string oscillates around its mean."""
 
 CALM_S = 6.0
-"""For so long: half a swing of a string that swings in 12 s."""
+"""Time for which it must be calm, s: half a period of a string with a period of 12 s."""
 
 WINDOW_S = 12.0
 NO_CALMER = 0.75
-"""Of what it was over the time before: a swing that is still above this share gets no smaller."""
+"""Ratio to the oscillation of the time before; above it the oscillation counts as not decaying."""
 
 STICK_SLIP_TORQUE_SHARE = 0.5
-"""Of the mean torque: a swing that feeds itself goes so far. Where ζ is known, that tells it (`STICK_SLIP_SHARE`)."""
+"""Share of the mean torque that stick-slip reaches. With a known ζ `STICK_SLIP_SHARE` is used instead."""
 
 MOST_CALMING_S = 120.0
 
 
 @dataclass(frozen=True)
 class Swing:
-    """How a string swings: half of peak to peak; ``period_s`` 0 and ``regular`` 0 where nothing repeats."""
+    """Oscillation of a string: half of peak to peak; ``period_s`` 0 and ``regular`` 0 where nothing repeats."""
 
     torque_nm: float
     speed_rad_s: float
@@ -120,21 +121,21 @@ class Swing:
 
     @property
     def told(self) -> str:
-        """In words."""
+        """Return it in words."""
         every = f" every {self.period_s:.1f} s" if self.regular >= STICK_SLIP_REGULAR else ""
         return (
-            f"the string below swings by ±{self.torque_nm:.0f} N·m{every}, the top by ±{self.speed_rad_s:.2f} rad/s,"
-            " and gets no calmer"
+            f"the string below oscillates with ±{self.torque_nm:.0f} N·m{every}, the top with ±{self.speed_rad_s:.2f}"
+            " rad/s, and the oscillation does not decay"
         )
 
     def restless(self, limits: MachineLimits) -> bool:
-        """Does it swing further than a calm string?"""
+        """Return whether it oscillates more than a calm string."""
         return self.torque_nm > CALM_SHARE * limits.torque_nm
 
 
 @dataclass(frozen=True)
 class Calmed:
-    """``setpoints_rad_s``: one a sample. ``swing``: what is left of it. ``damper`` goes on with it."""
+    """``setpoints_rad_s``: one per sample. ``swing``: the remaining oscillation. ``damper`` continues to damp it."""
 
     samples: list[Sample]
     setpoints_rad_s: list[float]
@@ -143,12 +144,12 @@ class Calmed:
 
 
 def widest(*swings: Swing | None) -> Swing | None:
-    """Whichever takes the shaft furthest; None where there is none."""
+    """Return the oscillation with the largest speed; None if there is none."""
     return max((one for one in swings if one is not None), key=lambda one: one.speed_rad_s, default=None)
 
 
 def swing_of(samples: Sequence[Sample], period_s: float) -> Swing:
-    """From means over half a second, so that noise of the reports doesn't count."""
+    """Return the oscillation, from means over half a second, which remove the noise of the reports."""
     width = max(1, round(BLOCK_S / 2.0 / period_s))
     seen = trace(samples)
     blocks = len(seen.time_s) // width
@@ -161,7 +162,7 @@ def swing_of(samples: Sequence[Sample], period_s: float) -> Swing:
 
 
 def hold_damped(loop: ControlLoop, damper: SwingDamper, seconds: float) -> tuple[list[Sample], list[float]]:
-    """The samples of a time in which the top yields, and the speeds that were asked for."""
+    """Hold with a yielding top for a time. Return the samples and the speed setpoints."""
     samples: list[Sample] = []
     setpoints: list[float] = []
     for _ in range(loop.cycles(seconds)):
@@ -172,9 +173,9 @@ def hold_damped(loop: ControlLoop, damper: SwingDamper, seconds: float) -> tuple
 
 
 def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, tolerance_rad_s: float) -> Calmed:
-    """Turn at a speed, yielding, until the string is calm or gets no calmer.
+    """Turn at a speed, yielding, until the string is calm or its oscillation does not decay further.
 
-    Raises LimitHit where the mean speed isn't had in time, and where the string sticks and slips.
+    Raises LimitHit if the mean speed is not reached in time, and with stick-slip.
     """
     damper = SwingDamper(limits.torque_nm, limits.speed_max_rad_s, target_rad_s, loop.period_s)
     samples: list[Sample] = []
@@ -199,12 +200,13 @@ def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, t
             mean_nm = float(trace(samples[-2 * window :]).torque_nm.mean())
             if _feeds_itself(left, limits.wave_impedance_nm_s_rad, target_rad_s, mean_nm):
                 raise stick_slip(left, target_rad_s, f"at {loop.now_s:.1f} s")
-            # The top yields to what comes up, so that its mean is as far off as that may take it.
+            # The top yields to incoming waves, so its mean may deviate by as much.
             allowed_rad_s = max(2.0 * tolerance_rad_s, 0.5 * left.speed_rad_s)
             if abs(_mean_speed(samples[-window:]) - target_rad_s) <= allowed_rad_s:
                 loop.log.event(
                     loop.now_s, "string",
-                    f"the string gets no calmer at {target_rad_s:.2f} rad/s: its torque goes ±{left.torque_nm:.0f} N·m",
+                    f"the string's oscillation does not decay at {target_rad_s:.2f} rad/s:"
+                    f" torque ±{left.torque_nm:.0f} N·m",
                 )
                 return Calmed(samples, setpoints, left, damper)
     left = swing_of(samples[-2 * window :], loop.period_s)
@@ -214,15 +216,16 @@ def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, t
     )
     raise LimitHit(
         f"the string did not settle at {target_rad_s:.3f} rad/s within {MOST_CALMING_S:g} s (mean speed {mean:.3f}"
-        f" rad/s, torque swinging by ±{left.torque_nm:.0f} N·m"
+        f" rad/s, torque oscillation ±{left.torque_nm:.0f} N·m"
         + (f" every {left.period_s:.1f} s" if left.regular >= STICK_SLIP_REGULAR else "") + f"); {torque}",
         where=f"at {loop.now_s:.1f} s",
         next_step=helps,
+        entry=MessageCode.NOT_SETTLED,
     )
 
 
 def _feeds_itself(swing: Swing, wave_impedance_nm_s_rad: float, speed_rad_s: float, mean_nm: float) -> bool:
-    """Does a swing that repeats go as far as that of a bit that sticks and slips?"""
+    """Return whether a periodic oscillation is as large as stick-slip."""
     by_speed_nm = STICK_SLIP_SHARE * wave_impedance_nm_s_rad * speed_rad_s
     return swing.regular >= STICK_SLIP_REGULAR and swing.torque_nm >= (
         by_speed_nm or STICK_SLIP_TORQUE_SHARE * abs(mean_nm)
@@ -230,13 +233,14 @@ def _feeds_itself(swing: Swing, wave_impedance_nm_s_rad: float, speed_rad_s: flo
 
 
 def stick_slip(swing: Swing, speed_rad_s: float, where: str) -> LimitHit:
-    """The error of a string whose swing feeds itself."""
+    """Return the error for stick-slip."""
     return LimitHit(
-        f"the string sticks and slips at {speed_rad_s:.2f} rad/s: its torque swings by ±{swing.torque_nm:.0f} N·m every"
-        f" {swing.period_s:.1f} s, the top by ±{swing.speed_rad_s:.2f} rad/s, and yielding does not end it",
+        f"stick-slip at {speed_rad_s:.2f} rad/s: the string's torque oscillates by ±{swing.torque_nm:.0f} N·m"
+        f" every {swing.period_s:.1f} s, the top by ±{swing.speed_rad_s:.2f} rad/s, and yielding does not end it",
         where=where,
-        next_step="Lift the bit off bottom, take weight off it, or raise limits.speed_min_rad_s above the speed at"
-        " which it turns steadily",
+        next_step="Lift the bit off bottom, reduce the weight on bit, or raise limits.speed_min_rad_s above the"
+        " critical speed of stick-slip",
+        entry=MessageCode.STICK_SLIP,
     )
 
 

@@ -1,13 +1,13 @@
-"""Stage 3, torque: the bumpless switch, the braking probe, the ramp to a target torque that the speed window can bear.
+"""Stage 3, torque: the bumpless switch, the braking probe, and the ramp to a target torque within the speed window.
 
-It begins at the lower speed of stage 2. The torque target is seeded with the torque that is flowing *before* the
-switch, never below zero; the switch must be confirmed. Then one small braking torque is tried (`braking_probe`). The
-target torque T is that of steady rotation at the higher speed, T_c + B ω: without load any other torque would run away
-to a speed of its own choosing. While the speed drifts from one to the other,
+It begins at the lower speed of stage 2. The torque setpoint starts with the torque that flows *before* the switch,
+never below zero; the switch must be confirmed. Then one small braking torque is tried (`braking_probe`). The target
+torque T is that of steady rotation at the higher speed, T_c + B ω: without load, any other torque would lead to an
+arbitrary speed. While the speed drifts from one to the other,
 
     ∫(T − T_c − B ω) dt = J Δω
 
-gives the inertia a second time, now in torque mode; the probe's pulse is a part of the integral.
+gives the inertia a second time, now in torque mode. The probe's pulse is part of the integral.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from tdhil.runner.stages.steady import trace
 DRIFT_S = 8.0
 END_S = 0.5
 SLOPE_SHARE_PER_S = 0.1
-"""The torque is ramped by at most this share of the limit per second."""
+"""Steepest torque ramp, share of the limit per second."""
 
 
 @dataclass(frozen=True)
 class TorqueResult:
-    """``rough`` is the drift's own estimate, None where the speed hardly changed."""
+    """Result of stage 3. ``rough``: estimate from the drift, None if the speed hardly changed."""
 
     target_nm: float
     ramp: Ramp
     rough: RoughInertia | None
-    speed_rad_s: float                 # where the shaft is when the stage ends
+    speed_rad_s: float                 # speed at the end of the stage
 
 
 def run_torque(
@@ -48,13 +48,13 @@ def run_torque(
 ) -> TorqueResult:
     """Switch, try to brake, ramp, let the speed drift. ``slow``: steady rotation in speed mode, where it begins.
 
-    ``setpoint_where`` names the drive's torque setpoint. Raises ModeNotConfirmed, PreflightRefused if the drive doesn't
-    brake on a braking torque, and what the bench raises.
+    ``setpoint_where`` names the drive's torque setpoint. Raises ModeNotConfirmed, PreflightRefused if the drive does
+    not brake with a braking torque, and what the bench raises.
     """
     before = trace(slow)
     flowing_nm = kept_within(float(before.torque_nm.mean()) - torque_offset_nm, 0.0, limits.torque_nm)
     keep_rad_s = slow_speed(limits, speed.wander_rad_s)
-    # Seeded for a few cycles before the switch, so that the target is there when the mode is.
+    # The setpoint is sent a few cycles before the switch, so that it is present when the mode changes.
     samples = [*slow, *loop.hold(Command(Mode.SPEED, keep_rad_s, flowing_nm), 5.0 * loop.period_s)]
     samples.append(loop.switch_mode(Command(Mode.TORQUE, keep_rad_s, flowing_nm)))
     loop.log.event(loop.now_s, "mode", f"torque mode confirmed, seeded with {flowing_nm:.1f} N·m")

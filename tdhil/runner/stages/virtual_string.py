@@ -1,10 +1,10 @@
-"""Stage 5 with a virtual string: the drive in torque mode, string, bit and speed controller in the host; or the drive
-in its own speed loop, the string's torque through its torque offset.
+"""Stage 5 with a virtual string: the drive in torque mode, with string, bit and speed controller in the host; or the
+drive in its own speed loop, with the string's torque through its torque offset.
 
-What may end it beside the guard, which holds speed, torque and time as ever: a shaft that does not do what its torque
-says, a loop that swings more than string and bit can, and energy that the loop's own errors put into the shaft. However
-it ends, the string's torque goes first: on the regular way it is faded out, and in every other case the stop's first
-cycle commands none.
+Besides the guard, which checks speed, torque and time as always, it is ended by a shaft that does not follow its
+torque, a loop that oscillates more than string and bit can, and energy that the loop's own errors put into the shaft.
+However it ends, the string's torque ends first: at a regular end it is faded out, and in every other case the first
+cycle of the stop commands none.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 from drivers import Command, LimitHit, Mode, PreflightRefused, Sample
+from profiles import MessageCode
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.guard import kept_within
@@ -31,23 +32,23 @@ from tdhil.soft_torque import (
 )
 
 STRANGE_SHARE, STRANGE_COUNTS, STRANGE_SDS = 0.015, 8.0, 6.0
-"""Of the speed limit, counts of the reported speed, and standard deviations of its noise: by the most of these the
-report may be away from what the observer expects. A lag or an inertia that is believed wrongly by a tenth makes it a
-fifth of the first; a lost load or torque is seen in a tenth of a second."""
+"""Share of the speed limit, counts of the reported speed, and standard deviations of its noise: the largest of these is
+the permitted deviation of the report from the observer's expectation. An error of a tenth in a lag or inertia causes a
+fifth of the first. A lost load or torque is detected within a tenth of a second."""
 RMS_S = 5.0
 ENERGY_SHARE = 0.05
-"""Of what the string holds as the bit breaks away, that may have been put in."""
+"""Share of the string's energy at breakaway of the bit that loop errors may put in."""
 SAME_RIG = 0.5
-"""By so much, or by what it is uncertain by, stage 2's rough inertia may differ from the result's."""
+"""Permitted difference of stage 2's rough inertia from the result's, unless its uncertainty is larger."""
 TORQUE_SHARE, RAMP_S = 0.25, 5.0
-"""In the drive's own loop the first set speed is gone to with this share of the torque limit, or all of the window in
-so long."""
+"""Share of the torque limit with which the first set speed is approached in the drive's own loop; or time for the whole
+window, s."""
 RESERVE_S = 20.0
 BEFORE_S = 150.0
-"""Stages 1 to 4, about: what is left of the time limit is looked at before anything moves."""
+"""Approximate duration of stages 1 to 4, s; the rest of the time limit is checked before motion."""
 
 _TOLD = {
-    Phase.HOLD: "virtual string: coupled; the bit shall stick and slip",
+    Phase.HOLD: "virtual string: coupled; stick-slip of the bit is expected",
     Phase.RAMP: "virtual string: ramp of the set speed",
     Phase.STEADY: "virtual string: the bit turns",
     Phase.RELEASED: "virtual string: the bit is off bottom",
@@ -57,11 +58,12 @@ Keep = Callable[[Sequence[float]], None]
 
 
 def course_of(case: EvaluationCase, limits: MachineLimits, period_s: float, foresight_s: float) -> SpeedProgram:
-    """The virtual string's course within the limits. Raises PreflightRefused or EvaluationRefused, and says why."""
+    """Return the virtual string's speed program within the limits. Raises PreflightRefused or EvaluationRefused."""
     if limits.load != "none":
         raise PreflightRefused(
-            f"a virtual string was asked for, and load is {limits.load}", where="load in rig.yaml",
-            next_step="Evaluate before the string is below the drive",
+            f"a virtual string is requested, but load is {limits.load}", where="load in rig.yaml",
+            next_step="Evaluate before the string is connected",
+            entry=MessageCode.VIRTUAL_STRING_REFUSED,
         )
     refuse_untrue(case, period_s)
     window = RigWindow(limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, foresight_s)
@@ -69,28 +71,30 @@ def course_of(case: EvaluationCase, limits: MachineLimits, period_s: float, fore
     needed_s = program.longest_s + BEFORE_S + RESERVE_S
     if needed_s > limits.time_s:
         raise PreflightRefused(
-            f"the virtual string takes up to {needed_s:.0f} s, and the run may take {limits.time_s:g} s",
+            f"the virtual string takes up to {needed_s:.0f} s, which is above the limit of {limits.time_s:g} s",
             where="limits.time_s in rig.yaml", next_step="Raise it",
+            entry=MessageCode.VIRTUAL_STRING_REFUSED,
         )
     return program
 
 
 def refuse_other_rig(case: EvaluationCase, model: RigGuess) -> None:
-    """PreflightRefused where the shaft that turns can't be the one of the result."""
+    """Raise PreflightRefused if the turning shaft can't be the one of the result."""
     ratio = model.inertia_kg_m2 / case.rig.inertia_kg_m2
     open_by = 1.0 + max(SAME_RIG, 3.0 * model.inertia_rel_error)
     if not 1.0 / open_by <= ratio <= open_by:
         raise PreflightRefused(
             f"the result says {case.rig.inertia_kg_m2:.4g} kg·m² at the motor, and this shaft has about "
             f"{model.inertia_kg_m2:.4g}",
-            where="--controller and --result", next_step="Identify this rig, and tune with what comes of it",
+            where="--controller and --result", next_step="Identify this rig, then tune with that result",
+            entry=MessageCode.VIRTUAL_STRING_REFUSED,
         )
 
 
 def go_to(
     loop: ControlLoop, limits: MachineLimits, model: RigGuess, speed_rad_s: float, speed_resolution_rad_s: float
 ) -> None:
-    """Ramp to that speed in speed mode, and settle there. Raises what the bench raises, LimitHit if it doesn't."""
+    """Ramp to a speed in speed mode, and settle. Raises what the bench raises, LimitHit if it does not settle."""
     begun = max(0.0, loop.last.speed_rad_s) if loop.last is not None else 0.0
     rate = min(TORQUE_SHARE * limits.torque_nm / model.inertia_kg_m2, limits.speed_max_rad_s / RAMP_S)
     steps = loop.cycles(abs(speed_rad_s - begun) / rate)
@@ -104,7 +108,7 @@ def run_virtual_string(
     loop: ControlLoop, limits: MachineLimits, case: EvaluationCase, program: SpeedProgram, keep: Keep,
     say: Callable[[str], None], resolution_rad_s: float, noise_rad_s: float,
 ) -> None:
-    """All of the course, from steady rotation at its first speed; ``keep`` gets a row a cycle.
+    """Run the whole program, from steady rotation at its first speed; ``keep`` receives one row per cycle.
 
     ``resolution_rad_s``, ``noise_rad_s``: of the reported speed, a count and a standard deviation.
     Raises LimitHit, and what the bench raises.
@@ -131,20 +135,20 @@ def run_virtual_string(
         if (host.clamped or (case.own_loop and sample.limit_active)) and not clamped:
             clamped = True
             loop.log.event(loop.now_s, "limits", "virtual string: the torque limit acts; it is faded out")
-            say("the torque limit acts: the virtual string is faded out, and there will be no result")
+            say("the torque limit acts: the virtual string was faded out, and there will be no result")
             host.cut()
         if host.phase is not phase:
             phase = host.phase
             text = _TOLD.get(phase, "")
             if phase is Phase.TRIAL:
-                text = f"virtual string: does the bit end turning at {host.set_rad_s / RPM:.1f} rpm?"
+                text = f"virtual string: trial at {host.set_rad_s / RPM:.1f} rpm whether the bit ends turning"
             if text:
                 loop.log.event(loop.now_s, "string", text)
                 say(text)
 
 
 class _LoopWatch:
-    """Looks at every cycle of the loop, and raises LimitHit."""
+    """Checks every cycle of the loop, and raises LimitHit."""
 
     def __init__(
         self, loop: ControlLoop, limits: MachineLimits, case: EvaluationCase, program: SpeedProgram,
@@ -167,8 +171,10 @@ class _LoopWatch:
         self._observer.expected(host.innovation_rad_s * self._gear, self._strange_rad_s, sample)
         if not host.put_in_j <= self._most_j:
             raise LimitHit(
-                f"the loop's errors have put {host.put_in_j:.0f} J into the shaft", where=where,
-                next_step="The shaft was stopped. Are the lags those of the result? Identify again",
+                f"the loop's errors have put {host.put_in_j:.0f} J into the shaft (limit {self._most_j:.0f} J)",
+                where=where,
+                next_step="The shaft was stopped. Check the lags of the result: identify again",
+                entry=MessageCode.VIRTUAL_STRING_UNSTABLE,
             )
         if len(self._squares) == self._squares.maxlen:
             self._sum -= self._squares[0]
@@ -178,6 +184,8 @@ class _LoopWatch:
             rms = math.sqrt(max(0.0, self._sum) / len(self._squares))
             if rms > self._peak_nm:
                 raise LimitHit(
-                    f"the loop swings by {rms:.0f} N·m rms at the main shaft, more than string and bit could",
-                    where=where, next_step="The shaft was stopped. Are the lags those of the result? Identify again",
+                    f"the loop oscillates with {rms:.0f} N·m rms at the main shaft, above the limit of"
+                    f" {self._peak_nm:.0f} N·m of string and bit",
+                    where=where, next_step="The shaft was stopped. Check the lags of the result: identify again",
+                    entry=MessageCode.VIRTUAL_STRING_UNSTABLE,
                 )

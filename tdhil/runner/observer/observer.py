@@ -1,0 +1,442 @@
+"""The observer: takes every cycle, and holds its reports against each other. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from drivers import Command, Mode, PositionReading, PowerState, Sample, Unwrapped
+from tdhil.runner.excitation import RigGuess
+from tdhil.runner.observer.contradiction import Contradiction, Signal
+from tdhil.runner.observer.momentum_balance import HIDDEN_SHARE, WINDOWS_S, MomentumBalance
+from tdhil.runner.observer.points import AROUND_S, POINT_S, SLOPE_S, STALE_S, Point
+from tdhil.runner.observer.position_way import PositionWay, Way
+from tdhil.runner.observer.repeated_feedback import FROZEN_S, RepeatedFeedback
+from tdhil.runner.observer.revival import ALIVE_LAGS, ALIVE_S, BEFORE_S, KEPT_SHARE, RAMP_SLACK, Revival
+from tdhil.runner.observer.runaway import Belief, Runaway
+from tdhil.runner.observer.shaft_bounds import FRICTION_LIMIT_SHARE, RUN_OUT_S, ShaftBounds
+from tdhil.runner.observer.torque_following import TorqueFollowing
+from tdhil.runner.observer.unanswered_torque import STANDSTILLS, PointInRun, rules
+from tdhil.runner.settings import ControlAssumptions, MachineLimits
+
+LONGEST_GAP_S = 0.2
+"""Feedback that was missing for longer begins the comparison anew, s."""
+
+BEYOND_LIMIT = 1.25
+"""A reported torque beyond this multiple of the torque limit is false: the drive holds the limit but for ripple."""
+
+NOISE_SDS = 6.0
+"""Standard deviations of the reported speed that count as its noise."""
+
+STILL_SHARE = 0.01
+"""Share of the speed limit below which a shaft may stand still: static friction then takes any torque up to its own."""
+
+LOAD_RANGE, LOAD_BEFORE_S = 1.0, 10.0
+"""The torque of a string stays within this multiple of its range, about the middle, over so long before a window, s: a
+swing of a long string."""
+
+UNSEEN_SHARE = 0.1
+"""Least friction, as a share of the torque that was applied, of a shaft that never reported a motion."""
+
+UNSEEN_MOST_S = 60.0
+"""Longest time that a shaft without a reported motion gets to run out, s."""
+
+DOUBTED_REST_SHARE = 0.1
+"""Share of the speed that counts as standstill, for a report that was in doubt and may have a wrong scale."""
+
+
+class Observer:
+    """Compares the reports of one drive over one run; `see` takes every cycle, `doubt` says what does not fit."""
+
+    def __init__(
+        self,
+        limits: MachineLimits,
+        period_s: float,
+        speed_resolution_rad_s: float,
+        torque_resolution_nm: float = 0.0,
+        assumptions: ControlAssumptions | None = None,
+    ) -> None:
+        assumptions = (assumptions or ControlAssumptions()).at_period(period_s)
+        self._limits = limits
+        self._period_s = period_s
+        self._lag_s = assumptions.largest_speed_lag_s
+        self._count_rad_s = speed_resolution_rad_s
+        self._torque_count_nm = torque_resolution_nm
+        self._point_s = max(POINT_S, period_s)
+        self._still_rad_s = max(STILL_SHARE * limits.speed_max_rad_s, 3.0 * speed_resolution_rad_s)
+        self._bounds = ShaftBounds(limits, self._lag_s)
+        self._frozen = RepeatedFeedback(limits)
+        self._torques = TorqueFollowing(limits, self._lag_s)
+        self._angles = PositionWay(self._lag_s, speed_resolution_rad_s, self._still_rad_s)
+        self._turns: Unwrapped | None = None
+        self._runaway = Runaway(limits, self._still_rad_s)
+        self._balance = MomentumBalance(limits, self._lag_s, self._point_s, torque_resolution_nm)
+        self._rules = rules(limits, self._still_rad_s, self._lag_s, self._point_s)
+        self._revival: Revival | None = None
+        self._angle_revival: Revival | None = None
+        self.torque_offset_nm = 0.0
+        """Reported torque where none flows, N·m."""
+        self.swinging_offset_nm = 0.0
+        """The largest torque offset that the stage may command in speed mode, N·m."""
+        self.doubt: Contradiction | None = None
+        self.backwards = False
+        """Set by a stage that saw the shaft turn backwards under a forward torque: the sign of a report is inverted."""
+        self._time_s = self._block_from_s = -math.inf
+        self._speed = self._torque = self._before = 0.0
+        self._impulse = self._rough = self._way = self._bent = 0.0
+        self._friction_low = self._friction_high = 0.0
+        self._cycles, self._sum_speed, self._sum_torque = 0, 0.0, 0.0
+        self.demand_nm: float | None = None
+        """The demanded torque, where the drive reports one, N·m."""
+        self._shows_state = True
+        self._way_of = 0               # the integral of speed begins anew with each restart
+        self._unseen_nms = 0.0
+        self._unseen_nm = 0.0
+        self._moved = False
+        self._restart()
+
+    # -- what is known ---------------------------------------------------------------------------------------
+
+    def position(self, count_rad: float, gap_s: float) -> None:
+        """Take what preflight found: one count of the position, and the gap after which its turns are not known, s."""
+        self._angles.count_rad, self._angles.gap_s = count_rad, gap_s
+
+    def compare_position(self, ratio: float) -> None:
+        """Compare the position from now on: it must move this many times as far as the reported speed accounts for."""
+        self._angles.ratio = ratio
+        self._angles.restart()
+
+    def heard_position(self, now_s: float, within_s: float) -> bool:
+        """Return whether a position came within the last ``within_s``."""
+        return now_s - self._angles.heard_s <= within_s
+
+    def know(self, model: RigGuess) -> None:
+        """Take J and friction of stage 2, with their uncertainty."""
+        before = self._bounds.words
+        if not self._bounds.know(model):
+            self._doubt(
+                frozenset({Signal.SPEED, Signal.TORQUE}),
+                f"the way up to the first speed and the rest of stage 2 contradict each other: {before}, then"
+                f" {self._bounds.words}",
+                "Did the scale of torque or speed change meanwhile, or the load? Check the profile and the encoder",
+                self._time_s,
+            )
+        self._restart()
+
+    @property
+    def unseen_s(self) -> float:
+        """How long a shaft whose motion was never reported may go on turning without torque, s; 0: motion was seen."""
+        if self._moved or self._unseen_nm <= 0.0:
+            return 0.0
+        if self._limits.winds_up:          # the string turns the shaft on, long after its torque is off
+            return RUN_OUT_S
+        return min(UNSEEN_MOST_S, self._unseen_nms / (UNSEEN_SHARE * self._unseen_nm))
+
+    @property
+    def blind_s(self) -> float:
+        """How long friction takes at most to stop what (1) cannot find, s."""
+        return self._bounds.blind_s(self._still_rad_s)
+
+    @property
+    def turned(self) -> bool:
+        """Return whether the shaft turned when the stop began, or shortly before it."""
+        return self.turns(self._runaway.start_rad_s)
+
+    # -- each cycle ------------------------------------------------------------------------------------------
+
+    def see(self, command: Command, sample: Sample) -> None:
+        """Take one cycle: what was commanded, and what was reported."""
+        self._shows_state = sample.state is not PowerState.UNKNOWN
+        if not sample.fresh or not self._shows_state:
+            return                     # feedback without a valid state shows nothing of the shaft
+        frozen = self._frozen.see(command, sample, self.swinging_offset_nm)
+        if frozen is not None and not self._runaway.begun:     # in a stop the setpoint jumps to zero at once
+            self._doubt(frozenset({Signal.ALL}), *frozen, sample.time_s)
+        speed, torque, now_s = sample.speed_rad_s, sample.torque_nm - self.torque_offset_nm, sample.time_s
+        if not (math.isfinite(speed) and math.isfinite(torque)):
+            return
+        apart_s = now_s - self._time_s
+        if not 0.0 < apart_s <= max(LONGEST_GAP_S, 3.0 * self._period_s):
+            self._restart()
+            self._time_s, self._speed, self._torque = now_s, speed, torque
+            self._before = speed
+            self._block_from_s = now_s
+            if sample.position_rad is not None:
+                self._see_angle(sample.position_rad, now_s, speed)
+            return
+        mean_nm, mean_rad_s = 0.5 * (torque + self._torque), 0.5 * (speed + self._speed)
+        self._impulse += mean_nm * apart_s
+        self._rough += 0.5 * abs(torque - self._torque) * apart_s
+        self._way += mean_rad_s * apart_s
+        bent = speed - 2.0 * self._speed + self._before
+        self._bent += 0.005 * (min(bent * bent, 100.0 * self._bent + 9.0 * self._count_rad_s**2) - self._bent)
+        self._before, self._speed, self._torque, self._time_s = self._speed, speed, torque, now_s
+        self._cycles += 1
+        self.demand_nm = sample.torque_demand_nm
+        self._sum_speed += speed
+        self._sum_torque += torque
+        if sample.position_rad is not None:
+            self._see_angle(sample.position_rad, now_s, speed)
+        if now_s - self._block_from_s >= self._point_s - 0.5 * self._period_s:
+            self._point(command, sample)
+
+    def see_reading(self, reading: PositionReading) -> None:
+        """Take a position that came beside the cycle."""
+        if self._turns is None:
+            self._turns = Unwrapped(reading.wraps_rad, self._limits.speed_max_rad_s)
+            self._angles.restart()
+        angle_rad = self._turns.take(reading.time_s, reading.position_rad)
+        if angle_rad is None:
+            self._angles.restart()
+        else:
+            self._see_angle(angle_rad, reading.time_s, self._speed)
+
+    def expected(self, apart_rad_s: float, within_rad_s: float, sample: Sample) -> None:
+        """Take how far the reported speed is from what a stage's own model of the shaft predicts, rad/s."""
+        if sample.fresh and not abs(apart_rad_s) <= within_rad_s:
+            self._doubt(
+                frozenset({Signal.SPEED, Signal.TORQUE}),
+                f"the reported speed contradicts the torque: it is {sample.speed_rad_s:.2f} rad/s,"
+                f" {abs(apart_rad_s):.2f} rad/s away from the prediction (limit {within_rad_s:.2f} rad/s)",
+                "Check the encoder and its cable. Check whether the torque is lost or limited, and whether this is the"
+                " rig that was identified",
+                sample.time_s,
+            )
+
+    def turns(self, speed_rad_s: float) -> bool:
+        """Return whether a reported speed is clearly not zero."""
+        return abs(speed_rad_s) > STANDSTILLS * self._still_rad_s
+
+    # -- standstill ------------------------------------------------------------------------------------------
+
+    def speed_rad_s(self, sample: Sample) -> float:
+        """The speed to judge a stop by: of the angle where the reported speed is in doubt and the angle is not."""
+        rate = self.rate_rad_s
+        return sample.speed_rad_s if rate is None or not self._position_lives else rate
+
+    @property
+    def _position_lives(self) -> bool:
+        """Return whether the position went on after a contradiction, and so may stand in for the speed."""
+        return self._angle_revival is not None and self._angle_revival.alive and self.rate_rad_s is not None
+
+    @property
+    def moved(self) -> bool:
+        """Return whether the shaft was ever reported to move."""
+        return self._moved
+
+    @property
+    def rate_rad_s(self) -> float | None:
+        """Speed by the position, rad/s; None where too little has been reported, or nothing of late."""
+        return self._angles.rate_rad_s if self.heard_position(self._time_s, STALE_S) else None
+
+    @property
+    def comes_down(self) -> bool:
+        """Return whether a speed in doubt has come down since as a shaft does under a quick stop."""
+        seen = (self._revival, self._angle_revival)
+        return any(one is not None and one.falling and one.is_fresh(self._time_s) for one in seen)
+
+    @property
+    def believable(self) -> bool:
+        """Return whether a report of standstill counts: it has no contradiction, or that one has been refuted."""
+        doubt = self.doubt
+        if doubt is None or Signal.ALL in doubt.signals or Signal.SPEED not in doubt.signals:
+            return True
+        if self._position_lives:
+            return True
+        return self._revival is not None and self._revival.alive and self._balanced
+
+    def rest_rad_s(self, at_rest_rad_s: float) -> float:
+        """The speed that counts as standstill, rad/s: less once a report was in doubt, since its scale may be wrong."""
+        if self.doubt is None:
+            return at_rest_rad_s
+        return min(at_rest_rad_s, max(DOUBTED_REST_SHARE * at_rest_rad_s, self._noise_rad_s()))
+
+    def angle_quiet(self, at_rest_rad_s: float) -> bool:
+        """Return whether the angle moves no faster than this, rad/s; true where no angle is reported."""
+        rate = self.rate_rad_s
+        return rate is None or abs(rate) <= at_rest_rad_s + self._angles.blur_rad_s
+
+    @property
+    def _balanced(self) -> bool:
+        """Return whether the torque at reported standstill is too small to turn the shaft against its friction."""
+        points = self._points
+        if self._limits.winds_up or not points:
+            return True
+        return abs(points[-1].torque) <= 0.5 * self._bounds.breakaway_low_nm + 5.0 * self._torque_count_nm
+
+    # -- a stop that does not stop -----------------------------------------------------------------------------
+
+    def begin_stop(self) -> None:
+        """Note that a quick stop was requested: from now on the shaft must become slower."""
+        self._runaway.begin(self._earlier_rad_s())
+
+    def shows_s(self, at_rest_rad_s: float, torque_nm: float) -> float:
+        """How long a shaft that is disabled must be seen at rest, s; ``torque_nm``: what held it before.
+
+        A torque like that of friction may have kept the shaft turning, by a speed signal that is off by so much.
+        Without it the reported speed then leaves standstill at friction's rate.
+        """
+        return self._bounds.shows_s(at_rest_rad_s, torque_nm)
+
+    def runs_away(self, sample: Sample) -> str:
+        """How the shaft accelerates against the quick stop, seen in two independent ways; empty: it does not."""
+        return self._runaway.seen(self._belief, sample) if self._shows_state else ""
+
+    # -- inside ----------------------------------------------------------------------------------------------
+
+    def _restart(self) -> None:
+        """Forget the samples, keep what is known."""
+        self._points: deque[Point] = deque(maxlen=2 + math.ceil((WINDOWS_S[-1] + AROUND_S) / self._point_s))
+        self._loads: deque[float] = deque(maxlen=2 + math.ceil(LOAD_BEFORE_S / self._point_s))
+        self._time_s = -math.inf
+        self._speed = self._torque = self._before = 0.0
+        self._impulse = self._rough = self._way = self._bent = 0.0
+        self._friction_low = self._friction_high = 0.0
+        self._cycles, self._sum_speed, self._sum_torque = 0, 0.0, 0.0
+        self._block_from_s = -math.inf
+        self._balance.restart()
+        self._way_of += 1
+
+    def _point(self, command: Command, sample: Sample) -> None:
+        block_s = sample.time_s - self._block_from_s
+        point = Point()
+        point.time_s = sample.time_s - 0.5 * block_s
+        point.speed = self._sum_speed / self._cycles
+        point.torque = self._sum_torque / self._cycles
+        point.impulse = self._impulse - 0.5 * block_s * point.torque
+        point.rough = self._rough
+        known = self._bounds
+        self._around(point, command)
+        # A late speed still falls when the shaft stands already and its static friction takes any torque.
+        point.still = self._still_rad_s + self._lag_s * abs(point.slope)
+        low, high = known.friction(point.speed, point.still)
+        self._friction_low += low * block_s
+        self._friction_high += high * block_s
+        point.friction_low = self._friction_low - 0.5 * block_s * low
+        point.friction_high = self._friction_high - 0.5 * block_s * high
+        self._load(point)
+        self._block_from_s, self._cycles, self._sum_speed, self._sum_torque = sample.time_s, 0, 0.0, 0.0
+        self._points.append(point)
+        known.learn(self._points)
+        self._note_unseen(point, sample, block_s)
+        if self._revival is not None:
+            self._revival.see(point.time_s, point.speed)
+        if self._angle_revival is not None and (rate := self._angles.rate_rad_s) is not None:
+            self._angle_revival.see(point.time_s, rate)
+        self._contradict(self._runaway.unanswered(point))
+        self._runaway.see(point, known, self._belief)
+        if abs(point.torque) > BEYOND_LIMIT * self._limits.torque_nm:
+            self._doubt(
+                frozenset({Signal.TORQUE}),
+                f"the reported torque of {point.torque:.0f} N·m is beyond the torque limit of"
+                f" {self._limits.torque_nm:g} N·m",
+                "Check the units of torque in the profile and the rated torque", point.time_s,
+            )
+        if sample.state in (PowerState.ENABLED, PowerState.QUICK_STOP):
+            self._compare(point, command, block_s)
+        if (apart := self._torques.see(command, sample, self.torque_offset_nm, block_s)) is not None:
+            self._doubt(frozenset({Signal.TORQUE}), *apart, sample.time_s)
+
+    def _around(self, point: Point, command: Command) -> None:
+        """Slope, and bounds of slope and torque within `AROUND_S`."""
+        points = self._points
+        point.slope = 0.0
+        for before in reversed(points):
+            if point.time_s - before.time_s >= SLOPE_S - 0.5 * self._point_s:
+                point.slope = (point.speed - before.speed) / (point.time_s - before.time_s)
+                break
+        slopes, torques = [point.slope], [point.torque]
+        if command.mode is Mode.TORQUE:
+            torques.append(command.torque_nm)
+        for before in reversed(points):
+            if point.time_s - before.time_s > AROUND_S + 0.5 * self._point_s:
+                break
+            slopes.append(before.slope)
+            torques.append(before.torque)
+        point.slope_low, point.slope_high = min(slopes), max(slopes)
+        point.torque_low, point.torque_high = min(torques), max(torques)
+        limit_nm = self._limits.torque_nm
+        # In speed mode the torque may have moved faster than its report shows: by a quarter of the limit.
+        hidden_nm = HIDDEN_SHARE * limit_nm
+        point.torque_least = max(-limit_nm, min(torques) - hidden_nm)
+        point.torque_most = min(limit_nm, max(torques) + hidden_nm)
+        if command.mode is Mode.TORQUE:
+            point.torque_least, point.torque_most = min(torques[:2]), max(torques[:2])
+
+    def _load(self, point: Point) -> None:
+        """Bounds of what a drill string takes, from the torque of the time before, less what accelerated the shaft."""
+        point.load_low = point.load_high = 0.0
+        if not self._limits.winds_up:
+            return
+        accelerating_nm = self._bounds.likely_inertia * point.slope if self._bounds.known else 0.0
+        self._loads.append(point.torque - accelerating_nm)
+        middle = 0.5 * (max(self._loads) + min(self._loads))
+        half = LOAD_RANGE * (max(self._loads) - min(self._loads))
+        margin = half + FRICTION_LIMIT_SHARE * self._limits.torque_nm
+        point.load_low, point.load_high = middle - margin, middle + margin
+
+    def _note_unseen(self, point: Point, sample: Sample, block_s: float) -> None:
+        if self._moved:
+            return
+        if abs(point.speed) > 2.0 * self._still_rad_s or self._angles.moved:
+            self._moved = True
+            self._bounds.breakaway_nm = max(self._unseen_nm, abs(point.torque))
+            self._points.clear()       # what held the shaft before is not known
+            self._points.append(point)
+        elif sample.state is PowerState.ENABLED:
+            self._unseen_nms += abs(point.torque) * block_s
+            self._unseen_nm = max(self._unseen_nm, abs(point.torque))
+
+    def _compare(self, point: Point, command: Command, block_s: float) -> None:
+        """Test the balance of momentum, and whether the speed answers the torque."""
+        noise_rad_s = self._noise_rad_s()
+        self._contradict(self._balance.see(self._points, self._bounds, noise_rad_s))
+        now = PointInRun(
+            point, command, block_s, self._points, self._bounds, noise_rad_s, self._moved, self._runaway.begun
+        )
+        for rule in self._rules:
+            self._contradict(rule.see(now))
+
+    @property
+    def _belief(self) -> Belief:
+        return Belief(self.doubt, self.believable, self.comes_down, self._moved, self.rate_rad_s, self.demand_nm)
+
+    def _noise_rad_s(self) -> float:
+        """Noise of a point's speed, rad/s."""
+        per_point = max(1.0, self._point_s / self._period_s)
+        return NOISE_SDS * math.sqrt(self._bent / 6.0 / per_point) + self._count_rad_s
+
+    def _earlier_rad_s(self) -> float:
+        """The reported speed of `BEFORE_S` ago, rad/s: what a contradiction hides has hardly begun then."""
+        return next((point.speed for point in self._points if self._time_s - point.time_s <= BEFORE_S), 0.0)
+
+    def _see_angle(self, position_rad: float, now_s: float, speed_rad_s: float) -> None:
+        # A position that comes while the cycle brings nothing has no way by the reported speed to be compared with.
+        covered = now_s - self._time_s <= max(0.1, 2.0 * self._period_s)
+        way = Way(self._way_of if covered else -1, self._way, speed_rad_s)
+        apart = self._angles.see(position_rad, now_s, way, self._noise_rad_s())
+        if apart is not None and self._frozen.repeats_s(now_s) >= 0.4 * FROZEN_S and self._angles.repeats:
+            self._doubt(frozenset({Signal.ALL}), *self._frozen.words("and the position with them"), now_s)
+        elif apart is not None:
+            self._doubt(
+                frozenset({Signal.SPEED, Signal.ANGLE}), apart,
+                "Check the encoder, its cable, and the units of 606Ch and 6064h (or of the registers)", now_s,
+            )
+
+    def _doubt(self, signals: frozenset[Signal], what: str, helps: str, time_s: float) -> None:
+        self._contradict(Contradiction(signals, what, helps, time_s))
+
+    def _contradict(self, found: Contradiction | None) -> None:
+        """Take what was found; the first contradiction of a run stays."""
+        if found is None or self.doubt is not None:
+            return
+        self.doubt, time_s = found, found.time_s
+        slope, still = self._limits.quick_stop_rad_s2, self._still_rad_s
+        recent = [point for point in self._points if time_s - point.time_s <= BEFORE_S]
+        steady = True
+        if recent:
+            fastest = max(recent, key=lambda point: abs(point.speed))
+            braked = RAMP_SLACK * slope * (recent[-1].time_s - fastest.time_s) if self._runaway.begun else 0.0
+            steady = abs(recent[-1].speed) >= KEPT_SHARE * abs(fastest.speed) - braked
+        self._revival = Revival(steady, time_s + max(ALIVE_S, ALIVE_LAGS * self._lag_s), slope, still)
+        self._angle_revival = Revival(steady, time_s + ALIVE_S, slope, still + self._angles.blur_rad_s)

@@ -1,0 +1,96 @@
+"""Reported position against the way by the reported speed. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+from tdhil.runner.observer.points import IN_A_ROW
+
+ANGLE_SHARE = 0.1
+"""Tolerance of the angle against the reported speed, as `speed_check.TOLERANCE`."""
+
+MOVED_RAD = 0.5
+"""A position that moved so far shows that the shaft turns, and not that a string or a coupling winds up."""
+
+ANGLE_WINDOW_S = (0.5, 2.0)
+"""Least and longest window of that comparison, s."""
+
+
+class Way(NamedTuple):
+    """Way by the reported speed, rad, of which stretch without a gap, and the speed at its end, rad/s."""
+
+    stretch: int
+    way_rad: float
+    speed_rad_s: float
+
+
+class PositionWay:
+    """The reported angle beside the way by the reported speed."""
+
+    def __init__(self, lag_s: float, count_rad_s: float, still_rad_s: float) -> None:
+        self._lag_s = lag_s
+        self._still_rad_s = still_rad_s
+        self._count_rad_s = count_rad_s
+        self.count_rad, self.gap_s = 0.0, math.inf
+        self.ratio: float | None = None
+        self.heard_s = -math.inf
+        self.moved = False
+        self.restart()
+
+    def restart(self) -> None:
+        self._seen: deque[tuple[float, float, Way]] = deque()
+        self._apart = 0
+
+    @property
+    def rate_rad_s(self) -> float | None:
+        """Speed by the angle over the last half second, rad/s; None where too little has been reported."""
+        if len(self._seen) < 2:
+            return None
+        last = self._seen[-1]
+        first = next((one for one in self._seen if last[0] - one[0] <= 1.01 * ANGLE_WINDOW_S[0]), last)
+        took_s = last[0] - first[0]
+        return (last[1] - first[1]) / took_s if took_s >= 0.4 * ANGLE_WINDOW_S[0] else None
+
+    @property
+    def repeats(self) -> bool:
+        """Return whether the last two positions are the same."""
+        return len(self._seen) >= 2 and self._seen[-1][1] == self._seen[-2][1]
+
+    @property
+    def blur_rad_s(self) -> float:
+        """Return the uncertainty of that speed by one count of the position, rad/s."""
+        return self.count_rad / ANGLE_WINDOW_S[0]
+
+    def see(self, position_rad: float, time_s: float, way: Way, noise_rad_s: float) -> str | None:
+        """Return in words how the position contradicts the speed; None: it does not."""
+        seen = self._seen
+        if seen and time_s <= seen[-1][0]:
+            return None
+        if time_s - self.heard_s > self.gap_s:
+            self.restart()
+            seen = self._seen
+        self.heard_s = time_s
+        seen.append((time_s, position_rad, way))
+        self.moved = self.moved or abs(position_rad - seen[0][1]) > max(10.0 * self.count_rad, MOVED_RAD)
+        while time_s - seen[0][0] > ANGLE_WINDOW_S[1]:
+            seen.popleft()
+        first = seen[0]
+        took_s = time_s - first[0]
+        if took_s < ANGLE_WINDOW_S[0] or self.ratio is None or way.stretch < 0 or way.stretch != first[2].stretch:
+            return None
+        turned, reported = position_rad - first[1], self.ratio * (way.way_rad - first[2].way_rad)
+        speeds = [one[2].speed_rad_s for one in seen]
+        late = abs(self.ratio) * self._lag_s * (max(speeds) - min(speeds))
+        allowed = (
+            late + 2.0 * self.count_rad + ANGLE_SHARE * max(abs(turned), abs(reported))
+            + took_s * (0.5 * self._count_rad_s + 0.1 * noise_rad_s + self._still_rad_s)
+        )
+        self._apart = self._apart + 1 if abs(turned - reported) > allowed else 0
+        if self._apart < IN_A_ROW:
+            return None
+        return (
+            f"reported position and reported speed contradict each other: within {took_s:.1f} s the position moved by"
+            f" {turned:.2f} rad, and the reported speed accounts for {reported:.2f} rad"
+        )

@@ -1,0 +1,52 @@
+"""Feedback that repeats its last values. Pure."""
+
+from __future__ import annotations
+
+import math
+
+from drivers import Command, Mode, Sample
+from tdhil.runner.settings import MachineLimits
+
+FROZEN_S, FROZEN_SHARE = 0.5, 0.1
+"""Speed and torque that stay the same to the last bit for so long, while the setpoint moves by this share of its limit,
+are repeated and not measured (row 19)."""
+
+
+class RepeatedFeedback:
+    """Feedback that repeats its last values, as a gateway does."""
+
+    def __init__(self, limits: MachineLimits) -> None:
+        self._limits = limits
+        self._seen: tuple[float, float] | None = None
+        self._mode: Mode | None = None
+        self._since_s = self._lowest = self._highest = 0.0
+
+    def see(self, command: Command, sample: Sample, offset_nm: float) -> tuple[str, str] | None:
+        """Return cause and next step once the feedback has repeated for long enough; else None."""
+        seen, torque_mode = (sample.speed_rad_s, sample.torque_nm), command.mode is Mode.TORQUE
+        with_offset = offset_nm > 0.0 and not torque_mode
+        setpoint = command.torque_nm if torque_mode else command.speed_rad_s
+        limit = self._limits.torque_nm if torque_mode else self._limits.speed_max_rad_s
+        if with_offset:
+            setpoint, limit = command.torque_offset_nm, offset_nm
+        if seen != self._seen or command.mode is not self._mode or sample.limit_active:
+            self._seen, self._mode, self._since_s = seen, command.mode, sample.time_s
+            self._lowest = self._highest = setpoint
+            return None
+        self._lowest, self._highest = min(self._lowest, setpoint), max(self._highest, setpoint)
+        if self._highest - self._lowest <= FROZEN_SHARE * limit or self.repeats_s(sample.time_s) < FROZEN_S:
+            return None
+        return self.words("while the setpoint moved")
+
+    def repeats_s(self, now_s: float) -> float:
+        """For how long speed and torque have not changed, s."""
+        return 0.0 if self._seen is None else now_s - self._since_s
+
+    def words(self, besides: str) -> tuple[str, str]:
+        """Return cause and next step."""
+        speed_rad_s, torque_nm = self._seen or (math.nan, math.nan)
+        return (
+            f"the feedback has been frozen at {speed_rad_s:.3f} rad/s and {torque_nm:.1f} N·m for {FROZEN_S:g} s,"
+            f" {besides}",
+            "Does a gateway repeat old values? Check the bus and the drive; is the shaft locked?",
+        )

@@ -1,0 +1,224 @@
+"""Acceleration against a quick stop, seen in two independent ways. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from drivers import Sample
+from tdhil.runner.observer.contradiction import Contradiction, Signal
+from tdhil.runner.observer.points import STALE_S, Point
+from tdhil.runner.observer.shaft_bounds import ShaftBounds
+from tdhil.runner.observer.torque_following import TORQUE_SHARE
+from tdhil.runner.observer.unanswered_torque import AT_LIMIT_SHARE, STANDSTILLS
+from tdhil.runner.settings import MachineLimits
+
+UNANSWERED_S, UNANSWERED_SHARE = 8.0, 0.05
+"""A reported speed does not answer the stop if it changes by no more than this share for so long, s, under a braking
+torque at its limit. A shaft that slow would take minutes to stop."""
+
+PUSHING_S, PUSHING_SHARE = 1.0, 0.1
+"""A torque that pushes on for so long after a quick stop, past every reporting lag, drives the shaft: this share of the
+torque limit, where the reported speed is not believed or never showed a motion."""
+
+DOUBTED_SHARE = 0.5
+"""With a report in doubt, this share of the torque limit is more than a quick stop takes in the direction of motion."""
+
+IMPULSE_SHARE = 0.3
+"""Uncertainty of the speed by impulse, as a share of the speed at which the stop began."""
+
+FASTER_SHARE, FASTER_S, FASTER_BRAKED_S = 0.1, 0.4, 1.0
+"""Share of the speed limit by which a shaft must have become faster under a quick stop, and for how long, s. The last
+time holds while the reported torque brakes it. A slipping encoder may report a higher speed for a moment."""
+
+INVERTED_S, INVERTED_SHARE = 2.0, 0.3
+"""Over so long a speed that rises as the reported torque of the opposite sign accounts for, within this share and the
+bounds of J, shows an inverted polarity."""
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """Belief in the reports at present."""
+
+    doubt: Contradiction | None
+    believable: bool                   # a report of standstill counts
+    comes_down: bool                   # a speed in doubt has come down since as under a quick stop
+    moved: bool                        # the shaft was reported to move
+    rate_rad_s: float | None           # speed by the position
+    demand_nm: float | None            # demanded torque
+
+
+class Runaway:
+    """Acceleration against a quick stop. ``still_rad_s``: the speed of standstill."""
+
+    def __init__(self, limits: MachineLimits, still_rad_s: float) -> None:
+        self._limits = limits
+        self._still_rad_s = still_rad_s
+        self.begun = False
+        self._slowest_rad_s = self._slowest_angle_rad_s = math.inf
+        self._before: Point | None = None
+        self.start_rad_s = 0.0
+        self._by_impulse_rad_s: float | None = None
+        self._pushing_s = self._pushed_nm = 0.0
+        self._apart_nm_s = self._took_s = 0.0
+        self._for_s = self._unanswered_s = self._unanswered_rad_s = 0.0
+        self._speed_above_s = self._angle_above_s = 0.0
+        self._seen_s: float | None = None
+        self._recent: deque[Point] = deque()
+        self._inverted = self._brakes = False
+
+    def begin(self, speed_rad_s: float) -> None:
+        """Note that a quick stop was requested, from this speed."""
+        self.begun = True
+        self.start_rad_s = speed_rad_s
+
+    def unanswered(self, point: Point) -> Contradiction | None:
+        """Return a reported speed that does not change under a braking torque at its limit; before `see`."""
+        if not self.begun or self._before is None or point.time_s <= self._before.time_s:
+            return None
+        self._see_unanswered(point, point.time_s - self._before.time_s)
+        if self._unanswered_s < UNANSWERED_S:
+            return None
+        return Contradiction(
+            frozenset({Signal.SPEED}),
+            f"the reported speed stays at {point.speed:.2f} rad/s while {point.torque:.0f} N·m, the torque limit, brake"
+            f" the shaft for {self._unanswered_s:.0f} s",
+            "Check the encoder and its cable. Do not rely on the reported speed", point.time_s,
+        )
+
+    def see(self, point: Point, known: ShaftBounds, belief: Belief) -> None:
+        """Take one point of a stop."""
+        if not self.begun:
+            return
+        before, self._before = self._before, point
+        if before is None or point.time_s <= before.time_s:
+            self._by_impulse_rad_s = self.start_rad_s if math.isfinite(known.inertia_high) else None
+            return
+        self._for_s += point.time_s - before.time_s
+        if self._for_s >= PUSHING_S:
+            self._slowest_rad_s = min(self._slowest_rad_s, abs(point.speed))
+        self._see_inverted(point, known)
+        took_s = point.time_s - before.time_s
+        if self._by_impulse_rad_s is not None:
+            # What a string takes is not known well enough for more than a torque near its limit.
+            counts = not self._limits.winds_up or abs(point.torque) >= DOUBTED_SHARE * self._limits.torque_nm
+            held = abs(point.speed) <= point.still and abs(point.torque) <= known.friction(0.0, point.still)[1]
+            counts = counts and not (held and belief.believable)     # static friction takes it
+            self._by_impulse_rad_s += counts * (point.impulse - before.impulse) / known.likely_inertia
+        # What pushes in the direction of the last motion, beyond all friction. Of a shaft that was never seen to move
+        # nothing is known: any torque pushes.
+        least = known.pushing_nm
+        if belief.doubt is not None:
+            least = min(least, DOUBTED_SHARE * self._limits.torque_nm)
+        if not belief.believable:
+            least = PUSHING_SHARE * self._limits.torque_nm
+        elif not belief.moved:       # a little torque may be left over that static friction holds
+            least = DOUBTED_SHARE * (self._limits.probe_torque_nm or self._limits.torque_nm)
+        turning = belief.rate_rad_s if belief.rate_rad_s and belief.doubt is not None else self.start_rad_s
+        if self._limits.winds_up and belief.believable:
+            turning = point.speed      # the string may have turned it back
+        forward = 1.0 if turning >= 0.0 else -1.0
+        pushes = (forward * point.torque if belief.moved else abs(point.torque)) > least
+        self._pushing_s = self._pushing_s + took_s if pushes else 0.0
+        self._pushed_nm = point.torque
+        self._brakes = -forward * point.torque > least
+        self._apart_nm_s += took_s * abs(point.torque - belief.demand_nm) if belief.demand_nm is not None else 0.0
+        self._took_s += took_s
+
+    def _see_inverted(self, point: Point, known: ShaftBounds) -> None:
+        """Find a speed that rises as the reported torque of the opposite sign accounts for."""
+        recent = self._recent
+        recent.append(point)
+        while point.time_s - recent[0].time_s > INVERTED_S:
+            recent.popleft()
+        start, self._inverted = recent[0], False
+        window_s = point.time_s - start.time_s
+        change = abs(point.speed) - abs(start.speed)
+        least = FASTER_SHARE * self._limits.speed_max_rad_s
+        if self._limits.winds_up or not known.known or window_s < 0.9 * INVERTED_S or change < least:
+            return
+        forward = math.copysign(1.0, point.speed)
+        pushed_nms = -forward * (point.impulse - start.impulse)
+        usual_nm = 0.5 * math.fsum(known.friction(point.speed, 0.0))
+        expected_nms = pushed_nms - forward * usual_nm * window_s
+        least_nms, most_nms = known.inertia_low * change, known.inertia_high * change
+        slack_nms = INVERTED_SHARE * abs(pushed_nms)
+        self._inverted = least_nms - slack_nms <= expected_nms <= most_nms + slack_nms
+
+    def _see_unanswered(self, point: Point, took_s: float) -> None:
+        """Measure for how long a torque at its limit opposes the reported speed, which does not change."""
+        braking_nm = -point.torque * math.copysign(1.0, point.speed)
+        opposes = braking_nm >= AT_LIMIT_SHARE * self._limits.torque_nm
+        changed = abs(point.speed - self._unanswered_rad_s) > UNANSWERED_SHARE * abs(point.speed)
+        turns = abs(point.speed) > STANDSTILLS * self._still_rad_s
+        if changed or not opposes or not turns:
+            self._unanswered_s, self._unanswered_rad_s = 0.0, point.speed
+            return
+        self._unanswered_s += took_s
+
+    def seen(self, belief: Belief, sample: Sample) -> str:
+        """Return in words how the shaft accelerates, where two ways agree; else nothing."""
+        if not self.begun or self._for_s < PUSHING_S:
+            return ""
+        limit = self._limits.speed_max_rad_s
+        more = FASTER_SHARE * limit
+        if self._limits.winds_up:
+            # A string that is released turns back. Its torque is taken away only from a shaft that is beyond its limit.
+            self._slowest_rad_s = self._slowest_angle_rad_s = limit
+        faster = more + max(self._slowest_rad_s, IMPULSE_SHARE * abs(self.start_rad_s))
+        doubt = belief.doubt
+        # Of a shaft that became lighter the inertia is not known any more, but its speed is followed.
+        lighter = doubt is not None and doubt.lighter
+        in_vain = (not belief.believable and not lighter and not belief.comes_down) or (
+            not belief.moved and not self._limits.winds_up
+        )
+        by_speed = by_position = ""
+        took_s = 0.0 if self._seen_s is None else min(sample.time_s - self._seen_s, STALE_S)
+        self._seen_s = sample.time_s
+        above = belief.believable and abs(sample.speed_rad_s) > faster
+        self._speed_above_s = self._speed_above_s + took_s if above else 0.0
+        enough_s = FASTER_BRAKED_S if self._brakes else FASTER_S
+        if in_vain:
+            by_speed = "the reported speed does not follow the torque"
+        elif self._speed_above_s >= enough_s:
+            by_speed = f"the reported speed rose to {sample.speed_rad_s:.2f} rad/s"
+        rate = belief.rate_rad_s
+        if rate is not None:
+            self._slowest_angle_rad_s = min(self._slowest_angle_rad_s, abs(rate))
+            above = abs(rate) > more + max(self._slowest_angle_rad_s, IMPULSE_SHARE * abs(self.start_rad_s))
+            self._angle_above_s = self._angle_above_s + took_s if above else 0.0
+            if self._angle_above_s >= enough_s:
+                by_position = f"the position moves at {rate:.2f} rad/s"
+        by_torque = "" if lighter else self._by_torque(belief.believable, more)
+        # The speed of a shaft that became lighter is followed; so it is where only the sign of the torque is wrong.
+        if lighter and self._inverted and abs(sample.speed_rad_s) > limit:
+            by_speed = by_speed or f"the reported speed rose to {sample.speed_rad_s:.2f} rad/s"
+            by_torque = "it rises as the reported torque with the opposite sign accounts for"
+        ways = [one for one in (by_speed, by_position, by_torque) if one]
+        return "; ".join(ways) if len(ways) >= 2 else ""
+
+    def _by_torque(self, believable: bool, more_rad_s: float) -> str:
+        """Return what the torque alone shows. A torque that does not follow the demanded one accounts for nothing."""
+        if self._apart_nm_s > TORQUE_SHARE * self._limits.torque_nm * self._took_s:
+            return ""
+        if self._unanswered_s >= UNANSWERED_S:
+            return f"{self._pushed_nm:.0f} N·m for {self._unanswered_s:.0f} s have stopped any such shaft"
+        # Above a string the stop begins with a ramp of the setpoint, which may push: until that has ended.
+        ramp_s = self._limits.speed_max_rad_s / self._limits.quick_stop_rad_s2
+        pushes = not self._limits.winds_up or (believable and self._for_s >= ramp_s)
+        if self._pushing_s >= PUSHING_S and pushes:
+            return f"{self._pushed_nm:.0f} N·m push the shaft on"
+        by_impulse = self._by_impulse_rad_s
+        if by_impulse is not None and self._beyond(by_impulse, more_rad_s, believable):
+            return f"the torque since the quick stop accounts for {by_impulse:.2f} rad/s"
+        return ""
+
+    def _beyond(self, by_impulse_rad_s: float, more_rad_s: float, believable: bool) -> bool:
+        """Return whether torque alone takes the shaft past its limit or, with a speed in doubt, past zero."""
+        start = abs(self.start_rad_s)
+        forward = by_impulse_rad_s * (1.0 if self.start_rad_s >= 0.0 else -1.0)
+        if believable or self._limits.winds_up:
+            return abs(by_impulse_rad_s) > max(start, self._limits.speed_max_rad_s) + more_rad_s
+        slack = IMPULSE_SHARE * start + more_rad_s
+        return forward > start + slack or forward < -slack
