@@ -1,6 +1,7 @@
 """Recording in, Identification out; pure numpy and scipy, knows no drive and no file."""
 
 from tdhil.estimation.cross_checks import (
+    AngleRatio as AngleRatio, angle_ratios as angle_ratios, mean_speed as mean_speed,
     torque_contradiction as torque_contradiction, torque_ratios as torque_ratios,
 )
 from tdhil.estimation.frequency_domain import torque_answer as torque_answer
@@ -12,7 +13,7 @@ from tdhil.estimation.paper_method import STEP_S as STEP_S, line_fit as line_fit
 from tdhil.estimation.result import (
     BudgetLine as BudgetLine, Compliant as Compliant, Estimate as Estimate, FrictionPoint as FrictionPoint,
     Identification as Identification, InertiaEstimate as InertiaEstimate, LineFit as LineFit, Options as Options,
-    PaperEstimate as PaperEstimate, ResidualTest as ResidualTest, SecondOpinion as SecondOpinion,
+    PaperEstimate as PaperEstimate, Refused as Refused, ResidualTest as ResidualTest, SecondOpinion as SecondOpinion,
     Verdict as Verdict, normal_quantile as normal_quantile,
 )
 from tdhil.estimation.rough_estimates import (
@@ -24,6 +25,7 @@ from tdhil.estimation.samples import (
     Stretch as Stretch, excited_window as excited_window, repeats as repeats, stretches as stretches,
     usable_samples as usable_samples,
 )
+from tdhil.estimation.shared_filters import FittedTogether as FittedTogether, identify_together as identify_together
 from tdhil.estimation.spectrum import (
     SpectralLine as SpectralLine, period_lines as period_lines, pooled_lines as pooled_lines,
 )

@@ -31,7 +31,7 @@ def _no_samples() -> Samples:
 
 @dataclass(frozen=True)
 class Case:
-    """A recording, what is asked of it, and what is known of it so far.
+    """A recording, the options of its identification, and the results so far.
 
     ``recording``: up to the ``aborted`` stage, if one was. ``levels``: of the excited segments; None without any.
     ``sound``: nothing is wrong with the data as such, so that a second opinion on them is worth having.
@@ -87,7 +87,7 @@ _NONE, _WORDLESS = Refusal("", ""), ModelWords()
 
 @dataclass(frozen=True)
 class Finding:
-    """What a route makes of a case, in one form whichever route: `conclude` makes the verdict of it.
+    """The result of one route for a case, in the same form for every route; `conclude` adds the verdict.
 
     ``inertia``: as the data have it, bounded; None where the residuals contradict the model, of which then nothing else
     is told, and where it can't be told, as the ``refusal`` says. ``conditions``: what J is conditional on besides the

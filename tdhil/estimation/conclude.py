@@ -1,14 +1,15 @@
-"""From a finding to the conclusion: which verdict, why, and what the number rests on. Here alone is one made."""
+"""The conclusion drawn from a finding: verdict, reason and conditions. Only this module makes a verdict."""
 
 from dataclasses import replace
 
+from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.frequency_domain import widened_most_by_scale, with_total
 from tdhil.estimation.result import Identification, InertiaEstimate, Options, Verdict
 from tdhil.recording import Stage
 
 _SHARPER = "identical filters on reported speed and torque, or known ones, would sharpen this further"
-_BY_SCALE = "the drive's torque, checked against a known one, would sharpen this most"
+_BY_SCALE = "a torque calibration (tdhil calibrate torque) would sharpen this most"
 
 
 def conclude(case: Case, finding: Finding) -> Identification:
@@ -19,12 +20,13 @@ def conclude(case: Case, finding: Finding) -> Identification:
     route had to refuse.
     """
     inertia = _inertia(case, finding)
-    verdict, reason, advice = _judged(case.options, finding, inertia)
+    verdict, reason, advice, entry = _judged(case.options, finding, inertia)
     warnings = (*case.warnings, *finding.warnings)
     if case.aborted is not None:
         said = _aborted(case.aborted)
         if inertia is not None:
-            warnings = (f"{said}: the result is from what was recorded before", *warnings)
+            partial = f"{said}: the result is from what was recorded before"
+            warnings = (CodedText(partial, MessageCode.RUN_ENDED_EARLY), *warnings)
         else:
             reason = f"{said}; what was recorded before can't tell: {reason}"
             advice = "mend what ended the run, and run it again"
@@ -33,6 +35,7 @@ def conclude(case: Case, finding: Finding) -> Identification:
         model=finding.model,
         reason=reason,
         advice=advice,
+        entry=entry,
         inertia=inertia,
         viscous_nm_s_rad=finding.viscous_nm_s_rad,
         coulomb_nm=finding.coulomb_nm,
@@ -71,25 +74,29 @@ def _inertia(case: Case, finding: Finding) -> InertiaEstimate | None:
     )
 
 
-def _judged(options: Options, finding: Finding, inertia: InertiaEstimate | None) -> tuple[Verdict, str, str]:
-    """The verdict, its reason and the advice."""
+def _judged(
+    options: Options, finding: Finding, inertia: InertiaEstimate | None
+) -> tuple[Verdict, str, str, MessageCode]:
+    """The verdict, its reason and the advice, with their entry in the table of messages."""
     if finding.rejected:
-        return Verdict.MODEL_REJECTED, finding.contradicted, finding.words.if_rejected
+        return Verdict.MODEL_REJECTED, finding.contradicted, finding.words.if_rejected, MessageCode.MODEL_REJECTED
     if finding.contradiction.reason:
-        return Verdict.MODEL_REJECTED, finding.contradiction.reason, finding.contradiction.advice
+        found = finding.contradiction
+        return Verdict.MODEL_REJECTED, found.reason, found.advice, found.entry
     if finding.inertia is None or inertia is None:
-        return Verdict.NOT_IDENTIFIABLE, finding.refusal.reason, finding.refusal.advice
+        refused = finding.refusal
+        return Verdict.NOT_IDENTIFIABLE, refused.reason, refused.advice, refused.entry
     wide = f"wider than ±{options.tolerance:.2%}"
     own = 0.5 * (finding.inertia.high - finding.inertia.low) / finding.inertia.value
     whole = 0.5 * (inertia.high - inertia.low) / inertia.value
     if not own <= options.tolerance:
         reason = f"{finding.explained}, but the {finding.words.spread} is ±{own:.2%}, {wide}"
-        return Verdict.VALID_WIDE, reason, finding.advice or finding.words.if_wide
+        return Verdict.VALID_WIDE, reason, finding.advice or finding.words.if_wide, MessageCode.VALID_WIDE
     if whole > options.tolerance:
         reason = f"{finding.explained}, but the interval is ±{whole:.2%}, {wide}"
-        return Verdict.VALID_WIDE, reason, finding.advice or _SHARPER
+        return Verdict.VALID_WIDE, reason, finding.advice or _SHARPER, MessageCode.VALID_WIDE
     advice = _BY_SCALE if widened_most_by_scale(inertia) else finding.advice or _SHARPER
-    return Verdict.VALID, finding.explained, advice
+    return Verdict.VALID, finding.explained, advice, MessageCode.VALID
 
 
 def _aborted(stage: Stage) -> str:

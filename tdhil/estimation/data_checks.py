@@ -10,13 +10,14 @@ from itertools import pairwise
 
 import numpy as np
 
+from profiles import MessageCode
 from tdhil.config import has_plateaus
 from tdhil.estimation.result import Refused
 from tdhil.estimation.samples import Samples, excited_window, usual_interval
 from tdhil.recording import Excitation, FloatArray, Recording, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Motion that a limit shaped: the drive's flag, the torque at its limit, and flat tops that nobody declared.
+# Motion that a limit shaped: the drive's flag, the torque at its limit, and flat tops that no limit declares.
 #
 # A flat top is many samples at exactly the greatest (or least) value of a segment and few just below it. The crest of
 # a smooth wave, rounded to q, looks like that too. Of a sine of amplitude A, √(2q/A)/π is at the crest and 0.41 of it
@@ -50,7 +51,8 @@ def check_limited(
     count = sum(len(flag) for flag in flags)
     flagged = sum(int(np.count_nonzero(flag)) for flag in flags) / count if count else 0.0
     if flagged > LIMIT_SHARE:
-        raise Refused(f"the drive was at an internal limit for {flagged:.1%} of the excitation", _ADVICE)
+        raise Refused(f"the drive was at an internal limit for {flagged:.1%} of the excitation", _ADVICE,
+                      entry=MessageCode.SIGNAL_CLIPPED)
     limit = recording.torque_limit_nm
     if limit is not None and limit > 0.0:
         above, below = _AT_LIMIT * limit - recording.torque_offset_nm, -_AT_LIMIT * limit - recording.torque_offset_nm
@@ -75,6 +77,7 @@ def check_limited(
                 raise Refused(
                     f"the {name} is cut off flat for {share:.1%} of the excitation {where}",
                     f"{_ADVICE}; or widen the range in which the {name} is reported",
+                    entry=MessageCode.SIGNAL_CLIPPED,
                 )
 
 
@@ -110,7 +113,7 @@ def _pile(signal: FloatArray, top: float, quantum: float) -> float | None:
 #
 # The lines of a period are fitted side by side, so they must be different whole multiples of 1/period, and there must
 # be more samples in a period than there are unknowns. A line at or above half the sample rate is seen at another
-# frequency, and what is seen at a lower line may then be its image: nothing in such a record can be told apart.
+# frequency, and what is seen at a lower line may then be its image: nothing in such a record can be kept apart.
 
 
 _WHOLE = 2e-3             # of a line that it may be off a whole number of cycles a period
@@ -127,7 +130,7 @@ def check_declared(excitation: Excitation, samples: Samples) -> None:
         if after.start_s < before.end_s - 0.01 * before.period_s:
             raise Refused(
                 f"two segments overlap: one lasts until {before.end_s:g} s, the next starts at {after.start_s:g} s",
-                "correct the times of the segments",
+                "correct the times of the segments", entry=MessageCode.EXCITATION_MISDECLARED,
             )
     inside = [samples.between(*excited_window(segment)) for segment in excitation.segments]
     if not any(len(part) for part in inside):
@@ -135,6 +138,7 @@ def check_declared(excitation: Excitation, samples: Samples) -> None:
             f"no sample lies within the excitation after settling: the record lasts from {samples.time_s[0]:g} to "
             f"{samples.time_s[-1]:g} s",
             "let the excitation run longer, or correct the times of its segments and the unit of time",
+            entry=MessageCode.EXCITATION_MISDECLARED,
         )
     for segment, part in zip(excitation.segments, inside, strict=True):
         _check_rate(segment, part)
@@ -144,9 +148,11 @@ def _check_segment(segment: Segment, name: str) -> None:
     numbers = (segment.start_s, segment.end_s, segment.period_s, segment.offset_rad_s, *segment.lines_hz)
     advice = "check how the recording was made"
     if not all(math.isfinite(number) for number in numbers) or segment.settle_periods < 0:
-        raise Refused(f"{name}: its times or lines are not usable numbers", advice)
+        raise Refused(f"{name}: its times or lines are not usable numbers", advice,
+                      entry=MessageCode.EXCITATION_MISDECLARED)
     if not segment.lines_hz or segment.period_s <= 0.0 or segment.end_s <= segment.start_s:
-        raise Refused(f"{name}: it has no lines, no period or no length", advice)
+        raise Refused(f"{name}: it has no lines, no period or no length", advice,
+                      entry=MessageCode.EXCITATION_MISDECLARED)
     cycles = [line * segment.period_s for line in segment.lines_hz]
     whole = [round(one) for one in cycles]
     off = max(abs(one - near) / max(1.0, near) for one, near in zip(cycles, whole, strict=True))
@@ -154,9 +160,11 @@ def _check_segment(segment: Segment, name: str) -> None:
         raise Refused(
             f"{name}: its lines are not whole multiples of 1/period (period {segment.period_s:g} s)",
             "declare the period and the lines that were run, in s and Hz",
+            entry=MessageCode.EXCITATION_MISDECLARED,
         )
     if len(set(whole)) < len(whole):
-        raise Refused(f"{name}: a line stands there twice", "declare each line once")
+        raise Refused(f"{name}: a line stands there twice", "declare each line once",
+                      entry=MessageCode.EXCITATION_MISDECLARED)
 
 
 def _check_rate(segment: Segment, part: Samples) -> None:
@@ -170,11 +178,12 @@ def _check_rate(segment: Segment, part: Samples) -> None:
             f"aliased: one sample every {interval:.3g} s can't tell a line at {fastest:g} Hz from its image",
             "check the unit of the time stamps" if slow else
             f"sample at {5.0 * fastest:.3g} Hz or faster, or excite with lower lines",
+            entry=MessageCode.TOO_FEW_SAMPLES,
         )
     if segment.period_s / interval < 2.0 * (2 * len(segment.lines_hz) + 1):
         raise Refused(
             f"{segment.period_s / interval:.0f} samples a period are too few for {len(segment.lines_hz)} lines",
-            "sample faster, or excite with fewer lines",
+            "sample faster, or excite with fewer lines", entry=MessageCode.TOO_FEW_SAMPLES,
         )
 
 
@@ -193,38 +202,45 @@ def check_samples(recording: Recording) -> None:
     count = int(np.size(recording.time_s))
     others = (recording.speed_rad_s, recording.torque_nm, recording.fresh, recording.limited)
     if any(np.shape(other) != (count,) for other in others) or np.ndim(recording.time_s) != 1:
-        raise Refused("the signals differ in length", "record time, speed and torque of the same samples")
+        raise Refused("the signals differ in length", "record time, speed and torque of the same samples",
+                      entry=MessageCode.DATA_UNUSABLE)
     if count < _LEAST_SAMPLES:
-        raise Refused(f"{count} samples are too few to identify anything", "record whole periods of the excitation")
+        raise Refused(f"{count} samples are too few to identify anything", "record whole periods of the excitation",
+                      entry=MessageCode.TOO_FEW_SAMPLES)
     signals = (recording.time_s, recording.speed_rad_s, recording.torque_nm)
     flags = (recording.fresh, recording.limited)
     if any(signal.dtype.kind not in "fiu" for signal in signals) or any(flag.dtype.kind != "b" for flag in flags):
-        raise Refused("the signals are not numbers", "look for a decoding fault")
+        raise Refused("the signals are not numbers", "look for a decoding fault", entry=MessageCode.DATA_UNUSABLE)
     time = recording.time_s
     if not np.all(np.isfinite(time)) or np.any(time[1:] <= time[:-1]):
-        raise Refused("the time stamps do not rise throughout", "repair the clock or the order of the samples")
+        raise Refused("the time stamps do not rise throughout", "repair the clock or the order of the samples",
+                      entry=MessageCode.DATA_UNUSABLE)
     if float(time[-1]) - float(time[0]) > _LONGEST_S:
         raise Refused(
             f"the time spans {float(time[-1]) - float(time[0]):.3g} s, more than a week",
-            "check the unit of the time stamps",
+            "check the unit of the time stamps", entry=MessageCode.DATA_UNUSABLE,
         )
     if not np.isfinite(recording.torque_offset_nm):
-        raise Refused("the torque offset is not a number", "measure the torque at standstill again")
+        raise Refused("the torque offset is not a number", "measure the torque at standstill again",
+                      entry=MessageCode.DATA_UNUSABLE)
     fresh = recording.fresh
     finite = np.isfinite(recording.speed_rad_s)
     finite &= np.isfinite(recording.torque_nm)
     fresh_count = int(np.count_nonzero(fresh))
     bad = 1.0 - np.count_nonzero(finite & fresh) / fresh_count if fresh_count else 0.0
     if bad > LIMIT_SHARE:
-        raise Refused(f"{bad:.0%} of the samples are not numbers", "look for a decoding or wiring fault")
+        raise Refused(f"{bad:.0%} of the samples are not numbers", "look for a decoding or wiring fault",
+                      entry=MessageCode.DATA_UNUSABLE)
     stale = 1.0 - fresh_count / count
     if stale > 1.0 - _STALE_SHARE:
-        raise Refused(f"{stale:.0%} of the samples brought nothing new", "lower the cycle rate or repair the bus")
+        raise Refused(f"{stale:.0%} of the samples brought nothing new", "lower the cycle rate or repair the bus",
+                      entry=MessageCode.DATA_UNUSABLE)
     for name, signal in (("speed", recording.speed_rad_s), ("torque", recording.torque_nm)):
         largest = max(abs(float(np.max(signal, where=finite, initial=0.0))),
                       abs(float(np.min(signal, where=finite, initial=0.0))))
         if largest > _HUGE:
-            raise Refused(f"the {name} reaches {largest:.2g}, which no machine does", "look for a decoding fault")
+            raise Refused(f"the {name} reaches {largest:.2g}, which no machine does", "look for a decoding fault",
+                          entry=MessageCode.DATA_UNUSABLE)
     _check_known(recording)
 
 
@@ -238,7 +254,7 @@ def _check_known(recording: Recording) -> None:
     if not all(math.isfinite(size) and size >= 0.0 for size in sizes) or (limit is not None and math.isnan(limit)):
         raise Refused(
             "a resolution, lag, limit or standard deviation that goes with the recording is no usable number",
-            "check how the recording was made",
+            "check how the recording was made", entry=MessageCode.DATA_UNUSABLE,
         )
 
 
@@ -249,9 +265,11 @@ def check_motion(recording: Recording, excitation: Excitation, samples: Samples)
     parts = [(segment, part) for segment, window in zip(excitation.segments, windows, strict=True)
              if len(part := samples.between(*window))]
     if not _moved([part.speed_rad_s for _, part in parts], recording.speed_resolution_rad_s):
-        raise Refused("the speed did not change", "excite with more amplitude, and check that the shaft can turn")
+        raise Refused("the speed did not change", "excite with more amplitude, and check that the shaft can turn",
+                      entry=MessageCode.NO_EXCITATION)
     if not _moved([part.torque_nm for _, part in parts], recording.torque_resolution_nm):
-        raise Refused("the torque did not change", "excite with more amplitude, and check the torque signal")
+        raise Refused("the torque did not change", "excite with more amplitude, and check the torque signal",
+                      entry=MessageCode.NO_EXCITATION)
     check_limited(recording, windows, parts, excitation.kind)
 
 

@@ -1,10 +1,11 @@
-"""What is asked once there are lines: a wrong period, a wrong sign, a shaft at rest, other motion than was declared.
+"""Checks of the spectral lines: a wrong period, a wrong sign, a shaft at rest, other motion than was declared.
 
 The sign comes before the standstill: torque in the place of speed crosses zero too.
 """
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from tdhil.estimation.case import PeriodicCase
 from tdhil.estimation.friction_levels import Levels, warming_warning
 from tdhil.estimation.result import Refused
@@ -34,7 +35,7 @@ def check_direction(lines: tuple[SpectralLine, ...], mean_speed: float, mean_tor
     if _copied(lines):
         raise Refused(
             "the torque is a copy of the speed: their ratio is the same at every line",
-            "check which columns hold speed and torque",
+            "check which columns hold speed and torque", entry=MessageCode.SIGNALS_SWAPPED,
         )
     clearest = 0.0
     for line in lines:
@@ -50,16 +51,18 @@ def check_direction(lines: tuple[SpectralLine, ...], mean_speed: float, mean_tor
         raise Refused(
             "the torque opposes every acceleration, and the mean speed too: its sign is the wrong way round",
             "count torque positive that drives the speed positive",
+            entry=MessageCode.SIGNALS_SWAPPED,
         )
     raise Refused(
         "the torque trails the speed at every line, as for a negative inertia: speed and torque stand in each other's "
         "place, or one of them has the wrong sign",
         "check which column is which, and the sign of the torque",
+        entry=MessageCode.SIGNALS_SWAPPED,
     )
 
 
 def _copied(lines: tuple[SpectralLine, ...]) -> bool:
-    """Is T/W one and the same real number, at lines an octave apart or more?"""
+    """Return whether T/W is the same real number at lines an octave apart or more."""
     if lines[-1].hertz < 2.0 * lines[0].hertz:
         return False
     ratio = np.concatenate([line.torque / line.speed for line in lines])
@@ -95,11 +98,13 @@ def check_standstill(parts: list[tuple[Segment, Samples]], quantum: float) -> No
             raise Refused(
                 f"stick-slip: the shaft stood still for {at_rest / len(part):.1%} of the excitation {where}",
                 "turn faster on the mean, or excite with less amplitude, so that the shaft never stops",
+                entry=MessageCode.STICK_SLIP_RECORDED,
             )
         if behind > _LEAST_SHARE * len(part):
             raise Refused(
                 f"the shaft turned backwards for {behind / len(part):.1%} of the excitation {where}",
                 "turn faster on the mean, or excite with less amplitude, for friction jumps at zero speed",
+                entry=MessageCode.SHAFT_TURNED_BACK,
             )
 
 
@@ -123,7 +128,7 @@ _HARMLESS = 5e-4        # of the period: it makes J wrong by as much
 _WIDEST = 0.05
 _MOST_STEPS = 4001
 _STEPS_A_TURN = 32.0
-_MOST_PERIODS = 64      # of a segment that are looked at: enough to see a turning that matters
+_MOST_PERIODS = 64      # most periods used of a segment: enough to see a turning that matters
 _EQUAL = 1e-6           # of Λ: less is rounding
 _FLOOR = 1e-12          # relative: scatter that is the arithmetic's
 _CLEAR_LINE = 3.0       # a line that doesn't stand out of its turned scatter says nothing about turning
@@ -139,6 +144,7 @@ def check_period(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, ...]) 
         f"the motion repeats every {declared * (1.0 + found):.6g} s, not every {declared:g} s as declared: the time "
         f"base or the declared period is wrong by {abs(found):.2%}",
         "declare the period and the lines as they were run, and check the rate of the time stamps",
+        entry=MessageCode.EXCITATION_MISDECLARED,
     )
 
 
@@ -187,7 +193,7 @@ def _gain(turning: list[tuple[FloatArray, FloatArray, ComplexArray]], trial: Flo
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Motion that nobody declared: a strong line, in speed or torque, that is none of the excited ones.
+# Undeclared motion: a strong line, in speed or torque, that is none of the excited ones.
 #
 # A limit cycle, a resonance that noise rings, ripple that sampling folds down, another machine, or other lines than
 # excitation.yaml says. It does not bias the declared lines by itself (within whole periods it is orthogonal to them,
@@ -218,11 +224,12 @@ def undeclared_warning(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, 
                  if (line := strongest_undeclared(stretch, fit, name)) is not None]
         if found:
             hertz, amplitude, declared = max(found, key=lambda line: line[1])
-            said.append(
+            said.append(CodedText(
                 f"undeclared motion: the {name} swings by {amplitude:.2g} {unit} at {hertz:.4g} Hz, which is no line "
                 f"of the excitation (the strongest has {declared:.2g} {unit}): a limit cycle, a resonance, ripple "
-                "folded down by slow sampling, or other lines than were declared"
-            )
+                "folded down by slow sampling, or other lines than were declared",
+                MessageCode.UNDECLARED_MOTION,
+            ))
     return tuple(said)
 
 

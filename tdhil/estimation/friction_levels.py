@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from tdhil.estimation.samples import Samples, Stretch
 from tdhil.estimation.spectrum import PeriodLines
 from tdhil.recording import FloatArray, Level
@@ -43,7 +44,7 @@ from tdhil.recording import FloatArray, Level
 
 
 _NONE, _ALL = 2.0, 4.0       # normal deviations of the trend at which none, and all, of it is believed
-_TOLD = 3.5                  # at which the user is told
+_TOLD = 3.5                  # at which a warning is given
 _BEND = 0.15                 # of the trends' difference times the time between segments
 
 
@@ -62,7 +63,7 @@ class FrictionDrift:
 
 
 def warming_of(times: list[FloatArray], torques: list[FloatArray]) -> FrictionDrift:
-    """Of S segments' periods: middle (P,) in s and mean torque less J times its acceleration, (P,) N·m."""
+    """Data of S segments' periods: middle (P,) in s and mean torque less J times its acceleration, (P,) N·m."""
     none = FrictionDrift(own=(0.0,) * len(times))
     dof = sum(max(len(time) - 2, 0) for time in times)
     centred = [(time - time.mean(), torque - torque.mean()) for time, torque in zip(times, torques, strict=True)]
@@ -89,14 +90,15 @@ def warming_of(times: list[FloatArray], torques: list[FloatArray]) -> FrictionDr
 
 
 def warming_warning(warming: FrictionDrift) -> tuple[str, ...]:
-    """What a user should know; empty where there is no clear trend."""
+    """Return the warning about a trend; empty where there is no clear one."""
     if not warming.clear:
         return ()
     how = "falls" if warming.rate < 0.0 else "rises"
-    return (
+    return (CodedText(
         f"drifting: at steady speed the torque {how} by {abs(60.0 * warming.rate):.2g} N·m a minute (friction that "
         "warms, or a wandering torque zero), which is allowed for; warm the machine up first",
-    )
+        MessageCode.FRICTION_DRIFTS,
+    ),)
 
 
 def _deviations(trend: float, sd: float, dof: int) -> float:
@@ -193,7 +195,7 @@ def measure_levels(
 
 
 def _warming(times: list[FloatArray], errors: list[FloatArray]) -> FrictionDrift:
-    """Of the segments that have periods; the others drift like the rest."""
+    """Return the drift of the segments that have periods; the others drift like the rest."""
     fixed = [number for number, error in enumerate(errors) if len(error)]
     found = warming_of([times[number] for number in fixed], [errors[number][:, 1] for number in fixed])
     own = dict(zip(fixed, found.own, strict=True))
@@ -201,7 +203,7 @@ def _warming(times: list[FloatArray], errors: list[FloatArray]) -> FrictionDrift
 
 
 def tie_viscous(levels: Levels) -> ViscousConstraint | None:
-    """What the levels say of B; None if they don't span different speeds in one direction."""
+    """Return the constraint on B from the levels; None if they do not span different speeds in one direction."""
     if len(levels.speed) < 2 or not _span_enough(list(zip(levels.speed, levels.torque, strict=True))):
         return None
     if levels.dof < 1.0 or np.any(np.sign(levels.speed) != levels.direction):
@@ -229,7 +231,7 @@ def coulomb_level(levels: Levels, inertia: float, viscous: float, viscous_sd: fl
 
 
 def slope_over_speed(levels: Levels, values: FloatArray) -> float:
-    """Of ``values`` (N,) at the levels, weighted as their torques are for B."""
+    """Return the slope of ``values`` (N,) at the levels, weighted as their torques are for B."""
     return _slope(levels.speed, values, levels.duration)
 
 

@@ -60,7 +60,7 @@ _FLOOR = 1e-14                 # relative variance below which noise is rounding
 _LEAST_LINES = 4
 _CLEAR = 9.0                   # |mean|² over its variance, of a line that answers
 _STARTS_S = ((0.40, 0.15), (0.05, 0.02), (0.1, 0.4))
-_OPEN = 0.5                    # relative half-width of P beyond which nothing is told
+_OPEN = 0.5                    # relative half-width of P beyond which no value is given
 _AT_BOUND = 1e-6
 _REFERENCE_GAIN = 10.83        # −2 ln L that a reference filter must be worth: one time in a thousand by chance
 _POINTS = 49                   # of the curve
@@ -80,7 +80,7 @@ def measure_impedance(case: PeriodicCase) -> DriveImpedance:
 
 
 def refusal(asked: ImpedanceInput, reason: str, advice: str) -> DriveImpedance:
-    """Nothing can be told, and why."""
+    """Return a result without values, and the reason."""
     return DriveImpedance(Verdict.NOT_IDENTIFIABLE, asked.by, reason, advice, asked.string_nm_s_rad)
 
 
@@ -109,7 +109,7 @@ class ImpedanceLine:
 
 
 def lines_of(case: PeriodicCase, asked: ImpedanceInput) -> tuple[ImpedanceLine, ...]:
-    """Of every segment's longest run of whole periods; () where one has too few."""
+    """Return the lines of every segment's longest run of whole periods; () where one has too few."""
     pieces = []
     for stretch, fit_ in zip(case.stretches, case.fits, strict=True):
         run = _longest_run(stretch)
@@ -244,7 +244,7 @@ class ImpedanceProblem:
         return left
 
     def residuals(self, theta: FloatArray) -> FloatArray:
-        """Of unit variance each: lines, then priors."""
+        """Return the residuals, of unit variance each: lines, then priors."""
         whitened = math.sqrt(2.0) * np.einsum("kij,kmj->kmi", self.white, self.errors(theta))
         known = [(one.row @ theta - one.mean) / one.sd for one in self.priors]
         return np.concatenate([whitened.real.ravel(), whitened.imag.ravel(), np.asarray(known, dtype=np.float64)])
@@ -410,7 +410,7 @@ def _real_fit(columns: Sequence[NDArray[np.complex128]], target: NDArray[np.comp
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What is told: values with intervals by the quadratic approximation, and the residual test.
+# Results: values with intervals by the quadratic approximation, and the residual test.
 
 
 class _ThetaSpread:

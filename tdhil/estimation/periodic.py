@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from tdhil.config import told_before_echo
 from tdhil.estimation.case import Case, Finding, PeriodicCase
 from tdhil.estimation.cross_checks import Inertia, friction_curve
@@ -45,7 +46,7 @@ _BEFORE_ECHO_HELPS = (
 )
 _ONE_LINE = Refusal(
     "one excited line can't test the paper's assumption that the reported signals are not filtered",
-    "excite with more lines (a multisine)",
+    "excite with more lines (a multisine)", entry=MessageCode.TOO_FEW_LINES,
 )
 
 
@@ -87,6 +88,7 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
         raise Refused(
             f"{case.periods_used} usable whole periods are too few to know the scatter",
             "let each mean speed run for four periods or more after settling",
+            entry=MessageCode.TOO_FEW_PERIODS,
         )
     if _before_echo(case):       # all or none, and the likelihood knows how sure each is
         return replace(case, lines=every, usable=every, sound=True)
@@ -95,12 +97,14 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
         raise _too_few(case, "no excited line stands clear of the scatter", "excite with more amplitude, or for longer")
     warnings = case.warnings
     if len(lines) < len(every):
-        warnings = (*warnings, f"{len(every) - len(lines)} of {len(every)} lines were too weak to be used")
+        warnings = (*warnings, CodedText(
+            f"{len(every) - len(lines)} of {len(every)} lines were too weak to be used",
+            MessageCode.LINES_TOO_WEAK))
     return replace(case, lines=lines, usable=usable_lines(every, _LEAST_NU), warnings=warnings, sound=True)
 
 
 def identify_lines(case: PeriodicCase) -> Finding:
-    """The simplest shaft that was asked for and that the data do not contradict. Raises Refused where none tells J.
+    """Identify the simplest requested shaft that the data do not contradict. Raises Refused where none tells J.
 
     Straight friction that they hardly allow gives way to one that bends, where that says clearly more.
     """
@@ -116,11 +120,13 @@ def identify_lines(case: PeriodicCase) -> Finding:
         if rigid is not None and contradicted(rigid.fitted.problem, rigid.fitted.whole.theta, weak):
             rigid, doubted = _rigid(case, case.usable), asked.widened
         else:
-            doubted = asked.widened and rigid is not None and may_swing(rigid)
+            doubted = asked.widened and (case.recording.winds_up or (rigid is not None and may_swing(rigid)))
         finding = rigid_finding(rigid, case)
-        finding = identify_compliant(_settled(case), finding) if doubted else finding
+        if doubted:
+            finding = identify_compliant(_settled(case), finding, rigid is not None and rigid.first_order)
     if isinstance(finding, Refusal):
-        raise Refused(finding.reason, _BEFORE_ECHO_HELPS if _drowned(case) else finding.advice)
+        raise Refused(finding.reason, _BEFORE_ECHO_HELPS if _drowned(case) else finding.advice,
+                      finding.entry)
     if _drowned(case):
         finding = replace(finding, words=replace(finding.words, if_wide=_BEFORE_ECHO_HELPS))
     # A load that swings leaves residuals that a bend takes up, too: only where swinging was looked for it may.
@@ -131,22 +137,22 @@ def identify_lines(case: PeriodicCase) -> Finding:
 
 
 def _before_echo(case: PeriodicCase) -> bool:
-    """Unless a shaft was asked for that is no string."""
+    """Return whether the time before the echo is used; not where the requested shaft is no string."""
     excitation = case.recording.excitation
     return excitation is not None and told_before_echo(excitation.kind) and shaft_model(case.options.model).piped
 
 
 def _too_few(case: PeriodicCase, what: str, advice: str) -> Refused:
-    """Of the lines that stand clear; above a drill string whose pipe is known it is said what drowned the others."""
+    """Return the refusal for too few clear lines; above a string with a known pipe it says what drowned the others."""
     if not _drowned(case):
-        return Refused(what, advice)
+        return Refused(what, advice, MessageCode.TOO_FEW_LINES)
     weak = [line for line in case.every if not line.excited]
     best = max(weak, key=lambda line: float(np.max(np.abs(line.speed))) / math.sqrt(max(line.s_ww, 1e-300)))
     moved, scatter = float(np.max(np.abs(best.speed))), math.sqrt(best.s_ww)
     return Refused(
         f"{what}: at {best.hertz:.3g} Hz the excitation moves the speed by ±{moved:.2g} rad/s, and the string below by"
         f" ±{scatter:.2g} rad/s, another way in each period",
-        _BEFORE_ECHO_HELPS,
+        _BEFORE_ECHO_HELPS, entry=MessageCode.TOO_FEW_LINES,
     )
 
 
@@ -164,7 +170,7 @@ def _settled(case: PeriodicCase) -> PeriodicCase:
 
 
 def _rigid(case: PeriodicCase, lines: tuple[SpectralLine, ...]) -> RigidResult | None:
-    """What a rigid shaft makes of the lines; None if the arithmetic breaks down, which only data can cause that passed
+    """Fit a rigid shaft to the lines; None if the arithmetic breaks down, which only data can cause that passed
     every test before. Raises Refused where the lines are too few.
     """
     options, scale = case.options, case.recording.torque_scale_rel_sd
@@ -203,16 +209,18 @@ def _rough(fits: tuple[PeriodLines, ...]) -> float:
 
 
 def _warnings(cut: tuple[Stretch, ...]) -> tuple[str, ...]:
-    """What periods are missing, and where friction jumps."""
+    """Return warnings of missing periods, and of speeds where friction jumps."""
     found = []
     for stretch in cut:
         segment = stretch.segment
         expected = round((segment.end_s - segment.start_s) / segment.period_s) - segment.settle_periods
         if len(stretch.periods) < expected:
-            found.append(
-                f"{len(stretch.periods)} of {expected} periods about {segment.offset_rad_s:.3g} rad/s were usable"
-            )
+            found.append(CodedText(
+                f"{len(stretch.periods)} of {expected} periods about {segment.offset_rad_s:.3g} rad/s were usable",
+                MessageCode.PERIODS_MISSING))
         speeds = [period.speed_rad_s for period in stretch.periods]
         if speeds and min(float(s.min()) for s in speeds) < 0.0 < max(float(s.max()) for s in speeds):
-            found.append(f"the speed about {segment.offset_rad_s:.3g} rad/s crossed zero: friction is not linear there")
+            found.append(CodedText(
+                f"the speed about {segment.offset_rad_s:.3g} rad/s crossed zero: friction is not linear there",
+                MessageCode.SPEED_CHANGES_SIGN))
     return tuple(found)

@@ -1,10 +1,11 @@
-"""What identification concludes: numbers with intervals, or the reason why there are none."""
+"""The conclusion of an identification: numbers with intervals, or the reason why there are none."""
 
 import math
 from dataclasses import dataclass
 from enum import Enum
 from statistics import NormalDist
 
+from profiles import MessageCode
 from tdhil.config import MODELS
 
 
@@ -46,10 +47,10 @@ _OPEN = 0.5     # half-width, of the value, beyond which an interval says nothin
 
 
 class Verdict(Enum):
-    """Does the number stand?"""
+    """Verdict on the inertia."""
 
-    VALID = "valid"                            # stands, as tight as was asked for
-    VALID_WIDE = "valid_wide"                  # stands, but the interval is wider than was asked for
+    VALID = "valid"                            # stands, within the tolerance
+    VALID_WIDE = "valid_wide"                  # stands, but the interval is wider than the tolerance
     NOT_IDENTIFIABLE = "not_identifiable"      # the data can't tell; `reason` names what, `advice` the motion
     MODEL_REJECTED = "model_rejected"          # the data contradict every model tried
 
@@ -64,12 +65,12 @@ class Estimate:
 
     @property
     def finite(self) -> bool:
-        """Is it a number, with an end on either side?"""
+        """True if the value and both ends are finite."""
         return all(math.isfinite(x) for x in (self.value, self.low, self.high))
 
     @property
     def bounded(self) -> bool:
-        """Of something positive: does the interval say anything worth a number?"""
+        """True if a positive value has an interval narrow enough to be reported."""
         return self.finite and self.value > 0.0 and 0.5 * (self.high - self.low) <= _OPEN * self.value
 
 
@@ -218,7 +219,7 @@ class ImpedancePoint:
 
 @dataclass(frozen=True)
 class DriveImpedance:
-    """What a drive's speed loop is to whatever hangs on its shaft, Z = J s + B + H(s)(P + I/s), at the motor.
+    """Impedance of a drive's speed loop as seen by the load on its shaft, Z = J s + B + H(s)(P + I/s), at the motor.
 
     H = 1/((1 + τ_t s)(1 + τ_f s)) are the lags inside the loop: of its torque, and of the speed that it sees;
     ``inner_lag_s`` is their sum, which is known better than either. P and I are as the drive has them, in the scale of
@@ -237,7 +238,7 @@ class DriveImpedance:
     speed_filter_s: Estimate | None = None
     inertia_kg_m2: Estimate | None = None      # as this measurement has it
     viscous_nm_s_rad: Estimate | None = None
-    reference_filter_s: Estimate | None = None     # of a reference filter that nobody declared, where one shows
+    reference_filter_s: Estimate | None = None     # of an undeclared reference filter, where one shows
     residual: ResidualTest | None = None
     points: tuple[ImpedancePoint, ...] = ()    # rising frequency
     conditions: tuple[str, ...] = ()
@@ -265,14 +266,15 @@ class Refusal:
 
     reason: str
     advice: str
+    entry: MessageCode = MessageCode.NOT_IDENTIFIABLE
 
 
 class Refused(Exception):
     """Raised where an estimate can't be had. `identify` alone catches it, and makes it ``not_identifiable``."""
 
-    def __init__(self, reason: str, advice: str) -> None:
+    def __init__(self, reason: str, advice: str, entry: MessageCode = MessageCode.NOT_IDENTIFIABLE) -> None:
         super().__init__(reason)
-        self.refusal = Refusal(reason, advice)
+        self.refusal = Refusal(reason, advice, entry)
 
 
 @dataclass(frozen=True)
@@ -301,3 +303,4 @@ class Identification:
     impedance: DriveImpedance | None = None             # of a run that measured the drive's own
     lines: tuple[LinePoint, ...] = ()                   # rising frequency; for the picture of the report
     torque_ratios: tuple[TorqueRatio, ...] = ()         # of the signals of torque; empty where no setpoint is known
+    entry: MessageCode = MessageCode.NOT_IDENTIFIABLE   # entry of verdict, reason and advice in the table of messages

@@ -131,7 +131,7 @@ def rough_inertia_before_echo(
     ramps: Sequence[tuple[FloatArray, FloatArray, FloatArray, float]], echo_s: float, impedance_nm_s_rad: float,
     friction: RoughFriction,
 ) -> RoughInertia | None:
-    """Of a motor above a drill string that is never at rest: from the time of each ramp before its echo comes back.
+    """Estimate J of a motor above a drill string that is never at rest: from each ramp before its echo comes back.
 
     ``ramps``: time, speed, torque, (N,) each, and when the ramp began. Until ``echo_s`` (2L/v) later the string is the
     resistance ζ, ``impedance_nm_s_rad``, and J Δω = ∫ (T − T_0 − ζ (ω − ω_0)) dt. What the bit does adds noise, of
@@ -160,7 +160,7 @@ def rough_inertia_before_echo(
 
 
 def _sd_of_mean(time: FloatArray, torque: FloatArray) -> float:
-    """Of a level's mean torque, from the scatter of its block means (load disturbance is slow, noise is not)."""
+    """Return the standard deviation of a level's mean torque, from its block means (load disturbance is slow)."""
     blocks = int(min(8, max(2, (time[-1] - time[0]) // _BLOCK_S)))
     means = [float(np.mean(part)) for part in np.array_split(torque, blocks)]
     return float(np.std(means, ddof=1) / np.sqrt(blocks))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -12,7 +13,7 @@ from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 #
 # A smooth wave rounded to q rests on one value about its crests: x ≈ A − A ω² t²/2 stays within q for 2 √(2q/A)/ω. A
 # run of equal values several times as long as that, at the slowest line, and longer than a hole that a period may
-# have, is no wave. Two kinds of rest are other faults and are told elsewhere: at the extreme (clipped), and of the
+# have, is no wave. Two kinds of rest are other faults, reported elsewhere: at the extreme (clipped), and of the
 # speed at zero (the shaft stands still).
 
 
@@ -153,7 +154,7 @@ def _of(signal: FloatArray, quantum: float) -> BoolArray | None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Which samples are no measurements although nobody flagged them, and what a user is told of them.
+# Samples that are no measurements although no flag says so, and the warnings about them.
 
 
 def good_samples(recording: Recording) -> BoolArray:
@@ -169,13 +170,13 @@ def good_samples(recording: Recording) -> BoolArray:
 
 
 def log_warnings(recording: Recording) -> tuple[str, ...]:
-    """What the log itself says of its samples: that they are not all, and that some brought nothing new."""
+    """Return the warnings of the log about its samples: lost ones, and ones that brought nothing new."""
     found = []
     if not recording.complete:
-        found.append("the log ended before the run did: partial data")
+        found.append(CodedText("the log ended before the run did: partial data", MessageCode.PARTIAL_DATA))
     stale = float((~recording.fresh).mean())
     if stale > 0.01:
-        found.append(f"{stale:.1%} of the samples were stale and left out")
+        found.append(CodedText(f"{stale:.1%} of the samples were stale and left out", MessageCode.STALE_SAMPLES))
     return tuple(found)
 
 
@@ -186,17 +187,20 @@ def left_out_warnings(recording: Recording) -> tuple[str, ...]:
     finite &= np.isfinite(recording.torque_nm)
     odd = int(np.count_nonzero(recording.fresh & ~finite))
     if odd:
-        said.append(f"{_samples(odd)} not a number, and left out")
+        said.append(CodedText(f"{_samples(odd)} not a number, and left out", MessageCode.SAMPLES_LEFT_OUT))
     jumps = spikes(recording)
     if jumps is not None:
-        said.append(f"{_samples(int(np.count_nonzero(jumps)))} a spike far from its neighbours, and left out")
+        said.append(CodedText(
+            f"{_samples(int(np.count_nonzero(jumps)))} a spike far from its neighbours, and left out",
+            MessageCode.SAMPLES_LEFT_OUT))
     stuck = frozen(recording)
     if stuck is not None:
         where, share = float(recording.time_s[np.argmax(stuck)]), float(np.mean(stuck))
-        said.append(
+        said.append(CodedText(
             f"the feedback stuck although it was called fresh, first at {where:.6g} s: {share:.1%} of the samples were "
-            "left out"
-        )
+            "left out",
+            MessageCode.SAMPLES_LEFT_OUT,
+        ))
     return tuple(said)
 
 
@@ -256,7 +260,7 @@ def usable_samples(recording: Recording) -> Samples:
 
 
 def excited_window(segment: Segment) -> tuple[float, float]:
-    """From the end of settling to the end of the segment, s."""
+    """Return the span from the end of settling to the end of the segment, s."""
     return segment.start_s + segment.settle_periods * segment.period_s, segment.end_s
 
 

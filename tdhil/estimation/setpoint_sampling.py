@@ -25,6 +25,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Finding
 from tdhil.estimation.result import BudgetLine
 from tdhil.recording import FloatArray, Recording, SteppedSetpoint
@@ -53,7 +54,9 @@ def stretched(finding: Finding, recording: Recording) -> Finding:
     return replace(
         finding,
         advice="shorten the cycle (baud rate, function 23, TCP), or use a drive's torque mode",
-        warnings=(*finding.warnings, f"{note}: J may be off by {share:.1%} for that alone"),
+        warnings=(*finding.warnings, CodedText(
+            f"{note}: J may be off by {share:.1%} for that alone",
+            MessageCode.STEPPED_SETPOINT)),
     )
 
 
@@ -139,8 +142,8 @@ def _likely(period_s: float, moment: ReadMoment) -> FloatArray:
 
 
 _CROSSOVER_RAD_S = 5.0
-"""Of a quick speed loop of a top drive, for a drive whose loop is not known: the quicker the loop, the sharper torque
-answers a step. Simulated drives of all profiles stay below half of what follows from it."""
+"""Bandwidth of a quick speed loop of a top drive, for a drive with an unknown loop: a quicker loop
+answers a step more sharply. Simulated drives of all profiles stay below half of what follows from it."""
 
 
 _SHARES_OF_CROSSOVER = (0.2, 0.4, 0.6, 0.8, 1.0)

@@ -1,4 +1,4 @@
-"""From samples to lines: what speed and torque did at each excited frequency, and how sure that is.
+"""Spectral lines of samples: speed and torque at each excited frequency, with their scatter.
 
 Within each period, on the actual time stamps, least squares fits (tᶜ = time from the period's middle)
 
@@ -28,7 +28,7 @@ from tdhil.estimation.samples import Samples, Stretch
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The speed at the two ends of a period, from which its net change is told (why that is needed: `spectrum`).
+# The speed at the two ends of a period, from which its net change follows (why that is needed: `spectrum`).
 
 
 _EDGE_S = 0.1             # either side of a period's end, averaged to read the speed there
@@ -68,7 +68,7 @@ class Edge:
 # twice on a step, so N is at most twice the steps of a period, and the error's lines reach up to half of that.
 #
 # How much of it comes again depends on where the samples lie on the wave: in every period at the same instants, in
-# every second one, or elsewhere in each. It is seen at the harmonics h that nobody excited. Of P periods' lines there
+# every second one, or elsewhere in each. It is seen at the harmonics h that are not excited. Of P periods' lines there
 #
 #     E|mean|² = σ_h²/P + what comes again,      σ_h² their scatter,
 #
@@ -81,7 +81,7 @@ class Edge:
 _HARMONICS = np.arange(1.0, 9.0)
 _SURE = 1.25            # of q²/12: so much of the residuals' square may be rounding
 _LOOKED_AT = 40_000     # samples, in whole periods
-_LOOKED_FOR = 32        # harmonics that nobody excited
+_LOOKED_FOR = 32        # harmonics that are not excited
 _FEWEST = 3             # of them; fewer tell nothing
 _UNDETECTED = 0.01      # of the scatter of a segment's mean: less isn't looked at further
 

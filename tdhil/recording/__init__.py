@@ -1,4 +1,4 @@
-"""From samples to run.mcap and back to a Recording."""
+"""Recording of samples to run.mcap, and reading of run.mcap as a Recording."""
 
 from typing import TYPE_CHECKING
 

@@ -165,7 +165,7 @@ class RecordingBuilder:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What was learnt so far, for `RunWriter.configuration`."""
+        """Return the findings of the run so far, for `RunWriter.configuration`."""
         return dict(self._facts)
 
     def recording(self, *, complete: bool = True) -> Recording:

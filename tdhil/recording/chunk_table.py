@@ -216,7 +216,7 @@ def _taken(data: bytes, at: Offsets, row: np.dtype[np.void]) -> NDArray[np.void]
 def _records(
     data: bytes, starts: Offsets, ends: Offsets
 ) -> tuple[Offsets, NDArray[np.uint8], Offsets, NDArray[np.bool_]]:
-    """Where each record begins, its opcode and its length, in the order of ``data``; and of each chunk: is it whole?"""
+    """Return start, opcode and length of each record, in the order of ``data``; and whether each chunk is whole."""
     whole = np.ones(len(starts), np.bool_)
     places, opcodes, lengths = [], [], []
     chunk = np.flatnonzero(starts < ends)

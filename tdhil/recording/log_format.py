@@ -1,4 +1,4 @@
-"""What run.mcap holds: the channels, their numbers and their messages.
+"""Content of run.mcap: the channels, their numbers and their messages.
 
 ====  ===============  =============  =====================================================================
   id  topic            message        when
@@ -60,7 +60,7 @@ class Event:
 # ---------------------------------------------------------------------------------------------------------------------
 # Events once more as `foxglove.Log`, which viewers of MCAP show as a log (docs.foxglove.dev, schema Log).
 #
-# Our own Event stays what is read back; this one is for people with a viewer, and nothing here reads it.
+# Our own Event stays the one that is read back; this one is for viewers, and tdhil does not read it.
 
 
 _LEVELS: Final = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
@@ -193,7 +193,7 @@ VIRTUAL_COLUMNS: Final = (
     "time_s", "phase", "set_rad_s", "top_rad_s", "innovation_rad_s", "string_nm", "drive_nm", "share", "bit_rad_s",
     "unknown_nm", "put_in_j", "clamped",
 )
-"""Of a `VirtualString`, all doubles: what `tdhil.soft_torque.HostLoop.row` is."""
+"""Values of a `VirtualString`, all doubles: the content of `tdhil.soft_torque.HostLoop.row`."""
 
 CHANNELS: Final = {
     SAMPLE: ("/sample", "Sample"),

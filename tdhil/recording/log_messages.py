@@ -12,7 +12,7 @@ from struct import Struct
 from typing import Any, Final, NamedTuple
 
 from drivers import Command, Mode, PowerState, RawFrame, Sample
-from tdhil.errors import LogError
+from tdhil.errors import LogError, MessageCode
 from tdhil.recording.builder import plain
 from tdhil.recording.log_format import (
     CLASSES,
@@ -139,7 +139,7 @@ def excitation_message(excitation: Excitation | None, levels: Sequence[Level], r
 
 
 def event_message(event: Event) -> Cold:
-    """An `Event`; what is longer than 64 Ki characters is cut."""
+    """Return an `Event`; text beyond 64 Ki characters is cut."""
     content = {
         "time_s": event.time_s,
         "kind": event.kind,
@@ -174,9 +174,10 @@ def _text(channel: int, content: Mapping[str, Any]) -> Cold:
         text = json.dumps(content, ensure_ascii=False)
         payload = _bytes("Text", {"json": text})
     except (TypeError, ValueError) as error:
-        raise LogError(f"this can't be logged as JSON: {error}") from error
+        raise LogError(f"this can't be logged as JSON: {error}", entry=MessageCode.LOG_TEXT_TOO_LARGE) from error
     if len(payload) > TEXT_LIMIT:
-        raise LogError(f"a text of {len(payload)} bytes is too long for the log (limit {TEXT_LIMIT})")
+        raise LogError(f"a text of {len(payload)} bytes is too long for the log (limit {TEXT_LIMIT})",
+                       entry=MessageCode.LOG_TEXT_TOO_LARGE)
     return Cold(channel, None, payload, flush=True)
 
 

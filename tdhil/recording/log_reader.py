@@ -123,9 +123,9 @@ def messages(path: Path, *, salvage: bool = False) -> Iterator[Ours | Damage | W
 def _batches(
     path: Path, declared: "_Declared", salvage: bool, size_limit: int
 ) -> Iterator[list[Contents] | Damage | Whole]:
-    """The same with good chunks in batches of up to so many bytes; what is in them is the caller's to take.
+    """Yield the same with good chunks in batches of up to so many bytes; the caller uses their content.
 
-    What a damage or a header in between changes in ``declared`` is changed after the chunks before it were taken.
+    A damage or a header in between changes ``declared`` only after the chunks before it were used.
     """
     batch: list[Contents] = []
     waiting = 0
@@ -184,7 +184,7 @@ class _Declared:
         self._numbers = {number: number for number in CHANNELS}
 
     def assume_undeclared(self) -> None:
-        """Where nothing was declared so far: our own numbers."""
+        """Assume our own channel numbers if none were declared so far."""
         if not self._schemas:
             self._numbers = {number: number for number in CHANNELS} | self._numbers
 
@@ -402,7 +402,7 @@ class _Reading:
         return True
 
     def _epoch_of(self, log_time_ns: int) -> int:
-        """From the first sample; what lies before this century is the zero of a stepped log."""
+        """Return the epoch from the first sample; a time before this century is the zero of a stepped log."""
         time_s = self._builder.first_time_s
         epoch_ns = log_time_ns - round(time_s * 1e9) if abs(time_s) < 1e9 else 0
         return epoch_ns if epoch_ns > _CENTURY_NS else 0

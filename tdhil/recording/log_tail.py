@@ -34,7 +34,7 @@ _SKIPPED: Final = frozenset({
     log_format.COMMAND, log_format.CAN, log_format.MODBUS, log_format.LOG, log_format.VIRTUAL_STRING,
 })
 MOST: Final = 2**20
-"""Bytes of the file at a time, about: whoever comes late to a long run is not to hold everything up."""
+"""Approximate bytes read at a time: a viewer that joins a long run late must not delay the others."""
 
 
 def _nothing() -> FloatArray:
@@ -43,10 +43,10 @@ def _nothing() -> FloatArray:
 
 @dataclass(frozen=True)
 class LogNews:
-    """What came. ``samples`` (n, 3): control time in s, speed in rad/s, torque in N·m, in their order.
+    """News of a log. ``samples`` (n, 3): control time in s, speed in rad/s, torque in N·m, in order.
 
-    ``configuration`` and ``result``: the latest that came, None where none did. ``epoch_ns``: wall clock at control
-    time zero, 0 where no sample came. ``more``: there is more to read at once. ``closed``: that was all there will be.
+    ``configuration`` and ``result``: the latest new ones, or None. ``epoch_ns``: wall clock at control time zero, 0
+    without a sample. ``more``: more can be read at once. ``closed``: the log is complete.
     """
 
     samples: FloatArray = field(default_factory=_nothing)
@@ -61,7 +61,7 @@ class LogNews:
 
 @dataclass(frozen=True)
 class LogChunks:
-    """What came, as its writer put it together: whole chunks, decompressed. ``more`` and ``closed`` as of LogNews."""
+    """New whole chunks, decompressed. ``more`` and ``closed`` as in LogNews."""
 
     chunks: tuple[bytes, ...] = ()
     more: bool = False
@@ -102,7 +102,7 @@ class LogTail:
         self.closed = False
 
     def read(self) -> LogNews:
-        """What has come since the last time; nothing where the file isn't there yet, or can't be read now."""
+        """Return the news since the last call; none if the file is missing, or can't be read now."""
         came = self.read_chunks()
         decoded = [self._decoded(one) for one in came.chunks]
         samples = [one.samples for one in decoded if len(one.samples)]

@@ -51,7 +51,7 @@ class Backlog:
         self.room = Flag()                 # something was taken out
         self.dropped = 0
         self.ended = False
-        self.hurry = False                 # somebody waits until all that is here is in the file
+        self.hurry = False                 # a caller waits until all data is in the file
         self.written = Flag()              # that is done
         self.saved_s = 0.0                 # control time up to which the file holds everything
         self._limit = limit
@@ -88,7 +88,7 @@ class Backlog:
             pass                           # the time-out covers an end that came in between
 
     def end(self) -> None:
-        """Nothing is taken any more; whoever waits for room goes on."""
+        """Accept no more data, and release callers that wait for room."""
         self.ended = True
         self._alert = 0
         self.room.set()
@@ -115,7 +115,7 @@ class Backlog:
 # may take a second for that, and neither the control loop nor the thread that closes the chunks waits for it.
 
 
-EVERY_S: Final = 0.25                  # of wall time, at most so often
+EVERY_S: Final = 0.25                  # least interval, wall time
 _CANNOT: Final = frozenset({errno.EINVAL, errno.ENOTSUP, errno.EROFS, errno.ENOSYS})
 _data_to_disk = getattr(os, "fdatasync", os.fsync)
 
@@ -132,7 +132,7 @@ class Syncer:
         self._thread.start()
 
     def poke(self) -> None:
-        """There is something new in the file. Raises OSError where the disk failed since the last time."""
+        """Announce new data in the file. Raises OSError if the disk failed since the last call."""
         if self.failure is not None:
             raise self.failure
         if not self._wake.is_set():
@@ -193,7 +193,7 @@ class Pump:
         self._told = 0                         # drops that have been logged
 
     def run(self) -> None:
-        """The thread's body; lets no exception out. However it ends, nobody waits for it any more."""
+        """Run the thread; no exception leaves it. At its end no caller is left waiting."""
         try:
             self._guarded(self._work)
         finally:
@@ -370,7 +370,7 @@ class RunWriter:
 
     @property
     def failure(self) -> LogError | None:
-        """What ended the log before its time, or None."""
+        """The error that ended the log too early, or None."""
         cause = self._pump.failure
         return None if cause is None else self._error(LogBroken, "the log can't be written any more", cause)
 

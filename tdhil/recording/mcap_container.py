@@ -39,7 +39,7 @@ _TAIL: Final = 16
 
 
 class RawFile(Protocol):
-    """What is asked of a file: an unbuffered binary one fits."""
+    """Interface of the file: an unbuffered binary one fits."""
 
     def write(self, data: memoryview, /) -> int | None: ...
 
@@ -53,7 +53,7 @@ class RawFile(Protocol):
 
 
 class LogGone(OSError):
-    """Somebody else has removed the file, or cut it short, while it was being written."""
+    """The file was removed or cut short by another program while it was being written."""
 
 
 class Container:
@@ -142,7 +142,7 @@ class Container:
         self._put(end + summary + pointers + footer + MAGIC)
 
     def close(self) -> None:
-        """Lets go of the file."""
+        """Close the file."""
         self._file.close()
 
     def _put(self, data: bytes) -> None:
@@ -175,7 +175,7 @@ class Container:
             )
         # Cut between the last look and the last write: the write has made it long again, with a hole before it.
         start, before = self._seam
-        if sys.platform == "win32":    # has no pread, and lets nobody cut a file that another writes
+        if sys.platform == "win32":    # no pread; no other program can cut an open file
             return
         try:
             stands = os.pread(self._file.fileno(), len(before), start)
@@ -198,7 +198,7 @@ class Container:
 
 
 def _is_named(file: RawFile) -> bool:
-    """Is it a plain file whose names are counted? Pipes and devices aren't, and some file systems don't count."""
+    """Return whether it is a plain file with a count of names. Pipes, devices and some file systems have none."""
     try:
         found = os.fstat(file.fileno())
     except (OSError, ValueError):

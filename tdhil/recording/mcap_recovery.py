@@ -48,7 +48,7 @@ class Damage:
 
 @dataclass(frozen=True)
 class Contents:
-    """What one good chunk holds, uncompressed; ``offset`` is the chunk's place in the file."""
+    """Content of one good chunk, uncompressed; ``offset`` is the chunk's place in the file."""
 
     offset: int
     data: bytes
@@ -56,7 +56,7 @@ class Contents:
 
 @dataclass(frozen=True)
 class ChunkHead:
-    """What a chunk says of itself; its compressed data stand at ``start``, ``length`` bytes long."""
+    """Header of a chunk; its compressed data are at ``start``, ``length`` bytes long."""
 
     compression: str
     uncompressed_size: int
@@ -100,9 +100,9 @@ def contents(file: BinaryIO, offset: int, chunk: ChunkHead, zstd: zstandard.Zstd
 
 
 def _decompress(zstd: zstandard.ZstdDecompressor, compression: str, data: bytes, limit: int) -> bytes:
-    """At most ``limit`` bytes of it, and never more than that in memory."""
+    """Return at most ``limit`` bytes of it, and never use more memory than that."""
     if compression == "zstd":
-        if 0 <= zstandard.frame_content_size(data) < limit:     # what the frame states is all that is made room for
+        if 0 <= zstandard.frame_content_size(data) < limit:     # memory is reserved for the stated size only
             return zstd.decompress(data)
         with zstd.stream_reader(data) as reader:
             return reader.read(limit)
@@ -133,7 +133,7 @@ _STEP: Final = 2**20
 
 @dataclass(frozen=True)
 class Library:
-    """Who wrote the file, by its own words."""
+    """Program that wrote the file, as stated in it."""
 
     name: str
 
@@ -187,12 +187,12 @@ def walk(file: BinaryIO, size: int) -> Iterator[Found]:
 
 
 def _is_index(head: bytes, length: int) -> bool:
-    """Is this of a message index whose two lengths agree?"""
+    """Return whether this is the head of a message index whose two lengths agree."""
     return len(head) == _INDEX_HEAD and int.from_bytes(head[-4:], "little") + 6 == length
 
 
 def _next_chunk(file: BinaryIO, offset: int, size: int) -> int | None:
-    """Where the next chunk begins that agrees with itself; None if there is none."""
+    """Return the start of the next consistent chunk; None if there is none."""
     before = _RECORD.size + CHUNK_HEAD.size - 4           # from the chunk's first byte to its compression's name
     while offset < size:
         block = read_at(file, offset, _STEP + before + 8)  # blocks overlap by what a chunk's head takes

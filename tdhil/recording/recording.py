@@ -20,7 +20,7 @@ ABORTED: Final = "aborted"
 """Outcome of a stage that did not come to its end."""
 
 MARGIN_S: Final = 1.0
-"""What leads up to an abort is left out too: the fault is in the signals before anybody can have noticed it."""
+"""Time before an abort that is left out too, s: the fault is in the signals before it is detected."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Excitation:
-    """What stage 5 did. ``kind``: multisine, sine, step, …; ``mode``: speed or torque."""
+    """Motion of stage 5. ``kind``: multisine, sine, step, …; ``mode``: speed or torque."""
 
     kind: str
     mode: str
@@ -128,11 +128,11 @@ class TorqueAnswer:
 
 @dataclass(frozen=True)
 class ImpedanceInput:
-    """What was commanded to measure the drive's own impedance with: a torque offset or the speed reference.
+    """Command that measured the drive's own impedance: a torque offset or the speed reference.
 
-    ``count`` is one count of it, N·m or rad/s: what was commanded is rounded to it (0: it isn't). A command stood from
-    one sample to the next. ``reference_filter_s``: a first-order smoothing of the speed reference that the drive is
-    known to have. ``string_nm_s_rad``: impedance ζ of the string that |r| is told for, at the motor; 0: none is known.
+    ``count`` is one count of it, N·m or rad/s; commands are rounded to it (0: no rounding). A command holds from one
+    sample to the next. ``reference_filter_s``: known first-order filter of the drive's speed reference, s.
+    ``string_nm_s_rad``: impedance ζ of the string for |r|, at the motor; 0: unknown.
     """
 
     by: str                            # offset, reference
@@ -184,7 +184,7 @@ class Recording:
     timing_half_width_s: float = 0.0       # usual half-width of a transaction: when in it a sample was taken is open
     stepped_setpoint: SteppedSetpoint | None = None     # in speed mode
     impedance: ImpedanceInput | None = None             # where the drive's own impedance was measured
-    torque_answer: TorqueAnswer | None = None           # in torque mode, where it was looked at
+    torque_answer: TorqueAnswer | None = None           # in torque mode, if it was checked
     winds_up: bool = False                 # a load that winds up hangs on the shaft, as rig.yaml says (load: string)
     pipe: Pipe | None = None               # of the drill string that hangs on the shaft, where its sizes are known
     simulated: bool = False
@@ -202,10 +202,10 @@ def aborted_stage(recording: Recording) -> Stage | None:
 
 
 def before_abort(recording: Recording) -> Recording:
-    """What may be identified from: all up to a moment before the first aborted stage gave up, or all there is.
+    """Return the part for the identification: all until a moment before the first aborted stage ended, or everything.
 
-    An aborted run is stopped in the same record: samples of braking and of the shaft at rest follow those of the
-    motion that was planned. Segments end with their last whole period.
+    An aborted run is stopped in the same record: samples of braking and of standstill follow those of the planned
+    motion. Segments end with their last whole period.
     """
     stage = aborted_stage(recording)
     if stage is None or not math.isfinite(stage.end_s):
@@ -235,7 +235,7 @@ def _part(signal: FloatArray | None, kept: BoolArray) -> FloatArray | None:
 
 
 def _cut(excitation: Excitation, end_s: float) -> Excitation | None:
-    """None where all of it was still to come: then nothing was excited."""
+    """Return the excitation until ``end_s``; None if it had not started."""
     kept = tuple(_whole(one, end_s) for one in excitation.segments if one.start_s < end_s)
     return None if excitation.segments and not kept else replace(excitation, segments=kept)
 

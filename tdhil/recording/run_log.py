@@ -1,4 +1,4 @@
-"""Where a run goes as it happens: to the file, and to the Recording that is identified from afterwards."""
+"""Log of a run as it happens: to the file, and to the Recording for the identification afterwards."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drivers import Command, RawFrame, Sample, TdhilError
-from tdhil.errors import ExitCode, Interrupted, exit_code
+from tdhil.errors import ExitCode, Interrupted, code_of, exit_code
 from tdhil.recording.builder import RecordingBuilder
 from tdhil.recording.log_format import FAILURE, INTERRUPTED, VIRTUAL_COLUMNS, Event
 from tdhil.recording.log_writer import RunWriter
@@ -33,10 +33,11 @@ class RunEnd:
     next_step: str
     exit_code: int
     time_s: float
+    code: str = ""      # in the table of messages; a log of an older version has none
 
     @property
     def message(self) -> str:
-        """What happened, and where."""
+        """Text of the event, and its place."""
         return f"{self.where}: {self.what}" if self.where else self.what
 
 
@@ -45,17 +46,18 @@ def ended_by(error: BaseException, time_s: float) -> dict[str, Any]:
     what, where, next_step = str(error), "", ""
     if isinstance(error, TdhilError):
         what, where, next_step = error.what, error.where, error.next_step
-    return asdict(RunEnd(type(error).__name__, what, where, next_step, int(exit_code(error)), time_s))
+    return asdict(RunEnd(type(error).__name__, what, where, next_step, int(exit_code(error)), time_s,
+                         code_of(error)))
 
 
 def find_ended(configuration: Mapping[str, Any], events: tuple[Event, ...]) -> RunEnd | None:
-    """What ended the run of this log; None where it came to its end, or where the log ends first.
+    """Return the cause that ended the run of this log; None if the run was complete, or the log ends first.
 
-    Logs of before 0.2 have it in an event only, in words.
+    Logs older than 0.2 have it as text in an event only.
     """
     found = configuration.get("ended")
     if isinstance(found, Mapping):
-        text = {name: str(found.get(name, "")) for name in ("kind", "what", "where", "next_step")}
+        text = {name: str(found.get(name, "")) for name in ("kind", "what", "where", "next_step", "code")}
         return RunEnd(**text, exit_code=_code(found.get("exit_code")), time_s=_number(found.get("time_s")))
     for event in events:
         if event.kind == INTERRUPTED:
@@ -137,7 +139,7 @@ class RunLog:
         self._writer.event(Event(time_s, kind, text))
 
     def failure(self, time_s: float, error: BaseException) -> None:
-        """What ended a run, with its traceback: for us, in the log; the user gets the message alone."""
+        """Record the error that ended a run, with its traceback in the log; the user gets only the message."""
         self.configure(ended=ended_by(error, time_s))
         if isinstance(error, Interrupted):
             self._writer.event(Event(time_s, INTERRUPTED, str(error)))

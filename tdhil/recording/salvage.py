@@ -1,7 +1,7 @@
-"""What a damaged log still holds, and a clean copy of that.
+"""Readable content of a damaged log, and a clean copy of it.
 
-The copy is laid out anew from the messages that can be read, so nothing of the damage is carried over. It bears one
-more event, which says what was lost: the copy is a whole file, but whoever replays it must know that the run is not.
+The copy is made from the messages that can be read, so it contains no damage. One more event states the lost parts: the
+copy is a whole file, but its reader must know that the run is not complete.
 """
 
 import os
@@ -34,7 +34,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class Salvage:
-    """What was found. ``gaps`` are holes that no single missed cycle explains; ``lost`` is in words, a line each."""
+    """Readable content. ``gaps``: holes longer than a single missed cycle; ``lost``: text, one line each."""
 
     run: LoggedRun
     gaps: tuple[Gap, ...]
@@ -65,7 +65,7 @@ def examine(path: Path) -> Salvage:
 
 
 def find_gaps(run: LoggedRun) -> tuple[Gap, ...]:
-    """Where samples are missing between others: more than 20 periods, a period being the median step."""
+    """Return gaps between samples: more than 20 periods, a period being the median step."""
     time_s = run.recording.time_s
     with np.errstate(invalid="ignore", over="ignore"):        # a hostile file's times may be anything
         steps = np.diff(time_s)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from profiles import MessageCode
 from tdhil.config import SPEED_UNIT_TOLERANCE
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.result import Refusal
@@ -67,6 +68,24 @@ def angle_ratio(recording: Recording, samples: Samples, where: str, start_s: flo
     return AngleRatio(where, ratio, open_rad / abs(way))
 
 
+def mean_speed(recording: Recording, start_s: float, end_s: float) -> tuple[float, float] | None:
+    """Return the mean reported speed between two times, and a bound of its error, rad/s; None where it has a hole.
+
+    The bound covers the longest plausible lag of the reports, their rounding, and samples that miss at the ends.
+    """
+    inside = usable_samples(recording).between(start_s, end_s)
+    if len(inside) < _LEAST_READINGS:
+        return None
+    gaps = np.diff(inside.time_s, prepend=start_s, append=end_s)
+    if float(np.max(gaps)) > _LONGEST_GAP_S:
+        return None
+    time, speed = inside.time_s, inside.speed_rad_s
+    way = float(np.trapezoid(speed, time)) + float(speed[0]) * float(gaps[0]) + float(speed[-1]) * float(gaps[-1])
+    ends = [inside.between(at, at + _END_S).speed_rad_s for at in (float(time[0]), float(time[-1]) - _END_S)]
+    change = abs(float(np.mean(ends[1])) - float(np.mean(ends[0])))
+    return way / (end_s - start_s), _LAG_S * change / (end_s - start_s) + 0.5 * recording.speed_resolution_rad_s
+
+
 def _unbroken(recording: Recording, where: str, start_s: float, end_s: float) -> list[tuple[str, float, float]]:
     """The parts of a stretch in which no turn of the shaft is lost: none has a longer gap than the angle allows."""
     angle, gap_s = recording.position_rad, recording.position_gap_s
@@ -79,7 +98,7 @@ def _unbroken(recording: Recording, where: str, start_s: float, end_s: float) ->
 
 
 def angle_ratios(recording: Recording) -> tuple[tuple[AngleRatio, ...], tuple[AngleRatio, ...]]:
-    """Of the steady levels, and of stage 5: its segments, or all of it where it has none."""
+    """Return the time spans of the steady levels and of stage 5: its segments, or all of it if it has none."""
     if recording.position_rad is None:
         return (), ()
     samples = usable_samples(recording)
@@ -97,7 +116,7 @@ def angle_ratios(recording: Recording) -> tuple[tuple[AngleRatio, ...], tuple[An
 
 
 def angle_contradiction(recording: Recording) -> Refusal | None:
-    """What is wrong where the angle contradicts the speed that J comes from; None where it does not, or is not told."""
+    """Return how the angle contradicts the speed that J rests on; None where it does not, or is not told."""
     steady, excited = angle_ratios(recording)
     for one in excited:
         if not recording.speed_unit_accepted and abs(one.value - 1.0) > SPEED_UNIT_TOLERANCE + one.half_width:
@@ -106,6 +125,7 @@ def angle_contradiction(recording: Recording) -> Refusal | None:
                 f" times as far as the reported speed says (±{one.half_width:.2g}, tolerance"
                 f" ±{SPEED_UNIT_TOLERANCE:g})",
                 "check the unit of speed and the counts per turn in the profile, and the encoder's coupling",
+                entry=MessageCode.SPEED_SCALE_DOUBTFUL,
             )
         for other in (*steady, *excited):
             if abs(one.value - other.value) > _ALIKE * abs(other.value) + one.half_width + other.half_width:
@@ -114,7 +134,7 @@ def angle_contradiction(recording: Recording) -> Refusal | None:
                     f"{one.value:.4g} ± {one.half_width:.2g} times as far as the reported speed says in {one.where},"
                     f" and {other.value:.4g} ± {other.half_width:.2g} times as far in {other.where} before or after",
                     "check the encoder, its coupling and its supply, and which program writes to the drive; then run it"
-                    " again",
+                    " again", entry=MessageCode.SPEED_SCALE_DOUBTFUL,
                 )
     return None
 

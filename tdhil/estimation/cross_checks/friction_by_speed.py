@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from tdhil.estimation.cross_checks.momentum import (
     KNOT_S,
     BalanceKind,
@@ -48,7 +49,7 @@ _ALIKE = 0.01             # of the fastest: speeds closer than that are one
 
 @dataclass(frozen=True)
 class Inertia:
-    """What is known of J, kg·m², rough or final, with its standard deviation; and of the delay between the reports."""
+    """The known J, kg·m², rough or final, with its standard deviation; and the delay between the reports."""
 
     value: float
     sd: float
@@ -98,7 +99,7 @@ def _point(row: BalanceRow, inertia: Inertia, density: float, swing: float) -> F
 
 
 def merged(points: list[FrictionStretch]) -> list[FrictionStretch]:
-    """In rising speed; neighbours that are one speed, and both calm or both swung, put together by their weights."""
+    """Sort points by rising speed and merge neighbours of one speed, both calm or both swung, by their weights."""
     ordered = sorted(points, key=lambda point: point.speed)
     fastest = max((abs(point.speed) for point in ordered), default=0.0)
     found: list[FrictionStretch] = []
@@ -144,10 +145,10 @@ class FrictionCurve:
     def warnings(self) -> tuple[str, ...]:
         if not self.bent:
             return ()
-        return (
+        return (CodedText(
             f"friction is no straight line over speed (p = {self.p_value:.1g}): its slope B differs by "
             f"±{self.viscous_spread_nm_s_rad:.2g} N·m·s/rad from one mean speed to the other, and J knows less of it",
-        )
+            MessageCode.FRICTION_NOT_LINEAR),)
 
 
 _NOTHING = FrictionCurve((), None, False, 0.0)
@@ -186,7 +187,7 @@ def friction_curve(
 
 
 def _density(recording: Recording, samples: Samples, levels: Levels, delay: Delay) -> Density | None:
-    """Of the excited periods; where they are too few, of these and of what balances of momentum leave."""
+    """Friction of the excited periods; where they are too few, also of what balances of momentum leave."""
     own = Density(levels.density, levels.dof)
     if own.dof < _LEAST_DOF:
         found = balances(recording, samples)

@@ -11,7 +11,7 @@ from tdhil.estimation.samples import Samples
 from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Where a run stood calm, and where it coasted: read off half-second means of what was reported, whoever ran it.
+# Where a run stood calm, and where it coasted: read off half-second means of the reports, whichever host ran it.
 #
 # Calm is what every reporting lag agrees on: while speed hardly changes, reported and true speed and torque are the
 # same, whatever filters stand between. Between two calm stretches a momentum balance needs no model of the reports
@@ -58,7 +58,7 @@ class Blocks:
 
 
 def block_means(samples: Samples) -> Blocks | None:
-    """None for too few samples, or times that make no sense as a record."""
+    """Return None for too few samples, or for times that make no sense as a record."""
     if len(samples) < 16:
         return None
     start, length = float(samples.time_s[0]), float(samples.time_s[-1] - samples.time_s[0])
@@ -165,7 +165,7 @@ _CHUNK = 65_536           # samples worked on at once: a long row never stands i
 
 
 class BalanceKind(Enum):
-    """What a row is for."""
+    """The purpose of a row."""
 
     TURNING = "turning"       # steady or changing speed under torque
     COASTING = "coasting"
@@ -366,7 +366,7 @@ def _seen(blocks: Blocks, knots: list[Knot], direction: float) -> tuple[float, f
 
 
 def _calm_knots(span: Span, apart_s: float) -> list[Knot]:
-    """At both ends of a calm stretch and every few seconds between; one in the middle of a short one."""
+    """Place cuts at both ends of a calm stretch and every few seconds between; one in the middle of a short one."""
     count = 1 + int((span.duration_s - KNOT_S) / apart_s)
     if count == 1:
         middle = 0.5 * (span.start_s + span.end_s)
@@ -400,7 +400,7 @@ def _period_knots(segment: Segment) -> list[Knot]:
 
 
 def _coast_knots(span: Span, blocks: Blocks, direction: float, low: float) -> list[Knot]:
-    """From where the reports have settled to where friction is no longer known, or the coasting ends."""
+    """Return the span from settled reports to the point where friction is unknown, or the coasting ends."""
     inside = (blocks.time_s > span.start_s) & (blocks.time_s < span.end_s) & (blocks.speed_rad_s * direction >= low)
     start = span.start_s + _COAST_ENTRY_S
     end = float(blocks.time_s[inside][-1]) if np.any(inside) else start

@@ -43,7 +43,7 @@ class Delay:
 
 
 UNKNOWN_DELAY = Delay(0.0, 0.25, False)
-"""Up to half a second either way, two deviations: where nobody knows."""
+"""Unknown delay: up to half a second either way, as two standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def _bent(
     solve: Callable[..., tuple[FloatArray, FloatArray, float]], rows: list[BalanceRow], delay_s: float, inertia: float,
     further: tuple[FloatArray, ...], prior: float, rest: float, density: float,
 ) -> float:
-    """By how much J may change, kg·m², with friction that has a part ∝ ω|ω|: all of it where the rows show that part.
+    """Return the change of J, kg·m², with friction that has a part ∝ ω|ω|: all of it where the rows show that part.
 
     Where they do not, what they leave open of it is mostly noise, and counts up to a share of J.
     """

@@ -15,6 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from tdhil.config import has_plateaus
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.cross_checks.friction_by_speed import Inertia, friction_curve
@@ -43,10 +44,10 @@ _WORTH_A_FIT = 0.005
 Fitted = tuple[tuple[SecondOpinion, MomentumFit], ...]
 _ACQUISITION = "acquire"  # the stage that J comes from
 _CONTRADICTION = 1e-3
-"""Of the runs: the chance that a sound result is taken back, for noise and friction that bends unseen."""
+"""Share of runs: the chance that a sound result is taken back, for noise and friction that bends unseen."""
 
 _ALIKE = 0.05
-"""Of J: a difference below it contradicts nothing. Friction drifts between stages by some percent of J's torque."""
+"""Share of J: a smaller difference is none. Friction drifts between stages by some percent of J's torque."""
 
 
 def cross_checked(finding: Finding, case: Case) -> Finding:
@@ -63,7 +64,7 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
     inertia = _inertia(case, finding, opinions)
     contradiction = _contradiction(against, finding, case.options.confidence)
     if contradiction.reason:
-        # of a J that does not stand nothing else is told, as where the residuals contradict the model
+        # a J that does not stand gets no further figures, as where the residuals contradict the model
         finding = Finding(finding.model, finding.words, finding.residual, lines=finding.lines, bent=finding.bent,
                           samples_used=finding.samples_used, contradiction=contradiction)
     if inertia is None or case.levels is None:
@@ -75,7 +76,7 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
 
 
 def _inertia(case: Case, finding: Finding, opinions: tuple[SecondOpinion, ...]) -> Inertia | None:
-    """J of everything that turns with its standard deviation: the finding's, else a second opinion's."""
+    """Return J of everything that turns, with its standard deviation: the finding's, else a momentum cross-check's."""
     known = reference_inertia(finding)
     if known is None and opinions:
         known = opinions[0].inertia_kg_m2
@@ -87,7 +88,7 @@ def _inertia(case: Case, finding: Finding, opinions: tuple[SecondOpinion, ...]) 
 
 
 def second_opinions(case: Case, finding: Finding) -> tuple[SecondOpinion, ...]:
-    """J by every route that the run has; () where there is none. The finding's own J and lags are looked at, where it
+    """J by every route that the run has; () where there is none. The finding's own J and lags count, where it
     has them. Never raises.
     """
     return tuple(opinion for opinion, _ in _fitted_opinions(case, finding))
@@ -123,7 +124,7 @@ def _before_acquisition(case: Case, finding: Finding) -> Fitted:
 
 
 def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Refusal:
-    """What contradicts J beyond chance and beyond what friction that bends may do to a balance; else nothing.
+    """Return the contradiction of J beyond chance and the effect of nonlinear friction on a balance; else nothing.
 
     The torque's scale is shared by both and cancels.
     """
@@ -142,7 +143,7 @@ def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Ref
                 "a signal changed its scale during the run, the load changed, or friction is not what the model takes "
                 "it for",
                 "check that speed and torque are reported with one scale in all stages and that the load stays the same"
-                " during the run; then run it again",
+                " during the run; then run it again", entry=MessageCode.METHODS_CONTRADICT,
             )
     return Refusal("", "")
 
@@ -168,14 +169,17 @@ def _with_least_change(
 
 
 def disagreements(opinions: tuple[SecondOpinion, ...], finding: Finding) -> tuple[str, ...]:
-    """One warning for each second opinion that contradicts the finding."""
+    """Return one warning for each momentum cross-check that contradicts the finding."""
     reference = reference_inertia(finding)
     if reference is None:
         return ()
     return tuple(
-        f"a second opinion ({opinion.route}) does not agree: {opinion.inertia_kg_m2.value:.4g} "
-        f"({opinion.inertia_kg_m2.low:.4g} to {opinion.inertia_kg_m2.high:.4g}) kg·m² against "
-        f"{reference.value:.4g}; friction, load or the torque's scale may not be what the model takes them for"
+        CodedText(
+            f"a second opinion ({opinion.route}) does not agree: {opinion.inertia_kg_m2.value:.4g} "
+            f"({opinion.inertia_kg_m2.low:.4g} to {opinion.inertia_kg_m2.high:.4g}) kg·m² against "
+            f"{reference.value:.4g}; friction, load or the torque's scale may not be what the model takes them for",
+            MessageCode.CROSS_CHECK_DISAGREES,
+        )
         for opinion in opinions
         if opinion.agrees is False
     )
@@ -267,7 +271,7 @@ def known_delay(recording: Recording, finding: Finding) -> Delay:
 
 
 def _resolution(recording: Recording, samples: Samples, found: Balances) -> Resolution:
-    """What rounding to a quantum q leaves in a mean, by the scatter σ of the signal at steady speed.
+    """Return the error of a mean from rounding to a quantum q, by the scatter σ of the signal at steady speed.
 
     Noise of deviation σ before the rounding dithers it: the mean's error is at most (q/π) e^(−2π²σ²/q²), and
     uniform of deviation q/√12 without noise.
@@ -291,12 +295,12 @@ def _rounding(quantum: float, parts: list[FloatArray]) -> float:
 
 
 def reference_inertia(finding: Finding) -> Estimate | None:
-    """What a momentum balance must be compared with: all that turns, also behind a compliant shaft."""
+    """Return the inertia to compare with a momentum balance: all that turns, also behind a compliant shaft."""
     return finding.inertia if finding.compliant is None else finding.compliant.total_inertia
 
 
 def _agrees(own: Estimate, finding: Finding, confidence: float, miss_share: float) -> bool | None:
-    """Is the difference within what two independent intervals leave? ``miss_share``: the chance to say no wrongly."""
+    """Return whether the difference is within two independent intervals. ``miss_share``: chance of a wrong no."""
     reference = reference_inertia(finding)
     if reference is None or not reference.finite:
         return None

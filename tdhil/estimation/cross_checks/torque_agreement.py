@@ -20,6 +20,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Case
 from tdhil.estimation.frequency_domain import student_quantile
 from tdhil.estimation.result import Estimate, Refusal, Refused, TorqueRatio, normal_quantile
@@ -65,7 +66,7 @@ class _RatioFit:
     lean: float
 
     def half_width(self, confidence: float) -> float:
-        """Of the coverage interval."""
+        """Probability of the coverage interval."""
         return student_quantile(confidence, self.dof) * self.sd + self.lean
 
 
@@ -124,7 +125,7 @@ def _operators(bins: Bins) -> list[FloatArray]:
 
 
 def _left(bins: Bins, x: FloatArray) -> FloatArray:
-    """What the equation leaves over in every bin (M,), as torque: the inverse of the lags taken off again."""
+    """Return the residual of the equation in every bin (M,), as torque: the inverse of the lags taken off again."""
     first, second, third = _operators(bins)
     left = bins.torque[:, 0] + x[_FIRST] * first + x[_SECOND] * second + x[_THIRD] * third
     left = left - x[_RATIO] * bins.speed[:, 0] - x[_OFFSET] * bins.level[:, 0]
@@ -179,10 +180,10 @@ _FALSE_ALARM = 1e-3
 """Chance that sound signals are called contradicting, for the ratio's own noise; the scale's allowance comes on top."""
 
 _NEGLIGIBLE = 0.01
-"""Of one: a ratio that differs by less is one. Setpoints are rounded, and a torque loop keeps a small error."""
+"""Share of one: a ratio that differs by less is one. Setpoints are rounded, and a torque loop keeps a small error."""
 
 _FITS = 0.2
-"""Of how far the ratio is off: two signals that differ by less fit each other."""
+"""Share of the ratio's deviation: two signals that differ by less fit each other."""
 
 _ADVICE = (
     "check the units of torque in the profile (per_lsb of setpoint and reported torque) and the rated torque; or "
@@ -264,28 +265,29 @@ def torques_judged(case: Case) -> Case:
     scale = case.recording.torque_scale_rel_sd
     refusal = torque_contradiction(case.torque_ratios, scale)
     if refusal is not None:
-        raise Refused(refusal.reason, refusal.advice)
+        raise Refused(refusal.reason, refusal.advice, refusal.entry)
     worst = _worst(case.torque_ratios)
     if worst is None:
         return case
     widened = replace(
         case.recording, torque_scale_rel_sd=math.hypot(scale, abs(worst.ratio.value - 1.0) / normal_quantile(0.95)))
     warning = (
-        f"{_sentence(worst)}; the uncertainty of the torque scale was widened from {scale:.2%} to "
-        f"{widened.torque_scale_rel_sd:.2%} (1 sd)"
+        CodedText(f"{_sentence(worst)}; the uncertainty of the torque scale was widened from {scale:.2%} to "
+        f"{widened.torque_scale_rel_sd:.2%} (1 sd)",
+        MessageCode.TORQUE_SIGNALS_DIFFER)
     )
     return replace(case, recording=widened, warnings=(*case.warnings, warning))
 
 
 def torque_contradiction(found: tuple[TorqueRatio, ...], scale_rel_sd: float) -> Refusal | None:
-    """What is wrong where a ratio differs from 1 by more than the torque scale allows; None where none does.
+    """Return the contradiction where a ratio differs from 1 by more than the torque scale allows; None where none does.
 
     ``scale_rel_sd``: standard uncertainty of the torque scale, as a share.
     """
     worst, allowed = _worst(found), normal_quantile(0.95) * scale_rel_sd
     if worst is None or abs(worst.ratio.value - 1.0) <= allowed + worst.surely:
         return None
-    return Refusal(_contradiction(worst, allowed), _advice(worst))
+    return Refusal(_contradiction(worst, allowed), _advice(worst), entry=MessageCode.TORQUE_SCALE_DOUBTFUL)
 
 
 def _worst(found: tuple[TorqueRatio, ...]) -> TorqueRatio | None:

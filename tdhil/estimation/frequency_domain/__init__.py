@@ -12,7 +12,9 @@ if TYPE_CHECKING:
     from tdhil.estimation.frequency_domain.compliant import (
         identify_compliant as identify_compliant, may_swing as may_swing, usable_lines as usable_lines,
     )
-    from tdhil.estimation.frequency_domain.filter_order import simple_weight as simple_weight
+    from tdhil.estimation.frequency_domain.filter_order import (
+        FittedModel as FittedModel, simple_weight as simple_weight,
+    )
     from tdhil.estimation.frequency_domain.inference import (
         contradicted as contradicted, fisher_tail as fisher_tail, profile_edge as profile_edge,
         student_quantile as student_quantile, torque_scale_line as torque_scale_line,

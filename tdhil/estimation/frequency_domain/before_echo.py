@@ -25,6 +25,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Finding, ModelWords, PeriodicCase
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import FittedModel, fit_model
@@ -103,7 +104,7 @@ class EchoShaft:
         return np.concatenate([[rough_inertia, zeta, zeta], np.ones(len(self.at_s))])
 
     def beliefs(self, m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As of `shafts.Believing`."""
+        """Return the prior residuals and slopes, as `shafts.Believing` does."""
         return self._beliefs @ m - self._believed, self._beliefs
 
     def start(self, inertia: float) -> FloatArray:
@@ -116,7 +117,7 @@ class EchoShaft:
         return np.concatenate([[inertia, 0.0, zeta], echo])
 
     def _delays(self, s: ComplexArray) -> ComplexArray:
-        """Of the lines, which are the same ones all along a fit."""
+        """Cached values of the lines, which stay the same during a fit."""
         if self._delayed is None or self._delayed[0] is not s:
             self._delayed = s, np.exp(-np.outer(s, self.at_s))
         return self._delayed[1]
@@ -178,6 +179,7 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
         raise Refused(
             "pseudo-random torque tells the inertia above a drill string only if its pipe is known",
             "state load.length_m and both diameters in rig.yaml, or use --excitation multisine",
+            entry=MessageCode.ECHO_NOT_SEPARATED,
         )
     lines = unleaked(pooled_lines(case.fits, 0.0), case.fits)
     answer = case.recording.torque_answer if case.recording.lag_prior.torque_lag_s is None else None
@@ -187,14 +189,17 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
     shaft = echo_shaft(problem)
     finding = Finding(
         model="string", words=_WORDS, residual=residual, lines=fitted_points(fitted, confidence),
-        warnings=("J is the motor's side of the string, J_r, from what it does before an echo comes back",),
+        warnings=(CodedText(
+            "J is the motor's side of the string, J_r, from what it does before an echo comes back",
+            MessageCode.MOTOR_SIDE_ONLY),),
         compliant=Compliant(None, None, None, None, None, None),
     )
     if rejects(residual):
         return replace(finding, compliant=None)
     inertia = estimate(fitted, INERTIA, confidence)
     if not (inertia.bounded and inertia.low > 0.0):
-        raise Refused("the lines before the echo leave the inertia open", _WORDS.if_wide)
+        raise Refused("the lines before the echo leave the inertia open", _WORDS.if_wide,
+                      entry=MessageCode.NOT_IDENTIFIABLE)
     speed_lag, torque_lag, skew = lags_of(fitted, confidence)
     told = f"to {100.0 * pipe.rel_sd:.2g} % (1 sd), as {pipe.source or 'stated'}"
     return replace(
@@ -217,7 +222,7 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
 def problem_of(
     lines: tuple[SpectralLine, ...], pipe: Pipe, prior: LagPrior, answer: TorqueAnswer | None = None
 ) -> Likelihood:
-    """``answer``: of the torque, where nobody states its lag.
+    """``answer``: the response of the torque, where no lag of it is stated.
 
     Raises Refused where the lines are too few or too far apart to see an echo apart from what was before it.
     """
@@ -229,12 +234,13 @@ def problem_of(
             f"the lines are {apart:.3g} Hz apart: an echo after {shaft.echo_s:.2f} s can't be told from what was before"
             f" it; {1.0 / (shaft.echo_s + _LASTS_S):.3g} Hz at most would do",
             "use a lower --frequency, or --excitation multisine",
+            entry=MessageCode.ECHO_NOT_SEPARATED,
         )
     if not max(hertz) * shaft.echo_s >= 1.0:
         raise Refused(
             f"the echo comes back after {shaft.echo_s:.2f} s, before the fastest line, {max(hertz):.3g} Hz, has turned"
             " once: the string is too short",
-            "use --excitation multisine",
+            "use --excitation multisine", entry=MessageCode.ECHO_NOT_SEPARATED,
         )
     model = Model(shaft)
     lags = (model.at(signal_filters.SPEED_LAG), model.at(signal_filters.TORQUE_LAG))
@@ -251,7 +257,7 @@ def problem_of(
 # ---------------------------------------------------------------------------------------------------------------------
 # What the torque's report does, from the torque that was commanded.
 #
-# Before an echo comes back, J is told by lines at which the reports' filters matter as much as it does: long lags on
+# Before an echo comes back, J follows from lines at which the reports' filters matter as much as it does: long lags on
 # both reports and a lighter motor look alike, and with nothing known of the filters the interval reaches down to half
 # of J. But what reports the torque can be seen apart from all mechanics. In torque mode the torque is commanded, and a
 # drive's torque loop follows within some milliseconds: how much later and smoother the reported torque is than the
@@ -261,13 +267,13 @@ def problem_of(
 
 _OWN_LAG_S, _OWN_LAG_SD_S = 0.01, 0.015      # of the torque behind its setpoint: from none to some 40 ms
 _SHAPE_SD = 0.1
-_ANSWER_MISFIT = 0.01       # of the lines, rms: what is no filter of two poles is left unknown
+_ANSWER_MISFIT = 0.01       # of the lines, rms: above it the response is no filter of two poles, and stays unknown
 _LEAST_ANSWER = 0.1         # of the strongest line
 _FOLLOWS = "the drive's torque follows its setpoint within some 40 ms: what its report is late by beyond is its filter"
 
 
 def torque_answer(recording: Recording, commanded_nm: FloatArray) -> TorqueAnswer | None:
-    """Of a motion that `identify_before_echo` is for; ``commanded_nm`` (N,). None where it is no filter of two poles.
+    """Return the response of a motion for `identify_before_echo`; ``commanded_nm`` (N,). None if not of two poles.
 
     A command stood from its cycle on, and a report answers it a cycle later or so: all of that is delay.
     """
@@ -322,7 +328,8 @@ def fit_before_echo(problem: Likelihood, prior: LagPrior) -> FittedModel:
     try:
         return fit_model(problem, fixed, starts)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError) as error:
-        raise Refused("the lines before the echo leave the inertia open", _WORDS.if_wide) from error
+        raise Refused("the lines before the echo leave the inertia open", _WORDS.if_wide,
+                      entry=MessageCode.NOT_IDENTIFIABLE) from error
 
 
 def _apparent_inertia(lines: tuple[SpectralLine, ...]) -> float:
@@ -332,7 +339,7 @@ def _apparent_inertia(lines: tuple[SpectralLine, ...]) -> float:
 
 
 def residual_of(fitted: FittedModel) -> ResidualTest | None:
-    """Of the lines alone, less as many numbers as they were fitted with: beliefs about an echo aren't measured."""
+    """Return the test of the lines alone, less the fitted parameters: a prior on the echo is no measurement."""
     from scipy.special import chdtrc
 
     problem, theta = fitted.problem, fitted.whole.theta
@@ -379,6 +386,7 @@ def refuse_stick_slip(case: PeriodicCase) -> None:
                 f"stick-slip: besides the excitation the speed swings by ±{swing_rad_s:.2f} rad/s every {period_s:.1f}"
                 f" s about {mean_rad_s:.3g} rad/s, as above a bit that sticks and slips",
                 "lift the bit off bottom, take weight off it, or turn faster",
+                entry=MessageCode.STICK_SLIP_RECORDED,
             )
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Finding, ModelWords, PeriodicCase
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.compliant_fit import (
@@ -51,7 +52,7 @@ from tdhil.estimation.spectrum import SpectralLine
 from tdhil.recording import Pipe
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Two masses, or the string? The simplest that the residuals allow stands; what can't be told apart is not assumed.
+# Two masses, or the string? The simplest that the residuals allow stands; models that fit alike widen the interval.
 #
 # Two masses are a string that weighs nothing. A light string is, to first order in its weight, two masses with other
 # shares of the same total: a third of it seems to turn with the motor. Only its second swing, near one half of the
@@ -59,7 +60,7 @@ from tdhil.recording import Pipe
 # whatever string the data do not contradict (`result_of`; one whose lowest swing the lines can see, `too_slow`);
 # J_r + J_L is the same in both. Only who says ``--model two-mass`` takes the spring's weight for nothing.
 #
-# So little is lost by holding on to two masses too long, and J_r moves by what the string weighs if they are given up
+# So little is lost by holding on to two masses too long, and J_r moves by the weight of the string if they are given up
 # too early: the string must gain what would be as unlikely by chance as residuals that reject a model (χ²(1); half of
 # that at the bound η = 0), each model with the structure of lags that it does best with.
 
@@ -106,14 +107,16 @@ def _clear(line: SpectralLine) -> bool:
 def choose(
     asked: str, lines: tuple[SpectralLine, ...], constraint: ViscousConstraint | None,
     priors: tuple[GaussianPrior, ...],
-    fixed: Fixed, pipe: Pipe | None = None
+    fixed: Fixed, pipe: Pipe | None = None, is_string: bool = False
 ) -> Chosen | Refusal:
     """``asked``: by its name, a compliant shaft; or two masses and the string are tried. ``priors`` and ``fixed`` as
-    with a rigid shaft. A ``pipe`` that is known makes it a string, unless the data contradict that.
+    with a rigid shaft. A ``pipe`` that is known makes it a string, unless the data contradict that. ``is_string``: the
+    rig says that a string hangs there, so that two masses never stand without the string beside them.
     """
     model = shaft_model(asked)
     compliant = model.compliant
-    refusal = _refuse_count(TWO_MASS if compliant is None else model, lines, constraint, priors)
+    simplest = model if compliant is not None else STRING if is_string and pipe is None else TWO_MASS
+    refusal = _refuse_count(simplest, lines, constraint, priors)
     if refusal is not None:
         return refusal
 
@@ -122,7 +125,7 @@ def choose(
         known = fit_compliant(KnownStringShaft(pipe), lines, constraint, priors, fixed, near)
         if not rejects(known.residual) and plausible(known):
             return Chosen(known, pipe=pipe)
-        other = choose(asked, lines, constraint, priors, fixed)
+        other = choose(asked, lines, constraint, priors, fixed, is_string=is_string)
         return replace(other, other_pipe=True) if isinstance(other, Chosen) else other
     if compliant is not None:
         forced = fit_compliant(compliant(), lines, constraint, priors, fixed)
@@ -132,6 +135,7 @@ def choose(
         return Refusal(
             f"{len(lines)} excited lines leave nothing to test two masses on a spring with",
             "excite more lines about two mean speeds, from well below the resonance to well above it",
+            entry=MessageCode.TOO_FEW_LINES,
         )
     if _refuse_count(STRING, lines, constraint, priors) is not None:
         return Chosen(two, rejected=rejects(two.residual) or not plausible(two))
@@ -158,7 +162,7 @@ def choose_unlike(
     found: Chosen, asked: str, lines: tuple[SpectralLine, ...], constraint: ViscousConstraint | None,
     priors: tuple[GaussianPrior, ...], fixed: Fixed, pipe: Pipe | None = None
 ) -> Chosen:
-    """What stands in place of ``found``, which is rejected, with lines that count by how the mean speeds differ."""
+    """Choose again in place of ``found``, which is rejected, with lines that count by how the mean speeds differ."""
     swing_hz = float(found.fit.mechanical[SWING]) / (2.0 * math.pi)
     counted = tuple(_by_difference(line) for line in lines)
     unlike = tuple(line.hertz for line, before in zip(counted, lines, strict=True) if line is not before)
@@ -185,7 +189,7 @@ def _by_difference(line: SpectralLine) -> SpectralLine:
 
 
 def _outdoes(string: CompliantFit, two: CompliantFit) -> bool:
-    """Does the string gain more on two masses than chance gives a parameter?
+    """Return whether the string gains more on two masses than chance gives a parameter.
 
     Each with the structure of lags that it needs: two masses may bend filters of two poles and averages into what a
     string does behind plain lags, and those parameters are counted.
@@ -225,11 +229,25 @@ def may_swing(rigid: RigidResult) -> bool:
 
 
 def plausible(fit: CompliantFit) -> bool:
-    """Does something swing that the lines can see, or has one bad line been explained by a load of its own?"""
+    """Return whether the lines see a swing, rather than one bad line explained by a load of its own."""
     omega = np.abs(fit.fitted.problem.s)
     m = fit.mechanical
     near = _NEAR[0] * float(np.min(omega)) <= m[SWING] <= _NEAR[1] * float(np.max(omega))
     return bool(near and m[LOAD] >= _LEAST_LOAD * (m[INERTIA] + m[LOAD]))
+
+
+# Where rig.yaml declares a string, a string hangs on the shaft whatever the residuals allow. Filters of two poles and
+# averages that no manual states let a rigid shaft explain what a string does to few lines: of 58 random strings and
+# two-mass shafts, identified with four lines, 14 intervals held neither the motor's inertia nor, some of them, that of
+# all that turns. So a rigid shaft stands only where there are lines enough to test a string, first-order lags explain
+# them, and no string that swings in sight tells the motor's inertia: then all turns as one, and the result says so.
+
+
+def _turns_as_one(fit: CompliantFit) -> bool:
+    """Return whether the load in the fit is negligible, or swings too fast for the lines."""
+    m = fit.mechanical
+    light = m[LOAD] < _LEAST_LOAD * (m[INERTIA] + m[LOAD])
+    return bool(light or m[SWING] > _NEAR[1] * float(np.max(np.abs(fit.fitted.problem.s))))
 
 
 def _refuse_count(
@@ -250,6 +268,7 @@ def _refuse_count(
         f"{len(lines)} excited lines, mean speeds and known lags give {equations} equations, but "
         f"{model.have or model.text + ' has'} {unknowns} unknowns",
         f"excite at least {wanted} lines, from well below the resonance to well above it",
+        entry=MessageCode.TOO_FEW_LINES,
     )
 
 
@@ -276,7 +295,7 @@ class CompliantResult:
 
 
 def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_rel_sd: float) -> CompliantResult:
-    """Of the model that stands; where two masses stand, their intervals hold what a string would say too."""
+    """Return the intervals of the model that stands; those of two masses also hold the values of a string."""
     alone = intervals(chosen.fit, confidence)
     fixed = alone if chosen.beside is None else _united(alone, inertias(chosen.beside, confidence))
     speed_lag, torque_lag, skew = lags_of(chosen.fit.fitted, confidence)
@@ -328,8 +347,8 @@ def _coulomb(levels: Levels, fit: CompliantFit, fixed: CompliantIntervals, confi
 
 
 def _budget(fit: CompliantFit, alone: Estimate, fixed: Estimate, confidence: float) -> tuple[BudgetLine, ...]:
-    """As `budget_of` of a rigid shaft: set free one group after another, each its share in squares; the shaft's model
-    is the last.
+    """Return the budget as `budget_of` does for a rigid shaft: one group after another is set free, each with its share
+    in squares; the shaft's model is the last.
     """
     at = fit.fitted.problem.model.at
     lags, timing = (at(signal_filters.SPEED_LAG), at(signal_filters.TORQUE_LAG)), (at(signal_filters.SKEW),)
@@ -359,6 +378,10 @@ _OPEN = Refusal(
     "the lines bend as those of a shaft that swings do, and leave its inertia open",
     "excite with more amplitude, for longer, on both sides of the resonance",
 )
+_UNSEEN = Refusal(
+    "the rig's load is a string, and these lines do not tell the motor's inertia from what hangs below it",
+    "excite with more amplitude, for longer, from below the string's lowest swing to well above it",
+)
 _WIDE = "state the drive's speed and torque filters, or excite with more amplitude above the resonance"
 _WHICH = (
     "say what swings, since a spring that weighs something isn't excluded: --model two-mass for a coupling or a shaft"
@@ -366,42 +389,57 @@ _WHICH = (
 )
 
 
-def identify_compliant(case: PeriodicCase, rigid: Finding | Refusal | None = None) -> Finding | Refusal:
+def identify_compliant(
+    case: PeriodicCase, rigid: Finding | Refusal | None = None, plain_lags: bool = False
+) -> Finding | Refusal:
     """Two masses or the string. ``rigid``: what was found of a rigid shaft that the data contradict or throw doubt on,
-    under auto; it stands where no other shaft does better.
+    or whose load is declared a string, under auto; it stands where no other shaft does better. ``plain_lags``: behind
+    first-order lags it explains the data.
     """
     told = None
     contradicted = rigid if isinstance(rigid, Finding) and rigid.rejected else None
-    priors, fixed = known_of(case.recording.lag_prior, len(case.usable), case.constraint)
+    is_string = rigid is not None and contradicted is None and case.recording.winds_up
     try:
-        chosen = choose(case.options.model, case.usable, case.constraint, priors, fixed, case.recording.pipe)
-        if isinstance(chosen, Chosen) and chosen.rejected:
-            chosen = choose_unlike(
-                chosen, case.options.model, case.usable, case.constraint, priors, fixed, case.recording.pipe
-            )
+        chosen = _chosen(case)
         if isinstance(chosen, Chosen) and not chosen.rejected:
             told = result_of(chosen, case.levels, case.options.confidence, case.recording.torque_scale_rel_sd)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
-        return rigid or _OPEN
+        return _OPEN if is_string else rigid or _OPEN
     if isinstance(chosen, Refusal):
+        if is_string:
+            return Refusal(f"the rig's load is a string: {chosen.reason}", chosen.advice, chosen.entry)
         if contradicted is None:
             return rigid or chosen
         advice = f"{contradicted.words.if_rejected}; {chosen.advice}, for a shaft that is not rigid to be identified"
         return replace(contradicted, words=replace(contradicted.words, if_rejected=advice))
     if told is None:
+        if is_string and not rejects(chosen.fit.residual):
+            return (rigid if plain_lags and _turns_as_one(chosen.fit) else None) or _UNSEEN
         if contradicted is None:
             name = name_of(chosen.fit, case.options.model)
-            return rigid or Finding(name, _words(name), chosen.fit.residual)
+            return (None if is_string else rigid) or Finding(name, _words(name), chosen.fit.residual)
         words = replace(contradicted.words, if_rejected=_LOOK_FOR)
         return replace(contradicted, words=words, remark=", and two masses or a string do no better")
     if told.inertia.bounded or _told(told.shaft.total_inertia):
         return _stands(chosen, told, case, rigid)
+    if is_string:
+        return (rigid if plain_lags else None) or _UNSEEN
     # a rigid shaft that is only doubted gives a number, which would be wrong: see `may_swing`
     return rigid if isinstance(rigid, Refusal) else contradicted or _OPEN
 
 
+def _chosen(case: PeriodicCase) -> Chosen | Refusal:
+    """Apply `choose` to the lines, and `choose_unlike` where the data contradict its result."""
+    recording, asked = case.recording, case.options.model
+    priors, fixed = known_of(recording.lag_prior, len(case.usable), case.constraint)
+    chosen = choose(asked, case.usable, case.constraint, priors, fixed, recording.pipe, recording.winds_up)
+    if isinstance(chosen, Chosen) and chosen.rejected:
+        return choose_unlike(chosen, asked, case.usable, case.constraint, priors, fixed, recording.pipe)
+    return chosen
+
+
 def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Finding | Refusal | None) -> Finding:
-    """What is told of the shaft; without J where only the sum of both inertias is."""
+    """Return the finding of a shaft that stands; without J where only the sum of both inertias is known."""
     fit = chosen.fit
     name = name_of(fit, case.options.model)
     finding = Finding(
@@ -420,7 +458,7 @@ def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Fi
     )
     if isinstance(rigid, Finding) and rigid.rejected:
         finding = replace(finding, preface=f"{rigid.contradicted}; ")
-    elif rigid is not None:
+    elif rigid is not None and not case.recording.winds_up:
         finding = replace(finding, remark=", much better than the lags of a rigid shaft do")
     if told.inertia.bounded:
         words = replace(finding.words, if_wide=_WHICH) if told.by_model else finding.words
@@ -443,7 +481,7 @@ def _together(total: Estimate | None) -> str:
 
 
 def name_of(fit: CompliantFit, asked: str) -> str:
-    """As ``--model`` has it: what was asked for, or which of the two that are tried."""
+    """Return the name as in ``--model``: the requested model, or the one of the two candidates that stands."""
     if shaft_model(asked).compliant is not None:
         return asked
     return "string" if fit.is_string else "two-mass"
@@ -454,9 +492,10 @@ def _words(name: str) -> ModelWords:
     return ModelWords(model.text, f"{_LOOK_FOR}; try --model auto", _WIDE, model.explain)
 
 
-_OTHER_PIPE = (
+_OTHER_PIPE = CodedText(
     "the data contradict the pipe's sizes in rig.yaml, which were left out of account: look at load.length_m and the"
-    " diameters"
+    " diameters",
+    MessageCode.OTHER_PIPE,
 )
 
 
@@ -477,20 +516,34 @@ def _caveats(chosen: Chosen, found: CompliantResult) -> tuple[str, ...]:
     said = [_OTHER_PIPE] if chosen.other_pipe else []
     if chosen.unlike_hz:
         where = ", ".join(f"{hz:.3g}" for hz in chosen.unlike_hz)
-        said.append("the load swings so widely that it answers otherwise at one mean speed than at another (it may turn"
-                    f" back at the slower one): lines at {where} Hz count by that difference")
-    said += ["J is the motor's side of the spring, J_r; what a slow motion feels is J_r + J_L"]
+        said.append(CodedText(
+            "the load swings so widely that it answers otherwise at one mean speed than at another (it may turn"
+            f" back at the slower one): lines at {where} Hz count by that difference",
+            MessageCode.LOAD_SWINGS_WIDELY))
+    said += [CodedText(
+        "J is the motor's side of the spring, J_r; what a slow motion feels is J_r + J_L",
+        MessageCode.MOTOR_SIDE_ONLY)]
     if not _told(found.shaft.total_inertia):
-        said.append("J_r + J_L is left open on one side: a slower line, well below the resonance, would show it")
+        said.append(CodedText(
+            "J_r + J_L is left open on one side: a slower line, well below the resonance, would show it",
+            MessageCode.TOTAL_INERTIA_OPEN))
     hertz = [line.hertz for line in fit.fitted.problem.lines]
     for name, one in (("resonance", found.shaft.resonance_hz), ("antiresonance", found.shaft.antiresonance_hz)):
         if one is not None and min(hertz) <= one.value <= max(hertz):
             article = "an" if name == "antiresonance" else "a"
-            said.append(f"{article} {name} at {one.value:.3g} Hz lies inside the excited band")
+            said.append(CodedText(
+                f"{article} {name} at {one.value:.3g} Hz lies inside the excited band",
+                MessageCode.RESONANCE_IN_BAND))
     if fit.fitted.problem.constraint is None:
-        said.append("only one mean speed: viscous friction rests on the lines, not on levels")
+        said.append(CodedText(
+            "only one mean speed: viscous friction rests on the lines, not on levels",
+            MessageCode.ONE_MEAN_SPEED))
     if not fit.fitted.first_order:
-        said.append("first-order lags do not explain the reports; filters of two poles and moving averages do")
+        said.append(CodedText(
+            "first-order lags do not explain the reports; filters of two poles and moving averages do",
+            MessageCode.LAGS_NOT_FIRST_ORDER))
     if fit.residual is not None and REJECT_P <= fit.residual.p_value < 0.01:
-        said.append(f"the residuals are only just consistent with the model (p = {fit.residual.p_value:.2g})")
+        said.append(CodedText(
+            f"the residuals are only just consistent with the model (p = {fit.residual.p_value:.2g})",
+            MessageCode.BARELY_CONSISTENT))
     return tuple(said)

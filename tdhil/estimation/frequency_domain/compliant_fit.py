@@ -69,7 +69,7 @@ def compliant_starts(problem: Likelihood, fixed: Fixed) -> list[FloatArray]:
 
 
 def _proposals(problem: Likelihood) -> list[FloatArray]:
-    """Of every neighbourhood of the grid the best, in rising misfit."""
+    """Return the best of every neighbourhood of the grid, in rising misfit."""
     shapes = _shapes(problem)
     hung = np.array([problem.model.shaft.impedance(shape, problem.s) for shape in shapes])[:, problem.owner]
     solved = [_solved(problem, hung, skew) for skew in _SKEWS]
@@ -154,7 +154,7 @@ def _theta(problem: Likelihood, shape: FloatArray, x: FloatArray, skew: float) -
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The same shaft with one of its parameters replaced by another that is asked for: the total inertia, the stiffness, a
+# The same shaft with one of its parameters replaced by a derived quantity: the total inertia, the stiffness, a
 # resonance. Its interval is then a profile like any other (`inference.estimate`), bounds and curved valleys included.
 #
 # The parameter m_i gives way to u with m_i = h(u, the others); the rest keep their places. By the chain rule
@@ -242,7 +242,7 @@ class ViewedShaft:
         return scales
 
     def beliefs(self, m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Of the shaft inside; none where nothing is known of it."""
+        """Return the prior residuals of the inner shaft; empty where it has none."""
         if not isinstance(self.inner, Believing):
             return np.zeros(0), np.zeros((0, len(m)))
         inside, slope = self._inside(m)
@@ -258,7 +258,7 @@ class ViewedShaft:
 
 
 def viewed(fitted: FittedModel, view: ParameterView) -> FittedModel:
-    """The same fits in the view's parameters; `view.index` is where the interval is asked for."""
+    """The same fits in the view's parameters; `view.index` is the index of the interval."""
     old = fitted.problem
     problem = Likelihood(old.lines, Model(ViewedShaft(old.model.shaft, view)), old.constraint, old.priors)
     size = old.model.mechanical
@@ -308,7 +308,7 @@ class CompliantFit:
 
 @dataclass(frozen=True)
 class CompliantIntervals:
-    """Of one fit; infinite on a side that the data leave open. SI units, resonances in Hz."""
+    """Intervals of one fit; infinite on a side that the data leave open. SI units, resonances in Hz."""
 
     inertia: Estimate
     viscous: Estimate
@@ -372,14 +372,14 @@ def too_slow(problem: Likelihood) -> Apart:
 
 
 def chance_gain() -> float:
-    """By how much one parameter more lowers −2 ln L as seldom by chance as residuals reject a true model, χ²(1)."""
+    """Return the drop of −2 ln L by one more parameter that is as unlikely as rejecting a true model, χ²(1)."""
     from scipy.special import chdtri
 
     return float(chdtri(1.0, REJECT_P))
 
 
 def inertias(fit: CompliantFit, confidence: float) -> dict[str, Estimate]:
-    """What a string's weight bears on most, as `CompliantIntervals` names it."""
+    """Return the quantities that a string's weight changes most, named as in `CompliantIntervals`."""
     fitted = fit.fitted
     return {
         "inertia": estimate(fitted, INERTIA, confidence),
@@ -405,7 +405,7 @@ def intervals(fit: CompliantFit, confidence: float) -> CompliantIntervals:
 
 
 def _hertz(fit: CompliantFit) -> tuple[float, float]:
-    """What the two frequencies of the parametrisation are to be multiplied by: exact for two lumps.
+    """Return the factors for the two frequencies of the parametrisation: exact for two lumps.
 
     The string's own lie a few per cent away, by a factor that hardly depends on what is uncertain.
     """

@@ -53,7 +53,7 @@ class FittedModel:
 
     @property
     def simple_held(self) -> Fixed:
-        """What is held in the first-order fit."""
+        """Parameters held in the first-order fit."""
         return {**dict.fromkeys(self.problem.model.structure, 0.0), **self.fixed}
 
     @property
@@ -108,7 +108,7 @@ def fit_model(
 
 
 def simple_weight(gain: float, more: int, numbers: int) -> float:
-    """Of the answer with as many parameters fewer as ``more``; ``gain``: by how much those lower −2 ln L."""
+    """Return the weight of the answer with ``more`` fewer parameters; ``gain``: the drop of −2 ln L by them."""
     return 1.0 / (1.0 + math.exp(min(0.5 * (gain - more * math.log(numbers)), 700.0)))
 
 

@@ -39,7 +39,7 @@ _AT_BOUND = 1e-6      # of the natural scale
 
 
 def residual_of(fitted: FittedModel, chosen: int = 0) -> ResidualTest | None:
-    """Of the whole family's fit; what counts as fitted are the free parameters inside their bounds.
+    """Return the test of the whole family's fit; counted as fitted are the free parameters inside their bounds.
 
     ``chosen``: how many more were, by a choice among models.
     """
@@ -111,7 +111,7 @@ def fisher_tail(ratio: float, dof_above: float, dof_below: float) -> float:
 
 
 def standard_deviation(problem: Likelihood, theta: FloatArray, index: int, free: list[int]) -> tuple[float, float]:
-    """Of theta[index] in the quadratic approximation, and the degrees of freedom of that (Satterthwaite).
+    """Return the sd of theta[index], quadratic, and its degrees of freedom (Satterthwaite).
 
     var = cᵀ F c with c = F⁻¹ e_i = Σ over the parts of F, each as uncertain as the weight it was built on.
     """
@@ -137,7 +137,7 @@ Others = Callable[[Fit, float], Iterable[Fit]]
 def profile_edge(
     refit: Refit, limits: Box, best: Fit, index: int, step: float, rise: float, others: Others
 ) -> float:
-    """Where the profile has risen by ``rise`` on the side of ``step``'s sign; a bound, or ±inf, if it never does.
+    """Return where the profile has risen by ``rise`` on the side of ``step``'s sign; a bound or ±inf if it never does.
 
     The root of √(P − P_best) is sought, which is a straight line for a quadratic likelihood.
     """
@@ -187,7 +187,7 @@ def profile_edge(
 # ten of the field rig's, and its profile excludes the truth that is the other. With the whole family alone 7.2 % of 249
 # intervals of that rig missed, with the first-order ones beside it 3.6 %, for 5 % of width; on the fifteen plants of
 # the coverage study whose lags are first order (750 runs) 3.2 % instead of 4.3, for 2 %. An average of the two was
-# tried in its place, and misses where a second pole is just not to be seen (docs/accuracy.md).
+# tried in its place, and misses where a second pole is just not to be seen (docs/explanation/accuracy.md).
 
 
 def quantile_of(fitted: FittedModel, index: int, confidence: float) -> float:
@@ -303,7 +303,7 @@ def torque_scale_line(value: float, rel_sd: float, confidence: float) -> BudgetL
 
 
 def widened_most_by_scale(inertia: InertiaEstimate) -> bool:
-    """Is the torque scale more of the total interval than all else together?"""
+    """Return whether the torque scale adds more to the total interval than all else together."""
     repeatable, total = inertia.high - inertia.low, inertia.high_total - inertia.low_total
     return total > 0.0 and total * total > 2.0 * repeatable * repeatable
 
@@ -341,7 +341,7 @@ def budget_of(
 
 
 def grown_lines(grown: Iterable[tuple[str, float, str]], half: float) -> tuple[BudgetLine, ...]:
-    """What each step adds in squares.
+    """Return the part that each step adds in squares.
 
     ``grown`` are (source, half-width reached with it free, note), ``half`` the last of them.
     """

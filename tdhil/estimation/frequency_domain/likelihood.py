@@ -140,7 +140,7 @@ class Likelihood:
         return residuals, slopes()
 
     def at(self, theta: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]]:
-        """The residuals (R,), and what gives ∂residuals/∂theta (R, P) should it be asked for.
+        """The residuals (R,), and a function that gives ∂residuals/∂theta (R, P) on demand.
 
         With u = √P r/√v: ∂u = −√P ∂(G W + c N)/√v − u Re(h ∂G), h = (G* S_WW − S_TW*)/v, since ∂v = 2 v Re(h ∂G);
         ∂q = 2 Σ Re(u* ∂u), and ∂(φ u) = φ ∂u + φ' ∂q u. All but W, N and u is one number for a line, whose sums go
@@ -248,7 +248,7 @@ class Likelihood:
         return residuals, slopes
 
     def _shared_lag(self, theta: FloatArray) -> tuple[float, float, float]:
-        """What the reports' common lag costs (`signal_filters.shared_lag`), and its slopes over either lag."""
+        """Return the penalty on the reports' common lag (`signal_filters.shared_lag`), and its slopes by either lag."""
         assert self._lags is not None
         speed, torque = self._lags
         return signal_filters.shared_lag(float(theta[speed]), float(theta[torque]), self._unseen_s)

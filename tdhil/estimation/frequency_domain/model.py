@@ -38,11 +38,11 @@ class Model:
 
     @property
     def rigid(self) -> bool:
-        """Does nothing hang on a spring?"""
+        """True if the shaft has no spring."""
         return "load_inertia" not in self.shaft.names
 
     def at(self, report: int) -> int:
-        """Where a parameter of the reports stands in theta."""
+        """Return the index in theta of a parameter of the reports."""
         return self.mechanical + report
 
     @property
@@ -51,7 +51,7 @@ class Model:
         return tuple(self.at(index) for index in signal_filters.STRUCTURE)
 
     def plausible(self, stated: Set[int]) -> tuple[GaussianPrior, ...]:
-        """What is plausible of the reports' parameters, but for those that somebody stated."""
+        """Return the prior on the reports' parameters, except stated ones."""
         soft = ((self.at(index), sd) for index, sd in signal_filters.PLAUSIBLE)
         return tuple(GaussianPrior(index, 0.0, sd) for index, sd in soft if index not in stated)
 
@@ -75,7 +75,7 @@ class Model:
         return g, slopes().T
 
     def seen(self, theta: FloatArray, s: ComplexArray) -> tuple[ComplexArray, Callable[[], ComplexArray]]:
-        """G (K,), and what gives ∂G/∂theta (P, K) should it be asked for."""
+        """G (K,), and a function that gives ∂G/∂theta (P, K) on demand."""
         mechanical = len(theta) - signal_filters.COUNT
         m = theta[:mechanical]
         reports = signal_filters.FilterRatio(theta[mechanical:], s)

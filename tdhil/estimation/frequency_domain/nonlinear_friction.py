@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Finding, PeriodicCase
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import FittedModel, fit_model
@@ -38,7 +39,7 @@ from tdhil.recording import FloatArray, Segment
 #
 # g is Stribeck's bell, exp(−(ω/ω_s)²), whose ω_s runs over a grid, or the parabola ω |ω| of a fan and of churned oil,
 # which wide bells come near. One shape with either sign of c, not a sum of them: over the speeds of one run two of
-# them could hardly be told apart.
+# them could hardly be kept apart.
 
 
 _WIDTHS = 9
@@ -161,7 +162,7 @@ class SegmentWave:
 
 
 def wave_of(fit: PeriodLines, segment: Segment) -> SegmentWave:
-    """Of all its periods together."""
+    """Mean over all its periods together."""
     return SegmentWave(fit.lines_hz, fit.speed.mean(axis=0), float(fit.speed_mean.mean()), segment.period_s)
 
 
@@ -183,7 +184,7 @@ _SLOWEST = 0.1      # of the mean speed: what comes nearer to rest than that is 
 
 @dataclass(frozen=True)
 class ShaftMotion:
-    """What the shaft did: a wave for each segment, the levels (the segments' first, in their order), the lines."""
+    """Motion of the shaft: a wave for each segment, the levels (the segments' first, in their order), the lines."""
 
     waves: tuple[SegmentWave, ...]
     levels: Levels
@@ -233,7 +234,7 @@ def fit_bends(motion: ShaftMotion, priors: tuple[GaussianPrior, ...], fixed: Fix
 
 
 def starts_of(motion: ShaftMotion, straight: FloatArray) -> list[FloatArray]:
-    """Where the descents begin: the straight fit, and the same without the lag that both reports have in common.
+    """Yield the starts of the descents: the straight fit, and the same without the lag that both reports share.
 
     A straight fit bends long lags that all but cancel to the friction's shape. They change its ratio little, but the
     wave that is made of the reported one by taking such a lag off it swings far too wide. Only those count by whose
@@ -244,7 +245,7 @@ def starts_of(motion: ShaftMotion, straight: FloatArray) -> list[FloatArray]:
 
 
 def _keeps_turning(motion: ShaftMotion, phi: FloatArray) -> bool:
-    """Does the shaft behind the reports ``phi`` (6,) stay away from rest?"""
+    """Return whether the shaft behind the reports ``phi`` (6,) stays away from rest."""
     least = _SLOWEST * min(abs(wave.mean) for wave in motion.waves)
     return all(np.min(wave.over_period(phi) * np.sign(wave.mean)) > least for wave in motion.waves)
 
@@ -369,7 +370,7 @@ def identify_bent(case: PeriodicCase, rigid: RigidResult) -> Finding | None:
 def _result(
     found: list[BentFit], constraint: ViscousConstraint, confidence: float, torque_scale_rel_sd: float
 ) -> RigidResult:
-    """As of a rigid shaft; ``viscous`` is the slope of friction between the two mean speeds, Coulomb's is not told."""
+    """Return the result like a rigid one; ``viscous``: slope of friction between the mean speeds; no Coulomb."""
     best = found[0]
     own = estimate(best.fitted, INERTIA, confidence)
     inertia = inertia_of(found, own, confidence)
@@ -393,7 +394,7 @@ def _result(
 def _budget(
     best: BentFit, own: Estimate, inertia: Estimate, confidence: float, torque_scale_rel_sd: float
 ) -> tuple[BudgetLine, ...]:
-    """Of the best shape's ``own`` interval, with a line more: what other shapes add to it."""
+    """Return the budget of the best shape's ``own`` interval, with one more line: the share of other shapes."""
     *lines, scale = budget_of(best.fitted, own, confidence, torque_scale_rel_sd)
     grown = math.sqrt(max((inertia.high - inertia.low) ** 2 - (own.high - own.low) ** 2, 0.0))
     return (*lines, BudgetLine("friction's shape", 0.5 * grown, "other shapes that the data allow"), scale)
@@ -402,7 +403,8 @@ def _budget(
 def _told(best: BentFit, motion: ShaftMotion) -> str:
     width = best.bend.width_rad_s
     shape = "with the square of speed" if width is None else f"by a bell of about {width:.2g} rad/s (Stribeck)"
-    return (
+    return CodedText(
         f"friction is no straight line over speed: it bends {shape}, which is allowed for; B is its slope between the "
-        f"mean speeds {', '.join(f'{wave.mean:.3g}' for wave in motion.waves)} rad/s"
+        f"mean speeds {', '.join(f'{wave.mean:.3g}' for wave in motion.waves)} rad/s",
+        MessageCode.FRICTION_NOT_LINEAR,
     )

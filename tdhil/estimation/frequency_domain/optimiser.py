@@ -21,14 +21,14 @@ from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
 from tdhil.recording import BoolArray, FloatArray
 
 At = Callable[[FloatArray], tuple[FloatArray, Callable[[], FloatArray]]]
-"""From parameters to residuals r, and to what gives their slopes A should it come to that."""
+"""A function from parameters to residuals r, and to a function that gives their slopes A."""
 
 _MOST_STEPS = 200
 _MOST_TRIES = 12
 _SMALL_GAIN = 1e-6        # of −2 ln L, absolute: an interval's edge is where it has risen by about 4
 _SMALL_STEP = 1e-9        # of the natural scale
 _CREEPING, _LOOKED_BACK = 0.01, 20         # of −2 ln L, gained in so many steps: along the floor of a flat valley
-_FAR, _LOOKS_TO_TELL = 5.0, 4              # above what it is to beat, after twice as many: it won't; looks for a trend
+_FAR, _LOOKS_TO_TELL = 5.0, 4              # above the goal, after twice as many: it won't reach it; looks for a trend
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Box:
 
 
 def descend(at: At, start: FloatArray, free: BoolArray, box: Box, goal: float = math.inf) -> Fit:
-    """From ``start`` (P,) down; only ``free`` (P,) parameters move. Arithmetic that overflows ends the descent.
+    """Descend from ``start`` (P,); only ``free`` (P,) parameters move. Arithmetic that overflows ends the descent.
 
     ``goal``: what it is to beat; where that is far off after a while, it is left.
     """
@@ -104,7 +104,7 @@ def descend(at: At, start: FloatArray, free: BoolArray, box: Box, goal: float = 
 
 
 def _leads_nowhere(course: Sequence[float], goal: float) -> bool:
-    """Is a descent, seen now and then, at its end, or where it will end above ``goal``?
+    """Return whether a descent, seen now and then, is at its end, or will end above ``goal``.
 
     Along the floor of a flat valley what is gained falls by the same share from look to look; the first is left out.
     """
@@ -277,7 +277,7 @@ def rigid_starts(problem: Likelihood) -> list[FloatArray]:
 
 
 def rigid_rivals(theta: FloatArray) -> list[FloatArray]:
-    """Where a rigid shaft's lag and the lag of its speed's report have changed places.
+    """Starts at which a rigid shaft's lag and the lag of its speed's report have changed places.
 
     (J s + B)(1 + τ_w s) = (B τ_w s + B)(1 + (J/B) s): shaft and report can't be told apart if both J/B and τ_w are
     plausible lags of a report. An answer has this rival, and so has an interval.

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Case, Finding, ModelWords
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import FittedModel, fit_model
@@ -52,7 +53,7 @@ _LEAST_SD_S = 1e-4     # a lag "known exactly" is known to a tenth of a millisec
 def lag_priors(
     prior: LagPrior, speed_index: int = _AT(SPEED_LAG), torque_index: int = _AT(TORQUE_LAG)
 ) -> tuple[GaussianPrior, ...]:
-    """What is known of the two lags; the indices are where they stand in theta."""
+    """Return the priors on the two lags; the indices are those in theta."""
     known = []
     if prior.speed_lag_s is not None:
         known.append(GaussianPrior(speed_index, prior.speed_lag_s, max(prior.speed_lag_sd_s, _LEAST_SD_S)))
@@ -74,7 +75,7 @@ def known_structure(prior: LagPrior) -> dict[int, float]:
 
 
 def unfiltered() -> dict[int, float]:
-    """The paper's assumption: what is reported is what is."""
+    """Return the paper's assumption: the reported signals are not filtered."""
     return {_AT(index): 0.0 for index in (SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE, AVERAGE, SKEW)}
 
 
@@ -91,7 +92,7 @@ def with_skew(
 def known_of(
     prior: LagPrior, lines: int, constraint: ViscousConstraint | None
 ) -> tuple[tuple[GaussianPrior, ...], dict[int, float]]:
-    """What is known of a rigid shaft's reports beforehand: the priors, and what is held."""
+    """Return the prior knowledge of a rigid shaft's reports: the priors, and the held parameters."""
     return with_skew(lag_priors(prior), lines, constraint, prior.skew_sd_s), known_structure(prior)
 
 
@@ -110,6 +111,7 @@ def refuse_count(lines: int, constraint: ViscousConstraint | None, priors: tuple
         f"{', '.join(sources)}, but there are five unknowns: inertia, viscous friction, the lags of the reported speed "
         "and torque, and their skew",
         f"excite with {missing}, or state the drive's speed and torque filters with their uncertainty",
+        entry=MessageCode.TOO_FEW_LINES,
     )
 
 
@@ -231,7 +233,7 @@ def fit_inertia(
 
 
 def _bare(fitted: FittedModel, residual: ResidualTest | None) -> RigidResult:
-    """Of a model that the data reject: the values, for whoever wants to look, without width."""
+    """Return the values of a model that the data reject, without intervals."""
     theta, at = fitted.whole.theta, fitted.problem.model.at
     point = [Estimate(float(x), float(x), float(x)) for x in theta]
     lags = (signal_filters.SPEED_LAG, signal_filters.TORQUE_LAG, signal_filters.SKEW)
@@ -278,7 +280,7 @@ def _coulomb(levels: Levels, fitted: FittedModel, confidence: float) -> Estimate
 def rigid_finding(
     result: RigidResult | None, case: Case, what: str = "a rigid shaft seen through reporting lags"
 ) -> Finding | Refusal:
-    """What a rigid shaft is found to be; the refusal where its inertia stays open. ``what``: it, for the reader."""
+    """Return the finding of a rigid shaft; a refusal where its inertia stays open. ``what``: its name in messages."""
     if result is None or not (rejects(result.residual) or result.inertia.bounded):
         return _OPEN
     as_paper = not shaft_model(case.options.model).lags
@@ -320,12 +322,12 @@ def _conditions(result: RigidResult, case: Case) -> tuple[str, ...]:
 
 
 def simultaneous(priors: tuple[GaussianPrior, ...], skew: int) -> tuple[str, ...]:
-    """What an inertia is conditional on where the skew, of this index, was taken as known."""
+    """Return the condition on an inertia where the skew, of this index, was taken as known."""
     return tuple(f"speed and torque simultaneous to {p.sd * 1e3:.3g} ms (1 sd)" for p in priors if p.index == skew)
 
 
 def of_reports(prior: LagPrior) -> list[str]:
-    """What an inertia is conditional on, of the reports."""
+    """Return the conditions on an inertia that come from the reports."""
     stated = [
         name for name, lag in (("speed", prior.speed_lag_s), ("torque", prior.torque_lag_s)) if lag is not None
     ]
@@ -341,12 +343,20 @@ def of_reports(prior: LagPrior) -> list[str]:
 def _caveats(result: RigidResult, as_paper: bool, winds_up: bool) -> tuple[str, ...]:
     found = []
     if winds_up:
-        found.append("the rig's load is a string, but at these lines all turns as one: J is that of motor, string and "
-                     "what hangs below it together, not the motor's alone")
+        found.append(CodedText(
+            "the rig's load is a string, but at these lines all turns as one: J is that of motor, string and "
+            "what hangs below it together, not the motor's alone",
+            MessageCode.STRING_MOVES_WITH_MOTOR))
     if result.fitted.problem.constraint is None:
-        found.append("only one mean speed: viscous friction rests on the lines, not on levels")
+        found.append(CodedText(
+            "only one mean speed: viscous friction rests on the lines, not on levels",
+            MessageCode.ONE_MEAN_SPEED))
     if not as_paper and not result.first_order:
-        found.append("first-order lags do not explain the reports; filters of two poles and moving averages do")
+        found.append(CodedText(
+            "first-order lags do not explain the reports; filters of two poles and moving averages do",
+            MessageCode.LAGS_NOT_FIRST_ORDER))
     if result.residual is not None and doubtful(result.residual) and not rejects(result.residual):
-        found.append(f"the residuals are only just consistent with the model (p = {result.residual.p_value:.2g})")
+        found.append(CodedText(
+            f"the residuals are only just consistent with the model (p = {result.residual.p_value:.2g})",
+            MessageCode.BARELY_CONSISTENT))
     return tuple(found)

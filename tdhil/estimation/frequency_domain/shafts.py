@@ -36,7 +36,7 @@ from tdhil.recording import FloatArray, Pipe
 #
 #     m = J_r, B = B_r + B_L, J_L, ω_a = √(k/J_L), c, B_L            k = ω_a² J_L.
 #
-# c and B_L damp alike and can hardly be told apart.
+# c and B_L damp alike and can hardly be kept apart.
 
 
 LOAD, SWING, DAMPING, LOAD_VISCOUS = range(2, 6)    # in m, after shaft.py's INERTIA and VISCOUS
@@ -326,7 +326,7 @@ def _q(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
 
 @dataclass(frozen=True)
 class ShaftModel:
-    """What a shaft may be taken for, by name in `tdhil.config.registry.MODELS`.
+    """A model of the shaft, by name in `tdhil.config.registry.MODELS`.
 
     ``compliant``: makes the shaft whose swing is fitted, whose m begins as that of two masses does; None: a rigid one.
     ``text``: of a compliant shaft, what it is, for the reader; ``explain``: what it does with the data, if so;

@@ -1,4 +1,4 @@
-"""What a drive does to the two signals that it reports, as a ratio: only what the reports do not share can be seen.
+"""The ratio of the filters on the two signals that a drive reports: only what the reports do not share can be seen.
 
 Torque and speed are reported through filters and delays of their own, T_rep = T·F_T, ω_rep = ω·F_w, and a line of the
 excitation shows T_rep/ω_rep = (T/ω)·F_T/F_w. With s = jω,
@@ -47,7 +47,7 @@ _SERIES: Final = 1e-3                          # of y², below which a is its se
 
 
 class FilterRatio:
-    """F_T/F_w at some lines and its slopes, by Horner's rule and without logarithms: thousands are asked for a result.
+    """F_T/F_w at some lines and its slopes, by Horner's rule and without logarithms: thousands are needed for a result.
 
     ``phi`` (6,) = τ_w (s), ρ_w, τ_T (s), ρ_T, u (s²), d (s); ``s`` (K,). ``value`` (K,).
     """

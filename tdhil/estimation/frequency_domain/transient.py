@@ -1,4 +1,4 @@
-"""What a shaft that swings still does of its own while the periods are counted, taken off their lines.
+"""Residual oscillation of a shaft during the counted periods, taken off their lines.
 
 A string that an excitation sets swinging takes minutes to repeat itself: damped by little but the host's slow control,
 the lines of its tenth period still differ from those of its first by more than all noise. Left in, this is a bias that
@@ -64,11 +64,11 @@ class _ScaledSegment:
     viscous: float
 
     def without(self, modes: Sequence[complex]) -> ComplexArray:
-        """What modes and means leave, (2, P, K)."""
+        """Return the residual after modes and means, (2, P, K)."""
         return _centred(self.signals) if not modes else self._fitted(modes)[0]
 
     def swing(self, modes: Sequence[complex]) -> _ModeShare:
-        """What the modes do here."""
+        """Return the contribution of the modes."""
         left, amplitudes, inverse, columns = self._fitted(modes)
         means, about = columns.mean(axis=1), _centred(columns)
         variance = np.maximum(np.mean(np.abs(left) ** 2, axis=1), _ROUNDING)
@@ -81,7 +81,7 @@ class _ScaledSegment:
         return _ModeShare(left, self.signals.mean(axis=1) - means @ amplitudes, uncertain / variance, fitted)
 
     def _fitted(self, modes: Sequence[complex]) -> tuple[ComplexArray, FloatArray, FloatArray, ComplexArray]:
-        """What is left, (2, P, K); amplitudes (M,), the inverse of their normal matrix, and their columns."""
+        """Return the residual, (2, P, K); amplitudes (M,), the inverse of their normal matrix, and their columns."""
         columns = np.concatenate([self._columns(mode) for mode in modes], axis=-1)
         about, signals = _centred(columns), _centred(self.signals)
         size = about.shape[-1]
@@ -118,7 +118,7 @@ def _centred(values: ComplexArray) -> ComplexArray:
 def settled_lines(
     fits: tuple[PeriodLines, ...], cut: tuple[Stretch, ...], viscous: float, warming_nm_s: tuple[float, ...] = ()
 ) -> tuple[SpectralLine, ...]:
-    """As `pooled_lines`, without what dies away; those very lines where nothing does. ``fits`` of the stretches."""
+    """Return `pooled_lines` without decaying oscillation; the same lines where there is none."""
     plain = pooled_lines(fits, viscous, warming_nm_s)
     rates = warming_nm_s or (0.0,) * len(fits)
     if not fits or len({fit.lines_hz for fit in fits}) != 1 or min(len(fit.speed) for fit in fits) < _LEAST_PERIODS:

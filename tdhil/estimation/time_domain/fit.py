@@ -95,9 +95,9 @@ def guessed(bins: Bins, inertia: float) -> BinNoise:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-# What is plausible of lags that nobody stated: about a second at most, as in the frequency domain; and what both share
+# Plausible values of unstated lags: about a second at most, as in the frequency domain; and what both share
 # is held against `shared_lag`'s prior, at a quarter of it, beyond what the middle of the frequencies can see. A record
-# that nobody planned sees far less of lags than a multisine does, and two long ones that are unlike by a few percent
+# without a plan sees far less of lags than a multisine does, and two long ones that are unlike by a few percent
 # must still be covered.
 
 
@@ -108,7 +108,7 @@ _SHARED = 0.5         # of the residual
 
 @dataclass(frozen=True)
 class FitProblem:
-    """The equations, their noise, what is known beforehand, and which parameters are free."""
+    """The equations, their noise, the priors, and the free parameters."""
 
     bins: Bins
     variance: FloatArray
@@ -118,14 +118,14 @@ class FitProblem:
 
     @cached_property
     def _unseen_s(self) -> float | None:
-        """What the reports' common lag is held against (`shared_lag`); None where a lag was stated."""
+        """Scale, s, of the prior on the reports' common lag (`shared_lag`); None where a lag was stated."""
         moving = self.bins.hertz[self.bins.hertz > 0.0]
         if any(prior.index in (SPEED_LAG, TORQUE_LAG) for prior in self.priors) or not len(moving):
             return None
         return 1.0 / (2.0 * math.pi * float(np.median(moving)))
 
     def _of_lags(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What is plausible of lags that nobody stated: residuals and slopes."""
+        """Return the prior on unstated lags: residuals and slopes."""
         if self._unseen_s is None:
             return np.zeros(0), np.zeros((0, PARAMETERS))
         speed_lag_s, torque_lag_s = float(theta[SPEED_LAG]), float(theta[TORQUE_LAG])
@@ -204,7 +204,7 @@ def minimise(problem: FitProblem, start: FloatArray, held: dict[int, float] | No
 
 
 def covariance(problem: FitProblem, theta: FloatArray, free: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
-    """Of the free parameters in the quadratic approximation (F, F), and the leverage of every bin (M,)."""
+    """Return the covariance of the free parameters (F, F), quadratic, and the leverage of every bin (M,)."""
     _, slopes = problem.stacked(theta)
     scale = problem.box.scale[list(free)]
     u, sizes, vt = np.linalg.svd(slopes[:, list(free)] * scale, full_matrices=False)
@@ -223,9 +223,9 @@ def covariance(problem: FitProblem, theta: FloatArray, free: tuple[int, ...]) ->
 # A bin counts where the torque that the speed explains stands clear of the residual. Where it doesn't, the direction
 # of the regression would matter: least squares of torque on speed errs by the share of the noise in the speed, the
 # other way round by the share in the torque. And frequencies end where the longer lag turns the phase by more than
-# about a radian: up to there any filter is told by its mean and its spread. Beyond, the structure counts, which nobody
-# knows; but half of what a record says of the lags stands there, and two poles, or one, are what most filters are. So
-# from that fit the band is widened to three times as far, for whoever finds that the wider one holds (`solve`).
+# about a radian: up to there any filter is described by its mean and its spread. Beyond, the unknown structure counts;
+# but half of the information on the lags stands there, and most filters have one pole or two. So from that fit the
+# band is widened to three times as far, used where the wider one holds (`solve`).
 
 
 _STARTS = ((0.0, 0.0, 0.0), (0.40, 0.15, 0.0), (0.15, 0.40, 0.0), (0.1, 0.1, 0.0))
@@ -252,7 +252,7 @@ class FoundFit:
 
 
 def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float) -> tuple[FoundFit, ...]:
-    """In a wide band and in a narrow one, in this order; none where too few bins stand clear of the noise.
+    """Fit in a wide band and in a narrow one, in this order; none where too few bins stand clear of the noise.
 
     Filters are taken as one pole each.
     """

@@ -11,6 +11,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Case, Finding, ModelWords
 from tdhil.estimation.frequency_domain import (
     LAG_BOUND_S,
@@ -30,7 +31,7 @@ from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure,
 from tdhil.recording import BoolArray, FloatArray, Recording
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What kind of motion a record holds, in words: a refusal should name what is missing, not only that something is.
+# What kind of motion a record holds, in words: a refusal names the missing part, not only that something is.
 
 
 IntArray = NDArray[np.intp]
@@ -55,48 +56,53 @@ def check_signals(recording: Recording, samples: Samples) -> None:
     """Raise Refused where nothing moves, nothing pushes, or a limit shaped what is seen."""
     speed, torque = samples.speed_rad_s, samples.torque_nm
     if np.ptp(speed) <= 2.0 * recording.speed_resolution_rad_s or np.ptp(speed) == 0.0:
-        raise Refused("the speed did not change", ADVICE)
+        raise Refused("the speed did not change", ADVICE, entry=MessageCode.NO_EXCITATION)
     if np.ptp(torque) <= 2.0 * recording.torque_resolution_nm or np.ptp(torque) == 0.0:
         raise Refused("the torque did not change: a shaft that coasts shows how inertia and friction relate, not "
-                       "how large they are", "record the torque, and a motion that the drive's torque causes")
+                       "how large they are", "record the torque, and a motion that the drive's torque causes",
+                       entry=MessageCode.NO_EXCITATION)
     advice = "use less amplitude, or more torque if the machine allows it"
     flagged = float(np.mean(recording.limited))
     if flagged > _LIMIT_SHARE:
-        raise Refused(f"the drive was at an internal limit for {flagged:.1%} of the record", advice)
+        raise Refused(f"the drive was at an internal limit for {flagged:.1%} of the record", advice,
+                      entry=MessageCode.SIGNAL_CLIPPED)
     limit = recording.torque_limit_nm
     if limit is not None and limit > 0.0:
         at_limit = float(np.mean(np.abs(torque + recording.torque_offset_nm) >= _AT_LIMIT * limit))
         if at_limit > _LIMIT_SHARE:
-            raise Refused(f"the torque was at its limit of {limit:g} N·m for {at_limit:.1%} of the record", advice)
+            raise Refused(f"the torque was at its limit of {limit:g} N·m for {at_limit:.1%} of the record", advice,
+                          entry=MessageCode.SIGNAL_CLIPPED)
     for name, signal, quantum in (("torque", torque, recording.torque_resolution_nm),
                                   ("speed", speed, recording.speed_resolution_rad_s)):
         share = cut_off(signal, quantum)
         if share is not None:
-            raise Refused(f"the {name} is cut off flat for {share:.1%} of the record", advice)
+            raise Refused(f"the {name} is cut off flat for {share:.1%} of the record", advice,
+                          entry=MessageCode.SIGNAL_CLIPPED)
 
 
 def refuse_open(samples: Samples, found: tuple[OneWayStretch, ...]) -> NoReturn:
     """Raise Refused, the inertia being open: with which motion it was, and which would do."""
     if not found:
-        raise Refused("the shaft never turned one way long enough without holes in the record", ADVICE)
+        raise Refused("the shaft never turned one way long enough without holes in the record", ADVICE,
+                      entry=MessageCode.NO_EXCITATION)
     speed = _blocks(samples.speed_rad_s)
     torque = _blocks(samples.torque_nm)
     middle = float(np.max(np.abs(speed)))
     if np.ptp(speed) <= _STEADY_SHARE * middle:
         raise Refused("the speed was constant: torque at one speed is friction, and tells nothing of the inertia",
-                       ADVICE)
+                       ADVICE, entry=MessageCode.NO_EXCITATION)
     scatter = float(np.median(np.abs(np.diff(samples.torque_nm)))) + 1e-300
     moving = np.abs(speed) > _STEADY_SHARE * middle
     span = float(np.ptp(torque))
     if span <= 5.0 * scatter or np.mean(np.abs(torque[moving]) <= _IDLE_SHARE * span + scatter) > 0.5:
         raise Refused("for most of the motion no torque was reported: a shaft that coasts shows how inertia and "
                        "friction relate, not how large they are",
-                       f"add motion that the drive's torque causes: {ADVICE}")
+                       f"add motion that the drive's torque causes: {ADVICE}", entry=MessageCode.NO_EXCITATION)
     rates = np.diff(speed)
     fast = rates[np.abs(rates) > 0.25 * float(np.max(np.abs(rates)))]
     if np.count_nonzero(np.diff(np.sign(fast))) < _TURNS:
         raise Refused("one change of speed leaves inertia, friction and the lags of the reported signals open: they "
-                       "explain each other", ADVICE)
+                       "explain each other", ADVICE, entry=MessageCode.NO_EXCITATION)
     raise Refused("torque and speed don't tell the inertia apart from friction, the lags of the reported signals and "
                    "the noise", ADVICE)
 
@@ -162,7 +168,7 @@ def recorded(case: Case) -> Case:
 
 
 def identify_record(case: Case) -> Finding:
-    """What a record without periodic excitation tells of a rigid shaft. Raises Refused where it leaves J open.
+    """Identify a rigid shaft from a record without periodic excitation. Raises Refused where it leaves J open.
 
     Stick-slip is refused by name: friction is no constant where the shaft sticks, and the answers of such records miss
     the true inertia more often than they state, whatever the residual test says.
@@ -186,7 +192,7 @@ def identify_record(case: Case) -> Finding:
 
 
 def _runs(samples: Samples, recording: Recording) -> tuple[OneWayStretch, ...]:
-    """What turns; a machine that stops every few seconds would have nothing left of it but for a shorter wait."""
+    """Return the stretches that turn; for a machine that stops every few seconds the wait before a stop is shorter."""
     found: tuple[OneWayStretch, ...] = ()
     for hidden in (_HIDDEN_S, 0.4 * _HIDDEN_S, 0.1 * _HIDDEN_S):
         found = runs(samples, recording.speed_resolution_rad_s, hidden)
@@ -198,7 +204,7 @@ def _runs(samples: Samples, recording: Recording) -> tuple[OneWayStretch, ...]:
 
 def _solved(recording: Recording, samples: Samples, found: tuple[OneWayStretch, ...],
     options: Options) -> tuple[Solved | None, tuple[str, ...]]:
-    """With what is known of the lags; if both are and it doesn't do, with the signals taken as simultaneous.
+    """Solve with the stated lags; if both are stated and J stays open, with the signals taken as simultaneous.
 
     And what J is conditional on by that.
     """
@@ -223,7 +229,7 @@ def _solved(recording: Recording, samples: Samples, found: tuple[OneWayStretch, 
 
 
 def _is_open(inertia: Estimate) -> bool:
-    """Does the interval say nothing worth a number?"""
+    """Return whether the interval is too wide to be reported."""
     return not inertia.bounded or inertia.low <= 0.0
 
 
@@ -239,7 +245,8 @@ def _finding(solved: Solved, case: Case) -> Finding:
         digits=2,
     )
     if solved.residual is None:
-        raise Refused("the record has too few frequencies to test the model that J comes from", ADVICE)
+        raise Refused("the record has too few frequencies to test the model that J comes from", ADVICE,
+                      entry=MessageCode.TOO_FEW_LINES)
     bare = Finding(MODEL, words, solved.residual, warnings=_caveats(solved), reject_p=DOUBT_P)
     if bare.rejected:
         return bare
@@ -258,7 +265,7 @@ def _finding(solved: Solved, case: Case) -> Finding:
 
 
 def _told(estimate: Estimate, bound: float) -> Estimate | None:
-    """None for a lag that the record leaves open up to the bound."""
+    """Return None for a lag that the record leaves open up to the bound."""
     return None if max(abs(estimate.low), abs(estimate.high)) >= bound * (1.0 - 1e-6) else estimate
 
 
@@ -275,7 +282,11 @@ def _conditions(recording: Recording) -> tuple[str, ...]:
 def _caveats(solved: Solved) -> tuple[str, ...]:
     found = []
     if solved.bent:
-        found.append("friction is no straight line over speed: a part that grows with its square was fitted too")
+        found.append(CodedText(
+            "friction is no straight line over speed: a part that grows with its square was fitted too",
+            MessageCode.FRICTION_NOT_LINEAR))
     if solved.shaped:
-        found.append("one-pole filters do not fit the reported signals; their structure was fitted too")
+        found.append(CodedText(
+            "one-pole filters do not fit the reported signals; their structure was fitted too",
+            MessageCode.LAGS_NOT_FIRST_ORDER))
     return tuple(found)

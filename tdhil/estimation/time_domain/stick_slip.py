@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from profiles import MessageCode
 from tdhil.estimation.result import Refused
 from tdhil.estimation.samples import Samples
 from tdhil.recording import BoolArray, FloatArray
@@ -47,6 +48,7 @@ def refuse_stick_slip(samples: Samples, speed_quantum: float, torque_quantum: fl
         f" and then jumped; it was at standstill for {seen.still:.0%} of the record",
         "turn faster, so that the shaft never stops, or use a stiffer speed loop: friction at standstill is larger"
         " than in motion, and the speed loop does not hold the speed between them",
+        entry=MessageCode.STICK_SLIP_RECORDED,
     )
 
 

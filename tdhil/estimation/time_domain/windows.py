@@ -1,4 +1,4 @@
-r"""From runs to equations: the record seen through smooth windows, at frequencies one window length apart.
+r"""Equations from runs: the record seen through smooth windows, at frequencies one window length apart.
 
 A window w of compact support times e^(−st) is a test function. Integrating by parts moves every derivative onto it, so
 that for any polynomial H (and any H smooth over the window's own bandwidth)
@@ -54,7 +54,7 @@ class OneWayStretch:
 
 
 def thinned(samples: Samples, most: int = _MOST_SAMPLES) -> Samples:
-    """At most some 200 000 samples, never below 50 Hz: means over groups of neighbours, their time included."""
+    """Return at most some 200 000 samples, never below 50 Hz: means over groups of neighbours, their time included."""
     count = len(samples)
     length = float(samples.time_s[-1] - samples.time_s[0])
     rate = count / length if length > 0.0 else 0.0
@@ -117,7 +117,7 @@ _LEAST_SAMPLES = 32
 
 @dataclass(frozen=True)
 class TaperWindow:
-    """Where a window lies in its run: tapers of ``taper_s`` at both ends, ``hop_s`` from one window to the next.
+    """Place of a window in its run: tapers of ``taper_s`` at both ends, ``hop_s`` from one window to the next.
 
     ``finer``: how many of the run's samples stand for one that was recorded.
     """

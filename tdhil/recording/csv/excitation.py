@@ -73,7 +73,7 @@ class SegmentFile(DataModel):
         return self
 
     def segment(self) -> Segment:
-        """As a recording has it; amplitudes and phases that nobody knows are empty."""
+        """Return the segment for a recording; unknown amplitudes and phases are empty."""
         return Segment(
             start_s=self.start_s,
             end_s=self.start_s + self.whole_periods * self.period_s,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import islice
 
 from profiles import quantities
-from tdhil.errors import CsvMisnamed, CsvUnusable, UsageError, shown
+from tdhil.errors import CsvMisnamed, CsvUnusable, MessageCode, UsageError, shown
 from tdhil.recording.csv.text import decimal_sign, is_missing, looks_numeric, split_cells
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -29,7 +29,7 @@ _TURN = 2.0 * math.pi
 
 @dataclass(frozen=True)
 class ColumnUnit:
-    """Of a column. ``factor`` into SI; ``of_rated``: the factor is a share of the rated torque."""
+    """Unit of a column. ``factor`` into SI; ``of_rated``: the factor is a share of the rated torque."""
 
     quantity: str
     symbol: str
@@ -58,7 +58,7 @@ def unit_of(quantity: str, text: str) -> ColumnUnit | None:
     """The unit that ``text`` spells for a quantity: ``rpm``, ``[1/min]``, ``N.m``; None if none of ours."""
     found = _BRACKETED.match(text.strip())
     inner = found.group(2) if found is not None and not found.group(1) else text
-    # Case tells milli from mega; nobody samples in megaseconds, and mN·m and MN·m are not read at all.
+    # Case separates milli from mega; no tool samples in megaseconds, and mN·m and MN·m are not read at all.
     word = _IGNORED.sub("", inner.replace("¹", "1").casefold())
     if (also := _ALSO[quantity].get(word)) is not None:
         return also
@@ -120,17 +120,20 @@ def parse_columns(items: Iterable[str]) -> Choices:
         quantity, equals, name = item.partition("=")
         quantity = quantity.strip().casefold()
         if not equals or not name.strip():
-            raise UsageError(f"{shown(item)!r} is not quantity=column", where=_WHERE, next_step=_NEXT)
+            raise UsageError(f"{shown(item)!r} is not quantity=column", where=_WHERE, next_step=_NEXT,
+                             entry=MessageCode.CSV_COLUMNS_UNCLEAR)
         if quantity not in QUANTITIES:
             meant = difflib.get_close_matches(quantity, QUANTITIES, 1)
             hint = f"; did you mean {meant[0]!r}?" if meant else f"; there are {', '.join(QUANTITIES)}"
-            raise UsageError(f"there is no quantity {shown(quantity)!r}{hint}", where=_WHERE, next_step=_NEXT)
+            raise UsageError(f"there is no quantity {shown(quantity)!r}{hint}", where=_WHERE, next_step=_NEXT,
+                             entry=MessageCode.CSV_COLUMNS_UNCLEAR)
         if quantity in found:
-            raise UsageError(f"{quantity} is named twice", where=_WHERE)
+            raise UsageError(f"{quantity} is named twice", where=_WHERE, entry=MessageCode.CSV_COLUMNS_UNCLEAR)
         found[quantity] = _choice(quantity, name.strip())
     names = [choice.name.casefold() for choice in found.values()]
     if len(set(names)) < len(names):
-        raise UsageError("one column can't hold two quantities", where=_WHERE, next_step=_NEXT)
+        raise UsageError("one column can't hold two quantities", where=_WHERE, next_step=_NEXT,
+                         entry=MessageCode.CSV_COLUMNS_UNCLEAR)
     time, speed, torque = (found.get(quantity, ColumnChoice(quantity)) for quantity in QUANTITIES)
     return time, speed, torque
 
@@ -144,6 +147,7 @@ def _choice(quantity: str, text: str) -> ColumnChoice:
         raise UsageError(
             f"{shown(spelt)!r} is no unit of {quantity}; there are {', '.join(known_units(quantity))}",
             where=_WHERE, next_step="If the colon belongs to the column's name, write the unit behind another colon",
+            entry=MessageCode.CSV_COLUMNS_UNCLEAR,
         )
     return ColumnChoice(quantity, name.strip(), unit)
 
@@ -272,7 +276,7 @@ class ColumnLayout:
 
 
 def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayout:
-    """From the file's first block. CsvMisnamed for columns and units, CsvUnusable where no number follows."""
+    """Return the layout from the first block. CsvMisnamed for columns and units, CsvUnusable without numbers."""
     header = find_header(lines, choices, file)
     below = range(header.line, min(header.line + _BELOW + 1, len(lines)))     # positions, so one line further
     rows = {at: _wanted(lines[at], header) for at in below if lines[at].strip()}
@@ -328,7 +332,7 @@ def _holds_data(row: Sequence[str]) -> bool:
 
 
 def _unit(choice: ColumnChoice, name: str, stated: str, where: str) -> tuple[ColumnUnit, list[str]]:
-    """The unit of one column, and what has to be said about it."""
+    """Return the unit of one column, and remarks about it."""
     quantity = choice.quantity
     below = unit_of(quantity, stated)
     named = unit_in_name(quantity, name)

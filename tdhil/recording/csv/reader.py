@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.errors import CsvUnusable, UsageError
+from tdhil.errors import CsvUnusable, MessageCode, UsageError
 from tdhil.recording.csv.excitation import load_excitation
 from tdhil.recording.csv.layout import USUAL, Choices, ColumnLayout, find_layout
 from tdhil.recording.csv.text import (
@@ -250,6 +250,7 @@ def _factors(layout: ColumnLayout, rated_torque_nm: float | None, file: str) -> 
                 f"the torque is in {unit.symbol} of the rated torque, which is not given",
                 where=f"{file}:{layout.header.line}",
                 next_step="Add --rated-torque, in N·m, from the name plate or the drive",
+                entry=MessageCode.RATED_TORQUE_MISSING,
             )
         factors.append(unit.factor * (rated_torque_nm or 1.0) if unit.of_rated else unit.factor)
     return factors
@@ -331,10 +332,10 @@ _ROUNDING = 1e-9         # of the largest value: differences below it are the ar
 
 @dataclass(frozen=True)
 class Bench:
-    """What a trace doesn't say: N·m and 1 at the motor shaft; None where nobody knows.
+    """Data that a trace does not hold: N·m and 1 at the motor shaft; None if unknown.
 
-    ``skew_sd_s``: to within what the tool read speed and torque at one time, 1 sd. None: to within a sample, for it may
-    read one after the other, and at no less than what is usual of a frame (`LagPrior`).
+    ``skew_sd_s``: standard uncertainty of the time offset between speed and torque, s. None: one sample, because the
+    tool may read them one after the other, and at least the usual value within a frame (`LagPrior`).
     """
 
     rated_torque_nm: float | None = None

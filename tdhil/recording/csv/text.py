@@ -87,13 +87,13 @@ class ClockReader:
                 return None
             if self._first is None:
                 self._first = ordinal
-            # Day and month of 5/1/2024 can't be told apart; another date is the next day.
+            # Day and month of 5/1/2024 are ambiguous; another date is the next day.
             self._days[text] = len(self._days) if ordinal == 0 else ordinal - self._first
         return self._days[text]
 
 
 def _ordinal(text: str) -> int | None:
-    """The day's number; 0 for a date of which day and month can't be told apart."""
+    """Return the day's number; 0 for a date with ambiguous day and month."""
     try:
         if found := _YEAR_FIRST.fullmatch(text):
             return date(int(found[1]), int(found[2]), int(found[3])).toordinal()
@@ -229,7 +229,8 @@ def encoding_of(path: Path) -> str:
     except OSError as error:
         raise CsvUnusable(f"can't be read ({error.strerror or error})", where=str(path)) from error
     if not head:
-        raise CsvUnusable("the file is empty", where=str(path))
+        raise CsvUnusable("the file is empty", where=str(path),
+                          next_step="Nothing was recorded in it, or its copy failed. Copy it again, or repeat the run")
     if size > MAX_BYTES:
         raise CsvUnusable(
             f"the file is larger than {MAX_BYTES >> 30} GiB", where=str(path),
