@@ -1,4 +1,4 @@
-"""One run, from what was asked for to a closed log: which drive, who confirms, where the files go."""
+"""One run, from the request to a closed log: connection, confirmation, log files."""
 
 from typing import TYPE_CHECKING
 
@@ -7,6 +7,7 @@ from profiles import lazy_face
 if TYPE_CHECKING:
     from tdhil.session.conclusion import conclude as conclude
     from tdhil.session.confirm import (
+        confirm_mounted as confirm_mounted, require_terminal as require_terminal,
         CallbackOperator as CallbackOperator, TerminalOperator as TerminalOperator, motion_summary as motion_summary,
     )
     from tdhil.session.connection import (
@@ -45,10 +46,25 @@ if TYPE_CHECKING:
         OperatorInterface as OperatorInterface, RunRequest as RunRequest,
         RunSession as RunSession,
     )
+    from tdhil.session.speed_calibration import (
+        SECONDS_SD as SECONDS_SD, SPEED_REL_SD as SPEED_REL_SD, TURNS_SD as TURNS_SD, TurnsCount as TurnsCount,
+        add_speed_calibration as add_speed_calibration, check_speed_place as check_speed_place,
+        speed_by_position as speed_by_position, speed_by_turns as speed_by_turns,
+    )
+    from tdhil.session.stored_calibration import (
+        drive_identity as drive_identity, drive_settings as drive_settings, load_calibration as load_calibration,
+        save_calibration as save_calibration, with_calibration as with_calibration,
+    )
     from tdhil.session.stop_signals import Ending as Ending, stop_on_signals as stop_on_signals
     from tdhil.session.task import (
         bench_of as bench_of, excitation_request as excitation_request, facts as facts,
         machine_limits as machine_limits, stated_lags as stated_lags, suited as suited,
+    )
+    from tdhil.session.torque_calibration import (
+        ASSUMED_BODY_REL_SD as ASSUMED_BODY_REL_SD, CalibrationFound as CalibrationFound,
+        CalibrationRun as CalibrationRun, find_calibration as find_calibration, find_plan as find_plan,
+        read_pairs as read_pairs,
+        sha256_of_log as sha256_of_log,
     )
 else:
     __getattr__, __dir__ = lazy_face(__name__)

@@ -1,4 +1,4 @@
-"""From a Recording to the result document: the same road for a live run and for its replay."""
+"""The result document of a Recording, made in the same way for a live run and for its replay."""
 
 from __future__ import annotations
 
@@ -6,17 +6,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from profiles import CodedText
 from tdhil.config import ASKED_AGAIN
-from tdhil.errors import ExitCode, UsageError
+from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.estimation import Identification, Verdict
 from tdhil.recording import Recording
+from tdhil.session.stored_calibration import apply_calibration
+
+TORQUE_SCALE = "torque scale"
+"""The budget's line that a torque calibration sharpens."""
+CALIBRATE = "tdhil calibrate torque"
+"""In the advice on a torque scale that was not calibrated."""
 
 
 def working_confidence_of(run: Mapping[str, Any], confidence: float) -> float:
-    """The confidence to identify with; ``confidence`` itself where stage 5 had a fixed length.
+    """Return the confidence for the identification; ``confidence`` itself if stage 5 had a fixed length.
 
-    The run's own is in its log. Another one, asked for in a replay, is worked out by the same rule. A log that was cut
-    before the first look owes nothing to it.
+    The run's own working confidence is in its log. Another requested confidence follows from the same rule. A log that
+    ends before the first interim analysis needs no correction.
     """
     stopping = run.get("stopping")
     if not isinstance(stopping, Mapping) or not stopping.get("decisions"):
@@ -30,7 +37,7 @@ def working_confidence_of(run: Mapping[str, Any], confidence: float) -> float:
 
 
 def after_looks(found: Identification, run: Mapping[str, Any], confidence: float) -> Identification:
-    """The result under the confidence that it holds with, and what would have brought the tolerance within reach."""
+    """Return the result with its coverage probability, and with advice how to reach the tolerance."""
     stopping = run.get("stopping")
     if not isinstance(stopping, Mapping):
         return found
@@ -43,7 +50,7 @@ def after_looks(found: Identification, run: Mapping[str, Any], confidence: float
 
 @dataclass(frozen=True)
 class Conclusion:
-    """What was identified, as it is printed and kept, and how a process ends with it."""
+    """The identification, its document, and the exit code of the process."""
 
     identification: Identification
     document: dict[str, Any]
@@ -53,9 +60,9 @@ class Conclusion:
 def conclude(
     recording: Recording, run: Mapping[str, Any], log: str, warnings: Sequence[str] | None = None
 ) -> Conclusion:
-    """The identification, its document, and the exit code it means. ``run`` is the log's configuration.
+    """Return the identification, its document, and its exit code. ``run`` is the log's configuration.
 
-    ``warnings``: what was assumed in reading a foreign trace; None for a run of ours.
+    ``warnings``: assumptions in reading a foreign trace; None for a tdhil log.
     """
     from tdhil.estimation import Options, Verdict, identify
     from tdhil.report import result_document
@@ -67,12 +74,16 @@ def conclude(
         options = Options(**known)
     except (TypeError, ValueError) as error:
         flags = " or ".join(one.flag for one in ASKED_AGAIN)
-        raise UsageError(str(error), where=log, next_step=f"Say {flags} anew") from error
+        raise UsageError(str(error), where=log, next_step=f"Give {flags} again") from error
     working = working_confidence_of(run, options.confidence)
+    applied = apply_calibration(recording, run)
+    recording = applied.recording
     identification = after_looks(identify(recording, replace(options, confidence=working)), run, options.confidence)
+    identification = _dated(identification, applied.day)
     said = (
-        *(warnings or ()), *_stop_warnings(run), *precondition_warnings(run), *speed_warnings(run),
-        *stage_warnings(run),
+        *(CodedText(one, MessageCode.TRACE_ASSUMPTION) for one in warnings or ()),
+        *(CodedText(one, MessageCode.CALIBRATION_WARNING) for one in applied.warnings),
+        *_stop_warnings(run), *precondition_warnings(run), *speed_warnings(run), *stage_warnings(run),
     )
     if said:
         identification = replace(identification, warnings=(*said, *identification.warnings))
@@ -83,8 +94,21 @@ def conclude(
     return Conclusion(identification, document, ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE)
 
 
+def _dated(found: Identification, day: str) -> Identification:
+    """With the day of the torque calibration in the budget's line."""
+    if not day:
+        return found
+    advice = found.advice
+    if CALIBRATE in advice:
+        advice = "the torque calibration is most of the interval: a larger body, or longer runs, would sharpen it"
+    return replace(found, advice=advice, budget=tuple(
+        replace(line, source=f"{TORQUE_SCALE}, calibrated {day}") if line.source == TORQUE_SCALE else line
+        for line in found.budget))
+
+
 def _stop_warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
-    """A run whose stop nobody saw through has no result of its own; its replay has one, and says so."""
+    """Return a warning if the stop was not confirmed. Such a run has no result of its own; its replay has one."""
     stop = run.get("stop")
     unseen = isinstance(stop, Mapping) and stop.get("confirmed") is False
-    return ("at the end of this run the shaft was NOT seen at rest: the stop was not confirmed",) if unseen else ()
+    said = "the stop of this run was NOT confirmed: standstill was not observed at its end"
+    return (CodedText(said, MessageCode.STOP_WAS_NOT_CONFIRMED),) if unseen else ()

@@ -14,18 +14,18 @@ from typing import TypeVar
 from rich.console import Console
 
 from drivers import ACCEPTED_BY, ANY_CLIENT, NOTHING_STOPS_IT, Preflight, PreflightRefused
-from profiles import visible
+from profiles import MessageCode, visible
 from profiles.quantities import RPM
 from tdhil.report import LiveDisplay, minutes
 from tdhil.runner import Display, ExcitationRequest, Idle, MachineLimits, Task
 
 T = TypeVar("T")
 
-WORD = "MOVE"
+WORD, MOUNTED = "MOVE", "MOUNTED"
 SPEED_FLAG = "--accept-speed-unit"
-_UNWATCHED = "  [ ] somebody stands at that stop for the whole run: nothing else stops the shaft if this host fails\n"
+_UNWATCHED = "  [ ] an operator stays at that stop for the whole run: nothing else stops the shaft if this host fails\n"
 _SHARED = (
-    "  [ ] every other client of this drive is switched off (PLC, panel, historian, gateway), and somebody stands at\n"
+    "  [ ] every other client of this drive is switched off (PLC, panel, historian, gateway); an operator stays at\n"
     "      that stop for the whole run\n"
 )
 
@@ -53,14 +53,16 @@ def confirm_motion(
         return
     if sys.stdin is None or not sys.stdin.isatty():
         raise PreflightRefused(
-            "nobody is there to confirm that the shaft may move",
+            "no operator can confirm that the shaft may move",
             where="no terminal",
-            next_step="Run it at a terminal, or pass --yes if somebody stands at the hard-wired stop",
+            next_step="Run it at a terminal, or add --yes if an operator stands at the hard-wired stop",
+            entry=MessageCode.NOT_CONFIRMED,
         )
     _forget_what_was_typed()
     console.print(f"Type {WORD} and Enter to turn the shaft, anything else to leave it alone: ", end="")
     if _ask(idle).strip() != WORD:
-        raise PreflightRefused("not confirmed", where="prompt", next_step="Nothing has moved")
+        raise PreflightRefused("the motion was not confirmed", where="prompt", next_step="Nothing has moved",
+                               entry=MessageCode.NOT_CONFIRMED)
 
 
 def confirm_speed(
@@ -74,45 +76,75 @@ def confirm_speed(
 ) -> None:
     """Return if the operator sees the shaft turn as fast as the drive reports; PreflightRefused (exit 4) if not.
 
-    Asked while the shaft turns, one cycle after the other; ``--yes`` is no answer to it.
+    Cycles continue while the prompt waits. ``--yes`` does not answer this question.
     """
     turning = turns_text(speed_rad_s)
     if sys.stdin is None or not sys.stdin.isatty():
         raise PreflightRefused(
-            f"nobody is there to see whether the shaft turns {turning}, as the drive reports ({why})",
+            f"no operator can confirm that the shaft turns {turning}, as the drive reports ({why})",
             where="no terminal",
-            next_step="Run it at a terminal, where somebody sees the shaft; say in the profile where the drive tells"
-            f" its angle (position); or take the unit of speed by name: {SPEED_FLAG}",
+            next_step="Run it at a terminal, where an operator sees the shaft. Or name the drive's position object in"
+            f" the profile (position). Or accept the unit of speed by name: {SPEED_FLAG}",
+            entry=MessageCode.SPEED_UNIT_NOT_SEEN,
         )
     main = f" (the main shaft, behind the gear, {turns_text(speed_rad_s / gear_ratio)})" if gear_ratio != 1.0 else ""
 
     def ask() -> str:
-        """In the thread that waits, and the display's last words too: a terminal that takes nothing holds no cycle."""
+        """Run in the waiting thread, with the last output of the display: a blocked terminal then delays no cycle."""
         pause_display()
         _forget_what_was_typed()
         console.print(
             f"\nThe shaft turns, and {why}.\n"
-            f"The drive reports {speed_rad_s:.3g} rad/s: watch a mark on the motor's shaft for some turns.",
+            f"The drive reports {speed_rad_s:.3g} rad/s. Watch a mark on the motor shaft for some turns.",
             markup=False,
         )
         console.print(
-            f"Is it turning {turning}{main}? Type yes and Enter; anything else stops it: ", end="", markup=False
+            f"Does it turn {turning}{main}? Type yes and Enter; any other answer stops it: ", end="", markup=False
         )
         return _line()
 
     answer = _meanwhile(idle, ask).strip().lower()
     if answer not in ("y", "yes"):
         raise PreflightRefused(
-            f"the shaft was not seen to turn {turning}, as the drive reports: its unit of speed is not what the profile"
-            " says",
+            f"the operator did not confirm that the shaft turns {turning}, as the drive reports: the unit of speed in"
+            " the profile is probably wrong",
             where="prompt",
-            next_step="Check the speed scaling in the profile: how long one turn really takes, against what was asked,"
-            " is the factor",
+            next_step="Time one turn of the shaft. Divide the measured time by the expected time: this is the factor by"
+            " which the speed scaling in the profile is wrong",
+            entry=MessageCode.SPEED_UNIT_WRONG,
         )
 
 
+def require_terminal(what: str) -> None:
+    """Raise PreflightRefused (exit 4) where no operator can confirm ``what`` at a terminal."""
+    if sys.stdin is None or not sys.stdin.isatty():
+        raise PreflightRefused(f"no operator can confirm {what}", where="no terminal",
+                               next_step="Run it at a terminal. --yes does not answer this question",
+                               entry=MessageCode.NOT_CONFIRMED)
+
+
+def confirm_mounted(console: Console, later: str) -> None:
+    """Return once the operator confirms that the body is on the shaft; PreflightRefused (exit 4) if not.
+
+    No drive is open meanwhile. ``later``: the command that calibrates from a second run of another time.
+    """
+    require_terminal("that the body is mounted")
+    _forget_what_was_typed()
+    console.print(
+        "\nThe drive is disabled. Before you touch the shaft:\n"
+        "  [ ] switch the drive off and lock it out\n"
+        "  [ ] bolt the body tight to the motor shaft; change nothing else (drive, filters, gear)\n"
+        "  [ ] take tools off the shaft, clear it of people, and switch the drive on again", markup=False)
+    console.print(f"Type {MOUNTED} and Enter when the body is mounted, anything else to end here: ", end="")
+    if _line().strip() != MOUNTED:
+        raise PreflightRefused(
+            "the body was not confirmed as mounted; the second run was not started", where="prompt",
+            next_step=f"The first log is kept. Do the run with the body later, then: {later}",
+            entry=MessageCode.NOT_CONFIRMED)
+
+
 def turns_text(speed_rad_s: float) -> str:
-    """A speed as somebody with a watch sees it."""
+    """Return a speed in turns per time, as an operator with a watch sees it."""
     way = "forward" if speed_rad_s >= 0.0 else "backwards"
     turn_s = 2.0 * math.pi / max(abs(speed_rad_s), 1e-9)
     if turn_s >= 2.0:
@@ -123,7 +155,7 @@ def turns_text(speed_rad_s: float) -> str:
 def motion_summary(
     preflight: Preflight, limits: MachineLimits, request: ExcitationRequest, unverified: Sequence[str] = ()
 ) -> str:
-    """What will happen, and what the operator must have seen to. ``unverified``: what he took of the profile."""
+    """Return the planned motion and the checklist. ``unverified``: profile entries that the operator accepted."""
     silent = f"{preflight.watchdog_s:g} s in the drive, then {preflight.safe_action.replace('_', ' ')}"
     watchdog, seen_to = (silent, "") if preflight.watched else (f"NONE, {ACCEPTED_BY}: {NOTHING_STOPS_IT}", _UNWATCHED)
     if preflight.watched and preflight.fed_by_any_client:
@@ -150,16 +182,16 @@ def _taken(unverified: Sequence[str]) -> str:
     if not unverified:
         return ""
     lines = "".join(f"  {visible(one)}\n" for one in unverified)
-    return f"Taken as the profile has it, although nobody verified it:\n{lines}"
+    return f"Accepted although unverified in the profile:\n{lines}"
 
 
 def _ask(idle: Idle) -> str:
-    """A line from the terminal. Raises PreflightRefused where it can't be read, as by a program in the background."""
+    """Return a line from the terminal. Raises PreflightRefused if it can't be read, as in a background process."""
     return _meanwhile(idle, _line)
 
 
 def _forget_what_was_typed() -> None:
-    """What was typed before the question was asked is no answer to it."""
+    """Discard input that was typed before the question appeared."""
     with suppress(ImportError, OSError, ValueError):
         import termios
 
@@ -172,13 +204,14 @@ def _line() -> str:
         return sys.stdin.readline()
     except OSError as error:
         raise PreflightRefused(
-            f"the terminal can't be asked: {error.strerror or error}", where="terminal",
+            f"the terminal can't be read: {error.strerror or error}", where="terminal",
             next_step="Run it in the foreground, at a terminal",
+            entry=MessageCode.NOT_CONFIRMED,
         ) from error
 
 
 def _meanwhile(idle: Idle, ask: Callable[[], T]) -> T:
-    """What ``ask`` gives, or raises what it raises: done in a thread, with a cycle of nothing again and again."""
+    """Return what ``ask`` returns, or raise what it raises. It runs in a thread; idle cycles continue meanwhile."""
     answer: Future[T] = Future()
 
     def work() -> None:
@@ -195,7 +228,7 @@ def _meanwhile(idle: Idle, ask: Callable[[], T]) -> T:
 
 
 class TerminalOperator:
-    """Whoever sits at the terminal: sees the run there, types the confirmation, watches the shaft."""
+    """The operator at the terminal: sees the run there, types the confirmation, watches the shaft."""
 
     def __init__(self, console: Console, *, yes: bool = False, gear_ratio: float = 1.0) -> None:
         self._console = console
@@ -236,17 +269,18 @@ class TerminalOperator:
 
 
 class CallbackOperator(TerminalOperator):
-    """The same, but a function of the caller's confirms motion: it is given in words what will move."""
+    """The same, but a function of the caller confirms motion. It receives the summary of the motion as text."""
 
     def __init__(self, console: Console, ask: Callable[[str], bool], *, gear_ratio: float = 1.0) -> None:
         super().__init__(console, gear_ratio=gear_ratio)
         self._ask = ask
 
     def confirm(self, task: Task, preflight: Preflight, idle: Idle, unverified: tuple[str, ...]) -> None:
-        """Ask in a thread of its own: the drive's watchdog is fed meanwhile."""
+        """Call the function in its own thread. The drive's watchdog is fed meanwhile."""
         if preflight.identity.simulated:
             return
         self._display.pause()
         text = motion_summary(preflight, task.limits, task.request, unverified)
         if _meanwhile(idle, partial(self._ask, text)) is not True:
-            raise PreflightRefused("not confirmed", where="confirm", next_step="Nothing has moved")
+            raise PreflightRefused("the motion was not confirmed", where="confirm", next_step="Nothing has moved",
+                                   entry=MessageCode.NOT_CONFIRMED)

@@ -1,6 +1,6 @@
-"""How the drive is spoken to: which bus, which profile, and where on that bus; each with who had the say.
+"""The connection to the drive: bus, profile, address on the bus, and the source of each value.
 
-Nothing here, nor above, names a bus: `BusKind` is what a run asks of one, and `tdhil.config.registry.BUSES` lists them.
+No code here or above names a bus. `BusKind` is the interface of a bus, and `tdhil.config.registry.BUSES` lists them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from drivers import DataFileError, Problem
 from profiles import Profile, load_profile
 from tdhil.config import BUSES, DEFAULT_BUS, Origin, RunOptions, Setting, load
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 
 if TYPE_CHECKING:
     from drivers import Clock, Drive, FrameTap, Target
@@ -29,125 +29,125 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LineConfig(ABC):
-    """Where a drive is: every value with the place that it came from. What is there to ask for is its bus's own."""
+    """The address of a drive: every value with its source. The options are those of its bus."""
 
-    nothing_there: ClassVar[str]       # why the embedded simulator runs although nobody asked for it
-    simulated_text: ClassVar[str]      # what that is then, in words
-    row_name: ClassVar[str] = "bus"    # what stands before each row
+    nothing_there: ClassVar[str]       # why the embedded simulator runs although it was not requested
+    simulated_text: ClassVar[str]      # the simulated equipment, in words
+    row_name: ClassVar[str] = "bus"    # label in front of each row
 
     settings: Mapping[str, Setting] = field(default_factory=lambda: MappingProxyType({}))
 
     @property
     @abstractmethod
     def configured(self) -> bool:
-        """Has anybody said where the drive is? If not, the embedded simulator is meant."""
+        """Return whether an address of the drive is given. If not, the embedded simulator is meant."""
 
     def value(self, name: str, default: Any = None) -> Any:
-        """What an option is; ``default`` where nobody said it."""
+        """Return the value of an option; ``default`` if it is not given."""
         return self.settings[name].value if name in self.settings else default
 
     def source(self, name: str) -> str:
-        """Where an option's value came from, in words; '' where nobody said it."""
+        """Return the source of an option's value, in words; '' if it is not given."""
         return self.settings[name].source if name in self.settings else ""
 
     def origin(self, name: str) -> Origin | None:
-        """Who said it, None where nobody did."""
+        """Return the kind of source; None if the option is not given."""
         return self.settings[name].origin if name in self.settings else None
 
     def rows(self) -> Iterator[tuple[str, str, str]]:
-        """(option, value, source) to print."""
+        """Yield (option, value, source) to print."""
         for name, setting in self.settings.items():
             yield name, str(setting.value), setting.source
 
 
 class BusKind(ABC):
-    """What a run asks of a bus: its options, where they put the drive, and how that is opened.
+    """A bus as a run uses it: its options, the address that they give, and how to open it.
 
-    An object of it stands where `tdhil.config.registry.BUSES` says. Its module is imported for every ``--help``: what
-    loads a library of the bus is imported where it is used.
+    `tdhil.config.registry.BUSES` names one object for each bus. Every ``--help`` imports its module, so a library of
+    the bus is imported only where it is used.
     """
 
     name: ClassVar[str]                # as in BUSES, --drive, and `bus:` of a profile
-    title: ClassVar[str]               # as people write it
-    named_by: ClassVar[str]            # the options that name a drive on it, in words
-    section: ClassVar[str] = ""        # its section in rig.yaml; '' where it has none …
-    place_keys: ClassVar[str] = ""     # … and which keys of that say where a drive is
+    title: ClassVar[str]               # as it is written in texts
+    named_by: ClassVar[str]            # options that name a drive on it, in words
+    section: ClassVar[str] = ""        # its section in rig.yaml; '' if it has none
+    place_keys: ClassVar[str] = ""     # keys of that section that give a drive's address
     flags: ClassVar[Mapping[str, str]] = MappingProxyType({})
     """Options of the command line that no other bus has: name in the namespace → flag."""
-    default_profile: ClassVar[str]     # worn and spoken where nobody names another
-    steps_over_a_wire: ClassVar[bool] = False     # can a simulator in another process be stepped over it?
+    default_profile: ClassVar[str]     # profile if none is named
+    steps_over_a_wire: ClassVar[bool] = False     # True if it can step a simulator in another process
 
     @property
     def frame_channel(self) -> int:
-        """The log's channel for its raw frames (`tdhil.recording.CHANNELS`)."""
+        """Return the log's channel for its raw frames (`tdhil.recording.CHANNELS`)."""
         from tdhil.recording import CAN
 
         return CAN
 
     @abstractmethod
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Its options, in a group of their own."""
+        """Add its options in their own group."""
 
     @abstractmethod
     def line(self, cli: Mapping[str, Any], rig: Rig | None, profile: Profile) -> LineConfig:
-        """Where the drive is, by all who have a say. Raises UsageError and DataFileError for what can't be used."""
+        """Return the drive's address from all sources. Raises UsageError and DataFileError for unusable values."""
 
     @property
     @abstractmethod
     def nowhere(self) -> LineConfig:
-        """The same where nobody was asked: an embedded simulator is meant."""
+        """Return an empty address: an embedded simulator is meant."""
 
     @abstractmethod
     def open(self, plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData, clock: Clock,
              tap: FrameTap, trace: Path | None) -> AbstractContextManager[Drive]:
-        """The drive, or the embedded simulator's; closed afterwards, with all that was opened for it."""
+        """Open the drive, real or simulated. It is closed afterwards, with all that was opened for it."""
 
     @abstractmethod
     def open_target(self, options: RunOptions, connection: Connection, clock: Clock) -> AbstractContextManager[Target]:
-        """What ``tdhil stop`` needs of the drive, and no more; closed afterwards."""
+        """Open only what ``tdhil stop`` needs of the drive. It is closed afterwards."""
 
     def address(self, options: RunOptions, connection: Connection) -> str | None:
-        """The drive's place as one text, the same for every program that means this drive: what `hold` locks.
+        """Return the drive's address as one text, the same for every program that means this drive. `hold` locks it.
 
-        None where other processes can't reach it. Unless a bus knows better, all that was said of the place.
+        None if other processes can't reach the drive. By default the text contains all given values of the address.
         """
         return " ".join((self.name, *(f"{name} {value}" for name, value, _ in connection.line.rows())))
 
     @abstractmethod
     def parse_faults(self, texts: Sequence[str]) -> tuple[Any, ...]:
-        """Faults of the embedded simulator, from what ``--fault`` says. Raises UsageError."""
+        """Return the faults of the embedded simulator that ``--fault`` requests. Raises UsageError."""
 
     @abstractmethod
     def faults(self) -> tuple[KnownFault, ...]:
-        """What ``--fault`` knows of the embedded simulator."""
+        """Return the faults that ``--fault`` accepts for the embedded simulator."""
 
     @abstractmethod
     def fault_listing(self) -> str:
-        """What ``--fault list`` shows of it."""
+        """Return the text that ``--fault list`` prints."""
 
     def asked_for(self, cli: Mapping[str, Any]) -> str | None:
-        """The flag on the command line that only this bus has; None if there is none."""
+        """Return the given flag that belongs only to this bus; None if there is none."""
         return next((flag for name, flag in self.flags.items() if cli.get(name) is not None), None)
 
     def placed_in(self, rig: Rig) -> bool:
-        """Does rig.yaml say where a drive on this bus is?"""
+        """Return whether rig.yaml gives the address of a drive on this bus."""
         return False
 
 
 def bus_kind(name: str) -> BusKind:
-    """The bus of that name. KeyError where there is none."""
+    """Return the bus of that name. Raises KeyError if there is none."""
     found: BusKind = load(BUSES, name)
     return found
 
 
 def bus_kinds() -> tuple[BusKind, ...]:
-    """All of them, in their order."""
+    """Return all buses in their order."""
     return tuple(bus_kind(name) for name in BUSES)
 
 
 @dataclass(frozen=True)
 class Connection:
-    """Which bus, what is known of the drive on it, and where that is."""
+    """The bus, the drive's profile, and the drive's address on the bus."""
 
     kind: BusKind
     profile: Profile
@@ -155,28 +155,28 @@ class Connection:
 
     @property
     def drive(self) -> str:
-        """The bus's name, as --drive has it."""
+        """Return the bus's name, as in --drive."""
         return self.kind.name
 
     @property
     def configured(self) -> bool:
-        """Has anybody said where the drive is? If not, the embedded simulator is meant."""
+        """Return whether an address of the drive is given. If not, the embedded simulator is meant."""
         return self.line.configured
 
     @property
     def nothing_there(self) -> str:
-        """Why the embedded simulator runs although nobody asked for it."""
+        """Return why the embedded simulator runs although it was not requested."""
         return self.line.nothing_there
 
     def rows(self) -> Iterator[tuple[str, str, str]]:
-        """(option, value, source) to print and to log."""
+        """Yield (option, value, source) to print and to log."""
         return self.line.rows()
 
 
 def connection_of(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) -> tuple[RunOptions, Connection]:
-    """The options with drive and profile decided, and the way to the drive.
+    """Return the options with drive and profile decided, and the connection to the drive.
 
-    UsageError for options of another bus, DataFileError for a profile that can't be used.
+    Raises UsageError for options of another bus, DataFileError for an unusable profile.
     """
     options = choose_drive(cli, rig, options)
     kind = bus_kind(options.drive)
@@ -184,9 +184,10 @@ def connection_of(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) 
         flag = None if other.name == kind.name else other.asked_for(cli)
         if flag is not None:
             raise UsageError(
-                f"belongs to {other.title}", where=flag,
-                next_step=f"A {kind.title} drive is named by {kind.named_by}; for {other.title} say "
+                f"belongs to {other.title}, but the drive is on {kind.title}", where=flag,
+                next_step=f"Name a {kind.title} drive with {kind.named_by}. For {other.title} add "
                 f"--drive {other.name}",
+                entry=MessageCode.OPTION_OF_ANOTHER_BUS,
             )
     profile = load_profile(options.profile, kind.name)
     found = Connection(kind, profile, kind.line(cli, rig, profile))
@@ -195,7 +196,7 @@ def connection_of(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) 
 
 
 def _refuse_another_bus(found: Connection, rig: Rig | None, options: RunOptions) -> None:
-    """A rig.yaml that says where a drive is, but on another bus: nobody meant the simulator. Raises DataFileError."""
+    """Raise DataFileError if rig.yaml gives a drive's address on another bus: the simulator was not meant."""
     if rig is None or found.configured or options.simulate:
         return
     kind = found.kind
@@ -205,13 +206,13 @@ def _refuse_another_bus(found: Connection, rig: Rig | None, options: RunOptions)
     missing = f"{kind.section}: ({kind.place_keys})" if kind.section else kind.named_by
     raise DataFileError((Problem(
         rig.file or "rig.yaml", rig.line(other.section),
-        f"{other.section}: says where a drive is, but the drive is on {kind.name} ({options.source('drive')}), and"
-        f" nothing says where; give {missing}, name the other drive, or take the simulated one with --simulate",
-    ),))
+        f"{other.section}: gives a drive's address, but the drive is on {kind.name} ({options.source('drive')}), and"
+        f" its address is missing; give {missing}, name the other drive, or use the simulated one with --simulate",
+    ),), entry=MessageCode.OPTION_OF_ANOTHER_BUS)
 
 
 def choose_drive(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) -> RunOptions:
-    """Who doesn't name the bus has named it by the profile, or by saying where the drive is."""
+    """Return the options with the bus. If it is not named, it follows from the profile or the given address."""
     if not options.given("drive"):
         if options.given("profile"):
             profile = load_profile(options.profile)
@@ -224,7 +225,7 @@ def choose_drive(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) -
 
 
 def _bus_by_place(cli: Mapping[str, Any], rig: Rig | None) -> Setting | None:
-    """The bus on which the command line, or else rig.yaml, has the drive; None for the usual one."""
+    """Return the bus of the address on the command line, or else in rig.yaml; None for the default bus."""
     others = [kind for kind in bus_kinds() if kind.name != DEFAULT_BUS]
     for kind in others:
         if (flag := kind.asked_for(cli)) is not None:
@@ -235,31 +236,31 @@ def _bus_by_place(cli: Mapping[str, Any], rig: Rig | None) -> Setting | None:
 
 
 def simulated_connection(options: RunOptions) -> Connection:
-    """The way to an embedded drive on the bus of the options."""
+    """Return the connection to an embedded drive on the bus of the options."""
     kind = bus_kind(options.drive)
     return Connection(kind, load_profile(options.profile, kind.name), kind.nowhere)
 
 
 @dataclass(frozen=True)
 class PeerPlan:
-    """What will be opened. ``seed`` and ``plant`` are the embedded simulator's, None without it."""
+    """The peer to open. ``seed`` and ``plant`` belong to the embedded simulator, None without it."""
 
     embedded: bool
     stepped: bool
     seed: int | None
     plant: Any
     faults: tuple[Any, ...] = ()       # scripted faults of the embedded simulator (`sim_bus.fault_script`)
-    never_came: list[str] = field(default_factory=list)    # those of them whose moment the run did not reach
-    left_in: Path | None = None        # where it is written down what a run changes in a drive; None: beside the log
+    never_came: list[str] = field(default_factory=list)    # those that the run ended too early to trigger
+    left_in: Path | None = None        # folder of the undo journal of the drive's settings; None: beside the log
 
     @property
     def epoch_ns(self) -> int:
-        """Wall clock at control time zero, for the log's time stamps; in stepped time the clock runs ahead of it."""
+        """Return the wall clock at control time zero, for the log. In stepped time the control time runs ahead."""
         return time.time_ns()
 
 
 def one_host(name: str) -> str:
-    """The host's first address, so that its name and its number are one; the name where nobody knows it."""
+    """Return the host's first address, so that name and number give the same text; the name if it is unknown."""
     try:
         found = sorted({str(one[4][0]) for one in socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)})
     except (OSError, UnicodeError):

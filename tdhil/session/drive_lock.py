@@ -1,9 +1,9 @@
-"""One drive, one holder: a lock on the drive's address, which everything takes that may move its shaft.
+"""One drive, one holder: a lock on the drive's address. Every program that may move the shaft takes it.
 
-The lock (flock) belongs to an open file, so that the system lets go of it when the process ends, whatever ends it. The
-file says who holds it. It lies where every user and every service of this computer finds the same one; a folder of the
-user's would leave two users two locks. A file can be removed while it is locked, and the next one would lock another:
-so on Linux a name in the kernel is taken besides (abstract socket), which nobody can remove. Stopping takes no lock.
+The lock (flock) belongs to an open file, so the system releases it when the process ends, for whatever reason. The file
+names the holder. It lies in one folder for all users and services of this computer; a folder per user would give two
+users two locks. A locked file can be removed, and the next process would then lock another one. So on Linux an abstract
+socket name in the kernel is taken too, which can't be removed. Stopping takes no lock.
 """
 
 from __future__ import annotations
@@ -25,21 +25,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivers import PreflightRefused
+from profiles import MessageCode
 
 if TYPE_CHECKING:
     from tdhil.config import RunOptions
     from tdhil.session.connection import Connection
 
 FOLDERS = ("/run/lock", "/dev/shm", "/tmp")
-"""The first of them in which anybody may make files is the one for all."""
+"""Candidates. The first one in which every user may create files is used."""
 PATIENCE_S = 0.3
-"""Who only asks for the holder has the lock for a moment; so long it is tried again."""
+"""Time for which taking the lock is retried, s. A process that only reads the holder has the lock for a moment."""
 _LONGEST = 4096
 
 
 @dataclass(frozen=True)
 class Holder:
-    """Who holds a drive: process, command line, and since when (local time, ISO 8601)."""
+    """The holder of a drive: process, command line, and start (local time, ISO 8601)."""
 
     pid: int
     command: str
@@ -49,11 +50,13 @@ class Holder:
         return f"process {self.pid} ({self.command}), since {self.since}"
 
 
-NOBODY_KNOWN = Holder(0, "it does not say who it is", "it does not say when")
+NOBODY_KNOWN = Holder(0, "command line unknown", "unknown time")
 
 
 class DriveHeld(PreflightRefused):
-    """Another process holds the drive; ``holder`` says which."""
+    """Another process holds the drive; ``holder`` names it."""
+
+    entry = MessageCode.DRIVE_HELD
 
     def __init__(self, holder: Holder, address: str) -> None:
         self.holder = holder
@@ -64,9 +67,9 @@ class DriveHeld(PreflightRefused):
 
 
 def address_of(connection: Connection, options: RunOptions) -> str | None:
-    """The drive's address as one text, the same for everybody on this computer.
+    """Return the drive's address as one text, the same for every user of this computer.
 
-    None where no other process can reach it: the embedded simulator, and what its bus says of itself.
+    None if no other process can reach it: the embedded simulator, or a bus that exists only in this process.
     """
     if options.simulate or not connection.configured:
         return None
@@ -75,9 +78,9 @@ def address_of(connection: Connection, options: RunOptions) -> str | None:
 
 @contextmanager
 def hold(address: str | None) -> Iterator[None]:
-    """Hold the drive for as long as the block takes, or as the process lives.
+    """Hold the drive until the block or the process ends.
 
-    Raises DriveHeld, naming the holder, where another has it, and PreflightRefused where there can be no lock. On a
+    Raises DriveHeld, with the holder, if another process holds it, and PreflightRefused if no lock is possible. On a
     system without such locks (Windows) nothing is held.
     """
     if address is None or sys.platform == "win32":
@@ -97,12 +100,12 @@ def hold(address: str | None) -> Iterator[None]:
 
 
 def holder_of(address: str | None) -> Holder | None:
-    """Who holds the drive now; None where nobody does, or where this system can't tell."""
+    """Return the present holder of the drive; None if there is none, or if this system has no such locks."""
     return None if address is None else _holder(_path(address))
 
 
 def holders() -> list[Holder]:
-    """Who holds any drive on this computer now."""
+    """Return the present holders of all drives on this computer."""
     found = (_holder(path) for path in sorted(_folder().glob(_name("*"))))
     return [one for one in found if one is not None]
 
@@ -141,7 +144,7 @@ def _take(descriptor: int, address: str) -> None:
             raise _no_lock(error, _path(address)) from error
         time.sleep(0.01)
     me = Holder(os.getpid(), _command(), datetime.now().astimezone().isoformat(timespec="seconds"))
-    with suppress(OSError):            # who it is matters to people; the lock holds without it
+    with suppress(OSError):            # the name is for the operator; the lock holds without it
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, json.dumps(asdict(me)).encode(), 0)
 
@@ -159,7 +162,7 @@ def _name_in_kernel(address: str) -> Iterator[None]:
 
 
 def _read(descriptor: int) -> Holder:
-    """What the file says of its holder; what another user wrote there may be anything."""
+    """Return the holder from the file. Its content is untrusted: another user may have written it."""
     try:
         found: Any = json.loads(os.pread(descriptor, _LONGEST, 0))
         return Holder(int(found["pid"]), str(found["command"])[:300], str(found["since"])[:40])
@@ -192,24 +195,25 @@ def _folder() -> Path:
 
 
 def _open(path: Path) -> int:
-    """The lock's file, which belongs to whoever was first, and which anybody may lock."""
+    """Open the lock's file. The first user owns it, and every user may lock it."""
     flags = os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC
     try:
         for _ in range(3):
-            with suppress(FileNotFoundError):      # without O_CREAT first: the kernel refuses it for another's file
+            with suppress(FileNotFoundError):      # first without O_CREAT: refused for another user's file
                 return os.open(path, flags)
             with suppress(FileExistsError):
                 descriptor = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666)
                 with suppress(OSError):
-                    os.fchmod(descriptor, 0o666)   # whatever the mask of whoever came first
+                    os.fchmod(descriptor, 0o666)   # regardless of the first user's umask
                 return descriptor
-        raise FileNotFoundError(errno.ENOENT, "it comes and goes", str(path))
+        raise FileNotFoundError(errno.ENOENT, "the file appears and disappears", str(path))
     except OSError as error:
         raise _no_lock(error, path) from error
 
 
 def _no_lock(error: OSError, path: Path) -> PreflightRefused:
     return PreflightRefused(
-        f"whether somebody else moves this drive can't be known: its lock can't be had ({error.strerror or error})",
-        where=str(path), next_step="See to whom that file belongs; nothing has moved",
+        f"the drive can't be locked against other programs: no access to its lock file ({error.strerror or error})",
+        where=str(path), next_step="Check the owner of that file. Nothing has moved",
+        entry=MessageCode.DRIVE_HELD,
     )

@@ -1,4 +1,4 @@
-"""The plan of a run that has not begun: on the rig as it is assumed. Connects to nothing, moves nothing."""
+"""The plan of a run before it starts, for the assumed rig. Nothing is connected and nothing moves."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from drivers import Identity, PreflightRefused
+from profiles import MessageCode
 from tdhil.config import Rig, RunOptions, simulated_default_rig
 from tdhil.session.task import bench_of, excitation_request, lag_prior, machine_limits
 from tdhil.version import __version__
@@ -26,7 +27,7 @@ BEFORE_ACQUIRE_S = 90.0     # stages 1 to 4, about
 
 @dataclass(frozen=True)
 class Figure:
-    """One thing that the plan rests on. ``source``: assumed, or where it stands in rig.yaml."""
+    """One value that the plan uses. ``source``: assumed, or its place in rig.yaml."""
 
     name: str
     value: float
@@ -41,7 +42,7 @@ class Figure:
 def plan_dry(
     options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True, lets_go: bool = False
 ) -> tuple[Planned, tuple[Figure, ...], MachineLimits]:
-    """The plan, what it rests on, and the machine's limits."""
+    """Return the plan, the values that it uses, and the machine's limits."""
     from tdhil.runner import plan_acquisition, refuse_by_plan
     from tdhil.runner.excitation import PlanRefused
 
@@ -56,7 +57,8 @@ def plan_dry(
         )
     except PlanRefused as error:
         raise PreflightRefused(
-            str(error), where="plan of stage 5", next_step=error.next_step
+            str(error), where="plan of stage 5", next_step=error.next_step,
+            entry=MessageCode.PLAN_NOT_POSSIBLE,
         ) from error
     return planned, figures, limits
 
@@ -64,7 +66,7 @@ def plan_dry(
 def plan_course(
     case: EvaluationCase, rig: Rig | None, simulated: bool, rate_hz: float
 ) -> tuple[SpeedProgram, MachineLimits]:
-    """A virtual string's course, and the machine's limits. Raises what keeps it from being turned."""
+    """Return the speed program of a virtual string, and the machine's limits. Raises an error if they do not fit."""
     from tdhil.runner import ControlAssumptions, Guard, course_of
 
     limits = machine_limits(bench_of(Identity(0, 0, 0, 0, "", simulated), rig))
@@ -73,7 +75,7 @@ def plan_course(
 
 
 def plan_document(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits) -> dict[str, Any]:
-    """The plan as plain data."""
+    """Return the plan as plain data."""
     plan, stopping = planned.plan, planned.stopping
     return {
         "dry_run": True,
@@ -96,9 +98,9 @@ def plan_document(planned: Planned, figures: tuple[Figure, ...], limits: Machine
 
 
 def refuse_hopeless(options: RunOptions, rig: Rig | None, can_torque: bool) -> None:
-    """Before a run touches its drive: PreflightRefused for what no shaft could do within the limits.
+    """Raise PreflightRefused, before the run touches its drive, if no shaft could do it within the limits.
 
-    Nothing is known of the shaft yet, nor whether it is a simulated one, whose limits need not be given.
+    At this point tdhil knows neither the shaft nor whether it is simulated. A simulated rig needs no limits.
     """
     from tdhil.runner import refuse_hopeless as refuse_hopeless_plan
     from tdhil.runner.excitation import PlanRefused
@@ -110,22 +112,24 @@ def refuse_hopeless(options: RunOptions, rig: Rig | None, can_torque: bool) -> N
     try:
         refuse_hopeless_plan(excitation_request(options), modes, _room(options, limits), guess, known)
     except PlanRefused as error:
-        raise PreflightRefused(str(error), where="plan of stage 5", next_step=error.next_step) from error
+        raise PreflightRefused(str(error), where="plan of stage 5", next_step=error.next_step,
+                               entry=MessageCode.PLAN_NOT_POSSIBLE) from error
 
 
 def _mode(options: RunOptions, can_torque: bool) -> str:
     wanted: str | None = options.mode
     if wanted == "torque" and not can_torque:
         raise PreflightRefused(
-            "torque mode was asked for, but this drive has none that can be entered while it turns",
+            "torque mode is requested, but this drive can't enter a torque mode while the shaft turns",
             where=f"profile {options.profile}",
             next_step="Use --mode speed",
+            entry=MessageCode.NO_TORQUE_MODE,
         )
     return wanted or ("torque" if can_torque else "speed")
 
 
 def _room(options: RunOptions, limits: MachineLimits) -> excitation.MotionLimits:
-    """What a plan may use of the limits at the rate that was asked for."""
+    """Return the part of the limits that a plan may use at the requested rate."""
     from tdhil.runner import ControlAssumptions, Guard
 
     assumptions = ControlAssumptions()
@@ -135,7 +139,7 @@ def _room(options: RunOptions, limits: MachineLimits) -> excitation.MotionLimits
 
 
 def _assumed(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, DesignKnowledge, tuple[Figure, ...]]:
-    """The rig, its noise and its lags, and what each of them rests on."""
+    """Return the assumed rig, its noise and its lags, with the source of each."""
     from tdhil.runner import DesignKnowledge, assumed_noise
 
     guess, figures = _guess(bench, limits)
@@ -151,7 +155,7 @@ def _assumed(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, DesignKnowled
 
 
 def _guess(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, tuple[Figure, ...]]:
-    """What rig.yaml expects of the shaft; for the rest, a shaft that suits its drive."""
+    """Return the shaft that rig.yaml expects. Missing values describe a shaft that suits its drive."""
     from tdhil.runner.excitation import RigGuess
 
     expected = bench.expected

@@ -1,7 +1,7 @@
-"""The connection of a run as plain data: with it, a later stop reaches the drive of that run and no other.
+"""The connection of a run as plain data. With it a later stop reaches the drive of that run and no other.
 
-A rig's file, a profile's file and the environment may change while a run goes on. What is kept here has the bus, each
-setting of its line, the node, and the profile's text.
+The rig's file, the profile's file and the environment may change during a run. The data contain the bus, each setting
+of its line, the node, and the profile's text.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _PLAIN: Final = (str, int, float, bool, type(None), list, dict)
 
 
 def kept_connection(options: RunOptions, connection: Connection) -> dict[str, Any]:
-    """Return it for JSON. Raises DataFileError where the profile can't be read any more."""
+    """Return the connection for JSON. Raises DataFileError if the profile can't be read any more."""
     line = {name: one.value for name, one in connection.line.settings.items() if isinstance(one.value, _PLAIN)}
     return {
         "drive": connection.drive, "line": line, "node": options.node, "profile": connection.profile.name,

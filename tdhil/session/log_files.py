@@ -1,4 +1,4 @@
-"""Where a run's files go: never over an older log, never into a live one, never over a file that isn't theirs."""
+"""Places for a run's files: never over an older log, a log that another run writes, or a foreign file."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from pathlib import Path
 from typing import IO
 
 from tdhil.config import OPTION
-from tdhil.errors import LogBroken, UsageError
+from tdhil.errors import LogBroken, MessageCode, UsageError
 
-_LARGEST_STUB = 1_000_000      # bytes; a log that holds motion is read no further than its size
+_LARGEST_STUB = 1_000_000      # bytes; a larger log holds motion and is not read
 
 
 class LogPlace:
-    """The file of one run. ``open`` takes it; ``settle`` gives it its last name once it is closed.
+    """The file of one run. ``open`` takes it; ``settle`` gives it its final name once it is closed.
 
-    A log that another run is writing is left alone, and this one gets a name of its own. What a run that ended before
-    anything moved leaves behind goes beside the last good log, which keeps its name.
+    A log that another run is writing is left alone, and this run uses another name. The log of a run that ended before
+    motion goes beside the last good log, which keeps its name.
     """
 
     def __init__(self, wanted: Path) -> None:
         self.wanted = wanted
         self.path = wanted
         self.older: Path | None = None         # where an older log was moved to
-        self.live = False                      # somebody else is writing ``wanted``
-        self.motion = False                    # set by whoever lets the shaft move
-        self.moved = ""                        # what became of the file meanwhile, for people; empty: nothing
-        self._descriptor: int | None = None    # of the file, as long as it may have to be looked for
+        self.live = False                      # another run is writing ``wanted``
+        self.motion = False                    # set when motion is confirmed
+        self.moved = ""                        # message if the file was moved or removed; empty: it was not
+        self._descriptor: int | None = None    # of the file, while it may have to be found again
 
     def open(self, wanted: Path) -> IO[bytes]:
-        """The file, held against other runs for as long as it is open. OSError, or UsageError for a foreign file."""
+        """Open the file, locked against other runs. Raises OSError, and UsageError for a foreign file."""
         with _held(wanted.parent):
             if wanted.exists() and not wanted.is_file():
                 return wanted.open("wb", buffering=0)      # a device
@@ -50,16 +50,17 @@ class LogPlace:
             return file
 
     def follow(self) -> None:
-        """Find the file again where its folder was renamed or removed in mid-run; ``path`` and ``moved`` then say so.
+        """Find the file again if its folder was renamed or removed during the run; ``path`` and ``moved`` then state
+        it.
 
-        Linux tells where an open file is. One that was removed is written once more, to its own place or, without
-        that, to the working or the temporary folder. Raises LogBroken where it can't be found or saved.
+        Linux reports the path of an open file. A removed file is written once more, to its own place or else to the
+        working or the temporary folder. Raises LogBroken if it can't be found or saved.
         """
         if self._descriptor is None or self._is_there(self.path):
             return
         missing, found = self.path, self._real_path()
         if found is not None:
-            self.path, self.moved = found, f"{missing} was moved in mid-run: the log is {found}"
+            self.path, self.moved = found, f"{missing} was moved during the run: the log is now {found}"
             return
         for folder in (missing.parent, Path.cwd(), Path(tempfile.gettempdir())):
             target = _dated(folder / missing.name, time.time())
@@ -67,12 +68,12 @@ class LogPlace:
                 with Path(f"/proc/self/fd/{self._descriptor}").open("rb") as source, target.open("xb") as copy:
                     shutil.copyfileobj(source, copy)
                 self._forget()
-                self.path, self.moved = target, f"{missing} was removed in mid-run: what it held was saved as {target}"
+                self.path, self.moved = target, f"{missing} was removed during the run: its content is now in {target}"
                 return
         self._forget()
         raise LogBroken(
-            "the log's file was moved or removed in mid-run, and where it is can't be found out", where=str(missing),
-            next_step="Look for it where its folder was moved to",
+            "the log file was moved or removed during the run, and its new place is unknown", where=str(missing),
+            next_step="Look for it in the new place of its folder",
         )
 
     def _is_there(self, path: Path) -> bool:
@@ -94,24 +95,24 @@ class LogPlace:
         self._descriptor = None
 
     def name(self, *, stub: bool) -> Path:
-        """What the file will be called in the end. ``stub``: nothing moved in this run."""
+        """Return the file's final path. ``stub``: nothing moved in this run."""
         if stub and self.older is not None and not _is_stub(self.older):
             return self.wanted.with_name(f"{self.wanted.stem}.refused{self.wanted.suffix}")
         return self.path
 
     def settle(self, *, stub: bool) -> None:
-        """Once the file is closed: a stub makes room for the older log again."""
+        """Give the file its final name, once it is closed. A stub returns the name to the older log."""
         self._forget()
         final = self.name(stub=stub)
         if final != self.path and self.older is not None:
-            with suppress(OSError), _held(self.wanted.parent):      # nothing is lost under the names as they are
+            with suppress(OSError), _held(self.wanted.parent):      # a failure loses nothing: the names stay
                 self.path.replace(final)
                 self.older.rename(self.path)
                 self.path = final
 
 
 def check_log_path(path: Path, where: str = OPTION["log"].flag) -> None:
-    """UsageError for a file that is no log: it would be moved aside by mistake."""
+    """Raise UsageError for a file that is not a log: it would be moved aside by mistake."""
     from tdhil.recording import MAGIC
 
     if not path.is_file() or path.suffix == ".mcap":
@@ -119,23 +120,25 @@ def check_log_path(path: Path, where: str = OPTION["log"].flag) -> None:
     with suppress(OSError), path.open("rb") as file:
         if file.read(5) in (b"", MAGIC[:5]):
             return
-    raise UsageError("is no log; it is left as it is", where=f"{where} {path}", next_step="Name another, as run.mcap")
+    raise UsageError("is not a log; it was left unchanged", where=f"{where} {path}",
+                     next_step="Name another file, such as run.mcap", entry=MessageCode.FILE_EXISTS)
 
 
 def check_different_files(paths: Mapping[str, Path | None]) -> None:
-    """UsageError where two of the files that a run reads or writes are the same one; by option."""
+    """Raise UsageError if two options name the same file."""
     seen: dict[Path, str] = {}
     for option, path in paths.items():
         if path is None:
             continue
         real = path.resolve()
         if real in seen:
-            raise UsageError(f"is the file of {seen[real]} too", where=f"{option} {path}", next_step="Name another")
+            raise UsageError(f"is also the file of {seen[real]}", where=f"{option} {path}",
+                             next_step="Name another file", entry=MessageCode.SAME_FILE_TWICE)
         seen[real] = option
 
 
 def make_room(path: Path) -> Path | None:
-    """Move an older log at ``path`` aside, named by the time it was last written; its new place, if there was one."""
+    """Move an older log at ``path`` aside, named by the time of its last write. Return its new path, or None."""
     if not path.is_file():
         return None
     older = _dated(path, path.stat().st_mtime)
@@ -144,12 +147,12 @@ def make_room(path: Path) -> Path | None:
 
 
 def is_live(path: Path) -> bool:
-    """Is some process writing this log now? False where the system can't tell."""
+    """Return whether a process writes this log now. False if the system can't report it."""
     try:
         import fcntl
     except ImportError:
         try:
-            path.rename(path)      # Windows renames nothing that is open
+            path.rename(path)      # Windows does not rename an open file
         except OSError:
             return True
         return False
@@ -172,7 +175,7 @@ def _dated(path: Path, time_s: float) -> Path:
 
 
 def _is_stub(path: Path) -> bool:
-    """Does an older log hold no motion either?"""
+    """Return whether an older log holds no motion either."""
     from tdhil.errors import LogError
     from tdhil.recording import read_run
 
@@ -185,7 +188,7 @@ def _is_stub(path: Path) -> bool:
 
 @contextmanager
 def _held(folder: Path) -> Iterator[None]:
-    """No other run chooses a name in this folder meanwhile; where the system has no such lock, nothing is held."""
+    """Keep other runs from choosing a name in this folder. Without such locks in the system nothing is held."""
     descriptor = None
     try:
         import fcntl

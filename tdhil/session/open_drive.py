@@ -1,4 +1,4 @@
-"""The other end: a drive on its bus or line, or the embedded simulator."""
+"""The peer: a drive on its bus or line, or the embedded simulator."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ from pathlib import Path
 
 from drivers import Clock, Drive, FrameTap, MonotonicClock, SteppedClock
 from tdhil.config import OPTION, DriveData, RunOptions
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 from tdhil.session.connection import Connection, PeerPlan, bus_kind
 from tdhil.session.drive_lock import address_of, hold
 
 
 def plan_peer(options: RunOptions, connection: Connection) -> PeerPlan:
-    """The embedded simulator with --simulate, or when nobody says where a drive is. UsageError for stepped Modbus."""
+    """Return the peer; embedded with --simulate or without an address. Raises UsageError for stepped Modbus."""
     embedded = options.simulate or not connection.configured
     if not embedded:
         if options.stepped and not connection.kind.steps_over_a_wire:
             raise UsageError(
-                f"a {connection.kind.title} line has no SYNC to step by: over a wire it runs in real time",
+                f"a {connection.kind.title} line has no SYNC, so it can't be stepped over a wire",
                 where=options.source("stepped"),
-                next_step="Leave --stepped out, or use --simulate, which is stepped",
+                next_step="Remove --stepped, or use --simulate, which is stepped",
+                entry=MessageCode.STEPPED_NEEDS_SYNC,
             )
         return PeerPlan(False, options.stepped, None, None)
     from sim_bus import RigParams
@@ -32,6 +33,8 @@ def plan_peer(options: RunOptions, connection: Connection) -> PeerPlan:
         from profiles import load_model
 
         plant = load_model(Path(options.plant), RigParams)
+    plant = plant.with_scales(
+        options.simulated_torque_scale, options.simulated_speed_scale, options.simulated_added_inertia_kg_m2)
     seed = options.seed
     if seed is None:
         import secrets
@@ -45,9 +48,9 @@ def opened_drive(
     plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData | None, tap: FrameTap,
     trace: Path | None,
 ) -> Iterator[Drive]:
-    """The drive, held against others, closed with its bus and simulator afterwards.
+    """Open the drive and lock it against other programs. Drive, bus and simulator are closed afterwards.
 
-    ``data``: what the bench knows and the drive doesn't. Raises DriveHeld where another process has it.
+    ``data``: facts of the bench that the drive does not report. Raises DriveHeld if another process holds the drive.
     """
     clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
     data = data or DriveData()
@@ -57,12 +60,13 @@ def opened_drive(
 
 
 def with_faults(plan: PeerPlan, texts: Sequence[str] | None, drive: str) -> PeerPlan:
-    """The plan with these faults. UsageError where the peer isn't ours to spoil."""
+    """Return the plan with these faults. Raises UsageError if the peer is not the embedded simulator."""
     if not texts:
         return plan
     if not plan.embedded:
         raise UsageError(
             "faults can be scripted in the embedded simulator only", where=OPTION["fault"].flag,
             next_step="Add --simulate, or give --fault to tdhil simulate",
+            entry=MessageCode.FAULTS_NEED_SIMULATOR,
         )
     return replace(plan, faults=bus_kind(drive).parse_faults(texts))

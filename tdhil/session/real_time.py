@@ -1,9 +1,9 @@
-"""`--real-time-priority`: the control loop before everything else on this computer, and its memory never paged out.
+"""`--real-time-priority`: real-time priority for the control loop, and locked memory.
 
-Of Linux alone. Only the thread that sends setpoints is raised (SCHED_FIFO): threads and programs that it starts are
-ordinary ones again, the log's and the display's among them. It sleeps for most of each cycle. Should it ever not, the
-kernel says so after ``MOST_CPU_S`` without a pause, and it becomes an ordinary one itself: a computer of two cores
-must not hang on account of a mistake of ours.
+It exists on Linux only. Only the thread that sends setpoints gets SCHED_FIFO. Threads and programs that it starts keep
+ordinary priority, among them the log and the display. The thread sleeps for most of each cycle. If it computes for
+``MOST_CPU_S`` without a pause, the kernel signals this and the thread returns to ordinary priority. So a mistake in
+tdhil can't hang a computer of two cores.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 PRIORITY = 40
-"""Of 99; below the kernel's own interrupt threads (50), among them the adapter's, which must run first."""
+"""SCHED_FIFO priority, 1 to 99. The kernel's interrupt threads (50), the adapter's among them, must run first."""
 MOST_CPU_S = 1.0
 LIMITS_FILE = "/etc/security/limits.d/99-tdhil.conf"
 HOW = (
@@ -31,32 +31,32 @@ _CAP_IPC_LOCK = 14                           # linux/capability.h
 
 @dataclass(frozen=True)
 class Raised:
-    """What came of the wish: which of both was had, and in words why not."""
+    """The outcome of the request: which of both was granted, and in words why not."""
 
     priority: int = 0                        # SCHED_FIFO; 0: an ordinary thread
     memory_locked: bool = False
     said: str = ""
 
     def plain(self) -> dict[str, Any]:
-        """As the run's configuration keeps it."""
+        """Return it as plain data for the run's configuration."""
         return asdict(self)
 
 
 @contextmanager
 def real_time_priority(wanted: bool, *, stepped: bool = False) -> Iterator[Raised]:
-    """Around the run, in the thread that drives it; everything is as before afterwards. Raises nothing."""
+    """Apply it around the run, in the thread that drives it, and undo it afterwards. Raises nothing."""
     if not wanted:
         yield Raised()
         return
     if stepped:
-        yield Raised(said="stepped time waits for nobody: --real-time-priority changes nothing")
+        yield Raised(said="--real-time-priority has no effect in stepped time")
         return
     why_not = _raise_thread()
     locked = _lock_memory()
     said = f"real-time priority: SCHED_FIFO {PRIORITY}" if not why_not else f"no real-time priority: {why_not}"
     said += ", memory locked" if not locked else f"; memory not locked: {locked}"
     if why_not or locked:
-        said += f". To allow it, {HOW} (tdhil doctor looks again)"
+        said += f". To allow it, {HOW} (then check with tdhil doctor)"
     try:
         yield Raised(0 if why_not else PRIORITY, not locked, said)
     finally:
@@ -66,7 +66,7 @@ def real_time_priority(wanted: bool, *, stepped: bool = False) -> Iterator[Raise
 
 
 def allowed() -> tuple[str, str]:
-    """Why priority, and why locked memory, can't be had here; empty where they can. Both are tried, and given back."""
+    """Return why priority and locked memory are not available; empty if they are. Both are tried and undone."""
     why_not = _raise_thread()
     if not why_not:
         _lower_thread()
@@ -75,9 +75,9 @@ def allowed() -> tuple[str, str]:
 
 def _raise_thread() -> str:
     if not hasattr(os, "sched_setscheduler"):
-        return "this system has none that a program may ask for"
+        return "this system offers no such call to a program"
     try:
-        # Without the flag every thread that is started from here on would be raised as well.
+        # Without the flag every thread that is started from here on would get the priority too.
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
     except OSError as error:
         return f"{error.strerror or error}"
@@ -96,7 +96,7 @@ def _lower_thread() -> None:
 
 
 def _lower_where_it_runs_away() -> None:
-    """RLIMIT_RTTIME: SIGXCPU to a real-time thread that computes for so long without waiting once."""
+    """Set RLIMIT_RTTIME: the kernel sends SIGXCPU to a real-time thread that computes that long without a pause."""
     with suppress(OSError, ValueError, AttributeError, ImportError):   # no main thread, or no such limit
         import resource
 
@@ -106,12 +106,12 @@ def _lower_where_it_runs_away() -> None:
 
 
 def _lock_memory() -> str:
-    """Why not; empty where it is locked."""
+    """Lock the memory. Return why not; empty if it is locked."""
     if limit := _memory_limit():
         return limit
     try:
         libc = _libc()
-        # On fault: what is never touched, such as the far end of a thread's stack, takes no memory.
+        # On fault: pages that are never touched, such as the far end of a thread's stack, take no memory.
         failed = libc.mlockall(_CURRENT | _FUTURE | _ON_FAULT)
     except (OSError, AttributeError) as error:
         return str(error)
@@ -119,16 +119,16 @@ def _lock_memory() -> str:
 
 
 def _memory_limit() -> str:
-    """Where only so much may be locked, the next allocation beyond it would fail: in motion, that is worse."""
+    """Return why memory can't be locked without limit. An allocation above the limit would fail during motion."""
     try:
         import resource
 
         soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     except (ImportError, AttributeError, OSError):
-        return "this system can't"
+        return "this system does not support it"
     if soft == resource.RLIM_INFINITY or _may_lock():
         return ""
-    return f"only {soft / 1e6:.3g} MB of it may be"
+    return f"at most {soft / 1e6:.3g} MB may be locked"
 
 
 def _may_lock() -> bool:

@@ -1,4 +1,4 @@
-"""What was recorded, with all that identification needs: a log of ours or a trace in CSV, told apart by its content."""
+"""A recorded run with all that identification needs, read from a tdhil log or from a trace in CSV."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tdhil.errors import ExitCode, LogError, NothingRecoverable, TdhilError, UsageError
+from tdhil.errors import ExitCode, LogError, MessageCode, NothingRecoverable, TdhilError, UsageError
 
 if TYPE_CHECKING:
     import pandas
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tdhil.recording import FloatArray, LagPrior, Recording, RunEnd
 
 _REPEATED = frozenset(ExitCode) - {ExitCode.INTERNAL, ExitCode.INTERRUPTED, ExitCode.TERMINATED}
-"""Exit codes of a run that tell of the run; the others tell of the process that it was."""
+"""Exit codes that describe the run itself. The others describe its process."""
 
 _UNITS = {"time_s": "s", "speed_rad_s": "rad/s", "torque_nm": "N m", "fresh": "1", "limited": "1"}
 _LONG_NAMES = {
@@ -30,11 +30,11 @@ _LONG_NAMES = {
 
 @dataclass(frozen=True)
 class RunRecord:
-    """One run or one trace. ``configuration``: the run's, as its log has it; ``log``: the file.
+    """One run or one trace. ``configuration``: of the run, as in its log; ``log``: the file.
 
-    ``assumed``: what was assumed in reading a foreign trace, None for a run of ours; ``problems``: what of the file was
-    stepped over, a line each; ``stored_result``: the result document that the run itself left in its log;
-    ``virtual_string``: a row a cycle of one, with the columns of `tdhil.recording.VIRTUAL_COLUMNS`.
+    ``assumed``: assumptions in reading a foreign trace, None for a tdhil log; ``problems``: parts of the file that were
+    skipped, a line each; ``stored_result``: the result document that the run itself wrote to its log;
+    ``virtual_string``: one row per cycle, with the columns of `tdhil.recording.VIRTUAL_COLUMNS`.
     """
 
     recording: Recording
@@ -48,24 +48,24 @@ class RunRecord:
 
     @property
     def whole(self) -> bool:
-        """Did the run come to its end, and all of it into the log?"""
+        """Return whether the run reached its end and the log holds all of it."""
         from tdhil.recording import aborted_stage
 
         return self.recording.complete and aborted_stage(self.recording) is None
 
     def asked(self, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """The configuration, with other settings of identification."""
+        """Return the configuration, with other settings of identification."""
         own = {**self.configuration.get("identify", {}), **asked}
         return {**self.configuration, "identify": own} if asked else dict(self.configuration)
 
     def with_said(self, said: Mapping[str, str]) -> RunRecord:
-        """The same with another operator or note."""
+        """Return the same record with another operator or note."""
         return replace(self, configuration={**self.configuration, **said})
 
     def require_motion(self) -> None:
-        """Raise NothingRecorded where the run was refused, or ended in setup: what ended it is all there is to say.
+        """Raise NothingRecorded if the run was refused or ended in setup. The error repeats what ended the run.
 
-        It has that run's own exit code, but for one that tells of a process and not of a run.
+        It has that run's exit code, except for codes that describe a process and not a run.
         """
         from tdhil.errors import NothingRecorded
 
@@ -80,13 +80,13 @@ class RunRecord:
         )
 
     def to_pandas(self) -> pandas.DataFrame:
-        """The samples, a row a cycle, indexed by ``time_s``; units in ``attrs`` (extra `notebook`)."""
+        """Return the samples, one row per cycle, indexed by ``time_s``; units in ``attrs`` (extra `notebook`)."""
         frame = _extra("pandas").DataFrame(self._columns()).set_index("time_s")
         frame.attrs = {"units": dict(_UNITS), "log": self.log, "simulated": self.recording.simulated}
         return frame
 
     def to_xarray(self) -> xarray.Dataset:
-        """The samples along ``time_s``, each with its unit and long name (extra `notebook`)."""
+        """Return the samples along ``time_s``, each with its unit and long name (extra `notebook`)."""
         library = _extra("xarray")
         columns = self._columns()
         time_s = columns.pop("time_s")
@@ -118,11 +118,11 @@ _KEYWORDS = {
     "--columns": "columns", "--rated-torque": "rated_torque_nm", "--torque-limit": "torque_limit_nm",
     "--gear": "gear_ratio", "--torque-scale-sd": "torque_scale_rel_sd", "--skew-sd": "skew_sd_s",
 }
-"""Python keywords of the flags that no table of options has: those of `read`, and short ones of python-can."""
+"""Python keywords of the flags outside the table of options: those of `read`, and short ones of python-can."""
 
 
 class ByKeyword(ContextDecorator):
-    """Has errors of the tree name options by what Python calls them: around what the API offers, or on top of it."""
+    """Make errors name options by their Python keywords. Use it as a decorator or as a context."""
 
     def __enter__(self) -> None:
         return None
@@ -152,8 +152,8 @@ def read(
     """Read a run.mcap, whole or cut short, or a trace in CSV; the options are those of ``tdhil replay`` for a trace.
 
     ``columns``: such as ``["time=t_s", "speed=n_rpm:rpm", "torque=m_pct:%"]``; ``excitation``: an excitation.yaml;
-    ``skew_sd_s``: to within what speed and torque are of one time, s (1 sd). A log of ours brings all of it along.
-    Raises LogError (nothing of ours in the file), DataFileError (with the line) and UsageError.
+    ``skew_sd_s``: time offset between speed and torque, s (1 sd). A tdhil log contains all of this.
+    Raises LogError (no tdhil data in the file), DataFileError (with the line) and UsageError.
     """
     path = Path(path)
     require_file(path)
@@ -165,7 +165,8 @@ def read(
         }
         for name, value in of_trace.items():
             if value is not None:
-                raise UsageError("is for a trace in CSV; this log brings its own", where=name)
+                raise UsageError("is for a trace in CSV; this log contains its own", where=name,
+                                 entry=MessageCode.OPTION_FOR_CSV_ONLY)
         return _read_log(path)
     return _read_trace(
         path, columns, excitation, rated_torque_nm, torque_limit_nm, gear_ratio, torque_scale_rel_sd, lags, skew_sd_s
@@ -173,17 +174,18 @@ def read(
 
 
 def require_file(path: Path) -> None:
-    """Raise UsageError where there is no such file, or a folder in its place."""
+    """Raise UsageError if the file does not exist or is a folder."""
     if path.is_dir():
         raise UsageError("is a folder", where=str(path),
-                         next_step=f"Name one log in it, or all of them: tdhil fleet {path} --out fleet.csv")
+                         next_step=f"Name one log in it, or identify all of them: tdhil fleet {path} --out fleet.csv",
+                         entry=MessageCode.FILE_NOT_FOUND)
     if not path.is_file():
-        raise UsageError("there is no such log", where=str(path),
-                         next_step="Name a run.mcap of this tool, or a trace in CSV")
+        raise UsageError("this log does not exist", where=str(path),
+                         next_step="Name a run.mcap of tdhil, or a trace in CSV", entry=MessageCode.FILE_NOT_FOUND)
 
 
 def is_log(path: Path) -> bool:
-    """Tell MCAP by its first bytes, also if there are no more than some of them. Raises NothingRecoverable."""
+    """Recognise MCAP by its first bytes, also in a file that holds only some of them. Raises NothingRecoverable."""
     from tdhil.recording import MAGIC
 
     try:
@@ -203,7 +205,7 @@ def _read_log(path: Path) -> RunRecord:
         raise NothingRecoverable(error.what, where=error.where, next_step=error.next_step) from error
     ended = find_ended(found.configuration, found.events)
     configuration: dict[str, Any] = found.configuration | ({} if ended is None else {"ended": asdict(ended)})
-    if "started" not in configuration and found.epoch_ns:      # a log of before 0.2, of a run in real time
+    if "started" not in configuration and found.epoch_ns:      # a log from before 0.2, of a run in real time
         began = datetime.fromtimestamp(found.epoch_ns / 1e9, UTC).astimezone()
         configuration["started"] = began.isoformat(timespec="seconds")
     return RunRecord(found.recording, configuration, str(path), None, found.problems, ended, found.result,
@@ -230,15 +232,16 @@ def _read_trace(
     choices = USUAL if columns is None else parse_columns(list(columns))
     recording, assumed = read_recording(path, choices, None if excitation is None else Path(excitation), bench)
     if scale is None:
-        assumed = (*assumed, f"the torque scale was assumed right to {ASSUMED_TORQUE_SCALE_REL_SD:.0%} (1 sd)")
+        assumed = (*assumed, f"standard uncertainty of the torque scale, assumed: {ASSUMED_TORQUE_SCALE_REL_SD:.0%}")
     return RunRecord(recording, {"identify": {one.name: one.default for one in ASKED_AGAIN}}, str(path), assumed)
 
 
 def _extra(name: str) -> Any:
-    """A library of the extra `notebook`. Raises UsageError, which says how to get it."""
+    """Import a library of the extra `notebook`. Raises UsageError with the command that installs it."""
     from importlib import import_module
 
     try:
         return import_module(name)
     except ImportError as error:
-        raise UsageError(f"{name} is not installed", next_step="Install it with: pip install '.[notebook]'") from error
+        raise UsageError(f"{name} is not installed", next_step="Install it with: pip install '.[notebook]'",
+                         entry=MessageCode.PACKAGE_MISSING) from error

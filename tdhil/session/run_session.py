@@ -1,7 +1,7 @@
-"""One run, from what was asked for to a log that is closed: log, drive, Runner, identification.
+"""One run, from the request to a closed log: log, drive, Runner, identification.
 
-The command line and the Python API both go through here, so that guard, stop and confirmation are the same. What a
-person sees and is asked is an `OperatorInterface`'s; nothing here prints.
+The command line and the Python API both use it, so that guard, stop and confirmation are the same. The
+`OperatorInterface` shows the run and asks the operator. Nothing here prints.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from tdhil.session.open_drive import opened_drive
 from tdhil.session.overrides import accepted_lines, note, require_accepted
 from tdhil.session.real_time import real_time_priority
 from tdhil.session.stop_signals import stop_on_signals
+from tdhil.session.stored_calibration import KEPT, calibration_of_rig, refuse_another_drive
 from tdhil.session.task import bench_of, excitation_request, facts, machine_limits, suited
 from tdhil.version import __version__
 
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunRequest:
-    """Everything that is known of a run before a drive is touched."""
+    """Everything that defines a run before a drive is touched."""
 
     options: RunOptions
     connection: Connection
@@ -47,7 +48,7 @@ class RunRequest:
     note: str | None = None
     real_time_priority: bool = False
     evaluation: EvaluationCase | None = None
-    """A virtual string in stage 5, in place of an excitation."""
+    """Virtual string in stage 5, in place of an excitation."""
 
     @classmethod
     def of(
@@ -55,7 +56,7 @@ class RunRequest:
         operator: str | None = None, note: str | None = None, real_time_priority: bool = False,
         evaluation: EvaluationCase | None = None,
     ) -> RunRequest:
-        """The rig suited to the simulated plant. Raises PreflightRefused for what no shaft could do in its limits."""
+        """Return the request, with limits that suit the plant. Raises PreflightRefused for motion beyond the limits."""
         bench = suited(rig, peer.plant)
         if evaluation is None:
             refuse_hopeless(options, bench, connection.profile.can_torque)
@@ -63,10 +64,10 @@ class RunRequest:
 
 
 class OperatorInterface(Protocol):
-    """Who is there while a run goes: watches it, lets the shaft move, sees it turn."""
+    """The operator during a run: watches the display, confirms motion, confirms the speed."""
 
     def watch(self) -> AbstractContextManager[Display]:
-        """The display of this run, for as long as it goes."""
+        """Show this run until the block ends."""
         ...
 
     def confirm(self, task: Task, preflight: Preflight, idle: Idle, unverified: tuple[str, ...]) -> None:
@@ -74,23 +75,23 @@ class OperatorInterface(Protocol):
         ...
 
     def confirm_speed(self, speed_rad_s: float, why: str, idle: Idle) -> None:
-        """Return if the shaft is seen to turn at that speed; raise PreflightRefused if not."""
+        """Return if the operator sees the shaft turn at that speed; raise PreflightRefused if not."""
         ...
 
     def say(self, text: str) -> None:
-        """Take one line, by the way."""
+        """Show one line of information."""
         ...
 
     def warn(self, text: str) -> None:
-        """Take one line that must not be missed."""
+        """Show one line as a warning."""
         ...
 
 
 class RunSession:
-    """One run. `move` runs the drive, `conclude` identifies; `close` always, or `abandon` where all else failed."""
+    """One run. `move` runs the drive, `conclude` identifies. `close` always follows, or `abandon` after a failure."""
 
     def __init__(self, request: RunRequest, operator_interface: OperatorInterface, *, report: bool = False) -> None:
-        """Open the log; nothing else is touched. ``report``: one will be written, so its modules are loaded as well."""
+        """Open the log only. ``report``: a report will be written, so its modules are loaded too."""
         load_what_the_end_needs(report)
         options, peer = request.options, request.peer
         self._request, self._operator_interface = request, operator_interface
@@ -99,7 +100,7 @@ class RunSession:
                            frames=request.connection.kind.frame_channel)
         writer.path = place.path
         if place.live:
-            operator_interface.warn(f"another run is writing {place.wanted}: this one's log is {place.path}")
+            operator_interface.warn(f"another run writes {place.wanted}: the log of this run is {place.path}")
         self._older_told = False
         self._outcome: RunOutcome | None = None
         said = {"operator": request.operator, "note": request.note}
@@ -107,8 +108,8 @@ class RunSession:
 
     @property
     def path(self) -> Path:
-        """What the log will be called in the end, also where its folder was renamed meanwhile."""
-        with suppress(LogError):           # `close` says so
+        """Return the log's final path, also if its folder was renamed during the run."""
+        with suppress(LogError):           # `close` reports it
             self._place.follow()
         return self._place.name(stub=self._stub)
 
@@ -118,14 +119,14 @@ class RunSession:
         return not (self._place.motion or stopped)
 
     def move(self, stop: StopRequest | None = None) -> RunOutcome:
-        """Connect, five stages, stop, close. Raises what kept the drive from being opened.
+        """Connect, five stages, stop, close. Raises the error that prevents opening the drive.
 
-        ``stop``: asked from elsewhere; signals go there too, where this is the main thread.
+        ``stop``: a request from elsewhere. Signals set it too, if this is the main thread.
         """
         try:
             return self._move(stop)
         except TdhilError as error:
-            if self._outcome is None:       # a log without a cause would be said to hold too few samples
+            if self._outcome is None:       # without it the log would be reported as too short
                 with suppress(LogError):
                     self.log.failure(0.0, error)
             raise
@@ -156,12 +157,12 @@ class RunSession:
             ).run()
         for fault in peer.never_came:
             with suppress(LogError):
-                log.event(drive.clock.now_s(), "fault", f"--fault {fault} never came")
-            operator_interface.warn(f"tdhil: --fault {fault} never came: this run did not reach its moment")
+                log.event(drive.clock.now_s(), "fault", f"--fault {fault} was not triggered")
+            operator_interface.warn(f"tdhil: --fault {fault} was not triggered: the run ended before its time")
         return outcome
 
     def conclude(self) -> Conclusion | EvaluationConclusion:
-        """Identify from what was recorded, or look what the virtual string did, and put the result into the log."""
+        """Identify from the recording, or evaluate the virtual string, and write the result to the log."""
         from tdhil.session.conclusion import conclude
         from tdhil.session.evaluation import conclude_evaluation, is_evaluation
 
@@ -171,12 +172,12 @@ class RunSession:
             found = conclude_evaluation(self.log.virtual_string, recording, run, path)
         else:
             found = conclude(recording, run, path)
-        with suppress(LogError):  # a log that has just failed must not take the result with it; closing it says so
+        with suppress(LogError):  # a log failure must not lose the result; `close` reports it
             self.log.result(found.document)
         return found
 
     def close(self) -> None:
-        """Finish the log. Raises LogError; the file has its name then, too."""
+        """Finish the log. Raises LogError; the file has its final name also then."""
         try:
             self.log.close()
             self._place.follow()
@@ -184,7 +185,7 @@ class RunSession:
             self._settle()
 
     def abandon(self) -> None:
-        """Finish the log where something else is the cause already. Raises nothing of the log."""
+        """Finish the log after another error. Raises no error of the log."""
         with suppress(LogError):
             self.log.close()
         self._settle()
@@ -196,11 +197,11 @@ class RunSession:
         self._tell_older()
 
     def _tell_older(self) -> None:
-        """Where an older log is now, once: not before that is certain, since a refused run gives its name back."""
+        """Report once where an older log is now. Wait until this is certain: a refused run returns the name."""
         older = self._place.older
         if not self._older_told and older is not None and older.exists():
             self._older_told = True
-            self._operator_interface.say(f"an older {self._place.wanted} was kept as {older}")
+            self._operator_interface.say(f"the older {self._place.wanted} was kept as {older}")
 
     def _confirm(self, task: Task, preflight: Preflight, idle: Idle) -> None:
         request = self._request
@@ -214,6 +215,7 @@ class RunSession:
         profile, overrides, accepted = request.connection.profile, request.overrides, request.options.accept_unverified
         bench = bench_of(identity, request.rig)
         log.configure(bench=bench.model_dump(mode="json", by_alias=True), identity=asdict(identity))
+        refuse_another_drive(log.run, asdict(identity))
         if not identity.simulated:
             require_accepted(profile, accepted)
             log.configure(unverified=list(accepted_lines(profile, accepted)))
@@ -233,13 +235,15 @@ class RunSession:
 
 
 def configuration(request: RunRequest) -> dict[str, Any]:
-    """For the log: everything that identification needs.
+    """Return the configuration for the log: everything that identification needs.
 
-    And the whole profile, so that a later decoder can start again from the raw frames.
+    It includes the whole profile, so that a later decoder can start from the raw frames.
     """
     options, connection, peer, rig = request.options, request.connection, request.peer, request.rig
+    calibration = calibration_of_rig(rig)
     return {
         "tdhil": __version__,
+        **({} if calibration is None else {KEPT: calibration}),
         "started": datetime.now().astimezone().isoformat(timespec="seconds"),
         "rig_file": None if rig is None or not rig.file else rig.file,
         "options": {name: {"value": value, "source": source} for name, value, source in options.rows()},
@@ -258,7 +262,7 @@ def configuration(request: RunRequest) -> dict[str, Any]:
 
 
 def load_what_the_end_needs(report: bool) -> None:
-    """Load it before anything moves: later there may be no descriptor left to read what stop and result need."""
+    """Import the modules for stop and result before motion: later there may be no file descriptor left."""
     import traceback  # noqa: F401
 
     import scipy.optimize
@@ -273,6 +277,6 @@ def load_what_the_end_needs(report: bool) -> None:
     from tdhil.session import conclusion, evaluation  # noqa: F401
 
     with Console(file=io.StringIO()).status(""):
-        pass      # rich loads its spinners when it needs them
+        pass      # rich loads its spinners at first use
     if report:
         from tdhil.report import draw_run, evaluation_report, require_extra  # noqa: F401

@@ -1,11 +1,11 @@
-"""Each signal that would end the process becomes a request to stop, which the control loop sees in its next cycle.
+"""Convert each signal that would end the process into a stop request, which the control loop reads in its next cycle.
 
-Ctrl-C, Ctrl-Z, SIGQUIT, SIGTERM and SIGHUP in any case; SIGUSR1, SIGALRM, SIGXCPU, the real-time signals and all others
-whose default ends a process, unless the program that uses tdhil handles or ignores them. Not those that a processor
-raises for a broken program (SIGSEGV, SIGBUS, SIGFPE, SIGILL): a handler would return to the same instruction for ever.
+These are Ctrl-C, Ctrl-Z, SIGQUIT, SIGTERM and SIGHUP in any case. SIGUSR1, SIGALRM, SIGXCPU, the real-time signals and
+all others whose default ends a process are added, unless the program that uses tdhil handles or ignores them. Signals
+of a broken program (SIGSEGV, SIGBUS, SIGFPE, SIGILL) are left: a handler would return to the same instruction for ever.
 
-A program in the background that asks its terminal something is stopped by the system where it stands (SIGTTIN,
-SIGTTOU). Meanwhile it isn't: a turning shaft must not be left to the drive's watchdog, if it has one, by that.
+The system suspends a background process that reads from or writes to its terminal (SIGTTIN, SIGTTOU). During a run
+these signals are ignored: a suspended process would leave a turning shaft to the drive's watchdog, if it has one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tdhil.runner import StopRequest
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGBREAK")  # the last four don't exist everywhere
 _UNHEARD = ("SIGTTIN", "SIGTTOU")
 _HARMLESS = ("SIGCHLD", "SIGCLD", "SIGCONT", "SIGURG", "SIGWINCH", "SIGINFO")
-"""Their default is to be ignored."""
+"""Signals that are ignored by default."""
 _OUT_OF_REACH = ("SIGKILL", "SIGSTOP", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL")
 
 
@@ -32,7 +32,7 @@ def _numbers(names: tuple[str, ...]) -> set[int]:
 
 
 def _others() -> list[int]:
-    """Numbers of all other signals that would end this process, or raise in it (`Ending`), as they stand now."""
+    """Return the numbers of all other signals that now would end this process or raise in it (`Ending`)."""
     known = _numbers((*_NAMES, *_UNHEARD, *_HARMLESS, *_OUT_OF_REACH))
     return sorted(int(one) for one in signal.valid_signals() if one not in known and _ends(signal.getsignal(one)))
 
@@ -43,10 +43,10 @@ def _ends(handler: object) -> bool:
 
 @contextmanager
 def stop_on_signals(request: StopRequest | None = None) -> Iterator[StopRequest]:
-    """Handlers that only note the wish, in ``request`` or one of its own; the former ones come back afterwards.
+    """Install handlers that set ``request``, or a new one. The former handlers are restored afterwards.
 
-    A second Ctrl-C changes nothing. Python hands signals to the main thread: in another one they stay with whoever has
-    that, and only ``request`` stops.
+    A second Ctrl-C changes nothing. Python delivers signals to the main thread. In another thread no handler is
+    installed, and only ``request`` stops.
     """
     request = StopRequest() if request is None else request
     if threading.current_thread() is not threading.main_thread():
@@ -72,10 +72,10 @@ def _restore(former: Mapping[int, Any]) -> None:
 class Ending:
     """The signals of a command that runs a shaft, from before the run until the process has ended.
 
-    While a result is worked out the first signal raises Interrupted. Once a signal has ended the run (``request``,
-    which the run is given), or `calm` was called, none interrupts any more: the log is closed and what was found is
-    said, however many come. In a process of tdhil's own (`own_process`) they
-    are ignored from the end on: the interpreter, which gives them back their defaults, would be killed by the next.
+    During the evaluation the first signal raises Interrupted. After a signal has ended the run (``request``, which the
+    run receives), or after `calm`, no signal interrupts any more: the log is closed and the result is printed. In a
+    process of tdhil's own (`own_process`) signals are ignored from the end on. The interpreter restores the defaults
+    when it exits, and the next signal would then kill it.
     """
 
     def __init__(self, *, own_process: bool) -> None:
@@ -97,15 +97,15 @@ class Ending:
 
     @staticmethod
     def _wanted() -> tuple[int, ...]:
-        """All but Ctrl-Z: a process that no shaft depends on any more may be suspended."""
+        """Return all signals except Ctrl-Z: a process may be suspended when no shaft depends on it any more."""
         return *sorted(_numbers(_NAMES) - _numbers(("SIGTSTP",))), *_others()
 
     def calm(self) -> None:
-        """Finish what is left, whatever signal comes."""
+        """Ignore further signals, so that the remaining work is finished."""
         self._calm = True
 
     def code(self, code: int) -> int:
-        """Return the exit code of a command that ended with ``code``: a signal shows where all else went well."""
+        """Return the exit code of a command that ended with ``code``: a signal's code if ``code`` is 0."""
         return code if code or self.signum is None else int(Interrupted(self.signum).exit_code)
 
     def _on_signal(self, signum: int, frame: FrameType | None) -> None:

@@ -1,4 +1,4 @@
-"""From rig.yaml and the command line to what the protocol is told."""
+"""Limits, excitation and bench data of a run, from rig.yaml and the command line."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from tdhil.recording import LagPrior, Pipe
 from tdhil.runner import ExcitationRequest, MachineLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Limits of the embedded simulated rig where a plant.yaml hangs a drill string on it and no rig.yaml names any.
+# Limits of the embedded simulated rig if plant.yaml adds a drill string and rig.yaml names no limits.
 #
-# The usual ones (`tdhil.config.rig`) are those of the default rig, which is light: with them a string is neither moved
-# to speed nor brought to rest in reasonable time. These follow from the simulated drive's own torque limit.
+# The default limits (`tdhil.config.rig`) belong to the light default rig. They are too low to bring a string to speed
+# or to rest in reasonable time. The limits here follow from the torque limit of the simulated drive.
 
 
 TORQUE_SHARE, PROBE_SHARE = 0.5, 0.25
-"""Of the simulated drive's torque limit, which also stands for the make-up torque of the string's joints."""
+"""Shares of the simulated drive's torque limit. This limit also stands for the make-up torque of the joints."""
 TIME_S = 1800.0
 QUICK_STOP_RAD_S2 = 1.0
 RAMP_S = 40.0
-"""All of the torque would be let go in so long."""
+"""Time in which the whole torque would be released, s."""
 
 
 def suited(rig: Rig | None, plant: Any) -> Rig | None:
-    """``rig`` as it is, unless ``plant`` (`sim_bus.params.RigParams`) can be wound up and ``rig`` has no limits."""
+    """Return ``rig``; it gets limits for a string if ``plant`` (`sim_bus.params.RigParams`) has one and it has none."""
     if plant is None or (rig is not None and rig.limits is not None):
         return rig
     from sim_bus.plant import PLANTS
@@ -56,14 +56,14 @@ def suited(rig: Rig | None, plant: Any) -> Rig | None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 ASSUMED_TORQUE_SCALE_REL_SD = 0.03
-"""Where nobody says how good a real drive's torque scale is: inverters know it to some percent."""
+"""Assumed standard uncertainty of a real drive's torque scale if none is stated: inverters know it to some percent."""
 
 UNKNOWN_LAG_SD_SHARE = 0.1
 """Standard deviation of a lag that is stated without one."""
 
 
 def bench_of(identity: Identity, rig: Rig | None) -> Rig:
-    """The bench for this peer: a real one needs rig.yaml's limits, a simulated one has its own.
+    """Return the bench for this peer. A real one needs the limits of rig.yaml, a simulated one has its own.
 
     Raises PreflightRefused without limits.
     """
@@ -78,9 +78,9 @@ def machine_limits(
     bench: Rig, *, accept_no_watchdog: bool = False, accept_shared_watchdog: bool = False,
     accept_wider: Collection[str] = (), accept_speed_unit: bool = False,
 ) -> MachineLimits:
-    """The guard's limits. Raises PreflightRefused where the rig has none.
+    """Return the guard's limits. Raises PreflightRefused if the rig has none.
 
-    What is accepted is a run's, on its own command line: no file of the bench says it.
+    The overrides belong to one run and its command line. No file of the bench can set them.
     """
     limits = require_limits(bench)
     pipe = pipe_of(bench)
@@ -107,7 +107,7 @@ def machine_limits(
 
 
 def excitation_request(options: RunOptions, bench: Rig | None = None) -> ExcitationRequest:
-    """What stage 5 shall do; what the ``bench`` says of the drive goes with it."""
+    """Return the request for stage 5, with the filter time that the ``bench`` states for the drive."""
     return ExcitationRequest(
         kind=options.excitation,
         mode=options.mode,
@@ -128,7 +128,7 @@ def stated_lags(
     speed_lag_s: float | None, speed_lag_sd_s: float | None, torque_lag_s: float | None, torque_lag_sd_s: float | None,
     source: str,
 ) -> LagPrior:
-    """Reporting lags as somebody states them, with who that is; a deviation that isn't stated is a tenth."""
+    """Return stated reporting lags with their source. A standard deviation that isn't stated is a tenth of the lag."""
     def deviation(lag_s: float | None, stated_s: float | None) -> float:
         if lag_s is None:
             return 0.0
@@ -142,7 +142,7 @@ def stated_lags(
 
 
 def lag_prior(bench: Rig) -> LagPrior:
-    """What rig.yaml says of the reporting lags."""
+    """Return the reporting lags that rig.yaml states."""
     data = bench.drive_data
     return stated_lags(
         data.speed_lag_s, data.speed_lag_sd_s, data.torque_lag_s, data.torque_lag_sd_s, "rig.yaml"
@@ -150,7 +150,7 @@ def lag_prior(bench: Rig) -> LagPrior:
 
 
 def facts(bench: Rig) -> dict[str, Any]:
-    """What a Recording must know of the bench."""
+    """Return the facts of the bench that a Recording needs."""
     scale = bench.drive_data.torque_scale_rel_sd
     return {
         "gear_ratio": bench.gear.ratio,
@@ -162,7 +162,7 @@ def facts(bench: Rig) -> dict[str, Any]:
 
 
 def pipe_of(bench: Rig) -> Pipe | None:
-    """The drill string's pipe, at the motor's shaft, where rig.yaml gives its sizes."""
+    """Return the drill pipe, referred to the motor shaft; None if rig.yaml does not give its sizes."""
     load, i = bench.load, bench.gear.ratio
     if load.length_m is None or load.outer_diameter_m is None or load.inner_diameter_m is None:
         return None

@@ -1,1 +1,1 @@
-"""What is particular to one bus in reaching a drive: where it is, and how it is opened."""
+"""One module for each bus: the address of a drive, and how it is opened."""

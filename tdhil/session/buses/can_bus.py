@@ -1,8 +1,8 @@
-"""Which CAN bus: python-can's own options, with the place that each value came from.
+"""The CAN bus: python-can's own options, with the source of each value.
 
-Command line, then rig.yaml's ``bus:``, then CAN_INTERFACE, CAN_CHANNEL, CAN_BITRATE and CAN_CONFIG, then
-python-can's files, the last of which that names an option has the say, as python-can has it. Values from
-the environment and from files pass through python-can's own conversion, so that they mean what they mean there.
+Order: command line, rig.yaml's ``bus:``, CAN_INTERFACE, CAN_CHANNEL, CAN_BITRATE and CAN_CONFIG, python-can's files.
+Among the files the last one that names an option applies, as in python-can. Values from the environment and from files
+pass through python-can's own conversion, so they mean the same as there.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from drivers import CommunicationLost, DataFileError, PreflightRefused, Problem
 from tdhil.config import Origin, Rig, Setting, bit_rate_problem
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 from tdhil.session.connection import LineConfig
 
 if TYPE_CHECKING:
@@ -43,14 +43,14 @@ _VARIABLES = {"interface": "CAN_INTERFACE", "channel": "CAN_CHANNEL", "bitrate":
 
 @dataclass(frozen=True)
 class BusConfig(LineConfig):
-    """Each option of the bus and its origin, in the order in which python-can takes them."""
+    """Each option of the bus and its origin, in python-can's order."""
 
     nothing_there = "no CAN bus is configured"
     simulated_text = "drive and rig on a virtual bus"
 
     @property
     def configured(self) -> bool:
-        """Has anybody named an interface? If not, the embedded simulator is meant."""
+        """Return whether an interface is named. If not, the embedded simulator is meant."""
         return self.interface is not None
 
     @property
@@ -66,14 +66,14 @@ class BusConfig(LineConfig):
         return cast("int | None", self.value("bitrate"))
 
     def kwargs(self) -> dict[str, Any]:
-        """What `can.Bus` takes; it looks at the same places again, but finds nothing there that isn't here."""
+        """Return the arguments of `can.Bus`. It reads the same sources again, but finds nothing new there."""
         return {name: setting.value for name, setting in self.settings.items()}
 
 
 def bus_config(cli: Mapping[str, Any], rig: Rig | None = None) -> BusConfig:
-    """The bus as configured from everywhere; ``cli`` is the namespace that `can.cli.add_bus_arguments` filled.
+    """Return the bus from all sources; ``cli`` is the namespace that `can.cli.add_bus_arguments` filled.
 
-    UsageError and DataFileError where a value can't be used. A file or variable that names a bit rate but no
+    Raises UsageError and DataFileError for an unusable value. A file or variable that names a bit rate but no
     interface leaves the bus unconfigured.
     """
     settings: dict[str, Setting] = {}
@@ -121,14 +121,14 @@ def _from_environment() -> dict[str, Setting]:
         more = None
     if not isinstance(more, dict):
         step = 'Write it like {"interface": "socketcan"}, or unset it'
-        raise UsageError("not a JSON object", where="CAN_CONFIG", next_step=step)
+        raise UsageError("not a JSON object", where="CAN_CONFIG", next_step=step, entry=MessageCode.BUS_OPTIONS_WRONG)
     for name, value in more.items():
         found.setdefault(_option(name), Setting(_cast(value), "CAN_CONFIG", Origin.BUS_FILE))
     return found
 
 
 def _from_files() -> dict[str, Setting]:
-    """python-can's files, section [default]; a later file's word goes before an earlier one's."""
+    """Return the options of python-can's files, section [default]. A later file overrides an earlier one."""
     from can.util import CONFIG_FILES
 
     found: dict[str, Setting] = {}
@@ -155,7 +155,7 @@ def _as_written(option: str) -> str:
 
 
 def _option(name: str) -> str:
-    return "interface" if name == "bustype" else name      # python-can's old word for it
+    return "interface" if name == "bustype" else name      # python-can's old name for it
 
 
 def _cast(value: Any) -> Any:
@@ -173,39 +173,43 @@ def _check(settings: dict[str, Setting]) -> None:
             f"python-can knows no interface '{chosen.value}'",
             where=chosen.source,
             next_step=f"It knows {', '.join(sorted(can.VALID_INTERFACES))}",
+            entry=MessageCode.BUS_OPTIONS_WRONG,
         )
     for name in ("bitrate", "port"):
         if (given := settings.get(name)) and (not isinstance(given.value, int) or given.value <= 0):
-            raise UsageError(f"{name} must be a positive whole number, not {given.value!r}", where=given.source)
+            raise UsageError(f"{name} must be a positive whole number, not {given.value!r}", where=given.source,
+                             entry=MessageCode.BUS_OPTIONS_WRONG)
     if (given := settings.get("bitrate")) and (wrong := bit_rate_problem(given.value)):
-        raise UsageError(f"bitrate {wrong}", where=given.source)
+        raise UsageError(f"bitrate {wrong}", where=given.source, entry=MessageCode.BUS_OPTIONS_WRONG)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Opens the bus, and says what to do when that fails, before python-can has its say in a traceback.
+# Open the bus. If that fails, report the cause and the next step in place of python-can's traceback.
 #
-# On socketcan the kernel's link has the bit rate and ``-b`` does nothing: the link is read, and a mismatch refused.
+# On socketcan the kernel's link has the bit rate and ``-b`` has no effect: the link is read, and a mismatch refused.
 
 
 PROBE_S = 2.0
-"""How long a socketcand server may take to answer a connection; python-can would wait 10 s, spinning."""
+"""Time in which a socketcand server must answer a connection, s. python-can would wait 10 s in a busy loop."""
 
 _GREETING = b"< hi >"
 
 
 def open_bus(config: BusConfig) -> "can.BusABC":
-    """The open bus; the caller shuts it down.
+    """Return the open bus; the caller shuts it down.
 
-    UsageError without an interface; PreflightRefused if the device is missing, may not be used, is down or has
-    another bit rate; CommunicationLost if a socketcand server can't be reached.
+    Raises UsageError without an interface. Raises PreflightRefused if the device is missing, is down, has another bit
+    rate, or is not permitted. Raises CommunicationLost if a socketcand server can't be reached.
     """
     import can
 
     if not config.configured:
-        raise UsageError("no CAN interface", next_step="Name one, such as -i socketcan -c can0, or use --simulate")
+        raise UsageError("no CAN interface", next_step="Name one, such as -i socketcan -c can0, or use --simulate",
+                         entry=MessageCode.BUS_NOT_CONFIGURED)
     arguments = config.kwargs()
     if config.interface == "socketcan" and not config.channel:
-        raise UsageError("socketcan needs a channel", next_step="Name one, such as -c can0")
+        raise UsageError("socketcan needs a channel", next_step="Name one, such as -c can0",
+                         entry=MessageCode.BUS_NOT_CONFIGURED)
     if config.interface == "socketcan":
         check_link(config)
     elif config.interface == "socketcand":
@@ -218,7 +222,7 @@ def open_bus(config: BusConfig) -> "can.BusABC":
 
 
 def check_link(config: BusConfig) -> None:
-    """Refuses a SocketCAN link that is down or runs at another bit rate than asked for; PreflightRefused."""
+    """Raise PreflightRefused for a SocketCAN link that is down or runs at another bit rate than requested."""
     text = _read_link(config.channel)
     if text is None:
         return
@@ -229,20 +233,22 @@ def check_link(config: BusConfig) -> None:
     setting = f" type can bitrate {rate}" if bitrate is not None or not config.channel.startswith("vcan") else ""
     set_up = f"sudo ip link set {config.channel} up{setting}"
     if not up:
-        raise PreflightRefused("the link is down", where=config.channel, next_step=f"Run: {set_up}")
+        raise PreflightRefused("the CAN link is down", where=config.channel, next_step=f"Run: {set_up}",
+                               entry=MessageCode.BUS_UNUSABLE)
     if wanted is not None and bitrate is not None and wanted != bitrate:
         raise PreflightRefused(
-            f"the link runs at {bitrate} bit/s, {config.source('bitrate')} says {wanted}",
+            f"the CAN link runs at {bitrate} bit/s, but {config.source('bitrate')} requests {wanted} bit/s",
             where=config.channel,
-            next_step=f"Find out which of them the drive has; to change the link: "
+            next_step=f"Check the bit rate of the drive. To change the link: "
             f"sudo ip link set {config.channel} down && {set_up}",
+            entry=MessageCode.BIT_RATE_DIFFERS,
         )
 
 
 def parse_link(text: str, channel: str) -> tuple[bool, int | None]:
-    """(is it up, bit rate in bit/s or None if it has none) from ``ip -details -json link show``.
+    """Return (link is up, bit rate in bit/s or None) from ``ip -details -json link show``.
 
-    Anything unexpected counts as up and without a rate: opening the bus will tell.
+    Unexpected text counts as up and without a rate: opening the bus will show the cause.
     """
     try:
         links = json.loads(text)
@@ -259,7 +265,7 @@ def parse_link(text: str, channel: str) -> tuple[bool, int | None]:
 
 
 def _read_link(channel: str) -> str | None:
-    """What ``ip`` says of the link; None where it can't be asked. PreflightRefused if there is no such link."""
+    """Return the report of ``ip`` on the link; None without ``ip``. Raises PreflightRefused for a missing link."""
     command = shutil.which("ip", path="/usr/sbin:/sbin:/usr/bin:/bin")
     if command is None:
         return None
@@ -276,10 +282,11 @@ def _read_link(channel: str) -> str | None:
 
 
 def _no_device(channel: str) -> PreflightRefused:
-    step = "See what there is: ip link show type can. Is the adapter plugged in and its kernel module loaded?"
+    step = "List the devices: ip link show type can. Is the adapter plugged in and its kernel module loaded?"
     if channel.startswith("vcan"):
-        step = f"Make one: sudo ip link add dev {channel} type vcan && sudo ip link set {channel} up"
-    return PreflightRefused("no such CAN device", where=channel or "channel", next_step=step)
+        step = f"Create it: sudo ip link add dev {channel} type vcan && sudo ip link set {channel} up"
+    return PreflightRefused("no such CAN device", where=channel or "channel", next_step=step,
+                            entry=MessageCode.BUS_UNUSABLE)
 
 
 def _probe_server(arguments: dict[str, Any]) -> None:
@@ -287,7 +294,8 @@ def _probe_server(arguments: dict[str, Any]) -> None:
         if arguments.get(name) in (None, ""):
             raise UsageError(
                 f"socketcand needs '{name}'",
-                next_step="Such as -i socketcand -c can0 --bus-kwargs host=127.0.0.1 port=29536",
+                next_step="Give it, for example -i socketcand -c can0 --bus-kwargs host=127.0.0.1 port=29536",
+                entry=MessageCode.BUS_NOT_CONFIGURED,
             )
     host, port = str(arguments["host"]), arguments["port"]
     try:
@@ -297,16 +305,19 @@ def _probe_server(arguments: dict[str, Any]) -> None:
         raise CommunicationLost(
             f"no socketcand server answers ({error})",
             where=f"{host}:{port}",
-            next_step=f"Is it started, is the port right, does a firewall stand between? Try: nc -vz {host} {port}",
+            next_step=f"Is it started? Is the port right? Does a firewall block it? Try: nc -vz {host} {port}",
+            entry=MessageCode.SERVER_UNREACHABLE,
         ) from error
     if greeting != _GREETING:      # python-can would wait for it for ever
         raise CommunicationLost(
-            "what answers there is no socketcand server", where=f"{host}:{port}", next_step="Check host and port"
+            "the program at this address is not a socketcand server", where=f"{host}:{port}",
+            next_step="Check host and port",
+            entry=MessageCode.SERVER_UNREACHABLE,
         )
 
 
 def _greeting(probe: socket.socket) -> bytes:
-    """What the server says first, as far as it comes in time."""
+    """Return the server's greeting, as far as it arrives in time."""
     found = b""
     probe.settimeout(PROBE_S)
     with contextlib.suppress(TimeoutError):
@@ -316,30 +327,37 @@ def _greeting(probe: socket.socket) -> bytes:
 
 
 def _explained(config: BusConfig, error: Exception) -> Exception:
-    """The likely cause, from the error number where there is one below python-can's wrapping."""
+    """Return an error with the likely cause, from the error number below python-can's wrapping if there is one."""
     where = f"{config.interface} {config.channel}".strip()
     number = _number(error)
     if number in {errno.ENODEV, errno.ENOENT, errno.ENXIO}:
         if config.interface == "socketcan":
             return _no_device(config.channel)
-        return PreflightRefused("no such device", where=where, next_step="Is the adapter plugged in? Check -c")
+        return PreflightRefused("no such device", where=where, next_step="Is the adapter plugged in? Check -c",
+                                entry=MessageCode.BUS_UNUSABLE)
     if number in {errno.EACCES, errno.EPERM}:
         step = "Give your user the right: sudo usermod -aG dialout $USER (serial adapters), then log in again"
-        return PreflightRefused("permission denied", where=where, next_step=step)
+        return PreflightRefused("permission denied", where=where, next_step=step, entry=MessageCode.BUS_UNUSABLE)
     if number == errno.EBUSY:
-        return PreflightRefused("in use by another program", where=where, next_step="End it, then try again")
+        return PreflightRefused("in use by another program", where=where, next_step="End it, then try again",
+                                entry=MessageCode.BUS_UNUSABLE)
     if number in {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT}:
         step = "Load it: sudo modprobe can_raw. Without it, use an adapter through python-can, or socketcand"
-        return PreflightRefused("this kernel has no SocketCAN", where=where, next_step=step)
+        return PreflightRefused("this kernel has no SocketCAN", where=where, next_step=step,
+                                entry=MessageCode.BUS_UNUSABLE)
     if isinstance(error, ImportError | NotImplementedError):
         step = "Install the vendor's driver and the Python package that python-can's manual names for it"
-        return UsageError(f"the interface can't be used here ({error})", where=where, next_step=step)
+        return UsageError(f"the interface can't be used here ({error})", where=where, next_step=step,
+                          entry=MessageCode.BUS_OPTIONS_WRONG)
     if isinstance(error, TypeError | ValueError):
-        return UsageError(f"the interface refuses its options ({error})", where=where, next_step="Check its options")
+        return UsageError(f"the interface refuses its options ({error})", where=where, next_step="Check its options",
+                          entry=MessageCode.BUS_OPTIONS_WRONG)
     if config.interface == "socketcand":
         step = "Is the channel name one that the server offers?"
-        return CommunicationLost(f"the server did not accept us ({error})", where=where, next_step=step)
-    return PreflightRefused(f"can't be opened ({error})", where=where, next_step="Check the adapter, its driver and -c")
+        return CommunicationLost(f"the socketcand server refused the connection ({error})", where=where, next_step=step,
+                                 entry=MessageCode.SERVER_UNREACHABLE)
+    return PreflightRefused(f"can't be opened ({error})", where=where, next_step="Check the adapter, its driver and -c",
+                            entry=MessageCode.BUS_UNUSABLE)
 
 
 def _number(error: BaseException | None) -> int | None:
@@ -351,7 +369,7 @@ def _number(error: BaseException | None) -> int | None:
 
 
 def link_report(channel: str) -> str | None:
-    """What ``ip -details -json link show`` says of a SocketCAN link; None where it can't be asked.
+    """Return the text of ``ip -details -json link show`` for a SocketCAN link; None without ``ip``.
 
     Raises PreflightRefused if there is no such link.
     """

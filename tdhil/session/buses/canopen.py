@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from profiles import Profile
 from profiles.canopen import CanopenProfile
@@ -26,12 +26,20 @@ if TYPE_CHECKING:
     from tdhil.session.connection import PeerPlan
 
 PLAIN = "generic/cia402"
-"""What the simulator is when it wears no profile."""
-_ADAPTER = ("host", "port", "serial", "unique_hardware_id", "app_name")     # what names it, beside its channel
+"""Profile of the simulator if none is named."""
+_ADAPTER = ("host", "port", "serial", "unique_hardware_id", "app_name")     # they identify the adapter
+
+
+_OPTIONS: Final = {
+    "channel": ("NAME", "channel of the adapter, such as can0"),
+    "interface": ("NAME", "kind of adapter, such as socketcan, pcan or vector"),
+    "bitrate": ("BIT_S", "bit rate, such as 500000 or 500k; on socketcan the link has it"),
+}
+"""What ``--help`` says of the options of python-can that most runs need: metavar and help."""
 
 
 class CanopenKind(BusKind):
-    """CiA 402 over any adapter of python-can's; of its nodes, the one that the options, or else the profile, name."""
+    """CiA 402 over any adapter of python-can. The options, or else the profile, name the node."""
 
     name, title = "canopen", "CANopen"
     named_by = "--interface and --channel, and --node"
@@ -43,31 +51,33 @@ class CanopenKind(BusKind):
     steps_over_a_wire = True
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """python-can's own."""
+        """Add python-can's own options."""
         from can.cli import add_bus_arguments
 
         add_bus_arguments(parser, group_title="CAN bus (python-can's own options)")
-        for action in parser._actions:  # python-can's take no 500k
+        for action in parser._actions:  # python-can's own type does not accept 500k
             if action.dest in ("bitrate", "data_bitrate"):
                 action.type = _bit_rate
+            if (named := _OPTIONS.get(action.dest)) is not None:
+                action.metavar, action.help = named
 
     def line(self, cli: Mapping[str, Any], rig: Rig | None, profile: Profile) -> BusConfig:
-        """As python-can is configured."""
+        """Return the bus as python-can is configured."""
         return bus_config(cli, rig)
 
     @property
     def nowhere(self) -> BusConfig:
-        """No bus."""
+        """Return a configuration without a bus."""
         return BusConfig()
 
     def placed_in(self, rig: Rig) -> bool:
-        """Does ``bus:`` name an interface?"""
+        """Return whether ``bus:`` names an interface."""
         return rig.bus.interface is not None
 
     @contextmanager
     def open(self, plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData, clock: Clock,
              tap: FrameTap, trace: Path | None) -> Iterator[Drive]:
-        """The bus, shut down afterwards, and the drive on it."""
+        """Open the bus and the drive on it. The bus is shut down afterwards."""
         from drivers.canopen import Cia402Drive
         from drivers.undo_journal import UndoJournal
 
@@ -86,7 +96,7 @@ class CanopenKind(BusKind):
 
     @contextmanager
     def open_target(self, options: RunOptions, connection: Connection, clock: Clock) -> Iterator[Target]:
-        """The node alone, on an open bus."""
+        """Open the bus and the node alone."""
         from drivers.canopen import Cia402Target
 
         bus = can_bus.open_bus(config_of(connection))
@@ -97,7 +107,7 @@ class CanopenKind(BusKind):
             target.close()
 
     def address(self, options: RunOptions, connection: Connection) -> str | None:
-        """Adapter, channel and node; python-can's virtual bus is this process's alone."""
+        """Return adapter, channel and node. None for python-can's virtual bus, which exists only in this process."""
         config = config_of(connection)
         if config.interface == "virtual":
             return None
@@ -108,19 +118,19 @@ class CanopenKind(BusKind):
         return " ".join((*words, f"node {node_of(options, connection)}"))
 
     def parse_faults(self, texts: Sequence[str]) -> tuple[Any, ...]:
-        """Of `sim_bus.canopen`."""
+        """Parse faults of `sim_bus.canopen`."""
         from sim_bus.canopen import parse_all
 
         return parse_all(texts)
 
     def faults(self) -> tuple[KnownFault, ...]:
-        """Of `sim_bus.canopen`."""
+        """Return the faults of `sim_bus.canopen`."""
         from sim_bus.canopen import listed
 
         return listed()
 
     def fault_listing(self) -> str:
-        """All faults of the simulated CANopen drive."""
+        """Return the list of all faults of the simulated CANopen drive."""
         from sim_bus.canopen import listing
 
         return listing()
@@ -134,24 +144,24 @@ def _bit_rate(text: str) -> int:
 
 
 def profile_of(connection: Connection) -> CanopenProfile:
-    """What is known of the drive."""
+    """Return the drive's profile."""
     assert isinstance(connection.profile, CanopenProfile)
     return connection.profile
 
 
 def config_of(connection: Connection) -> BusConfig:
-    """Which CAN bus."""
+    """Return the CAN bus."""
     assert isinstance(connection.line, BusConfig)
     return connection.line
 
 
 def node_of(options: RunOptions, connection: Connection) -> int:
-    """The node that the options name, or else the profile."""
+    """Return the node that the options, or else the profile, name."""
     return options.node if options.node is not None else profile_of(connection).node
 
 
 def rated_torque_nm(plan: PeerPlan, profile: CanopenProfile, data: DriveData) -> float | None:
-    """As rig.yaml has it; a simulated motor has no plate to read it from."""
+    """Return rig.yaml's rated torque; for a simulated motor without one, the plant's."""
     if data.rated_torque_nm is None and plan.embedded and profile.rated_torque_by_hand:
         return float(plan.plant.drive.rated_torque_nm)
     return data.rated_torque_nm
@@ -159,11 +169,11 @@ def rated_torque_nm(plan: PeerPlan, profile: CanopenProfile, data: DriveData) ->
 
 @contextmanager
 def open_can(plan: PeerPlan, connection: Connection, node: int, trace: Path | None = None) -> Iterator[can.BusABC]:
-    """The bus, shut down afterwards, with the simulated drive on it where one was asked for."""
+    """Open the bus, with the simulated drive on it if requested. It is shut down afterwards."""
     with ExitStack() as stack:
         if plan.embedded:
             simulator, channel = _embedded(stack, plan, connection, node, trace)
-            # Before the simulator runs out by itself: what comes then is no part of the run.
+            # Before the simulator continues alone to its end: what happens then is not part of the run.
             stack.callback(lambda: plan.never_came.extend(simulator.faults_waiting))
         else:
             channel = can_bus.open_bus(config_of(connection))
@@ -174,7 +184,7 @@ def open_can(plan: PeerPlan, connection: Connection, node: int, trace: Path | No
 def _embedded(
     stack: ExitStack, plan: PeerPlan, connection: Connection, node: int, trace: Path | None
 ) -> tuple[Simulator, can.BusABC]:
-    """The simulator and the host's bus to it: in this thread where it is stepped, else in one of its own."""
+    """Return the simulator and the host's bus to it. A stepped one runs in this thread, else in its own thread."""
     worn = None if connection.profile.name == PLAIN else profile_of(connection)
     if plan.stepped:
         from sim_bus.canopen import InlineSimulator

@@ -1,4 +1,4 @@
-"""Modbus: its options, and a drive on TCP or on a serial line, or the embedded simulator that wears its profile."""
+"""Modbus: its options, and a drive on TCP or a serial line, or the embedded simulator with its profile."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivers import PreflightRefused, TdhilError
-from profiles import Profile
+from profiles import MessageCode, Profile
 from profiles.modbus import ModbusProfile
 from tdhil.config import DriveData, Rig, RunOptions
 from tdhil.session.buses.modbus_line import FLAGS, ModbusConfig, modbus_config
@@ -24,29 +24,31 @@ if TYPE_CHECKING:
 
 
 class SettingsRefused(PreflightRefused):
-    """The serial device is there, but not with these settings."""
+    """The serial device exists, but refuses these settings."""
+
+    entry = MessageCode.SERIAL_LINE_REFUSED
 
 
 class ModbusKind(BusKind):
-    """TCP where a host is named, else a serial line; of its units, the one that the options, or the profile, name."""
+    """Modbus over TCP if a host is named, else over a serial line. The options, or else the profile, name the unit."""
 
     name, title = "modbus", "Modbus"
     named_by = "--host or --serial, and --unit"
     section, place_keys = "modbus", "host or serial"
     flags = FLAGS
     default_profile = "generic/modbus"
-    steps_over_a_wire = False          # it has no SYNC
+    steps_over_a_wire = False          # Modbus has no SYNC
 
     @property
     def frame_channel(self) -> int:
-        """Requests and replies (PDU)."""
+        """Return the log's channel of requests and replies (PDU)."""
         from tdhil.recording import MODBUS
 
         return MODBUS
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Of a TCP or a serial line."""
-        group = parser.add_argument_group("Modbus (what is left out is as the profile says)")
+        """Add the options of a TCP or a serial line."""
+        group = parser.add_argument_group("Modbus (defaults: the profile's)")
         group.add_argument("--host", metavar="NAME", help="Modbus TCP: name or address of the drive")
         group.add_argument("--port", type=int, metavar="N", help="TCP port (default 502)")
         group.add_argument("--serial", metavar="DEVICE", help="Modbus RTU: serial device, such as /dev/ttyUSB0")
@@ -56,23 +58,23 @@ class ModbusKind(BusKind):
         group.add_argument("--unit", type=int, metavar="N", help="unit (slave) number of the drive")
 
     def line(self, cli: Mapping[str, Any], rig: Rig | None, profile: Profile) -> ModbusConfig:
-        """As configured; for the rest as the drive leaves the factory."""
+        """Return the configured line. Missing values are the drive's factory settings."""
         assert isinstance(profile, ModbusProfile)
         return modbus_config(cli, rig, profile)
 
     @property
     def nowhere(self) -> ModbusConfig:
-        """No line."""
+        """Return a configuration without a line."""
         return ModbusConfig()
 
     def placed_in(self, rig: Rig) -> bool:
-        """Does ``modbus:`` name a host or a device?"""
+        """Return whether ``modbus:`` names a host or a device."""
         return bool(rig.modbus.host or rig.modbus.serial)
 
     @contextmanager
     def open(self, plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData, clock: Clock,
              tap: FrameTap, trace: Path | None) -> Iterator[Drive]:
-        """The line, closed afterwards, and the drive on it."""
+        """Open the line and the drive on it. The line is closed afterwards."""
         from drivers.modbus import ModbusDrive
 
         with open_line(plan, connection, data, clock, trace) as line:
@@ -88,7 +90,7 @@ class ModbusKind(BusKind):
 
     @contextmanager
     def open_target(self, options: RunOptions, connection: Connection, clock: Clock) -> Iterator[Target]:
-        """The unit alone, on an open line."""
+        """Open the line and the unit alone."""
         from drivers.modbus import ModbusTarget
 
         config = config_of(connection)
@@ -99,46 +101,46 @@ class ModbusKind(BusKind):
             link.close()
 
     def address(self, options: RunOptions, connection: Connection) -> str | None:
-        """Host and port, or the serial device whatever links lead to it, and the unit."""
+        """Return host and port, or the serial device with links resolved, and the unit."""
         line = config_of(connection)
         if line.host is not None:
             return f"modbus tcp {one_host(line.host)} port {line.port} unit {line.unit}"
         return f"modbus rtu {Path(str(line.serial)).resolve()} unit {line.unit}"
 
     def parse_faults(self, texts: Sequence[str]) -> tuple[Any, ...]:
-        """Of `sim_bus.modbus`, as far as the embedded drive has them."""
+        """Parse the faults of `sim_bus.modbus` that the embedded drive has."""
         from sim_bus.modbus import parse_all
 
         return parse_all(texts, "embedded")
 
     def faults(self) -> tuple[KnownFault, ...]:
-        """Of `sim_bus.modbus`, as far as the embedded drive has them."""
+        """Return the faults of `sim_bus.modbus` that the embedded drive has."""
         from sim_bus.modbus import listed
 
         return listed("embedded")
 
     def fault_listing(self) -> str:
-        """All faults of the simulated Modbus drive."""
+        """Return the list of all faults of the simulated Modbus drive."""
         from sim_bus.modbus import listing
 
         return listing()
 
 
 def profile_of(connection: Connection) -> ModbusProfile:
-    """What is known of the drive."""
+    """Return the drive's profile."""
     assert isinstance(connection.profile, ModbusProfile)
     return connection.profile
 
 
 def config_of(connection: Connection) -> ModbusConfig:
-    """Which line."""
+    """Return the line."""
     assert isinstance(connection.line, ModbusConfig)
     return connection.line
 
 
 @dataclass(frozen=True)
 class OpenLine:
-    """An open line, and what the drive at its end can't tell of itself."""
+    """An open line, and the values that the drive at its end does not report."""
 
     link: Link
     profile: ModbusProfile
@@ -150,7 +152,7 @@ class OpenLine:
 def open_line(
     plan: PeerPlan, connection: Connection, data: DriveData, clock: Clock, trace: Path | None = None
 ) -> Iterator[OpenLine]:
-    """Closed afterwards. Raises what opening it raises, with what to do."""
+    """Open the line; it is closed afterwards. Raises the errors of opening, with the next step."""
     profile, config = profile_of(connection), config_of(connection)
     if plan.embedded:
         line = _embedded(plan, profile, config.unit, data, clock, trace)
@@ -163,7 +165,7 @@ def open_line(
 
 
 def open_wire(line: ModbusConfig, clock: Clock) -> Link:
-    """TCP where a host is named, else RTU on the serial device."""
+    """Open TCP if a host is named, else RTU on the serial device."""
     if line.host is not None:
         from drivers.modbus import TcpLink
 
@@ -175,7 +177,7 @@ def open_wire(line: ModbusConfig, clock: Clock) -> Link:
         return RtuLink(line.serial, clock, baud=line.baud, parity=line.parity, stop_bits=line.stop_bits)
     except TdhilError:
         raise
-    except Exception as error:      # termios.error, say, which is no OSError: the device refuses a setting
+    except Exception as error:      # such as termios.error, which is not an OSError: a setting is refused
         raise SettingsRefused(
             f"the device refuses {line.baud} baud 8{line.parity}{line.stop_bits} ({error})", where=line.serial,
             next_step="Try other settings (--baud, --parity, --stop-bits); a pseudo terminal has no parity: --parity N",
@@ -184,7 +186,7 @@ def open_wire(line: ModbusConfig, clock: Clock) -> Link:
 
 def _embedded(plan: PeerPlan, profile: ModbusProfile, unit: int, data: DriveData, clock: Clock,
               trace: Path | None) -> OpenLine:
-    """What nobody states of a simulated drive it states itself: there is no panel to read it from."""
+    """Return a simulated drive. It states missing values itself, because it has no panel to read them from."""
     from drivers.modbus import EmbeddedLink
     from sim_bus.modbus import EmbeddedModbusDrive
 
@@ -195,9 +197,9 @@ def _embedded(plan: PeerPlan, profile: ModbusProfile, unit: int, data: DriveData
         rated_nm = drive.rated_torque_nm
 
     def ended() -> None:
-        if not plan.never_came:             # closed more than once, by whoever ends first
+        if not plan.never_came:             # it may be closed more than once
             plan.never_came.extend(drive.faults_waiting)
-        drive.run_until(clock.now_s())      # the shaft's trace goes up to now, and on to rest
+        drive.run_until(clock.now_s())      # the shaft's trace continues to now, and then to standstill
         drive.run_on()
         drive.close()
 

@@ -1,7 +1,7 @@
-"""Where a Modbus drive is reached, with the place that each value came from.
+"""The address of a Modbus drive, with the source of each value.
 
-Command line, then rig.yaml's ``modbus:``, then the profile's ``line:``, which says how the drive leaves the factory.
-A host means TCP, a serial device means RTU; the command line's word for one of them undoes rig.yaml's for the other.
+Order: command line, rig.yaml's ``modbus:``, the profile's ``line:`` (factory settings of the drive). A host means
+TCP, a serial device means RTU. If the command line names one of them, rig.yaml's value for the other is ignored.
 """
 
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from typing import Any, Literal, cast
 
 from profiles.modbus import BusLine, ModbusProfile
 from tdhil.config import Modbus, Origin, Rig, Setting, check_values
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 from tdhil.session.connection import LineConfig
 
 FLAGS: Mapping[str, str] = MappingProxyType({
@@ -28,7 +28,7 @@ TCP, RTU = ("host", "port", "unit"), ("serial", "baud", "parity", "stop_bits", "
 
 @dataclass(frozen=True)
 class ModbusConfig(LineConfig):
-    """Each value and its origin; only those that the way to the drive (TCP or RTU) knows."""
+    """Each value and its origin; only those of the transport in use (TCP or RTU)."""
 
     nothing_there = "no Modbus host and no serial device is named"
     simulated_text = "Modbus drive and rig"
@@ -36,7 +36,7 @@ class ModbusConfig(LineConfig):
 
     @property
     def configured(self) -> bool:
-        """Has anybody named a host or a serial device? If not, the embedded simulator is meant."""
+        """Return whether a host or a serial device is named. If not, the embedded simulator is meant."""
         return self.host is not None or self.serial is not None
 
     @property
@@ -69,9 +69,9 @@ class ModbusConfig(LineConfig):
 
 
 def modbus_config(cli: Mapping[str, Any], rig: Rig | None, profile: ModbusProfile | None) -> ModbusConfig:
-    """The line as configured from everywhere; ``cli`` is keyed by the names in `FLAGS`.
+    """Return the line from all sources; ``cli`` is keyed by the names in `FLAGS`.
 
-    UsageError where a value can't be used. Without a profile what it would say is left as the standard has it.
+    Raises UsageError for an unusable value. Without a profile the defaults are those of the Modbus standard.
     """
     given = {name: Setting.by_flag(cli[name], flag) for name, flag in FLAGS.items() if cli.get(name) is not None}
     values = {name: setting.value for name, setting in given.items()}
@@ -94,11 +94,13 @@ def modbus_config(cli: Mapping[str, Any], rig: Rig | None, profile: ModbusProfil
     for name in given:
         if name not in known:
             needs = "--serial" if name in RTU else "--host"
-            raise UsageError(f"means nothing without {needs}", where=FLAGS[name], next_step="See tdhil identify --help")
+            raise UsageError(f"has no effect without {needs}", where=FLAGS[name], next_step="See tdhil identify --help",
+                             entry=MessageCode.BUS_OPTIONS_WRONG)
     if found.serial is not None and not 1 <= found.unit <= 247:
         raise UsageError(
-            f"a serial line has units 1 to 247, not {found.unit}", where=found.source("unit"),
-            next_step="Give the drive's own with --unit",
+            f"unit {found.unit} is outside 1 to 247, the range of a serial line", where=found.source("unit"),
+            next_step="Give the drive's unit with --unit",
+            entry=MessageCode.BUS_OPTIONS_WRONG,
         )
     return found
 

@@ -1,0 +1,329 @@
+r"""Torque calibration by bodies of known inertia: the line of identified over added inertia.
+
+The drive reports T/κ, κ the *calibration factor* of its torque. A run on an inertia J with a body b on it identifies
+
+    y = (J + b)/κ,        a straight line over b: slope 1/κ, intercept J/κ,
+
+so that two runs, without a body (y₁) and with one (y₂), give κ = b/(y₂ − y₁) and J = b y₁/(y₂ − y₁). What is off by the
+same share in both cancels in J. Of relative errors x₁ and x₂ of the runs remains
+
+    dJ/J = (1 + J/b)(x₁ − x₂),        dκ/κ = (y₁ x₁ − y₂ x₂)/(y₂ − y₁),        and of the body db/b in either.
+
+With more runs than two the line is fitted by generalised least squares, weights C⁻¹ with C the runs' covariance plus
+that of the bodies, and the residuals test that it is straight. Uncertainties are propagated to first order (GUM 5.2),
+degrees of freedom by Welch and Satterthwaite (GUM G.4); coverage intervals are symmetric with Student's quantile.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tdhil.estimation import ResidualTest, Verdict
+from tdhil.estimation.frequency_domain import student_quantile
+from tdhil.recording import FloatArray
+
+CERTAIN = 1e6
+"""Degrees of freedom of what is taken for known as well as it is stated."""
+CONTRADICTED_P = 0.001
+"""Below, a test contradicts that filters are shared, or that the line is straight."""
+LARGEST_ERROR, LARGEST_IN_SD = 0.15, 5.0
+"""A torque scale is off by no more than this share, or so many of its stated standard deviations."""
+_LIKE_GEAR = 0.25
+"""Of i²: so near, a factor points to the wrong shaft."""
+
+
+@dataclass(frozen=True)
+class BodyRun:
+    """One run. ``added_kg_m2`` and ``added_sd_kg_m2`` at the motor; 0 without a body. ``name`` in messages."""
+
+    name: str
+    added_kg_m2: float
+    added_sd_kg_m2: float = 0.0
+    noise_share: float = 0.0
+    """Standard uncertainty of its J with the filters known, as a share."""
+
+
+@dataclass(frozen=True)
+class CalibrationCase:
+    """All runs. ``reported_kg_m2`` (n,) in the drive's unit, ``covariance`` (n, n) with its ``degrees_of_freedom``.
+
+    ``covariance_known`` (n, n): with the filters of the reports known. ``sharing``: do the runs share them; None: not
+    tested. ``scale_rel_sd``: of the torque scale as it is stated so far. ``gear_ratio`` i = ω_motor/ω_main.
+    """
+
+    runs: tuple[BodyRun, ...]
+    reported_kg_m2: FloatArray
+    covariance: FloatArray
+    covariance_known: FloatArray
+    degrees_of_freedom: float
+    sharing: ResidualTest | None
+    sharing_words: str = ""
+    scale_rel_sd: float = 0.02
+    gear_ratio: float = 1.0
+    confidence: float = 0.95
+
+
+@dataclass(frozen=True)
+class MeasuredValue:
+    """A value with its standard uncertainty, effective degrees of freedom, and coverage interval."""
+
+    value: float
+    standard_uncertainty: float
+    degrees_of_freedom: float
+    coverage_factor: float
+    low: float
+    high: float
+
+    @property
+    def half_width_share(self) -> float:
+        """Half the interval, as a share of the value."""
+        return 0.5 * (self.high - self.low) / abs(self.value)
+
+
+@dataclass(frozen=True)
+class CalibrationLine:
+    """One input quantity of the budget (GUM 8, EA-4/02): what it adds to κ and to J, as a share of each (1 sd)."""
+
+    source: str
+    standard_uncertainty_kg_m2: float
+    distribution: str
+    degrees_of_freedom: float
+    of_factor: float
+    of_inertia: float
+
+
+@dataclass(frozen=True)
+class FittedPoint:
+    """One run on the line. ``residual_kg_m2`` in the drive's unit, with the standard uncertainty of the point."""
+
+    added_kg_m2: float
+    reported_kg_m2: float
+    standard_uncertainty_kg_m2: float
+    fitted_kg_m2: float
+    residual_kg_m2: float
+
+
+@dataclass(frozen=True)
+class TorqueCalibration:
+    """``factor`` κ: true over reported torque; ``inertia_kg_m2``: true J without a body. None where refused.
+
+    ``least_added_kg_m2``: of a body that would do, where the one that was used is too small; else None.
+    ``line``: slope 1/κ and intercept J/κ with their covariance (2, 2) as rows, for the picture.
+    """
+
+    verdict: Verdict
+    reason: str
+    advice: str
+    factor: MeasuredValue | None = None
+    inertia_kg_m2: MeasuredValue | None = None
+    budget: tuple[CalibrationLine, ...] = ()
+    points: tuple[FittedPoint, ...] = ()
+    linearity: ResidualTest | None = None
+    sharing: ResidualTest | None = None
+    least_added_kg_m2: float | None = None
+    slope: float = math.nan
+    intercept_kg_m2: float = math.nan
+    line_covariance: tuple[tuple[float, ...], ...] = ()
+
+
+def calibrate_torque(case: CalibrationCase) -> TorqueCalibration:
+    """κ and J from the runs, or the reason why not. Raises ValueError for fewer than two different bodies."""
+    added = np.array([run.added_kg_m2 for run in case.runs])
+    if len(added) < 2 or float(np.ptp(added)) <= 0.0:
+        raise ValueError("two runs with different bodies are needed")
+    line = _line(case, added)
+    slope, intercept = float(line.beta[1]), float(line.beta[0])
+    points = tuple(
+        FittedPoint(float(b), float(y), float(math.sqrt(max(c, 0.0))), intercept + slope * float(b),
+                    float(y) - intercept - slope * float(b))
+        for b, y, c in zip(added, case.reported_kg_m2, np.diag(case.covariance), strict=True)
+    )
+    refused = TorqueCalibration(
+        Verdict.NOT_IDENTIFIABLE, "", "", points=points, sharing=case.sharing, linearity=line.linearity, slope=slope,
+        intercept_kg_m2=intercept, line_covariance=tuple(tuple(float(x) for x in row) for row in line.covariance))
+    if slope <= 0.0:
+        return replace(refused, reason=_falls(points), advice="give the log without the body first, and the inertia of"
+                       " the body that was mounted")
+    factor, inertia, budget = _propagated(case, line)
+    least = _least(case, inertia)
+    refused = replace(refused, budget=budget)
+    if case.sharing is not None and case.sharing.p_value < CONTRADICTED_P:
+        reason = ("the runs do not share the filters of the drive's reports"
+                  f" (p = {case.sharing.p_value:.1g}){case.sharing_words}")
+        return replace(refused, verdict=Verdict.MODEL_REJECTED, reason=reason, advice="repeat both runs with the same"
+                       " drive, the same filters and gear, and a body that is bolted tight")
+    if line.linearity is not None and line.linearity.p_value < CONTRADICTED_P:
+        worst = max(points, key=lambda point: abs(point.residual_kg_m2))
+        reason = ("the identified inertia is no straight line over the known one"
+                  f" (p = {line.linearity.p_value:.1g}); the run with {worst.added_kg_m2:.4g} kg·m² is off by"
+                  f" {worst.residual_kg_m2:+.2g} kg·m²")
+        return replace(refused, verdict=Verdict.MODEL_REJECTED, reason=reason, advice="check the inertia of each body,"
+                       " and whether it turned with the shaft; then repeat that run")
+    assumed = student_quantile(case.confidence, CERTAIN) * case.scale_rel_sd
+    if inertia.half_width_share > assumed:
+        reason = (f"the body of {float(np.ptp(added)):.4g} kg·m² is too small: it would leave J at"
+                  f" ±{inertia.half_width_share:.1%}, and the stated torque scale leaves ±{assumed:.1%}")
+        advice = "measure for longer, and state how well the body's inertia is known (--added-sd)"
+        if least is not None:
+            advice = f"use a body of {least:.3g} kg·m² or more at the motor, or measure for longer"
+        return replace(refused, reason=reason, advice=advice, least_added_kg_m2=least)
+    # The factor's own uncertainty doesn't count against it.
+    most = max(LARGEST_ERROR, LARGEST_IN_SD * case.scale_rel_sd) + student_quantile(case.confidence, CERTAIN) * (
+        factor.standard_uncertainty)
+    if abs(factor.value - 1.0) > most:
+        return replace(refused, verdict=Verdict.MODEL_REJECTED, advice=_shaft(case, factor.value),
+                       reason=f"the calibration factor would be {factor.value:.3g}: more than {most:.0%} from 1 is no"
+                       " error of a torque scale")
+    reason = f"the runs give κ to ±{factor.half_width_share:.2%} and J to ±{inertia.half_width_share:.2%}"
+    return replace(refused, verdict=Verdict.VALID, reason=reason, factor=factor, inertia_kg_m2=inertia)
+
+
+def _falls(points: Sequence[FittedPoint]) -> str:
+    small, large = (pick(points, key=lambda point: point.added_kg_m2) for pick in (min, max))
+    return (f"the identified inertia falls from {small.reported_kg_m2:.4g} to {large.reported_kg_m2:.4g} kg·m² with"
+            f" {large.added_kg_m2 - small.added_kg_m2:.4g} kg·m² more on the shaft: the logs are exchanged, or the body"
+            " was not mounted")
+
+
+def _shaft(case: CalibrationCase, factor: float) -> str:
+    square = case.gear_ratio**2
+    if square > 1.0 + _LIKE_GEAR:
+        for wrong, right, ratio in (("main", "motor", factor * square), ("motor", "main", factor / square)):
+            if abs(ratio - 1.0) < _LIKE_GEAR:
+                return (f"with the body at the {right} shaft it would be {ratio:.3g}: the inertia seems to have been"
+                        f" given at the {wrong} shaft; use --at {right}")
+    return ("check the inertia of the body and its shaft (--at motor or main); the body must be mounted in one run"
+            " only, and must turn with the shaft")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The line, and what follows from it.
+
+
+@dataclass(frozen=True)
+class _FittedLine:
+    beta: FloatArray                   # intercept, slope
+    by_reported: FloatArray            # (2, n): ∂beta/∂y; of the bodies −slope times that
+    covariance: FloatArray
+    linearity: ResidualTest | None
+
+
+_ROUNDS = 10
+
+
+def _line(case: CalibrationCase, added: FloatArray) -> _FittedLine:
+    design = np.column_stack([np.ones_like(added), added])
+    bodies = np.diag([run.added_sd_kg_m2**2 for run in case.runs])
+    slope = 1.0
+    for _ in range(_ROUNDS):
+        whole = case.covariance + slope**2 * bodies
+        weighted = np.linalg.solve(whole, design)
+        covariance = np.linalg.inv(design.T @ weighted)
+        by = covariance @ weighted.T
+        beta = by @ case.reported_kg_m2
+        if abs(beta[1] - slope) <= 1e-12 * abs(slope):
+            break
+        slope = float(beta[1])
+    left = case.reported_kg_m2 - design @ beta
+    linearity = None
+    if len(added) > 2:
+        from scipy.special import chdtrc
+
+        statistic, more = float(left @ np.linalg.solve(whole, left)), float(len(added) - 2)
+        linearity = ResidualTest(statistic, more, float(chdtrc(more, statistic)))
+    return _FittedLine(beta, by, covariance, linearity)
+
+
+def _propagated(
+    case: CalibrationCase, line: _FittedLine
+) -> tuple[MeasuredValue, MeasuredValue, tuple[CalibrationLine, ...]]:
+    """κ, J, and the budget of both."""
+    intercept, slope = line.beta
+    factor, inertia = 1.0 / slope, intercept / slope
+    of_factor = -(factor**2) * line.by_reported[1]
+    of_inertia = factor * line.by_reported[0] - inertia * factor * line.by_reported[1]
+    both = np.stack([of_factor / factor, of_inertia / inertia])           # shares, by kg·m² in the drive's unit
+    lines = []
+    known = np.diag(case.covariance_known)
+    for k, run in enumerate(case.runs):
+        sd = math.sqrt(max(float(known[k]), 0.0))
+        lines.append(CalibrationLine(f"scatter of {run.name}", sd, "Student", case.degrees_of_freedom,
+                                     *(abs(float(one)) * sd for one in both[:, k])))
+    rest = case.covariance - np.diag(known)
+    shared = [math.sqrt(max(float(one @ rest @ one), 0.0)) for one in both]
+    scale = math.sqrt(max(float(np.trace(rest)) / len(case.runs), 0.0))
+    lines.append(CalibrationLine("filters of the reports", scale, "Student", case.degrees_of_freedom, *shared))
+    for k, run in enumerate(case.runs):
+        if run.added_sd_kg_m2 > 0.0:
+            shares = (abs(float(one)) * slope * run.added_sd_kg_m2 for one in both[:, k])
+            lines.append(CalibrationLine(f"body of {run.name}", run.added_sd_kg_m2, "normal", CERTAIN, *shares))
+    found = []
+    body = slope * np.array([run.added_sd_kg_m2 for run in case.runs])
+    for value, row in ((factor, both[0]), (inertia, both[1])):
+        runs, bodies = float(row @ case.covariance @ row), float(np.sum((row * body) ** 2))
+        variance = runs + bodies
+        dof = variance**2 / (runs**2 / case.degrees_of_freedom + bodies**2 / CERTAIN)
+        found.append(measured_value(float(value), math.sqrt(variance) * abs(float(value)), dof, case.confidence))
+    return found[0], found[1], tuple(lines)
+
+
+def measured_value(value: float, standard_uncertainty: float, dof: float, confidence: float) -> MeasuredValue:
+    """With the interval that Student's quantile makes of it."""
+    k = student_quantile(confidence, dof)
+    half = k * standard_uncertainty
+    return MeasuredValue(value, standard_uncertainty, dof, k, value - half, value + half)
+
+
+def _least(case: CalibrationCase, inertia: MeasuredValue) -> float | None:
+    """The body with which J would be as sure as it is with the stated scale; None where none is.
+
+    Of two runs: half-width = (1 + J/b) w, w that of the difference of the runs' relative errors.
+    """
+    body = max(run.added_kg_m2 for run in case.runs) - min(run.added_kg_m2 for run in case.runs)
+    w = inertia.half_width_share / (1.0 + inertia.value / body) if inertia.value > 0.0 else math.inf
+    wanted = student_quantile(case.confidence, CERTAIN) * case.scale_rel_sd
+    return inertia.value / (wanted / w - 1.0) if w < wanted else None
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Beforehand: which body, and for how long?
+
+
+_SIZES = (0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0)
+"""Bodies of a plan, as shares of J."""
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """With a body of ``added_kg_m2`` at the motor: half-width of J, as a share, after two runs like the one at hand.
+
+    ``minutes``: of stage 5 in each of two runs until J is as sure as is wanted; None where no time is enough.
+    """
+
+    added_kg_m2: float
+    half_width_share: float
+    minutes: float | None
+
+
+_LONGEST_MIN = 24.0 * 60.0
+
+
+def plan_bodies(
+    inertia_kg_m2: float, noise_share: float, minutes: float, wanted: float, added_sd_share: float, *,
+    confidence: float = 0.95, sizes: Sequence[float] = (),
+) -> tuple[RunPlan, ...]:
+    """Plan two runs with each body. ``noise_share``: standard uncertainty of J of a run of ``minutes``, filters known.
+
+    ``added_sd_share``: of the body's inertia, as a share of it; ``sizes``: bodies, kg·m²; else shares of J.
+    """
+    k = student_quantile(confidence, CERTAIN)
+    plans = []
+    for body in sizes or [share * inertia_kg_m2 for share in _SIZES]:
+        runs = math.sqrt(2.0) * (1.0 + inertia_kg_m2 / body) * noise_share * k
+        fixed = k * added_sd_share
+        left = wanted**2 - fixed**2
+        needed = minutes * runs**2 / left if left > 0.0 else math.inf
+        plans.append(RunPlan(body, math.hypot(runs, fixed), needed if needed <= _LONGEST_MIN else None))
+    return tuple(plans)

@@ -1,0 +1,115 @@
+"""A torque calibration as it is kept and used: which drive it is of, since when, and a recording in its N·m."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from typing import Any, Final
+
+from tdhil.estimation import normal_quantile
+from tdhil.recording import FloatArray, Recording
+
+KIND: Final = "torque_calibration"
+_NUMBERS: Final = ("value", "low", "high", "confidence")
+_LEAST, _MOST = 0.1, 10.0
+"""A factor beyond these is no calibration of a drive."""
+_ALIKE = 1e-6
+
+
+class CalibrationUnusable(ValueError):
+    """Raised for a document that is no calibration; the text says what is wrong."""
+
+
+@dataclass(frozen=True)
+class StoredCalibration:
+    """``factor`` κ = true over reported torque, with its coverage interval. ``date`` in ISO 8601.
+
+    ``drive`` and ``settings``: identity of the drive, and what its unit of torque depends on.
+    """
+
+    factor: float
+    low: float
+    high: float
+    confidence: float
+    date: str
+    drive: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    simulated: bool
+
+    @classmethod
+    def of(cls, document: Any) -> "StoredCalibration":
+        """Read the document of ``tdhil calibrate torque``. Raises CalibrationUnusable."""
+        if not isinstance(document, Mapping) or document.get("kind") != KIND:
+            raise CalibrationUnusable("is no calibration of tdhil calibrate torque")
+        factor = document.get("calibration_factor")
+        if not isinstance(factor, Mapping):
+            raise CalibrationUnusable("holds no calibration factor: that calibration was refused")
+        numbers = [factor.get(name) for name in _NUMBERS]
+        if not all(isinstance(one, int | float) and math.isfinite(one) for one in numbers):
+            raise CalibrationUnusable("holds a calibration factor that is no number")
+        value, low, high, confidence = (float(one) for one in numbers if isinstance(one, int | float))
+        if not (_LEAST <= low <= value <= high <= _MOST and 0.5 <= confidence < 1.0):
+            raise CalibrationUnusable(f"holds a calibration factor that can't be: {value:g} ({low:g} to {high:g})")
+        date = document.get("date")
+        try:
+            datetime.fromisoformat(str(date))
+        except ValueError:
+            raise CalibrationUnusable("holds no date") from None
+        drive, settings = (document.get(name) or {} for name in ("drive", "settings"))
+        if not isinstance(drive, Mapping) or not isinstance(settings, Mapping):
+            raise CalibrationUnusable("names no drive")
+        return cls(value, low, high, confidence, str(date), dict(drive), dict(settings),
+                   document.get("simulated") is True)
+
+    @property
+    def day(self) -> str:
+        """``2026-11-23``."""
+        return f"{datetime.fromisoformat(self.date):%Y-%m-%d}"
+
+    @property
+    def rel_sd(self) -> float:
+        """Standard deviation of a normal scale that has this interval, as a share."""
+        return 0.5 * (self.high - self.low) / self.factor / normal_quantile(self.confidence)
+
+    def another_drive(self, drive: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
+        """Return the difference to this drive or its settings, in words; '' if there is none."""
+        for ours, theirs in ((self.drive, drive), (self.settings, settings)):
+            for name in ours.keys() & theirs.keys():
+                if name not in ("name", "profile") and _differ(ours[name], theirs[name]):
+                    return f"its {name} is {ours[name]}, and {theirs[name]} here"
+        return ""
+
+    def too_old(self, started: str | None, valid_days: float) -> str:
+        """Return its age at the start of a run, in words, where that exceeds ``valid_days``; else ''."""
+        try:
+            age = datetime.fromisoformat(str(started)).astimezone() - datetime.fromisoformat(self.date).astimezone()
+        except ValueError:
+            return ""
+        return f"{age.days} days old, and valid for {valid_days:g}" if age > timedelta(days=valid_days) else ""
+
+    def applied(self, recording: Recording) -> Recording:
+        """The recording with every torque in calibrated N·m."""
+        factor = self.factor
+        limit = recording.torque_limit_nm
+        return replace(
+            recording,
+            torque_nm=factor * recording.torque_nm,
+            commanded_torque_nm=_scaled(recording.commanded_torque_nm, factor),
+            demanded_torque_nm=_scaled(recording.demanded_torque_nm, factor),
+            torque_limit_nm=None if limit is None else factor * limit,
+            torque_offset_nm=factor * recording.torque_offset_nm,
+            torque_resolution_nm=factor * recording.torque_resolution_nm,
+            torque_scale_rel_sd=self.rel_sd,
+        )
+
+
+def _scaled(signal: FloatArray | None, factor: float) -> FloatArray | None:
+    return None if signal is None else factor * signal
+
+
+def _differ(a: Any, b: Any) -> bool:
+    if a is None or b is None:
+        return False
+    if isinstance(a, int | float) and isinstance(b, int | float):
+        return abs(a - b) > _ALIKE * max(abs(a), abs(b))
+    return bool(a != b)

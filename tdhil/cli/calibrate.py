@@ -1,0 +1,276 @@
+"""`tdhil calibrate`: the scales of a drive's torque and speed from recordings and known quantities; nothing moves."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from profiles.quantities import INERTIA
+from tdhil.cli.arguments import add_option, amount, share
+from tdhil.cli.calibrate_speed import add_speed_arguments
+from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
+from tdhil.cli.results import print_json
+from tdhil.config import OPTION
+from tdhil.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from tdhil.session import CalibrationFound, CalibrationRun
+
+_EXAMPLE = "tdhil calibrate torque without.mcap with.mcap --added 55"
+_LARGEST = 1e9
+"""kg·m²; no body has more."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The kinds of calibration, with their options."""
+    kinds = parser.add_subparsers(dest="kind", metavar="torque|speed", required=True)
+    torque = kinds.add_parser(
+        "torque", allow_abbrev=False, help="by runs without and with a body of known inertia",
+        description="Find the calibration factor of the drive's torque from a run without and a run with a body of"
+        " known inertia on the shaft. More bodies are given with --body.")
+    _add_torque(torque)
+    speed = kinds.add_parser(
+        "speed", allow_abbrev=False, help="by counted turns, or by the position that the drive reports",
+        description="Find the calibration factor of the drive's speed: from a log whose drive reports a position, or"
+        " from turns of the shaft that an operator counted.")
+    add_speed_arguments(speed)
+
+
+def _add_torque(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("logs", type=Path, nargs="*", metavar="WITHOUT.mcap WITH.mcap",
+                        help="the run without the body and the run with it, of --added; or runs without a body, beside"
+                        " --body")
+    parser.add_argument("--added", type=amount(INERTIA), metavar="J", help="inertia of the body, kg·m²")
+    parser.add_argument("--added-sd", type=amount(INERTIA), metavar="SD",
+                        help="its standard uncertainty, kg·m² (default 0.2 %% of it, assumed)")
+    parser.add_argument("--body", action="append", default=[], metavar="FILE=J",
+                        help="a run with a body of this inertia, kg·m²; repeatable; FILE=J±SD states its uncertainty")
+    parser.add_argument("--pairs", type=Path, metavar="pairs.csv",
+                        help="torque of a reference sensor beside reported torque, in N·m, with the columns"
+                        " reported_nm, reported_sd_nm, reference_nm, reference_sd_nm and direction (up or down); a log"
+                        " beside it names the drive")
+    parser.add_argument("--at", choices=("motor", "main"), default="motor",
+                        help="shaft that the inertia is given at; main: behind the gear (default motor)")
+    add_option(parser, OPTION["confidence"])
+    parser.add_argument("--plan", action="store_true",
+                        help="from one log: which body, and how long a run, reach --want")
+    parser.add_argument("--want", type=share, default=0.01, metavar="SHARE",
+                        help="with --plan: half-width of J that is wanted (default 1 %%)")
+    parser.add_argument("--save", type=Path, metavar="calibration.json",
+                        help="where the calibration goes, for torque_calibration in rig.yaml; never over a file")
+    add_option(parser, OPTION["json"])
+    parser.add_argument("--report", type=Path, metavar="FILE", help="with pictures: report.html, or report.pdf on A4")
+    add_trace_arguments(parser)
+    parser.set_defaults(run=run_torque)
+
+
+def run_torque(namespace: argparse.Namespace) -> int:
+    """Read, fit together, print; or plan."""
+    if namespace.columns and "=" not in namespace.columns[-1]:
+        raise UsageError("takes every word behind it", where="--columns", next_step="Name the logs before --columns")
+    check_trace(namespace)
+    asked = OPTION["confidence"]
+    confidence = asked.default if namespace.confidence is None else namespace.confidence
+    if wrong := asked.refusal(confidence):
+        raise UsageError(f"{confidence:g}: must be {wrong}", where=asked.flag)
+    if namespace.plan:
+        return _plan(namespace)
+    if namespace.pairs is not None:
+        return _pairs(namespace, confidence)
+    wanted = _wanted(namespace)
+    _require_new(namespace.save)
+    if namespace.report is not None:
+        from tdhil.report import check_report_path
+
+        for path, _, _ in wanted:
+            check_report_path(namespace.report, path)
+    runs = _read(namespace, wanted)
+    from tdhil.report import PlainConsole, print_calibration, stderr_console, write_calibration_report
+    from tdhil.session import find_calibration, save_calibration
+
+    found = find_calibration(runs, namespace.at, confidence)
+    document = document_of(found)
+    if namespace.json:
+        print_json(document)
+    else:
+        print_calibration(document, PlainConsole())
+    if namespace.save is not None:
+        if found.calibration.factor is None:
+            stderr_console().print(f"tdhil: nothing was written to {namespace.save}: there is no calibration factor",
+                                   style="yellow", markup=False, soft_wrap=True)
+        else:
+            save_calibration(document, namespace.save)
+            stderr_console().print(f"calibration: {namespace.save}", markup=False, soft_wrap=True)
+    if namespace.report is not None:
+        written = write_calibration_report(document, namespace.report)
+        stderr_console().print(f"report: {written}", markup=False, soft_wrap=True)
+    return int(ExitCode.OK if found.calibration.factor is not None else ExitCode.NOT_IDENTIFIABLE)
+
+
+def calibrate_two(without: Path, with_body: Path, added: float, added_sd: float | None, save: Path) -> int:
+    """Calibrate by two logs, as the command does. Return the exit code."""
+    parser = argparse.ArgumentParser()
+    _add_torque(parser)
+    more = [] if added_sd is None else ["--added-sd", repr(added_sd)]
+    return run_torque(parser.parse_args(
+        [str(without), str(with_body), "--added", repr(added), *more, "--save", str(save)]))
+
+
+def _require_new(path: Path | None) -> None:
+    if path is not None and path.exists():
+        raise UsageError("is there already, and is left as it is", where=f"--save {path}",
+                         next_step="Name another file, or move that one away")
+
+
+def _now() -> str:
+    from datetime import datetime
+
+    return datetime.now().astimezone().isoformat(timespec="seconds")
+
+
+Wanted = list[tuple[Path, float, float | None]]
+
+
+def _wanted(namespace: argparse.Namespace) -> Wanted:
+    """(log, body, its standard uncertainty) of each run. UsageError for what can't be."""
+    logs, added = namespace.logs, namespace.added
+    _positive("--added", added)
+    _positive("--added-sd", namespace.added_sd, zero=True)
+    bodies = [_body(text) for text in namespace.body]
+    if added is None:
+        if namespace.added_sd is not None:
+            raise UsageError("needs --added, the inertia that it is the uncertainty of", where="--added-sd")
+        if not bodies:
+            raise UsageError("the inertia of the body is not given", next_step=f"Such as: {_EXAMPLE}")
+        return [*((path, 0.0, 0.0) for path in logs), *bodies]
+    if len(logs) != 2:
+        raise UsageError(f"takes two logs, without the body and with it, not {len(logs)}", where="--added",
+                         next_step=f"Such as: {_EXAMPLE}; more bodies with --body FILE=J")
+    return [(logs[0], 0.0, 0.0), (logs[1], added, namespace.added_sd), *bodies]
+
+
+def _positive(flag: str, value: float | None, *, zero: bool = False) -> None:
+    if value is not None and not ((value > 0.0 or (zero and value == 0.0)) and value <= _LARGEST):
+        raise UsageError(f"{value:g}: must be a positive number of kg·m²", where=flag)
+
+
+def _body(text: str) -> tuple[Path, float, float | None]:
+    name, equals, value = text.rpartition("=")
+    number, _, sd = value.replace("+-", "±").partition("±")
+    try:
+        found = Path(name), float(number), float(sd) if sd else None
+    except ValueError:
+        equals = ""
+    if not equals or not name:
+        raise UsageError(f"{text[:60]!r} is not FILE=J", where="--body", next_step="Such as --body with.mcap=55.0")
+    _positive("--body", found[1], zero=True)
+    _positive("--body", found[2], zero=True)
+    return found
+
+
+def _read(namespace: argparse.Namespace, wanted: Wanted) -> list[CalibrationRun]:
+    from tdhil.session import CalibrationRun, require_file
+
+    for path, _, _ in wanted:
+        require_file(path)
+    return [CalibrationRun(read_recorded(namespace, path), added, sd) for path, added, sd in wanted]
+
+
+def document_of(found: CalibrationFound) -> dict[str, Any]:
+    """The document of a calibration."""
+    from tdhil.report import calibration_document
+    from tdhil.session import drive_identity, drive_settings, sha256_of_log
+
+    first = found.runs[0].record
+    runs = tuple(
+        {"log": run.record.log, "sha256": sha256_of_log(run.record), "date": run.record.configuration.get("started"),
+         "added_kg_m2": run.added_kg_m2, "added_sd_kg_m2": run.added_sd_kg_m2}
+        for run in found.runs
+    )
+    dates = [str(run["date"]) for run in runs if run["date"]]
+    return calibration_document(
+        found.calibration, runs, drive_identity(first.configuration),
+        drive_settings(first.configuration, first.recording),
+        date=max(dates) if dates else _now(), at=found.at,
+        confidence=found.confidence, simulated=first.recording.simulated, warnings=found.warnings,
+    )
+
+
+def _pairs(namespace: argparse.Namespace, confidence: float) -> int:
+    """Read the pairs, fit, print."""
+    from tdhil.calibration import calibrate_pairs
+    from tdhil.report import PlainConsole, pairs_document, print_pairs, stderr_console
+    from tdhil.session import drive_identity, drive_settings, read_pairs, require_file, save_calibration
+
+    for name in ("body", "added", "added_sd", "report"):
+        if getattr(namespace, name):
+            raise UsageError("does not go with --pairs", where=f"--{name.replace('_', '-')}",
+                             next_step="Such as: tdhil calibrate torque --pairs pairs.csv")
+    if len(namespace.logs) > 1 or (namespace.save is not None and not namespace.logs):
+        raise UsageError("takes one log, which names the drive", where="--save" if namespace.save else "--pairs",
+                         next_step="Such as: tdhil calibrate torque run.mcap --pairs pairs.csv --save calibration.json")
+    _require_new(namespace.save)
+    pairs = read_pairs(namespace.pairs)
+    record = None
+    for path in namespace.logs:
+        require_file(path)
+        record = read_recorded(namespace, path)
+    try:
+        found = calibrate_pairs(pairs, confidence)
+    except ValueError as error:
+        raise UsageError(str(error), where=str(namespace.pairs)) from None
+    drive = {} if record is None else drive_identity(record.configuration)
+    settings = {} if record is None else drive_settings(record.configuration, record.recording)
+    document = pairs_document(found, pairs, str(namespace.pairs), drive, settings, date=_now(), confidence=confidence,
+                              simulated=record is not None and record.recording.simulated)
+    if namespace.json:
+        print_json(document)
+    else:
+        print_pairs(document, PlainConsole())
+    if namespace.save is not None and not found.refusal:
+        save_calibration(document, namespace.save)
+        stderr_console().print(f"calibration: {namespace.save}", markup=False, soft_wrap=True)
+    return int(ExitCode.NOT_IDENTIFIABLE if found.refusal else ExitCode.OK)
+
+
+def _plan(namespace: argparse.Namespace) -> int:
+    from tdhil.report import PlainConsole
+    from tdhil.session import ASSUMED_BODY_REL_SD, find_plan, require_file
+
+    if len(namespace.logs) != 1 or namespace.body:
+        raise UsageError("takes one log, of a run without a body", where="--plan",
+                         next_step="Such as: tdhil calibrate torque without.mcap --plan --want 1%")
+    if not 0.0 < namespace.want < 1.0:
+        raise UsageError(f"{namespace.want:g}: must be a share between 0 and 1", where="--want")
+    _positive("--added", namespace.added)
+    _positive("--added-sd", namespace.added_sd, zero=True)
+    require_file(namespace.logs[0])
+    record = read_recorded(namespace, namespace.logs[0])
+    sd_share = ASSUMED_BODY_REL_SD
+    if namespace.added_sd is not None and namespace.added:
+        sd_share = namespace.added_sd / namespace.added
+    ratio = record.recording.gear_ratio if namespace.at == "main" else 1.0
+    sizes = () if namespace.added is None else (namespace.added / ratio**2,)
+    inertia, minutes, plans = find_plan(record, namespace.want, sd_share, sizes)
+    document = {
+        "kind": "torque_calibration_plan", "inertia_kg_m2": inertia, "minutes": minutes, "want": namespace.want,
+        "added_rel_sd": sd_share, "at": namespace.at,
+        "bodies": [{"added_kg_m2": one.added_kg_m2 * ratio**2, "half_width_share": one.half_width_share,
+                    "minutes": one.minutes} for one in plans],
+    }
+    if namespace.json:
+        print_json(document)
+        return int(ExitCode.OK)
+    from rich.table import Table
+
+    table = Table(title=f"J {inertia:.4g} kg·m² in the drive's unit; stage 5 took {minutes:.1f} min", box=None,
+                  title_justify="left", padding=(0, 3))
+    for name in (f"body, kg·m² ({namespace.at})", "J after two such runs", f"minutes each for ±{namespace.want:.2%}"):
+        table.add_column(name, justify="right")
+    for one in plans:
+        longer = "not in a day" if one.minutes is None else f"{math.ceil(10.0 * one.minutes) / 10.0:.1f}"
+        table.add_row(f"{one.added_kg_m2 * ratio**2:.4g}", f"±{one.half_width_share:.2%}", longer)
+    PlainConsole().print(table)
+    return int(ExitCode.OK)

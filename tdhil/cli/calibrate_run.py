@@ -1,0 +1,96 @@
+"""`tdhil identify --calibrate`: a run without a body, the question for the body, a run with it, and the calibration."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+from profiles.quantities import INERTIA
+from tdhil.cli.arguments import amount
+from tdhil.config import load_rig, resolve
+from tdhil.errors import UsageError
+
+_EXAMPLE = "tdhil identify --calibrate --added 55"
+_LARGEST = 1e9
+Run = Callable[[argparse.Namespace, list[Path]], int]
+"""One run with its own confirmation: appends the path of its log, returns the exit code."""
+
+
+def add_calibrate_arguments(section: argparse._ActionsContainer) -> None:
+    """Add the options of a calibration by two runs."""
+    section.add_argument("--calibrate", action="store_true",
+                         help="calibrate the torque: a run without a body, then a run with a body of --added")
+    section.add_argument("--added", type=amount(INERTIA), metavar="J",
+                         help="with --calibrate: inertia of the body at the motor shaft, kg·m²")
+    section.add_argument("--added-sd", type=amount(INERTIA), metavar="SD",
+                         help="its standard uncertainty, kg·m² (default 0.2 %% of it, assumed)")
+
+
+def check_calibrate(namespace: argparse.Namespace) -> None:
+    """Raise UsageError for options that do not go together."""
+    for flag, value in (("--added", namespace.added), ("--added-sd", namespace.added_sd)):
+        if value is not None and not namespace.calibrate:
+            raise UsageError("is for a calibration", where=flag, next_step=f"Such as: {_EXAMPLE}")
+        if value is not None and not ((value > 0.0 or (flag == "--added-sd" and value == 0.0)) and value <= _LARGEST):
+            raise UsageError(f"{value:g}: must be a positive number of kg·m²", where=flag)
+    if not namespace.calibrate:
+        return
+    if namespace.added is None:
+        raise UsageError("needs the inertia of the body", where="--calibrate", next_step=f"Such as: {_EXAMPLE}")
+    for flag, given in (("--dry-run", namespace.dry_run), ("--json", namespace.json),
+                        ("--report", namespace.report is not None), ("--trace", namespace.trace is not None),
+                        ("--fault", bool(namespace.fault))):
+        if given:
+            raise UsageError("does not go with --calibrate", where=flag, next_step="Run both runs one by one, then:"
+                             " tdhil calibrate torque without.mcap with.mcap --added J")
+
+
+def run_calibration(namespace: argparse.Namespace, run: Run) -> int:
+    """Do both runs and the calibration. Return the exit code of the first of them that failed, or 0.
+
+    Nothing runs while the operator mounts the body: the drive is disabled and its bus is closed. Raises UsageError
+    before anything moves, and PreflightRefused where the body was not confirmed.
+    """
+    from tdhil.cli.calibrate import calibrate_two
+    from tdhil.report import stderr_console
+    from tdhil.session import check_log_path, confirm_mounted, connection_of, plan_peer, require_terminal
+
+    rig = load_rig(namespace.rig) if namespace.rig else None
+    options, connection = connection_of(vars(namespace), rig, resolve(vars(namespace), rig))
+    peer = plan_peer(options, connection)
+    first = Path(options.log)
+    second = first.with_name(f"{first.stem}-with-body{first.suffix}")
+    saved = first.with_name(f"{first.stem}-calibration.json")
+    check_log_path(second, "--log")
+    if saved.exists():
+        raise UsageError("is there already, and is left as it is", where=str(saved),
+                         next_step="Move that file away, or name another log with --log")
+    if options.json or options.trace is not None:
+        raise UsageError("does not go with --calibrate", where=options.source("json" if options.json else "trace"))
+    if not peer.embedded:
+        require_terminal("that the body is mounted")
+    console = stderr_console()
+    logs: list[Path] = []
+
+    def step(number: int, text: str) -> None:
+        console.print(f"calibration, step {number} of 4: {text}", style="bold", markup=False, soft_wrap=True)
+
+    step(1, "run without the body")
+    if code := run(namespace, logs):
+        return code
+    body = f"body of {namespace.added:g} kg·m²"
+    changed: dict[str, object] = {"log": str(second)}
+    if peer.embedded:
+        step(2, f"{body} mounted on the simulated shaft")
+        mounted = peer.plant.plant.added_inertia_kg_m2
+        changed |= {"simulated_added_inertia_kg_m2": mounted + namespace.added}
+        changed |= {} if options.seed is None else {"seed": options.seed + 1}
+    else:
+        step(2, f"mount the {body}")
+        confirm_mounted(console, f"tdhil calibrate torque {logs[0]} with.mcap --added {namespace.added:g}")
+    step(3, "run with the body")
+    if code := run(argparse.Namespace(**{**vars(namespace), **changed}), logs):
+        return code
+    step(4, "calibration")
+    return calibrate_two(logs[0], logs[1], namespace.added, namespace.added_sd, saved)

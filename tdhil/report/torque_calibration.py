@@ -1,0 +1,342 @@
+"""A torque calibration as a document for machines, on a terminal, and as a calibration laboratory writes it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Group
+from rich.panel import Panel
+from rich.table import Table as Grid
+from rich.text import Text as Words
+
+from tdhil.report.blocks import AnswerBox, Block, Column, Pairs, Picture, Report, ReportSection, Table, Text, shown_date
+from tdhil.report.card import plus_minus, sentence, with_interval
+from tdhil.report.console import PlainConsole, names_and_texts
+from tdhil.report.document import SIMULATED
+from tdhil.report.html import write_blocks
+from tdhil.report.plots import DARK, OURS, QUIET
+from tdhil.version import __version__
+
+if TYPE_CHECKING:
+    from matplotlib.figure import FigureBase
+
+    from tdhil.calibration import MeasuredValue, PairsFit, TorqueCalibration, TorquePairs
+
+Part = Mapping[str, Any]
+
+_STYLE = {"valid": "bold green", "not_identifiable": "bold red", "model_rejected": "bold red"}
+_COLOUR = {"valid": "green", "not_identifiable": "red", "model_rejected": "red"}
+
+
+def calibration_document(
+    found: TorqueCalibration, runs: tuple[Part, ...], drive: Part, settings: Part, *, date: str, at: str,
+    confidence: float, simulated: bool, warnings: tuple[str, ...],
+) -> dict[str, Any]:
+    """Plain data for `json.dumps`. ``runs``: log, its hash, its date, the body; in the order of the points.
+
+    ``at``: the shaft that the bodies were given at; every inertia is at the motor shaft. ``date``: of the calibration.
+    """
+    told = [{**run, **asdict(point)} for run, point in zip(runs, found.points, strict=True)] if found.points else [
+        dict(run) for run in runs]
+    return {
+        "kind": "torque_calibration",
+        "method": "bodies",
+        "verdict": found.verdict.value,
+        "reason": found.reason,
+        "advice": found.advice,
+        "calibration_factor": _quantity(found.factor, confidence),
+        "inertia_kg_m2": _quantity(found.inertia_kg_m2, confidence),
+        "budget": [asdict(line) for line in found.budget],
+        "runs": told,
+        "line": None if not math.isfinite(found.slope) else {
+            "slope": found.slope, "intercept_kg_m2": found.intercept_kg_m2,
+            "covariance": [list(row) for row in found.line_covariance],
+        },
+        "linearity": None if found.linearity is None else asdict(found.linearity),
+        "sharing": None if found.sharing is None else asdict(found.sharing),
+        "least_added_kg_m2": found.least_added_kg_m2,
+        "at": at,
+        "drive": dict(drive) or None,
+        "settings": dict(settings),
+        "date": date,
+        "simulated": simulated,
+        "warnings": list(warnings),
+        "tdhil": __version__,
+    }
+
+
+def _quantity(one: MeasuredValue | None, confidence: float) -> dict[str, Any] | None:
+    return None if one is None else {**asdict(one), "confidence": confidence}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The card
+
+
+def print_calibration(document: Part, console: PlainConsole) -> None:
+    """The card of a torque calibration, on a console."""
+    rows = names_and_texts(())
+    verdict = document["verdict"]
+    rows.add_row("verdict", Words(verdict, style=_STYLE.get(verdict, "bold")))
+    factor, inertia = document["calibration_factor"], document["inertia_kg_m2"]
+    if factor is not None:
+        rows.add_row("calibration factor", Words(_with_share(factor, ""), style="bold"))
+        rows.add_row("", f"true torque = κ · reported torque: the drive reports {_error(factor)}")
+    if inertia is not None:
+        rows.add_row("J without the body", Words(_with_share(inertia, "kg·m²"), style="bold"))
+    for run in document["runs"]:
+        text = f"{Path(run['log']).name}: {run['added_kg_m2']:.4g} kg·m² added"
+        if "reported_kg_m2" in run:
+            text += f", identified {plus_minus(run['reported_kg_m2'], 2.0 * run['standard_uncertainty_kg_m2'])}"
+        rows.add_row("run", text)
+    for name, key in (("straight line", "linearity"), ("filters shared", "sharing")):
+        if document[key] is not None:
+            rows.add_row(name, f"p = {document[key]['p_value']:.2g}")
+    body: list[Any] = [rows]
+    if factor is not None and document["budget"]:
+        body.append(_budget(document))
+    body.append(Words(sentence(document["reason"])))
+    if document["advice"]:
+        body.append(Words(sentence(document["advice"]), style="italic"))
+    body += [Words(f"! {warning}", style="yellow") for warning in document["warnings"]]
+    title = "torque calibration" + (f" · {SIMULATED}" if document["simulated"] else "")
+    console.print(Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue"))
+
+
+def _with_share(part: Part, unit: str) -> str:
+    share = 50.0 * (part["high"] - part["low"]) / part["value"]
+    return f"{with_interval(part['value'], part['low'], part['high'], unit).rstrip()}  ±{share:#.2g} %"
+
+
+def _error(factor: Part) -> str:
+    """Return the error of the drive's own torque: ``4.8 % too much torque``."""
+    error = 100.0 * (1.0 / factor["value"] - 1.0)
+    return f"{abs(error):.2g} % too {'much' if error > 0.0 else 'little'} torque"
+
+
+def _budget(document: Part) -> Grid:
+    """Each input quantity's share of κ and of J, at the coverage factor of the result."""
+    k_factor, k_inertia = (document[key]["coverage_factor"] for key in ("calibration_factor", "inertia_kg_m2"))
+    table = Grid.grid(padding=(0, 2))
+    table.add_column(style="dim")
+    for _ in range(2):
+        table.add_column(justify="right", no_wrap=True)
+    table.add_row(Words("uncertainty budget", style="italic"), Words("± % of κ", style="dim"),
+                  Words("± % of J", style="dim"))
+    for line in sorted(document["budget"], key=lambda one: -one["of_inertia"]):
+        table.add_row(line["source"], f"{100.0 * k_factor * line['of_factor']:.2f}",
+                      f"{100.0 * k_inertia * line['of_inertia']:.2f}")
+    return table
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Pairs of a reference sensor
+
+
+def pairs_document(
+    found: PairsFit, pairs: TorquePairs, source: str, drive: Part, settings: Part, *, date: str, confidence: float,
+    simulated: bool,
+) -> dict[str, Any]:
+    """Plain data for `json.dumps`; ``source``: the file of the pairs, ``drive``: as a log names it."""
+    return {
+        "kind": "torque_calibration",
+        "method": "pairs",
+        "verdict": "model_rejected" if found.refusal else "valid",
+        "reason": found.refusal or f"{len(pairs.direction)} pairs give κ to ±{found.factor.half_width_share:.2%}",
+        "calibration_factor": None if found.refusal else _quantity(found.factor, confidence),
+        "offset_nm": _quantity(found.offset_nm, confidence),
+        "scatter": asdict(found.scatter),
+        "spread": found.spread,
+        "hysteresis_nm": found.hysteresis_nm,
+        "pairs": [
+            {"reported_nm": float(x), "reference_nm": float(y), "residual_nm": float(left), "direction": direction}
+            for x, y, left, direction in zip(pairs.reported_nm, pairs.reference_nm, found.residuals_nm,
+                                             pairs.direction, strict=True)
+        ],
+        "source": source,
+        "drive": dict(drive) or None,
+        "settings": dict(settings),
+        "date": date,
+        "simulated": simulated,
+        "tdhil": __version__,
+    }
+
+
+def print_pairs(document: Part, console: PlainConsole) -> None:
+    """The card of a calibration against a reference sensor."""
+    rows = names_and_texts(())
+    verdict, factor, offset = (document[name] for name in ("verdict", "calibration_factor", "offset_nm"))
+    rows.add_row("verdict", Words(verdict, style=_STYLE.get(verdict, "bold")))
+    if factor is not None:
+        rows.add_row("calibration factor", Words(_with_share(factor, ""), style="bold"))
+        rows.add_row("", f"true torque = κ · reported torque: the drive reports {_error(factor)}")
+    rows.add_row("offset", with_interval(offset["value"], offset["low"], offset["high"], "N·m"))
+    scatter = document["scatter"]
+    rows.add_row("scatter", f"p = {scatter['p_value']:.2g}" + (
+        f"; {document['spread']:.2g} times as much as stated, and counted so" if document["spread"] > 1.0 else ""))
+    if document["hysteresis_nm"] is not None:
+        rows.add_row("hysteresis", f"{document['hysteresis_nm']:+.2g} N·m, rising over falling torque")
+    else:
+        rows.add_row("hysteresis", "not known: all pairs are of one direction")
+    for pair in document["pairs"]:
+        rows.add_row("pair", f"{pair['reported_nm']:9.2f} N·m reported, {pair['reference_nm']:9.2f} N·m true,"
+                             f" {pair['residual_nm']:+.2g}, {pair['direction']}")
+    console.print(Panel(Group(rows, Words(sentence(document["reason"]))), title="torque calibration by pairs",
+                        border_style="blue"))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The page
+
+
+def write_calibration_report(document: Part, path: Path) -> Path:
+    """The page, as PDF where the name ends so; and where it went. Raises UsageError where it can't be written."""
+    return write_blocks(calibration_report(document), path)
+
+
+def calibration_report(document: Part) -> Report:
+    """Laid out as a calibration laboratory does: item, conditions, result, budget, data, date and signature."""
+    factor, inertia = document["calibration_factor"], document["inertia_kg_m2"]
+    lines = []
+    if factor is not None and inertia is not None:
+        lines = [f"J without the body {_with_share(inertia, 'kg·m²')}", f"The drive reports {_error(factor)}"]
+    return Report(
+        title="Calibration of a drive's torque",
+        subtitle=shown_date(document["date"]),
+        simulated=f"{SIMULATED}: drive and rig are simulated, nothing real turned" if document["simulated"] else "",
+        answer=AnswerBox(
+            _COLOUR.get(document["verdict"], "yellow"),
+            "No number" if factor is None else f"κ = {_with_share(factor, '')}", tuple(lines), document["verdict"],
+            sentence(document["reason"]), sentence(document["advice"])),
+        warnings=tuple(document["warnings"]),
+        sections=tuple(one for one in _sections(document) if one.blocks),
+        footer=f"tdhil {document['tdhil']}",
+    )
+
+
+def _sections(document: Part) -> Iterator[ReportSection]:
+    drive = document["drive"] or {}
+    identity = [(name, str(drive[name])) for name in ("name", "vendor", "product", "revision", "serial")
+                if name in drive]
+    settings = [(_SETTINGS.get(name, name), str(value)) for name, value in document["settings"].items()
+                if value is not None]
+    yield ReportSection("Calibrated item", (Pairs((*identity, *settings)),) if identity or settings else ())
+    yield ReportSection("Method", (Text(_METHOD),))
+    if document["calibration_factor"] is not None:
+        yield ReportSection("Result", (_results(document), Text(_result_note(document))))
+        yield ReportSection("Uncertainty budget", (_factor_budget(document), Text(_BUDGET_NOTE)))
+    if document["line"] is not None:
+        yield ReportSection("Identified over known inertia", (_picture(document), _data(document)))
+    conditions = [(Path(run["log"]).name, f"{shown_date(run['date'])}, SHA-256 {run['sha256']}")
+                  for run in document["runs"]]
+    yield ReportSection("Recordings", (Pairs(tuple(conditions)),))
+    yield ReportSection("Date and signature", (Pairs((
+        ("date of calibration", shown_date(document["date"])), ("conditions", "temperature, warm-up: ____________"),
+        ("signature", "______________________"))),))
+
+
+_SETTINGS = {"rated_torque_nm": "rated torque, N·m", "torque_count_nm": "one count of torque, N·m",
+             "gear_ratio": "gear ratio"}
+_METHOD = (
+    "The moment of inertia y was identified from the drive's reported torque and speed, without and with bodies of"
+    " known inertia b on the shaft. With the calibration factor κ, true torque T = κ T_rep, the measurement equation is"
+    " y = (J + b)/κ. The runs were fitted together with the filters of the drive's reports in common; the line over b"
+    " was fitted by generalised least squares. Evaluation of uncertainty: JCGM 100 (GUM), first order, effective"
+    " degrees of freedom after Welch and Satterthwaite."
+)
+_BUDGET_NOTE = (
+    "u(x): standard uncertainty of the input quantity, kg·m²; ν: degrees of freedom; c·u: contribution to the relative"
+    " standard uncertainty of κ and of J (sensitivity coefficient times standard uncertainty)."
+)
+
+
+def _result_note(document: Part) -> str:
+    factor = document["calibration_factor"]
+    return (f"The expanded uncertainty U is the standard uncertainty multiplied by the coverage factor k for a coverage"
+            f" probability of {100 * factor['confidence']:g} %. Of a calibrated torque, the share that comes from the"
+            " unit of speed is part of κ: κ is right for inertia and for torque over acceleration.")
+
+
+def _results(document: Part) -> Table:
+    rows = []
+    for name, key, unit in (("calibration factor κ", "calibration_factor", "1"),
+                            ("moment of inertia J", "inertia_kg_m2", "kg·m²")):
+        part = document[key]
+        dof = part["degrees_of_freedom"]
+        rows.append((name, unit, f"{part['value']:.5g}", f"{part['standard_uncertainty']:.3g}",
+                     "∞" if dof > 1e4 else f"{dof:.0f}", f"{part['coverage_factor']:.2f}",
+                     f"{0.5 * (part['high'] - part['low']):.3g}"))
+    columns = (Column("quantity", 0.26), Column("unit", 0.1), *(Column(name, 0.128, True)
+                                                               for name in ("value", "u", "ν_eff", "k", "U")))
+    return Table(columns, tuple(rows))
+
+
+def _factor_budget(document: Part) -> Table:
+    rows = []
+    for line in document["budget"]:
+        dof = line["degrees_of_freedom"]
+        rows.append((line["source"], f"{line['standard_uncertainty_kg_m2']:.3g}", line["distribution"],
+                     "∞" if dof > 1e4 else f"{dof:.0f}", f"{100 * line['of_factor']:.3f} %",
+                     f"{100 * line['of_inertia']:.3f} %"))
+    total = ("combined", "", "", "", *(
+        f"{100 * document[key]['standard_uncertainty'] / document[key]['value']:.3f} %"
+        for key in ("calibration_factor", "inertia_kg_m2")))
+    columns = (Column("input quantity", 0.36), Column("u(x), kg·m²", 0.15, True), Column("distribution", 0.13),
+               Column("ν", 0.08, True), Column("c·u of κ", 0.14, True), Column("c·u of J", 0.14, True))
+    return Table(columns, (*rows, total))
+
+
+def _data(document: Part) -> Table:
+    rows = tuple((Path(run["log"]).name, f"{run['added_kg_m2']:.5g}", f"{run['reported_kg_m2']:.5g}",
+                  f"{run['standard_uncertainty_kg_m2']:.2g}", f"{_residual(run):+.2g}")
+                 for run in document["runs"])
+    return Table((Column("recording", 0.36), *(Column(name, 0.16, True) for name in
+                                              ("b, kg·m²", "y, kg·m²", "u(y)", "residual"))), rows)
+
+
+def _residual(run: Part) -> float:
+    """Return the residual; 0 where it is rounding only, as with two runs."""
+    left = float(run["residual_kg_m2"])
+    return left if abs(left) > _ROUNDING * abs(run["reported_kg_m2"]) else 0.0
+
+
+_ROUNDING = 1e-9
+
+
+def _picture(document: Part) -> Block:
+    return Picture(partial(draw_calibration, document=document), 4.2,
+                   "Identified over known added inertia, in the drive's unit of torque; the line, its 95 % band, and"
+                   " what it leaves.")
+
+
+def draw_calibration(figure: FigureBase, document: Part) -> None:
+    """Above: the runs, the line and its 95 % band; dotted: an exact torque scale. Below: residuals."""
+    runs, line = document["runs"], document["line"]
+    added = np.array([run["added_kg_m2"] for run in runs])
+    seen = np.array([run["reported_kg_m2"] for run in runs])
+    half = 1.96 * np.array([run["standard_uncertainty_kg_m2"] for run in runs])
+    left = np.array([run["residual_kg_m2"] for run in runs])
+    x = np.linspace(min(0.0, float(added.min())), 1.08 * float(added.max()), 100)
+    y = line["intercept_kg_m2"] + line["slope"] * x
+    covariance = np.array(line["covariance"])
+    design = np.column_stack([np.ones_like(x), x])
+    band = 1.96 * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", design, covariance, design), 0.0))
+    top, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    top.fill_between(x, y - band, y + band, color=OURS, alpha=0.2, lw=0, label="95 % band")
+    top.plot(x, y, "-", color=OURS, lw=1.4, label=f"slope 1/κ = {line['slope']:.4f}")
+    top.plot(x, line["intercept_kg_m2"] + x, ":", color=QUIET, lw=1.2, label="exact torque scale")
+    top.errorbar(added, seen, half, fmt="o", color=DARK, ms=5, capsize=3, lw=1.2, label="runs")
+    top.set_ylabel("identified, kg·m²")
+    top.legend(fontsize="small", loc="best")
+    below.axhline(0.0, color=OURS, lw=1.0)
+    below.fill_between(x, -band, band, color=OURS, alpha=0.2, lw=0)
+    below.errorbar(added, left, half, fmt="o", color=DARK, ms=4, capsize=3, lw=1.0)
+    below.set(xlabel="known added inertia at the motor shaft, kg·m²", ylabel="residual,\nkg·m²")
+    for axes in (top, below):
+        axes.grid(alpha=0.3)

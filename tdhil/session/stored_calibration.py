@@ -1,0 +1,169 @@
+"""The file of a torque calibration: read, checked against the drive, kept in the log, and applied to a recording."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from drivers import PreflightRefused
+from tdhil.errors import UsageError
+
+if TYPE_CHECKING:
+    from tdhil.calibration import StoredCalibration
+    from tdhil.config import Rig
+    from tdhil.recording import Recording
+
+KEPT: Final = "torque_calibration"
+"""Key of the log's configuration."""
+VALID_DAYS: Final = 365.0
+"""Of a calibration, where rig.yaml says nothing else."""
+_LARGEST_FILE = 1 << 20
+_AGAIN = "Make one with: tdhil calibrate torque without.mcap with.mcap --added J --save calibration.json"
+
+
+def load_calibration(path: Path) -> dict[str, Any]:
+    """The document of a calibration. Raises UsageError for a file that is none."""
+    from tdhil.calibration import CalibrationUnusable, StoredCalibration
+
+    if not path.is_file():
+        raise UsageError("there is no such file", where=str(path), next_step=_AGAIN)
+    try:
+        if path.stat().st_size > _LARGEST_FILE:
+            raise ValueError("too large")
+        document = json.loads(path.read_text(encoding="utf-8"))
+        StoredCalibration.of(document)
+    except CalibrationUnusable as error:
+        raise UsageError(str(error), where=str(path), next_step=_AGAIN) from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise UsageError(f"is no JSON ({str(error)[:80]})", where=str(path), next_step=_AGAIN) from None
+    return dict(document)
+
+
+def save_calibration(document: Mapping[str, Any], path: Path) -> None:
+    """Write the document of a calibration that stands, never over a file. Raises UsageError."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            json.dump(document, file, ensure_ascii=False, indent=2, allow_nan=False)
+            file.write("\n")
+    except FileExistsError:
+        raise UsageError("is there already, and is left as it is", where=f"--save {path}",
+                         next_step="Name another file, or move that one away") from None
+    except OSError as error:
+        raise UsageError(f"can't be written ({error.strerror or error})", where=f"--save {path}") from error
+
+
+def calibration_of_rig(rig: Rig | None) -> dict[str, Any] | None:
+    """The calibration that rig.yaml names, for the log. Raises UsageError for a file that is none."""
+    if rig is None or rig.drive_data.torque_calibration is None:
+        return None
+    document = load_calibration(rig.folder / rig.drive_data.torque_calibration)
+    return document | {"valid_days": rig.drive_data.calibration_valid_days}
+
+
+def refuse_another_drive(run: Mapping[str, Any], identity: Mapping[str, Any]) -> None:
+    """Before motion: the calibration in the log's configuration is of this drive. Raises PreflightRefused."""
+    found = stored_of(run)
+    if found is None:
+        return
+    settings = drive_settings({**run, "identity": identity})
+    if other := _other(found, identity, settings):
+        raise PreflightRefused(f"the torque calibration is of another drive: {other}", where=KEPT,
+                               next_step="Calibrate this drive, or take torque_calibration out of rig.yaml")
+
+
+def stored_of(run: Mapping[str, Any]) -> StoredCalibration | None:
+    """The calibration of a log's configuration; None for none, or what is none."""
+    from tdhil.calibration import CalibrationUnusable, StoredCalibration
+
+    document = run.get(KEPT)
+    if document is None:
+        return None
+    try:
+        return StoredCalibration.of(document)
+    except CalibrationUnusable:
+        return None
+
+
+def other_drive(document: Mapping[str, Any], drive: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
+    """Return how the drive of a calibration differs from this one, in words; '' if it does not, or is not known."""
+    found = stored_of({KEPT: document})
+    return "" if found is None else _other(found, drive, settings)
+
+
+def with_calibration(run: Mapping[str, Any], recording: Recording, document: Mapping[str, Any], where: str,
+                     ) -> dict[str, Any]:
+    """The configuration with another calibration, for a replay. Raises UsageError where it is of another drive."""
+    changed = {**run, KEPT: dict(document)}
+    found = stored_of(changed)
+    if found is None:
+        raise UsageError("is no calibration", where=where, next_step=_AGAIN)
+    if other := _other(found, drive_identity(run), drive_settings(run, recording)):
+        raise UsageError(f"is of another drive: {other}", where=where, next_step="Name the calibration of this drive")
+    if found.simulated != recording.simulated:
+        raise UsageError("is of a simulated drive, and this recording is not" if found.simulated else
+                         "is of a real drive, and this recording is simulated", where=where,
+                         next_step="Name the calibration of this drive")
+    return changed
+
+
+def without_calibration(run: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration with torque in the drive's own unit."""
+    return {name: value for name, value in run.items() if name != KEPT}
+
+
+@dataclass(frozen=True)
+class AppliedCalibration:
+    """``recording`` in calibrated N·m; ``day``: of the calibration, '' where none was applied."""
+
+    recording: Recording
+    day: str = ""
+    warnings: tuple[str, ...] = ()
+
+
+def apply_calibration(recording: Recording, run: Mapping[str, Any]) -> AppliedCalibration:
+    """Apply the log's calibration to a recording: the same for a live run and for its replay."""
+    if run.get(KEPT) is None:
+        return AppliedCalibration(recording)
+    found = stored_of(run)
+    if found is None:
+        unread = "the torque calibration in the log can't be read; it was not applied"
+        return AppliedCalibration(recording, "", (unread,))
+    if recording.impedance is not None:
+        own = ("the torque calibration was not applied: a measured impedance, and the gains from it, are in the drive's"
+               " own unit of torque")
+        return AppliedCalibration(recording, "", (own,))
+    if other := _other(found, drive_identity(run), drive_settings(run, recording)):
+        return AppliedCalibration(recording, "", (
+            f"the torque calibration of {found.day} was not applied, since it is of another drive: {other}",))
+    document = run[KEPT]
+    days = document.get("valid_days") if isinstance(document, Mapping) else None
+    old = found.too_old(run.get("started"), float(days) if isinstance(days, int | float) else VALID_DAYS)
+    said = f"the torque calibration of {found.day} is {old} (calibration_valid_days); calibrate again"
+    return AppliedCalibration(found.applied(recording), found.day, (said,) if old else ())
+
+
+def drive_settings(run: Mapping[str, Any], recording: Recording | None = None) -> dict[str, Any]:
+    """Return what the drive's unit of torque depends on, as far as the log states it."""
+    bench, profile = _part(run.get("bench")), _part(run.get("profile"))
+    found = {"profile": profile.get("name"),
+             "rated_torque_nm": _part(bench.get("drive_data")).get("rated_torque_nm")}
+    if recording is not None:
+        found |= {"torque_count_nm": recording.torque_resolution_nm or None, "gear_ratio": recording.gear_ratio}
+    return found
+
+
+def drive_identity(run: Mapping[str, Any], _recording: Recording | None = None) -> dict[str, Any]:
+    """Name and numbers of the drive; empty for a trace."""
+    identity = _part(run.get("identity"))
+    return {name: identity[name] for name in ("name", "vendor", "product", "serial") if name in identity}
+
+
+def _other(found: StoredCalibration, drive: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
+    return found.another_drive(drive, settings)
+
+
+def _part(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
