@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from math import sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,45 +14,71 @@ from profiles.quantities import RPM, TIME, TORQUE
 from tdhil.cli.arguments import add_option, amount, share
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
-from tdhil.errors import ExitCode, UsageError
+from tdhil.errors import ExitCode, MessageCode, UsageError
 
 if TYPE_CHECKING:
     from profiles import Profile
     from tdhil.report import TunedFor
-    from tdhil.soft_torque import DrillString, DriveSetting, Moved, SpeedController, TuneCase, Tuning
+    from tdhil.soft_torque import (
+        DrillString,
+        DriveSetting,
+        Moved,
+        RequiredMargins,
+        SpeedController,
+        TuneCase,
+        Tuning,
+    )
 
     Ends = tuple[Moved, Moved]
 
 IDENTIFIED = ("inertia_kg_m2", "viscous_nm_s_rad", "coulomb_nm", "speed_lag_s", "torque_lag_s", "gear_ratio")
-"""Of the result, that `tdhil evaluate` needs to know of the rig."""
+"""Keys of the result that `tdhil evaluate` needs."""
+CONTROL_PERIOD_S, DEAD_TIME_PERIODS = 0.002, 10.0
+"""Assumed control period of an inverter's speed loop, s; and the dead-time reserve in such periods."""
+STATED_LAG_TOLERANCE, ASSUMED_LAG_TOLERANCE = 0.1, 0.5
+"""Relative uncertainty of each lag that was not measured."""
+IDENTIFIED_DRAWS, IDENTIFIED_SEED = 20, 3
+MOST_IMPEDANCE_SPREAD = 0.15
+"""Relative half-width of ζ up to which an identified pipe counts as known."""
 ASSUMED_LAGS_S = (0.020, 0.010, 0.003)
-"""Speed filter, torque loop and sampling of an inverter in vector control: of that order, not measured."""
+"""Speed filter, torque loop and sampling of an inverter in vector control, s: typical, not measured."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of tune."""
     parser.add_argument("result", type=Path, metavar="result.json|run.mcap",
-                        help="what tdhil identify --json wrote, or the log of a run")
+                        help="result of tdhil identify --json, or the log of a run")
     parser.add_argument("--string", type=Path, metavar="string.yaml",
-                        help="drill string, bottom and bit (docs/soft_torque.md); without it, k and J_L as the result "
-                        "has them, of a shaft that was identified as compliant")
+                        help="drill string, bottom and bit (reference/string.md); without it, k and J_L of the result "
+                             "are used, for a shaft that was identified as compliant")
     parser.add_argument("--impedance", type=Path, metavar="z.json|z.mcap",
-                        help="what identify --impedance measured: the drive's present gains beside the others, and its "
+                        help="result of identify --impedance: adds the drive's present gains for comparison, and its "
                         "inner lags")
     parser.add_argument("--loop", choices=("drive", "bus"), default="drive",
-                        help="where the speed loop runs: in the drive (default), or in a host over the bus")
+                        help="place of the speed loop: in the drive (default), or in a host over the bus")
     parser.add_argument("--inner-lags", type=amount(TIME), nargs="+", metavar="S",
                         help="time constants inside the drive's speed loop (default 0.02 0.01 0.003, assumed)")
-    parser.add_argument("--phase-margin", type=float, default=60.0, metavar="DEG", help="of the stiff controller (60)")
-    parser.add_argument("--a", type=float, metavar="A", help="softness, P = ζ/a (default: the one that damps most)")
+    parser.add_argument("--present", type=float, nargs=2, metavar=("P", "I"),
+                        help="gains in the drive now, N·m·s/rad and N·m/rad at the motor shaft")
+    parser.add_argument("--phase-margin", type=float, default=60.0, metavar="DEG",
+                        help="phase margin of the stiff controller (default 60)")
+    parser.add_argument("--margins", nargs=3, metavar=("DEG", "DB", "S"),
+                        help="phase margin, gain margin and dead-time reserve that every sampled machine and string "
+                        "keeps (default 30 6 and ten control periods: 20ms for a loop in the drive)")
+    parser.add_argument("--a", type=float, metavar="A",
+                        help="softness, P = ζ/a (default: the one with the lowest critical speed)")
     parser.add_argument("--compensate", type=share, metavar="SHARE",
-                        help="of J that the controller gives back (default: what damps most, with a reserve)")
-    parser.add_argument("--profile", metavar="NAME", help="of the drive, for its parameters (default: the result's)")
-    parser.add_argument("--rated-torque", type=amount(TORQUE), metavar="NM", help="of the motor, for gains in %%")
-    parser.add_argument("--rated-speed", type=amount(RPM), metavar="RPM", help="of the motor, for gains in %%")
-    parser.add_argument("--no-simulation", action="store_true", help="without critical speeds, which take a minute")
+                        help="share of J to compensate (default: the one with the lowest critical speed)")
+    parser.add_argument("--profile", metavar="NAME",
+                        help="profile of the drive, for its parameters (default: the result's)")
+    parser.add_argument("--rated-torque", type=amount(TORQUE), metavar="NM",
+                        help="rated torque of the motor, for gains in %%")
+    parser.add_argument("--rated-speed", type=amount(RPM), metavar="RPM",
+                        help="rated speed of the motor, for gains in %%")
+    parser.add_argument("--no-simulation", action="store_true", help="omit the critical speeds")
     add_option(parser, OPTION["json"])
-    parser.add_argument("--report", type=Path, metavar="FILE", help="with pictures: tune.html, or tune.pdf")
+    parser.add_argument("--report", type=Path, metavar="FILE", help="write a report with pictures: tune.html, or "
+                                                                    "tune.pdf")
     parser.set_defaults(run=run)
 
 
@@ -104,19 +130,29 @@ def _check(namespace: argparse.Namespace) -> None:
     ):
         value = getattr(namespace, name)
         if value is not None and not low <= value <= high:
-            raise UsageError(f"{value:g}: must be {wanted}", where=f"--{name.replace('_', '-')}")
+            raise UsageError(f"{value:g}: must be {wanted}", where=f"--{name.replace('_', '-')}",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
+    for value in namespace.present or ():
+        if not 0.0 < value < 1e9:
+            raise UsageError(f"{value:g}: must be a positive number", where="--present",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
+    if namespace.present is not None and namespace.impedance is not None:
+        raise UsageError("--present and --impedance both state the present gains", where="--present",
+                         next_step="Leave one of them out", entry=MessageCode.VALUE_NOT_ALLOWED)
     for lag in namespace.inner_lags or ():
         if not 0.0 <= lag <= 5.0:
-            raise UsageError(f"{lag:g}: must be a time from 0 to 5 s", where="--inner-lags")
+            raise UsageError(f"{lag:g}: must be a time from 0 to 5 s", where="--inner-lags",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
 
 
 def read_result(path: Path) -> Mapping[str, Any]:
-    """The result's document: as --json wrote it, or identified again from the log."""
+    """Return the result's document, from --json or identified again from the log."""
     from tdhil.session import is_log
 
     if not path.is_file():
-        raise UsageError("there is no such file", where=str(path),
-                         next_step="Name a result.json of tdhil identify --json, or a run.mcap")
+        raise UsageError("this file does not exist", where=str(path),
+                         next_step="Name a result.json of tdhil identify --json, or a run.mcap",
+                         entry=MessageCode.FILE_NOT_FOUND)
     if is_log(path):
         from tdhil.api import identify, read
 
@@ -125,16 +161,18 @@ def read_result(path: Path) -> Mapping[str, Any]:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise UsageError(f"is neither a log nor JSON ({str(error)[:80]})", where=str(path),
-                         next_step="Name a result.json of tdhil identify --json, or a run.mcap") from None
+                         next_step="Name a result.json of tdhil identify --json, or a run.mcap",
+                         entry=MessageCode.WRONG_KIND_OF_FILE) from None
     if not isinstance(document, dict) or not {"inertia_kg_m2", "gear_ratio", "verdict"} <= document.keys():
-        raise UsageError("is JSON, but no result of tdhil identify", where=str(path),
-                         next_step="tdhil identify … --json > result.json")
+        raise UsageError("is JSON, but not a result of tdhil identify", where=str(path),
+                         next_step="Write one with: tdhil identify --json > result.json",
+                         entry=MessageCode.WRONG_KIND_OF_FILE)
     return document
 
 
 def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[TuneCase, str]:
-    """All at the main shaft, and where the lags come from. Raises TuningRefused where the result has no J."""
-    from tdhil.soft_torque import Interval, TopDrive, TuneCase, TuningRefused
+    """Return the case at the main shaft, and the source of the lags. Raises TuningRefused without J."""
+    from tdhil.soft_torque import Interval, SpeedController, TopDrive, TuneCase, TuningRefused
 
     measured = None if namespace.impedance is None else _impedance(namespace.impedance, result)
     inertia = result["inertia_kg_m2"]
@@ -142,52 +180,113 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     if not stands or not all(_is_number(inertia.get(key)) for key in ("value", "low_total", "high_total")):
         raise TuningRefused(
             f"the result has no J to tune for ({result['verdict']})", where=str(namespace.result),
-            next_step="Identify again with a motion that tells it" if not result.get("impedance") else
-            "It is of a run that measured the drive's own impedance: name the result of one that tells J, and this "
-            f"one as --impedance {namespace.result}")
+            next_step="Identify again with a motion that identifies J" if not result.get("impedance") else
+            "It is from a measurement of the drive's own impedance: name a result with J, and this one with "
+            f"--impedance {namespace.result}", entry=MessageCode.NO_INERTIA_TO_TUNE)
     square = _positive(result, "gear_ratio", namespace) ** 2
     low, value, high = (square * float(inertia[key]) for key in ("low_total", "value", "high_total"))
     if not 0.0 < low <= value <= high:
-        raise TuningRefused("J's interval reaches down to nothing", where=str(namespace.result),
-                            next_step="Identify again, for longer")
-    string, of_string = _string(result, namespace, square**0.5)
+        raise TuningRefused("the interval of J reaches down to zero", where=str(namespace.result),
+                            next_step="Identify again, for longer", entry=MessageCode.NO_INERTIA_TO_TUNE)
+    string, of_string, drawn = _string(result, namespace, square**0.5)
     lags, of_lags, lags_from = _lags(result, namespace, measured)
     drive = TopDrive(value, square * _estimate(result, "viscous_nm_s_rad"),
                      square**0.5 * _estimate(result, "coulomb_nm"), lags)
     present, of_present = (None, ()) if measured is None else _present(measured, square)
+    if namespace.present is not None:
+        present = SpeedController(square * namespace.present[0], square * namespace.present[1])
     case = TuneCase(string, drive, Interval(value, low, high), namespace.phase_margin, namespace.a,
-                    namespace.compensate, present, (*of_string, *of_lags, *of_present))
+                    namespace.compensate, present, (*of_string, *of_lags, *of_present),
+                    required=_required(result, namespace), string_draws=drawn,
+                    lag_tolerance=STATED_LAG_TOLERANCE if namespace.inner_lags else ASSUMED_LAG_TOLERANCE)
     return case, lags_from
+
+
+def _required(result: Mapping[str, Any], namespace: argparse.Namespace) -> RequiredMargins:
+    """Return the requested margins, or the usual ones: ten control periods of dead time."""
+    from tdhil.soft_torque import RequiredMargins
+
+    if namespace.margins is not None:
+        try:
+            degrees, decibels = (float(one) for one in namespace.margins[:2])
+            seconds = amount(TIME)(namespace.margins[2])
+        except (ValueError, argparse.ArgumentTypeError) as error:
+            raise UsageError(str(error), where="--margins", next_step="For example --margins 30 6 20ms",
+                             entry=MessageCode.VALUE_NOT_ALLOWED) from None
+        if not (0.0 <= degrees <= 90.0 and 0.0 <= decibels <= 40.0 and 0.0 <= seconds <= 10.0):
+            raise UsageError("must be 0 to 90 degrees, 0 to 40 dB and 0 to 10 s", where="--margins",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
+        return RequiredMargins(degrees, decibels, seconds)
+    period: Any = (result.get("cycle") or {}).get("period_s")
+    control_s = float(period) if namespace.loop == "bus" and _is_number(period) else CONTROL_PERIOD_S
+    return RequiredMargins(dead_time_s=DEAD_TIME_PERIODS * control_s)
 
 
 def _string(
     result: Mapping[str, Any], namespace: argparse.Namespace, ratio: float
-) -> tuple[DrillString, tuple[Ends, ...]]:
-    """As its file has it; or a spring with a mass, as identified, and both ends of what is open of that."""
-    from tdhil.soft_torque import Moved, load_string, spring_and_mass
+) -> tuple[DrillString, tuple[Ends, ...], tuple[DrillString, ...]]:
+    """Return the string, both ends of the interval of each of its values, and random draws of all of them.
+
+    The string comes from its file. Without one it is identified: a pipe if k, f and J_L together show one, else a
+    spring with a mass.
+    """
+    from tdhil.soft_torque import Moved, identified_string, load_string, spring_and_mass
 
     if namespace.string is not None:
-        return load_string(namespace.string), ()
+        return load_string(namespace.string), (), ()
     shaft = result.get("compliant") or {}
     spring, swing = (_three(shaft.get(key)) for key in ("stiffness_nm_rad", "antiresonance_hz"))
     if spring is None or swing is None:
-        why = ("leaves the spring's stiffness or its swing open" if shaft else "is of a rigid shaft")
+        why = ("does not determine the spring's stiffness or load" if shaft else "is of a rigid shaft")
         raise UsageError(f"--string is missing, and the result {why}", where=str(namespace.result),
-                         next_step="--string string.yaml (docs/soft_torque.md) names the pipe and what hangs on it")
+                         next_step="--string string.yaml (reference/string.md) describes the pipe and its load",
+                         entry=MessageCode.STRING_MISSING)
     loss = _three(shaft.get("damping_nm_s_rad")) or (0.0, 0.0, 0.0)
-    values = [(one[0], one[1], one[2]) for one in (spring, swing, loss)]
+    load = _three(shaft.get("load_inertia_kg_m2")) if result.get("model") == "string" else None
+    values = [spring, swing, loss, *([load] if load is not None else [])]
+    name = f"k and J_L as identified ({result.get('model')})"
 
-    def string(*ends: int) -> DrillString:
-        k, hertz, damping = (values[at][end] for at, end in enumerate(ends))
-        return spring_and_mass(ratio**2 * k, hertz, ratio**2 * damping,
-                               f"k and J_L as identified ({result.get('model')})")
+    def pipe(k: float, hertz: float, damping: float, inertia: float) -> DrillString | None:
+        return identified_string(ratio**2 * k, hertz, ratio**2 * inertia, ratio**2 * damping, name)
 
-    moved = ((0, 1, 1), (2, 1, 1)), ((1, 0, 1), (1, 2, 1)), ((1, 1, 0), (1, 1, 2))
-    return string(1, 1, 1), tuple((Moved(string=string(*low)), Moved(string=string(*high))) for low, high in moved)
+    def string(numbers: Sequence[float]) -> DrillString:
+        found = pipe(*numbers) if len(numbers) == 4 else None
+        return found or spring_and_mass(ratio**2 * numbers[0], numbers[1], ratio**2 * numbers[2], name)
+
+    middle = [one[1] for one in values]
+    if load is not None and not _known_pipe(values, pipe):
+        values, middle = values[:3], middle[:3]
+
+    def moved(at: int, end: int) -> DrillString:
+        return string([*middle[:at], values[at][end], *middle[at + 1 :]])
+
+    ends = tuple((Moved(string=moved(at, 0)), Moved(string=moved(at, 2))) for at in range(len(values)))
+    return string(middle), ends, tuple(string(one) for one in _drawn(values))
+
+
+def _drawn(values: Sequence[tuple[float, float, float]]) -> list[list[float]]:
+    """Draws of independent normal estimates: (low, value, high) of each is its 95 % interval."""
+    import numpy as np
+
+    random = np.random.default_rng(IDENTIFIED_SEED)
+    return [[max(1e-12, value + z / 1.96 * (high - value if z > 0.0 else value - low))
+             for (low, value, high), z in zip(values, random.standard_normal(len(values)), strict=True)]
+            for _ in range(IDENTIFIED_DRAWS)]
+
+
+def _known_pipe(
+    values: Sequence[tuple[float, float, float]], pipe: Callable[..., DrillString | None]
+) -> bool:
+    """Return whether every draw of k, f and J_L is a pipe, and all have about the same ζ."""
+    import numpy as np
+
+    found = [pipe(*one) for one in _drawn(values)]
+    known = [one.impedance_nm_s_rad for one in found if one is not None]
+    return len(known) == len(found) and 1.96 * float(np.std(known)) <= MOST_IMPEDANCE_SPREAD * float(np.mean(known))
 
 
 def _three(part: Any) -> tuple[float, float, float] | None:
-    """(low, value, high) of an estimate that is bounded and positive."""
+    """Return (low, value, high) of an estimate that is bounded and positive."""
     if not isinstance(part, dict) or not all(_is_number(part.get(key)) for key in ("low", "value", "high")):
         return None
     low, value, high = (float(part[key]) for key in ("low", "value", "high"))
@@ -195,28 +294,30 @@ def _three(part: Any) -> tuple[float, float, float] | None:
 
 
 def _impedance(path: Path, result: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The section `impedance` of a result, valid and of the same shaft. Raises UsageError, and TuningRefused."""
+    """Return the section `impedance` of a result for the same shaft. Raises UsageError and TuningRefused."""
     from tdhil.soft_torque import TuningRefused
 
     document = read_result(path)
     found = document.get("impedance")
     if not isinstance(found, dict):
-        raise UsageError("the drive's own impedance wasn't measured there", where=f"--impedance {path}",
-                         next_step="tdhil identify --impedance offset … --json > z.json")
+        raise UsageError("this run did not measure the drive's own impedance", where=f"--impedance {path}",
+                         next_step="tdhil identify --impedance offset … --json > z.json",
+                         entry=MessageCode.WRONG_KIND_OF_FILE)
     if found.get("verdict") != "valid":
         raise TuningRefused(f"the drive's own impedance is {found.get('verdict')}: {found.get('reason')}",
                             where=f"--impedance {path}", next_step=str(found.get("advice", "")))
     if document["gear_ratio"] != result["gear_ratio"]:
         raise UsageError(f"was measured with a gear ratio of {document['gear_ratio']:g}, and J with "
-                         f"{result['gear_ratio']:g}", where=f"--impedance {path}")
+                         f"{result['gear_ratio']:g}", where=f"--impedance {path}", entry=MessageCode.WRONG_KIND_OF_FILE)
     for key in ("gain_nm_s_rad", "integral_nm_rad", "torque_lag_s", "speed_filter_s"):
         if not isinstance(found.get(key), dict) or not _is_number(found[key].get("value")):
-            raise UsageError(f"{key} is no number", where=f"--impedance {path}")
+            raise UsageError(f"{key} is not a number", where=f"--impedance {path}",
+                             entry=MessageCode.WRONG_KIND_OF_FILE)
     return found
 
 
 def _present(measured: Mapping[str, Any], square: float) -> tuple[SpeedController, tuple[Ends, ...]]:
-    """What stands in the drive, and both ends of each gain."""
+    """Return the present controller of the drive, and both ends of each gain."""
     from tdhil.soft_torque import Moved, SpeedController
 
     gain, integral = ((_ends(measured[key], square)) for key in ("gain_nm_s_rad", "integral_nm_rad"))
@@ -228,7 +329,7 @@ def _present(measured: Mapping[str, Any], square: float) -> tuple[SpeedControlle
 
 
 def _ends(part: Mapping[str, Any], times: float = 1.0) -> tuple[float, float, float]:
-    """(low, value, high), none below 0; an end that isn't there is the value."""
+    """Return (low, value, high), none below 0; a missing end is the value."""
     value = max(0.0, float(part["value"]))
     low, high = (float(part[key]) if _is_number(part.get(key)) else value for key in ("low", "high"))
     return times * max(0.0, min(low, value)), times * value, times * max(high, value)
@@ -237,22 +338,23 @@ def _ends(part: Mapping[str, Any], times: float = 1.0) -> tuple[float, float, fl
 def _lags(
     result: Mapping[str, Any], namespace: argparse.Namespace, measured: Mapping[str, Any] | None
 ) -> tuple[tuple[float, ...], tuple[Ends, ...], str]:
-    """Time constants in the loop, both ends of what is open of them, and who says so."""
+    """Return the time constants in the loop, both ends of their intervals, and their source."""
     inner = list(namespace.inner_lags or ASSUMED_LAGS_S)
     axes: list[list[float]] = []
-    said = "as stated" if namespace.inner_lags else "assumed: nobody measured them"
+    said = "as stated" if namespace.inner_lags else "assumed, not measured"
     if measured is not None and not namespace.inner_lags:
         inner, axes = _measured_lags(measured)
         said = "as measured (--impedance)"
     if namespace.loop == "drive":
         if not any(inner):
-            raise UsageError("no lag at all in the drive's loop: then nothing limits its gains", where="--inner-lags",
-                             next_step="State the filter of its speed, its torque loop and its sampling")
+            raise UsageError("there is no lag in the drive's loop, so nothing limits its gains", where="--inner-lags",
+                             next_step="State the filter of its speed, its torque loop and its sampling",
+                             entry=MessageCode.LAGS_MISSING)
         return _moved_lags(inner, axes, said)
     reported = result.get("speed_lag_s")
     if not isinstance(reported, dict) or not _is_number(reported.get("value")):
-        raise UsageError("the result doesn't say how late the reported speed is", where="--loop bus",
-                         next_step="Identify with a multisine, which tells it")
+        raise UsageError("the result has no lag of the reported speed", where="--loop bus",
+                         next_step="Identify with a multisine, which identifies it", entry=MessageCode.LAGS_MISSING)
     period: Any = (result.get("cycle") or {}).get("period_s")
     waiting = 1.5 * float(period) if _is_number(period) else 0.0
     low, late, high = _ends(reported)
@@ -265,9 +367,9 @@ def _lags(
 
 
 def _measured_lags(measured: Mapping[str, Any]) -> tuple[list[float], list[list[float]]]:
-    """Of the speed, of the torque; and the main axes of what is open of them, as far as 95 % goes along each.
+    """Return the lags of speed and torque, and the main axes of their 95 % coverage region.
 
-    Their sum is known better than either: from its half-width follows how both hang together.
+    Their sum is known better than each: its half-width gives their correlation.
     """
     import numpy as np
 
@@ -303,12 +405,13 @@ def _is_number(value: Any) -> bool:
 def _positive(result: Mapping[str, Any], key: str, namespace: argparse.Namespace) -> float:
     value = result[key]
     if not _is_number(value) or value <= 0.0:
-        raise UsageError(f"{key} is no positive number", where=str(namespace.result))
+        raise UsageError(f"{key} is not a positive number", where=str(namespace.result),
+                         entry=MessageCode.WRONG_KIND_OF_FILE)
     return float(value)
 
 
 def _estimate(result: Mapping[str, Any], key: str) -> float:
-    """0 where the result doesn't have it, or has it negative."""
+    """Return an estimate; 0 if the result does not have it, or it is negative."""
     part = result.get(key)
     value = part.get("value") if isinstance(part, dict) else None
     return max(0.0, float(value)) if isinstance(value, int | float) else 0.0
@@ -337,10 +440,14 @@ def _tuned_for(
     if not namespace.inner_lags and namespace.impedance is None:
         warnings.append("the lags inside the loop are assumed; they decide how much of J can be compensated: state "
                         "them with --inner-lags")
-    if namespace.string is None:
-        warnings.append("|r|, a and what swings above the lowest mode rest on a spring that is taken to weigh a tenth "
-                        "of its load, and to damp by 0.01 at the least: name the pipe in a string.yaml for them, and "
-                        "the bit for critical speeds")
+    if namespace.string is None and not tuning.case.string.supposed:
+        warnings.append(f"the pipe is the one that k, f and J_L as identified have in common, ζ = "
+                        f"{tuning.case.string.impedance_nm_s_rad:.4g} N·m·s/rad; name the bit in a string.yaml for "
+                        "critical speeds")
+    elif namespace.string is None:
+        warnings.append("|r|, a and the modes above the lowest one assume a spring with a tenth of the mass of its "
+                        "load and a damping of at least 0.01: describe the pipe in a string.yaml for better values, "
+                        "and the bit for critical speeds")
     elif tuning.case.string.bit is None:
         warnings.append("no bit is stated in string.yaml: critical speeds need one")
     return TunedFor(str(namespace.result), bool(result.get("simulated")),

@@ -1,4 +1,4 @@
-"""What came of a virtual string on a drive: as a document for machines, on a terminal, and as a page with pictures."""
+"""Result of a virtual string on a drive: as a document for machines, on a terminal, and as a page with pictures."""
 
 from __future__ import annotations
 
@@ -45,7 +45,11 @@ def evaluation_document(
         },
         "critical_rpm": None if found.critical_rpm is None else asdict(found.critical_rpm),
         "predicted_critical_rpm": asdict(prediction.cure_rpm),
-        "least_damping": None if found.damping is None else {"value": found.damping, "hertz": found.damped_hz},
+        "least_damping": None if found.damping is None else {
+            "value": found.damping, "hertz": found.damped_hz,
+            "low": None if found.damping_interval is None else found.damping_interval.low,
+            "high": None if found.damping_interval is None else found.damping_interval.high,
+        },
         "predicted_least_damping": asdict(prediction.least_damping),
         "ramp_rpm": found.ramp_rpm,
         "trials": [asdict(one) for one in found.trials],
@@ -84,6 +88,13 @@ def print_evaluation(document: Mapping[str, Any], console: PlainConsole) -> None
     console.print(names_and_texts((head, *_rows(document))))
 
 
+def _damping(part: Part) -> str:
+    """With its 95 % interval; a document from before there was one has none."""
+    if part.get("low") is None or part.get("high") is None:
+        return f"{part['value']:.3f}"
+    return f"{part['value']:.3f} ({part['low']:.3f} to {part['high']:.3f})"
+
+
 def _rows(document: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "why", document["reason"]
     critical, predicted = document["critical_rpm"], document["predicted_critical_rpm"]
@@ -94,7 +105,7 @@ def _rows(document: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     damping, expected = document["least_damping"], document["predicted_least_damping"]
     told = f"tune: {expected['value']:.3f} ({expected['low']:.3f} to {expected['high']:.3f})"
     yield "least damping", (
-        f"not seen; {told}" if damping is None else f"{damping['value']:.3f} at {damping['hertz']:.3f} Hz; {told}")
+        f"not seen; {told}" if damping is None else f"{_damping(damping)} at {damping['hertz']:.3f} Hz; {told}")
     rms = document["torque_rms_nm"]
     yield "torque at the top, rms", ", ".join(
         f"{value:.0f} N·m {what}" for what, value in rms.items() if value is not None) or "not seen"
@@ -190,7 +201,7 @@ def _beside(document: Part) -> Iterator[tuple[str, str, str]]:
            f"{cure['value']:.0f} ({cure['low']:.0f} to {cure['high']:.0f})")
     damping, expected = document["least_damping"], document["predicted_least_damping"]
     yield ("least damping of the lowest modes",
-           "not seen" if damping is None else f"{damping['value']:.3f} at {damping['hertz']:.3f} Hz",
+           "not seen" if damping is None else f"{_damping(damping)} at {damping['hertz']:.3f} Hz",
            f"{expected['value']:.3f} ({expected['low']:.3f} to {expected['high']:.3f})")
     for what, value in document["torque_rms_nm"].items():
         yield f"torque at the top, rms, {what}, N·m", "not seen" if value is None else f"{value:.0f}", "–"

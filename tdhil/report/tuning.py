@@ -20,9 +20,12 @@ from tdhil.report.document import SIMULATED
 from tdhil.report.html import write_blocks
 from tdhil.soft_torque import (
     BAND_HZ,
+    HIGHEST_NOISY_RPM,
+    NOISY_RESOLUTION,
     RPM,
     Begin,
     CriticalSpeeds,
+    DrawnValues,
     DriveSetting,
     Interval,
     SimulationTrace,
@@ -42,20 +45,38 @@ if TYPE_CHECKING:
 Part = Mapping[str, Any]
 
 _WHAT = {
-    "present": "what stands in the drive now, as its own impedance was measured",
-    "stiff": "the stiffest that keeps its phase margin",
-    "soft": "P = ζ/a, I = ω²J: rotor and I tuned to the string's lowest mode",
-    "compensated": "the same, part of the rotor's inertia given back",
+    "present": "the gains in the drive now, measured or typed",
+    "stiff": "the stiffest PI that keeps its phase margin",
+    "soft": "P = ζ/a, I = (φω)² J, with the lowest critical speed that the margins allow",
+    "compensated": "the same, with a part of the rotor's inertia compensated",
     "broadband": "near ζ over more than one mode, as far as lags and J's interval allow",
 }
+SIMULATION_ERROR_RPM, SIMULATION_ERROR_SHARE = 0.5, 0.015
+"""Of a critical speed: half of the search's step, and what the tick and the length of the simulation move it by
+(the stiff loop of the reference case: 182 for 183; collars as sections: 1.5 %)."""
 _COLOURS = {"present": "0.25", "stiff": "#c2410c", "soft": "#1f5fa8", "compensated": "#1a7f37", "broadband": "#7c3aed"}
-_CRITICAL = ("cure", "start", "onset")
-_IN_BRACKETS = "over the 95 % interval of J, and of all else that was measured; the gains as they are"
+_CRITICAL = ("cure", "start")
+_IN_BRACKETS = "95 % interval over J, string, lags and bit drawn together; ψ: over J alone, the string as stated"
 _MEANT = {
     "cure": "lowest set speed from which a stuck bit ends turning, the top at full speed",
-    "start": "the same after a ramp from rest",
-    "onset": "set speed, falling from rotation, at which the bit first sticks",
+    "start": "lowest set speed at which the bit turns after a ramp from rest",
 }
+_EXPLAINED = {
+    "P, I, J_c": "gains in N·m·s/rad, N·m/rad and kg·m², at the main shaft and at the motor shaft",
+    "critical": "lowest set speed from which a stuck bit, under bit noise, ends turning",
+    "by ramp": "the same after a ramp of the set speed from rest",
+    "linear": "mean speed below which steady rotation is unstable, without noise",
+    "phase margin": "phase that the loop with the string on it may lose; this and the next two: the least of all "
+                    "sampled machines and strings",
+    "gain margin": "change of all gains that makes the loop unstable; 6 dB is a factor of 2",
+    "dead time": "further dead time in the loop that makes it unstable",
+    "a, φ": "softness and frequency factor: P = ζ/a, I = (φω)² (J − J_c)",
+    "|r|, mean": f"share of a wave that the top sends back, 1 is a wall: at the lowest mode, and over "
+                 f"{BAND_HZ[0]:g} to {BAND_HZ[1]:g} Hz",
+    "damping": "damping ratio of the least damped of the lowest modes",
+    "J wrong": "damping and critical speed without noise if J is believed wrongly by as much",
+}
+_OF_SPEEDS = ("critical", "by ramp", "linear")
 
 
 @dataclass(frozen=True)
@@ -121,9 +142,14 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
         "critical_speeds": None if search is None else {
             "meant": dict(_MEANT), "bit": "as stated in string.bit: they hold for it alone",
             "resolution_rpm": search.resolution_rpm, "highest_rpm": search.highest_rpm,
-            "start_ramp_rpm_s": search.start_ramp_rpm_s, "onset_from_rpm": search.onset_from_rpm,
-            "onset_fall_rpm_s": search.onset_fall_rpm_s,
+            "start_ramp_rpm_s": search.start_ramp_rpm_s,
+            "under_noise": {
+                "noise_nm": string.bit.noise_nm if string.bit else 0.0, "draws": len(tuning.truths),
+                "resolution_share": NOISY_RESOLUTION, "highest_rpm": HIGHEST_NOISY_RPM,
+            },
         },
+        "required_margins": asdict(case.required),
+        "advice": _advice(tuning),
         "warnings": [*tuned_for.warnings, *_sends_back_more(tuning)],
         "tdhil": __version__,
     }
@@ -137,7 +163,7 @@ def _whole_lag(case: TuneCase) -> Interval:
 
 
 def _sends_back_more(tuning: Tuning) -> Iterator[str]:
-    """Where |r| > 1: what is stable there is so by the string's own losses, which nobody has measured."""
+    """Yield a warning for |r| > 1: the loop is stable there only by the string's own losses, which are not measured."""
     import numpy as np
 
     hertz = np.geomspace(0.02, 5.0, 300)
@@ -145,8 +171,8 @@ def _sends_back_more(tuning: Tuning) -> Iterator[str]:
         if one.controller is not None:
             over = reflection_at(tuning.case.drive, one.controller, tuning.case.string, hertz)
             if over.max() > 1.001:
-                yield (f"{one.kind} sends back up to {over.max():.3f} of a wave at {hertz[int(over.argmax())]:.2g} Hz: "
-                       "what keeps it stable there is the drag of mud and bit as stated in string.yaml")
+                yield (f"{one.kind} sends back up to {over.max():.3f} of a wave at {hertz[int(over.argmax())]:.2g} Hz. "
+                       "There only the drag of mud and bit, as stated in string.yaml, keeps it stable.")
 
 
 def _controller(one: Tuned, ratio: float, settings: Sequence[DriveSetting]) -> dict[str, Any]:
@@ -169,6 +195,16 @@ def _controller(one: Tuned, ratio: float, settings: Sequence[DriveSetting]) -> d
         "phase_margin_deg": one.margins.phase_deg, "crossover_rad_s": one.margins.crossover_rad_s,
         "least_distance_from_minus_1": one.margins.modulus,
         "lag_reserve_s": one.lag_reserve_s,
+        "dead_time_reserve_s": one.dead_time_reserve_s,
+        "frequency_factor": one.frequency_factor,
+        "margins": None if one.worst is None or one.with_string is None else {
+            "as_believed": _finite(asdict(one.with_string)), "worst": _finite(asdict(one.worst)),
+            "failed": list(one.failed),
+        },
+        "critical_under_noise_rpm": None if one.cure is None or one.start is None else {
+            "cure": _spread(one.cure, NOISY_RESOLUTION), "start": _spread(one.start, NOISY_RESOLUTION),
+        },
+        "linear_limit_rpm": None if one.linear_limit is None else _spread(one.linear_limit, 0.0),
         "critical_rpm": None if one.critical is None else {
             name: _critical_part(one, name) for name in _CRITICAL
         },
@@ -176,21 +212,81 @@ def _controller(one: Tuned, ratio: float, settings: Sequence[DriveSetting]) -> d
     }
 
 
+def _spread(spread: DrawnValues, resolution_share: float) -> dict[str, float | None]:
+    """Median of the sampled truths and 95 % interval; None: above the highest that was tried."""
+    median = spread.median
+    low, high = spread.interval(resolution_share * (median or 0.0))
+    return {"value": median, "low": low, "high": high}
+
+
 def _critical_part(one: Tuned, name: str) -> dict[str, float | None]:
-    """Value, and ends over all that has an interval; None: not found below the highest speed tried."""
+    """Value, and ends over all that has an interval; None: not found below the highest speed tried.
+
+    The ends include the search's resolution and the error of the simulation's grid.
+    """
     def of(speeds: CriticalSpeeds | None) -> float | None:
         found: float | None = None if speeds is None else getattr(speeds, f"{name}_rpm")
         return found
 
-    value, ends = of(one.critical), [of(one.critical), of(one.critical_low), of(one.critical_high)]
+    value, ends = of(one.critical), [of(one.critical), *(of(one) for one in one.critical_along)]
     pairs = [[of(end) for end in pair] for pair in one.critical_moved]
     known = [end for end in ends if end is not None]
     if value is None or len(known) < len(ends) or any(end is None for pair in pairs for end in pair):
         known += [end for pair in pairs for end in pair if end is not None]
         return {"value": value, "low": min(known) if known else None, "high": None}
     moved = [[end for end in pair if end is not None] for pair in pairs]
-    found = in_squares(Interval(value, min(known), max(known)), moved)
+    error = SIMULATION_ERROR_RPM + SIMULATION_ERROR_SHARE * value
+    found = in_squares(Interval(value, min(known), max(known)), [*moved, (value - error, value + error)])
     return {"value": value, "low": found.low, "high": found.high}
+
+
+def _advice(tuning: Tuning) -> dict[str, Any]:
+    """What to do, in one sentence and as data."""
+    advice = tuning.advice
+    base = tuning.by_kind(advice.compared_with)
+    best = None if advice.kind is None else tuning.by_kind(advice.kind)
+    return {
+        "kind": advice.kind, "compared_with": advice.compared_with, "keep": advice.keep,
+        "better_share": advice.better_share, "sentence": _sentence(tuning, base, best),
+        "thin": [] if base is None else list(base.failed),
+    }
+
+
+def _sentence(tuning: Tuning, base: Tuned | None, best: Tuned | None) -> str:
+    assert base is not None
+    what = "the present gains" if base.kind == "present" else "a stiff speed loop"
+    if best is None:
+        offered = any(one.controller is not None and not one.failed for one in tuning.tuned if one is not base)
+        head = ("Keep what you have: " if base.kind == "present" else "Keep a stiff speed loop: ")
+        if not offered:
+            return head + "no other controller keeps the margins."
+        speed = "" if base.cure is None else f" of {_rpm_words(base.cure)}"
+        return head + f"no other controller lowers the critical speed{speed} by more than the search resolves."
+    changes = []
+    if base.cure is not None and best.cure is not None:
+        low, high = best.cure.interval(NOISY_RESOLUTION * (best.cure.median or 0.0))
+        end = "?" if high is None else f"{high:.0f}"
+        changes.append(f"critical speed {_rpm_words(base.cure, unit=False)} → {_rpm_words(best.cure)} "
+                       f"({low:.0f}–{end})")
+    elif base.damping is not None and best.damping is not None:
+        changes.append(f"least damping {base.damping.value:.2f} → {best.damping.value:.2f}")
+    if base.worst is not None and best.worst is not None:
+        changes.append(f"phase margin {_degrees(base.worst.phase_deg)} → {_degrees(best.worst.phase_deg)}")
+    return f"Type in the {best.kind} gains. Compared with {what}: {', '.join(changes)}."
+
+
+def _rpm_words(spread: DrawnValues, *, unit: bool = True) -> str:
+    if spread.median is None:
+        found = f"above {HIGHEST_NOISY_RPM:.0f}"
+    elif spread.median <= spread.lowest_tried:
+        found = f"below {spread.lowest_tried:.0f}"
+    else:
+        found = f"{spread.median:.0f}"
+    return f"{found} rpm" if unit else found
+
+
+def _degrees(value: float) -> str:
+    return f"{value:.0f}°" if math.isfinite(value) else "none needed"
 
 
 def _gains(law: SpeedController) -> dict[str, float]:
@@ -216,6 +312,13 @@ def _finite(values: Mapping[str, Any]) -> dict[str, Any]:
 def print_tuning(document: Part, console: PlainConsole) -> None:
     """Gains, what they do, what they rest on. 80 columns do."""
     simulated = f" · {SIMULATED}" if document["tuned_for"]["simulated"] else ""
+    advice = document["advice"]
+    console.print(Words(advice["sentence"], style="bold yellow" if advice["keep"] else "bold green"))
+    for one in document["controllers"]:
+        if not one["refused"] and one["margins"] and one["margins"]["failed"]:
+            thin = ", ".join(one["margins"]["failed"])
+            console.print(Words(f"{one['kind']}: thin margins, {thin}", style="bold red"))
+    console.print()
     console.print(Words(f"speed controller for {_string_words(document)}{simulated}", style="bold"))
     console.print(names_and_texts(_rests_on(document)))
     console.print()
@@ -225,7 +328,7 @@ def print_tuning(document: Part, console: PlainConsole) -> None:
     for one in taken:
         grid.add_column(one["kind"], justify="right")
     for name, cells in _rows(document):
-        grid.add_row(name, *cells)
+        grid.add_row(name, *(Words(cell[1:], style="bold red") if cell.startswith("!") else cell for cell in cells))
     console.print(grid)
     console.print(names_and_texts(_legend(document), quiet=True))
     for one in document["controllers"]:
@@ -261,16 +364,16 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
         if whole["high"] > whole["low"] else "")
     yield "string", (f"ζ {string['impedance_nm_s_rad']:.4g} N·m·s/rad, echo after {string['echo_s']:.3f} s, modes at "
                      + ", ".join(f"{hertz:.3g}" for hertz in string["modes_hz"]) + " Hz")
-    yield "bit", string["bit"]["words"] if string["bit"] else "not stated: no critical speeds"
+    yield "bit", string["bit"]["words"] if string["bit"] else "not stated; tdhil reports no critical speeds"
     if tuned_for["loop"] == "bus":
         yield "loop", "closed over the bus, in torque mode: the reported speed's lag is in it"
 
 
 def _legend(document: Part) -> Iterator[tuple[str, str]]:
-    """What the lines of the table mean that don't say it themselves."""
+    """What each line of the table is, in a few words."""
     yield "in brackets", _IN_BRACKETS
-    if document["critical_speeds"] is not None:
-        yield from ((name, _MEANT[name]) for name in _CRITICAL)
+    left_out = () if document["critical_speeds"] is not None else _OF_SPEEDS
+    yield from ((name, words) for name, words in _EXPLAINED.items() if name not in left_out)
 
 
 def _interval(part: Part, digits: int = 2) -> str:
@@ -283,23 +386,25 @@ def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
     ratio = document["tuned_for"]["gear_ratio"]
     shafts = [("at_main_shaft", ", main"), ("at_motor", ", motor")] if ratio != 1.0 else [("at_motor", "")]
     for key, shaft in shafts:
-        yield f"P{shaft}, N·m·s/rad", [_gain(one[key]["gain_nm_s_rad"]) for one in taken]
-        yield f"I{shaft}, N·m/rad", [_gain(one[key]["integral_nm_rad"]) for one in taken]
+        yield f"P{shaft}", [_gain(one[key]["gain_nm_s_rad"]) for one in taken]
+        yield f"I{shaft}", [_gain(one[key]["integral_nm_rad"]) for one in taken]
         if any(one[key]["compensated_kg_m2"] for one in taken):
-            yield f"J_c{shaft}, kg·m²", [_gain(one[key]["compensated_kg_m2"]) for one in taken]
-    yield "a", ["–" if one["a"] is None else f"{one['a']:.3g}" for one in taken]
+            yield f"J_c{shaft}", [_gain(one[key]["compensated_kg_m2"]) for one in taken]
+    noise = document["critical_speeds"] is not None
+    if noise:
+        yield "critical, rpm", [_noisy_speed(one["critical_under_noise_rpm"]["cure"]) for one in taken]
+        yield "  by ramp, rpm", [_noisy_speed(one["critical_under_noise_rpm"]["start"]) for one in taken]
+        yield "  linear, rpm", [_interval(one["linear_limit_rpm"], 0) for one in taken]
+    yield "phase margin", [_margin(one, "phase_deg", "{:.0f}°") for one in taken]
+    yield "gain margin, dB", [_margin(one, "gain_db", "{:.1f}") for one in taken]
+    yield "dead time, ms", [_margin(one, "dead_time_s", "{:.0f}", 1e3) for one in taken]
+    yield "a, φ", ["–" if one["a"] is None else f"{one['a']:.2g}, {one['frequency_factor']:.2g}" for one in taken]
     yield "J compensated", [f"{100 * one['compensated_share']:.0f} %" for one in taken]
-    yield "|r|, lowest mode", [_interval(one["reflection_at_lowest_mode"]) for one in taken]
-    yield f"|r|, {BAND_HZ[0]:g}–{BAND_HZ[1]:g} Hz", [f"{one['mean_reflection']['value']:.2f}" for one in taken]
-    yield "least damping", [_interval(one["least_damping"]) for one in taken]
-    if document["critical_speeds"] is not None:
-        for name in _CRITICAL:
-            yield f"{name}, rpm", [_speed(one["critical_rpm"][name], document) for one in taken]
-    yield "phase margin", ["–" if one["phase_margin_deg"] is None else f"{one['phase_margin_deg']:.0f}°"
-                           for one in taken]
-    yield "L to −1, least", [f"{one['least_distance_from_minus_1']:.2f}" for one in taken]
-    yield "one more lag", ["> 1 s" if one["lag_reserve_s"] is None else f"{1e3 * one['lag_reserve_s']:.0f} ms"
-                                for one in taken]
+    yield "|r|, mean", [f"{one['reflection_at_lowest_mode']['value']:.2f}, {one['mean_reflection']['value']:.2f}"
+                        for one in taken]
+    yield "damping ψ", [f"{one['least_damping']['low']:.2f}–{one['least_damping']['high']:.2f}" for one in taken]
+    if noise:
+        yield "no noise ψ, rpm", [_speed(one["critical_rpm"]["cure"], document) for one in taken]
     wrongs: list[Part] = next((one["inertia_wrong_by"] for one in taken if one["inertia_wrong_by"]), [])
     for k, error in enumerate(wrong["error"] for wrong in wrongs):
         yield (f"J {100 * error:+.3g} % wrong",
@@ -309,6 +414,29 @@ def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
 def _gain(value: float) -> str:
     """Four digits, and no power of ten."""
     return f"{value:.0f}" if value >= 1e3 else f"{value:.4g}"
+
+
+def _noisy_speed(part: Part) -> str:
+    if part["value"] is None:
+        return f"> {HIGHEST_NOISY_RPM:.0f}"
+    high = f"> {HIGHEST_NOISY_RPM:.0f}" if part["high"] is None else f"{part['high']:.0f}"
+    return f"{part['value']:.0f} ({part['low']:.0f}–{high})"
+
+
+_LIMIT_OF = {"phase_deg": "phase margin", "gain_db": "gain margin", "dead_time_s": "dead-time reserve"}
+
+
+def _margin(one: Part, key: str, form: str, times: float = 1.0) -> str:
+    """The least over the sampled truths; "!" before one that is thin."""
+    if one["margins"] is None:
+        return "–"
+    worst = one["margins"]["worst"]
+    if not worst["stable"]:
+        return "!unstable"
+    if worst[key] is None:
+        return "no limit"
+    thin = any(words.startswith(_LIMIT_OF[key]) for words in one["margins"]["failed"])
+    return ("!" if thin else "") + form.format(times * worst[key])
 
 
 def _speed(part: Part, document: Part) -> str:
@@ -380,13 +508,14 @@ def write_tuning_report(document: Part, showcase: Showcase | None, path: Path) -
 def tuning_report(document: Part, showcase: Showcase | None) -> Report:
     """The blocks of the page."""
     taken = [one for one in document["controllers"] if not one["refused"]]
-    # what any drive can take goes first: a proportional gain and an integral time
-    best = next((one for kind in ("soft", "compensated") for one in taken if one["kind"] == kind), None)
+    best = next((one for one in taken if one["kind"] == document["advice"]["kind"]), None)
     sections = [
         ReportSection("Controllers", (
             Table((Column("", 0.24), *(Column(one["kind"], 0.76 / max(1, len(taken)), number=True) for one in taken)),
-                  tuple((name, *cells) for name, cells in _rows(document))),
+                  tuple((name, *(cell.replace("!", "⚠ ") for cell in cells)) for name, cells in _rows(document))),
             Pairs(tuple((one["kind"], _WHAT[one["kind"]]) for one in taken)),
+            *(Text(f"{one['kind']}: thin margins, {', '.join(one['margins']['failed'])}.") for one in taken
+              if one["margins"] and one["margins"]["failed"]),
             *(Text(f"{one['kind']} refused: {one['refused']}") for one in document["controllers"] if one["refused"]),
         )),
         ReportSection("What the top drive sends back up the string", (
@@ -429,20 +558,22 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
 
 
 def _answer(best: Part | None, document: Part) -> AnswerBox:
+    sentence = document["advice"]["sentence"]
     if best is None:
-        return AnswerBox("red", "No tuned controller", (), "refused",
-                         "Nothing softer than the stiff loop can be recommended.", "")
+        thin = document["advice"]["thin"]
+        lines = (f"Thin: {', '.join(thin)}.",) if thin else ()
+        return AnswerBox("red" if thin else "yellow", "Nothing to change", lines,
+                         "keep what you have", sentence, "")
     gains = best["at_motor"]
-    lines = [f"at the motor shaft; {best['kind']}: {_WHAT[best['kind']]}"]
+    told = [f"at the motor shaft; {best['kind']}: {_WHAT[best['kind']]}"]
     if gains["compensated_kg_m2"]:
-        lines.append(f"inertia compensation J_c = {gains['compensated_kg_m2']:.4g} kg·m², its derivative filtered by "
+        told.append(f"inertia compensation J_c = {gains['compensated_kg_m2']:.4g} kg·m², its derivative filtered by "
                      f"{1e3 * gains['derivative_filter_s']:g} ms")
-    reason = f"It damps the lowest modes by {_interval(best['least_damping'])}."
-    if best["critical_rpm"] is not None:
-        cure = _speed(best["critical_rpm"]["cure"], document)
-        reason += f" With the bit as stated, a stuck bit is freed from {cure} rpm."
     headline = f"P = {_gain(gains['gain_nm_s_rad'])} N·m·s/rad, I = {_gain(gains['integral_nm_rad'])} N·m/rad"
-    return AnswerBox("green", headline, tuple(lines), "most damping that these two gains can give", reason, "")
+    required = document["required_margins"]
+    verdict = (f"keeps {required['phase_deg']:.0f}°, {required['gain_db']:g} dB and "
+               f"{1e3 * required['dead_time_s']:.0f} ms on every sampled machine and string")
+    return AnswerBox("green", headline, tuple(told), verdict, sentence, "")
 
 
 def draw_reflection(figure: FigureBase, document: Part) -> None:

@@ -1,4 +1,4 @@
-"""What J is for: drill string, soft-torque controllers, their reflection, damping and critical speeds; pure numbers."""
+"""Soft torque: drill string, speed controllers, their margins, damping and critical speeds; pure numbers."""
 
 from typing import TYPE_CHECKING
 
@@ -6,9 +6,11 @@ from profiles import lazy_face
 
 if TYPE_CHECKING:
     from tdhil.soft_torque.drill_string import (
-        BitFriction as BitFriction, BottomEnd as BottomEnd, DrillString as DrillString, WaveLine as WaveLine,
+        BitFriction as BitFriction, EXACT_STRING as EXACT_STRING,
+        BottomEnd as BottomEnd, DrillString as DrillString, WaveLine as WaveLine,
         PipeSection as PipeSection,
-        StringFile as StringFile, load_string as load_string, spring_and_mass as spring_and_mass,
+        StringFile as StringFile, identified_string as identified_string, StringTolerance as StringTolerance,
+        load_string as load_string, spring_and_mass as spring_and_mass,
         string_of as string_of,
     )
     from tdhil.soft_torque.controller import (
@@ -28,14 +30,22 @@ if TYPE_CHECKING:
         DriveSetting as DriveSetting, drive_settings as drive_settings,
     )
     from tdhil.soft_torque.roots import RootsLost as RootsLost, count_in as count_in, roots_in as roots_in
+    from tdhil.soft_torque.stability import (
+        LoopMargins as LoopMargins, NO_MARGINS as NO_MARGINS, RequiredMargins as RequiredMargins,
+        is_stable as is_stable, linear_limit as linear_limit, loop_margins as loop_margins,
+    )
+    from tdhil.soft_torque.uncertainty import (
+        Interval as Interval, DrawnValues as DrawnValues, Truth as Truth, draw_truths as draw_truths,
+    )
     from tdhil.soft_torque.simulation import (
         Begin as Begin, CriticalSpeeds as CriticalSpeeds, Grid as Grid, RPM as RPM, Search as Search,
         SimulationTrace as SimulationTrace,
         critical_speeds as critical_speeds, grid_of as grid_of, lowest_turning as lowest_turning,
-        onset_speeds as onset_speeds, simulate as simulate,
+        HIGHEST_NOISY_RPM as HIGHEST_NOISY_RPM, NOISY_RESOLUTION as NOISY_RESOLUTION,
+        lowest_turning_with_noise as lowest_turning_with_noise, simulate as simulate,
     )
     from tdhil.soft_torque.tuning import (
-        BAND_HZ as BAND_HZ, Interval as Interval, Moved as Moved, TUNING_REFUSED as TUNING_REFUSED,
+        Advice as Advice, BAND_HZ as BAND_HZ, Moved as Moved, TUNING_REFUSED as TUNING_REFUSED,
         TuneCase as TuneCase, Tuned as Tuned, Tuning as Tuning, TuningRefused as TuningRefused,
         WrongInertia as WrongInertia, figures_at as figures_at, in_squares as in_squares,
         largest_stable_share as largest_stable_share, least_damping as least_damping,

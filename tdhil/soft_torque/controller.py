@@ -1,4 +1,4 @@
-r"""A top drive under a speed controller, as the string feels it.
+r"""Impedance of a top drive under a speed controller, at the top of the string.
 
 ::
 
@@ -137,7 +137,7 @@ class ClosedSystem:
     drive: TopDrive | None = None
     controller: SpeedController | None = None
     stuck: bool = False
-    """Is the bit stuck, or does it turn?"""
+    """True: the bit is stuck. False: it turns."""
 
     def characteristic(self, s: Complex) -> Complex:
         """F(s), whose roots are the poles."""
@@ -156,14 +156,14 @@ class ClosedSystem:
         return lags * filtered * s * rotor + law * speed
 
     def modes(self, below_hz: float) -> tuple[NaturalMode, ...]:
-        """Every natural motion up to |s| = 2π ``below_hz`` that swings, by frequency; damping of up to 0.98."""
+        """Return every oscillating mode up to |s| = 2π ``below_hz``, by frequency; damping of up to 0.98."""
         reach = 2.0 * pi * below_hz
         found = roots_in(self.characteristic, complex(-reach, 0.02 * reach), complex(0.25 * reach, reach), self._pace)
         swinging = [NaturalMode(pole) for pole in found if abs(pole) <= reach]
         return tuple(sorted(swinging, key=lambda mode: mode.frequency_hz))
 
     def is_stable(self, up_to_rad_s: float | None = None) -> bool:
-        """No pole right of the imaginary axis, as far up as one could be (`reach_rad_s` unless it is said)."""
+        """Whether no pole lies right of the imaginary axis, up to ``up_to_rad_s`` (default `reach_rad_s`)."""
         reach = self.reach_rad_s() if up_to_rad_s is None else up_to_rad_s
         return count_right_of(self.characteristic, reach, self._pace, most=200.0 / self.string.echo_s) == 0
 
@@ -202,7 +202,7 @@ class ClosedSystem:
 
 @dataclass(frozen=True)
 class Margins:
-    """How far the loop is from swinging by itself."""
+    """Margins of the loop of the bare drive."""
 
     phase_deg: float | None
     """Without a string, at the crossover; None: the gain is below 1 everywhere."""
@@ -233,7 +233,7 @@ def margins(drive: TopDrive, controller: SpeedController, string: DrillString | 
 
 
 def phase_lag_rad(drive: TopDrive, omega: float) -> float:
-    """Of H at ``omega``."""
+    """Return the phase lag of H at ``omega``, rad."""
     return sum(atan(lag * omega) for lag in drive.inner_lags_s)
 
 

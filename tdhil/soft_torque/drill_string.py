@@ -1,4 +1,4 @@
-r"""A drill string as its file says it, and as the top drive feels it: exact transmission lines, section by section.
+r"""Drill string of string.yaml as a load of the top drive: exact transmission lines, section by section.
 
 ::
 
@@ -46,8 +46,30 @@ Complex = NDArray[np.complex128]
 STEEL_SHEAR_MODULUS_PA = 79.3e9
 STEEL_DENSITY_KG_M3 = 7850.0
 MUD_DRAG_NM_S_RAD_M = 0.005
-"""Viscous drag of mud on 5 inch pipe, of the order that simulations use; nobody has measured yours."""
+"""Viscous drag of mud on 5 inch pipe, of the order that simulations use; not measured."""
+WALL_FRICTION_KINETIC, WALL_FRICTION_STATIC = 0.2, 0.3
+"""Of steel on rock or casing in mud: of the order that torque-and-drag programs use; not measured on this well."""
+SHEAR_RANGE_PA = (61e9, 80e9)
+"""Where G of a string of steel lies: 79 to 80 GPa by the handbook; U. J. Aarsnes and R. Shor (2018) fitted 61 GPa for
+pipe and 67 GPa for collars to field data, tool joints and connections included."""
+STATED_SHEAR_TOLERANCE = 0.05
+"""Relative, of a G that was stated because it was fitted."""
+LENGTH_TOLERANCE = 0.01
+"""Relative: a stand of 28 m on a string of 3,000 m."""
+WORN_POLAR_SHARE = 0.85
+"""Polar moment of area of pipe with 80 % of its wall left (API RP 7G, premium class), over that of new pipe."""
+DRAG_FACTOR = 2.5
+"""Up or down: the mud's drag is a guess in every string file."""
+BOTTOM_TOLERANCE = 0.10
+BIT_TORQUE_TOLERANCE, STRIBECK_FACTOR, NOISE_FACTOR = 0.15, 1.25, 1.5
+"""Of a bit as stated: relative, and factors up or down; assumptions, as the bit itself is one."""
+BIT_NOISE_SHARE = 0.08
+"""Root mean square of the bit's random torque over its Coulomb torque: an assumption, 200 N·m on a bit of 2,500 N·m.
+A log of steady drilling gives the value of a real bit."""
+NOISE_CORRELATION_S = 0.2
+"""Correlation time of the bit's random torque, s: an assumption; above the string's lowest modes it hardly matters."""
 
+_Share = Annotated[float, Field(ge=0.0, le=0.9)]
 _Length = Annotated[float, Field(gt=0.0, le=20_000.0)]
 _Diameter = Annotated[float, Field(gt=0.0, le=2.0)]
 _NotNegative = Annotated[float, Field(ge=0.0, le=1e9)]
@@ -79,6 +101,15 @@ class PipeSection(DataModel):
     shear_modulus_pa: Annotated[float, Field(ge=1e9, le=1e12)] = STEEL_SHEAR_MODULUS_PA
     density_kg_m3: Annotated[float, Field(ge=500.0, le=3e4)] = STEEL_DENSITY_KG_M3
     drag_nm_s_rad_m: _NotNegative = MUD_DRAG_NM_S_RAD_M
+    side_force_n_m: _NotNegative = Field(
+        default=0.0, description="N per metre with which the pipe lies on the wall of a deviated hole"
+    )
+    friction_kinetic: Annotated[float, Field(ge=0.0, le=2.0)] = Field(
+        default=WALL_FRICTION_KINETIC, description="friction coefficient on that wall while the pipe turns"
+    )
+    friction_static: Annotated[float, Field(ge=0.0, le=2.0)] = Field(
+        default=WALL_FRICTION_STATIC, description="friction coefficient on that wall from standstill"
+    )
     tool_joints: ToolJoints | None = None
 
     @classmethod
@@ -108,6 +139,10 @@ class BottomEnd(DataModel):
     stribeck_speed_rad_s: Annotated[float, Field(gt=0.0, le=1e4)] | None = Field(
         default=None, description="rad/s, over which it falls from one to the other (Gaussian)"
     )
+    noise_nm: _NotNegative | None = Field(
+        default=None, description="N·m, root mean square of the bit's random torque; default 8 % of coulomb_nm"
+    )
+    noise_correlation_s: Annotated[float, Field(gt=0.0, le=60.0)] = NOISE_CORRELATION_S
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
@@ -128,12 +163,28 @@ class BottomEnd(DataModel):
         return found
 
 
+class ToleranceFile(DataModel):
+    """How far string and bit may differ from what string.yaml states; each relative, 0.1 is 10 %."""
+
+    length: _Share = LENGTH_TOLERANCE
+    shear_modulus: _Share | None = Field(
+        default=None, description="of shear_modulus_pa; default 61 to 80 GPa, or 5 % of a value that is stated")
+    wear: _Share = Field(default=1.0 - WORN_POLAR_SHARE, description="loss of polar moment of area, at most")
+    drag: Annotated[float, Field(ge=0.0, le=9.0)] = Field(
+        default=DRAG_FACTOR - 1.0, description="1.5 is a factor of 2.5, up or down")
+    bottom_inertia: _Share = BOTTOM_TOLERANCE
+    bit_torque: _Share = BIT_TORQUE_TOLERANCE
+    stribeck_speed: _Share = STRIBECK_FACTOR - 1.0
+    noise: _Share = NOISE_FACTOR - 1.0
+
+
 class StringFile(DataModel):
     """string.yaml."""
 
     name: str | None = Field(default=None, min_length=1, max_length=200)
     sections: Annotated[tuple[PipeSection, ...], Field(min_length=1)]
     bottom: BottomEnd
+    tolerance: ToleranceFile | None = None
 
 
 def _bore(values: Mapping[str, Any]) -> list[Finding]:
@@ -155,6 +206,15 @@ class WaveLine:
     compliance_rad_nm_m: float
     """y, per metre: rad/(N·m) per m."""
     drag_nm_s_rad_m: float
+    coulomb_nm_m: float = 0.0
+    """Kinetic dry friction on the wall of the hole, N·m per metre."""
+    static_nm_m: float = 0.0
+    """The same, from standstill."""
+
+    @property
+    def has_friction(self) -> bool:
+        """Whether anything along the line takes energy."""
+        return self.drag_nm_s_rad_m > 0.0 or self.coulomb_nm_m > 0.0
 
     @property
     def impedance_nm_s_rad(self) -> float:
@@ -163,7 +223,7 @@ class WaveLine:
 
     @property
     def speed_m_s(self) -> float:
-        """C, of the waves."""
+        """Speed c of the waves."""
         return 1.0 / sqrt(self.inertia_kg_m * self.compliance_rad_nm_m)
 
     @property
@@ -173,15 +233,41 @@ class WaveLine:
 
 
 @dataclass(frozen=True)
+class StringTolerance:
+    """How far string and bit may differ from what is stated: relative half-widths, and factors up or down."""
+
+    length: float = LENGTH_TOLERANCE
+    shear: tuple[float, float] = (1.0 - STATED_SHEAR_TOLERANCE, 1.0 + STATED_SHEAR_TOLERANCE)
+    """Least and largest G, as factors on the stated one."""
+    polar: tuple[float, float] = (WORN_POLAR_SHARE, 1.0)
+    """Least and largest polar moment of area, as factors on that of the stated diameters."""
+    drag_factor: float = DRAG_FACTOR
+    bottom_inertia: float = BOTTOM_TOLERANCE
+    bit_torque: float = BIT_TORQUE_TOLERANCE
+    stribeck_factor: float = STRIBECK_FACTOR
+    noise_factor: float = NOISE_FACTOR
+
+
+STRING_AS_USUAL = StringTolerance()
+IDENTIFIED_STRING = StringTolerance(0.0, (1.0, 1.0), (1.0, 1.0), 2.0, 0.0)
+"""Of a string whose k, f and J_L were identified: their own intervals are drawn; its losses are known to a factor."""
+EXACT_STRING = StringTolerance(0.0, (1.0, 1.0), (1.0, 1.0), 1.0, 0.0, 0.0, 1.0, 1.0)
+"""Of a string that is what it is said to be, as a simulated one."""
+
+
+@dataclass(frozen=True)
 class BitFriction:
     """T_f = sgn ω (F_c + (F_s − F_c) e^−(ω/ω_s)²) while it turns, up to F_s while it sticks."""
 
     coulomb_nm: float
     static_nm: float
     stribeck_speed_rad_s: float
+    noise_nm: float = 0.0
+    """Root mean square of the torque's random part."""
+    noise_correlation_s: float = NOISE_CORRELATION_S
 
     def describe(self) -> str:
-        """The bit in half a line, for every figure that hangs on it."""
+        """Return the bit in half a line, for every figure that depends on it."""
         if self.static_nm == self.coulomb_nm:
             return f"Coulomb {self.coulomb_nm:g} N·m"
         return (f"static {self.static_nm:g} N·m, Coulomb {self.coulomb_nm:g} N·m, "
@@ -197,8 +283,10 @@ class DrillString:
     bottom_viscous_nm_s_rad: float = 0.0
     bit: BitFriction | None = None
     name: str | None = None
+    tolerance: StringTolerance = STRING_AS_USUAL
+    """How far the true string may differ."""
     supposed: bool = False
-    """Its waves and their losses are supposed: of a spring that was identified nobody knows them."""
+    """Its waves and their losses are assumed: an identified spring does not show them."""
 
     @property
     def impedance_nm_s_rad(self) -> float:
@@ -231,6 +319,10 @@ class DrillString:
             speed, torque = none, one
         else:
             speed, torque = one, s * self.bottom_inertia_kg_m2 + self.bottom_viscous_nm_s_rad
+        return self.carried_up(s, speed, torque)
+
+    def carried_up(self, s: Complex, speed: Complex, torque: Complex) -> tuple[Complex, Complex]:
+        """(speed, torque) at the top that belong to those at the lower end of the last line."""
         for line in reversed(self.lines):
             series, shunt = line.compliance_rad_nm_m * s, line.inertia_kg_m * s + line.drag_nm_s_rad_m
             cosh, sinh_over = _cosh_and_sinh_over(series * shunt, line.length_m)
@@ -267,7 +359,10 @@ def line_of(section: PipeSection) -> WaveLine:
     else:
         assert section.stiffness_nm_rad is not None
         length = 1.0 / (section.stiffness_nm_rad * compliance)
-    return WaveLine(length, inertia, compliance, section.drag_nm_s_rad_m)
+    radius = 0.5 * max(section.outer_diameter_m, 0.0 if joints is None else joints.outer_diameter_m)
+    kinetic = section.friction_kinetic * section.side_force_n_m * radius
+    static = max(kinetic, section.friction_static * section.side_force_n_m * radius)
+    return WaveLine(length, inertia, compliance, section.drag_nm_s_rad_m, kinetic, static)
 
 
 def _per_metre(section: PipeSection, outer_m: float, inner_m: float) -> tuple[float, float]:
@@ -282,9 +377,25 @@ def string_of(file: StringFile) -> DrillString:
     if bottom.coulomb_nm is not None:
         static = bottom.static_nm if bottom.static_nm is not None else bottom.coulomb_nm
         speed = bottom.stribeck_speed_rad_s if bottom.stribeck_speed_rad_s is not None else inf
-        bit = BitFriction(bottom.coulomb_nm, static, speed)
-    lines = tuple(line_of(section) for section in (*file.sections, *bottom.sections))
-    return DrillString(lines, bottom.inertia_kg_m2, bottom.viscous_nm_s_rad, bit, file.name)
+        noise = BIT_NOISE_SHARE * bottom.coulomb_nm if bottom.noise_nm is None else bottom.noise_nm
+        bit = BitFriction(bottom.coulomb_nm, static, speed, noise, bottom.noise_correlation_s)
+    sections = (*file.sections, *bottom.sections)
+    lines = tuple(line_of(section) for section in sections)
+    return DrillString(lines, bottom.inertia_kg_m2, bottom.viscous_nm_s_rad, bit, file.name,
+                       tolerance=_tolerance_of(file, sections))
+
+
+def _tolerance_of(file: StringFile, sections: tuple[PipeSection, ...]) -> StringTolerance:
+    """As stated; G of the handbook may be anything that was ever fitted, a stated G is known better."""
+    stated = file.tolerance or ToleranceFile()
+    shear = tuple(one / STEEL_SHEAR_MODULUS_PA for one in SHEAR_RANGE_PA)
+    if stated.shear_modulus is not None:
+        shear = (1.0 - stated.shear_modulus, 1.0 + stated.shear_modulus)
+    elif any(section.shear_modulus_pa != STEEL_SHEAR_MODULUS_PA for section in sections):
+        shear = (1.0 - STATED_SHEAR_TOLERANCE, 1.0 + STATED_SHEAR_TOLERANCE)
+    return StringTolerance(
+        stated.length, (shear[0], shear[1]), (1.0 - stated.wear, 1.0), 1.0 + stated.drag,
+        stated.bottom_inertia, stated.bit_torque, 1.0 + stated.stribeck_speed, 1.0 + stated.noise)
 
 
 def load_string(path: Path) -> DrillString:
@@ -314,4 +425,36 @@ def spring_and_mass(
     drag = 2.0 * SPRING_LOSS * inertia * pi / delay_s
     line = WaveLine(1.0, inertia, 1.0 / stiffness_nm_rad, drag)
     mass = inertia / (swing * delay_s * tan(swing * delay_s))
-    return DrillString((line,), mass, max(0.0, damping_nm_s_rad - drag / 3.0), name=name, supposed=True)
+    return DrillString((line,), mass, max(0.0, damping_nm_s_rad - drag / 3.0), name=name,
+                       tolerance=IDENTIFIED_STRING, supposed=True)
+
+
+LEAST_PIPE_SHARE = 0.03
+"""Of the load's inertia, that a pipe has to have for its characteristic impedance to follow from k, f and J_L."""
+
+
+def identified_string(
+    stiffness_nm_rad: float, antiresonance_hz: float, load_inertia_kg_m2: float, damping_nm_s_rad: float = 0.0,
+    name: str | None = None,
+) -> DrillString | None:
+    """Return the uniform pipe with stiffness k whose load J_L swings at f with its top held; None: no pipe does.
+
+    ωT tan ωT = kT²/J_L with ω = 2πf, that is tan ωT = kT/(ω J_L), gives the travel time T; ζ = kT and J_s = kT². A
+    load that swings as k/ω² does by itself leaves no inertia for the pipe.
+    """
+    omega = 2.0 * pi * antiresonance_hz
+    light = stiffness_nm_rad / omega**2 - load_inertia_kg_m2      # J_s/3, about
+    if light < LEAST_PIPE_SHARE / 3.0 * load_inertia_kg_m2:
+        return None
+    low, high = 1e-6, (0.5 - 1e-9) * pi
+    for _ in range(200):
+        x = 0.5 * (low + high)
+        # x tan x / x² falls short of k/(ω² J_L) below the root
+        low, high = (x, high) if tan(x) / x < stiffness_nm_rad / (omega**2 * load_inertia_kg_m2) else (low, x)
+    delay_s = 0.5 * (low + high) / omega
+    inertia = stiffness_nm_rad * delay_s**2
+    drag = max(2.0 * SPRING_LOSS * inertia * pi / delay_s if damping_nm_s_rad <= 0.0 else 0.0,
+               min(3.0 * damping_nm_s_rad, 2.0 * SPRING_LOSS * inertia * pi / delay_s))
+    line = WaveLine(1.0, inertia, 1.0 / stiffness_nm_rad, drag)
+    return DrillString((line,), load_inertia_kg_m2, max(0.0, damping_nm_s_rad - drag / 3.0), name=name,
+                       tolerance=IDENTIFIED_STRING)

@@ -1,4 +1,4 @@
-r"""Gains in a drive's own parameters: what to type where, as far as its profile knows. Written by hand, never by us.
+r"""Gains in a drive's own parameters, as far as its profile states them. tdhil does not write them to the drive.
 
 ::
 

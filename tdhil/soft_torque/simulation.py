@@ -1,24 +1,30 @@
-r"""Top drive, string and bit in time: waves along characteristics, many set speeds and controllers side by side.
+r"""Top drive, string and bit in time: waves along characteristics, many strings, controllers and set speeds at once.
 
 ::
 
     a = τ + ζω runs down, b = ζω − τ runs up, each unchanged at speed c along a line
 
-**Nodes.** Lines are cut at nodes a whole number of ticks apart, so that a wave is a ring of past values: written at one
-end, read at the other m ticks later; nothing is interpolated, nothing disperses. At a node the speeds are equal and
-τ_above − τ_below = βω, with β the drag of half of what lies above and half of what lies below, lumped:
+**Nodes.** Lines are cut at nodes a whole number of ticks apart. A wave is a ring of past values: written at one end,
+read at the other m ticks later. Nothing is interpolated, and nothing disperses. At a node the speeds are equal and
+τ_above − τ_below = βω + F sgn ω. β and F are the viscous drag and the dry friction of half of the line above and half
+of the line below:
 
-    ω = (a + b)/(ζ₁ + ζ₂ + β)        a' = 2 ζ₂ ω − b        b' = 2 ζ₁ ω − a
+    ω = (a + b − F sgn ω)/(ζ₁ + ζ₂ + β)        a' = 2 ζ₂ ω − b        b' = 2 ζ₁ ω − a
 
-which holds for a change of section (ζ₁ ≠ ζ₂) as for drag within one. A node never adds energy: what goes out is ½(a² +
-b²)-wise what came in less βω².
+A node at standstill stays there while |a + b| is at most its static friction. A node never adds energy: ½(a² + b²)-wise
+it sends out what came in, less βω² + F|ω|.
 
-**Top.** J dω/dt = T + b − (B + ζ + β/2) ω − F_c sgn ω, with the controller's states and lags beside it, is linear for a
-wave that is constant over a tick: its step is a matrix exponential. It sends down 2ζ (mean ω) − b.
+**Top.** J dω/dt = T + b − (B + ζ + β/2) ω − F_c sgn ω is linear, together with the states of the controller and its
+lags, for a wave that is constant over a tick. Its step is a matrix exponential. It sends down 2ζ (mean ω) − b.
 
-**Bit.** J_L dω/dt = a − (ζ + β/2 + B_b) ω − T_f(ω): each tick follows the tangent of the friction's curve exactly
-(exponential Rosenbrock–Euler), in parts that change little; at zero speed it sticks while |a| ≤ F_s. A bottom without
-inertia of its own is given that of half a tick of its line, which is that much shorter for it.
+**Bit.** J_L dω/dt = a − (ζ + β/2 + B_b) ω − T_f(ω) − n(t). Each tick follows the tangent of the friction's curve
+exactly (exponential Rosenbrock–Euler), in parts that change little. At zero speed the bit sticks while |a − n| ≤ F_s.
+A bottom without inertia of its own is given that of half a tick of its line, which is shorter by as much.
+
+**Bit noise.** n is a first-order Gauss–Markov process. Loops with the same seed have the same one, at every set speed.
+
+**Many strings at once.** Each string has its own tick, so that all have the same number of ticks. This holds for
+strings whose travel times differ by one common factor, and which may differ in everything else.
 
 No torque limit is simulated.
 """
@@ -34,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdhil.soft_torque.controller import SpeedController, TopDrive
-from tdhil.soft_torque.drill_string import BitFriction, DrillString
+from tdhil.soft_torque.drill_string import DrillString
 
 LONGEST_TICK_S = 0.006
 SHORTEST_TICK_S = 0.002
@@ -42,9 +48,15 @@ DRAG_EVERY_S = 0.15
 """Drag is lumped at nodes about so far apart; the echo of a lump is of the order of β/2ζ."""
 SLIDING_BLUR_RAD_S = 0.05
 """Over which the top's own dry friction changes its sign."""
+LARGEST_GROWTH = 0.05
+"""Of the bit's speed in one part of a tick, along a falling branch of its friction."""
+NOISE_BLOCK = 500
+"""Ticks of bit noise that are drawn at once."""
 
 Array = NDArray[np.float64]
 Loop = tuple[TopDrive, SpeedController]
+Strings = DrillString | Sequence[DrillString]
+"""One string for all loops, or one for each."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +67,14 @@ class Grid:
     ticks: tuple[int, ...]
     impedance_nm_s_rad: tuple[float, ...]
     drag_nm_s_rad: tuple[float, ...]
-    """Of each segment as a whole."""
+    """Of each segment as a whole; so are the next two."""
+    coulomb_nm: tuple[float, ...]
+    static_nm: tuple[float, ...]
     bottom_inertia_kg_m2: float
+    line_ticks: tuple[int, ...]
+    """Of each line."""
+    line_parts: tuple[int, ...]
+    """Segments of each line."""
 
     @property
     def delay_s(self) -> float:
@@ -69,12 +87,11 @@ def grid_of(string: DrillString, longest_tick_s: float = LONGEST_TICK_S) -> Grid
     delays = np.array([line.delay_s for line in string.lines])
     last = string.lines[-1].impedance_nm_s_rad
 
-    def rounded(tick: float) -> tuple[NDArray[np.int64], float, float]:
+    def rounded(tick: float) -> tuple[NDArray[np.int64], float]:
         # where the bit has next to no inertia, half a tick of pipe becomes one
-        own = max(0.0, 0.5 * tick - string.bottom_inertia_kg_m2 / last)
-        wanted = delays - np.append(np.zeros(len(delays) - 1), own)
+        wanted = delays - np.append(np.zeros(len(delays) - 1), _own_delay_s(string, tick))
         counts = np.maximum(1, np.rint(wanted / tick)).astype(np.int64)
-        return counts, float(np.abs(counts * tick - wanted).sum()), own
+        return counts, float(np.abs(counts * tick - wanted).sum())
 
     if len(delays) == 1 and string.bottom_inertia_kg_m2 >= 0.5 * longest_tick_s * last:
         exact = float(delays[0]) / ceil(float(delays[0]) / longest_tick_s * (1.0 - 1e-9))
@@ -83,18 +100,43 @@ def grid_of(string: DrillString, longest_tick_s: float = LONGEST_TICK_S) -> Grid
         shortest = min(SHORTEST_TICK_S * longest_tick_s / LONGEST_TICK_S, longest_tick_s)
         candidates = np.linspace(shortest, longest_tick_s, 400)
     tick = float(min(candidates, key=lambda one: rounded(float(one))[1] / one**0.25))
-    counts, _, own = rounded(tick)
+    counts = tuple(int(count) for count in rounded(tick)[0])
+    parts = tuple(
+        max(1, min(count, round(line.delay_s / DRAG_EVERY_S))) if line.has_friction else 1
+        for line, count in zip(string.lines, counts, strict=True)
+    )
+    return _cut(string, tick, counts, parts)
+
+
+def grid_like(string: DrillString, model: DrillString, grid: Grid) -> Grid:
+    """The grid of ``model`` for a string with the same lines in other sizes.
+
+    Raises ValueError where the travel times differ by more than one common factor.
+    """
+    factors = [line.delay_s / other.delay_s for line, other in zip(string.lines, model.lines, strict=True)]
+    if max(factors) > 1.001 * min(factors):
+        raise ValueError("the travel times of the lines differ by more than one common factor")
+    return _cut(string, grid.tick_s * factors[0], grid.line_ticks, grid.line_parts)
+
+
+def _own_delay_s(string: DrillString, tick_s: float) -> float:
+    """Travel time of pipe that counts as inertia of the bit."""
+    return max(0.0, 0.5 * tick_s - string.bottom_inertia_kg_m2 / string.lines[-1].impedance_nm_s_rad)
+
+
+def _cut(string: DrillString, tick_s: float, counts: tuple[int, ...], parts: tuple[int, ...]) -> Grid:
     ticks: list[int] = []
-    impedances: list[float] = []
-    drags: list[float] = []
-    for line, count in zip(string.lines, counts, strict=True):
-        parts = max(1, min(int(count), round(line.delay_s / DRAG_EVERY_S))) if line.drag_nm_s_rad_m else 1
-        edges = np.rint(np.linspace(0, count, parts + 1)).astype(int)
+    of_segments: list[tuple[float, float, float, float]] = []
+    for line, count, part in zip(string.lines, counts, parts, strict=True):
+        edges = np.rint(np.linspace(0, count, part + 1)).astype(int)
         for size in np.diff(edges):
+            share_m = line.length_m * float(size) / float(count)
             ticks.append(int(size))
-            impedances.append(line.impedance_nm_s_rad)
-            drags.append(line.drag_nm_s_rad_m * line.length_m * float(size) / float(count))
-    return Grid(tick, tuple(ticks), tuple(impedances), tuple(drags), string.bottom_inertia_kg_m2 + own * last)
+            of_segments.append((line.impedance_nm_s_rad, line.drag_nm_s_rad_m * share_m,
+                                line.coulomb_nm_m * share_m, line.static_nm_m * share_m))
+    impedances, drags, kinetic, static = zip(*of_segments, strict=True)
+    inertia = string.bottom_inertia_kg_m2 + _own_delay_s(string, tick_s) * string.lines[-1].impedance_nm_s_rad
+    return Grid(tick_s, tuple(ticks), impedances, drags, kinetic, static, inertia, counts, parts)
 
 
 @dataclass(frozen=True)
@@ -102,6 +144,7 @@ class SimulationTrace:
     """What was kept: first index time, second the loop, third the set speed."""
 
     time_s: Array
+    """Of the first loop; another string's time runs faster by the ratio of the travel times."""
     set_rad_s: Array
     top_rad_s: Array
     bit_rad_s: Array
@@ -111,6 +154,8 @@ class SimulationTrace:
     """When the bit stood still for the first time after it had turned; infinite: never."""
     last_stuck_s: Array
     """When the bit stood still for the last time; −1: never."""
+    end_s: Array
+    """When the simulation ended, for each loop; (loops, 1)."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +172,7 @@ class Begin:
 
 
 def simulate(
-    string: DrillString,
+    strings: Strings,
     loops: Sequence[Loop],
     begin: Begin,
     target_rad_s: Array,
@@ -136,91 +181,143 @@ def simulate(
     keep_every_s: float = 0.1,
     longest_tick_s: float = LONGEST_TICK_S,
     hold_s: float = 0.0,
+    seeds: Sequence[int] | None = None,
 ) -> SimulationTrace:
     """Every loop at every set speed: the set speed goes from ``begin``'s to the target along the ramp, after a hold.
 
-    ``target_rad_s``: (loops, speeds). A bit must be stated. Raises ValueError where none is.
+    ``target_rad_s``: (loops, speeds). ``seeds``: of the bit noise, one for each loop; None: no noise. Times are those
+    of the first string. Raises ValueError where a bit isn't stated.
     """
-    if string.bit is None:
-        raise ValueError("no bit is stated")
-    grid = grid_of(string, longest_tick_s)
+    every_string = [strings] * len(loops) if isinstance(strings, DrillString) else list(strings)
+    first_string = every_string[0]
+    grid = grid_of(first_string, longest_tick_s)
+    known = {first_string: grid}
+    for one in every_string:
+        if one not in known:
+            known[one] = grid_like(one, first_string, grid)
+    grids = [known[one] for one in every_string]
     shape = target_rad_s.shape
-    top = _Top(loops, grid, shape[1])
+    top = _Top(loops, grids, shape[1])
     now = np.broadcast_to(begin.speed_rad_s, shape).astype(float).copy()
     set_speed = now.copy() if begin.how != "rest" else np.zeros(shape)
-    pipe = PipeSimulation(string, grid, shape[0] * shape[1])
+    pipe = PipeSimulation(every_string, grids, shape[1])
     speed, held = np.zeros(shape), np.zeros(shape)
     if begin.how == "stuck":
-        speed, held = now, np.full(shape, string.bit.static_nm)
+        speed, held = now, pipe.breakaway_nm.reshape(shape)
         pipe.wind_up(held.ravel())
     elif begin.how == "turning":
         speed = now
         held = pipe.turn(now.ravel()).reshape(shape)
     top.begin(speed, held)
-    step = ramp_rad_s2 * grid.tick_s
+    noise = None if seeds is None else _BitNoise(every_string, grids, seeds, shape[1])
+    tick_s = np.array([one.tick_s for one in grids])[:, None]
+    step = ramp_rad_s2 * tick_s
     count, held_ticks = ceil(duration_s / grid.tick_s), round(hold_s / grid.tick_s)
     every = max(1, round(keep_every_s / grid.tick_s))
     kept: list[tuple[float, Array, Array, Array, Array]] = []
     first: Array = np.full(now.size, np.inf)
     last: Array = np.full(now.size, -1.0)
     turned = pipe.bit_rad_s > 0.0
+    arrived = False
     for tick in range(count):
-        if tick >= held_ticks:
+        if tick >= held_ticks and not arrived:
             set_speed = set_speed + np.clip(target_rad_s - set_speed, -step, step)
+            arrived = bool(np.array_equal(set_speed, target_rad_s))
         top_wave, mean_top = top.step(pipe.at_top(), set_speed)
-        pipe.tick(top_wave)
-        time_s = (tick + 1) * grid.tick_s
+        pipe.tick(top_wave, None if noise is None else noise.at(tick))
         bit_speed = pipe.bit_rad_s
         still = bit_speed == 0.0
-        last[still] = time_s
-        turned |= bit_speed > 0.0
-        first = np.where(still & turned & ~np.isfinite(first), time_s, first)
+        if still.any():
+            last[still] = tick + 1.0
+            first[still & turned & ~np.isfinite(first)] = tick + 1.0
+        turned |= ~still
         if tick % every == 0:
-            kept.append((time_s, set_speed, mean_top, bit_speed.reshape(shape), top.torque_nm))
+            kept.append(((tick + 1) * grid.tick_s, set_speed, mean_top, bit_speed.reshape(shape), top.torque_nm))
     times, sets, tops, bits, torques = zip(*kept, strict=True)
+    late = last.reshape(shape)
     return SimulationTrace(np.array(times), np.array(sets), np.array(tops), np.array(bits), np.array(torques),
-                           first.reshape(shape), last.reshape(shape))
+                           first.reshape(shape) * tick_s, np.where(late < 0.0, late, late * tick_s), count * tick_s)
+
+
+class _BitNoise:
+    """n(t) of every case: drawn for each seed, with the size and the correlation time of each string's bit."""
+
+    def __init__(self, strings: Sequence[DrillString], grids: Sequence[Grid], seeds: Sequence[int], repeats: int
+                 ) -> None:
+        bits = [one.bit for one in strings]
+        self._rms = np.array([0.0 if bit is None else bit.noise_nm for bit in bits])
+        keep = np.array([np.exp(-grid.tick_s / max(1e-9, 1.0 if bit is None else bit.noise_correlation_s))
+                         for bit, grid in zip(bits, grids, strict=True)])
+        self._keep, self._new = keep, np.sqrt(1.0 - keep**2)
+        own = list(dict.fromkeys(seeds))
+        self._of = np.array([own.index(seed) for seed in seeds])
+        self._random = [np.random.default_rng(seed) for seed in own]
+        self._repeats = repeats
+        self._state = np.array([random.standard_normal() for random in self._random])[self._of]
+        self._block: Array = np.empty((0, len(own)))
+
+    def at(self, tick: int) -> Array:
+        """N·m, during that tick; ticks in their order."""
+        row = tick % NOISE_BLOCK
+        if row == 0:
+            self._block = np.array([random.standard_normal(NOISE_BLOCK) for random in self._random]).T
+        self._state = self._keep * self._state + self._new * self._block[row, self._of]
+        found: Array = np.repeat(self._rms * self._state, self._repeats)
+        return found
+
+
+def _columns(values: Sequence[Sequence[float]], repeats: int) -> Array:
+    """(segments, cases) from one row a string."""
+    return np.repeat(np.array(values, dtype=float).T, repeats, axis=1)
 
 
 class _Waves:
     """The rings: what was sent into each segment at its ends, and comes out of it after its ticks."""
 
-    def __init__(self, grid: Grid, cases: int) -> None:
-        self._grid = grid
-        self._ticks = np.array(grid.ticks)
+    def __init__(self, grids: Sequence[Grid], repeats: int) -> None:
+        cases = len(grids) * repeats
+        self._ticks = np.array(grids[0].ticks)
         self._size = int(self._ticks.max())
-        segments = len(grid.ticks)
+        segments = len(self._ticks)
         self._down = np.zeros((self._size, segments, cases))
         self._up = np.zeros((self._size, segments, cases))
         self._rows = np.arange(segments)
         self._now = 0
-        impedance, drag = np.array(grid.impedance_nm_s_rad), np.array(grid.drag_nm_s_rad)
-        above, below = impedance[:-1, None], impedance[1:, None]
-        beta = 0.5 * (drag[:-1] + drag[1:])[:, None]
+        self._impedance = _columns([grid.impedance_nm_s_rad for grid in grids], repeats)
+        self._drag = _columns([grid.drag_nm_s_rad for grid in grids], repeats)
+        self._coulomb = _columns([grid.coulomb_nm for grid in grids], repeats)
+        static = _columns([grid.static_nm for grid in grids], repeats)
+        above, below = self._impedance[:-1], self._impedance[1:]
+        beta = 0.5 * (self._drag[:-1] + self._drag[1:])
         self._over = 1.0 / (above + below + beta)
         self._twice_above, self._twice_below = 2.0 * above, 2.0 * below
+        self._kinetic = 0.5 * (self._coulomb[:-1] + self._coulomb[1:])
+        self._static = np.maximum(0.5 * (static[:-1] + static[1:]), self._kinetic)
+        self._dry = bool(np.any(self._static > 0.0))
+        self._moving = np.zeros(self._kinetic.shape, dtype=bool)
 
     def fill(self, bottom_torque_nm: Array, speed: Array) -> None:
         """One speed all along; torque as the drag at that speed makes it grow upwards."""
-        grid = self._grid
         torque = bottom_torque_nm.copy()
-        below = 0.0
-        for row in range(len(grid.ticks) - 1, -1, -1):
-            drag, impedance = grid.drag_nm_s_rad[row], grid.impedance_nm_s_rad[row]
-            torque = torque + 0.5 * (drag + below) * speed
-            below = drag
+        side = np.sign(speed)
+        below: Array = np.zeros_like(torque)
+        self._moving[:] = speed != 0.0
+        for row in range(len(self._ticks) - 1, -1, -1):
+            own, impedance = self._drag[row] * speed + self._coulomb[row] * side, self._impedance[row]
+            torque = torque + 0.5 * (own + below)
+            below = own
             self._down[:, row] = torque + impedance * speed
             self._up[:, row] = impedance * speed - torque
 
     def top_torque(self, top_speed: Array) -> Array:
         """τ just below the rotor."""
-        felt = self._grid.impedance_nm_s_rad[0] + 0.5 * self._grid.drag_nm_s_rad[0]
-        torque: Array = felt * top_speed - self.at_top()
+        felt = self._impedance[0] + 0.5 * self._drag[0]
+        torque: Array = felt * top_speed + 0.5 * self._coulomb[0] * np.sign(top_speed) - self.at_top()
         return torque
 
     def at_top(self) -> Array:
         """What comes out of the topmost segment now, at its upper end."""
-        arriving: Array = self._up[(self._now - self._grid.ticks[0]) % self._size, 0]
+        arriving: Array = self._up[(self._now - self._ticks[0]) % self._size, 0]
         return arriving
 
     def arriving(self) -> tuple[Array, Array]:
@@ -231,7 +328,12 @@ class _Waves:
     def send(self, down: Array, up: Array, from_top: Array, from_bit: Array) -> None:
         """Through every node, and one tick on."""
         a, b = down[:-1], up[1:]
-        speed = (a + b) * self._over
+        driven = a + b
+        if self._dry:
+            least = np.where(self._moving, self._kinetic, self._static)
+            self._moving = np.abs(driven) > least
+            driven = np.where(self._moving, driven - np.copysign(self._kinetic, driven), 0.0)
+        speed = driven * self._over
         slot = self._now % self._size
         self._down[slot, 0] = from_top
         self._up[slot, -1] = from_bit
@@ -243,12 +345,16 @@ class _Waves:
 class PipeSimulation:
     """Waves and bit, a tick at a time: whatever hangs below a top drive, simulated or real; one number a case."""
 
-    def __init__(self, string: DrillString, grid: Grid, cases: int) -> None:
-        assert string.bit is not None
-        self._viscous = string.bottom_viscous_nm_s_rad
-        self._waves = _Waves(grid, cases)
-        self._bit = _Bit(string.bit, string.bottom_viscous_nm_s_rad, grid)
-        self.bit_rad_s: Array = np.zeros(cases)
+    def __init__(self, strings: Sequence[DrillString], grids: Sequence[Grid], repeats: int = 1) -> None:
+        self._waves = _Waves(grids, repeats)
+        self._bit = _Bit(strings, grids, repeats)
+        self._viscous = np.repeat([string.bottom_viscous_nm_s_rad for string in strings], repeats)
+        self.bit_rad_s: Array = np.zeros(len(strings) * repeats)
+
+    @property
+    def breakaway_nm(self) -> Array:
+        """At which each bit begins to turn."""
+        return self._bit.static_nm
 
     def wind_up(self, torque_nm: Array) -> None:
         """Nothing turns, and all of it is wound up to that torque."""
@@ -257,7 +363,7 @@ class PipeSimulation:
     def turn(self, speed: Array) -> Array:
         """All of it turns steadily; the torque that this takes at the top."""
         self.bit_rad_s = speed.copy()
-        load = self._bit.sliding(speed) * np.sign(speed) + self._viscous * speed
+        load = self._bit.rubbing(speed) * np.sign(speed) + self._viscous * speed
         self._waves.fill(load, speed)
         return self.top_torque(speed)
 
@@ -273,32 +379,36 @@ class PipeSimulation:
         """τ just below the rotor, at that speed."""
         return self._waves.top_torque(speed)
 
-    def tick(self, from_top: Array) -> None:
+    def tick(self, from_top: Array, noise_nm: Array | None = None) -> None:
         """One on, with the wave that the top sends down meanwhile."""
         arriving_down, arriving_up = self._waves.arriving()
-        bit_wave, self.bit_rad_s = self._bit.step(arriving_down[-1], self.bit_rad_s)
+        bit_wave, self.bit_rad_s = self._bit.step(arriving_down[-1], self.bit_rad_s, noise_nm)
         self._waves.send(arriving_down, arriving_up, from_top, bit_wave)
 
 
 class _Top:
     """Rotor, controller and lags; (loops, speeds, states)."""
 
-    def __init__(self, loops: Sequence[Loop], grid: Grid, speeds: int) -> None:
+    def __init__(self, loops: Sequence[Loop], grids: Sequence[Grid], speeds: int) -> None:
         from scipy.linalg import expm
 
-        self._impedance = grid.impedance_nm_s_rad[0]
-        self._drag = 0.5 * grid.drag_nm_s_rad[0]
         self._lags = max(1, *(len(drive.inner_lags_s) for drive, _ in loops))
-        self._size = 4 + self._lags
-        matrices = [self._matrix(drive, controller) for drive, controller in loops]
+        self._size = size = 4 + self._lags
+        ticks = np.array([grid.tick_s for grid in grids])
+        self._impedance = np.array([grid.impedance_nm_s_rad[0] for grid in grids])[:, None]
+        matrices = np.array([self._matrix(*loop, grid) for loop, grid in zip(loops, grids, strict=True)])
         # right factors: (states + inputs) → states
-        self._step = np.array([expm(matrix * grid.tick_s)[: self._size].T for matrix in matrices])
-        self._dry = np.array([drive.coulomb_nm for drive, _ in loops])[:, None]
+        step = np.swapaxes(expm(matrices * ticks[:, None, None])[:, :size], 1, 2)
+        step[:, :, 3] /= ticks[:, None]      # ∫ω dt over the tick becomes its mean
+        step[:, 3] = 0.0                     # and begins anew with each
+        self._step, self._of_inputs = np.ascontiguousarray(step[:, :size]), step[:, None, size:]
+        self._dry = np.array([drive.coulomb_nm + 0.5 * grid.coulomb_nm[0]
+                              for (drive, _), grid in zip(loops, grids, strict=True)])[:, None]
+        self._own_dry = np.array([drive.coulomb_nm for drive, _ in loops])[:, None]
         self._viscous = np.array([drive.viscous_nm_s_rad for drive, _ in loops])[:, None]
-        self._tick_s = grid.tick_s
-        self._state = np.zeros((len(loops), speeds, self._size))
+        self._state = np.zeros((len(loops), speeds, size))
 
-    def _matrix(self, drive: TopDrive, controller: SpeedController) -> Array:
+    def _matrix(self, drive: TopDrive, controller: SpeedController, grid: Grid) -> Array:
         """Of states ω, ∫e·I, filtered ω, ∫ω dt, lags; and the inputs wave, dry friction, set speed."""
         size = self._size
         law = np.zeros((size + 3, size + 3))
@@ -306,14 +416,14 @@ class _Top:
         lags = [lag for lag in drive.inner_lags_s if lag > 0.0]
         lags += [1e-4] * (self._lags - len(lags))
         inertia = drive.inertia_kg_m2
-        law[0, 0] = -(drive.viscous_nm_s_rad + self._impedance + self._drag) / inertia
+        felt = grid.impedance_nm_s_rad[0] + 0.5 * grid.drag_nm_s_rad[0]
+        law[0, 0] = -(drive.viscous_nm_s_rad + felt) / inertia
         law[0, 3 + self._lags] = law[0, wave] = law[0, dry] = 1.0 / inertia
         law[1, 0], law[1, wanted] = -controller.integral_nm_rad, controller.integral_nm_rad
         filter_s = controller.derivative_filter_s
         law[2, 0], law[2, 2] = 1.0 / filter_s, -1.0 / filter_s
         law[3, 0] = 1.0
         back = controller.compensated_kg_m2 / filter_s
-        law[4] = np.zeros(size + 3)
         law[4, 0], law[4, wanted] = back - controller.gain_nm_s_rad, controller.gain_nm_s_rad
         law[4, 1], law[4, 2] = 1.0, -back
         law[4] /= lags[0]
@@ -330,7 +440,8 @@ class _Top:
 
     def begin(self, speed: Array, string_torque_nm: Array) -> None:
         """Turning at the set speed, the torque in balance."""
-        torque = string_torque_nm + self._viscous * speed + self._dry * np.clip(speed / SLIDING_BLUR_RAD_S, -1.0, 1.0)
+        torque = string_torque_nm + self._viscous * speed + self._own_dry * np.clip(
+            speed / SLIDING_BLUR_RAD_S, -1.0, 1.0)
         self._state[:, :, 0] = self._state[:, :, 2] = speed
         self._state[:, :, 1] = torque
         self._state[:, :, 4:] = torque[:, :, None]
@@ -338,63 +449,83 @@ class _Top:
     def step(self, arriving: Array, set_speed: Array) -> tuple[Array, Array]:
         """(wave that goes down, mean speed)."""
         state = self._state
-        shape = set_speed.shape
-        wave = arriving.reshape(shape)
-        state[:, :, 3] = 0.0
+        wave = arriving.reshape(set_speed.shape)
         friction = -self._dry * np.clip(state[:, :, 0] / SLIDING_BLUR_RAD_S, -1.0, 1.0)
-        inputs = np.stack([wave, friction, set_speed], axis=2)
-        self._state = state = np.concatenate([state, inputs], axis=2) @ self._step
-        mean = state[:, :, 3] / self._tick_s
+        of = self._of_inputs
+        after = state @ self._step
+        after += wave[:, :, None] * of[:, :, 0]
+        after += friction[:, :, None] * of[:, :, 1]
+        after += set_speed[:, :, None] * of[:, :, 2]
+        self._state = after
+        mean = after[:, :, 3]
         return (2.0 * self._impedance * mean - wave).ravel(), mean
 
 
 class _Bit:
     """What turns at the bottom, one number a case."""
 
-    def __init__(self, friction: BitFriction, viscous_nm_s_rad: float, grid: Grid) -> None:
-        self._friction = friction
-        self._inertia = grid.bottom_inertia_kg_m2
-        self._impedance = grid.impedance_nm_s_rad[-1]
-        self._viscous = viscous_nm_s_rad + self._impedance + 0.5 * grid.drag_nm_s_rad[-1]
-        self._falls = friction.static_nm - friction.coulomb_nm
-        # A falling branch steeper than what the line takes grows: in parts of 2 %. One that isn't runs to a balance,
-        # which the tangent's exponential reaches in one step.
-        steepest = sqrt(2.0 / e) * self._falls / friction.stribeck_speed_rad_s if self._falls else 0.0
-        growth = max(0.0, steepest - self._viscous) / self._inertia * grid.tick_s
-        self._parts = int(np.clip(ceil(growth / 0.02), 1, 25))
-        self._part_s = grid.tick_s / self._parts
-        self._tick_s = grid.tick_s
+    def __init__(self, strings: Sequence[DrillString], grids: Sequence[Grid], repeats: int) -> None:
+        def each(values: Sequence[float]) -> Array:
+            return np.repeat(np.array(values, dtype=float), repeats)
 
-    def sliding(self, speed: Array) -> Array:
-        """T_f without its sign."""
-        return self._friction.coulomb_nm + self._bent(speed)
+        bits = [string.bit for string in strings]
+        if any(bit is None for bit in bits):
+            raise ValueError("no bit is stated")
+        along = [0.5 * grid.coulomb_nm[-1] for grid in grids]
+        along_static = [0.5 * grid.static_nm[-1] for grid in grids]
+        self._wall = each(along)
+        self._coulomb = each([bit.coulomb_nm + more for bit, more in zip(bits, along, strict=True) if bit])
+        self.static_nm = each([bit.static_nm + more for bit, more in zip(bits, along_static, strict=True) if bit])
+        self._falls = each([bit.static_nm - bit.coulomb_nm for bit in bits if bit])
+        self._width = each([bit.stribeck_speed_rad_s for bit in bits if bit])
+        self._inertia = each([grid.bottom_inertia_kg_m2 for grid in grids])
+        self._impedance = each([grid.impedance_nm_s_rad[-1] for grid in grids])
+        self._viscous = self._impedance + each([
+            string.bottom_viscous_nm_s_rad + 0.5 * grid.drag_nm_s_rad[-1]
+            for string, grid in zip(strings, grids, strict=True)])
+        self._tick_s = each([grid.tick_s for grid in grids])
+        # A falling branch steeper than what the line takes grows: in parts of 5 %. One that isn't runs to a balance,
+        # which the tangent's exponential reaches in one step.
+        steepest = sqrt(2.0 / e) * self._falls / self._width
+        growth = float(np.max(np.maximum(0.0, steepest - self._viscous) / self._inertia * self._tick_s))
+        self._parts = int(np.clip(ceil(growth / LARGEST_GROWTH), 1, 25))
+        self._part_s = self._tick_s / self._parts
+        self._pace = self._part_s / self._inertia
+        self._bends = bool(np.any(self._falls > 0.0))
+
+    def rubbing(self, speed: Array) -> Array:
+        """T_f of the bit alone, without its sign."""
+        return self._coulomb - self._wall + self._bent(speed)
 
     def release(self) -> None:
-        """No dry friction any more."""
-        self._friction, self._falls = BitFriction(0.0, 0.0, np.inf), 0.0
+        """No dry friction of the bit any more."""
+        self._coulomb, self._falls = self._wall.copy(), np.zeros_like(self._falls)
+        self.static_nm, self._bends = self._wall.copy(), False
 
     def _bent(self, speed: Array) -> Array:
-        if self._falls == 0.0:
+        if not self._bends:
             return np.zeros_like(speed)
-        over: Array = self._falls * np.exp(-((speed / self._friction.stribeck_speed_rad_s) ** 2))
+        over: Array = self._falls * np.exp(-((speed / self._width) ** 2))
         return over
 
-    def step(self, arriving: Array, speed: Array) -> tuple[Array, Array]:
+    def step(self, arriving: Array, speed: Array, noise_nm: Array | None = None) -> tuple[Array, Array]:
         """(wave that goes up, speed after the tick)."""
         travel = np.zeros_like(speed)
-        width, inertia, part_s = self._friction.stribeck_speed_rad_s, self._inertia, self._part_s
+        driven = arriving if noise_nm is None else arriving - noise_nm
+        slower = -self._viscous * self._pace
         for _ in range(self._parts):
-            side = np.where(speed != 0.0, np.sign(speed), np.sign(arriving))
-            holds = (speed == 0.0) & (np.abs(arriving) <= self._friction.static_nm)
+            side = np.where(speed != 0.0, np.sign(speed), np.sign(driven))
+            holds = (speed == 0.0) & (np.abs(driven) <= self.static_nm)
             bent = self._bent(speed)
-            net = arriving - side * (self._friction.coulomb_nm + bent) - self._viscous * speed
-            growth = (2.0 * bent * np.abs(speed) / width**2 - self._viscous) / inertia * part_s
+            net = driven - side * (self._coulomb + bent) - self._viscous * speed
+            growth = slower + 2.0 * bent * np.abs(speed) / self._width**2 * self._pace if self._bends else slower
             growth = np.where(np.abs(growth) < 1e-9, 1e-9, growth)
-            end = speed + net / inertia * part_s * np.expm1(growth) / growth
-            end = np.where(holds | (end * side < 0.0), 0.0, end)
-            travel += 0.5 * (speed + end) * part_s
+            end = speed + net * self._pace * np.expm1(growth) / growth
+            end[holds | (end * side < 0.0)] = 0.0
+            travel += speed + end
             speed = end
-        return 2.0 * self._impedance * travel / self._tick_s - arriving, speed
+        mean = travel / (2.0 * self._parts)
+        return 2.0 * self._impedance * mean - arriving, speed
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -407,14 +538,12 @@ RPM = 2.0 * pi / 60.0
 
 @dataclass(frozen=True)
 class CriticalSpeeds:
-    """In rpm of the main shaft; None: none up to the highest that was tried, or (onset) never stuck."""
+    """In rpm of the main shaft, without bit noise; None: none up to the highest that was tried."""
 
     cure_rpm: float | None
     """The lowest set speed from which a stuck bit (at breakaway, the top at full set speed) ends turning."""
     start_rpm: float | None
     """The lowest set speed at which the bit turns in the end after a ramp from rest."""
-    onset_rpm: float | None
-    """Set speed at which a turning bit first sticks, as it falls by 1 rpm/s."""
 
 
 @dataclass(frozen=True)
@@ -429,35 +558,33 @@ class Search:
     calm_s: float = 20.0
     """At the end of it: the bit turns if it has not stood still for so long."""
     start_ramp_rpm_s: float = 5.0
-    onset_from_rpm: float = 210.0
-    onset_fall_rpm_s: float = 1.0
+    longest_tick_s: float = LONGEST_TICK_S
 
 
-def critical_speeds(string: DrillString, loops: Sequence[Loop], search: Search = Search()) -> list[CriticalSpeeds]:
+def critical_speeds(strings: Strings, loops: Sequence[Loop], search: Search = Search()) -> list[CriticalSpeeds]:
     """Of every loop. Raises ValueError where no bit is stated."""
-    cures = lowest_turning(string, loops, "stuck", search)
-    starts = lowest_turning(string, loops, "rest", search)
-    onsets = onset_speeds(string, loops, search)
-    return [CriticalSpeeds(*three) for three in zip(cures, starts, onsets, strict=True)]
+    cures = lowest_turning(strings, loops, "stuck", search)
+    starts = lowest_turning(strings, loops, "rest", search)
+    return [CriticalSpeeds(*two) for two in zip(cures, starts, strict=True)]
 
 
 Start = Literal["stuck", "rest"]
 
 
-def lowest_turning(string: DrillString, loops: Sequence[Loop], how: Start, search: Search) -> list[float | None]:
+def lowest_turning(strings: Strings, loops: Sequence[Loop], how: Start, search: Search) -> list[float | None]:
     """The lowest set speed, to the resolution, at which and above which every one tried ends with a bit that turns.
 
     First on a coarse grid, then between the last that sticks and the first above it.
     """
     coarse = np.arange(search.lowest_rpm, search.highest_rpm + 1.0, search.coarse_rpm)
-    turns = _ends_turning(string, loops, how, np.tile(coarse, (len(loops), 1)), search)
+    turns = _ends_turning(strings, loops, how, np.tile(coarse, (len(loops), 1)), search)
     first = [_first_of_the_rest(row) for row in turns]
     parts = max(1, round(search.coarse_rpm / search.resolution_rpm))
     offsets = search.coarse_rpm * (np.arange(1, parts + 1) / parts - 1.0)
     # above a loop for which nothing turned there is nothing to look for: it goes along, and is not looked at
     top = np.array([coarse[min(at, coarse.size - 1)] for at in first])
     fine = np.maximum(top[:, None] + offsets[None, :], 0.5 * search.resolution_rpm)
-    turns = _ends_turning(string, loops, how, fine, search)
+    turns = _ends_turning(strings, loops, how, fine, search)
     return [
         None if at == coarse.size else float(fine[k, min(_first_of_the_rest(turns[k]), parts - 1)])
         for k, at in enumerate(first)
@@ -471,23 +598,57 @@ def _first_of_the_rest(turns: NDArray[np.bool_]) -> int:
 
 
 def _ends_turning(
-    string: DrillString, loops: Sequence[Loop], how: Start, speeds_rpm: Array, search: Search
+    strings: Strings, loops: Sequence[Loop], how: Start, speeds_rpm: Array, search: Search,
+    seeds: Sequence[int] | None = None,
 ) -> NDArray[np.bool_]:
     target = speeds_rpm * RPM
     begin = Begin(how, target if how == "stuck" else np.zeros_like(target))
     ramp = search.start_ramp_rpm_s * RPM
     duration = search.duration_s + (0.0 if how == "stuck" else float(target.max()) / ramp)
-    trace = simulate(string, loops, begin, target, ramp, duration, keep_every_s=duration / 4.0)
-    turned: NDArray[np.bool_] = trace.last_stuck_s < duration - search.calm_s
+    trace = simulate(strings, loops, begin, target, ramp, duration, keep_every_s=duration / 4.0,
+                     longest_tick_s=search.longest_tick_s, seeds=seeds)
+    turned: NDArray[np.bool_] = trace.last_stuck_s < trace.end_s * (1.0 - search.calm_s / duration)
     return turned
 
 
-def onset_speeds(string: DrillString, loops: Sequence[Loop], search: Search) -> list[float | None]:
-    """The set speed, rpm, at which each first sticks as it falls."""
-    begin = np.full((len(loops), 1), search.onset_from_rpm * RPM)
-    fall = search.onset_fall_rpm_s
-    duration = search.onset_from_rpm / fall
-    trace = simulate(string, loops, Begin("turning", begin), np.zeros_like(begin), fall * RPM, duration,
-                     keep_every_s=duration)
-    stuck = trace.first_stuck_s[:, 0]
-    return [float(search.onset_from_rpm - fall * time) if np.isfinite(time) else None for time in stuck]
+# ---------------------------------------------------------------------------------------------------------------------
+# Under bit noise: many strings, each with its own noise, on a grid of speeds that rises by a factor.
+
+TICKS_PER_WAY, LONGEST_NOISY_TICK_S = 30.0, 0.02
+"""Of a search over many strings: the tick is a thirtieth of the way down, at most. Cure speeds of the reference case
+are the same at 0.006 and at 0.03 s."""
+COARSE_SPEEDS, FINE_SPEEDS = 14, 8
+"""Speeds of the first and of the second grid."""
+PERIODS, CALM_PERIODS = 12.0, 3.0
+"""Length of a simulation in periods of the string's lowest mode with the top held, and of its end in which the bit must
+not stand still."""
+LOWEST_NOISY_RPM, HIGHEST_NOISY_RPM = 10.0, 240.0
+NOISY_RESOLUTION = (HIGHEST_NOISY_RPM / LOWEST_NOISY_RPM) ** (1.0 / ((COARSE_SPEEDS - 1) * FINE_SPEEDS)) - 1.0
+"""Relative, of a critical speed under noise: 3 %."""
+
+
+def coarse_tick_s(string: DrillString) -> float:
+    """Return the longest tick with which critical speeds of that string are found."""
+    return min(LONGEST_NOISY_TICK_S, 0.5 * string.echo_s / TICKS_PER_WAY)
+
+
+def lowest_turning_with_noise(
+    strings: Sequence[DrillString], loops: Sequence[Loop], seeds: Sequence[int], how: Start, period_s: float
+) -> Array:
+    """Return for each loop the lowest set speed, rpm, from which on the bit ends turning; infinite: none.
+
+    ``period_s``: of the lowest mode with the top held. Every loop has its own string and seed. Raises ValueError where
+    a bit isn't stated.
+    """
+    search = Search(duration_s=PERIODS * period_s, calm_s=CALM_PERIODS * period_s,
+                    longest_tick_s=coarse_tick_s(strings[0]))
+    coarse = np.geomspace(LOWEST_NOISY_RPM, HIGHEST_NOISY_RPM, COARSE_SPEEDS)
+    turns = _ends_turning(strings, loops, how, np.tile(coarse, (len(loops), 1)), search, seeds)
+    first = np.array([_first_of_the_rest(row) for row in turns])
+    ratio = float(coarse[1] / coarse[0])
+    top = coarse[np.minimum(first, COARSE_SPEEDS - 1)]
+    fine = top[:, None] * ratio ** (np.arange(1, FINE_SPEEDS + 1) / FINE_SPEEDS - 1.0)
+    turns = _ends_turning(strings, loops, how, fine, search, seeds)
+    turns[:, -1] = True
+    found = fine[np.arange(len(loops)), [_first_of_the_rest(row) for row in turns]]
+    return np.where(first < COARSE_SPEEDS, found, np.inf)

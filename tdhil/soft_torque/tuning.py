@@ -1,35 +1,43 @@
-r"""From J, with its interval, to gains: stiff, soft, with inertia compensated, broadband; and what J's error costs.
+r"""From J, with its interval, to gains that can be typed in: the lowest critical speed that the margins allow.
 
-**Soft.** P = ζ/a, I = ω² J. Rotor and I are a tuned absorber on the string: where they swing alone as the string's
-lowest mode does, the mode splits into two, and a decides how both are damped. a = 1 matches ζ at that one frequency and
-damps least; the a that damps the lesser of the two most (0.19 on the reference case) is looked for here, on the exact
-poles with the lags in the loop.
+**Objective.** The lowest set speed without stick-slip, *cure under bit noise*, as the mean over truths that are drawn
+jointly (`uncertainty`): J, string, lags and bit at once. **Subject to** a phase margin, a gain margin and a dead-time
+reserve (`stability`) on every one of these truths. **Free** are softness a, frequency factor φ and the share of J that
+is compensated: P = ζ/a, I = (φω)² (J − J_c). A grid is ranked without a simulation (`candidates`); the best that keep
+the margins are simulated under noise, and the best of those is taken. Without a bit the rank decides.
 
-**Compensated.** The part of J that the controller gives back is gone from the absorber: less inertia, more damping. Too
-much given back is a rotor with negative inertia behind the lags, which swings by itself. It must be stable for every J
-of the interval; of the largest share that is, a reserve is kept.
+**Soft** compensates nothing: any drive takes it. **Compensated** gives back a part of the rotor's inertia.
+**Broadband** is full compensation and P = ζ as far as lags and margins allow. Where that is no more than a soft
+controller does, it is refused under this name. **Stiff** and **present** gains are rows like the others.
 
-**Broadband.** Full compensation and P = ζ would be Z = ζ everywhere, and is unstable behind any lag. As far as the
-same rule lets it come: the a whose mean |r| from 0.05 to 1.5 Hz is least, with the largest share that it allows; where
-that is no more than a soft controller does, it is refused under this name.
+**Advice.** The best row is compared with the present gains (without them: with the stiff ones), truth by truth. Where
+it isn't better by more than the search resolves, the advice is to keep what there is.
 
-**How J's error comes in.** The gains are what they are; J is what moves. Every derived number is taken at some values
-of J from end to end of its interval, and its interval is what these span, turning points between them included:
-whatever J is in its own, the number is in this one. What else has an interval (lags and gains as measured, a string as
-identified) is moved to either end of it, one after the other, and what each does to a number is added in squares.
-(Checked by drawing all of them, in the tests.)
+**How J's error comes in.** The gains are what they are; J is what moves. The figures of one string as it is stated are
+also told over the 95 % interval of J alone, with the turning points between its ends. What else was measured (lags,
+present gains, k and ω as identified) is moved to either end of its interval, one after the other, and what each does
+is added in squares.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from math import inf, pi, sqrt
+from dataclasses import dataclass, field, replace
+from math import inf, log, pi, sqrt
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from profiles import TdhilError
+from profiles import MessageCode, TdhilError
+from tdhil.soft_torque.candidates import (
+    SHARES,
+    SOFTNESSES,
+    Candidate,
+    candidates,
+    gains,
+    ranked_speeds,
+)
 from tdhil.soft_torque.controller import (
     ClosedSystem,
     Margins,
@@ -42,12 +50,34 @@ from tdhil.soft_torque.controller import (
     stiff_controller,
     tuned_controller,
 )
-from tdhil.soft_torque.drill_string import DrillString
-from tdhil.soft_torque.roots import RootsLost
-from tdhil.soft_torque.simulation import CriticalSpeeds, Search, critical_speeds, lowest_turning
+from tdhil.soft_torque.drill_string import MUD_DRAG_NM_S_RAD_M, DrillString
+from tdhil.soft_torque.simulation import (
+    LOWEST_NOISY_RPM,
+    NOISY_RESOLUTION,
+    RPM,
+    CriticalSpeeds,
+    Search,
+    coarse_tick_s,
+    critical_speeds,
+    lowest_turning,
+    lowest_turning_with_noise,
+)
+from tdhil.soft_torque.stability import (
+    USUAL_MARGINS,
+    LoopMargins,
+    RequiredMargins,
+    StringResponse,
+    highest_crossover,
+    is_stable,
+    least_of,
+    linear_limit,
+    loop_margins,
+    response_of,
+)
+from tdhil.soft_torque.uncertainty import DrawnValues, Interval, Truth, draw_truths
 
 TUNING_REFUSED = 11
-"""Exit code: the gains that were asked for would make the string swing."""
+"""Exit code: the gains that were asked for would be unstable, or leave less margin than is required."""
 STEPS = 9
 """Values of J, from end to end of its interval, at which what follows from it is worked out; odd."""
 RESERVE = 0.8
@@ -63,7 +93,16 @@ BROADBAND_BELOW = 0.8
 NEXT_MODE_SHARE = 0.85
 """Of the second mode with the top held, that the whole's second mode stays above: there a top drive is a rotor, or a
 wall."""
-_LEAST_SOFT, _MOST_SOFT = 0.02, 2.0
+DRAWS, SEARCH_DRAWS = 20, 6
+"""Truths that a row's figures are taken over, and those on which finalists are simulated."""
+FINALISTS, MOST_TRIED = 5, 120
+"""Candidates of one kind that are simulated, and that are held against the margins before it is given up."""
+GOLDEN_STEPS = 7
+"""Each leaves 0.62 of the range in which a turning point lies: 0.03 of two steps of J."""
+CRITICAL_STEPS = 5
+"""Values of J at which critical speeds of the stated string are simulated."""
+NOT_BETTER_SHARE = 2.0 * NOISY_RESOLUTION
+"""A critical speed that is lower by less is no reason to change anything."""
 _WAVES_SUPPOSED = ("what inertia compensation does to the pipe's waves, and whether their losses keep it stable, is "
                    "not known of a spring alone: the pipe has to be named (string.yaml)")
 
@@ -71,16 +110,9 @@ _WAVES_SUPPOSED = ("what inertia compensation does to the pipe's waves, and whet
 class TuningRefused(TdhilError):
     """The gains that were asked for can't be recommended for this machine, and the message says why."""
 
+    entry = MessageCode.TUNING_REFUSED
+
     exit_code = TUNING_REFUSED
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A number with the ends of its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -101,14 +133,23 @@ class TuneCase:
     """With the J that is believed."""
     inertia_kg_m2: Interval
     phase_margin_deg: float = 60.0
+    """Of the stiff controller."""
     softness: float | None = None
-    """a, where it is asked for; None: the one that damps most."""
+    """a, where it is asked for; None: the one with the lowest critical speed."""
     compensated_share: float | None = None
-    """Share of J, where it is asked for; None: the one that damps most within the reserve."""
+    """Share of J, where it is asked for; None: the one with the lowest critical speed."""
     present: SpeedController | None = None
-    """What stands in the drive now, as measured (`identify --impedance`); shown beside the others."""
+    """The gains in the drive now, measured (`identify --impedance`) or typed; shown beside the others."""
     also: tuple[tuple[Moved, Moved], ...] = ()
-    """What else is known to an interval only, none hanging on another: both ends of each."""
+    """What else is known to an interval only, each independent of the others: both ends of each."""
+    required: RequiredMargins = USUAL_MARGINS
+    """On every sampled truth."""
+    lag_tolerance: float = 0.1
+    """Relative, of each lag, where ``also`` has no lags."""
+    string_draws: tuple[DrillString, ...] = ()
+    """Strings drawn from the covariance of an identification; (): drawn from the string's own tolerances."""
+    draws: int = DRAWS
+    seed: int = 1
 
     def moved(self, by: Moved) -> TuneCase:
         """The case with that one thing moved."""
@@ -124,11 +165,31 @@ class TuneCase:
     @property
     def at_inertias(self) -> tuple[TopDrive, ...]:
         """The drive at `STEPS` values of J from end to end of its interval, the believed one in the middle."""
+        return tuple(self.drive.with_inertia(one) for one in self.inertias(STEPS))
+
+    def inertias(self, steps: int) -> tuple[float, ...]:
+        """So many values of J (odd), from end to end of its interval, the believed one in the middle."""
         low, value, high = self.inertia_kg_m2.low, self.inertia_kg_m2.value, self.inertia_kg_m2.high
-        half = STEPS // 2
+        half = steps // 2
         below = [low + (value - low) * k / half for k in range(half)]
-        above = [value + (high - value) * k / half for k in range(half + 1)]
-        return tuple(self.drive.with_inertia(one) for one in (*below, *above))
+        return (*below, *(value + (high - value) * k / half for k in range(half + 1)))
+
+    def truths(self) -> tuple[Truth, ...]:
+        """Draw `draws` truths from all that is open."""
+        lags, gains_open = [], []
+        for low, high in self.also:
+            if low.inner_lags_s is not None and high.inner_lags_s is not None:
+                size = max(len(low.inner_lags_s), len(high.inner_lags_s), len(self.drive.inner_lags_s))
+                ends = [np.array((*end, *(0.0,) * (size - len(end)))) for end in (low.inner_lags_s, high.inner_lags_s)]
+                lags.append((0.5 * (ends[1] - ends[0])).tolist())
+            if low.present is not None and high.present is not None:
+                gains_open.append((0.5 * (high.present.gain_nm_s_rad - low.present.gain_nm_s_rad),
+                                   0.5 * (high.present.integral_nm_rad - low.present.integral_nm_rad)))
+        same = all(len(axis) == len(self.drive.inner_lags_s) for axis in lags)
+        return draw_truths(
+            self.string, self.drive, self.inertia_kg_m2, count=self.draws, seed=self.seed,
+            lag_tolerance=self.lag_tolerance, lag_axes=lags if same else (), present=self.present,
+            present_axes=gains_open, string_draws=self.string_draws)
 
 
 @dataclass(frozen=True)
@@ -150,6 +211,8 @@ class Tuned:
     controller: SpeedController | None
     refusal: str = ""
     softness: float | None = None
+    frequency_factor: float = 1.0
+    """φ: I = (φω)² (J − J_c)."""
     softest: float | None = None
     """The a at which the lags make Z negative at low frequencies."""
     compensated_share: float = 0.0
@@ -158,22 +221,57 @@ class Tuned:
     integral_nm_rad: Interval | None = None
     """I as J's interval has it."""
     reflection: Interval | None = None
-    """|r| at the lowest mode."""
+    """|r| at the lowest mode; this and the next two over J's interval, the string as stated."""
     band_reflection: Interval | None = None
     """Mean |r| over `BAND_HZ`."""
     damping: Interval | None = None
     """The least of the lowest modes'."""
     modes: tuple[NaturalMode, ...] = ()
     margins: Margins | None = None
-    lag_reserve_s: float | None = None
-    """So much more lag in the loop, and it swings; None: more than 1 s."""
+    """Of the bare drive."""
+    with_string: LoopMargins | None = None
+    """All as believed."""
+    worst: LoopMargins | None = None
+    """The least of each margin over all sampled truths."""
+    failed: tuple[str, ...] = ()
+    """Margins that are thinner than required on a sampled truth, with their numbers."""
     critical: CriticalSpeeds | None = None
-    critical_low: CriticalSpeeds | None = None
-    """At the lower end of J's interval."""
-    critical_high: CriticalSpeeds | None = None
+    """Without noise, the string as stated."""
+    critical_along: tuple[CriticalSpeeds, ...] = ()
+    """The same at values of J from end to end of its interval."""
     critical_moved: tuple[tuple[CriticalSpeeds, CriticalSpeeds], ...] = ()
     """At both ends of whatever else has an interval."""
+    cure: DrawnValues | None = None
+    """Under bit noise, rpm, over the sampled truths; so are the next two."""
+    start: DrawnValues | None = None
+    linear_limit: DrawnValues | None = None
+    """Mean speed below which steady rotation is unstable."""
     wrong: tuple[WrongInertia, ...] = ()
+
+    @property
+    def lag_reserve_s(self) -> float | None:
+        """Smallest further first-order lag in the loop that destabilises it; None: none does."""
+        return None if self.with_string is None or self.with_string.lag_s == inf else self.with_string.lag_s
+
+    @property
+    def dead_time_reserve_s(self) -> float | None:
+        """Smallest further dead time in the loop that destabilises it; None: none does."""
+        found = self.with_string
+        return None if found is None or found.dead_time_s == inf else found.dead_time_s
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What to do."""
+
+    kind: str | None
+    """The row whose gains to type in; None: keep what there is, or nothing can be recommended."""
+    compared_with: str
+    """present, or stiff."""
+    keep: bool
+    """Nothing that keeps the margins is better than that."""
+    better_share: float | None = None
+    """Share of the sampled truths on which the critical speed isn't higher; None: not simulated."""
 
 
 @dataclass(frozen=True)
@@ -186,6 +284,37 @@ class Tuning:
     tuned: tuple[Tuned, ...]
     searched: Search | None
     """How critical speeds were looked for; None: not at all."""
+    advice: Advice
+    truths: tuple[Truth, ...] = field(default=(), repr=False)
+
+    def by_kind(self, kind: str) -> Tuned | None:
+        """The row of that name."""
+        return next((one for one in self.tuned if one.kind == kind), None)
+
+
+class _TruthMargins:
+    """The truths of one case, with each string's response worked out once."""
+
+    def __init__(self, case: TuneCase) -> None:
+        self.truths = case.truths()
+        self._responses: dict[int, StringResponse] = {}
+
+    def margins(self, number: int, law: SpeedController) -> LoopMargins:
+        truth = self.truths[number]
+        top = highest_crossover(truth.drive, law)
+        known = self._responses.get(number)
+        if known is None or known.omega_rad_s[-1] < 0.98 * top:
+            known = self._responses[number] = response_of(truth.string, 1.3 * top)
+        return loop_margins(truth.drive, law, truth.string, known)
+
+    def every(self, law: SpeedController | None) -> LoopMargins:
+        """The least over all truths; ``law`` None: each truth's present gains."""
+        return least_of([self.margins(k, law or truth.present or SpeedController(0.0, 0.0))
+                         for k, truth in enumerate(self.truths)])
+
+    def keeps(self, law: SpeedController, required: RequiredMargins) -> bool:
+        """Whether no truth has a margin that is thinner."""
+        return not any(required.failed(self.margins(k, law)) for k in range(len(self.truths)))
 
 
 def tune(
@@ -197,23 +326,30 @@ def tune(
     """
     told("string's modes")
     held = string_modes_hz(case.string)
-    present = case.present
-    recipes: list[tuple[str, Callable[[], Tuned]]] = [
-        *([("present", lambda: Tuned("present", present))] if present is not None else []),
-        ("stiff", lambda: _stiff(case)),
-        ("soft", lambda: _soft(case, held)),
-        ("compensated", lambda: _compensated(case, held)),
-        ("broadband", lambda: _broadband(case, held)),
-    ]
-    found = []
-    for kind, recipe in recipes:
-        told(f"{kind}: gains")
-        tuned = recipe()
-        found.append(tuned if tuned.controller is None else _with_figures(case, tuned, held, told))
-    tuned_all = tuple(found)
-    if search is not None and case.string.bit is not None:
-        tuned_all = _with_critical_speeds(case, tuned_all, held, search, told)
-    return Tuning(case, held, tuned_all, search if case.string.bit is not None else None)
+    told("what is open: drawing truths")
+    samples = _TruthMargins(case)
+    simulated = search is not None and case.string.bit is not None
+    found: list[Tuned] = []
+    if case.present is not None:
+        found.append(Tuned("present", case.present))
+    found.append(_stiff(case))
+    told("soft, compensated: gains that keep the margins")
+    pools = [_soft(case, held, samples), _compensated(case, held, samples)]
+    if simulated:
+        told("the best of them, simulated under bit noise")
+        pools = _chosen_by_simulation(pools, samples, held)
+    found += [pool[0] for pool in pools]
+    told("broadband: gains")
+    found.append(_broadband(case, held, samples))
+    for k, one in enumerate(found):
+        if one.controller is not None:
+            told(f"{one.kind}: reflection, modes, margins")
+            found[k] = _with_figures(case, one, held, samples)
+    if simulated and search is not None:
+        found = _under_noise(found, samples, held, told)
+        stated = replace(search, longest_tick_s=coarse_tick_s(case.string))
+        found = list(_with_critical_speeds(case, tuple(found), held, stated, told))
+    return Tuning(case, held, tuple(found), search if simulated else None, _advice(case, found), samples.truths)
 
 
 def string_modes_hz(string: DrillString) -> tuple[float, ...]:
@@ -251,73 +387,174 @@ def _stiff(case: TuneCase) -> Tuned:
         return Tuned("stiff", None, str(error))
 
 
-def _soft(case: TuneCase, held: Sequence[float]) -> Tuned:
+def _soft(case: TuneCase, held: Sequence[float], samples: _TruthMargins) -> list[Tuned]:
+    """Best first; one that is refused if there is none. Raises `TuningRefused` where it was asked for."""
     softest = softest_allowed(case.string, case.drive, held[0])
     asked = case.softness
-    if asked is not None:
-        if asked >= softest:
-            raise TuningRefused(_too_soft(case, asked, softest, held), where=f"--a {asked:g}",
-                                next_step=f"Ask for less than {LAG_RESERVE * softest:.2g}, or find a shorter loop")
-        softness = asked
-    else:
-        best = _best_softness(case, held, 0.0, LAG_RESERVE * softest)
-        if best is None:
-            return Tuned("soft", None, _too_soft(case, _LEAST_SOFT, softest, held), softest=softest)
-        softness = best
-    law = tuned_controller(case.string, case.drive.inertia_kg_m2, softness, held[0])
-    if not _stable_everywhere(case, softness, 0.0, held):
-        words = (f"with a = {softness:.2g} the whole swings by itself at some J of the interval: "
-                 f"{_lag_ms(case)} of lag in the loop are too many for this string")
+    if asked is not None and asked >= softest:
+        raise TuningRefused(_too_soft(case, asked, softest, held), where=f"--a {asked:g}",
+                            next_step=f"Ask for less than {LAG_RESERVE * softest:.2g}, or find a shorter loop")
+    grid = [one for one in candidates(case.string, case.drive.inertia_kg_m2, held[0], (0.0,),
+                                      SOFTNESSES if asked is None else (asked,))
+            if asked is not None or one.softness <= LAG_RESERVE * softest_allowed(
+                case.string, case.drive, one.frequency_factor * held[0])]
+    kept = _within_margins(case, grid, samples)
+    if not kept:
+        tried = tuned_controller(case.string, case.drive.inertia_kg_m2, asked or 0.3, held[0])
+        words = _no_margin(case, samples, tried)
         if asked is not None:
-            raise TuningRefused(words, where=f"--a {asked:g}", next_step="Ask for less, or find a shorter loop")
-        return Tuned("soft", None, words, softest=softest)
-    return Tuned("soft", law, softness=softness, softest=softest)
+            raise TuningRefused(f"a = {asked:g} leaves too little margin: {words}", where=f"--a {asked:g}",
+                                next_step="Ask for another a, leave --a out, or find a shorter loop")
+        return [Tuned("soft", None, f"no a keeps the margins; a = 0.3, for one: {words}", softest=softest)]
+    return [Tuned("soft", one.controller, softness=one.softness, frequency_factor=one.frequency_factor,
+                  softest=softest) for one in kept]
 
 
-def _compensated(case: TuneCase, held: Sequence[float]) -> Tuned:
+def _compensated(case: TuneCase, held: Sequence[float], samples: _TruthMargins) -> list[Tuned]:
+    """As `_soft`."""
     asked = case.compensated_share
     if case.string.supposed:
         if asked:
             raise TuningRefused(_WAVES_SUPPOSED, where=f"--compensate {asked:g}", next_step="--string string.yaml")
-        return Tuned("compensated", None, _WAVES_SUPPOSED)
-    start = case.softness if case.softness is not None else 0.3
-    largest = largest_stable_share(case, start, held)
-    if asked is not None:
-        if asked > largest:
+        return [Tuned("compensated", None, _WAVES_SUPPOSED)]
+    largest = largest_stable_share(case, case.softness if case.softness is not None else 0.3, held)
+    if asked is not None and asked > largest:
+        raise TuningRefused(
+            f"{100 * asked:.0f} % of J compensated swings by itself if J is {_worst(case)}; at most "
+            f"{100 * largest:.0f} % is stable over J's interval behind {_lag_ms(case)} of lag{_no_drag(case)}",
+            where=f"--compensate {asked:g}",
+            next_step=f"Ask for {RESERVE * largest:.2f} or less, narrow J's interval, or find a shorter loop")
+    shares = tuple(share for share in SHARES if share <= RESERVE * largest) if asked is None else (asked,)
+    softnesses = SOFTNESSES if case.softness is None else (case.softness,)
+    grid = [one for one in candidates(case.string, case.drive.inertia_kg_m2, held[0], shares, softnesses)
+            if one.softness <= LAG_RESERVE * softest_allowed(case.string, case.drive, one.frequency_factor * held[0],
+                                                              one.share)]
+    kept = _within_margins(case, grid, samples)
+    if not kept:
+        share = asked if asked is not None else SHARES[0]
+        tried = tuned_controller(case.string, case.drive.inertia_kg_m2, case.softness or 0.3, held[0], share)
+        words = _no_margin(case, samples, tried)
+        if asked is not None:
             raise TuningRefused(
-                f"{100 * asked:.0f} % of J compensated swings by itself if J is {_worst(case)}; at most "
-                f"{100 * largest:.0f} % is stable over J's interval behind {_lag_ms(case)} of lag",
+                f"{100 * asked:.0f} % of J compensated leaves too little margin: {words}",
                 where=f"--compensate {asked:g}",
-                next_step=f"Ask for {RESERVE * largest:.2f} or less, narrow J's interval, or find a shorter loop")
-        shares = [asked]
-    else:
-        shares = [RESERVE * largest * part for part in (0.5, 0.75, 1.0)]
-        if largest < 0.05:
-            return Tuned("compensated", None, f"not even 5 % of J can be compensated over J's interval behind "
-                                              f"{_lag_ms(case)} of lag", largest_share=largest)
-    best: tuple[float, float, float, float] | None = None
-    for share in shares:
-        softest = LAG_RESERVE * softest_allowed(case.string, case.drive, held[0], share)
-        softness = case.softness if case.softness is not None else _best_softness(case, held, share, softest)
-        if softness is None or softness > softest:
-            continue
-        # a softer one bears less than `start` does: what is chosen keeps its reserve at its own a
-        here = largest_stable_share(case, softness, held)
-        if share > (here if asked is not None else RESERVE * here):
-            continue
-        law = tuned_controller(case.string, case.drive.inertia_kg_m2, softness, held[0], share)
-        damping = min(least_damping(case, drive, law, held) for drive in case.at_inertias[:: STEPS // 2])
-        if best is None or damping > best[0]:
-            best = damping, share, softness, here
-    if best is None:
-        return Tuned("compensated", None, "no a is stable beside it, with a reserve", largest_share=largest)
-    _, share, softness, largest = best
-    law = tuned_controller(case.string, case.drive.inertia_kg_m2, softness, held[0], share)
-    softest = softest_allowed(case.string, case.drive, held[0], share)
-    return Tuned("compensated", law, softness=softness, softest=softest, compensated_share=share, largest_share=largest)
+                next_step="Ask for less, allow less margin with --margins, or find a shorter loop")
+        return [Tuned("compensated", None, f"no share of J keeps the margins; {100 * share:.0f} %, for one: {words}",
+                      largest_share=largest)]
+    return [Tuned("compensated", one.controller, softness=one.softness, frequency_factor=one.frequency_factor,
+                  softest=softest_allowed(case.string, case.drive, one.frequency_factor * held[0], one.share),
+                  compensated_share=one.share, largest_share=largest) for one in kept]
 
 
-def _broadband(case: TuneCase, held: Sequence[float]) -> Tuned:
+def _within_margins(case: TuneCase, grid: Sequence[Candidate], samples: _TruthMargins) -> list[Candidate]:
+    """The `FINALISTS` that rank best of those that keep the margins on every truth."""
+    if not grid:
+        return []
+    speeds = ranked_speeds(samples.truths[:SEARCH_DRAWS], [one.controller for one in grid])
+    order = np.argsort(np.mean(np.log(np.maximum(speeds, 1e-3)), axis=1), kind="stable")
+    kept = []
+    for at in order[:MOST_TRIED]:
+        if samples.keeps(grid[at].controller, case.required):
+            kept.append(grid[at])
+            if len(kept) == FINALISTS:
+                break
+    return kept
+
+
+def _no_margin(case: TuneCase, samples: _TruthMargins, law: SpeedController) -> str:
+    """What fails on the worst of the truths."""
+    worst = samples.every(law)
+    return ", ".join(case.required.failed(worst) or ("too soft for these lags",)) + (
+        f" over J's interval, string, bit and {_lag_ms(case)} of lag{_no_drag(case)}")
+
+
+def _no_drag(case: TuneCase) -> str:
+    """Words for a string that is stated to lose nothing, if that is why."""
+    if any(line.drag_nm_s_rad_m > 0.0 for line in case.string.lines):
+        return ""
+    return (". string.yaml states no drag (drag_nm_s_rad_m: 0): nothing takes energy out of the pipe's waves. Mud has "
+            f"about {MUD_DRAG_NM_S_RAD_M:g} N·m·s/rad per metre")
+
+
+def _chosen_by_simulation(
+    pools: list[list[Tuned]], samples: _TruthMargins, held: Sequence[float]
+) -> list[list[Tuned]]:
+    """Each pool, the lowest cure speed under noise first, as the mean over the first truths."""
+    every = [one for pool in pools for one in pool if one.controller is not None]
+    if len(every) < 2:
+        return pools
+    truths = samples.truths[:SEARCH_DRAWS]
+    speeds = _noisy(truths, [one.controller for one in every], held, "stuck")
+    score = {id(one): float(np.mean(np.log(np.minimum(row, 1e3)))) for one, row in zip(every, speeds, strict=True)}
+    return [sorted(pool, key=lambda one: score.get(id(one), inf)) for pool in pools]
+
+
+def _noisy(
+    truths: Sequence[Truth], laws: Sequence[SpeedController | None], held: Sequence[float],
+    how: Literal["stuck", "rest"],
+) -> NDArray[np.float64]:
+    """Critical speeds, rpm, under bit noise: (laws, truths); a law that is None is each truth's present one."""
+    loops = [(truth, law or truth.present) for law in laws for truth in truths]
+    found = lowest_turning_with_noise(
+        [truth.string for truth, _ in loops],
+        [(truth.drive, law) for truth, law in loops if law is not None],
+        [truth.seed for truth, _ in loops], how, 1.0 / held[0])
+    return found.reshape(len(laws), len(truths))
+
+
+def _under_noise(
+    found: list[Tuned], samples: _TruthMargins, held: Sequence[float], told: Callable[[str], None]
+) -> list[Tuned]:
+    told("critical speeds under bit noise, simulated on every truth")
+    taken = [one for one in found if one.controller is not None]
+    laws = [None if one.kind == "present" else one.controller for one in taken]
+    cures, starts = (_noisy(samples.truths, laws, held, how) for how in ("stuck", "rest"))
+    done = {}
+    for one, law, cure, start in zip(taken, laws, cures, starts, strict=True):
+        limits = [linear_limit(truth.string, truth.drive, law or truth.present or SpeedController(0.0, 0.0)) / RPM
+                  for truth in samples.truths]
+        done[one.kind] = replace(one, cure=DrawnValues(tuple(map(float, cure)), LOWEST_NOISY_RPM),
+                                 start=DrawnValues(tuple(map(float, start)), LOWEST_NOISY_RPM),
+                                 linear_limit=DrawnValues(tuple(limits)))
+    return [done.get(one.kind, one) for one in found]
+
+
+def _advice(case: TuneCase, found: Sequence[Tuned]) -> Advice:
+    """The best row that keeps every margin, if it is better than what there is."""
+    base = found[0]
+    offered = [one for one in found[1:] if one.controller is not None and not one.failed and one.kind != "stiff"]
+    if base.kind == "stiff":
+        offered = [one for one in offered if one is not base]
+    elif found[1].controller is not None and not found[1].failed:
+        offered.append(found[1])
+    if not offered:
+        return Advice(None, base.kind, keep=True)
+    if base.cure is None or base.controller is None:
+        wanted = "soft" if any(one.kind == "soft" for one in offered) else offered[0].kind
+        return Advice(wanted, base.kind, keep=False)
+
+    def mean(one: Tuned) -> float:
+        assert one.cure is not None
+        return float(np.mean(np.log(np.minimum(one.cure.values, 1e3))))
+
+    offered.sort(key=mean)
+    best = offered[0]
+    # what any drive can take goes first, if it is as good
+    soft = next((one for one in offered if one.kind == "soft"), None)
+    if soft is not None and mean(soft) < mean(best) + NOT_BETTER_SHARE:
+        best = soft
+    assert best.cure is not None
+    pairs = list(zip(best.cure.values, base.cure.values, strict=True))
+    share = sum(new <= old * (1.0 + NOISY_RESOLUTION) for new, old in pairs) / len(pairs)
+    gain = mean(base) - mean(best)
+    if base.failed and mean(best) <= mean(base) + NOT_BETTER_SHARE:
+        return Advice(best.kind, base.kind, keep=False, better_share=share)
+    if gain < log(1.0 + NOT_BETTER_SHARE) or share < 0.8:
+        return Advice(None, base.kind, keep=True, better_share=share)
+    return Advice(best.kind, base.kind, keep=False, better_share=share)
+
+
+def _broadband(case: TuneCase, held: Sequence[float], samples: _TruthMargins) -> Tuned:
     if case.string.supposed:
         return Tuned("broadband", None, _WAVES_SUPPOSED)
     best: tuple[float, float, float, float] | None = None
@@ -334,7 +571,7 @@ def _broadband(case: TuneCase, held: Sequence[float]) -> Tuned:
         if best is None or mean < best[0]:
             best = mean, float(softness), share, here
     if best is None:
-        words = f"not even 5 % of J can be compensated over J's interval behind {_lag_ms(case)} of lag"
+        words = f"not even 5 % of J can be compensated over J's interval behind {_lag_ms(case)} of lag{_no_drag(case)}"
         return Tuned("broadband", None, words, largest_share=largest)
     mean, softness, share, here = best
     if mean > BROADBAND_BELOW:
@@ -344,39 +581,11 @@ def _broadband(case: TuneCase, held: Sequence[float]) -> Tuned:
         return Tuned("broadband", None, words, largest_share=here)
     softness = round(float(softness), 3)
     law = tuned_controller(case.string, case.drive.inertia_kg_m2, softness, held[0], share)
+    thin = case.required.failed(samples.every(law))
+    if thin:
+        return Tuned("broadband", None, f"it would leave too little margin: {', '.join(thin)}", largest_share=here)
     softest = softest_allowed(case.string, case.drive, held[0], share)
     return Tuned("broadband", law, softness=softness, softest=softest, compensated_share=share, largest_share=here)
-
-
-def _best_softness(case: TuneCase, held: Sequence[float], share: float, most: float) -> float | None:
-    """The a that damps the least damped of the lowest modes most; None: none within the lags' bound is stable."""
-    top = min(_MOST_SOFT, most)
-    if top <= _LEAST_SOFT:
-        return None
-
-    def damping(softness: float) -> float:
-        law = tuned_controller(case.string, case.drive.inertia_kg_m2, softness, held[0], share)
-        return least_damping(case, case.drive, law, held)
-
-    grid = np.geomspace(_LEAST_SOFT, top, 15)
-    seen = [damping(float(one)) for one in grid]
-    at = int(np.argmax(seen))
-    if seen[at] <= 0.0:
-        return None
-    low, high = float(grid[max(0, at - 1)]), float(grid[min(len(grid) - 1, at + 1)])
-    golden = 0.5 * (sqrt(5.0) - 1.0)
-    a, b = high - golden * (high - low), low + golden * (high - low)
-    of_a, of_b = damping(a), damping(b)
-    for _ in range(7):
-        if of_a < of_b:
-            low, a, of_a = a, b, of_b
-            b = low + golden * (high - low)
-            of_b = damping(b)
-        else:
-            high, b, of_b = b, a, of_a
-            a = high - golden * (high - low)
-            of_a = damping(a)
-    return round(0.5 * (low + high), 3)
 
 
 def largest_stable_share(
@@ -406,15 +615,8 @@ def _stable_everywhere(
     upper = tuned_controller(case.string, inertia.high, softness, held[0], share)
     wanted = [(inertia.low, law), (inertia.high, law), *([(inertia.value, upper)] if believed_upper else [])]
     ends = [end for pair in case.moves(present=False) for end in pair]
-    return all(_is_stable(case.string, case.drive.with_inertia(true), one) for true, one in wanted) and all(
-        _is_stable(end.string, end.drive.with_inertia(inertia.low), law) for end in ends)
-
-
-def _is_stable(string: DrillString, drive: TopDrive, law: SpeedController) -> bool:
-    try:
-        return ClosedSystem(string, drive, law).is_stable()
-    except RootsLost:      # a pole on the axis itself
-        return False
+    return all(is_stable(case.string, case.drive.with_inertia(true), one) for true, one in wanted) and all(
+        is_stable(end.string, end.drive.with_inertia(inertia.low), law) for end in ends)
 
 
 def _too_soft(case: TuneCase, softness: float, softest: float, held: Sequence[float]) -> str:
@@ -450,10 +652,9 @@ def figures_at(
     return one, mean, least_damping(case, drive, law, held_hz)
 
 
-def _with_figures(case: TuneCase, tuned: Tuned, held: Sequence[float], told: Callable[[str], None]) -> Tuned:
+def _with_figures(case: TuneCase, tuned: Tuned, held: Sequence[float], samples: _TruthMargins) -> Tuned:
     law = tuned.controller
     assert law is not None
-    told(f"{tuned.kind}: reflection, modes, margins")
     along = np.array([figures_at(case, drive, law, held) for drive in case.at_inertias])
     present = tuned.kind == "present"
     pairs = case.moves(present=present)
@@ -467,19 +668,45 @@ def _with_figures(case: TuneCase, tuned: Tuned, held: Sequence[float], told: Cal
     integral = None
     if tuned.kind != "stiff" and not present:
         share = 1.0 - tuned.compensated_share
-        of = [[(2.0 * pi * modes[0]) ** 2 * share * inertia.value for modes in own] for own in heard]
-        square = (2.0 * pi * held[0]) ** 2 * share
+        omega = 2.0 * pi * tuned.frequency_factor
+        of = [[(omega * modes[0]) ** 2 * share * inertia.value for modes in own] for own in heard]
+        square = (omega * held[0]) ** 2 * share
         integral = in_squares(Interval(law.integral_nm_rad, square * inertia.low, square * inertia.high), of)
     system = ClosedSystem(case.string, case.drive, law)
     errors = WRONG_BY if not present else ()       # those gains hang on no J that is believed now
     wrong = tuple(_wrong(case, tuned, error, held) for error in errors)
+    worst = samples.every(None if present else law)
+    damping = _turning_points(along[:, 2], case, lambda drive: least_damping(case, drive, law, held))
     return replace(
         tuned, integral_nm_rad=integral, reflection=in_squares(_spanned(along[:, 0]), moved[:, :, 0]),
         band_reflection=in_squares(_spanned(along[:, 1]), moved[:, :, 1]),
-        damping=in_squares(_spanned(along[:, 2]), moved[:, :, 2], -inf, 1.0, (along[0, 2], along[-1, 2])),
+        damping=in_squares(damping, moved[:, :, 2], -inf, 1.0, (along[0, 2], along[-1, 2])),
         modes=system.modes(1.1 * held[min(2, len(held) - 1)]),
-        margins=margins(case.drive, law, case.string), lag_reserve_s=_lag_reserve(case, law), wrong=wrong,
+        margins=margins(case.drive, law, case.string),
+        with_string=loop_margins(case.drive, law, case.string, exact=True),
+        worst=worst, failed=case.required.failed(worst), wrong=wrong,
     )
+
+
+def _turning_points(along: NDArray[np.float64], case: TuneCase, value_at: Callable[[TopDrive], float]) -> Interval:
+    """What a figure spans over J, its turning points included, kinks too: where the least of two changes sides.
+
+    Golden sections between the neighbours of the largest and of the smallest value.
+    """
+    inertias = case.inertias(len(along))
+    ends = [float(along.min()), float(along.max())]
+    for side, sign in ((0, -1.0), (1, 1.0)):
+        at = int(np.argmax(sign * along))
+        if not 0 < at < len(along) - 1:
+            continue
+        low, high = inertias[at - 1], inertias[at + 1]
+        golden = 0.5 * (sqrt(5.0) - 1.0)
+        for _ in range(GOLDEN_STEPS):
+            a, b = high - golden * (high - low), low + golden * (high - low)
+            of_a, of_b = (sign * value_at(case.drive.with_inertia(one)) for one in (a, b))
+            ends[side] = sign * max(sign * ends[side], of_a, of_b)
+            low, high = (low, b) if of_a > of_b else (a, high)
+    return Interval(float(along[len(along) // 2]), *ends)
 
 
 def _spanned(along: NDArray[np.float64]) -> Interval:
@@ -518,33 +745,18 @@ def in_squares(
     return Interval(value, max(least, value - sqrt(below)), min(most, value + sqrt(above)))
 
 
-def _lag_reserve(case: TuneCase, law: SpeedController) -> float | None:
-    """How much one more lag in the loop may be; to 1 ms or 2 %."""
-    low, high = 0.0, 1.0
-
-    def stable(more_s: float) -> bool:
-        lags = (*case.drive.inner_lags_s, more_s)
-        return _is_stable(case.string, replace(case.drive, inner_lags_s=lags), law)
-
-    if stable(high):
-        return None
-    while high - low > max(0.001, 0.02 * high):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if stable(middle) else (low, middle)
-    return low
-
-
 def recipe_with(case: TuneCase, tuned: Tuned, believed_kg_m2: float, held_hz: Sequence[float]) -> SpeedController:
     """The same kind of controller for another J: the stiff one's margin, or a and the compensated share, as before."""
     if tuned.kind == "stiff":
         return stiff_controller(case.drive.with_inertia(believed_kg_m2), case.phase_margin_deg)
     assert tuned.softness is not None
-    return tuned_controller(case.string, believed_kg_m2, tuned.softness, held_hz[0], tuned.compensated_share)
+    return gains(case.string, believed_kg_m2, held_hz[0], tuned.softness, tuned.frequency_factor,
+                 tuned.compensated_share)
 
 
 def _wrong(case: TuneCase, tuned: Tuned, error: float, held: Sequence[float]) -> WrongInertia:
     law = recipe_with(case, tuned, (1.0 + error) * case.inertia_kg_m2.value, held)
-    stable = _is_stable(case.string, case.drive, law)
+    stable = is_stable(case.string, case.drive, law)
     return WrongInertia(error, stable, least_damping(case, case.drive, law, held) if stable else None, None)
 
 
@@ -555,14 +767,14 @@ def _with_critical_speeds(
     taken = [one for one in every if one.controller is not None]
     believed = [
         (case.string, case.drive.with_inertia(true), one.controller)
-        for one in taken for true in (inertia.value, inertia.low, inertia.high) if one.controller is not None
+        for one in taken for true in case.inertias(CRITICAL_STEPS) if one.controller is not None
     ]
     ends = [
         (end.string, end.drive, end.present or one.controller if one.kind == "present" else one.controller)
         for one in taken for pair in case.moves(present=one.kind == "present") for end in pair
         if one.controller is not None
     ]
-    told("critical speeds, simulated: cure, start, onset")
+    told("critical speeds without noise, the string as stated")
     speeds = _critical_speeds([*believed, *ends], search)
     found, moved = speeds[: len(believed)], iter(speeds[len(believed) :])
     wrong = [(one.kind, part.error) for one in taken for part in one.wrong if part.stable]
@@ -576,7 +788,8 @@ def _with_critical_speeds(
     cure = dict(zip(wrong, cures, strict=True))
     done = {
         one.kind: replace(
-            one, critical=found[3 * k], critical_low=found[3 * k + 1], critical_high=found[3 * k + 2],
+            one, critical=found[CRITICAL_STEPS * k + CRITICAL_STEPS // 2],
+            critical_along=tuple(found[CRITICAL_STEPS * k : CRITICAL_STEPS * (k + 1)]),
             critical_moved=tuple((next(moved), next(moved)) for _ in case.moves(present=one.kind == "present")),
             wrong=tuple(replace(part, cure_rpm=cure.get((one.kind, part.error))) for part in one.wrong),
         )

@@ -51,7 +51,7 @@ class VirtualString:
 
     def arm(self) -> None:
         """At rest, and wound up to where the bit is about to break away."""
-        self._pipe = PipeSimulation(self._string, self._grid, 1)
+        self._pipe = PipeSimulation((self._string,), (self._grid,))
         self._pipe.wind_up(np.array([self._static_nm]))
         self._into_tick_s = self._travel_rad = self._top_rad_s = 0.0
 

@@ -1,0 +1,104 @@
+r"""Which gains are worth simulating: all of a grid, ranked by how steep a falling bit friction they bear.
+
+**Grid.** P = ζ/a, I = (φω)² (J − J_c), J_c = share · J: softness a, frequency factor φ and share are free.
+
+**Rank.** At the lowest mode the bit sees Re Z_b (`stability`). A bit that swings by A about its mean speed Ω takes in
+as much energy as a slope of −σ_e does, σ_e = −(2/A) mean(T_f(Ω + A sin φ) sin φ) (describing function; any text on
+nonlinear control). Where σ_e < Re Z_b for every A up to Ω no swing grows until the bit stops. The lowest such Ω ranks
+like the critical speeds that are simulated, and costs no simulation. The linear stability limit is a lower bound of
+it. A bit that isn't stated is replaced by one of the reference case: only the order counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdhil.soft_torque.controller import SpeedController, impedance
+from tdhil.soft_torque.drill_string import BitFriction, Complex, DrillString
+from tdhil.soft_torque.stability import bit_grid, bit_impedance, chain_of, linear_limit_rad_s, steepest_slope
+from tdhil.soft_torque.uncertainty import Truth
+
+Reals = NDArray[np.float64]
+
+SOFTNESSES = tuple(float(one) for one in np.geomspace(0.05, 2.0, 17))
+FREQUENCY_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15)
+SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
+"""Of J, compensated."""
+SUPPOSED_BIT = BitFriction(2500.0, 5000.0, 2.5)
+"""Only to rank, where no bit is stated."""
+_PHASES = (np.arange(48) + 0.5) * 2.0 * np.pi / 48
+_SPEEDS = np.linspace(0.5, 14.0, 200)
+"""Mean speeds, in Stribeck speeds."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Gains and how they were made."""
+
+    softness: float
+    frequency_factor: float
+    share: float
+    controller: SpeedController
+
+
+def candidates(
+    string: DrillString, inertia_kg_m2: float, mode_hz: float, shares: Sequence[float],
+    softnesses: Sequence[float] = SOFTNESSES, factors: Sequence[float] = FREQUENCY_FACTORS,
+) -> list[Candidate]:
+    """Return the grid."""
+    return [
+        Candidate(softness, factor, share, gains(string, inertia_kg_m2, mode_hz, softness, factor, share))
+        for share in shares for factor in factors for softness in softnesses
+    ]
+
+
+def gains(
+    string: DrillString, inertia_kg_m2: float, mode_hz: float, softness: float, factor: float, share: float = 0.0
+) -> SpeedController:
+    """P = ζ/a, I = (φω)² (J − J_c), J_c = share · J."""
+    left = (1.0 - share) * inertia_kg_m2
+    return SpeedController(string.impedance_nm_s_rad / softness, (2.0 * pi * factor * mode_hz) ** 2 * left,
+                           share * inertia_kg_m2)
+
+
+def ranked_speeds(truths: Sequence[Truth], laws: Sequence[SpeedController]) -> Reals:
+    """Return the estimated critical speed, rad/s, of every law on every truth: (laws, truths). Ranks, not promises."""
+    found = np.empty((len(laws), len(truths)))
+    for column, truth in enumerate(truths):
+        string = truth.string
+        bit = string.bit or SUPPOSED_BIT
+        omega = bit_grid(string)
+        s: Complex = np.asarray(1j * omega, dtype=np.complex128)
+        chain = chain_of(string, s)
+        low = omega < 1.6 * pi / string.echo_s      # the second mode with the top held is never below
+        for row, law in enumerate(laws):
+            seen = bit_impedance(string, impedance(truth.drive, law, s), s, chain)
+            slope = steepest_slope(omega[low], seen[low])
+            found[row, column] = max(free_speed(bit, slope), linear_limit_rad_s(bit, steepest_slope(omega, seen)))
+    return found
+
+
+def free_speed(bit: BitFriction, slope_nm_s_rad: float) -> float:
+    """Return the lowest mean speed, rad/s, above which no swing up to that speed takes in more than that slope does."""
+    falls = bit.static_nm - bit.coulomb_nm
+    if falls <= 0.0:
+        return 0.0
+    above = np.flatnonzero(_slopes() > slope_nm_s_rad * bit.stribeck_speed_rad_s / falls)
+    return float(_SPEEDS[above[-1]]) * bit.stribeck_speed_rad_s if above.size else 0.0
+
+
+@cache
+def _slopes() -> Reals:
+    """Largest σ_e over all amplitudes up to the mean speed, for `_SPEEDS`, in units of (F_s − F_c)/ω_s."""
+    shares = np.linspace(0.05, 1.0, 24)
+    amplitude = _SPEEDS[:, None] * shares
+    speed = _SPEEDS[:, None, None] + amplitude[:, :, None] * np.sin(_PHASES)
+    mean = np.mean(np.exp(-(speed**2)) * np.sin(_PHASES), axis=2)
+    found: Reals = np.max(-2.0 / amplitude * mean, axis=1)
+    return found

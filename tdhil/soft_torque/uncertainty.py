@@ -1,0 +1,171 @@
+r"""What is not known exactly, drawn jointly: rotor, lags, present gains, string and bit.
+
+The true machine is one of many that the data allow. Each draw, a `Truth`, is one of them: J from its interval, every
+lag, every property of the string and of the bit within its tolerance, all at once. What a controller does is worked
+out on each; a figure's interval is what the draws spread over.
+
+Draws are a Latin hypercube: each property takes values from every part of its range once (McKay, Beckman and Conover
+1979), so that some twenty draws represent the whole. From n draws the interval of a further one is
+mean ± t s √(1 + 1/n) of the logarithm, with Student's t for n − 1 degrees of freedom (prediction interval,
+ISO 16269-8).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import exp, inf, log, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdhil.soft_torque.controller import SpeedController, TopDrive
+from tdhil.soft_torque.drill_string import BitFriction, DrillString
+
+COVERAGE_K = 1.959964
+"""Standard deviations from the middle of a normal 95 % interval to either end."""
+COLUMNS_OF_STRING = 8
+"""Properties of string and bit that are drawn; before them J, after them lags and gains."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number with the ends of its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Truth:
+    """One machine and one string that the data allow."""
+
+    string: DrillString
+    drive: TopDrive
+    present: SpeedController | None
+    seed: int
+    """Of the bit noise that it is simulated with."""
+
+
+@dataclass(frozen=True)
+class DrawnValues:
+    """One number over all draws; a draw at which it wasn't found below the highest tried is infinite."""
+
+    values: tuple[float, ...]
+    lowest_tried: float = 0.0
+    """A value at or below it is only known to be no higher."""
+
+    @property
+    def median(self) -> float | None:
+        """None: not found."""
+        middle = float(np.median(self.values))
+        return middle if middle < inf else None
+
+    def interval(self, resolution: float = 0.0) -> tuple[float, float | None]:
+        """Return the 95 % prediction interval of one further draw, widened by half of a search's resolution.
+
+        The high end is None where a draw wasn't found. Values are positive or 0.
+        """
+        found = np.array([one for one in self.values if one < inf])
+        if not found.size:
+            return 0.0, None
+        low, high = float(found.min()), float(found.max())
+        if found.size > 2 and low > 0.0:
+            from scipy.stats import t
+
+            logs = np.log(found)
+            half = float(t.ppf(0.975, found.size - 1)) * float(logs.std(ddof=1)) * sqrt(1.0 + 1.0 / found.size)
+            middle = float(logs.mean())
+            low, high = min(low, exp(middle - half)), max(high, exp(middle + half))
+        low, high = max(0.0, low - 0.5 * resolution), high + 0.5 * resolution
+        if float(found.min()) <= self.lowest_tried:
+            low, high = 0.0, max(high, self.lowest_tried)
+        return low, high if found.size == len(self.values) else None
+
+
+def draw_truths(
+    string: DrillString, drive: TopDrive, inertia: Interval, *, count: int, seed: int = 1,
+    lag_tolerance: float = 0.0,
+    lag_axes: Sequence[Sequence[float]] = (),
+    present: SpeedController | None = None,
+    present_axes: Sequence[tuple[float, float]] = (),
+    string_draws: Sequence[DrillString] = (),
+) -> tuple[Truth, ...]:
+    """Draw ``count`` truths.
+
+    ``lag_tolerance``: relative, ± of each lag, where ``lag_axes`` (half of the 95 % range along each main axis, s) are
+    not known. ``present_axes``: half ranges of (P, I). ``string_draws``: strings that were drawn elsewhere, from the
+    covariance of an identification; else each is drawn from ``string``'s own tolerances.
+    """
+    lags = drive.inner_lags_s
+    free = len(lag_axes) if lag_axes else len(lags)
+    cube = _latin_hypercube(count, 1 + COLUMNS_OF_STRING + free + len(present_axes), seed)
+    found = []
+    for number, row in enumerate(cube):
+        normal = _normal(row)
+        j = normal[0] / COVERAGE_K
+        value = inertia.value + j * (inertia.high - inertia.value if j > 0.0 else inertia.value - inertia.low)
+        at = 1 + COLUMNS_OF_STRING
+        if lag_axes:
+            moved = np.array(lags, dtype=float)
+            for k, axis in enumerate(lag_axes):
+                moved = moved + normal[at + k] / COVERAGE_K * np.array(axis)
+        else:
+            moved = np.array(lags) * (1.0 + lag_tolerance * (2.0 * row[at : at + free] - 1.0))
+        law = present
+        if law is not None and present_axes:
+            p, i = (sum(normal[at + free + k] / COVERAGE_K * axis[which] for k, axis in enumerate(present_axes))
+                    for which in (0, 1))
+            law = replace(law, gain_nm_s_rad=max(0.0, law.gain_nm_s_rad + p),
+                          integral_nm_rad=max(0.0, law.integral_nm_rad + i))
+        own = (string_draws[number % len(string_draws)] if string_draws
+               else string_at(string, row[1 : 1 + COLUMNS_OF_STRING]))
+        true = replace(drive, inertia_kg_m2=max(1e-6, float(value)),
+                       inner_lags_s=tuple(float(max(0.0, lag)) for lag in moved))
+        found.append(Truth(own, true, law, 1000 * seed + number))
+    return tuple(found)
+
+
+def string_at(string: DrillString, shares: NDArray[np.float64]) -> DrillString:
+    """Return the string at these shares (0 to 1) of its tolerances' ranges: `COLUMNS_OF_STRING` of them."""
+    tolerance = string.tolerance
+
+    def within(low: float, high: float, share: float) -> float:
+        return low + (high - low) * float(share)
+
+    def times(factor: float, share: float) -> float:
+        return exp(log(factor) * (2.0 * float(share) - 1.0))
+
+    length = within(1.0 - tolerance.length, 1.0 + tolerance.length, shares[0])
+    shear = within(*tolerance.shear, shares[1])
+    polar = within(*tolerance.polar, shares[2])
+    drag = times(tolerance.drag_factor, shares[3])
+    load = within(1.0 - tolerance.bottom_inertia, 1.0 + tolerance.bottom_inertia, shares[4])
+    lines = tuple(
+        replace(line, length_m=length * line.length_m, inertia_kg_m=polar * line.inertia_kg_m,
+                compliance_rad_nm_m=line.compliance_rad_nm_m / (shear * polar),
+                drag_nm_s_rad_m=drag * line.drag_nm_s_rad_m)
+        for line in string.lines
+    )
+    bit: BitFriction | None = string.bit
+    if bit is not None:
+        size = within(1.0 - tolerance.bit_torque, 1.0 + tolerance.bit_torque, shares[5])
+        bit = replace(bit, coulomb_nm=size * bit.coulomb_nm, static_nm=size * bit.static_nm,
+                      stribeck_speed_rad_s=times(tolerance.stribeck_factor, shares[6]) * bit.stribeck_speed_rad_s,
+                      noise_nm=times(tolerance.noise_factor, shares[7]) * bit.noise_nm)
+    return replace(string, lines=lines, bottom_inertia_kg_m2=load * string.bottom_inertia_kg_m2, bit=bit)
+
+
+def _latin_hypercube(count: int, columns: int, seed: int) -> NDArray[np.float64]:
+    random = np.random.default_rng(seed)
+    cells = np.array([random.permutation(count) for _ in range(columns)]).T
+    shares: NDArray[np.float64] = (cells + random.random((count, columns))) / count
+    return shares
+
+
+def _normal(shares: NDArray[np.float64]) -> NDArray[np.float64]:
+    from scipy.special import ndtri
+
+    found: NDArray[np.float64] = ndtri(np.clip(shares, 1e-6, 1.0 - 1e-6))
+    return found
