@@ -1,4 +1,4 @@
-"""What `import tdhil` offers: read, identify, open_drive, simulate, run. The command line goes the same ways.
+"""The Python API: read, identify, open_drive, simulate, run. The command line uses the same functions.
 
 ::
 
@@ -52,7 +52,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Motion:
-    """What stage 5 can be asked for: any excitation of `tdhil.config.registry`, by name. None: chosen to fit the rig.
+    """Request for stage 5: any excitation of `tdhil.config.registry`, by name. None: chosen to fit the rig.
 
     The classes below are those that ship. ``amplitude_rad_s``: greatest deviation of the speed from its mean;
     ``offset_rad_s``: mean speed; ``periods``: at each mean speed, or ways up and down.
@@ -111,7 +111,7 @@ class CoastDown(Pulses):
 
 @dataclass(frozen=True)
 class Result:
-    """What was identified from one recording. Shows itself as the card: in a terminal, and in a notebook.
+    """The identification of one recording. It is displayed as the card in a terminal and in a notebook.
 
     ``exit_code``: how ``tdhil replay`` would end on a whole run, 0 where there is a number to quote, 9 where not.
     """
@@ -123,17 +123,17 @@ class Result:
 
     @property
     def inertia(self) -> InertiaEstimate | None:
-        """At the motor shaft, kg·m², with both intervals; None where it can't be known, and `reason` says why."""
+        """Return J at the motor shaft, kg·m², with both intervals; None if it is not identifiable, see `reason`."""
         return self.identification.inertia
 
     @property
     def verdict(self) -> Verdict:
-        """Does the number stand?"""
+        """Return whether the result is valid."""
         return self.identification.verdict
 
     @property
     def reason(self) -> str:
-        """Why the verdict is what it is, in words."""
+        """Return the reason of the verdict, in words."""
         return self.identification.reason
 
     def to_dict(self) -> dict[str, Any]:
@@ -282,7 +282,7 @@ def run(
 
 
 def _peer(drive: DriveHandle, asked: Mapping[str, Any]) -> tuple[RunOptions, Connection, PeerPlan]:
-    """What would be opened: the command line's checks, in its order. Raises UsageError and DataFileError."""
+    """Return what would be opened, after the command line's checks. Raises UsageError and DataFileError."""
     from tdhil.config import resolve
     from tdhil.session import check_log_path, check_unverified, connection_of, plan_peer, with_faults
 

@@ -24,9 +24,11 @@
 
 Codes 3 (partial result) and 9 (not identifiable, model rejected) belong to results, which are no errors; a log that
 broke off ends with 3 as well, since what it holds can be replayed.
+Each error has an entry in the table of messages (`profiles.messages`), whose code is shown behind its text.
 A class or an instance may carry an attribute ``exit_code``, which goes before this table.
 """
 
+import errno
 import signal
 from enum import IntEnum
 
@@ -39,6 +41,7 @@ from drivers import (
     StopNotConfirmed,
     TdhilError,
 )
+from profiles import MessageCode
 
 SIGNALS, HIGHEST_SIGNAL = 128, 64
 """An exit code above the first says which signal ended the process."""
@@ -75,12 +78,16 @@ class ExitCode(IntEnum):
 class UsageError(TdhilError):
     """The command line asks for something that can't be, or for two things that exclude each other."""
 
+    entry = MessageCode.USAGE
+
 
 class Interrupted(TdhilError):
     """Somebody, or the system, asked the program to end; raised once the shaft has been taken care of.
 
     ``why``: who or what it was, where more is known of it than a signal's name.
     """
+
+    entry = MessageCode.INTERRUPTED
 
     def __init__(self, number: int, why: str = "", *, next_step: str = "") -> None:
         self.signal = int(number)
@@ -148,9 +155,13 @@ def exit_code(error: BaseException) -> ExitCode:
 class LogError(TdhilError):
     """The log can't be written (disk full, no such folder) or can't be read (empty, not MCAP, not a run of ours)."""
 
+    entry = MessageCode.LOG_PROBLEM
+
 
 class LogUnopened(LogError):
     """There can be no file at the place that was named."""
+
+    entry = MessageCode.LOG_UNOPENED
 
     exit_code = ExitCode.USAGE
 
@@ -158,11 +169,15 @@ class LogUnopened(LogError):
 class LogRefused(LogError):
     """The disk is too full for a run to be begun."""
 
+    entry = MessageCode.LOG_DISK_FULL
+
     exit_code = ExitCode.REFUSED
 
 
 class LogBroken(LogError):
     """The log ended before its run did."""
+
+    entry = MessageCode.LOG_BROKEN
 
     exit_code = ExitCode.PARTIAL
 
@@ -170,11 +185,15 @@ class LogBroken(LogError):
 class NothingRecoverable(LogError):
     """A log of which nothing can be read."""
 
+    entry = MessageCode.NOTHING_RECOVERABLE
+
     exit_code = ExitCode.NOTHING_RECOVERABLE
 
 
 class NothingRecorded(LogError):
     """A log of a run that ended before there was anything to identify from; it ends as that run did."""
+
+    entry = MessageCode.NOTHING_RECORDED
 
     def __init__(self, what: str, code: int, *, where: str = "", next_step: str = "") -> None:
         super().__init__(what, where=where, next_step=next_step)
@@ -194,13 +213,39 @@ class NothingRecorded(LogError):
 class CsvMisnamed(LogError):
     """A column or a unit that was asked for is not there, or not clear: the command line can mend it."""
 
+    entry = MessageCode.CSV_COLUMNS_UNCLEAR
+
     exit_code = ExitCode.USAGE
 
 
 class CsvUnusable(LogError):
     """Nothing of the file can be used as a trace: another export is needed."""
 
+    entry = MessageCode.CSV_UNUSABLE
+
     exit_code = ExitCode.NOTHING_RECOVERABLE
+
+
+def code_of(error: BaseException) -> str:
+    """Return the code of ``error`` in the table of messages (`profiles.messages`)."""
+    if isinstance(error, TdhilError):
+        return error.entry.code
+    if isinstance(error, KeyboardInterrupt):
+        return MessageCode.INTERRUPTED.code
+    return (MessageCode.SYSTEM_REFUSED if of_the_system(error) else MessageCode.INTERNAL_ERROR).code
+
+
+def error_document(error: BaseException) -> dict[str, str]:
+    """Return what a JSON document states of an error: ``kind``, ``message`` and ``code``."""
+    return {"kind": type(error).__name__, "message": str(error), "code": code_of(error)}
+
+
+_THE_SYSTEM_S = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOSPC, errno.ENOMEM, errno.EIO, errno.EROFS})
+
+
+def of_the_system(error: BaseException) -> bool:
+    """Tell an error of the computer's state (open files, disk, memory, a lost terminal) from a mistake of tdhil."""
+    return isinstance(error, OSError) and error.errno in _THE_SYSTEM_S
 
 
 def shown(text: str) -> str:
@@ -209,4 +254,4 @@ def shown(text: str) -> str:
     return clean if len(text) <= 40 else clean[:39] + "…"
 
 
-__all__ = ["ExitCode", "Interrupted", "TdhilError", "UsageError", "exit_code"]
+__all__ = ["ExitCode", "Interrupted", "MessageCode", "TdhilError", "UsageError", "code_of", "exit_code"]

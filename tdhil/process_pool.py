@@ -33,7 +33,7 @@ from selectors import EVENT_READ, DefaultSelector
 from struct import Struct
 from typing import Any, Final, Generic, Self, TypeVar
 
-from tdhil.errors import TdhilError
+from tdhil.errors import MessageCode, TdhilError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -42,7 +42,7 @@ _PROGRAM: Final = "import sys; sys.path[:] = {path!r}; from tdhil.process_pool i
 _LENGTH: Final = Struct("<Q")
 _TRIES: Final = 2
 _KILLS: Final = 5
-_ASK_S: Final = 0.2             # how often somebody is asked whether to stop
+_ASK_S: Final = 0.2             # interval of the check for a stop, s
 _START_S: Final = 60.0          # a process may take to begin, on a machine that is busy
 _STARTS: Final = 3              # processes in a row that end before they take a task: something is wrong with all
 ONE_CORE: Final = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -77,12 +77,12 @@ class _Job(Generic[Task]):
 
 
 def usable_cores() -> int:
-    """Of the processor, as many as this process may use."""
+    """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Pool(Generic[Task, Result]):
-    """``jobs`` processes that call ``function``, which is told by its name: one of a module. Started when needed."""
+    """``jobs`` processes that call ``function``, a function of a module, passed by name. They start when needed."""
 
     def __init__(self, function: Callable[[Task], Result], jobs: int, limits: TaskLimits) -> None:
         self._function = function
@@ -141,7 +141,8 @@ class Pool(Generic[Task, Result]):
                     stillborn = 0 if worker.awake else stillborn + 1
                     if stillborn > _STARTS * self._jobs:
                         raise TdhilError(f"the processes end before they begin: {loss.text}", where="process pool",
-                                         next_step="Look for memory and for `ulimit -v`")
+                                         next_step="Look for memory and for `ulimit -v`",
+                                         entry=MessageCode.WORKER_PROCESS_LOST)
                     job.kills += outside
                     job.faults += not outside
                     if job.faults < _TRIES and job.kills < _KILLS:
@@ -245,7 +246,7 @@ class _Worker:
         return data
 
     def bury(self, late: bool, limits: TaskLimits) -> tuple[Loss, bool]:
-        """What to say of its end, and was it killed from outside?"""
+        """Return a text on its end, and whether it was killed from outside."""
         if late:
             self.kill()
             return Loss("TimeLimit", f"no result within {limits.time_s:g} s, in each of {_TRIES} tries"), False
@@ -280,7 +281,7 @@ def _signal_name(number: int) -> str:
 def serve(memory_bytes: int | None) -> None:
     """One task after the other, until the host closes the pipe or is gone."""
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)                               # whatever else is printed is no answer
+    os.dup2(2, 1)                               # other output is not an answer
     limited = memory_bytes is None
     tasks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(sys.stdin.buffer, tasks), daemon=True).start()
@@ -311,7 +312,7 @@ def _listen(stdin: io.BufferedReader, tasks: queue.SimpleQueue[bytes]) -> None:
 
 
 def _limit_memory(memory_bytes: int) -> None:
-    """So much more address space than now: what asks for more gets a MemoryError. Nothing where the system has no such
+    """Limit further address space; above it Python raises MemoryError. No effect if the system has no such
     limit.
     """
     try:

@@ -9,12 +9,13 @@ import argparse
 import difflib
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+from weakref import WeakSet
 
 from profiles import quantities
 from profiles.quantities import SHARE, Unit
-from tdhil.config import ASKED_AGAIN, OPTIONS, Option, Topic
-from tdhil.errors import UsageError
+from tdhil.config import ASKED_AGAIN, COMMON_LINE_FLAGS, OPTIONS, Option, Topic
+from tdhil.errors import MessageCode, UsageError
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Quantities as people type them on the command line: 1%, 0.01, 5min, 40rpm. `profiles.quantities` has the units.
@@ -44,7 +45,16 @@ def meant(name: str, known: Iterable[str]) -> str:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-def add_option(group: argparse._ActionsContainer, option: Option, *, help: str = "") -> None:
+_RARE: Final[WeakSet[argparse.Action]] = WeakSet()
+"""Options that ``--help`` leaves to ``--help-all``, of all parsers."""
+
+
+def rare_options(parser: argparse.ArgumentParser) -> list[argparse.Action]:
+    """Return the options of ``parser`` that ``--help`` leaves to ``--help-all``."""
+    return [action for action in parser._actions if action in _RARE]
+
+
+def add_option(group: argparse._ActionsContainer, option: Option, *, help: str = "") -> argparse.Action:
     """A row of the table as an argument; ``help``: of a command for which it means something else."""
     words: dict[str, Any] = {"dest": option.name, "help": (help or option.help_text).replace("%", "%%")}
     if option.kind is bool:
@@ -55,7 +65,7 @@ def add_option(group: argparse._ActionsContainer, option: Option, *, help: str =
             words["action"] = "append"
         elif option.kind is not str:
             words["type"] = option.kind if option.unit is None else amount(option.unit)
-    group.add_argument(option.flag, **words)
+    return group.add_argument(option.flag, **words)
 
 
 def add_options(parser: argparse.ArgumentParser, *groups: Topic) -> dict[Topic, argparse._ArgumentGroup]:
@@ -64,7 +74,9 @@ def add_options(parser: argparse.ArgumentParser, *groups: Topic) -> dict[Topic, 
     for group, section in sections.items():
         for option in OPTIONS:
             if option.group is group:
-                add_option(section, option)
+                action = add_option(section, option)
+                if not option.common:
+                    _RARE.add(action)
     return sections
 
 
@@ -81,7 +93,7 @@ def settings_in(namespace: argparse.Namespace) -> dict[str, Any]:
         if (value := getattr(namespace, one.name)) is None:
             continue
         if one.limits and (wanted := one.refusal(value)):
-            raise UsageError(f"{value:g}: must be {wanted}", where=one.flag)
+            raise UsageError(f"{value:g}: must be {wanted}", where=one.flag, entry=MessageCode.VALUE_NOT_ALLOWED)
         given[one.name] = value
     return given
 
@@ -94,8 +106,11 @@ def add_drive_arguments(parser: argparse.ArgumentParser) -> argparse._ArgumentGr
 
 
 def add_line_arguments(parser: argparse.ArgumentParser) -> None:
-    """Where it is, on any bus: python-can's own options are the most, and come last."""
+    """Add the options of the address on any bus. python-can's own options are the most, and come last."""
     from tdhil.session import bus_kinds
 
+    before = set(parser._actions)
     for kind in reversed(bus_kinds()):
         kind.add_arguments(parser)
+    _RARE.update(action for action in parser._actions
+                 if action not in before and COMMON_LINE_FLAGS.isdisjoint(action.option_strings))

@@ -1,4 +1,4 @@
-"""`tdhil attend`: the code that lets a shaft move, on the terminal of whoever stands there."""
+"""`tdhil attend`: the code that permits motion, on the terminal of the operator at the shaft."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Until Ctrl-C, which ends no run."""
+    """Show codes until Ctrl-C. Runs continue."""
     from tdhil.service import attend
 
     def say(text: str) -> None:

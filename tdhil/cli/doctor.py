@@ -1,4 +1,4 @@
-"""`tdhil doctor`: is everything there that a run needs? Read only, and it works with nothing connected.
+"""`tdhil doctor`: checks of everything that a run needs. Read only; it also works with nothing connected.
 
 Each check is one line: ok, note, or bad with what to do. Exit 0 when nothing is bad, else 4.
 """
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 
 LIBRARIES = {"python-can": (4, 6), "canopen": (2, 4), "pymodbus": (3, 16)}
-"""Name on the package index → the first version that this program was written for."""
+"""Name on the package index → oldest supported version."""
 
 WANTED_FREE_BYTES = 200_000_000
-"""As the log wants it (tdhil.recording.log_writer)."""
+"""Free disk space that the log requires, bytes (tdhil.recording.log_writer)."""
 TIMER_RESOLUTION_S = 1e-4
 LATE_S = 0.002
 """Half a period at 250 Hz: a cycle that starts later counts as an overrun."""
@@ -45,7 +45,7 @@ NAPS, NAP_S = 50, 0.002
 
 
 def host_findings(log: Path) -> Iterator[DoctorFinding]:
-    """All of it; ``log`` says on which disk a run would write."""
+    """Yield all findings on the computer; ``log`` determines the disk."""
     yield ok("computer", f"{platform.system()} {platform.release()}, Python {platform.python_version()}")
     yield from library_findings(_version)
     yield timer_finding(time.get_clock_info("monotonic").resolution)
@@ -55,7 +55,7 @@ def host_findings(log: Path) -> Iterator[DoctorFinding]:
 
 
 def library_findings(version_of: Callable[[str], str | None]) -> Iterator[DoctorFinding]:
-    """Is each library there, and not older than this program needs?"""
+    """Yield whether each library is installed, and new enough."""
     pip = f"{shlex.quote(sys.executable or 'python')} -m pip"      # of this environment, whichever is active
     for name, least in LIBRARIES.items():
         version = version_of(name)
@@ -69,7 +69,7 @@ def library_findings(version_of: Callable[[str], str | None]) -> Iterator[Doctor
 
 
 def timer_finding(resolution_s: float) -> DoctorFinding:
-    """How finely the monotonic clock counts."""
+    """Return the finding on the resolution of the monotonic clock."""
     text = f"resolution {resolution_s * 1e9:.3g} ns"
     if resolution_s <= TIMER_RESOLUTION_S:
         return ok("timer", text)
@@ -77,27 +77,27 @@ def timer_finding(resolution_s: float) -> DoctorFinding:
 
 
 def jitter_finding(late_s: Sequence[float]) -> DoctorFinding:
-    """How late a sleeping process wakes up, from some naps."""
+    """Return the finding on the lateness of wake-ups, from some short sleeps."""
     ordered = sorted(late_s)
     typical, worst = ordered[len(ordered) // 2], ordered[-1]
-    text = f"wakes {typical * 1e3:.2f} ms late, at worst {worst * 1e3:.2f} ms (of {len(ordered)} times)"
+    text = f"wakes {typical * 1e3:.2f} ms late, at worst {worst * 1e3:.2f} ms (in {len(ordered)} tries)"
     if worst <= LATE_S:
         return ok("scheduling", text)
-    return note("scheduling", text, "Close other programs, plug the laptop in; or run at a lower --rate")
+    return note("scheduling", text, "Close other programs, connect the laptop to mains, or use a lower --rate")
 
 
 def priority_finding(why_no_priority: str, why_not_locked: str) -> DoctorFinding:
-    """May the control loop go before everything else, and is its memory its own?"""
+    """Return whether the control loop may have real-time priority and locked memory."""
     both = (("priority", why_no_priority), ("locked memory", why_not_locked))
     missing = [f"{name}: {why}" for name, why in both if why]
     if not missing:
-        return ok("real time", "--real-time-priority may be used")
-    said = f"--real-time-priority can't be had ({'; '.join(missing)})"
-    return note("real time", said, f"Where cycles are late: {HOW}")
+        return ok("real time", "--real-time-priority is available")
+    said = f"--real-time-priority is not available ({'; '.join(missing)})"
+    return note("real time", said, f"If cycles are late: {HOW}")
 
 
 def naps(now_s: Callable[[], float], sleep: Callable[[float], None]) -> list[float]:
-    """By how much each of some short sleeps was too long."""
+    """Return by how much each of some short sleeps was too long, s."""
     late = []
     for _ in range(NAPS):
         begun_s = now_s()
@@ -107,7 +107,7 @@ def naps(now_s: Callable[[], float], sleep: Callable[[float], None]) -> list[flo
 
 
 def disk_finding(log: Path) -> DoctorFinding:
-    """Room for a log, where it would be written."""
+    """Return the finding on the disk space for the log."""
     folder = log.absolute().parent
     try:
         free = shutil.disk_usage(folder).free
@@ -116,7 +116,7 @@ def disk_finding(log: Path) -> DoctorFinding:
     text = f"{free / 1e6:.0f} MB free for {log}"
     if free >= WANTED_FREE_BYTES:
         return ok("disk", text)
-    return bad("disk", f"{text}, {WANTED_FREE_BYTES / 1e6:.0f} MB wanted", "Free some space, or log to another disk")
+    return bad("disk", f"{text}, {WANTED_FREE_BYTES / 1e6:.0f} MB required", "Free disk space, or log to another disk")
 
 
 def _version(name: str) -> str | None:
@@ -140,20 +140,20 @@ def _numbers(version: str) -> tuple[int, ...]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The drive and the line, as for identify."""
+    """Add the options of drive and line, as for identify."""
     from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, add_option
     from tdhil.config import OPTION
 
     drive = add_drive_arguments(parser)
-    add_option(drive, OPTION["simulate"], help="look at the embedded simulator")
-    add_option(drive, OPTION["log"], help="where a run would write its log")
+    add_option(drive, OPTION["simulate"], help="check the embedded simulator")
+    add_option(drive, OPTION["log"], help="path at which a run would write its log")
     add_option(parser, OPTION["json"])
     add_line_arguments(parser)
     parser.set_defaults(run=run)
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """0 when nothing is bad, else 4. Raises UsageError and DataFileError for options and a rig.yaml that are wrong."""
+    """Run all checks. Return 0 if nothing is bad, else 4. Raises UsageError and DataFileError for wrong input."""
     from tdhil.config import load_rig, resolve
     from tdhil.errors import ExitCode
 
@@ -173,14 +173,14 @@ def run(namespace: argparse.Namespace) -> int:
     else:
         _show_registers(registers)
         bad = sum(one.grade == "bad" for one in found)
-        print("nothing stands in the way" if not bad else f"{bad} to mend, see 'bad'")  # noqa: T201
+        print("no obstacle was found" if not bad else f"{bad} to correct, see 'bad'")  # noqa: T201
     return int(code)
 
 
 def findings(
     cli: Mapping[str, Any], rig: Rig | None, options: RunOptions, registers: list[ValueSeen]
 ) -> Iterator[DoctorFinding]:
-    """From the computer to the drive; ``registers`` is filled with what a person may compare."""
+    """Yield findings from the computer to the drive; ``registers`` receives values to compare."""
     from tdhil.session import connection_of, plan_peer
 
     yield from host_findings(Path(options.log))
@@ -193,7 +193,7 @@ def findings(
     yield from _profile(options, connection)
     yield from _limits(rig)
     if not (options.simulate or connection.configured):
-        yield note("drive", f"{connection.nothing_there}: no drive was looked at",
+        yield note("drive", f"{connection.nothing_there}: no drive was checked",
                    "Name it, such as -i socketcan -c can0, --host 192.0.2.10 or --serial /dev/ttyUSB0")
     else:
         yield from bus_commands(connection.drive).findings(
@@ -202,7 +202,7 @@ def findings(
 
 
 def _left(folder: Path) -> Iterator[DoctorFinding]:
-    """What runs that died have left in their drives."""
+    """Yield settings that died runs have left in their drives."""
     from drivers.undo_journal import PREFIX, SUFFIX, read
 
     for path in sorted(folder.glob(f"{PREFIX}*{SUFFIX}")):
@@ -212,7 +212,7 @@ def _left(folder: Path) -> Iterator[DoctorFinding]:
             yield of_error("left in a drive", error)
             continue
         yield bad("left in a drive", f"{drive}: {', '.join(one.text for one in settings)} ({path.name})",
-                  "A run is under way, or one died: the next run on that drive gives them back; or set them by hand, "
+                  "A run is active, or one died. The next run on that drive restores them. Or set them by hand, "
                   "and remove the file")
 
 
@@ -226,7 +226,7 @@ def _profile(options: RunOptions, connection: Connection) -> Iterator[DoctorFind
     open_questions = [name for name, entry in doubtful(profile) if not is_accepted(name, entry, accepted)]
     if open_questions:
         yield note("profile", f"not verified: {', '.join(open_questions)}",
-                   f"A run on a real drive is refused until they are: tdhil profiles show {profile.name}")
+                   f"A run on a real drive needs them verified or accepted: tdhil profiles show {profile.name}")
 
 
 def _limits(rig: Rig | None) -> Iterator[DoctorFinding]:
@@ -235,11 +235,11 @@ def _limits(rig: Rig | None) -> Iterator[DoctorFinding]:
         yield ok("limits", f"{limits.speed_max_rad_s:g} rad/s, {limits.torque_nm:g} N·m ({rig.source('limits')})")
     else:
         step = "Add a section limits: to rig.yaml, and name the file with --rig"
-        yield note("limits", "none: nothing real will be moved", step)
+        yield note("limits", "none: a real drive will not be moved", step)
 
 
 def _show_registers(registers: list[ValueSeen]) -> None:
-    """Beside each register what it is taken for: people compare it with the drive's panel."""
+    """Show each register with its meaning, to compare with the drive's panel."""
     if not registers:
         return
     from rich.table import Table

@@ -1,4 +1,4 @@
-"""One line of `tdhil doctor`: what was looked at, how it is, and what to do about it."""
+"""One line of `tdhil doctor`: what was checked, its state, and what to do."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Grade = Literal["ok", "note", "bad"]
 
 @dataclass(frozen=True)
 class DoctorFinding:
-    """``bad`` is what would keep a run from starting, or make it unsafe; ``do``: what mends it."""
+    """One finding. ``bad``: it prevents a run or makes it unsafe; ``do``: the remedy."""
 
     grade: Grade
     name: str
@@ -23,34 +23,34 @@ class DoctorFinding:
 
     @property
     def text(self) -> str:
-        """One line; a second one says what to do."""
+        """Return one line; a second one states what to do."""
         line = f"{self.grade:<5} {self.name:<16} {self.said}"
         return visible(f"{line}\n{'':<22} → {self.do}" if self.do else line, keep="\n")
 
 
 def ok(name: str, said: str) -> DoctorFinding:
-    """As it should be."""
+    """Return a finding that is in order."""
     return DoctorFinding("ok", name, said)
 
 
 def note(name: str, said: str, do: str = "") -> DoctorFinding:
-    """Worth a line, and no obstacle."""
+    """Return a finding for information."""
     return DoctorFinding("note", name, said, do)
 
 
 def bad(name: str, said: str, do: str) -> DoctorFinding:
-    """An obstacle."""
+    """Return a finding that is an obstacle."""
     return DoctorFinding("bad", name, said, do)
 
 
 def of_error(name: str, error: TdhilError) -> DoctorFinding:
-    """An error of the tree as a line: what and where; its next step is what to do."""
+    """Return an error of the tree as a finding; its next step is what to do."""
     said = f"{error.where}: {error.what}" if error.where else error.what
     return bad(name, said, error.next_step or "See the message")
 
 
 def of_check(check: Check) -> DoctorFinding:
-    """A row of a preflight table as a line."""
+    """Return a row of a preflight table as a finding."""
     at = f" ({check.where})" if check.where else ""
     if check.outcome is Outcome.REFUSED:
         said = f"{check.name}: {check.found}, wanted: {check.wanted}{at}"
@@ -60,7 +60,7 @@ def of_check(check: Check) -> DoctorFinding:
 
 
 def attempted(name: str, work: Callable[[], Iterable[DoctorFinding]]) -> list[DoctorFinding]:
-    """What ``work`` finds, up to where it fails: then that failure is the last line."""
+    """Return the findings of ``work``. If it fails, the failure is the last one."""
     found: list[DoctorFinding] = []
     try:
         for one in work():

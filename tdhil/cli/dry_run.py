@@ -1,4 +1,4 @@
-"""`--dry-run`: the plan of a run and what may be expected of it. Connects to nothing, moves nothing."""
+"""`--dry-run`: the plan of a run and its expected result. Nothing is connected and nothing moves."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 def dry_run(
     options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True, lets_go: bool = False
 ) -> int:
-    """Plan and print; exit code 0. Raises PreflightRefused where there is nothing to plan, as a run would.
+    """Plan and print; exit code 0. Raises PreflightRefused if no plan is possible, as a run would.
 
-    ``can_torque``: the drive can regulate torque; without it stage 5 is planned in speed mode. ``lets_go``: by its
-    profile the drive's torque is off after a quick stop.
+    ``can_torque``: the drive has a torque mode; without it stage 5 is planned in speed mode. ``lets_go``: by its
+    profile the drive is disabled after a quick stop.
     """
     planned, figures, limits = plan_dry(options, rig, simulated, can_torque, lets_go)
     if options.json:
@@ -39,7 +39,7 @@ def dry_run(
 
     console = PlainConsole()
     if simulated:
-        console.print(f"{SIMULATED}: the embedded rig, its own limits where rig.yaml has none", style="magenta")
+        console.print(f"{SIMULATED}: the embedded rig, with its own limits if rig.yaml has none", style="magenta")
     show(planned, figures, limits, console)
     for key, text, source in rig.conversions if rig is not None else ():
         console.print(f"{key}: {text}  ({source})", markup=False)
@@ -49,7 +49,7 @@ def dry_run(
 def dry_run_course(
     options: RunOptions, rig: Rig | None, case: EvaluationCase, simulated: bool, rate_hz: float
 ) -> int:
-    """A virtual string's course within the limits; exit code 0. Raises what a run would raise before it moves."""
+    """Print a virtual string's speed program; exit code 0. Raises what a run would raise before motion."""
     program, limits = plan_course(case, rig, simulated, rate_hz)
     ratio = case.rig.gear_ratio
     plain = {
@@ -68,27 +68,27 @@ def dry_run_course(
     from tdhil.report import PlainConsole
 
     console = PlainConsole()
-    console.print(Text("DRY RUN: nothing is connected to, nothing moves", style="magenta"))
-    table = _table(f"stage 5: virtual string, {case.prediction.kind} controller, {rate_hz:g} cycles a second")
+    console.print(Text("DRY RUN: nothing is connected, nothing moves", style="magenta"))
+    table = _table(f"stage 5: virtual string, {case.prediction.kind} controller, {rate_hz:g} cycles per second")
     for heading in ("", "planned", "limit"):
         table.add_column(heading, overflow="fold")
     table.add_row(
         "set speed", f"{RPM.of_si(program.start_rad_s):.1f} to at most {RPM.of_si(program.highest_rad_s):.1f} rpm, "
         "main shaft", f"{RPM.of_si(limits.speed_min_rad_s / ratio):.4g} to "
-        f"{RPM.of_si(limits.speed_max_rad_s / ratio):.4g} rpm for the top's swing",
+        f"{RPM.of_si(limits.speed_max_rad_s / ratio):.4g} rpm for the oscillation of the top",
     )
     table.add_row("torque on the rotor", f"up to {plain['moving_torque_nm']:.0f} N·m, and friction",
                   f"±{limits.torque_nm:g} N·m")
-    table.add_row("time, s", f"{program.longest_s:.0f} at the longest (+ about {BEFORE_ACQUIRE_S:.0f})",
+    table.add_row("time, s", f"{program.longest_s:.0f} at most (+ about {BEFORE_ACQUIRE_S:.0f})",
                   f"{limits.time_s:g}")
     console.print(table)
     return 0
 
 
 def say_unreachable(options: RunOptions, rig: Rig | None, connection: Connection, simulated: bool) -> str | None:
-    """Before anything moves: that --tolerance is not to be expected, and the least that is; None where it may be.
+    """Return, before motion, that --tolerance can't be reached, and the least possible value; None if it can be.
 
-    On the rig as rig.yaml expects it, or as it suits its drive: what the run measures decides in the end.
+    It refers to the rig that rig.yaml expects, or to a typical one. The measured values of the run decide in the end.
     """
     from drivers import PreflightRefused
 
@@ -99,20 +99,20 @@ def say_unreachable(options: RunOptions, rig: Rig | None, connection: Connection
             options, rig, simulated, connection.profile.can_torque, connection.profile.quick_stop.ends == "off"
         )
     except PreflightRefused:
-        return None         # a rig that is only assumed refuses nothing
+        return None         # an assumed rig is no reason to refuse
     if planned.stopping is None or planned.stopping.reachable:
         return None
-    assumed = " (a rig that is assumed; `expected:` in rig.yaml says more)"
-    return (f"--tolerance: {_conclusions(planned)[1]}. The least to be expected is "
+    assumed = " (for an assumed rig; improve it with `expected:` in rig.yaml)"
+    return (f"--tolerance: {_conclusions(planned)[1]}. The least possible value is "
             f"±{100.0 * planned.half_width:.2g} % after {planned.duration_s:.0f} s"
             f"{assumed if any(figure.source == 'assumed' for figure in figures) else ''}")
 
 
 def show(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits, console: Console) -> None:
-    """Tables for people, in 80 columns."""
+    """Print tables, in 80 columns."""
     from rich.text import Text
 
-    console.print(Text("DRY RUN: nothing is connected to, nothing moves", style="magenta"))
+    console.print(Text("DRY RUN: nothing is connected, nothing moves", style="magenta"))
     console.print(_motion_table(planned, limits))
     if lines := planned.plan.lines():
         console.print(_lines_table(lines))
@@ -151,7 +151,7 @@ def _lines_table(lines: list[tuple[float, float]]) -> Table:
 def _figures_table(figures: tuple[Figure, ...]) -> Table:
     from rich.text import Text
 
-    table = _table("it rests on")
+    table = _table("assumptions")
     for heading in ("", "value", "from"):
         table.add_column(heading, overflow="fold")
     for figure in figures:
@@ -169,13 +169,13 @@ def _conclusions(planned: Planned) -> list[str]:
     share = f"±{100.0 * planned.half_width:.2g} %"
     found = [f"expected interval of J: {share} after {planned.duration_s:.0f} s (repeatability)"]
     if stopping is not None and not stopping.reachable:
-        found.append(f"±{100.0 * stopping.tolerance:.3g} % is not to be expected: {stopping.advice}")
+        found.append(f"±{100.0 * stopping.tolerance:.3g} % can't be reached: {stopping.advice}")
     elif stopping is not None:
         found.append(
-            f"±{100.0 * stopping.tolerance:.3g} % asked for: a pilot of {stopping.pilot_periods} periods at each mean "
-            f"speed, some {stopping.expected_periods} in all; the scatter decides"
+            f"±{100.0 * stopping.tolerance:.3g} % requested: a pilot of {stopping.pilot_periods} periods at each mean "
+            f"speed, about {stopping.expected_periods} in total; the scatter decides"
         )
-    found.append("A run measures friction, inertia and noise first, and plans again from that.")
+    found.append("A run first measures friction, inertia and noise, and then plans again.")
     return found
 
 

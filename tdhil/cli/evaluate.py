@@ -12,19 +12,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of evaluate."""
     from tdhil.cli.identify import add_peer_arguments
 
-    what = parser.add_argument_group("what is evaluated")
+    what = parser.add_argument_group("evaluation")
     what.add_argument("--virtual-string", type=Path, required=True, metavar="string.yaml",
-                      help="drill string, bottom and bit (docs/soft_torque.md), simulated in this host")
+                      help="drill string, bottom and bit (docs/reference/string.md), simulated in this host")
     what.add_argument("--controller", type=Path, required=True, metavar="tune.json",
                       help="what tdhil tune --json wrote for that string: the speed controller, run in this host")
-    what.add_argument("--use", choices=CONTROLLERS, default="soft", help="which controller of it (soft)")
+    what.add_argument("--use", choices=CONTROLLERS, default="soft", help="controller in that file (default soft)")
     what.add_argument("--own-loop", action="store_true",
-                      help="the drive's own speed loop, with these gains typed in; the string's torque goes through "
+                      help="the drive's own speed loop, with these gains set in the drive; the string's torque "
+                           "goes through "
                       "its torque offset")
     what.add_argument("--result", type=Path, metavar="result.json",
-                      help="of tdhil identify on the rig that turns, where that isn't the machine that was tuned for")
+                      help="result of tdhil identify on the present rig, if it is not the machine that was tuned for")
     what.add_argument("--dry-run", action="store_true",
-                      help="lay the course within the rig's limits, or say what keeps it; nothing moves")
+                      help="plan the speed program within the rig's limits, or report what prevents it; nothing moves")
     what.add_argument("--report", type=Path, metavar="FILE",
                       help="the result with pictures in one file: evaluation.html, or evaluation.pdf on A4")
     add_peer_arguments(parser)
@@ -32,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Read the three files, then the road of every run."""
+    """Read the three files, then run like every run."""
     from tdhil.cli.identify import run_with
     from tdhil.cli.tune import read_result
     from tdhil.session import evaluation_case, load_tuning

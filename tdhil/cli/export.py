@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
-from tdhil.errors import ExitCode, LogError, NothingRecoverable, UsageError
+from tdhil.errors import ExitCode, LogError, MessageCode, NothingRecoverable, UsageError
 
 if TYPE_CHECKING:
     from drivers import RawFrame
@@ -22,7 +22,7 @@ COLUMNS: Final = (
     "mode", "state", "status", "fresh", "limit_active", "standstill", "age_s", "half_width_s",
     "simulated", "position_rad",
 )
-"""Of a table; the first three are what `tdhil replay` reads of a CSV."""
+"""Columns of a table. `tdhil replay` reads the first three from a CSV."""
 
 _CAN_ONLY: Final = ("candump", "asc")
 _LARGEST_STANDARD: Final = 0x7FF
@@ -45,9 +45,11 @@ def run(namespace: argparse.Namespace) -> int:
     path: Path = namespace.log
     target: Path = namespace.output or path.with_suffix(SUFFIXES[namespace.to])
     if not path.is_file():
-        raise UsageError("there is no such log", where=str(path), next_step="Name a run.mcap of this tool")
+        raise UsageError("this log does not exist", where=str(path), next_step="Name a run.mcap of tdhil",
+                         entry=MessageCode.FILE_NOT_FOUND)
     if target.exists():
-        raise UsageError("is there already, and is left as it is", where=str(target), next_step="Name another with -o")
+        raise UsageError("already exists and was left unchanged", where=str(target),
+                         next_step="Name another file with -o", entry=MessageCode.FILE_EXISTS)
     if namespace.to == "parquet":
         _duckdb()
     try:
@@ -60,7 +62,8 @@ def run(namespace: argparse.Namespace) -> int:
     except LogError as error:
         raise NothingRecoverable(error.what, where=error.where, next_step=error.next_step) from error
     except OSError as error:
-        raise UsageError(f"can't be written ({error.strerror or error})", where=str(target)) from error
+        raise UsageError(f"can't be written ({error.strerror or error})", where=str(target),
+                         entry=MessageCode.FILE_NOT_WRITABLE) from error
     console = stderr_console()
     for problem in found.problems:
         console.print(f"tdhil: {path}: {problem}", style="yellow", markup=False, soft_wrap=True)
@@ -71,14 +74,14 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def _write_frames(to: str, path: Path, target: Path, epoch_ns: int) -> int:
-    """By python-can's own writers. Raises UsageError where there are no CAN frames in the log."""
+    """Write frames with python-can's own writers. Raises UsageError if the log has no CAN frames."""
     import can
 
     frames = _can_frames(path)
     first = next(frames, None)
     if first is None:
-        raise UsageError("has no CAN frames in it; that of a run on Modbus has none", where=str(path),
-                         next_step="Its samples: --to csv")
+        raise UsageError("contains no CAN frames, for example because the run was on Modbus", where=str(path),
+                         next_step="Export its samples with --to csv", entry=MessageCode.WRONG_KIND_OF_FILE)
     count = 0
     writer: Any = can.ASCWriter(target) if to == "asc" else can.CanutilsLogWriter(target, channel="can0")
     with writer:
@@ -94,7 +97,7 @@ def _write_frames(to: str, path: Path, target: Path, epoch_ns: int) -> int:
 
 
 def _can_frames(path: Path) -> Iterator[RawFrame]:
-    """Of a run on another bus none: older logs have a Modbus line's bytes on the topic of CAN frames."""
+    """Yield CAN frames; none for another bus: older logs have Modbus bytes on the topic of CAN frames."""
     from tdhil.config import BUSES
     from tdhil.recording import CAN, read_frames, read_run
     from tdhil.session import bus_kind
@@ -117,7 +120,7 @@ def _rows(path: Path, simulated: int) -> Iterator[tuple[Any, ...]]:
 
 
 def _write_csv(path: Path, target: Path, simulated: int) -> int:
-    """Numbers to their last digit: read again, they are the same."""
+    """Write numbers with all digits, so that they are read back unchanged."""
     count = 0
     with target.open("x", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
@@ -129,7 +132,7 @@ def _write_csv(path: Path, target: Path, simulated: int) -> int:
 
 
 def _write_parquet(path: Path, target: Path, simulated: int) -> int:
-    """The same table, typed; DuckDB reads its numbers to their last bit."""
+    """Write the same table, typed; DuckDB keeps all bits of its numbers."""
     texts, counts = {"mode", "state"}, {"status", "fresh", "limit_active", "standstill", "simulated"}
     typed = ", ".join(
         f"{name}: '{'VARCHAR' if name in texts else 'BIGINT' if name in counts else 'DOUBLE'}'" for name in COLUMNS
@@ -148,4 +151,4 @@ def _write_parquet(path: Path, target: Path, simulated: int) -> int:
 def _duckdb() -> Any:
     from tdhil.fleet import load_duckdb
 
-    return load_duckdb("--to parquet", "take --to csv")
+    return load_duckdb("--to parquet", "use --to csv")

@@ -1,4 +1,4 @@
-"""`tdhil fleet` and `tdhil watch`: many logs identified into one table, once or as they come."""
+"""`tdhil fleet` and `tdhil watch`: many logs identified into one table, once or as they arrive."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from profiles.quantities import TIME
 from tdhil.cli.arguments import add_option, add_settings, amount, settings_in
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
-from tdhil.errors import ExitCode, UsageError
+from tdhil.errors import ExitCode, MessageCode, UsageError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from tdhil.fleet import FleetRequest, FleetRow, FleetSummary
 
-_SHOWN = 10         # failures, changes: more stand in the table
+_SHOWN = 10         # failures, changes: the table has all of them
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,28 +34,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group()
     _add_jobs(where)
     where.add_argument("--scheduler", metavar="tcp://HOST:8786", help="a Dask cluster instead (extra `cluster`)")
-    parser.add_argument("--again", action="store_true", help="do all of them, whatever is there already")
-    parser.add_argument("--retry-failed", action="store_true", help="do those again that failed")
+    parser.add_argument("--again", action="store_true", help="identify all logs, also those that are finished")
+    parser.add_argument("--retry-failed", action="store_true", help="retry logs that failed")
     parser.set_defaults(run=run)
 
 
 def add_watch_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of watch."""
-    parser.add_argument("folder", type=Path, metavar="DIR", help="where logs come in; below it, too")
+    parser.add_argument("folder", type=Path, metavar="DIR", help="folder that receives logs, with its subfolders")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the table (default: DIR/fleet.csv)")
     _add_settings(parser)
     _add_jobs(parser)
     parser.add_argument("--every", type=amount(TIME), default=2.0, metavar="S", help="how often it looks (default 2 s)")
-    parser.add_argument("--once", action="store_true", help="look once, and end")
+    parser.add_argument("--once", action="store_true", help="check once, then end")
     parser.set_defaults(run=run_watch)
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
     add_settings(parser, "each run's")
     parser.add_argument("--time-limit", type=amount(TIME), default=120.0, metavar="S",
-                        help="for one log; twice over it, it is set aside (default 120 s)")
+                        help="time limit for one log; a log above it twice is set aside (default 120 s)")
     parser.add_argument("--memory-limit", type=int, default=1500, metavar="MB",
-                        help="for one log (default 1500 MB)")
+                        help="memory limit for one log (default 1500 MB)")
     parser.add_argument("--no-cache", action="store_true", help="keep no recordings beside the table")
     add_option(parser, OPTION["json"], help="the summary as one JSON document on stdout")
 
@@ -76,10 +76,10 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def run_watch(namespace: argparse.Namespace) -> int:
-    """Look, identify what is new, look again, until Ctrl-C."""
+    """Identify new logs repeatedly until Ctrl-C."""
     folder: Path = namespace.folder
     if not folder.is_dir():
-        raise UsageError("there is no such folder", where=str(folder))
+        raise UsageError("this folder does not exist", where=str(folder), entry=MessageCode.FILE_NOT_FOUND)
     request = _request(namespace, (str(folder),), namespace.out or folder / "fleet.csv")
     watch = FolderWatch(request)
     if not namespace.once and sys.stderr.isatty():
@@ -93,8 +93,8 @@ def run_watch(namespace: argparse.Namespace) -> int:
 
 
 class FolderWatch:
-    """What was there the last time, and what is done. A file that grows without a lock (a copy that is under way) is
-    left until it is the same at two looks.
+    """The known logs, and the finished ones. A file that grows without a lock (a copy in progress) is left until it is
+    unchanged in two checks.
     """
 
     def __init__(self, request: FleetRequest) -> None:
@@ -103,7 +103,7 @@ class FolderWatch:
         self._done: dict[str, tuple[int, int]] = {}
 
     def look(self, *, at_once: bool = False) -> list[FleetRow]:
-        """Rows of what is new since the last look; the table then has them, too. KeyboardInterrupt as usual."""
+        """Return the rows of logs that are new since the last check, and add them to the table."""
         from tdhil.fleet import find_logs, run_fleet
 
         now = {log: _stamp(log) for log in find_logs(self._request.roots).logs}
@@ -143,11 +143,14 @@ def _request(namespace: argparse.Namespace, roots: tuple[str, ...], out: Path) -
     from tdhil.process_pool import TaskLimits, usable_cores
 
     if namespace.jobs is not None and not 1 <= namespace.jobs <= 1024:
-        raise UsageError(f"{namespace.jobs}: must be from 1 to 1024", where="--jobs")
+        raise UsageError(f"{namespace.jobs}: must be from 1 to 1024", where="--jobs",
+                         entry=MessageCode.VALUE_NOT_ALLOWED)
     if not namespace.time_limit > 0.0:
-        raise UsageError(f"{namespace.time_limit:g}: must be a positive time", where="--time-limit")
+        raise UsageError(f"{namespace.time_limit:g}: must be a positive time", where="--time-limit",
+                         entry=MessageCode.VALUE_NOT_ALLOWED)
     if not namespace.memory_limit >= 100:
-        raise UsageError(f"{namespace.memory_limit}: must be at least 100 MB", where="--memory-limit")
+        raise UsageError(f"{namespace.memory_limit}: must be at least 100 MB", where="--memory-limit",
+                         entry=MessageCode.VALUE_NOT_ALLOWED)
     return FleetRequest(
         roots, out, FleetSettings(**settings_in(namespace)),
         jobs=namespace.jobs or usable_cores(),
@@ -159,11 +162,11 @@ def _request(namespace: argparse.Namespace, roots: tuple[str, ...], out: Path) -
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How it goes, on stderr; what came of it, on stdout
+# Progress, on stderr; results, on stdout
 
 
 class _Bar:
-    """A bar with the time left on a terminal; elsewhere nothing."""
+    """A progress bar with the remaining time, on a terminal only."""
 
     def __init__(self) -> None:
         from rich.progress import (
@@ -207,26 +210,26 @@ def _print(summary: FleetSummary, as_json: bool) -> None:
 
     console = PlainConsole()
     found = summary.document()
-    before = f" ({summary.done_before} of them done before)" if summary.done_before else ""
+    before = f" ({summary.done_before} of them finished before)" if summary.done_before else ""
     part = f"{found['logs']} of " if summary.left else ""
     logs = part + counted(found["logs"] + summary.left, "log")
     console.print(f"{logs}{before} in {summary.wall_s:.1f} s: {summary.out}", soft_wrap=True)
     if summary.left:
         why = "interrupted: " if summary.interrupted else ""
-        console.print(f"{why}{summary.left} left to do, by the same command again")
+        console.print(f"{why}{summary.left} remaining; run the same command again")
     console.print(_counts(found))
     if found["simulated"]:
         console.print(f"{found['simulated']} of them {SIMULATED}", style="magenta")
     _list(console, "failed", [f"{one['log']}: {one['text']}" for one in found["failures"]])
     _list(console, "from a part of the run", [f"{one['log']}: {one['text']}" for one in found["in_part"]])
-    _list(console, "other than the result in the log", [
+    _list(console, "different from the result in the log", [
         f"{one['log']}: {_was(one['stored_verdict'], one['stored_inertia_kg_m2'])} → "
         f"{_was(one['verdict'], one['inertia_kg_m2'])}" for one in found["changed"]])
     _list(console, "slowest", [f"{one['log']}: {one['cpu_s']:.2f} s of CPU" for one in found["slowest"]])
     if summary.live:
-        console.print(f"left alone: {summary.live} being written")
+        console.print(f"skipped: {summary.live} being written")
     if summary.bare_traces:
-        console.print(f"left out: {counted(summary.bare_traces, 'CSV file')} without a .yaml of the same name")
+        console.print(f"skipped: {counted(summary.bare_traces, 'CSV file')} without a .yaml of the same name")
 
 
 def _counts(found: dict[str, Any]) -> Table:

@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from profiles import with_code
 from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, add_options
+from tdhil.cli.calibrate_run import add_calibrate_arguments, check_calibrate, run_calibration
 from tdhil.config import OPTION, Overrides, RunDetails, Topic, load_rig, resolve
-from tdhil.errors import ExitCode, LogError, TdhilError, exit_code
+from tdhil.errors import ExitCode, LogError, TdhilError, code_of, error_document, exit_code
 from tdhil.session import PeerPlan, bus_kinds
 
 if TYPE_CHECKING:
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def list_faults() -> int:
-    """Prints what there is; the exit code."""
+    """Print the known faults. Return the exit code."""
     print("\n\n".join(f"--drive {kind.name}\n\n{kind.fault_listing()}" for kind in bus_kinds()))  # noqa: T201
     return 0
 
@@ -32,9 +34,9 @@ def list_faults() -> int:
 def show_settings(
     console: Console, options: RunOptions, connection: Connection, peer: PeerPlan, rig: Rig | None = None
 ) -> None:
-    """Which value came from where: everything that isn't a default; and what became of a value with a unit."""
+    """Print the source of every value that is not a default, and conversions of values with a unit."""
     if peer.embedded:
-        why = "as asked for" if options.simulate else connection.nothing_there
+        why = "as requested" if options.simulate else connection.nothing_there
         clock = "stepped time" if peer.stepped else "real time"
         what = connection.line.simulated_text
         console.print(f"SIMULATED: embedded {what} ({why}), {clock}, seed {peer.seed}", style="magenta")
@@ -54,27 +56,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of identify. None as a default means: rig.yaml, else the built-in default (`tdhil.config.options`)."""
     sections = add_options(parser, Topic.MOTION, Topic.RESULT)
     sections[Topic.MOTION].add_argument("--dry-run", action="store_true",
-                                        help="show the plan and what to expect; nothing moves")
+                                        help="show the plan and the expected result; nothing moves")
     sections[Topic.RESULT].add_argument("--report", type=Path, metavar="FILE", help="the result with pictures in one "
                                         "file: report.html, or report.pdf on A4")
+    add_calibrate_arguments(sections[Topic.RESULT])
     add_peer_arguments(parser)
     parser.set_defaults(run=run)
 
 
 def add_peer_arguments(parser: argparse.ArgumentParser) -> None:
-    """Which drive and where, what the operator takes upon himself, the log, and the simulated rig: of any run."""
+    """Add the options of any run: drive and address, overrides, log, simulated rig."""
     add_drive_arguments(parser)
     add_options(parser, Topic.CYCLE, Topic.OVERRIDES, Topic.OUTPUT, Topic.SIMULATED)
     add_line_arguments(parser)
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """The whole path."""
+    """Run the command; with --calibrate both runs and the calibration."""
+    check_calibrate(namespace)
+    if namespace.calibrate:
+        return run_calibration(namespace, lambda one, logs: run_with(one, logs=logs))
     return run_with(namespace)
 
 
-def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = None) -> int:
-    """The whole path, with a virtual string in stage 5 where one is to be evaluated.
+def run_with(
+    namespace: argparse.Namespace, evaluation: EvaluationCase | None = None, logs: list[Path] | None = None
+) -> int:
+    """Run the command, with a virtual string in stage 5 if one is to be evaluated.
+
+    ``logs``: the path of the run's log is appended to it, and the process goes on after the run.
 
     Raises TdhilError before the drive is touched; afterwards everything ends in an exit code.
     """
@@ -113,11 +123,11 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
     )
     if evaluation is None and (said := say_unreachable(options, rig, connection, simulated)) is not None:
         console.print(said, style="yellow", markup=False)
-    return _run(request, console, namespace.report)
+    return _run(request, console, namespace.report, logs)
 
 
 def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
-    """Before anything is opened: no file of this run is another's. UsageError names the option."""
+    """Check, before anything is opened, that all files differ. Raises UsageError with the option."""
     from tdhil.session import check_different_files, check_log_path
 
     check_different_files({"--rig": namespace.rig, "--report": namespace.report, **options.files()})
@@ -128,7 +138,7 @@ def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
         check_trace_path(Path(options.trace), options.source("trace"))
 
 
-def _run(request: RunRequest, console: Console, report: Path | None) -> int:
+def _run(request: RunRequest, console: Console, report: Path | None, logs: list[Path] | None) -> int:
     import tdhil.cli.main as entry
     from tdhil.session import Ending, RunSession, TerminalOperator
 
@@ -136,9 +146,13 @@ def _run(request: RunRequest, console: Console, report: Path | None) -> int:
     operator_interface = TerminalOperator(
         console, yes=options.yes, gear_ratio=1.0 if request.rig is None else request.rig.gear.ratio
     )
-    with Ending(own_process=entry.process.own) as ending:
+    # The process does not end after a run of a calibration: signals must then work again, at the prompt and later.
+    with Ending(own_process=entry.process.own and logs is None) as ending:
         session = RunSession(request, operator_interface, report=report is not None)
-        return ending.code(_finish(session, ending, options, console, report))
+        code = ending.code(_finish(session, ending, options, console, report))
+        if logs is not None:
+            logs.append(session.path)
+        return code
 
 
 def _finish(
@@ -163,13 +177,13 @@ def _finish(
     try:
         if document is not None:
             print_result(document, options.json)
-    finally:            # whoever should have read stdout may be gone: log and report are finished all the same
+    finally:            # the reader of stdout may be gone: log and report are still finished
         try:
             session.close()
         except LogError as error:
-            # Stdout has its one document already; and where the log was what ended the run, all is said.
+            # Stdout has its one document already. If the log ended the run, everything is reported.
             if not isinstance(outcome.cause, LogError):
-                console.print(f"tdhil: {error}", style="bold red", markup=False, soft_wrap=True)
+                console.print(f"tdhil: {error.coded}", style="bold red", markup=False, soft_wrap=True)
             code = code or int(exit_code(error))
         if document is not None:
             # it names the log's SHA-256
@@ -178,7 +192,7 @@ def _finish(
 
 
 def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> int:
-    """The first cause, how the stop went, and where the log is."""
+    """Print the first cause, the outcome of the stop, and the path of the log."""
     import traceback
 
     from tdhil.runner import not_confirmed
@@ -188,22 +202,22 @@ def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> 
     if cause is not None:
         if not isinstance(cause, TdhilError):
             traceback.print_exception(cause, file=sys.stderr)
-        console.print(f"tdhil: {cause}", style="bold red", markup=False, soft_wrap=True)
+        console.print(f"tdhil: {with_code(str(cause), code_of(cause))}", style="bold red", markup=False, soft_wrap=True)
     said = "the drive was never enabled; nothing has moved"
     if stop is not None and stop.confirmed:
         said = f"the shaft is at rest (seen at {stop.at_rest_s:.1f} s) and the drive is disabled"
     elif stop is not None:
         loud = not_confirmed(stop)
-        console.print(f"tdhil: {loud}", style="bold white on red", markup=False, soft_wrap=True)
+        console.print(f"tdhil: {loud.coded}", style="bold white on red", markup=False, soft_wrap=True)
         said = str(loud)
-        # Whatever came first: a script that reads the code alone must learn that the shaft may still turn.
+        # In any case: a script that reads only the exit code must learn that the shaft may still turn.
         code = ExitCode.STOP_NOT_CONFIRMED
     if stop is None or stop.confirmed:
         console.print(f"tdhil: {said}", markup=False, soft_wrap=True)
     console.print(f"tdhil: log: {path} (tdhil replay {path})", markup=False, soft_wrap=True)
     if as_json:
         document = {
-            "error": {"kind": type(cause).__name__, "message": str(cause)} if cause is not None else None,
+            "error": error_document(cause) if cause is not None else None,
             "exit_code": int(code),
             "stop": said,
             "stages": [

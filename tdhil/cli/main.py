@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import errno
 import json
 import logging
 import os
@@ -14,35 +13,65 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
 from types import SimpleNamespace
-from typing import NoReturn
+from typing import Final, NoReturn
 
+from profiles import with_code
+from tdhil.cli.parser import CommandParser, FrontParser
 from tdhil.cli.standard_streams import sheltered
-from tdhil.errors import ExitCode, TdhilError, UsageError, exit_code
+from tdhil.errors import (
+    ExitCode,
+    MessageCode,
+    TdhilError,
+    UsageError,
+    code_of,
+    error_document,
+    exit_code,
+    of_the_system,
+)
 from tdhil.version import __version__
 
-_COMMANDS = {
-    "identify": "put a drive into motion and identify its moment of inertia",
-    "replay": "identify again from a log, or from a trace that a drive's own tool exported",
-    "fleet": "identify many logs again, into one table: by processes here, or on a Dask cluster",
-    "trend": "did a rig change over time? From the table of a fleet",
-    "compare": "two runs or more side by side: settings, inertias, whether they differ",
-    "watch": "identify new logs in a folder as they come",
-    "tune": "from J to a speed controller that damps the drill string; nothing moves",
-    "evaluate": "a virtual drill string on the drive: does a tuned controller do what tune says?",
-    "export": "a log's CAN frames or samples in another program's format",
-    "profiles": "what is known of which drive, what it needs set, and how sure that is",
-    "scan": "find out who is on the bus; writes nothing to any drive",
-    "doctor": "check adapter, permissions, bus, computer, profile and drive; writes nothing",
-    "recover": "say what a damaged log still holds, and make a clean copy of it",
-    "stop": "stop a drive from outside of any run: best effort, no emergency stop",
-    "serve": "rigs, runs and live pages in a browser, on this computer",
-    "attend": "show the codes that let shafts of tdhil serve move, on this terminal",
-    "simulate": "run the simulated rig as a process of its own",
-    "rig": "write a rig.yaml to fill in, with no drive at hand",
-    "support": "put a log and what is around it into one archive, for a support case",
-    "docs": "where the documentation and the examples are",
-    "study": "run the paper's experiments again, beside what it published",
+_GROUPS: Final = {
+    "identify": {
+        "identify": "move the shaft and identify its moment of inertia",
+        "stop": "stop a drive without a run; this is no emergency stop",
+    },
+    "look again": {
+        "replay": "identify again, from a log or from a CSV trace",
+        "compare": "compare runs: settings, inertias and whether they differ",
+        "fleet": "identify many logs again, into one table",
+        "trend": "show from a fleet's table whether a rig changed over time",
+        "watch": "identify each new log in a folder",
+        "export": "write a log's CAN frames or samples in another format",
+        "recover": "show what a damaged log holds, and write a clean copy",
+        "support": "put a log and its surroundings into one archive",
+    },
+    "prepare": {
+        "doctor": "check adapter, permissions, bus, computer, profile, drive",
+        "scan": "list the drives on the bus; nothing is written to them",
+        "rig": "write a rig.yaml to fill in, without a drive",
+        "profiles": "show known drives, their settings and what is verified",
+        "calibrate": "compute the torque scale from a known body, the speed scale from turns",
+    },
+    "what J is for": {
+        "tune": "compute a speed controller that damps the drill string",
+        "evaluate": "test a tuned controller on the drive with a virtual string",
+    },
+    "service": {
+        "serve": "show rigs, runs and live pages in a browser",
+        "attend": "show the codes that allow motion, on this terminal",
+    },
+    "simulator": {
+        "simulate": "run the simulated rig as a process of its own",
+        "study": "repeat the experiments of the paper in simulation",
+    },
+    "help": {
+        "explain": "show cause and cure of a message by its code (TDH-412)",
+        "docs": "show where documentation and examples are",
+        "completion": "print a completion script for bash or zsh",
+    },
 }
+"""The commands, in the groups of ``tdhil --help``, each with its one line."""
+_COMMANDS: Final = {name: summary for commands in _GROUPS.values() for name, summary in commands.items()}
 
 
 process = SimpleNamespace(own=False)
@@ -59,12 +88,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
         except KeyboardInterrupt:
             _hear_no_more()
-            print("tdhil: interrupted", file=sys.stderr)  # noqa: T201
+            print(f"tdhil: {with_code('interrupted', MessageCode.INTERRUPTED.code)}", file=sys.stderr)  # noqa: T201
             return 130
         except BrokenPipeError:
-            return 141      # whoever read our output has gone
+            return 141      # the reader of the output has gone
         except Exception as error:
-            # What can't be understood leaves no namespace, and whoever asked for a document still waits for one.
+            # A syntax error leaves no namespace, but a caller with --json still expects a document.
             return _report(error, getattr(namespace, "json", None) is True or "--json" in arguments)
     return code
 
@@ -85,32 +114,36 @@ def _main(arguments: list[str], namespace: argparse.Namespace) -> int:
     return int(namespace.run(namespace))
 
 
-class _Parser(argparse.ArgumentParser):
-    """Its errors are a line, as all others: two dozen lines of usage above them would hide what is wrong."""
-
-    def error(self, message: str) -> NoReturn:
-        raise UsageError(message, where=self.prog.partition(" ")[2], next_step=f"See {self.prog} --help")
-
-
 def build_parser(chosen: str | None) -> argparse.ArgumentParser:
-    """The parser; only the chosen command's options are built, since python-can's alone cost 150 ms to import."""
-    parser = _Parser(
+    """Return the parser; only the chosen command has its options, since python-can's alone cost 150 ms to import."""
+    return _parser([chosen] if chosen is not None else [])
+
+
+def build_full_parser() -> argparse.ArgumentParser:
+    """Return the parser with the options of all commands, for the completion of a shell."""
+    return _parser(list(_COMMANDS))
+
+
+def _parser(chosen: Sequence[str]) -> argparse.ArgumentParser:
+    parser = FrontParser(
         prog="tdhil",
-        description="Identifies the moment of inertia of a top drive, or of any inverter-driven machine, "
-        "with an interval that holds.",
-        epilog="tdhil COMMAND --help tells more. Ctrl-C stops the shaft, but it is no emergency stop: "
-        "keep the hard-wired one within reach.",
+        description="Identify the moment of inertia of a top drive, or of any machine on an\n"
+        "inverter, with its 95 % coverage interval.",
+        epilog="tdhil COMMAND --help shows more. Ctrl-C stops the shaft, but it is no emergency\n"
+        "stop: keep the hard-wired one within reach.",
     )
+    parser.groups = _GROUPS
     parser.add_argument("--version", action="version", version=f"tdhil {__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=CommandParser)
     for name, summary in _COMMANDS.items():
         # Options are written out in full: no `--y` may stand for --yes.
-        sub = commands.add_parser(
-            name, help=summary, description=summary[0].upper() + summary[1:] + "." * (summary[-1] != "?"),
-            allow_abbrev=False,
-        )
-        if name == chosen:
+        sub = commands.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".",
+                                  allow_abbrev=False)
+        if name in chosen:
+            from tdhil.cli.arguments import rare_options
+
             _builder(name)(sub)
+            sub.set_rare(rare_options(sub))
     return parser
 
 
@@ -121,7 +154,8 @@ def _chosen(arguments: Sequence[str]) -> str | None:
 def _no_command(name: str) -> UsageError:
     from tdhil.cli.arguments import meant
 
-    return UsageError(f"there is no command '{name[:40]}'", next_step=f"{meant(name, _COMMANDS)}See tdhil --help")
+    return UsageError(f"there is no command '{name[:40]}'", next_step=f"{meant(name, _COMMANDS)}See tdhil --help",
+                      entry=MessageCode.UNKNOWN_COMMAND)
 
 
 _ELSEWHERE = {
@@ -138,24 +172,21 @@ def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
     return add_arguments
 
 
-_THE_SYSTEM_S = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOSPC, errno.ENOMEM, errno.EIO, errno.EROFS})
-"""Its state, not a mistake of ours: open files, disk, memory, a terminal that is gone."""
-
-
 def _report(error: Exception, as_json: bool) -> int:
     """One message for an error of the tree; a traceback only for what is a mistake of ours."""
     code = exit_code(error)
     if isinstance(error, TdhilError):
         error.spelling = {}
-        print(f"tdhil: {error}", file=sys.stderr)  # noqa: T201
-    elif isinstance(error, OSError) and error.errno in _THE_SYSTEM_S:
-        print(f"tdhil: the system refused: {error.strerror or error}", file=sys.stderr)  # noqa: T201
+        said = str(error)
+    elif isinstance(error, OSError) and of_the_system(error):
+        said = f"The operating system refused a request: {error.strerror or error}"
     else:
         traceback.print_exception(error, file=sys.stderr)
-        print("tdhil: internal error; please report it with the lines above", file=sys.stderr)  # noqa: T201
+        said = "Internal error. Please report it with the lines above"
         code = ExitCode.INTERNAL
+    print(f"tdhil: {with_code(said, code_of(error))}", file=sys.stderr)  # noqa: T201
     if as_json:
-        document = {"error": {"kind": type(error).__name__, "message": str(error)}, "exit_code": int(code)}
+        document = {"error": error_document(error), "exit_code": int(code)}
         print(json.dumps(document, ensure_ascii=False))  # noqa: T201
     return int(code)
 

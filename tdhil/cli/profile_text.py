@@ -1,4 +1,4 @@
-"""What a profile comes down to, in a few words each: for the table of `tdhil profiles` and for the head of a page."""
+"""Summary of a profile in a few words: for the table of `tdhil profiles` and the head of a page."""
 
 from __future__ import annotations
 
@@ -29,26 +29,28 @@ _SIGNALS = {
 
 @dataclass(frozen=True)
 class RegisterUse:
-    """One register. ``per_lsb``: units for one count, None for words of bits; ``times``: parameter that multiplies."""
+    """The use of one register. ``per_lsb``: units for one count, None for words of bits; ``times``: parameter that
+    multiplies.
+    """
 
     name: str                   # as in `ModbusProfile.entries`
     meaning: str
     register: Register
     per_lsb: float | None
-    unit: str                   # as people write it
+    unit: str                   # as it is written in texts
     times: str | None
     entry: ProfileEntry
 
     @property
     def address(self) -> str:
-        """As on the wire, and as the manual writes it."""
+        """Return the address as on the wire and as in the manual."""
         at = self.register
         table = "" if at.table == "holding" else " input"
         return f"{at.address} ({at.address:04X}h){table}" + (f" = {at.reference}" if at.reference else "")
 
     @property
     def scale(self) -> str:
-        """What one count means."""
+        """Return the value of one count."""
         if self.per_lsb is None:
             return "bits"
         times = f" × {self.times}" if self.times else ""
@@ -56,7 +58,7 @@ class RegisterUse:
 
 
 def register_uses(profile: ModbusProfile) -> tuple[RegisterUse, ...]:
-    """In the order of the profile: the cycle, the mode, parameters, echoes. Each use once, also where two share one."""
+    """Return all uses in the profile's order: cycle, mode, parameters, echoes. Two uses may share a register."""
     found = [
         RegisterUse(
             f"cycle.{name}", meaning, part.register_, getattr(part, "per_lsb", None),
@@ -77,7 +79,7 @@ def register_uses(profile: ModbusProfile) -> tuple[RegisterUse, ...]:
         if one.register_ is not None
     ]
     found += [
-        RegisterUse(f"echoes.{one.setpoint}", f"{one.setpoint} setpoint, as understood", one.register_, one.per_lsb,
+        RegisterUse(f"echoes.{one.setpoint}", f"{one.setpoint} setpoint, as received", one.register_, one.per_lsb,
                     unit_text(one.unit), one.times, one)
         for one in profile.echoes
     ]
@@ -85,7 +87,7 @@ def register_uses(profile: ModbusProfile) -> tuple[RegisterUse, ...]:
 
 
 def unit_text(unit: str) -> str:
-    """A unit of the schema as people write it."""
+    """Return a unit of the schema as it is written in texts."""
     return _UNITS.get(unit, unit)
 
 
@@ -95,25 +97,25 @@ LEVELS: tuple[Confidence, ...] = ("verified", "likely", "unverified")
 
 
 def modes_text(profile: Profile) -> str:
-    """What can be regulated, as far as a run needs it."""
+    """Return the control modes that a run needs."""
     return "speed, torque" if profile.can_torque else "speed only"
 
 
 def watchdog_text(profile: Profile) -> str:
-    """What stops the drive when the host falls silent."""
+    """Return what stops the drive when the host fails."""
     kind, reaction = profile.watchdog.kind, profile.watchdog.reaction
     if kind == "none":
-        return "none: the drive would go on turning"
+        return "none: the drive would keep turning"
     return f"{kind.replace('_', ' ')}, then {reaction.replace('_', ' ')}"
 
 
 def counts(profile: Profile) -> dict[str, int]:
-    """How many of its entries are how sure."""
+    """Return the number of entries by confidence."""
     return {level: len(profile.below(level)) for level in LEVELS}
 
 
 def sure_text(profile: Profile) -> str:
-    """The same in words; what is missing is zero."""
+    """Return the numbers by confidence in words; missing ones are zero."""
     found = counts(profile)
     if found["verified"] == sum(found.values()):
         return "all verified"
@@ -121,7 +123,7 @@ def sure_text(profile: Profile) -> str:
 
 
 def row(profile: Profile) -> dict[str, Any]:
-    """One profile of the table, as plain data."""
+    """Return one profile of the table, as plain data."""
     return {
         "name": profile.name,
         "bus": profile.bus,
@@ -134,7 +136,7 @@ def row(profile: Profile) -> dict[str, Any]:
 
 
 def required_text(require: Require, unit: str) -> str:
-    """What a parameter must read."""
+    """Return the required value of a parameter."""
     parts = []
     if require.equals is not None:
         parts.append(f"{require.equals:.10g}")
@@ -148,7 +150,7 @@ def required_text(require: Require, unit: str) -> str:
 
 
 def facts_of(entry: ProfileEntry) -> Iterator[tuple[str, str, str]]:
-    """(key, value, what the schema says of it) of everything an entry claims, below nested sections too."""
+    """Yield (key, value, description in the schema) of everything in an entry, with nested sections."""
     yield from _facts(entry, "")
 
 

@@ -1,4 +1,4 @@
-"""`tdhil profiles`: what ships, what each is sure of, what it needs set on the drive; and whether a file is right."""
+"""`tdhil profiles`: the profiles in tdhil, their confidence, the settings that they need, and checks of a file."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# `tdhil profiles show`: all that a person at the drive needs of a profile, on the terminal.
+# `tdhil profiles show`: everything that is needed at the drive, on the terminal.
 
 
 _NARROW = 72          # columns; a table of five would lose whole columns below
-_SHOW = "tdhil profiles show NAME tells what to set at the drive and what to look up in its manual."
+_SHOW = "tdhil profiles show NAME shows what to set at the drive and what to look up in its manual."
 _MARKS = {"verified": "", "likely": "likely", "unverified": "UNVERIFIED"}
 
 
 def show(profile: Profile, console: Console) -> None:
-    """The page. What is not verified stands last, where it is seen."""
+    """Print the page. Unverified entries come last, where they are visible."""
     _head(profile, console)
     _by_hand(profile, console)
     if isinstance(profile, ModbusProfile):
@@ -68,10 +68,10 @@ def _head(profile: Profile, console: Console) -> None:
         ways = {"tcp": f"TCP port {line.port}", "rtu": f"RTU {line.baud} baud 8{line.parity}{line.stop_bits}"}
         rows.append(("line", f"{' or '.join(ways[way] for way in line.transports)}; unit {line.unit}; 32 bit "
                              f"{line.word_order.replace('_', ' ')}"))
-        rows.append(("cycle", f"{profile.cycle.rate_hz:g} Hz unless told otherwise, if the line carries it"))
+        rows.append(("cycle", f"{profile.cycle.rate_hz:g} Hz unless another rate is given, if the line allows it"))
     if profile.experimental:
-        rows.append(("EXPERIMENTAL", "second-hand, or never tried on this bus"))
-    rows.append(("how sure", sure_text(profile)))
+        rows.append(("EXPERIMENTAL", "from secondary sources, or never tried on this bus"))
+    rows.append(("confidence", sure_text(profile)))
     for name, text in rows:
         console.print(f"  {name:<12}  {text}", markup=False)
     for hint in getattr(profile, "hints", ()):
@@ -79,10 +79,10 @@ def _head(profile: Profile, console: Console) -> None:
 
 
 def _by_hand(profile: Profile, console: Console) -> None:
-    """The checklist: what to set at the drive, what rig.yaml must say for it, and what a run sets itself."""
+    """Print the checklist: settings at the drive, keys in rig.yaml, and settings of a run."""
     required = [one for one in profile.parameters if one.require is not None]
     if required:
-        table = _table("set by hand at the drive; a run is refused until it reads so", "parameter", "must be", "do")
+        table = _table("set by hand at the drive; a run is refused until they are read", "parameter", "must be", "do")
         for one in required:
             assert one.require is not None
             table.add_row(one.title, required_text(one.require, unit_text(one.unit)), _advice(one))
@@ -91,13 +91,13 @@ def _by_hand(profile: Profile, console: Console) -> None:
     if profile.rated_torque_by_hand:
         told.insert(0, ("rated_torque_nm", "torque that is 100 %", "N·m"))
     if told:
-        table = _table("to be told in rig.yaml, since the drive does not", "key under drive_data", "what it is", "unit")
+        table = _table("required in rig.yaml, not reported by the drive", "key under drive_data", "meaning", "unit")
         for row in told:
             table.add_row(*row)
         console.print(table)
     written = [one for one in profile.parameters if one.set_to is not None]
     if written:
-        table = _table("written by a run, read back, and given back afterwards", "parameter", "gets")
+        table = _table("written by a run, read back, and restored afterwards", "parameter", "value")
         for one in written:
             table.add_row(one.title, str(one.set_to).replace("_", " "))
         console.print(table)
@@ -111,9 +111,9 @@ def _advice(one: Parameter | ModbusParameter) -> str:
 
 
 def _objects(profile: CanopenProfile, console: Console) -> None:
-    """Objects beyond those of CiA 402."""
+    """Print the objects beyond those of CiA 402."""
     if profile.parameters:
-        table = _table("the drive's own objects", "object", "type", "meaning", "one count", "how sure")
+        table = _table("the drive's own objects", "object", "type", "meaning", "one count", "confidence")
         for one in profile.parameters:
             scale = f"{one.per_lsb:g}{f' × {one.times}' if one.times else ''} {unit_text(one.unit)}".strip()
             scale = "2^count" if one.scale == "power_of_two" else scale
@@ -123,7 +123,7 @@ def _objects(profile: CanopenProfile, console: Console) -> None:
 
 
 def _registers(profile: ModbusProfile, console: Console) -> None:
-    table = _table("registers, as on the wire, counted from 0", "address", "type", "meaning", "one count", "how sure")
+    table = _table("registers, as on the wire, counted from 0", "address", "type", "meaning", "one count", "confidence")
     for use in register_uses(profile):
         table.add_row(use.address, use.register.type, use.meaning, use.scale, _MARKS[use.entry.confidence])
     console.print(table)
@@ -131,9 +131,9 @@ def _registers(profile: ModbusProfile, console: Console) -> None:
 
 def _filters(profile: ModbusProfile, console: Console) -> None:
     if not profile.filters:
-        console.print("No filter on the reported signals is known of this drive.")
+        console.print("This profile names no filter on the reported signals.")
         return
-    table = _table("smoothing of what the drive reports", "signal", "time constant", "to change for a better result")
+    table = _table("filters on the reported signals", "signal", "time constant", "to change for a better result")
     for one in profile.filters:
         where = f"{one.documented_s:g} s, as documented" if one.parameter is None else (
             f"read from {profile.parameter(one.parameter).title}"
@@ -159,14 +159,14 @@ def _not_verified(profile: Profile, console: Console) -> None:
     if not found:
         console.print("Every entry is verified.")
         return
-    table = _table("not verified: look these up in the drive's manual", "entry", "how sure", "claims", "from")
+    table = _table("not verified: look these up in the drive's manual", "entry", "confidence", "claim", "source")
     for name, entry in found:
         claims = "; ".join(f"{key} {value}" for key, value, _ in facts_of(entry))
         table.add_row(name, _MARKS[entry.confidence], claims, entry.source)
     console.print(table)
     console.print(
-        f"A real drive is refused until you say 'confidence: verified' in a copy of the profile, or take them as they "
-        f"are: {UNVERIFIED_FLAG} likely takes all that are likely, {UNVERIFIED_FLAG} NAME one of them.", markup=False
+        f"A real drive is refused until you set 'confidence: verified' in a copy of the profile, or accept them as "
+        f"they are: {UNVERIFIED_FLAG} likely accepts all likely ones, {UNVERIFIED_FLAG} NAME one entry.", markup=False
     )
 
 
@@ -183,20 +183,20 @@ def _table(title: str, *headings: str) -> Table:
 # ---------------------------------------------------------------------------------------------------------------------
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """`tdhil profiles`, `… show NAME`, `… check FILE`, `… import FILE`."""
+    """Add `tdhil profiles`, `… show NAME`, `… check FILE`, `… import FILE`."""
     add_option(parser, OPTION["json"])
     actions = parser.add_subparsers(dest="action", metavar="ACTION")
-    shown = actions.add_parser("show", help="all that a person at the drive needs of one profile",
-                               description="All that a person at the drive needs of one profile. A vendor's name "
-                                           "lists what ships for that vendor's drives.")
+    shown = actions.add_parser("show", help="everything that is needed at the drive, of one profile",
+                                description="Everything that is needed at the drive, of one profile. A vendor's name "
+                                            "lists the profiles for that vendor's drives.")
     shown.add_argument("name", metavar="NAME", help="vendor/model or the beginning of it, a vendor, or a .yaml file")
-    checked = actions.add_parser("check", help="is a profile of your own right? exit 2 and a line a problem if not",
-                                 description="Is a profile of your own right? Exit 2 and a line a problem if not.")
+    checked = actions.add_parser("check", help="check your own profile; exit 2 and one line per problem",
+                                 description="Check your own profile. Exit 2 and one line per problem.")
     checked.add_argument("files", metavar="FILE", nargs="+", help="a .yaml file, or vendor/model")
-    begun = actions.add_parser("import", help="begin a profile of your own from the drive's EDS or DCF",
-                               description="Begin a profile of your own from the drive's EDS or DCF. What the file "
-                                           "can't know is marked unverified, with what to look for in the manual.")
-    begun.add_argument("file", metavar="FILE", help="the .eds or .dcf file that the drive's maker gives out")
+    begun = actions.add_parser("import", help="create your own profile from the drive's EDS or DCF",
+                               description="Create your own profile from the drive's EDS or DCF. What the file "
+                                           "does not contain is marked unverified, with what to find in the manual.")
+    begun.add_argument("file", metavar="FILE", help="the .eds or .dcf file from the drive's manufacturer")
     begun.add_argument("-o", "--output", metavar="FILE", default=None,
                        help="the profile (default: named as the EDS, in this folder); none is overwritten")
     for action in (shown, checked, begun):
@@ -206,7 +206,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """The exit code; DataFileError, with every problem and its line, for what can't be loaded."""
+    """Run the command. Return the exit code. Raises DataFileError with every problem and its line."""
     as_json = namespace.json is True
     if namespace.action == "show":
         return _show(namespace.name, as_json)
@@ -218,7 +218,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def _list(as_json: bool, names: tuple[str, ...] = ()) -> int:
-    """All, or those of ``names``."""
+    """List all profiles, or those of ``names``."""
     profiles = [load_profile(name) for name in names or profile_names()]
     if as_json:
         print_json({"profiles": [row(profile) for profile in profiles]})
@@ -294,36 +294,36 @@ def _import(file: str, output: str | None, as_json: bool) -> int:
     source = Path(file)
     target = Path(output) if output is not None else Path(f"{source.stem}.yaml")
     if target.suffix not in (".yaml", ".yml"):
-        raise DataFileError((Problem(str(target), 0, "a profile's file ends in .yaml: name it so with -o"),))
+        raise DataFileError((Problem(str(target), 0, "a profile's file name must end in .yaml: name it with -o"),))
     begun = begin_profile(read_eds(source), file)
     try:
         with target.open("x", encoding="utf-8") as stream:
             stream.write(begun.text)
     except FileExistsError:
-        message = "is there already and stays as it is; name another one with -o"
+        message = "already exists and was left unchanged; name another file with -o"
         raise DataFileError((Problem(str(target), 0, message),)) from None
     except OSError as error:
-        message = f"can't be written ({error.strerror or error}); name another place with -o"
+        message = f"can't be written ({error.strerror or error}); name another path with -o"
         raise DataFileError((Problem(str(target), 0, message),)) from error
     open_entries = [name for name, entry in doubtful(begun.profile) if entry.confidence == "unverified"]
     if as_json:
         print_json({"file": str(target), "profile": row(begun.profile), "unverified": open_entries})
         return 0
-    print(f"{target}: {begun.profile.name} on canopen, begun from {source.name}: {sure_text(begun.profile)}")  # noqa: T201
-    print(f"Look up in the drive's manual: {', '.join(open_entries)}. What to look for stands in the file.")  # noqa: T201
+    print(f"{target}: {begun.profile.name} on canopen, created from {source.name}: {sure_text(begun.profile)}")  # noqa: T201
+    print(f"Look up in the drive's manual: {', '.join(open_entries)}. The file states what to look for.")  # noqa: T201
     print(f"Then: tdhil profiles check {target}, and tdhil identify --simulate --profile {_as_path(target)}")  # noqa: T201
     return 0
 
 
 def _as_path(target: Path) -> str:
-    """As a shell takes it, and as `--profile` knows it for a file."""
+    """Return the path quoted for a shell, in a form that `--profile` takes as a file."""
     import shlex
 
     return shlex.quote(str(target) if target.parent.name or target.is_absolute() else f"./{target}")
 
 
 def _load(file: str) -> Profile:
-    """As `load_profile`; and the EDS that it names is there."""
+    """Load a profile as `load_profile` does, and check that its EDS exists."""
     profile = load_profile(file)
     eds_path(file)
     return profile

@@ -1,4 +1,4 @@
-"""`tdhil recover`: what a damaged log still holds, in words, and a clean copy of it."""
+"""`tdhil recover`: the readable content of a damaged log, in words, and a clean copy of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from tdhil.cli.arguments import add_option
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
-from tdhil.errors import ExitCode, UsageError
+from tdhil.errors import ExitCode, MessageCode, UsageError
 
 if TYPE_CHECKING:
     from tdhil.recording import Salvage
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of recover."""
     parser.add_argument("log", type=Path, metavar="broken.mcap", help="the log of a run that was cut short or damaged")
     parser.add_argument("-o", "--output", type=Path, metavar="whole.mcap",
-                        help="write what can be read as a finished log; never over the damaged one")
+                        help="write what can be read as a finished log; the damaged one is never overwritten")
     add_option(parser, OPTION["json"])
     parser.set_defaults(run=run)
 
@@ -33,15 +33,17 @@ def run(namespace: argparse.Namespace) -> int:
 
     path, target = namespace.log, namespace.output
     if not path.is_file():
-        raise UsageError("there is no such log", where=str(path), next_step="Name a run.mcap of this tool")
+        raise UsageError("this log does not exist", where=str(path), next_step="Name a run.mcap of tdhil",
+                         entry=MessageCode.FILE_NOT_FOUND)
     if target is not None and target.exists() and target.samefile(path):
-        raise UsageError("would be written over the log itself", where=f"-o {target}", next_step="Name another file")
+        raise UsageError("would be written over the log itself", where=f"-o {target}", next_step="Name another file",
+                         entry=MessageCode.SAME_FILE_TWICE)
     if target is not None:
         check_log_path(target, "-o")
     found = examine(path)
     if target is not None:
         if (older := make_room(target)) is not None:
-            stderr_console().print(f"an older {target} was kept as {older}", style="dim", markup=False)
+            stderr_console().print(f"the older {target} was kept as {older}", style="dim", markup=False)
         write_copy(path, target, found)
     code = ExitCode.OK if found.whole else ExitCode.PARTIAL
     document = report(found, path, target) | {"exit_code": int(code)}
@@ -53,7 +55,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def report(found: Salvage, path: Path, target: Path | None) -> dict[str, Any]:
-    """Plain data. Times are control time in s; ``under_way``: the stage that the log breaks off in, or None."""
+    """Return plain data. Times are control time in s; ``under_way``: the stage at the end of the log, or None."""
     from tdhil.runner import STAGES
 
     run = found.run
@@ -109,7 +111,7 @@ def _print(document: dict[str, Any]) -> None:
     if copy is not None:
         say(f"copy: {copy} (tdhil replay {copy})")
     elif not document["whole"]:
-        say("A finished copy of what is there: tdhil recover -o whole.mcap " + document["log"])
+        say("To write a finished copy: tdhil recover -o whole.mcap " + document["log"])
 
 
 def _span(document: dict[str, Any]) -> str:
@@ -123,10 +125,10 @@ def _time(time_s: float | None) -> str:
 
 
 def _finite(value: float) -> float | None:
-    """JSON has no NaN, and a hostile file may have any."""
+    """Return a number for JSON, which has no NaN; a damaged file may contain it."""
     return float(value) if math.isfinite(value) else None
 
 
 def _clean(text: str) -> str:
-    """What a damaged file says, for a terminal: on one line, without control characters."""
+    """Return a damaged file's text for a terminal: on one line, without control characters."""
     return "".join(sign if sign.isprintable() else "·" for sign in text)

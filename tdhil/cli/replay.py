@@ -1,8 +1,9 @@
-"""`tdhil replay`: a log of ours, or a trace exported from a drive's own tool, identified like a run."""
+"""`tdhil replay`: a tdhil log, or a trace exported from a drive's own tool, identified like a run."""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +11,16 @@ from profiles.quantities import SHARE, TIME, TORQUE
 from tdhil.cli.arguments import add_option, add_settings, amount, settings_in
 from tdhil.cli.results import print_result, save_report
 from tdhil.config import OPTION
-from tdhil.errors import ExitCode, UsageError
-from tdhil.session import conclude_evaluation, is_evaluation, is_log, read, require_file
+from tdhil.errors import ExitCode, MessageCode, UsageError
+from tdhil.session import (
+    conclude_evaluation,
+    is_evaluation,
+    is_log,
+    load_calibration,
+    read,
+    require_file,
+    with_calibration,
+)
 
 if TYPE_CHECKING:
     from tdhil.session import RunRecord
@@ -23,49 +32,64 @@ _TRACE_ONLY = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of replay. None as a default: not given."""
-    # Optional for argparse only: behind --columns the file's name is taken for one more column (`_log`).
+    # Optional for argparse only: after --columns the file's name is taken as one more column (`_log`).
     parser.add_argument("log", type=Path, nargs="?", metavar="run.mcap|trace.csv",
-                        help="the log of a run, whole or cut short, or a trace in CSV; told apart by their content")
+                        help="the log of a run, whole or cut short, or a trace in CSV; recognised by their content")
     add_option(parser, OPTION["json"])
     parser.add_argument("--report", type=Path, metavar="FILE",
                         help="the result with pictures in one file: report.html, or report.pdf on A4")
-    add_option(parser, OPTION["operator"], help="who ran it, for the report (default: as the log says)")
-    add_option(parser, OPTION["note"], help="what else the report shall say (default: as the log says)")
+    add_option(parser, OPTION["operator"], help="name of the operator, for the report (default: from the log)")
+    add_option(parser, OPTION["note"], help="remark for the report (default: from the log)")
     add_settings(parser, "the run's")
-    trace = parser.add_argument_group("a trace in CSV (a run.mcap brings all this along)")
+    parser.add_argument("--torque-calibration", type=Path, metavar="calibration.json",
+                        help="file of tdhil calibrate torque: every torque in calibrated N·m (default: as the log has)")
+    add_trace_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def add_trace_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of reading a trace in CSV. None as a default: not given."""
+    trace = parser.add_argument_group("a trace in CSV (a run.mcap contains all this)")
     trace.add_argument("--columns", nargs="+", metavar="QUANTITY=NAME:UNIT",
                        help="such as time=t_s speed=n_rpm:rpm torque=m_pct:%%; default: time_s speed_rad_s torque_nm")
     trace.add_argument("--excitation", type=Path, metavar="excitation.yaml",
                        help="the periodic motion that was run: period, lines, mean speeds, start times")
     for flag, unit, metavar, text in (
-        ("--rated-torque", TORQUE, "NM", "what torque in %% or ‰ is a share of, N·m"),
-        ("--torque-limit", TORQUE, "NM", "the drive's torque limit, N·m: what is cut off there is refused"),
+        ("--rated-torque", TORQUE, "NM", "torque that is 100 %%, N·m, for torque in %% or ‰"),
+        ("--torque-limit", TORQUE, "NM", "the drive's torque limit, N·m: a trace that is clipped there is refused"),
         ("--gear", None, "RATIO", "i = ω_motor/ω_main (default 1)"),
-        ("--torque-scale-sd", SHARE, "SHARE", "how right the drive's torque is, 1 sd (default 0.03)"),
+        ("--torque-scale-sd", SHARE, "SHARE", "relative standard uncertainty of the torque scale (default 0.03)"),
         ("--speed-lag", TIME, "S", "time constant of the filter on the reported speed"),
         ("--speed-lag-sd", TIME, "S", "its standard deviation (default a tenth of it)"),
         ("--torque-lag", TIME, "S", "time constant of the filter on the reported torque"),
         ("--torque-lag-sd", TIME, "S", "its standard deviation (default a tenth of it)"),
-        ("--skew-sd", TIME, "S", "to within what speed and torque are of one time, 1 sd (default a sample, or 10 ms)"),
+        ("--skew-sd", TIME, "S", "time offset between speed and torque, 1 sd (default a sample, or 10 ms)"),
     ):
         trace.add_argument(flag, type=float if unit is None else amount(unit), metavar=metavar, help=text)
-    parser.set_defaults(run=run)
 
 
 def run(namespace: argparse.Namespace) -> int:
     """Read, identify, print."""
     path = _log(namespace)
-    _check(namespace)
+    settings_in(namespace)
+    check_trace(namespace)
     require_file(path)
     if namespace.report is not None:
         from tdhil.report import check_report_path
 
         check_report_path(namespace.report, path)
+    recorded = read_recorded(namespace, path).with_said(_said(namespace))
+    return _evaluation(namespace, recorded) if is_evaluation(recorded.configuration) else _identify(namespace, recorded)
+
+
+def read_recorded(namespace: argparse.Namespace, path: Path) -> RunRecord:
+    """A log, or a trace by its options. UsageError where options of a trace are given for a log."""
     trace: dict[str, Any] = {}
     if is_log(path):
         for name in _TRACE_ONLY:
             if getattr(namespace, name) is not None:
-                raise UsageError("is for a trace in CSV; this log brings its own", where=f"--{name.replace('_', '-')}")
+                raise UsageError("is for a trace in CSV; this log has its own", where=f"--{name.replace('_', '-')}",
+                                 entry=MessageCode.OPTION_FOR_CSV_ONLY)
     else:
         from tdhil.session import stated_lags
 
@@ -79,16 +103,15 @@ def run(namespace: argparse.Namespace) -> int:
             ),
             "skew_sd_s": namespace.skew_sd,
         }
-    recorded = read(path, **trace).with_said(_said(namespace))
-    return _evaluation(namespace, recorded) if is_evaluation(recorded.configuration) else _identify(namespace, recorded)
+    return read(path, **trace)
 
 
 def _evaluation(namespace: argparse.Namespace, recorded: RunRecord) -> int:
-    """What the virtual string of this log did, and print it."""
+    """Evaluate the virtual string of this log, and print the result."""
     from tdhil.report import stderr_console
 
     for name in settings_in(namespace):
-        raise UsageError("is for a run that identifies; this log is of a virtual string", where=OPTION[name].flag)
+        raise UsageError("is for a run that identifies; this log contains a virtual string", where=OPTION[name].flag)
     recorded.require_motion()
     assert recorded.virtual_string is not None
     found = conclude_evaluation(
@@ -104,10 +127,14 @@ def _evaluation(namespace: argparse.Namespace, recorded: RunRecord) -> int:
 
 
 def _identify(namespace: argparse.Namespace, recorded: RunRecord) -> int:
-    """Identify and print; the exit code is that of the result, or says that only a part of the run was used."""
+    """Identify and print; return the exit code of the result, or the one for a result from a part of the run."""
     from tdhil.api import identify
     from tdhil.report import stderr_console
 
+    if namespace.torque_calibration is not None:
+        path = namespace.torque_calibration
+        changed = with_calibration(recorded.configuration, recorded.recording, load_calibration(path), str(path))
+        recorded = replace(recorded, configuration=changed)
     result = identify(recorded, **settings_in(namespace))
     console = stderr_console()
     for problem in recorded.problems:
@@ -124,7 +151,8 @@ def _log(namespace: argparse.Namespace) -> Path:
     if namespace.log is None and namespace.columns and "=" not in namespace.columns[-1]:
         namespace.log = Path(namespace.columns.pop())
     if namespace.log is None:
-        raise UsageError("which log? None is named", next_step="Such as: tdhil replay run.mcap")
+        raise UsageError("no log is named", next_step="For example: tdhil replay run.mcap",
+                         entry=MessageCode.LOG_NEEDED)
     log: Path = namespace.log
     return log
 
@@ -133,9 +161,8 @@ def _said(namespace: argparse.Namespace) -> dict[str, str]:
     return {name: getattr(namespace, name) for name in ("operator", "note") if getattr(namespace, name) is not None}
 
 
-def _check(namespace: argparse.Namespace) -> None:
-    """Numbers that no trace could make sense of. UsageError names the option."""
-    settings_in(namespace)
+def check_trace(namespace: argparse.Namespace) -> None:
+    """Check numbers that are impossible for a trace. Raises UsageError with the option."""
     for name, low, high, wanted in (
         ("rated_torque", 1e-9, 1e9, "a positive number of N·m"),
         ("torque_limit", 1e-9, 1e9, "a positive number of N·m"),
@@ -146,8 +173,9 @@ def _check(namespace: argparse.Namespace) -> None:
     ):
         value = getattr(namespace, name)
         if value is not None and not low <= value < high:      # NaN neither
-            raise UsageError(f"{value:g}: must be {wanted}", where=f"--{name.replace('_', '-')}")
+            raise UsageError(f"{value:g}: must be {wanted}", where=f"--{name.replace('_', '-')}",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
     for lag in ("speed_lag", "torque_lag"):
         if getattr(namespace, lag) is None and getattr(namespace, f"{lag}_sd") is not None:
             flag = lag.replace("_", "-")
-            raise UsageError(f"needs --{flag}, the value that it is the deviation of", where=f"--{flag}-sd")
+            raise UsageError(f"needs --{flag}, the value of this standard deviation", where=f"--{flag}-sd")

@@ -1,4 +1,4 @@
-"""The result on stdout, as a card or as one JSON document, and as a report where one was asked for."""
+"""The result on stdout, as a card or as one JSON document, and as a report if requested."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 def save_report(
     document: Mapping[str, Any], recording: Recording, path: Path | None, virtual_string: FloatArray | None = None
 ) -> None:
-    """Where one was asked for, the page as a file. Raises UsageError if it can't be written.
+    """Write the report if requested. Raises UsageError if it can't be written.
 
-    ``virtual_string``: its cycles, where the document is of one.
+    ``virtual_string``: its cycles, if the run has one.
     """
     if path is not None:
         from tdhil.report import write_evaluation_report, write_report
@@ -29,17 +29,17 @@ def save_report(
         else:
             written = write_report(document, recording, path)
         if written != path:
-            print(f"tdhil: {path} has come there meanwhile; the report is {written}", file=sys.stderr)  # noqa: T201
+            print(f"tdhil: {path} was created by another program meanwhile; the report is {written}", file=sys.stderr)  # noqa: T201
 
 
 def print_json(document: Mapping[str, Any]) -> None:
-    """One document on stdout; a number that JSON doesn't know is a mistake of ours."""
+    """Print one document on stdout; a number that JSON does not know is an internal error."""
     json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
     sys.stdout.write("\n")
 
 
 def print_result(document: Mapping[str, Any], as_json: bool) -> None:
-    """Stdout: one JSON document, or the card. Where stdout takes nothing, the card goes to stderr, and it raises."""
+    """Print one JSON document, or the card, on stdout. If stdout fails, print the card on stderr and raise."""
     from tdhil.report import PlainConsole, print_card, print_evaluation
 
     show = print_evaluation if _is_evaluation(document) else print_card

@@ -9,21 +9,21 @@ from pathlib import Path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """`new` is the one thing to be done so far."""
+    """Add the command `new`."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     new = actions.add_parser("new", help="write a rig.yaml to fill in", allow_abbrev=False,
                              description="Writes a commented rig.yaml to fill in, with no drive at hand.")
     new.add_argument("file", type=Path, nargs="?", default=Path("rig.yaml"), metavar="rig.yaml",
-                     help="never over a file")
+                     help="file to write; an existing file is never overwritten")
     new.add_argument("--profile", default="generic/cia402", metavar="NAME",
-                     help="vendor/model, or a .yaml file (tdhil profiles shows what there is; default generic/cia402)")
+                     help="vendor/model, or a .yaml file (tdhil profiles lists them; default generic/cia402)")
     new.add_argument("--load", choices=("none", "string"), required=True,
-                     help="what hangs on the shaft: nothing that stores torque, or a drill string")
+                     help="load on the shaft: none that stores torque, or a drill string")
     new.set_defaults(run=run)
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Write it, and say what is left to be filled in. UsageError where it can't be written."""
+    """Write it, and report what must be filled in. Raises UsageError if it can't be written."""
     from profiles import load_profile
     from tdhil.cli.scan import blank_rig, to_fill_in, write_new
 
@@ -31,9 +31,9 @@ def run(namespace: argparse.Namespace) -> int:
     profile = load_profile(namespace.profile)
     named = namespace.profile
     if named.endswith((".yaml", ".yml")):
-        named = Path(os.path.relpath(named, path.parent)).as_posix()      # rig.yaml looks for it beside itself
+        named = Path(os.path.relpath(named, path.parent)).as_posix()      # relative to the folder of rig.yaml
     write_new(path, blank_rig(profile, named, namespace.load))
-    print(f"{path}: written. To be filled in, before that nothing real moves:", file=sys.stderr)  # noqa: T201
+    print(f"{path}: written. Fill these in; until then a real drive does not move:", file=sys.stderr)  # noqa: T201
     for line in to_fill_in(profile, namespace.load):
         print(f"  {line}", file=sys.stderr)  # noqa: T201
     return 0

@@ -1,6 +1,6 @@
-"""`tdhil scan`: who is on the bus or on the line, which profile may be his, and a rig.yaml to start from.
+"""`tdhil scan`: the drives on a bus or line, the profile of each, and a rig.yaml to start from.
 
-Never writes to a drive. It asks every node of a bus: not to be done while another master is busy there.
+It never writes to a drive. It requests data from every node of a bus: do not use it while another master is busy there.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tdhil.cli.profile_text import required_text
 from tdhil.cli.results import print_json
 from tdhil.cli.scan_common import FoundDrive, bus_commands
 from tdhil.config import BUSES, Limits, Rig, load_rig, resolve
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 from tdhil.session import bus_kind, doubtful
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The rig.yaml to start from: where the drive was found, and the limits as blanks that somebody has to fill in.
+# The rig.yaml to start from: where the drive was found, and blanks for the limits.
 
 
 _PLAIN = re.compile(r"[A-Za-z_./][A-Za-z0-9_./-]*")
@@ -36,9 +36,9 @@ _WORDS = {"true", "false", "null", "yes", "no", "on", "off", "y", "n", "~", ".in
 
 
 def starter(found: FoundDrive, line: Mapping[str, Any], profile: Profile | None) -> str:
-    """The file's text. ``line``: what the section bus: or modbus: has to say."""
+    """Return the file's text. ``line``: the content of the section bus: or modbus:."""
     parts = [
-        "# Written by tdhil scan. Torque and speed are those of the motor shaft; every key: docs/rig.md",
+        "# Written by tdhil scan. Torque and speed refer to the motor shaft. All keys: docs/reference/rig.md",
         f"# Found: {_comment(found.name)}, {_comment(found.title)}; {_comment(found.identity)}"
         + (" (SIMULATED)" if found.simulated else ""),
         "",
@@ -52,62 +52,62 @@ def starter(found: FoundDrive, line: Mapping[str, Any], profile: Profile | None)
     else:
         parts += [f"#profile:    # {_comment(found.why)}"]
     parts += _doubts(profile)
-    parts += ["", "# Nothing real moves without these. Take the '#' away and give every one your machine's value."]
+    parts += ["", "# A real drive does not move without these. Remove the '#' and give every value of your machine."]
     parts += ["#limits:", *(_blank(name) for name in _LIMITS)]
-    parts += ["", "# What the drive does not tell of itself.", "#drive_data:"]
+    parts += ["", "# Facts that the drive does not report.", "#drive_data:"]
     if profile is None or profile.rated_torque_by_hand:
-        parts.append("#  rated_torque_nm:         # N·m; name plate")
-    parts.append("#  torque_scale_rel_sd:     # how right the drive's torque is, 1 sd as a share (0.02 = 2 %)")
+        parts.append("#  rated_torque_nm:         # N·m; from the name plate")
+    parts.append("#  torque_scale_rel_sd:     # standard uncertainty of the torque scale (0.02 = 2 %)")
     parts += _untold(profile)
     parts += _by_hand(profile)
     return "\n".join(parts) + "\n"
 
 
 def blank_rig(profile: Profile, named: str, load: str) -> str:
-    """The file's text with no drive at hand. ``named``: the profile as the operator names it."""
+    """Return the file's text without a drive. ``named``: the profile as the operator names it."""
     parts = [
-        "# Written by tdhil rig new. Torque and speed are those of the motor shaft; every key: docs/rig.md,",
-        "# which lies where tdhil docs says.",
-        "# What stands behind a '#' has yet to be filled in. Without 'limits' nothing real moves.",
+        "# Written by tdhil rig new. Torque and speed refer to the motor shaft. All keys: docs/reference/rig.md,",
+        "# whose path tdhil docs prints.",
+        "# Fill in the lines with a '#'. Without 'limits' a real drive does not move.",
         "",
         f"drive: {profile.bus}",
         f"profile: {scalar(named)}    # {_comment(profile.title)}",
-        "# Where the drive is. Left out, the embedded simulator runs, and says so.",
+        "# The drive's address. Without it the embedded simulator runs.",
         *bus_commands(profile.bus).blank(profile),
     ]
     parts += _doubts(profile)
-    parts += ["", "# Nothing real moves without these. Take the '#' away and give every one your machine's value, in",
-              "# the key's unit or with a unit of its own: speed_max_rad_s: 95 rpm"]
+    parts += ["", "# A real drive does not move without these. Remove the '#' and give every value of your machine, in",
+              "# the key's unit or with another unit: speed_max_rad_s: 95 rpm"]
     parts += ["#limits:", *(_blank(name) for name in _LIMITS)]
     parts += ["", *_load(load)]
-    parts += ["", "#gear: {ratio: }    # motor turns for one of the main shaft; without it 1",
-              "", "# What the drive does not tell of itself. Leave out what you do not know.", "#drive_data:"]
+    parts += ["", "#gear: {ratio: }    # motor turns per turn of the main shaft; default 1",
+              "", "# Facts that the drive does not report. Omit unknown ones.", "#drive_data:"]
     if profile.rated_torque_by_hand:
-        parts.append("#  rated_torque_nm:         # N·m; name plate")
-    parts.append("#  torque_scale_rel_sd:     # how right the drive's torque is, 1 sd (2 %)")
+        parts.append("#  rated_torque_nm:         # N·m; from the name plate")
+    parts.append("#  torque_scale_rel_sd:     # standard uncertainty of the torque scale (2 %)")
     parts += _untold(profile)
     parts += _by_hand(profile)
     return "\n".join(parts) + "\n"
 
 
 def to_fill_in(profile: Profile, load: str) -> list[str]:
-    """What a run on a real drive will miss."""
-    found = [f"limits: {', '.join(_LIMITS)}", f"where the drive is: {bus_commands(profile.bus).to_fill_in}"]
+    """Return what a run on a real drive needs besides."""
+    found = [f"limits: {', '.join(_LIMITS)}", f"the drive's address: {bus_commands(profile.bus).to_fill_in}"]
     if load == "string":
-        found.append(f"{', '.join(_STRING)}: until then the file is refused")
+        found.append(f"{', '.join(_STRING)}: without them the file is refused")
     if doubtful(profile):
-        found.append("accept_unverified: what nobody verified in this profile, once you have looked it up")
+        found.append("accept_unverified: unverified entries of this profile, after you have checked them")
     if _untold(profile):
-        found.append("drive_data.parameters: what this drive doesn't tell over the bus")
+        found.append("drive_data.parameters: values that this drive does not report over the bus")
     if _by_hand(profile):
-        found.append("and at the drive: what stands at the file's end")
+        found.append("and at the drive: the settings at the file's end")
     return found
 
 
 def _load(load: str) -> list[str]:
     if load == "none":
-        return ["load: none    # as you said: nothing on the shaft stores torque. With a drill string: string"]
-    return ["load: string    # as you said; until these two are filled in, this file is refused",
+        return ["load: none    # as requested: no load that stores torque. With a drill string: string"]
+    return ["load: string    # as requested; this file is refused until these two are filled in",
             *(f"#{name}:    # {Rig.model_fields[name].description}" for name in _STRING)]
 
 
@@ -130,7 +130,7 @@ def _value(value: Any) -> str:
 
 
 def scalar(value: Any) -> str:
-    """A value as rig.yaml's strict reader takes it back."""
+    """Return a value as the strict reader of rig.yaml accepts it."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int | float):
@@ -146,13 +146,13 @@ def _doubts(profile: Profile | None) -> list[str]:
         return []
     return [
         f"# Not verified in this profile: {', '.join(names)}.",
-        f"# Compare them with the drive's manual (tdhil profiles show {profile.name}), then take them by name:",
+        f"# Compare them with the drive's manual (tdhil profiles show {profile.name}), then accept them by name:",
         "#accept_unverified: []",
     ]
 
 
 def _untold(profile: Profile | None) -> list[str]:
-    """Parameters that can't be read over the bus."""
+    """Return parameters that can't be read over the bus."""
     blanks = [] if profile is None else [f"#    {one.name}:    # {_comment(one.title)}" for one in profile.untold]
     return ["#  parameters:", *blanks] if blanks else []
 
@@ -161,7 +161,7 @@ def _by_hand(profile: Profile | None) -> list[str]:
     required = [] if profile is None else [one for one in profile.parameters if one.require is not None]
     if not required:
         return []
-    found = ["", "# To be set at the drive by hand; a run is refused until they read so:"]
+    found = ["", "# Set these at the drive by hand; a run is refused until they are read:"]
     for one in required:
         assert one.require is not None
         found.append(f"# - {_comment(one.title)}: {required_text(one.require, '')}")
@@ -169,30 +169,31 @@ def _by_hand(profile: Profile | None) -> list[str]:
 
 
 def _comment(text: str) -> str:
-    """One line, whatever a drive calls itself."""
+    """Return one line of printable text, also for a strange drive name."""
     return " ".join("".join(char if char.isprintable() else " " for char in text).split())
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The bus or line, as for identify; what to ask, and where a starter file goes."""
+    """Add the options of bus and line, as for identify; what to scan, and the path of a starter file."""
     from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, add_option
     from tdhil.config import OPTION
 
     drive = add_drive_arguments(parser)
-    add_option(drive, OPTION["simulate"], help="look at the embedded simulator")
+    add_option(drive, OPTION["simulate"], help="scan the embedded simulator")
     scan = parser.add_argument_group("scan")
     for name in BUSES:
         bus_commands(name).add_scan_arguments(scan)
-    scan.add_argument("--write", type=Path, metavar="rig.yaml", help="a rig.yaml to start from; never over a file")
+    scan.add_argument("--write", type=Path, metavar="rig.yaml", help="write a rig.yaml to start from; no file is "
+                                                                     "overwritten")
     add_option(scan, OPTION["json"])
     add_line_arguments(parser)
     parser.set_defaults(run=run)
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """0 if anybody answered. Raises CommunicationLost (exit 5) if nobody did, with the likely causes."""
+    """Scan. Return 0 with an answer. Raises CommunicationLost (exit 5) without one, with the likely causes."""
     from tdhil.session import connection_of, plan_peer
 
     if namespace.write is not None and namespace.write.exists():
@@ -202,7 +203,8 @@ def run(namespace: argparse.Namespace) -> int:
     if not (options.simulate or connection.configured):
         raise UsageError(
             f"{connection.nothing_there}", where="scan",
-            next_step="Say where to look, such as -i socketcan -c can0, --host 192.0.2.10 or --serial /dev/ttyUSB0",
+            next_step="Name a bus or line, such as -i socketcan -c can0, --host 192.0.2.10 or --serial /dev/ttyUSB0",
+            entry=MessageCode.BUS_NOT_CONFIGURED,
         )
     commands = bus_commands(connection.drive)
     found, remarks = commands.scan(plan_peer(options, connection), connection, options, namespace)
@@ -231,7 +233,7 @@ def _print(found: tuple[FoundDrive, ...], remarks: list[str], as_json: bool) -> 
 
 
 def write_new(path: Path, text: str) -> None:
-    """A file that isn't there yet. UsageError where it is, or can't be written."""
+    """Write a new file. Raises UsageError if it exists or can't be written."""
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
@@ -239,21 +241,23 @@ def write_new(path: Path, text: str) -> None:
         raise _there_already(path) from None
     except OSError as error:
         step = "Name a file in a folder that you may write to"
-        raise UsageError(f"can't be written ({error.strerror or error})", where=str(path), next_step=step) from error
+        raise UsageError(f"can't be written ({error.strerror or error})", where=str(path), next_step=step,
+                         entry=MessageCode.FILE_NOT_WRITABLE) from error
 
 
 def _there_already(path: Path) -> UsageError:
-    return UsageError("is there already, and is not written over", where=str(path), next_step="Name another file")
+    return UsageError("already exists and was not overwritten", where=str(path), next_step="Name another file",
+                      entry=MessageCode.FILE_EXISTS)
 
 
 def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, options: RunOptions) -> None:
-    """The starter file, of the one drive that was found, or of the one asked for among several."""
+    """Write the starter file for the only drive, or for the requested one of several."""
     one = _chosen(found, connection, options)
     if options.given("profile"):
-        one = replace(one, profile=options.profile, why=f"as named: {options.source('profile')}")
+        one = replace(one, profile=options.profile, why=f"as given: {options.source('profile')}")
     profile = load_profile(one.profile) if one.profile is not None else None
     write_new(path, starter(one, bus_commands(one.bus).section(one, connection), profile))
-    print(f"{path}: written. Fill in its limits: before that nothing real moves", file=sys.stderr)  # noqa: T201
+    print(f"{path}: written. Fill in its limits: until then a real drive does not move", file=sys.stderr)  # noqa: T201
 
 
 def _chosen(found: tuple[FoundDrive, ...], connection: Connection, options: RunOptions) -> FoundDrive:
@@ -265,5 +269,5 @@ def _chosen(found: tuple[FoundDrive, ...], connection: Connection, options: RunO
     if len(drives) == 1:
         return drives[0]
     what = f"{len(drives)} drives were found" if drives else f"number {named} did not answer"
-    raise UsageError(f"{what}, and a rig.yaml is for one", where="--write",
-                     next_step=f"Name it with {commands.address_flag}")
+    raise UsageError(f"{what}, but a rig.yaml is for one drive", where="--write",
+                     next_step=f"Select it with {commands.address_flag}")

@@ -1,4 +1,4 @@
-"""What the commands that only look, and write a rig.yaml to start from, ask of a bus; and a drive that a scan found."""
+"""The interface of a bus for scan, doctor and rig new; and a drive that a scan found."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FoundDrive:
-    """``address``: node or unit number. ``line``: how a Modbus line was set when it answered."""
+    """A drive that a scan found. ``address``: node or unit number. ``line``: how a Modbus line was set when it
+    answered.
+    """
 
     bus: str                            # as in BUSES
     address: int
@@ -28,70 +30,70 @@ class FoundDrive:
     simulated: bool
     profile: str | None = None
     why: str = ""                       # why this profile, or why none
-    seen: str = ""                      # what it sent by itself
+    seen: str = ""                      # what it sent without a request
     line: dict[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
-        """As people call it."""
+        """Return its name for display."""
         return f"{bus_commands(self.bus).address} {self.address}"
 
 
 class ValueSeen(Protocol):
-    """A value of the drive's beside what it is taken for: people compare it with the drive's panel."""
+    """A value of the drive with its meaning, to compare with the drive's panel."""
 
     def cells(self) -> tuple[str, str, str, str]:
-        """Address, counts, value, meaning."""
+        """Return address, counts, value and meaning."""
         ...
 
     def plain(self) -> dict[str, Any]:
-        """As the JSON document has it."""
+        """Return it as in the JSON document."""
         ...
 
 
 class BusCommands(ABC):
-    """What scan, doctor and rig new do on a bus, found by `tdhil.config.registry.BUSES`. None of it writes to a drive.
+    """Scan, doctor and rig new on a bus, found by `tdhil.config.registry.BUSES`. None of it writes to a drive.
 
-    Its module is imported for every ``--help``: what loads a library of the bus is imported where it is used.
+    Every ``--help`` imports its module, so a library of the bus is imported only where it is used.
     """
 
-    address: ClassVar[str]              # what tells drives apart: node, unit
-    address_flag: ClassVar[str]         # … and its option
-    to_fill_in: ClassVar[str]           # in words, what of rig.yaml says where a drive is
+    address: ClassVar[str]              # name of a drive's address: node, unit
+    address_flag: ClassVar[str]         # option of that address
+    to_fill_in: ClassVar[str]           # in words, the keys of rig.yaml with a drive's address
 
     @abstractmethod
     def scan(
         self, plan: PeerPlan, connection: Connection, options: RunOptions, asked: argparse.Namespace
     ) -> tuple[tuple[FoundDrive, ...], list[str]]:
-        """Who answers, and remarks. Raises CommunicationLost, with the likely causes, where nobody does."""
+        """Return the drives that answer, and remarks. Raises CommunicationLost without an answer."""
 
     @abstractmethod
     def findings(
         self, plan: PeerPlan, connection: Connection, options: RunOptions, rig: Rig | None, seen: list[ValueSeen]
     ) -> Iterator[DoctorFinding]:
-        """What doctor has to say of the bus and of the drive; ``seen`` is filled with values to compare."""
+        """Yield doctor's findings on bus and drive; ``seen`` receives values to compare."""
 
     def add_scan_arguments(self, scan: argparse._ArgumentGroup) -> None:
-        """What a scan of this bus can be told besides."""
+        """Add further options of a scan of this bus."""
         return
 
     @abstractmethod
     def wanted(self, connection: Connection, options: RunOptions) -> int | None:
-        """The address that was asked for by name."""
+        """Return the requested address."""
 
     @abstractmethod
     def section(self, found: FoundDrive, connection: Connection) -> Mapping[str, Any]:
-        """The bus's section of a rig.yaml for that drive; empty where nothing is to be said."""
+        """Return the bus's section of a rig.yaml for that drive; empty if there is none."""
 
     @abstractmethod
     def blank(self, profile: Profile) -> tuple[str, ...]:
-        """Lines of a rig.yaml that say where a drive with that profile is, behind '#'."""
+        """Return commented lines of a rig.yaml for the address of a drive with that profile."""
 
     def keys(self, found: FoundDrive) -> Mapping[str, Any]:
-        """What else rig.yaml has to say for that drive, beside the section."""
+        """Return further keys of rig.yaml for that drive, beside the section."""
         return {}
 
 
 def bus_commands(name: str) -> BusCommands:
-    """Of the bus of that name. KeyError where there is none."""
+    """Return the commands of a bus. Raises KeyError for an unknown name."""
     return cast(BusCommands, imported(BUSES[name].commands))

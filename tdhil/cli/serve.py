@@ -1,4 +1,4 @@
-"""`tdhil serve`: rigs, runs and live pages in a browser; and who may do what there."""
+"""`tdhil serve`: rigs, runs and live pages in a browser, with users and roles."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from profiles import visible
+from profiles import MessageCode, visible
 
 DATA = Path("tdhil-data")
 
@@ -16,35 +16,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from tdhil.service import HOST, PORT
 
     parser.add_argument("--rigs", type=Path, metavar="DIR",
-                        help="a rig.yaml for each rig (default: two that are simulated)")
+                        help="folder with a rig.yaml for each rig (default: two simulated rigs)")
     parser.add_argument("--data", type=Path, metavar="DIR", default=DATA,
-                        help=f"where runs, accounts, audit and index go (default: {DATA})")
+                        help=f"folder of runs, accounts, audit and index (default: {DATA})")
     parser.add_argument("--logs", type=Path, metavar="DIR", action="append", default=[],
-                        help="logs that the page Fleet may identify again, beside the service's own runs; repeatable")
+                        help="folder of logs that the page Fleet may identify again, besides the service's own "
+                             "runs; repeatable")
     parser.add_argument("--host", default=HOST, metavar="ADDRESS",
-                        help=f"where to listen (default {HOST}: this computer only; others need users and TLS)")
-    parser.add_argument("--port", type=int, default=PORT, metavar="N", help=f"default {PORT}; 0: any that is free")
+                        help=f"address to listen on (default {HOST}: this computer only; others need users and TLS)")
+    parser.add_argument("--port", type=int, default=PORT, metavar="N", help=f"TCP port (default {PORT}; 0: any "
+                                                                            f"free port)")
     parser.add_argument("--viewer", action="append", metavar="ORIGIN", default=[],
-                        help="where Foxglove or Lichtblick come from in a browser, such as http://localhost:8080:"
-                        " that page may read logs as they grow, and nothing else; more than one by repeating it")
+                        help="origin of Foxglove or Lichtblick in a browser, such as http://localhost:8080:"
+                        " that page may read logs as they grow, and nothing else; repeatable")
     parser.add_argument("--mqtt", metavar="URL",
-                        help="tell a broker the rigs' states and results, mqtt[s]://host:port/prefix; user and password"
+                        help="publish the rigs' states and results to a broker, mqtt[s]://host:port/prefix; user "
+                             "and password"
                         " from TDHIL_MQTT_USER and TDHIL_MQTT_PASSWORD_FILE (extra mqtt)")
     parser.add_argument("--check-idle", action="store_true",
-                        help="serve nothing: exit 0 where no run of --data lives and no tdhil here holds a drive,"
+                        help="do not serve: exit 0 if no run of --data is alive and no tdhil here holds a drive,"
                         " else 4 (before an upgrade)")
     parser.add_argument("--tls-cert", type=Path, metavar="PEM", help="the certificate, with its chain")
     parser.add_argument("--tls-key", type=Path, metavar="PEM", help="its key, without a password")
     parser.add_argument("--allowed-host", action="append", default=[], metavar="NAME",
-                        help="another name that browsers know this host by; again for more")
+                        help="another host name under which browsers reach this host; repeatable")
     parser.set_defaults(run=run)
     kinds = parser.add_subparsers(dest="kind", metavar="users|tokens|audit")
-    _add_accounts(kinds, "users", "people, who log in with a password", passwd=True)
+    _add_accounts(kinds, "users", "users, who log in with a password", passwd=True)
     _add_accounts(kinds, "tokens", "machines, which send a token", passwd=False)
-    audit = kinds.add_parser("audit", allow_abbrev=False, help="check the audit's chain, and print its head to be kept",
+    audit = kinds.add_parser("audit", allow_abbrev=False, help="check the audit's chain, and print its head",
                              description="Check the audit's chain, and print its head (NUMBER:HASH). Keep it on another"
                              " computer.")
-    audit.add_argument("--head", metavar="NUMBER:HASH", help="a head that was kept: the chain must have it")
+    audit.add_argument("--head", metavar="NUMBER:HASH", help="an exported head to check the chain against")
     audit.add_argument("--data", type=Path, metavar="DIR", default=argparse.SUPPRESS,
                        help=f"the service's folder (default: {DATA})")
     audit.set_defaults(run=run_audit)
@@ -57,16 +60,16 @@ def _add_accounts(kinds: argparse._SubParsersAction[argparse.ArgumentParser], ki
     parser = kinds.add_parser(kind, help=what, description=what[0].upper() + what[1:] + ".", allow_abbrev=False)
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     added = actions.add_parser("add", allow_abbrev=False,
-                               help="add one; a password is asked for, or read from stdin" if passwd
-                               else "make one; it is shown this once")
-    listed = actions.add_parser("list", allow_abbrev=False, help="who there is")
-    removed = actions.add_parser("remove", allow_abbrev=False, help="take one out; what is open ends within a second")
-    changed = [actions.add_parser("passwd", allow_abbrev=False, help="another password; ends what is open")
+                               help="add one; the password is prompted for, or read from stdin" if passwd
+                               else "make one; it is shown only once")
+    listed = actions.add_parser("list", allow_abbrev=False, help="list them")
+    removed = actions.add_parser("remove", allow_abbrev=False, help="remove one; its sessions end within a second")
+    changed = [actions.add_parser("passwd", allow_abbrev=False, help="set another password; ends all sessions")
                ] if passwd else []
     for one in (added, removed, *changed):
         one.add_argument("name", metavar="NAME")
     added.add_argument("--role", choices=ROLES, required=True,
-                       help="viewer: look, download, stop; operator: runs, replays; engineer: what nobody verified,"
+                       help="viewer: view, download, stop; operator: runs, replays; engineer: unverified entries,"
                             " signatures; admin: accounts, audit")
     for one in (added, listed, removed, *changed):
         one.add_argument("--data", type=Path, metavar="DIR", default=argparse.SUPPRESS,
@@ -75,15 +78,16 @@ def _add_accounts(kinds: argparse._SubParsersAction[argparse.ArgumentParser], ki
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Until Ctrl-C or SIGTERM, which brake what moves."""
+    """Serve until Ctrl-C or SIGTERM, which stop all runs."""
     from tdhil.errors import UsageError
     from tdhil.service import Tls, check_idle, serve
 
     if not 0 <= namespace.port <= 65535:
-        raise UsageError("must be 0 to 65535", where=f"--port {namespace.port}")
+        raise UsageError("must be 0 to 65535", where=f"--port {namespace.port}", entry=MessageCode.VALUE_NOT_ALLOWED)
     cert, key = namespace.tls_cert, namespace.tls_key
     if (cert is None) != (key is None):
-        raise UsageError("needs the other one, too", where="--tls-cert" if key is None else "--tls-key")
+        raise UsageError("needs --tls-cert and --tls-key together", where="--tls-cert" if key is None else "--tls-key",
+                         entry=MessageCode.SERVICE_OPTION_WRONG)
 
     def say(text: str) -> None:
         print(visible(text, keep="\n"), file=sys.stderr, flush=True)  # noqa: T201
@@ -97,7 +101,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def run_accounts(namespace: argparse.Namespace) -> int:
-    """Add, list, remove, or set a password; a service that runs sees it within a second."""
+    """Add, list, remove, or set a password; a running service applies it within a second."""
     from tdhil.errors import UsageError
     from tdhil.service import AccountsFile, require_folder
 
@@ -106,7 +110,7 @@ def run_accounts(namespace: argparse.Namespace) -> int:
             namespace.data.mkdir(parents=True, exist_ok=True, mode=0o750)
         except OSError as error:
             raise UsageError(f"can't be made ({error.strerror or error})", where=f"--data {namespace.data}",
-                             next_step="Name a folder that can be") from error
+                             next_step="Name a writable folder", entry=MessageCode.FILE_NOT_WRITABLE) from error
     require_folder(namespace.data)
     accounts = AccountsFile(namespace.data.resolve())
     users = namespace.kind == "users"
@@ -115,14 +119,14 @@ def run_accounts(namespace: argparse.Namespace) -> int:
         for one in (accounts.known.users if users else accounts.known.tokens).values():
             print(f"{one.name:<33}{one.role:<10}{one.since}")  # noqa: T201
         if first:
-            print(f"Nobody: {namespace.data} has no accounts, and is served to this computer alone.",  # noqa: T201
+            print(f"{namespace.data} has no accounts, and is served to this computer only.",  # noqa: T201
                   file=sys.stderr)
         return 0
     if namespace.action == "add" and users:
         accounts.add_user(namespace.name, namespace.role, _password())
     elif namespace.action == "add":
         token = accounts.add_token(namespace.name, namespace.role)
-        print("It is shown this once; send it as: Authorization: Bearer …", file=sys.stderr)  # noqa: T201
+        print("It is shown only once. Send it as: Authorization: Bearer …", file=sys.stderr)  # noqa: T201
         print(token)  # noqa: T201
     elif namespace.action == "passwd":
         accounts.set_password(namespace.name, _password())
@@ -131,13 +135,13 @@ def run_accounts(namespace: argparse.Namespace) -> int:
     else:
         accounts.remove_token(namespace.name)
     if first:
-        print("From now on tdhil serve asks for a login on this folder, and needs --tls-cert and --tls-key.",  # noqa: T201
+        print("From now on tdhil serve requires a login for this folder, and needs --tls-cert and --tls-key.",  # noqa: T201
               file=sys.stderr)
     return 0
 
 
 def run_audit(namespace: argparse.Namespace) -> int:
-    """Print the head of the audit's chain. Raises LogBroken where the chain doesn't hold."""
+    """Print the head of the audit's chain. Raises LogBroken if the chain is broken."""
     from tdhil.errors import LogBroken
     from tdhil.service import Audit, ChainHead, require_folder
 
@@ -146,20 +150,20 @@ def run_audit(namespace: argparse.Namespace) -> int:
     kept = None if namespace.head is None else ChainHead.of(namespace.head)
     if (broken := audit.verify(kept)) is not None:
         place = f"{broken.file}:{broken.line}" if broken.file else str(namespace.data)
-        raise LogBroken(f"the audit's chain doesn't hold: {broken.why}", where=place,
-                        next_step="Keep the folder as it is. Compare it with a backup")
+        raise LogBroken(f"the audit's chain is broken: {broken.why}", where=place,
+                        next_step="Keep the folder as it is. Compare it with a backup", entry=MessageCode.AUDIT_BROKEN)
     head, made = audit.head(), audit.made()
     if head is None:
-        print("The audit has no line yet.", file=sys.stderr)  # noqa: T201
+        print("The audit has no lines yet.", file=sys.stderr)  # noqa: T201
         return 0
-    print(f"The chain holds: {head.number} lines, its key was made {made}. Keep this head on another computer:",  # noqa: T201
+    print(f"The chain is intact: {head.number} lines, its key was made {made}. Keep this head on another computer:",  # noqa: T201
           file=sys.stderr)
     print(head)  # noqa: T201
     return 0
 
 
 def _password() -> str:
-    """Typed in twice; or a line of stdin, where that is no terminal. Raises UsageError."""
+    """Return a password, typed twice, or a line of stdin if it is not a terminal. Raises UsageError."""
     import getpass
 
     from tdhil.errors import UsageError
@@ -167,6 +171,7 @@ def _password() -> str:
     if sys.stdin is None or not sys.stdin.isatty():
         return "" if sys.stdin is None else sys.stdin.readline().rstrip("\r\n")
     given = getpass.getpass("Password: ")
-    if getpass.getpass("The same again: ") != given:
-        raise UsageError("the two are not the same", where="password", next_step="Try again")
+    if getpass.getpass("Repeat the password: ") != given:
+        raise UsageError("the two passwords differ", where="password", next_step="Try again",
+                         entry=MessageCode.ACCOUNT_WRONG)
     return given

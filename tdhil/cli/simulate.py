@@ -1,4 +1,4 @@
-"""`tdhil simulate canopen …`, `tdhil simulate modbus …`: a simulated rig as a process of its own."""
+"""`tdhil simulate canopen …`, `tdhil simulate modbus …`: a simulated rig in its own process."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """What to pretend to be, each kind with the simulator's own options."""
+    """Add a command for each kind of simulator, with the simulator's own options."""
     from sim_bus import add_kinds
 
     add_kinds(parser)

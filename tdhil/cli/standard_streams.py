@@ -1,4 +1,4 @@
-"""stdout and stderr as they are found: closed, full, or unable to write '²'. No run and no result is lost over them."""
+"""stdout and stderr in any state: closed, full, or unable to write '²'. No run and no result is lost by that."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO, cast
 
-from tdhil.errors import ExitCode, TdhilError
+from tdhil.errors import ExitCode, MessageCode, TdhilError
 
 _PLAIN = {
     "·": ".", "²": "2", "³": "3", "¹": "1", "⁻": "-", "±": "+-", "×": "x", "°": "deg", "µ": "u", "μ": "u", "–": "-",
@@ -23,13 +23,15 @@ _HANDLER = "tdhil"
 
 
 class OutputLost(TdhilError):
-    """stdout took no more: the disk behind it is full, or the terminal is gone. What was to be said went to stderr."""
+    """stdout can't be written: its disk is full, or the terminal is gone. The output went to stderr."""
+
+    entry = MessageCode.OUTPUT_LOST
 
     exit_code = ExitCode.PARTIAL
 
 
 class WatchedStream:
-    """A stream whose refusals are its own: of stdout an `OutputLost`, of stderr nothing, for there is no place left."""
+    """A stream that handles write errors: for stdout with `OutputLost`, for stderr silently."""
 
     def __init__(self, stream: TextIO, *, needed: bool) -> None:
         self._stream = stream
@@ -69,10 +71,10 @@ class WatchedStream:
 
 @contextmanager
 def sheltered() -> Iterator[None]:
-    """Before anything is opened or printed.
+    """Protect the streams before anything is opened or printed.
 
-    A closed stdout or stderr would give its number to the next file that is opened, which might be the log. Where a
-    stream can't encode a sign, one that resembles it is written, in stdout and stderr alike.
+    A closed stdout or stderr would give its number to the next opened file, possibly the log. A character that a stream
+    can't encode is replaced by a similar one, in stdout and stderr.
     """
     _fill_descriptors()
     codecs.register_error(_HANDLER, _resembling)
@@ -92,7 +94,7 @@ def sheltered() -> Iterator[None]:
 
 
 def forget(stream: TextIO) -> None:
-    """Whatever still waits in ``stream``, or is written to it, goes nowhere."""
+    """Discard buffered and later output of ``stream``."""
     with suppress(OSError, ValueError, AttributeError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())
@@ -111,9 +113,9 @@ def _fill_descriptors() -> None:
 
 
 def _in_columns(text: str, encoding: str | None) -> str:
-    """``text`` with signs that ``encoding`` has, each line as wide as before where it has spaces to give for that.
+    """Return ``text`` in characters that ``encoding`` has, with line widths kept where spaces allow it.
 
-    '+-' for '±' would push a table's right edge out of line.
+    '+-' for '±' would shift a table's right edge.
     """
     try:
         text.encode(encoding or "utf-8")

@@ -1,4 +1,4 @@
-"""`tdhil stop`: a best-effort quick stop from outside of any run. It is no emergency stop, and says so."""
+"""`tdhil stop`: a best-effort quick stop from outside of any run. It is no emergency stop."""
 
 from __future__ import annotations
 
@@ -7,21 +7,22 @@ import json
 import sys
 from typing import TYPE_CHECKING
 
-from tdhil.errors import ExitCode, UsageError, exit_code
+from profiles import with_code
+from tdhil.errors import ExitCode, MessageCode, UsageError, code_of, exit_code
 
 if TYPE_CHECKING:
     from drivers import BareStopReport
 
 NO_EMERGENCY_STOP = (
     "tdhil stop is NO emergency stop: it needs this computer, the cable and the drive. "
-    "Keep the hard-wired one within reach."
+    "Keep the hard-wired stop within reach."
 )
 
 NOT_CONFIRMED = "STOP NOT CONFIRMED: use the hard-wired emergency stop now."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The bus or line, as for identify."""
+    """Add the options of bus and line, as for identify."""
     from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, add_option
     from tdhil.config import OPTION
 
@@ -32,9 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """0 at rest, 8 wherever that wasn't seen: still turning, no answer, no way to the drive.
+    """Stop. Return 0 at standstill, else 8: still turning, no answer, or no connection to the drive.
 
-    Ctrl-C ends the watching only: what was asked for stays asked for.
+    Ctrl-C ends only the observation. The stop request stays in force.
     """
     from drivers import MonotonicClock, bare_stop
     from tdhil.config import load_rig, resolve
@@ -46,14 +47,15 @@ def run(namespace: argparse.Namespace) -> int:
         raise UsageError(
             connection.nothing_there,
             where="stop",
-            next_step="Say where the drive is, such as -i socketcan -c can0 --node 1, or --host 192.0.2.10",
+            next_step="Give the drive's address, such as -i socketcan -c can0 --node 1, or --host 192.0.2.10",
+            entry=MessageCode.BUS_NOT_CONFIGURED,
         )
     print(NO_EMERGENCY_STOP, file=sys.stderr)  # noqa: T201
     clock = MonotonicClock()
     try:
         with connection.kind.open_target(options, connection, clock) as target:
             report = bare_stop(target, clock)
-    except Exception as error:         # no way to the drive, or none any more; an adapter's driver raises what it likes
+    except Exception as error:         # no connection, or a lost one; an adapter's driver may raise anything
         if exit_code(error) is ExitCode.USAGE:
             raise
         return _not_reached(error, as_json=namespace.json is True)
@@ -70,13 +72,13 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def _not_reached(error: Exception, *, as_json: bool) -> int:
-    """Whoever asks for a stop must not read a mere connection error."""
+    """Report a stop that did not reach the drive: a connection error alone is not enough."""
     code = ExitCode.STOP_NOT_CONFIRMED
     if as_json:
-        document = {"ended": "not reached", "error": str(error), "remarks": [], "said": NOT_CONFIRMED,
-                    "emergency_stop": False, "exit_code": int(code)}
+        document = {"ended": "not reached", "error": str(error), "code": code_of(error), "remarks": [],
+                    "said": NOT_CONFIRMED, "emergency_stop": False, "exit_code": int(code)}
         print(json.dumps(document, ensure_ascii=False, indent=2))  # noqa: T201
-    print(f"tdhil: {error}", file=sys.stderr)  # noqa: T201
+    print(f"tdhil: {with_code(str(error), code_of(error))}", file=sys.stderr)  # noqa: T201
     print(NOT_CONFIRMED, file=sys.stderr if as_json else sys.stdout)
     return int(code)
 
@@ -92,7 +94,7 @@ def _exit_code(report: BareStopReport) -> ExitCode:
 
 
 def said(report: BareStopReport) -> list[str]:
-    """What was seen, a line each; the last one is the verdict."""
+    """Return the observations, a line each; the last one is the verdict."""
     from drivers import Ended
 
     lines = []
@@ -102,8 +104,8 @@ def said(report: BareStopReport) -> list[str]:
     lines += [f"! {remark}" for remark in report.remarks]
     verdict = {
         Ended.AT_REST: f"The shaft is at rest. {_holds(report)}",
-        Ended.TURNING: f"The shaft was NOT seen at rest. {NOT_CONFIRMED}",
-        Ended.NO_ANSWER: f"NO ANSWER: whether the shaft turns is not known. {NOT_CONFIRMED}",
+        Ended.TURNING: f"Standstill was NOT observed. {NOT_CONFIRMED}",
+        Ended.NO_ANSWER: f"NO ANSWER: it is unknown whether the shaft turns. {NOT_CONFIRMED}",
     }[report.ended]
     return [*lines, verdict]
 
@@ -112,8 +114,8 @@ def _holds(report: BareStopReport) -> str:
     from drivers import PowerState
 
     if report.last is not None and report.last.state in (PowerState.OFF, PowerState.READY, PowerState.FAULT):
-        return "The drive's torque is off: nothing but a brake holds it."
-    return "The drive was not disabled: it may be holding it."
+        return "The drive is disabled: only a brake holds the shaft."
+    return "The drive was not disabled: it may hold the shaft."
 
 
 def _document(report: BareStopReport, code: ExitCode) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""`tdhil study`: the paper's experiments and ours, run again, beside what was published."""
+"""`tdhil study`: the paper's experiments and tdhil's own, compared with the published values."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from profiles import MessageCode
 from tdhil.cli.arguments import add_option
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
@@ -30,17 +31,17 @@ if TYPE_CHECKING:
 
 
 BEFORE_ACQUIRE_S = 32.0
-"""Setup and the stage of speed take about so long; only the progress bar rests on it."""
+"""Approximate duration of setup and stage 2, s; only for the progress bar."""
 
 
 class SimulatedFieldBench:
-    """Each run is a whole one, all five stages and the stop, as `tdhil identify --simulate` does it.
+    """Runs all five stages and the stop, like `tdhil identify --simulate`.
 
     Its log is written and dropped with the run. Ctrl-C stops the shaft, and raises `tdhil.errors.Interrupted`.
     """
 
     def run(self, wish: FieldRun, progress: RunProgress) -> Recording:
-        """The Recording; raises what ended the run before its end."""
+        """Return the Recording. Raises the error that ended the run early."""
         from tdhil.config import resolve
         from tdhil.recording import RunLog, RunWriter
         from tdhil.runner import Runner
@@ -65,7 +66,7 @@ class SimulatedFieldBench:
 
 
 def bench_rig(wish: FieldRun) -> Rig:
-    """The limits of the bench: those of the simulated rig, with the study's torque limit."""
+    """Return the limits of the bench: those of the simulated rig, with the study's torque limit."""
     from tdhil.config import Rig, simulated_default_rig
 
     usual = simulated_default_rig().model_dump(by_alias=True)
@@ -73,7 +74,7 @@ def bench_rig(wish: FieldRun) -> Rig:
 
 
 def plant_of(wish: FieldRun) -> RigParams:
-    """The simulator's parameters: the study's rig, loop and torque limit on the simulator's own defaults."""
+    """Return the simulator's parameters: its defaults with the study's rig, loop and torque limit."""
     from sim_bus import RigParams
 
     rig = wish.rig
@@ -118,7 +119,7 @@ def _task(options: RunOptions, rig: Rig, identity: Identity) -> Task:
 
 
 def _no_prompt(task: Task, preflight: Preflight, idle: Idle) -> None:
-    """Nothing real moves: a peer without the simulator's marker is never opened here."""
+    """Confirm: only simulated peers are opened here, so no real shaft moves."""
     assert preflight.identity.simulated
 
 
@@ -132,7 +133,7 @@ def _raise_if_ended(outcome: RunOutcome) -> None:
 
 
 class _ProgressDisplay:
-    """A display that turns cycles into a share of the run."""
+    """A display that converts cycles to a share of the run."""
 
     def __init__(self, report: Callable[[float], None]) -> None:
         self._report = report
@@ -141,24 +142,24 @@ class _ProgressDisplay:
         self._next_s = 0.0
 
     def preflight(self, preflight: Preflight) -> None:
-        """Nothing to show."""
+        """Show nothing."""
 
     def stage_started(self, name: str, expected_s: float) -> None:
-        """Nothing to show."""
+        """Show nothing."""
 
     def stage_ended(self, stage: Stage) -> None:
-        """Nothing to show."""
+        """Show nothing."""
 
     def stopped(self, confirmed: bool) -> None:
-        """The run is over."""
+        """Report the end of the run."""
         self._report(1.0)
 
     def planned(self, plan: Plan | SwingPlan) -> None:
-        """Now it is known how long the run takes."""
+        """Note the duration of the run."""
         self._expected_s = BEFORE_ACQUIRE_S + plan.duration_s + 5.0
 
     def cycle(self, command: Command, sample: Sample) -> None:
-        """Every second of control time."""
+        """Report progress every second of control time."""
         if sample.time_s < self._next_s:
             return
         self._start_s = sample.time_s if self._start_s is None else self._start_s
@@ -170,7 +171,7 @@ class _ProgressDisplay:
 
 LIST, ALL = "list", "paper"
 OURS = ("coverage", "soft-torque")
-"""Studies that are no experiment of the paper's, and take long."""
+"""Long studies that are not experiments of the paper."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -178,17 +179,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "studies", nargs="*", metavar="NAME", help=f"studies to run; '{LIST}' names them, '{ALL}' runs all of them"
     )
-    parser.add_argument("--out", type=Path, default=Path("study"), metavar="DIR", help="where files go (default study)")
+    parser.add_argument("--out", type=Path, default=Path("study"), metavar="DIR", help="folder for the files "
+                                                                                       "(default study)")
     add_option(parser, OPTION["json"])
     parser.add_argument("--set", dest="assignments", action="append", default=[], metavar="NAME=VALUE",
-                        help="one setting of one study, such as Kp=3000; may be repeated")
+                        help="one setting of one study, such as Kp=3000; repeatable")
     parser.add_argument("--study", dest="file", type=Path, metavar="my.yaml", help="settings from a file")
-    parser.add_argument("--seed", type=int, metavar="N", help="of everything random in it")
+    parser.add_argument("--seed", type=int, metavar="N", help="seed of all random numbers")
     parser.set_defaults(run=run)
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """List, or run what was asked for. A statement that does not hold is a finding and no failure."""
+    """List, or run the requested studies. A statement that does not hold is a finding, not a failure."""
     studies = all_studies()
     if namespace.studies == [LIST]:
         return _list(studies, namespace.json)
@@ -197,7 +199,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def all_studies() -> dict[str, Study]:
-    """Every study by its name, tables first, figures in the paper's order; ours last."""
+    """Return every study by name: tables first, then figures in the paper's order, tdhil's own last."""
     from tdhil.studies import COVERAGE, SOFT_TORQUE, field_studies, simulated_studies
 
     known = {study.name: study for study in (*simulated_studies(), *field_studies(SimulatedFieldBench()))}
@@ -206,7 +208,7 @@ def all_studies() -> dict[str, Study]:
 
 
 def chosen(namespace: argparse.Namespace, studies: Mapping[str, Study]) -> list[tuple[Study, Any]]:
-    """Each study that was asked for, with its settings. UsageError and DataFileError, a line each."""
+    """Return each requested study with its settings. Raises UsageError and DataFileError, a line each."""
     from tdhil.errors import UsageError
     from tdhil.studies import load_study_file, with_assignments
 
@@ -220,14 +222,17 @@ def chosen(namespace: argparse.Namespace, studies: Mapping[str, Study]) -> list[
         study, settings = load_study_file(namespace.file, studies)
         if names and names != [study.name]:
             raise UsageError(f"the file is for {study.name}", where=f"--study {namespace.file}",
-                             next_step=f"Leave the name out, or name {study.name} alone")
+                             next_step=f"Remove the name, or name only {study.name}",
+                             entry=MessageCode.STUDY_SETTING_WRONG)
         found = [(study, settings)]
     else:
         found = [(studies[name], studies[name].settings_model()) for name in names]
     if not found:
-        raise UsageError("no study was named", next_step=f"tdhil study {LIST} names them")
+        raise UsageError("no study is named", next_step=f"tdhil study {LIST} lists them",
+                         entry=MessageCode.STUDY_SETTING_WRONG)
     if namespace.assignments and len(found) > 1:
-        raise UsageError("settings differ from study to study", where="--set", next_step="Name one study")
+        raise UsageError("settings differ from study to study", where="--set", next_step="Name one study",
+                         entry=MessageCode.STUDY_SETTING_WRONG)
     if namespace.assignments:
         found = [(study, with_assignments(settings, namespace.assignments)) for study, settings in found]
     if namespace.seed is None:
@@ -245,12 +250,12 @@ def _seeded(study: Study, settings: Any, seed: int, *, alone: bool) -> Any:
         except UsageError as error:
             raise UsageError(error.what.removeprefix("--set "), where="--seed") from None
     if alone:
-        raise UsageError(f"nothing in {study.name} is random", where="--seed")
+        raise UsageError(f"nothing in {study.name} is random", where="--seed", entry=MessageCode.STUDY_SETTING_WRONG)
     return settings
 
 
 def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, report: bool) -> int:
-    from tdhil.errors import ExitCode, Interrupted, TdhilError, exit_code
+    from tdhil.errors import ExitCode, Interrupted, TdhilError, error_document, exit_code
     from tdhil.report import PlainConsole, stderr_console
     from tdhil.studies import (
         INSTALL,
@@ -277,11 +282,11 @@ def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, repo
         except TdhilError as error:
             if not report or isinstance(error, Interrupted):
                 raise
-            # in a report the other studies still count
-            told.print(f"tdhil: {study.name}: {error}", style="bold red", markup=False, soft_wrap=True)
+            # in a report the other studies are still included
+            told.print(f"tdhil: {study.name}: {error.coded}", style="bold red", markup=False, soft_wrap=True)
             code = code or int(exit_code(error))
             chapters.append(Chapter(study.name, None, None, str(error)))
-            documents.append({"study": study.name, "error": {"kind": type(error).__name__, "message": str(error)}})
+            documents.append({"study": study.name, "error": error_document(error)})
             continue
         took_s = time.monotonic() - begun_s
         written = write_study(outcome, settings, folder / study.name)
@@ -292,7 +297,7 @@ def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, repo
             print_outcome(outcome, written, out)
         told.print(_cost(outcome, took_s), style="dim", markup=False)
         if outcome.interrupted:
-            told.print(f"tdhil: {study.name} was interrupted; its figures are of the runs done by then",
+            told.print(f"tdhil: {study.name} was interrupted; its figures use the runs finished before",
                        style="bold yellow", markup=False, soft_wrap=True)
             code = int(ExitCode.INTERRUPTED)
             break
@@ -308,18 +313,19 @@ def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, repo
 
 
 def _made(folder: Path) -> Path:
-    """The output folder, before anything is computed for it."""
+    """Make the output folder before the computation."""
     from tdhil.errors import UsageError
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UsageError(f"can't be made a folder ({error.strerror})", where=f"--out {folder}") from None
+        raise UsageError(f"can't be made a folder ({error.strerror})", where=f"--out {folder}",
+                         entry=MessageCode.FILE_NOT_WRITABLE) from None
     return folder
 
 
 def _cost(outcome: StudyOutcome, took_s: float) -> str:
-    """Wall time, and what a simulated second costs: of the simulation alone where a study tells."""
+    """Return wall time, and the time per simulated second: of the simulation alone if the study reports it."""
     simulated_s = outcome.simulated_s
     if simulated_s <= 0.0:
         return f"{outcome.name}: {took_s:.1f} s"
@@ -343,9 +349,10 @@ def _unknown(name: str, studies: Mapping[str, Study]) -> Exception:
     from tdhil.errors import UsageError
 
     if name in (LIST, ALL):
-        return UsageError(f"'{name}' stands alone", next_step=f"tdhil study {name}")
+        return UsageError(f"'{name}' must be the only name", next_step=f"tdhil study {name}")
     hint = meant(name, (*studies, LIST, ALL))
-    return UsageError(f"there is no study '{name[:40]}'", next_step=f"{hint}tdhil study {LIST} names them")
+    return UsageError(f"unknown study '{name[:40]}'", next_step=f"{hint}tdhil study {LIST} lists them",
+                      entry=MessageCode.STUDY_SETTING_WRONG)
 
 
 def _order(name: str) -> tuple[bool, str, int]:

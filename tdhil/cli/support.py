@@ -1,4 +1,4 @@
-"""`tdhil support run.mcap`: one archive for a support case, with nothing in it that tells of its sender."""
+"""`tdhil support run.mcap`: one archive for a support case, without data that identify its sender."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from tdhil.errors import ExitCode, LogError, UsageError
+from tdhil.errors import ExitCode, LogError, MessageCode, UsageError
 from tdhil.version import __version__
 
 LIBRARIES = (
@@ -29,7 +29,7 @@ VARIABLES = (
     "LANG", "LC_ALL", "LC_CTYPE", "TERM", "PYTHONIOENCODING", "PYTHONUTF8", "CAN_INTERFACE", "CAN_CHANNEL",
     "CAN_BITRATE", "OPENBLAS_CORETYPE", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS",
 )
-"""Of the environment only these: what else stands there is nobody's business."""
+"""The only environment variables that are included: others are private."""
 
 _SECRET = re.compile(r"pass(word|wd|phrase)?|secret|token|api_?key|credential|authori[sz]ation|private", re.IGNORECASE)
 _PERSON = frozenset({"operator"})
@@ -38,26 +38,27 @@ _LOGIN = re.compile(r"(\w+://)[^/@\s]+@")
 _ASSIGNED = re.compile(rf"((?:{_SECRET.pattern})\w*\s*[:=]\s*)[^\s,}}]+", re.IGNORECASE)
 _GONE = "<removed>"
 _SHORTEST_NAME = 4
-"""Characters; a shorter user name stands in words that mean something else."""
+"""Shortest name that is removed, characters; a shorter one occurs within other words."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of support."""
-    parser.add_argument("log", type=Path, metavar="run.mcap", help="the log of the run that it is about")
-    parser.add_argument("--rig", type=Path, metavar="rig.yaml", help="its rig.yaml, comments and all")
+    parser.add_argument("log", type=Path, metavar="run.mcap", help="the log of the run")
+    parser.add_argument("--rig", type=Path, metavar="rig.yaml", help="its rig.yaml, with comments")
     parser.add_argument("-o", "--output", type=Path, metavar="support.zip",
-                        help="default: beside the log; never over a file")
+                        help="default: beside the log; no file is overwritten")
     parser.set_defaults(run=run)
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Exit 0: all of it; 3: the log could be read in part, or not at all. UsageError for files that can't be used."""
+    """Write the archive. Exit 0: complete; 3: the log is partly or not readable. Raises UsageError."""
     log: Path = namespace.log
     target: Path = namespace.output or log.with_name(f"{log.stem}.support.zip")
     if not log.is_file():
-        raise UsageError("there is no such log", where=str(log), next_step="Name a run.mcap of this tool")
+        raise UsageError("this log does not exist", where=str(log), next_step="Name a run.mcap of tdhil",
+                         entry=MessageCode.FILE_NOT_FOUND)
     if namespace.rig is not None and not namespace.rig.is_file():
-        raise UsageError("there is no such file", where=f"--rig {namespace.rig}")
+        raise UsageError("this file does not exist", where=f"--rig {namespace.rig}", entry=MessageCode.FILE_NOT_FOUND)
     scrub = Scrub.of_this_computer()
     whole = True
     try:
@@ -69,18 +70,19 @@ def run(namespace: argparse.Namespace) -> int:
             whole = _add_log(archive, log, scrub)
             names = archive.namelist()
     except FileExistsError:
-        raise UsageError("is there already, and is not written over", where=str(target),
-                         next_step="Name another with -o") from None
+        raise UsageError("already exists and was not overwritten", where=str(target),
+                         next_step="Name another file with -o", entry=MessageCode.FILE_EXISTS) from None
     except OSError as error:
-        raise UsageError(f"can't be written ({error.strerror or error})", where=str(target)) from error
+        raise UsageError(f"can't be written ({error.strerror or error})", where=str(target),
+                         entry=MessageCode.FILE_NOT_WRITABLE) from error
     print(f"{target}: {', '.join(names)}")  # noqa: T201
-    print("Names of users, of this computer and of folders, and whatever looks like a secret, were taken out. "  # noqa: T201
-          "Look into it before you send it.", file=sys.stderr)
+    print("Names of users, of this computer and of folders, and possible secrets, were removed. "  # noqa: T201
+          "Check it before you send it.", file=sys.stderr)
     return int(ExitCode.OK if whole else ExitCode.PARTIAL)
 
 
 def about(log: Path) -> Iterable[tuple[str, str]]:
-    """(name in the archive, text): everything but the log itself and rig.yaml, not yet scrubbed."""
+    """Yield (name in the archive, text) of everything except the log and rig.yaml, not yet scrubbed."""
     from tdhil.cli.doctor import host_findings
 
     yield "versions.json", _json(versions())
@@ -88,7 +90,7 @@ def about(log: Path) -> Iterable[tuple[str, str]]:
 
 
 def versions() -> dict[str, Any]:
-    """What runs here, and the few variables that change what it does."""
+    """Return the versions, and the few environment variables that change tdhil's behaviour."""
     found: dict[str, str | None] = {}
     for name in LIBRARIES:
         with suppress(metadata.PackageNotFoundError):
@@ -107,7 +109,7 @@ def versions() -> dict[str, Any]:
 
 
 def _add_log(archive: zipfile.ZipFile, log: Path, scrub: Scrub) -> bool:
-    """The log with its texts scrubbed, and what it says of the run, as files that anybody reads."""
+    """Add the log with scrubbed texts, and its content as readable files."""
     from tdhil.cli.recover import report
     from tdhil.recording import examine, write_copy
 
@@ -134,7 +136,7 @@ def _add_log(archive: zipfile.ZipFile, log: Path, scrub: Scrub) -> bool:
 
 
 class Scrub:
-    """Takes out who sent it: home folders, the names of user and computer, operators, logins, secrets."""
+    """Removes data of the sender: home folders, the names of user and computer, operators, logins, secrets."""
 
     def __init__(self, *, home: str, names: Iterable[str]) -> None:
         self._home = home if len(home) > 1 else ""
@@ -143,7 +145,7 @@ class Scrub:
 
     @classmethod
     def of_this_computer(cls) -> Scrub:
-        """Names that mean something else in a log (root, user) stay."""
+        """Return the scrubber for this computer. Names with another meaning in a log (root, user) stay."""
         names = []
         with suppress(Exception):      # no entry for this user, no variables either
             names.append(getpass.getuser())
@@ -152,7 +154,7 @@ class Scrub:
         return cls(home=str(Path.home()), names=[name for name in names if name not in ("root", "user", "localhost")])
 
     def text(self, text: str) -> str:
-        """One text of whatever kind."""
+        """Scrub one text."""
         if self._home:
             text = text.replace(self._home, "~")
         text = _HOMES.sub(r"\1<user>", text)
@@ -161,7 +163,7 @@ class Scrub:
         return self._names.sub("<name>", text) if self._names is not None else text
 
     def value(self, value: Any, key: str = "") -> Any:
-        """Plain data, all the way down."""
+        """Scrub plain data at all levels."""
         if value not in (None, "") and isinstance(key, str) and (_SECRET.search(key) or key in _PERSON):
             return _GONE
         if isinstance(value, str):
@@ -173,7 +175,7 @@ class Scrub:
         return value
 
     def message(self, channel: int, payload: bytes) -> bytes:
-        """A message of a log: its numbers as they are, its texts scrubbed."""
+        """Scrub the texts of a log's message; its numbers stay."""
         from google.protobuf.descriptor import FieldDescriptor
 
         from tdhil.recording import CAN, CHANNELS, CLASSES, COMMAND, EXCITATION, MODBUS, SAMPLE, VIRTUAL_STRING

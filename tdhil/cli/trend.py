@@ -1,4 +1,4 @@
-"""`tdhil trend` and `tdhil compare`: did this rig change, and do these runs differ?"""
+"""`tdhil trend` and `tdhil compare`: changes of a rig over time, and differences between runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from tdhil.cli.arguments import add_option, add_settings, settings_in
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 
 if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
@@ -24,7 +24,7 @@ _COLOURS = ("#0b5cad", "#c2410c", "#15803d", "#7e22ce", "#525252", "#b45309", "#
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of trend."""
     parser.add_argument("table", type=Path, metavar="FILE", help="a table that `tdhil fleet` wrote")
-    parser.add_argument("--rig", metavar="NAME", help="whose results, by its name in rig.yaml (default: the only one)")
+    parser.add_argument("--rig", metavar="NAME", help="name of the rig in rig.yaml (default: the only one)")
     _add_output(parser)
     parser.set_defaults(run=run)
 
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of compare."""
     parser.add_argument("logs", nargs="+", type=Path, metavar="run.mcap",
-                        help="two or more; each is held beside the first")
+                        help="two or more; each is compared with the first")
     add_settings(parser, "each run's")
     _add_output(parser)
     parser.set_defaults(run=run_compare)
@@ -40,11 +40,12 @@ def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_output(parser: argparse.ArgumentParser) -> None:
     add_option(parser, OPTION["json"])
-    parser.add_argument("--report", type=Path, metavar="FILE.html", help="with a picture, in one file (extra `report`)")
+    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with a picture, in one "
+                                                                         "file (extra `report`)")
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Read the table, say what changed."""
+    """Read the table, report changes."""
     from tdhil.fleet import read_table, trend_document
 
     _check_report(namespace.report, (namespace.table,))
@@ -63,14 +64,17 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def run_compare(namespace: argparse.Namespace) -> int:
-    """Identify each, hold them beside the first."""
+    """Identify each log, and compare it with the first."""
     from tdhil.fleet import FleetSettings, compare_document, identified
 
     if len(namespace.logs) < 2:
-        raise UsageError("one log has nothing to be compared with", next_step="Name two or more")
+        raise UsageError(f"{len(namespace.logs)} log is named, and compare needs two or more",
+                         next_step="Name another log: tdhil compare before.mcap after.mcap",
+                         entry=MessageCode.LOG_NEEDED)
     for log in namespace.logs:
         if not log.is_file():
-            raise UsageError("there is no such log", where=str(log), next_step="Name a run.mcap of this tool")
+            raise UsageError("this log does not exist", where=str(log), next_step="Name a run.mcap of tdhil",
+                             entry=MessageCode.FILE_NOT_FOUND)
     settings = FleetSettings(**settings_in(namespace))
     _check_report(namespace.report, namespace.logs)
     document = compare_document([identified(log, settings) for log in namespace.logs])
@@ -104,7 +108,7 @@ def _print_trend(document: Mapping[str, Any]) -> None:
 
 
 def _followed_text(one: Mapping[str, Any]) -> str:
-    """What became of a quantity, behind the least and the greatest of its values."""
+    """Return the trend of a quantity, after the least and the greatest of its values."""
     values = [point["value"] for point in one["points"]]
     seen = f", {min(values):.4g} to {max(values):.4g} {one['unit']}" if values else ""
     return f"{one['name']}{seen}: {one['text']}"
@@ -133,21 +137,21 @@ def _print_compared(document: Mapping[str, Any]) -> None:
     console.print(table)
     for one in document["differences"]:
         console.print(f"{one['from']} and {one['to']}: {one['text']}", soft_wrap=True)
-        rest = [f"{other['name']}: {'differs' if other['differs'] else 'no difference seen'}"
+        rest = [f"{other['name']}: {'differs' if other['differs'] else 'no significant difference'}"
                 for other in one["quantities"] if other["column"] != "inertia_kg_m2"]
         if rest:
             console.print("  " + ", ".join(rest), soft_wrap=True)
 
 
 def _simulated(document: Mapping[str, Any]) -> str:
-    """For a title: said where any of the runs was none of a real shaft."""
+    """Return the suffix of a title if any of the runs is simulated."""
     from tdhil.report import SIMULATED
 
     return f" · {SIMULATED}" if document["simulated"] else ""
 
 
 def _headings(logs: Sequence[str]) -> Sequence[str]:
-    """Their files' names; where two have one name, the paths as they were given."""
+    """Return the file names; if two are the same, the given paths."""
     names = [Path(log).name for log in logs]
     return names if len(set(names)) == len(names) else logs
 
@@ -160,7 +164,7 @@ def _inertia_text(row: Mapping[str, Any]) -> str:
 
 
 def _by_line(document: Mapping[str, Any]) -> dict[float, list[float | None]]:
-    """Apparent inertia by frequency, a column a log; the mean where a frequency stands there for more mean speeds."""
+    """Return the apparent inertia by frequency, a column per log; the mean over several mean speeds."""
     found: dict[float, list[float | None]] = {}
     for number, lines in enumerate(document["apparent_inertia"]):
         by_hertz: dict[float, list[float]] = {}
@@ -183,9 +187,10 @@ def _check_report(path: Path | None, inputs: Sequence[Path]) -> None:
     from tdhil.report import require_extra
 
     if path.suffix != ".html":
-        raise UsageError("must end in .html", where=f"--report {path}")
+        raise UsageError("must end in .html", where=f"--report {path}", entry=MessageCode.VALUE_NOT_ALLOWED)
     if path.exists() or any(path.resolve() == one.resolve() for one in inputs):
-        raise UsageError("is there already; it is left as it is", where=f"--report {path}", next_step="Name another")
+        raise UsageError("already exists and was left unchanged", where=f"--report {path}",
+                         next_step="Name another file", entry=MessageCode.FILE_EXISTS)
     require_extra("--report")
 
 
@@ -203,7 +208,8 @@ def _write(
         with path.open("x", encoding="utf-8") as file:
             file.write(page)
     except OSError as error:
-        raise UsageError(f"can't be written: {error.strerror or error}", where=f"--report {path}") from error
+        raise UsageError(f"can't be written: {error.strerror or error}", where=f"--report {path}",
+                         entry=MessageCode.FILE_NOT_WRITABLE) from error
 
 
 def _draw_trend(figure: FigureBase, document: Mapping[str, Any]) -> None:
@@ -230,7 +236,7 @@ def _draw_trend(figure: FigureBase, document: Mapping[str, Any]) -> None:
 
 
 def _moment(date: str) -> datetime:
-    """Of a row's date; one without a zone is taken for this computer's."""
+    """Return a row's date; without a zone it counts as local time."""
     return datetime.fromisoformat(date).astimezone(UTC)
 
 
@@ -243,7 +249,7 @@ def _draw_curves(figure: FigureBase, document: Mapping[str, Any]) -> None:
             [line["hertz"] for line in known], [line["value"] for line in known],
             yerr=[[max(0.0, line["value"] - line["low"]) for line in known],
                   [max(0.0, line["high"] - line["value"]) for line in known]],
-            # rings, one around the other: runs that agree don't hide each other
+            # concentric rings: equal runs do not hide each other
             fmt="o", ms=3 + 3 * number, mfc="none", lw=1, color=_COLOURS[number % len(_COLOURS)], label=heading)
     axis.set_xlabel("Hz")
     axis.set_ylabel("apparent inertia, kg·m²")

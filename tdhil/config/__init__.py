@@ -1,4 +1,4 @@
-"""What a run is told: rig.yaml, and every option with where its value came from."""
+"""The settings of a run: rig.yaml, and every option with the source of its value."""
 
 from typing import TYPE_CHECKING
 
@@ -10,7 +10,8 @@ if TYPE_CHECKING:
         values_of as values_of, with_keywords as with_keywords,
     )
     from tdhil.config.options import (
-        ASKED_AGAIN as ASKED_AGAIN, OPTION as OPTION, OPTIONS as OPTIONS, Topic as Topic, Option as Option,
+        ASKED_AGAIN as ASKED_AGAIN, COMMON_LINE_FLAGS as COMMON_LINE_FLAGS, OPTION as OPTION, OPTIONS as OPTIONS,
+        Topic as Topic, Option as Option,
         Origin as Origin, Overrides as Overrides, RunDetails as RunDetails, RunOptions as RunOptions,
         Setting as Setting, form_options as form_options,
     )

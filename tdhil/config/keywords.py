@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any, Final, TypeVar
 
 from tdhil.config.options import ASKED_AGAIN, OPTIONS, Option, Topic
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 
 _OF_THE_DRIVE = frozenset({Topic.DRIVE, Topic.SIMULATED})
 OF_THE_RUN: Final = tuple(one for one in OPTIONS if one.python and one.group not in _OF_THE_DRIVE)
@@ -34,10 +34,10 @@ def with_keywords(options: Collection[Option]) -> Callable[[_Function], _Functio
 
 
 def values_of(options: Collection[Option], given: Mapping[str, Any], function: str) -> dict[str, Any]:
-    """Values by the options' names, from keywords; None is not given. UsageError for a keyword that no option has."""
+    """Return values by option name from keywords; None is not given. Raises UsageError for unknown keywords."""
     names = {one.keyword: one.name for one in options}
     if unknown := sorted(set(given) - set(names)):
-        raise UsageError(f"no such option: {', '.join(unknown)}", where=function,
-                         next_step=f"It takes {', '.join(names)}")
+        raise UsageError(f"unknown option: {', '.join(unknown)}", where=function,
+                         next_step=f"Use one of: {', '.join(names)}", entry=MessageCode.UNKNOWN_OPTION)
     return {names[keyword]: os.fspath(value) if isinstance(value, os.PathLike) else value
             for keyword, value in given.items() if value is not None}

@@ -1,4 +1,4 @@
-"""The rows of docs/rig.md that describe the options, from their table.
+"""Rows of docs/reference/rig.md that describe the options, made from their table.
 
 ``python -m tdhil.config.reference`` rewrites them in a clone; a test fails if they are stale.
 """
@@ -8,11 +8,11 @@ from pathlib import Path
 
 from tdhil.config.options import OPTIONS, Option
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "rig.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "rig.md"
 
 
 def page_of(text: str) -> str:
-    """The page with a row for each option: in place of the row that it had, or below those of its section."""
+    """Return the page with a row for each option, in place of its old row or below the rows of its section."""
     lines = text.splitlines()
     places = {line.split(" |")[0]: number for number, line in enumerate(lines)}
     new: list[tuple[int, str]] = []
@@ -28,7 +28,7 @@ def page_of(text: str) -> str:
 
 
 def row_of(option: Option) -> str:
-    """The option's row: key, default, flag and meaning; without a key flag, keyword in Python and meaning."""
+    """Return the option's row: key, default, flag and meaning. Without a key: flag, keyword in Python and meaning."""
     meaning = _meaning(option)
     if not option.at:
         return f"{_start(option)} | {f'`{option.keyword}`' if option.python else ''} | {meaning} |"
@@ -40,7 +40,7 @@ def _start(option: Option) -> str:
 
 
 def _section(option: Option) -> str:
-    """Its section of rig.yaml, '' for the top; '-' of an option that no file states."""
+    """Return its section of rig.yaml; '' for the top, '-' for an option that no file states."""
     return option.at.rpartition(".")[0] if option.at else "-"
 
 

@@ -1,8 +1,8 @@
-"""What there is to choose from, each in one list: excitations, models of the shaft, buses.
+"""Lists of choices: excitations, models of the shaft, buses.
 
-The command line's choices, rig.yaml's schema, `tdhil.api` and the code that acts read these. An entry is a name, where
-the object behind it stands and a line for people; the object is imported when it is asked for, so that ``--help``
-loads none of them. Plants of the simulator, which knows nothing of us, have their own list: `sim_bus.plant.kinds`.
+The command line, the schema of rig.yaml, `tdhil.api` and the code that acts read these lists. An entry has a name, the
+place of its object and a line of text. The object is imported at first use, so that ``--help`` loads none of them. The
+simulator is independent of tdhil and has its own list of plants: `sim_bus.plant.kinds`.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import Any
 class RegistryEntry:
     """``at``: ``module:attribute`` of the object; ``text``: what it is.
 
-    What a recording's excitation is to those who can't import it: ``periodic``, it has lines and whole periods;
-    ``plateaus``, the speed rests at levels within a period, so that it is calm there, and flat without being cut off;
-    ``before_echo``, it is for drill strings alone, and tells the inertia from the time before their echo.
+    Properties of an excitation for code that can't import it. ``periodic``: it has spectral lines and whole periods.
+    ``plateaus``: the speed is constant for a time within each period. There its noise is low, and a flat stretch is no
+    sign of clipping. ``before_echo``: it is for drill strings only, and J follows from the time before their echo.
     """
 
     at: str
@@ -31,18 +31,18 @@ class RegistryEntry:
 
 @dataclass(frozen=True)
 class BusEntry(RegistryEntry):
-    """``at``: what a run asks of the bus, a `tdhil.session.connection.BusKind`: its options, how a drive is opened.
+    """``at``: the bus as a run uses it, a `tdhil.session.connection.BusKind`: its options, how a drive is opened.
 
-    ``commands``: what scan, doctor and rig new do on it, a `tdhil.cli.scan_common.BusCommands`. Both stand in modules
-    that load no library of the bus by themselves: ``--help`` shows the options of every bus.
+    ``commands``: scan, doctor and rig new on this bus, a `tdhil.cli.scan_common.BusCommands`. The modules of both load
+    no library of the bus at import: ``--help`` shows the options of every bus.
     """
 
     commands: str = ""
 
 
 EXCITATIONS: dict[str, RegistryEntry] = {
-    "multisine": RegistryEntry("tdhil.runner.excitation.signals:MULTISINE", "several tones at once, of a low crest",
-                               True),
+    "multisine": RegistryEntry("tdhil.runner.excitation.signals:MULTISINE",
+                               "several tones at once, with a low crest factor", True),
     "sine": RegistryEntry("tdhil.runner.excitation.signals:SINE", "one tone (equation 8 of the paper)", True),
     "step": RegistryEntry("tdhil.runner.excitation.signals:STEP",
                           "a square wave of speed (equation 9 of the paper)", True, True),
@@ -50,7 +50,7 @@ EXCITATIONS: dict[str, RegistryEntry] = {
                           "pseudo-random torque, for a string whose pipe is known", periodic=True, before_echo=True),
     "pulses": RegistryEntry("tdhil.runner.excitation.pulses:PULSES", "torque pulses between steady speeds"),
     "coast-down": RegistryEntry("tdhil.runner.excitation.pulses:COAST_DOWN",
-                        "without torque down, under power back up; never with a string"),
+                        "coasting down without torque, then driven back up; never with a string"),
 }
 """Excitations of stage 5; each a `tdhil.runner.excitation.ExcitationKind`."""
 
@@ -61,9 +61,10 @@ MODELS: dict[str, RegistryEntry] = {
     "rigid": RegistryEntry("tdhil.estimation.frequency_domain.shafts:RIGID", "one inertia, with reporting lags"),
     "two-mass": RegistryEntry("tdhil.estimation.frequency_domain.shafts:TWO_MASS", "two masses on a spring"),
     "string": RegistryEntry("tdhil.estimation.frequency_domain.shafts:STRING", "a string with a mass at its end"),
-    "paper": RegistryEntry("tdhil.estimation.frequency_domain.shafts:PAPER", "rigid, by the paper's method: no lags"),
+    "paper": RegistryEntry("tdhil.estimation.frequency_domain.shafts:PAPER",
+                           "rigid shaft without lags, as in the paper (Xu 2026)"),
 }
-"""What the shaft is taken for."""
+"""Models of the shaft."""
 
 BUSES: dict[str, BusEntry] = {
     "canopen": BusEntry("tdhil.session.buses.canopen:CANOPEN", "CANopen, CiA 402",
@@ -71,41 +72,41 @@ BUSES: dict[str, BusEntry] = {
     "modbus": BusEntry("tdhil.session.buses.modbus:MODBUS", "Modbus TCP or RTU",
                        commands="tdhil.cli.buses.modbus:MODBUS"),
 }
-"""How a drive is spoken to.
+"""Buses of a drive.
 
-Two things of a bus stand elsewhere: the schema of its profiles, below all this, in the list of `profiles.library`; its
-section of rig.yaml, a field of `tdhil.config.rig.Rig`.
+Two parts of a bus are elsewhere: the schema of its profiles, in the list of `profiles.library`; its section of
+rig.yaml, a field of `tdhil.config.rig.Rig`.
 """
 
 DEFAULT_BUS = "canopen"
 
 
 def load(registry: Mapping[str, RegistryEntry], name: str) -> Any:
-    """Import what stands behind a name. KeyError where there is none of that name."""
+    """Import the object of a name. Raises KeyError for an unknown name."""
     return imported(registry[name].at)
 
 
 def imported(at: str) -> Any:
-    """The object at ``module:attribute``."""
+    """Return the object at ``module:attribute``."""
     module, _, attribute = at.partition(":")
     return getattr(import_module(module), attribute)
 
 
 def names(registry: Mapping[str, RegistryEntry], *, periodic: bool = False) -> list[str]:
-    """What there is, in its order; of the excitations, the periodic ones alone where asked."""
+    """Return the names in their order; with ``periodic`` only the periodic excitations."""
     return [name for name, entry in registry.items() if entry.periodic or not periodic]
 
 
 SPEED_UNIT_TOLERANCE = 0.1
-"""Of one, that the ratio of the shaft's angle to the integral of its reported speed may differ by. Encoders, gears and
-slip of sound rigs are within a few per cent; units that are wrong are off by 2, 4, 2π, 10, 60."""
+"""Accepted relative deviation of the shaft's angle from the integral of its reported speed. Encoders, gears and slip of
+sound rigs stay within a few per cent. Wrong units give factors of 2, 4, 2π, 10 or 60."""
 
 
 def has_plateaus(excitation: str) -> bool:
-    """Does the speed rest at levels within a period? Not of an excitation that nobody knows any more."""
+    """Return whether the speed is constant for a time within each period. False for an unknown excitation."""
     return excitation in EXCITATIONS and EXCITATIONS[excitation].plateaus
 
 
 def told_before_echo(excitation: str) -> bool:
-    """Is it for drill strings, whose echo is not looked at? Not of an excitation that nobody knows any more."""
+    """Return whether J follows from the time before a string's echo. False for an unknown excitation."""
     return excitation in EXCITATIONS and EXCITATIONS[excitation].before_echo

@@ -1,4 +1,4 @@
-"""Which value an option has: the command line's, before rig.yaml's, before the default; and its source."""
+"""The value of an option, from the command line, else rig.yaml, else the default; and its source."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,20 +8,20 @@ from pydantic import BaseModel, ValidationError
 from profiles import messages_of
 from tdhil.config.options import CLOCKS, OPTION, RESOLVED, Option, Origin, RunOptions, Setting, is_name
 from tdhil.config.rig import Rig
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 
 
 def resolve(cli_values: Mapping[str, Any], rig: Rig | None) -> RunOptions:
-    """Every option of `RunOptions`; None or absent in ``cli_values`` (keyed by option name) means not given.
+    """Return every option of `RunOptions`; None or absent in ``cli_values`` (keyed by option name) means not given.
 
     A flag that is not given must be None or absent too, not False: rig.yaml could not set it otherwise.
-    UsageError names every flag with a value that rig.yaml would not take either.
+    Raises UsageError with every flag whose value rig.yaml would not accept either.
     """
     given = {option.name: cli_values[option.name] for option in RESOLVED if cli_values.get(option.name) is not None}
     given |= {option.name: tuple(given[option.name]) for option in RESOLVED if option.joined and option.name in given}
     for one, other in (CLOCKS, CLOCKS[::-1]):
         if given.get(one) and other not in given:
-            given[other] = False           # the command line's word on the clock undoes rig.yaml's
+            given[other] = False           # a clock on the command line overrides rig.yaml's
     _check(given)
     settings = {option.name: _setting(option, given, cli_values, rig) for option in RESOLVED}
     return RunOptions.of(settings)
@@ -42,9 +42,9 @@ def _setting(option: Option, given: Mapping[str, Any], cli_values: Mapping[str, 
 
 
 def _joined(option: Option, given: Mapping[str, Any], rig: Rig | None) -> Setting:
-    """Everything that either place names, each thing once.
+    """Return all names from both sources, each once.
 
-    What a file takes of a profile it takes of the one that it goes with, not of another on the command line.
+    Accepted entries in rig.yaml apply only to the profile in rig.yaml, not to another one on the command line.
     """
     in_rig = (rig.get(option.at) if rig is not None else None) or ()
     if rig is not None and given.get("profile") not in (None, rig.get("profile")):
@@ -60,7 +60,7 @@ def _joined(option: Option, given: Mapping[str, Any], rig: Rig | None) -> Settin
 
 
 def _check(given: Mapping[str, Any]) -> None:
-    """The same rules as for rig.yaml, in terms of the flags."""
+    """Check the rules of rig.yaml, and name the flags in the error."""
     data: dict[str, Any] = {}
     flags: dict[tuple[str | int, ...], str] = {}
     for option in RESOLVED:
@@ -72,9 +72,10 @@ def _check(given: Mapping[str, Any]) -> None:
 
 
 def check_values(model: type[BaseModel], data: Mapping[str, Any], flags: Mapping[tuple[str | int, ...], str]) -> None:
-    """Raise UsageError with every value that ``model`` wouldn't take, each by the flag of its place."""
+    """Raise UsageError with every value that ``model`` refuses, each with its flag."""
     try:
         model.model_validate(data)
     except ValidationError as error:
         wrong = [f"{flags.get(path, '')}: {message}" for path, message in messages_of(error, data, model)]
-        raise UsageError("; ".join(wrong), next_step="See tdhil identify --help") from None
+        raise UsageError("; ".join(wrong), next_step="See tdhil identify --help",
+                         entry=MessageCode.VALUE_NOT_ALLOWED) from None

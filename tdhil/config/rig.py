@@ -1,7 +1,7 @@
-"""One bench: drive, bus, gear, load, machine limits, and what its user always wants of a run.
+"""One bench: drive, bus, gear, load, machine limits, and the usual options of a run.
 
-`Rig` mirrors rig.yaml key by key; units stand in the names, all of them SI. Torque and speed are those of the
-motor shaft. It is frozen, and knows from which line of which file each of its keys came::
+`Rig` mirrors rig.yaml key by key. The names contain the units, all of them SI. Torque and speed refer to the motor
+shaft. It is frozen, and holds the file and line of each key::
 
     drive: canopen
     bus: {interface: socketcan, channel: can0, bitrate: 500000}
@@ -30,21 +30,31 @@ from pydantic import (
 from pydantic_core import core_schema
 
 from drivers import DataFileError, PreflightRefused, Problem
-from profiles import Conversion, DataModel, Finding, Loaded, load_with_lines, messages_of, one_of, parse_with_lines
+from profiles import (
+    Conversion,
+    DataModel,
+    Finding,
+    Loaded,
+    MessageCode,
+    load_with_lines,
+    messages_of,
+    one_of,
+    parse_with_lines,
+)
 from tdhil.config.options import CLOCKS, OPTIONS, Option, Topic
 from tdhil.config.registry import RegistryEntry, names
 
 
 def _within(low: float, high: float, *, zero: bool = False) -> Any:
-    """A number that some machine could have: what lies beyond is a slip, and no arithmetic is to choke on it."""
+    """Return a field with the range of real machines. A value beyond it is a typing error and could overflow."""
     return Field(ge=0.0 if zero else low, le=high)
 
 
 @dataclass(frozen=True, eq=False)
 class Registered:
-    """For pydantic: one of a registry's names. What isn't is refused with all that there are, as by a Literal.
+    """For pydantic: a name of a registry. Another name is refused with the list of all names, as for a Literal.
 
-    ``periodic``: of the excitations, those with lines alone.
+    ``periodic``: only excitations with spectral lines.
     """
 
     registry: Mapping[str, RegistryEntry]
@@ -74,37 +84,37 @@ CAN_BIT_RATES = (
     5_000, 10_000, 20_000, 33_000, 33_333, 47_000, 47_619, 50_000, 62_000, 62_500, 83_000, 83_300, 83_333, 95_000,
     95_238, 100_000, 125_000, 200_000, 250_000, 400_000, 500_000, 750_000, 800_000, 1_000_000,
 )
-"""bit/s that CiA 301 names, and what else adapters have."""
+"""Bit rates of CiA 301, and others that adapters offer, bit/s."""
 
 
 def bit_rate_problem(bit_s: int) -> str:
-    """What is wrong with a CAN bit rate; '' where it is one."""
+    """Return the error of a CAN bit rate; '' if it is valid."""
     if bit_s in CAN_BIT_RATES:
         return ""
     if bit_s * 1000 in CAN_BIT_RATES:
-        return f"{bit_s} bit/s is none of CAN's; {bit_s}k is one: {bit_s * 1000}"
+        return f"{bit_s} bit/s is not a CAN bit rate; {bit_s}k is one: {bit_s * 1000}"
     nearest = min(CAN_BIT_RATES, key=lambda one: abs(math.log(one / max(bit_s, 1))))
-    return f"{bit_s} bit/s is none of CAN's; the nearest is {nearest}"
+    return f"{bit_s} bit/s is not a CAN bit rate; the nearest is {nearest}"
 
 
 class Bus(DataModel):
-    """python-can's own options; what is missing here is looked for in its environment variables and files."""
+    """python-can's own options. Missing ones come from its environment variables and files."""
 
     interface: str | None = Field(default=None, min_length=1, description="as for -i: socketcan, pcan, slcan …")
     channel: str | int | None = Field(default=None, description="as for -c: can0, PCAN_USBBUS1 …")
-    bitrate: int | None = Field(default=None, gt=0, description="bit/s; socketcan: as the link has it")
-    options: dict[str, str | int | float | bool] = Field(default={}, description="what else the interface takes")
+    bitrate: int | None = Field(default=None, gt=0, description="bit/s; for socketcan the bit rate of the link")
+    options: dict[str, str | int | float | bool] = Field(default={}, description="further options of the interface")
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """A bit rate that CAN doesn't know."""
+        """Return an invalid CAN bit rate."""
         bitrate = values.get("bitrate")
         wrong = "" if bitrate is None else bit_rate_problem(bitrate)
         return [("bitrate", wrong)] if wrong else []
 
 
 class Modbus(DataModel):
-    """Where a Modbus drive is reached; what is missing here is as the profile's ``line`` says."""
+    """The address of a Modbus drive. Missing values come from the profile's ``line``."""
 
     host: str | None = Field(default=None, min_length=1, description="Modbus TCP: name or address of the drive")
     port: int | None = Field(default=None, ge=1, le=65535, description="TCP port")
@@ -116,7 +126,7 @@ class Modbus(DataModel):
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """One line only, and a unit that it knows."""
+        """Return two lines at once, or a unit out of range."""
         findings = []
         host, serial, unit = (values.get(name) for name in ("host", "serial", "unit"))
         if host is not None and serial is not None:
@@ -127,27 +137,27 @@ class Modbus(DataModel):
 
 
 LONGEST_BRAKING_S = 90.0
-"""From the highest speed. A stop is waited for by three times its ramp, and five minutes at most."""
+"""Longest braking from the highest speed, s. A stop is awaited for three times its ramp, at most five minutes."""
 
 
 class Limits(DataModel):
-    """What the machine may do; watched by the host and, where it can, by the drive."""
+    """The limits of the machine. The host watches them, and the drive where it can."""
 
-    speed_min_rad_s: Speed = Field(description="rad/s; lowest speed while torque is regulated")
+    speed_min_rad_s: Speed = Field(description="rad/s; lowest speed in torque mode")
     speed_max_rad_s: Annotated[float, _within(1e-6, 1e5)] = Field(description="rad/s; highest speed")
     torque_nm: Torque = Field(description="N·m; highest torque, either sign")
     time_s: Time = Field(description="s; longest run")
-    quick_stop_rad_s2: Positive = Field(description="rad/s²; how hard the shaft is braked")
+    quick_stop_rad_s2: Positive = Field(description="rad/s²; deceleration of a stop")
     watchdog_s: float = Field(default=0.5, ge=0.02, le=5, description="s of silence until the drive stops by itself")
     temperature_c: float | None = Field(
-        default=None, gt=0, le=300, description="°C; above it a run is stopped, where the drive tells a temperature"
+        default=None, gt=0, le=300, description="°C; above it a run is stopped, if the drive reports a temperature"
     )
-    probe_torque_nm: Torque = Field(description="N·m; highest torque to find out the direction and the breakaway")
-    probe_travel_rad: Positive = Field(description="rad; farthest the shaft may turn while doing so")
+    probe_torque_nm: Torque = Field(description="N·m; highest torque of the sign probe (direction and breakaway)")
+    probe_travel_rad: Positive = Field(description="rad; farthest travel of the shaft during the sign probe")
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """A window that is empty, a probe beyond the limit, and a stop that never ends."""
+        """Return an empty speed window, a probe torque above the limit, or a stop that takes too long."""
         findings = []
         lowest, highest = values.get("speed_min_rad_s"), values.get("speed_max_rad_s")
         if lowest is not None and highest is not None and lowest >= highest:
@@ -157,20 +167,20 @@ class Limits(DataModel):
             findings.append(("probe_torque_nm", f"must not be above torque_nm, which is {most:g}"))
         braking = values.get("quick_stop_rad_s2")
         if highest is not None and braking is not None and highest > LONGEST_BRAKING_S * braking:
-            findings.append(("quick_stop_rad_s2", f"brakes from speed_max_rad_s in {highest / braking:.3g} s; more than"
-                             f" {LONGEST_BRAKING_S:g} s is no stop: give {highest / LONGEST_BRAKING_S:.2g} or more"))
+            findings.append(("quick_stop_rad_s2", f"brakes from speed_max_rad_s in {highest / braking:.3g} s, more than"
+                             f" the limit of {LONGEST_BRAKING_S:g} s: give {highest / LONGEST_BRAKING_S:.2g} or more"))
         return findings
 
 
 def _load_of(value: Any) -> Any:
-    """The word alone stands for the kind."""
+    """Accept a single word as the kind."""
     return {"kind": value} if isinstance(value, str) else value
 
 
 class Load(DataModel):
-    """What hangs on the shaft. A pipe whose sizes are given is known to the result; the word alone will do, too."""
+    """The load on the shaft. Given sizes of the pipe are used for the result; the kind alone is enough."""
 
-    kind: Literal["none", "string"] = Field(default="none", description="string: a drill string hangs on the shaft")
+    kind: Literal["none", "string"] = Field(default="none", description="string: a drill string is on the shaft")
     length_m: Annotated[float, _within(1.0, 2e4)] | None = Field(
         default=None, description="m; of uniform pipe, from the top down to where its section changes"
     )
@@ -179,12 +189,12 @@ class Load(DataModel):
         default=None, description="m; of the pipe"
     )
     tolerance: Annotated[float, _within(1e-3, 0.5)] = Field(
-        default=0.03, description="how well its weight and stiffness follow from that, 1 sd as a share"
+        default=0.03, description="relative standard uncertainty of the weight and stiffness that follow (1 sd)"
     )
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """Half a pipe, a pipe without a wall, and one on nothing."""
+        """Return missing sizes, a pipe without a wall, or sizes without a string."""
         sizes = ("length_m", "outer_diameter_m", "inner_diameter_m")
         given = [name for name in sizes if values.get(name) is not None]
         if values.get("kind") == "none" and given:
@@ -197,24 +207,32 @@ class Load(DataModel):
 
 
 class Gear(DataModel):
-    """Between motor and main shaft."""
+    """The gear between motor and main shaft."""
 
     ratio: Ratio = Field(default=1.0, description="i = ω_motor / ω_main; J at the main shaft is J·i²")
 
 
 class DriveData(DataModel):
-    """What the drive does not tell of itself, and how far it can be trusted."""
+    """Facts that the drive does not report, and the uncertainty of its signals."""
 
-    rated_torque_nm: Torque | None = Field(default=None, description="N·m; name plate, where 6076h does not say")
+    rated_torque_nm: Torque | None = Field(default=None, description="N·m; from the name plate, if 6076h has none")
     torque_scale_rel_sd: float | None = Field(
-        default=None, ge=0, lt=1, description="standard deviation of the drive's torque scale, as a share (0.02 = 2 %)"
+        default=None, ge=0, lt=1,
+        description="standard uncertainty of the drive's torque scale, as a share (0.02 = 2 %)",
+    )
+    torque_calibration: str | None = Field(
+        default=None, min_length=1, description="file of `tdhil calibrate torque`, beside rig.yaml: every torque is"
+        " then in calibrated N·m, and its interval replaces torque_scale_rel_sd"
+    )
+    calibration_valid_days: Positive = Field(
+        default=365.0, description="days; an older torque calibration is used with a warning"
     )
     speed_lag_s: NotNegative | None = Field(default=None, description="s; time constant on the reported speed")
     speed_lag_sd_s: NotNegative | None = Field(default=None, description="s; its standard deviation")
     torque_lag_s: NotNegative | None = Field(default=None, description="s; time constant on the reported torque")
     torque_lag_sd_s: NotNegative | None = Field(default=None, description="s; its standard deviation")
     reference_filter_s: NotNegative | None = Field(
-        default=None, description="s; time constant of the drive's smoothing of its speed reference"
+        default=None, description="s; time constant of the drive's filter on its speed reference"
     )
     parameters: dict[str, float] = Field(
         default={}, description="drive parameters that can't be read over the bus, by the profile's names, in its units"
@@ -222,7 +240,7 @@ class DriveData(DataModel):
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """A deviation of nothing."""
+        """Return a standard deviation without its value."""
         return [
             (f"{name}_sd_s", f"needs {name}_s, the value that it is the deviation of")
             for name in ("speed_lag", "torque_lag")
@@ -231,19 +249,19 @@ class DriveData(DataModel):
 
 
 class Expected(DataModel):
-    """What is expected of the shaft, for planning before it has moved (`--dry-run`); never used for the result."""
+    """Expected values of the shaft, for planning before motion (`--dry-run`); never used for the result."""
 
     inertia_kg_m2: Inertia | None = Field(default=None, description="kg·m² at the motor")
     viscous_nm_s_rad: NotNegative | None = Field(default=None, description="N·m·s/rad")
     coulomb_nm: Annotated[float, _within(0.0, 1e7, zero=True)] | None = Field(default=None, description="N·m")
-    load_noise_nm: Torque | None = Field(default=None, description="N·m; standard deviation of what disturbs")
+    load_noise_nm: Torque | None = Field(default=None, description="N·m; standard deviation of the disturbing torque")
 
 
 def _only_the_operator() -> Iterator[tuple[str, str]]:
     for one in OPTIONS:
         if one.group is Topic.OVERRIDES and not one.at:
             flag = f"{one.flag} NAME" if one.joined else one.flag
-            text = (f"a file never speaks for who stands at the shaft; take the line out and give {flag} on the "
+            text = (f"belongs to one run, never to a file; remove the line and give {flag} on the "
                     "command line")
             yield one.name, text
             if one.joined:
@@ -254,12 +272,12 @@ _ONLY_THE_OPERATOR = dict(_only_the_operator())
 
 
 def attribute_of(key: str) -> str:
-    """The attribute of a key of rig.yaml: pydantic has methods of its own, such as ``json``."""
+    """Return the attribute of a key of rig.yaml. Pydantic has its own methods, such as ``json``."""
     return f"{key}_" if hasattr(BaseModel, key) else key
 
 
 def _with_options(section: str, base: type[DataModel]) -> Any:
-    """``base`` with a field for each option that may stand in this section of rig.yaml; None: not given."""
+    """Return ``base`` with a field for each option of this section of rig.yaml; None: not given."""
     found: dict[str, Any] = {}
     for one in OPTIONS:
         at, _, key = one.at.rpartition(".")
@@ -282,13 +300,13 @@ def _annotation(one: Option) -> Any:
 
 
 class _RunSection(DataModel):
-    """What the options of the command line say of a run; None = chosen by the plan, or by the default."""
+    """The options of a run. None: the plan, or the default, applies."""
 
     never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """Two clocks."""
+        """Return two clocks at once."""
         first, second = CLOCKS
         both = values.get(first) and values.get(second)
         return [(second, f"and {first} exclude each other; keep one")] if both else []
@@ -303,28 +321,28 @@ else:
 
 
 class Service(DataModel):
-    """What `tdhil serve` may do with this bench."""
+    """The rights of `tdhil serve` on this bench."""
 
     motion: Literal["never", "attended", "watched"] = Field(
         default="never",
-        description="who may move it from afar: nobody, with a code from whoever stands there, or watched as well",
+        description="remote motion: never, with a code from the operator at the rig, or also watched all the time",
     )
 
 
 class Rig(_Options):
-    """Everything that a bench has; each key is optional until something needs it."""
+    """The whole bench. Each key is optional until it is needed."""
 
     never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
-    name: str | None = Field(default=None, min_length=1, max_length=200, description="of the rig, for reports and logs")
+    name: str | None = Field(default=None, min_length=1, max_length=200, description="name of the rig, in reports")
     bus: Bus = Bus()
     modbus: Modbus = Modbus()
-    limits: Limits | None = Field(default=None, description="needed on everything but a simulated drive")
+    limits: Limits | None = Field(default=None, description="required unless the drive is simulated")
     gear: Gear = Gear()
     load: Annotated[Load, BeforeValidator(_load_of)] = Load()
-    make_up_torque_nm: Torque | None = Field(default=None, description="N·m at the motor; of the string's joints")
-    torque_ramp_nm_s: Positive | None = Field(default=None, description="N·m/s; how fast trapped torque is let go")
-    allow_reverse: bool = Field(default=False, description="may the shaft turn backwards? backs off tool joints")
+    make_up_torque_nm: Torque | None = Field(default=None, description="N·m at the motor; make-up torque of the joints")
+    torque_ramp_nm_s: Positive | None = Field(default=None, description="N·m/s; release rate of trapped torque")
+    allow_reverse: bool = Field(default=False, description="allow reverse rotation; it can unscrew tool joints")
     drive_data: DriveData = DriveData()
     expected: Expected = Expected()
     reference_inertia_kg_m2: Inertia | None = Field(default=None, description="kg·m² at the motor; shown beside J")
@@ -337,7 +355,7 @@ class Rig(_Options):
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """What a string needs, and limits that don't fit the rest."""
+        """Return missing keys of a string, and limits that contradict other keys."""
         load = _load_of(values.get("load"))
         is_string = isinstance(load, Mapping) and load.get("kind") == "string"
         findings = [
@@ -351,28 +369,28 @@ class Rig(_Options):
         if is_string and make_up and torque is not None and torque >= make_up:
             findings.append(("limits.torque_nm", f"must be below make_up_torque_nm, which is {make_up:g}"))
         if lowest is not None and lowest < 0 and values.get("allow_reverse") is False:
-            findings.append(("limits.speed_min_rad_s", "below 0 the shaft runs backwards: needs allow_reverse: true"))
+            findings.append(("limits.speed_min_rad_s", "below 0 the shaft turns backwards: needs allow_reverse: true"))
         if rate_hz and watchdog is not None and watchdog * rate_hz < 5:
             findings.append(("limits.watchdog_s", f"must span at least 5 cycles ({5 / rate_hz:g} s at rate_hz)"))
         return findings
 
     def line(self, dotted: str) -> int:
-        """The line in rig.yaml of a key such as ``limits.torque_nm``; 0 where it does not stand there."""
+        """Return the line in rig.yaml of a key such as ``limits.torque_nm``; 0 if it is not there."""
         return self._lines.get(tuple(dotted.split(".")), 0)
 
     def source(self, dotted: str) -> str:
-        """``rig.yaml:7``, or '' where the key does not stand in the file."""
+        """Return ``rig.yaml:7``, or '' if the key is not in the file."""
         line = self.line(dotted)
         return f"{Path(self._file).name}:{line}" if line else ""
 
     @property
     def conversions(self) -> tuple[tuple[str, str, str], ...]:
-        """(key, '100 rpm = 10.47 rad/s', 'rig.yaml:7') of everything that stood there in a unit of its own."""
+        """Return (key, '100 rpm = 10.47 rad/s', 'rig.yaml:7') of every value that had a unit."""
         keys = [".".join(map(str, one.path)) for one in self._conversions]
         return tuple((key, one.text, self.source(key)) for key, one in zip(keys, self._conversions, strict=True))
 
     def get(self, dotted: str) -> Any:
-        """The value of a key such as ``run.seed``."""
+        """Return the value of a key such as ``run.seed``."""
         value: Any = self
         for part in dotted.split("."):
             value = getattr(value, attribute_of(part))
@@ -380,22 +398,22 @@ class Rig(_Options):
 
     @property
     def file(self) -> str:
-        """The file that it was read from; '' for none."""
+        """Return the file that it was read from; '' for none."""
         return self._file
 
     @property
     def folder(self) -> Path:
-        """Where the files that rig.yaml names are looked for."""
+        """Return the folder in which relative paths of rig.yaml start."""
         return Path(self._file).parent
 
 
 def load_rig(path: Path) -> Rig:
-    """The bench in a rig.yaml; DataFileError with every problem and its line. Values with a unit become SI."""
+    """Return the bench of a rig.yaml, in SI. Raises DataFileError with every problem and its line."""
     return _rig_of(load_with_lines(path, Rig, convert=True))
 
 
 def parse_rig(text: str, name: str) -> Rig:
-    """The same of a text that stands in no file yet; ``name`` is what problems are told of."""
+    """Return the bench of a text that is not in a file yet; ``name`` stands in the problems."""
     return _rig_of(parse_with_lines(text, name, Rig, convert=True))
 
 
@@ -406,14 +424,15 @@ def _rig_of(loaded: Loaded[Rig]) -> Rig:
 
 
 def require_limits(rig: Rig | None) -> Limits:
-    """The limits, without which nothing real moves; PreflightRefused, naming the keys, where there are none."""
+    """Return the limits. Raises PreflightRefused with the missing keys: no real shaft moves without limits."""
     if rig is not None and rig.limits is not None:
         return rig.limits
     keys = ", ".join(name for name, field in Limits.model_fields.items() if field.is_required())
     file = rig._file if rig is not None and rig._file else ""
     where = file or "rig.yaml"
     step = f"Add a section limits: with {keys} (docs: rig.yaml)" + ("" if file else ", and name the file with --rig")
-    raise PreflightRefused("no machine limits for a drive that is not simulated", where=where, next_step=step)
+    raise PreflightRefused("no machine limits for a drive that is not simulated", where=where, next_step=step,
+                           entry=MessageCode.NO_LIMITS)
 
 
 _SIMULATED_LIMITS = Limits(
@@ -430,7 +449,7 @@ _SIMULATED_TORQUE_SCALE_SD = 0.02
 
 
 def simulated_default_rig(rig: Rig | None = None) -> Rig:
-    """The bench of the simulated rig; what ``rig`` says goes before it. DataFileError where they don't fit."""
+    """Return the bench of the simulated rig; ``rig`` overrides it. Raises DataFileError if they contradict."""
     rig = rig or Rig()
     data = rig.model_dump(by_alias=True)
     data["limits"] = data["limits"] or _SIMULATED_LIMITS.model_dump()

@@ -75,9 +75,10 @@ class Measured:
 
 @dataclass(frozen=True)
 class Difference:
-    """From one result to another. ``change`` with its interval is a share of the first where ``relative``, else
-    absolute. ``probability``: that the true change has the sign that was found. ``shared_scale``: the torque scale is
-    the same in both and has cancelled.
+    """Difference of two results. ``change`` with its interval is a share of the first if ``relative``, else absolute.
+
+    ``probability``: that the true change has the sign that was found. ``shared_scale``: the torque scale is the same in
+    both and cancels.
     """
 
     change: float
@@ -90,12 +91,12 @@ class Difference:
 
     @property
     def differs(self) -> bool:
-        """Does the interval leave out zero?"""
+        """True if the interval excludes zero."""
         return self.low > 0.0 or self.high < 0.0
 
 
 def difference(before: Measured, after: Measured, confidence: float = 0.95) -> Difference:
-    """What changed from one result to another, and how sure that is. Raises ValueError for intervals that are none."""
+    """Return the change between two results, with its probability. Raises ValueError for invalid intervals."""
     relative = all(min(one.value, one.low) > 0.0 for one in (before, after))
     shared = before.drive is not None and before.drive == after.drive
     (x_a, sd_a), (x_b, sd_b) = (_on_scale(one, relative) for one in (before, after))
@@ -120,8 +121,8 @@ class ChangePoint:
 
 @dataclass(frozen=True)
 class History:
-    """What a history says. ``none``, ``step`` and ``drift`` add up to one; of ``changes`` and ``drift_change`` there is
-    nothing where "no change" isn't ruled out. ``drift_change``: from the first result to the last.
+    """Statement on a history. ``none``, ``step`` and ``drift`` add up to one. ``changes`` and ``drift_change`` are
+    empty unless "no change" is excluded. ``drift_change``: from the first result to the last.
     """
 
     none: float
@@ -133,7 +134,7 @@ class History:
 
     @property
     def changed(self) -> bool:
-        """Is "no change" ruled out?"""
+        """True if "no change" is excluded."""
         return self.none < ALARM
 
 

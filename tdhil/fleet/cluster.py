@@ -15,7 +15,7 @@ from contextlib import suppress
 from importlib import metadata
 from typing import Any, Final, TypeVar
 
-from tdhil.errors import TdhilError, UsageError
+from tdhil.errors import MessageCode, TdhilError, UsageError
 from tdhil.process_pool import Loss, Pool, TaskLimits
 from tdhil.version import __version__
 
@@ -27,12 +27,12 @@ _AHEAD: Final = 4                       # tasks for each thread of the cluster
 _RESUBMIT: Final = 5
 _PATIENCE_S: Final = 60.0               # without a single worker
 _LOOK_S: Final = 10.0
-_ASK_S: Final = 0.5                     # how often somebody is asked whether to stop
+_ASK_S: Final = 0.5                     # interval of asking the caller whether to stop
 _here = threading.local()
 
 
 def versions() -> dict[str, str]:
-    """What a worker must have in common with its host, by name."""
+    """Return what a worker must have in common with its host, by name."""
     found = {"python": ".".join(platform.python_version_tuple()[:2]), "tdhil": __version__}
     for name in _ASKED:
         try:
@@ -66,7 +66,7 @@ def run_on_cluster(
         client = distributed.Client(address, timeout="10s", set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise UsageError(f"no Dask scheduler answers: {error}", where=f"--scheduler {address}",
-                         next_step="Start one with: dask scheduler") from error
+                         next_step="Start one with: dask scheduler", entry=MessageCode.CLUSTER_UNUSABLE) from error
     with client:
         threads = _check(client, address)
         yield from _results(distributed, client, function, tasks, limits, threads * _AHEAD, stop)
@@ -107,7 +107,8 @@ def _results(
                 yield task, result
                 continue
             if not isinstance(failure, distributed.scheduler.KilledWorker):
-                raise TdhilError(f"a worker of the cluster failed: {failure!r}", where="fleet")
+                raise TdhilError(f"a worker of the cluster failed: {failure!r}", where="fleet",
+                                 entry=MessageCode.WORKER_PROCESS_LOST)
             if tries < _RESUBMIT:
                 submit(task, tries + 1)
             else:
@@ -126,6 +127,7 @@ def _done(distributed: Any, client: Any, futures: list[Any], stop: Callable[[], 
             raise TdhilError(
                 f"the cluster has had no worker for {empty_s:.0f} s; what is done is kept", where="fleet",
                 next_step="Start workers, and the same command again",
+                entry=MessageCode.WORKER_PROCESS_LOST,
             )
     return []
 
@@ -137,18 +139,20 @@ def _check(client: Any, address: str) -> int:
         theirs = client.run(versions, on_error="return")
     except Exception as error:
         raise UsageError(f"its workers can't be asked for their versions: {error}", where=f"--scheduler {address}",
-                         next_step=f"Install tdhil {__version__} where they run") from error
+                         next_step=f"Install tdhil {__version__} where they run",
+                         entry=MessageCode.CLUSTER_UNUSABLE) from error
     if not theirs:
         raise UsageError("the scheduler has no workers", where=f"--scheduler {address}",
-                         next_step=f"Start some with: dask worker {address}")
+                         next_step=f"Start some with: dask worker {address}", entry=MessageCode.CLUSTER_UNUSABLE)
     for worker, found in sorted(theirs.items()):
         if not isinstance(found, dict):
             raise UsageError(f"{worker} can't run it: {found!r}", where=f"--scheduler {address}",
-                             next_step=f"Install tdhil {__version__} there")
+                             next_step=f"Install tdhil {__version__} there", entry=MessageCode.CLUSTER_UNUSABLE)
         odd = [f"{name} {found.get(name)} (here {one})" for name, one in wanted.items() if found.get(name) != one]
         if odd:
             raise UsageError(f"{worker} has {', '.join(odd)}", where=f"--scheduler {address}",
-                             next_step="Rows would differ by who reckoned them: install the same versions")
+                             next_step="Rows would differ by who reckoned them: install the same versions",
+                             entry=MessageCode.CLUSTER_UNUSABLE)
     return int(sum(client.nthreads().values()))
 
 
@@ -157,4 +161,5 @@ def _distributed() -> Any:
         return importlib.import_module("distributed")
     except ImportError as error:
         raise UsageError("distributed is not installed", where="--scheduler",
-                         next_step="Install it with: pip install '.[cluster]'") from error
+                         next_step="Install it with: pip install '.[cluster]'",
+                         entry=MessageCode.PACKAGE_MISSING) from error

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from tdhil.errors import LogError, TdhilError, UsageError
+from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
 from tdhil.fleet.rows import FleetRow, FleetSettings, failure_row, row_key
 from tdhil.fleet.table import Journal, check_table_path, write_table
 from tdhil.fleet.task import Done, LogTask, content_hash, identify_log, remote, sidecar_of, told_of
@@ -42,14 +42,14 @@ class FleetRequest:
 
     @property
     def folder(self) -> Path:
-        """What is kept beside the table: the journal, and the recordings."""
+        """Folder beside the table with the journal and the recordings."""
         return self.out.with_name(f"{self.out.name}.work")
 
 
 @dataclass(frozen=True)
 class FleetSummary:
-    """What came of it, the rows by log. ``done_before``: rows that were there already; ``live``: logs that are being
-    written; ``bare_traces``: CSV files without a sidecar; ``slowest``: log and CPU time in s; ``left``: not done yet.
+    """Result of a fleet, rows by log. ``done_before``: rows that existed before; ``live``: logs that are being written;
+    ``bare_traces``: CSV files without a sidecar; ``slowest``: log and CPU time in s; ``left``: logs still to do.
     """
 
     rows: tuple[FleetRow, ...]
@@ -64,7 +64,7 @@ class FleetSummary:
     interrupted: bool = False
 
     def document(self) -> dict[str, Any]:
-        """As ``--json`` prints it."""
+        """Return the document that ``--json`` prints."""
         changed = [row for row in self.rows if row.changed]
         return {
             "out": str(self.out),
@@ -102,7 +102,7 @@ class Progress(Protocol):
     """Told how it goes."""
 
     def start(self, total: int, done: int) -> None:
-        """So many logs, of which so many are done."""
+        """Start the progress of ``total`` logs, of which ``done`` are done."""
 
     def done(self, row: FleetRow) -> None:
         """One more."""
@@ -132,7 +132,8 @@ def run_fleet(
     found = find_logs(request.roots)
     if not found.logs and not found.live:
         raise UsageError("no log is there", where=", ".join(request.roots),
-                         next_step="Logs end in .mcap; a trace in .csv needs a .yaml of the same name beside it")
+                         next_step="Logs end in .mcap; a trace in .csv needs a .yaml of the same name beside it",
+                         entry=MessageCode.NO_LOGS_FOUND)
     progress = progress or _Silent()
     with Journal(request.folder) as journal, ExitStack() as stack:
         rows, todo = _known(request, journal, found.logs)
@@ -291,12 +292,13 @@ def find_logs(roots: Sequence[str]) -> FoundLogs:
                     if name.lower().endswith((".mcap", ".csv")):
                         _sort_in(Path(folder) / name, logs, live, bare, named=False)
         else:
-            raise UsageError("there is no such file or folder", where=root, next_step=_meant(path))
+            raise UsageError("there is no such file or folder", where=root, next_step=_meant(path),
+                             entry=MessageCode.FILE_NOT_FOUND)
     return FoundLogs(tuple(sorted(logs)), tuple(sorted(live)), tuple(sorted(bare)))
 
 
 def _meant(path: Path) -> str:
-    """What stands there under a name much like it."""
+    """Return a suggestion if a similar name exists."""
     from difflib import get_close_matches
 
     with suppress(OSError):

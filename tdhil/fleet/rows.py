@@ -21,27 +21,27 @@ UNREAD: Final = "unread"
 
 @dataclass(frozen=True)
 class FleetSettings:
-    """What is asked of every log alike; None: as each run had it (`tdhil.identify`)."""
+    """Settings for every log; None: as each run had it (`tdhil.identify`)."""
 
     model: str | None = None
     confidence: float | None = None
     tolerance: float | None = None
 
     def asked(self) -> dict[str, Any]:
-        """What was said, by name."""
+        """Return the given settings, by name."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True)
 class FleetRow:
-    """What one log gave. SI at the motor shaft; ``low`` to ``high`` is the interval at ``confidence``.
+    """Result of one log. SI at the motor shaft; ``low`` to ``high`` is the interval at ``confidence``.
 
-    Of the inertia ``low`` to ``high`` is the repeatability on this drive, ``low_total`` to ``high_total`` has the
-    torque scale in it, which is right to ``torque_scale_rel_sd`` (1 sd, a share). ``stored_…`` is the result that the
-    run left in its log, ``changed`` whether this one differs from it. A run that was aborted has its result from what
-    came before: ``aborted_stage`` is the stage that gave up, ``aborted_by`` the kind of error that ended it;
-    ``complete`` is False where the log ended before the run did. None: not known, or there is none. No field depends
-    on which machine or process did it, nor on when.
+    For the inertia ``low`` to ``high`` is the repeatability on this drive; ``low_total`` to ``high_total`` include the
+    torque scale with its standard uncertainty ``torque_scale_rel_sd`` (a share). ``torque_calibration`` is the date of
+    the calibration that it comes from. ``stored_…`` is the result that the run left in its log; ``changed``: this
+    result differs from it. The result of an aborted run uses the data before the abort: ``aborted_stage`` is the stage
+    that was aborted, ``aborted_by`` the kind of error that ended it. ``complete`` is False if the log ended before the
+    run. None: unknown, or absent. No field depends on the machine, the process or the time of the calculation.
     """
 
     log: str
@@ -58,6 +58,7 @@ class FleetRow:
     inertia_high_total_kg_m2: float | None = None
     confidence: float | None = None
     torque_scale_rel_sd: float | None = None
+    torque_calibration: str | None = None
     gear_ratio: float | None = None
     viscous_nm_s_rad: float | None = None
     viscous_low_nm_s_rad: float | None = None
@@ -118,7 +119,7 @@ class FleetRow:
 
     @property
     def failed(self) -> bool:
-        """Is it the row of a log that gave nothing?"""
+        """True for the row of a log without a result."""
         return self.error_kind is not None
 
     @property
@@ -143,7 +144,7 @@ def counted(count: int, noun: str) -> str:
 
 
 def row_key(sha256: str, settings: FleetSettings) -> str:
-    """What a result hangs on: the file's content, this program's version, what was asked for."""
+    """Return the key of a result: the file's content, the version of tdhil, and the settings."""
     text = json.dumps([ROW_FORMAT, __version__, sha256, settings.asked()], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -211,6 +212,9 @@ def row_of(
         estimate = source.get(f"{name}_{unit}") or {}
         found[f"{name}_{unit}"] = estimate.get("value")
         found |= {f"{name}_{end}_{unit}": estimate.get(end) for end in ("low", "high")}
+    calibration = document.get("torque_calibration")
+    if isinstance(calibration, Mapping):
+        facts |= {"torque_calibration": calibration.get("date"), "torque_scale_rel_sd": calibration.get("rel_sd")}
     was = _stored(stored)
     now = (document["verdict"], inertia.get("value"))
     known: dict[str, Any] = found | facts | {

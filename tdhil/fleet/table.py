@@ -1,4 +1,4 @@
-"""Where rows are kept: a journal as they come, and the table, Parquet, CSV or SQLite by its ending."""
+"""Storage of rows: a journal as they come, and the table, Parquet, CSV or SQLite by its ending."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from tdhil.csv_text import cell_of, text_of
-from tdhil.errors import LogBroken, LogUnopened, UsageError
+from tdhil.errors import LogBroken, LogUnopened, MessageCode, UsageError
 from tdhil.fleet.rows import COLUMNS, FleetRow, row_from_json
 
 _TABLE: Final = "fleet"
@@ -60,7 +60,7 @@ class Journal(AbstractContextManager["Journal"]):
         self._learn(row, key, stamp)
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the journal."""
         with suppress(OSError):
             self._file.close()
 
@@ -95,7 +95,8 @@ class Journal(AbstractContextManager["Journal"]):
         except OSError:
             self._file.close()
             raise UsageError("another fleet is at work on it", where=str(self._path),
-                             next_step="Wait for it, or choose another --out") from None
+                             next_step="Wait for it, or choose another --out",
+                             entry=MessageCode.FLEET_TABLE_WRONG) from None
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -112,7 +113,7 @@ def check_table_path(path: Path, folder: Path) -> None:
         load_duckdb()
     if path.exists() and not folder.is_dir():
         raise UsageError("is a file that no fleet wrote; it is left as it is", where=f"--out {path}",
-                         next_step="Name another")
+                         next_step="Name another", entry=MessageCode.FLEET_TABLE_WRONG)
 
 
 def write_table(rows: Sequence[FleetRow], path: Path) -> None:
@@ -137,7 +138,8 @@ def read_table(path: Path) -> list[FleetRow]:
         ".parquet": _read_parquet, ".csv": _read_csv, ".sqlite": _read_sqlite,
     }
     if path.suffix not in readers or not path.is_file():
-        raise UsageError("there is no such table", where=str(path), next_step="Name one that `tdhil fleet` wrote")
+        raise UsageError("there is no such table", where=str(path), next_step="Name one that `tdhil fleet` wrote",
+                         entry=MessageCode.FLEET_TABLE_WRONG)
     try:
         return [row_from_json({name: value for name, value in row.items() if name in COLUMNS})
                 for row in readers[path.suffix](path)]
@@ -145,14 +147,14 @@ def read_table(path: Path) -> list[FleetRow]:
         raise
     except Exception as error:
         raise UsageError(f"is no table of a fleet: {error}", where=str(path),
-                         next_step="Name one that `tdhil fleet` wrote") from error
+                         next_step="Name one that `tdhil fleet` wrote", entry=MessageCode.FLEET_TABLE_WRONG) from error
 
 
 def _writer(path: Path) -> Callable[[list[dict[str, Any]], Path], None]:
     writers = {".parquet": _write_parquet, ".csv": _write_csv, ".sqlite": _write_sqlite}
     if path.suffix not in writers:
         raise UsageError("ends neither in .parquet nor in .csv nor in .sqlite", where=f"--out {path}",
-                         next_step="Such as --out fleet.csv")
+                         next_step="Such as --out fleet.csv", entry=MessageCode.VALUE_NOT_ALLOWED)
     return writers[path.suffix]
 
 
@@ -169,6 +171,7 @@ def load_duckdb(where: str = "--out", otherwise: str = "end it in .csv or .sqlit
         python = shlex.quote(sys.executable or "python")
         raise UsageError("Parquet needs duckdb, not installed here", where=where,
                          next_step=f"Install: {python} -m pip install 'duckdb>=1.1,<2'; or {otherwise}",
+                         entry=MessageCode.PACKAGE_MISSING,
                          ) from error
 
 

@@ -1,4 +1,4 @@
-"""One log in, one row out: the same function for the pool, for a cluster, and for whoever calls it himself."""
+"""One log in, one row out: the same function for the pool, a cluster, and any other caller."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from pydantic import Field
 
 from profiles import DataModel
-from tdhil.errors import LogError, NothingRecoverable, TdhilError, UsageError
+from tdhil.errors import LogError, MessageCode, NothingRecoverable, TdhilError, UsageError
 from tdhil.fleet.rows import FleetRow, FleetSettings, failure_row, row_of
 from tdhil.version import __version__
 
@@ -60,7 +60,7 @@ def identify_log(task: LogTask) -> Done:
 
 
 def _text(error: Exception) -> str:
-    """What a row says of it; of an error of our tree without the place, which is the row's own."""
+    """Return the error's text for a row; for an error of our tree without the place, which the row has."""
     if isinstance(error, TdhilError):
         return error.what if not error.next_step else f"{error.what}. {error.next_step}"
     if isinstance(error, OSError):
@@ -123,7 +123,7 @@ class Sidecar(DataModel):
 
 
 def sidecar_of(trace: Path) -> Path:
-    """Where what is known of a trace in CSV stands: the same name, ending .yaml."""
+    """Return the path of a CSV trace's sidecar: the same name, ending .yaml."""
     return trace.with_suffix(".yaml")
 
 
@@ -158,7 +158,7 @@ def read_any(path: Path) -> RunRecord:
 
 
 def _known(trace: Path) -> Sidecar:
-    """What its sidecar says. Raises DataFileError with every problem and its line."""
+    """Return the content of the sidecar. Raises DataFileError with every problem and its line."""
     from profiles import load_model
 
     side = sidecar_of(trace)
@@ -212,13 +212,14 @@ def remote(url: str) -> tuple[Any, str]:
     except ImportError as error:
         extra = "s3" if url.startswith(("s3://", "s3a://")) else "cluster"
         raise UsageError(f"a library for this address is missing: {error}", where=url,
-                         next_step=f"Install: pip install 'tdhil[{extra}]', and what the message names") from error
+                         next_step=f"Install: pip install 'tdhil[{extra}]', and what the message names",
+                         entry=MessageCode.PACKAGE_MISSING) from error
     return system, inside
 
 
 @contextmanager
 def told_of(url: str) -> Iterator[None]:
-    """What libraries behind fsspec raise of trees of their own (no credentials, no network) is a LogError here."""
+    """Convert errors of libraries behind fsspec (no credentials, no network) to a LogError."""
     try:
         yield
     except (OSError, ImportError):
@@ -228,7 +229,7 @@ def told_of(url: str) -> Iterator[None]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The cache: recordings that were read, by their file's content. What is damaged in it is read anew, and written anew.
+# Cache of recordings by the content of their files. A damaged entry is read again from its log and rewritten.
 
 
 def _from_cache(kept: Path) -> RunRecord | None:

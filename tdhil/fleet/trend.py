@@ -47,23 +47,28 @@ def measured(row: FleetRow, quantity: Quantity, time: float = 0.0) -> Measured |
         return None
     # Friction and lags are stated at the confidence of the run's own settings, which is J's.
     scale = (row.torque_scale_rel_sd or 0.0) if quantity.scaled else 0.0
-    return Measured(value, low, high, row.confidence or 0.95, scale, drive_of(row), time)
+    return Measured(value, low, high, row.confidence or 0.95, scale, scale_of(row), time)
 
 
 def drive_of(row: FleetRow) -> str | None:
-    """Whose torque scale it is. A drive without a serial number is taken for its rig's, by name and profile."""
+    """Return the drive whose torque scale applies. Without a serial number it is the rig's, by name and profile."""
     if row.drive_serial:
         return f"{row.drive_vendor}:{row.drive_product}:{row.drive_serial}"
     named = (row.rig, row.drive_name, row.profile)
     return None if row.rig is None else "assumed " + "|".join(str(one) for one in named)
 
 
+def scale_of(row: FleetRow) -> str | None:
+    """Which torque scale it is: the drive's, since its torque calibration. Another one stays in a difference."""
+    drive = drive_of(row)
+    return drive if drive is None or row.torque_calibration is None else f"{drive} calibrated {row.torque_calibration}"
+
+
 def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str, Any]:
-    """What a rig's results say over time, as ``tdhil trend --json`` prints it. Raises UsageError for an unknown rig.
+    """Return a rig's results over time, as ``tdhil trend --json`` prints them. Raises UsageError for an unknown rig.
 
-    None: the one rig that the table names; where it names more, a UsageError lists them.
-
-    Only results that stand count. Differences have the torque scale taken out where it is one drive's.
+    None: the one rig in the table; with several rigs a UsageError lists them. Only valid results count. The torque
+    scale cancels in differences of one drive.
     """
     known = sorted({row.rig for row in rows if row.rig is not None})
     if rig is None and len(known) == 1:
@@ -94,6 +99,11 @@ def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str
     drives = {drive_of(row) for _, row in kept}
     if len(drives) > 1:
         notes.append(f"{len(drives)} drives: each has a torque scale of its own, which stays in their differences")
+    calibrations = sorted({row.torque_calibration or "" for _, row in kept})
+    if len(calibrations) > 1:
+        told = ", ".join(one[:10] or "none" for one in calibrations)
+        notes.append(f"runs with different torque calibrations ({told}): each has a torque scale of its own, which"
+                     " stays in their differences")
     if any((one or "assumed").startswith("assumed") for one in drives):
         notes.append("the drive tells no serial number: runs on this rig are taken for runs on one drive")
     return {
@@ -220,6 +230,7 @@ def _settings(
         "cycles, Hz": (document.get("cycle") or {}).get("rate_hz"),
         "gear": recording.gear_ratio,
         "torque scale, 1 sd": row.torque_scale_rel_sd,
+        "torque calibration": None if row.torque_calibration is None else row.torque_calibration[:10],
         "torque limit, N·m": recording.torque_limit_nm,
         "speed window, rad/s": f"{limits['speed_min_rad_s']:g} to {limits['speed_max_rad_s']:g}"
         if {"speed_min_rad_s", "speed_max_rad_s"} <= set(limits) else None,
@@ -284,7 +295,8 @@ def _compare_text(first: FleetRow, other: FleetRow, quantities: Sequence[Mapping
         return f"the inertia can't be compared: {without.log} has no result that stands ({without.verdict})"
     told = Difference(**{name: inertia[name] for name in Difference.__dataclass_fields__})
     scale = "the torque scale is one drive's and cancels" if told.shared_scale else (
-        "two drives: the torque scale of each is in it")
+        "two torque calibrations: the scale of each is in it" if first.torque_calibration != other.torque_calibration
+        else "two drives: the torque scale of each is in it")
     if told.shared_scale and not (first.drive_serial and other.drive_serial):
         scale = "no serial numbers: taken for one drive, whose torque scale cancels"
     says = "differ" if told.differs else "can't be told apart"

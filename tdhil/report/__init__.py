@@ -26,6 +26,14 @@ if TYPE_CHECKING:
         repeatable_figures as repeatable_figures, require_extra as require_extra,
     )
     from tdhil.report.plots import draw_run as draw_run
+    from tdhil.report.speed_calibration import (
+        print_speed_calibration as print_speed_calibration, speed_document as speed_document,
+    )
+    from tdhil.report.torque_calibration import (
+        calibration_document as calibration_document, calibration_report as calibration_report,
+        draw_calibration as draw_calibration, pairs_document as pairs_document, print_calibration as print_calibration,
+        print_pairs as print_pairs, write_calibration_report as write_calibration_report,
+    )
     from tdhil.report.tuning import (
         TunedFor as TunedFor, print_tuning as print_tuning, showcase_of as showcase_of,
         tuning_document as tuning_document, write_tuning_report as write_tuning_report,

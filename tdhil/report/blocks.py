@@ -1,4 +1,4 @@
-"""What a report says, in order, whatever it is written as: HTML and PDF show the same blocks.
+"""Content of a report, in order, for any output: HTML and PDF show the same blocks.
 
 Everything comes from the result document and the recording; lengths of pictures are in inches of a page 7 inches wide.
 """
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from tdhil.recording import Recording
 from tdhil.report.card import COMPLIANT, estimate_text, inertia_text, minutes, plus_minus, rounded, sentence
-from tdhil.report.document import SIMULATED
+from tdhil.report.document import SIMULATED, coded_reason, coded_warnings
 
 if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
@@ -117,7 +117,7 @@ def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
         subtitle=" · ".join(facts),
         simulated=f"{SIMULATED}: drive and rig are simulated, nothing real turned" if document["simulated"] else "",
         answer=_answer(document),
-        warnings=tuple(document["warnings"]),
+        warnings=coded_warnings(document),
         sections=tuple(section for section in _sections(document, recording, sha256) if section.blocks),
         footer=f"tdhil {document['tdhil']}" + (f" · log SHA-256 {sha256[:16]}…" if sha256 else ""),
     )
@@ -153,7 +153,7 @@ def _answer(document: Part) -> AnswerBox:
         value=value,
         lines=tuple(lines),
         verdict=_VERDICTS.get(document["verdict"], str(document["verdict"])),
-        reason=sentence(document["reason"]),
+        reason=coded_reason(sentence(document["reason"]), document),
         advice=sentence(document["advice"]),
     )
 

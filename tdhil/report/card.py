@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import SIMULATED
+from tdhil.report.document import SIMULATED, coded_reason, coded_warnings
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Numbers as people read them: as many digits as the interval bears, and no more.
@@ -90,12 +90,12 @@ COMPLIANT = (
 
 
 def compliant_rows(document: Mapping[str, Any]) -> Iterator[Row]:
-    """What turns behind the spring; a quantity that the data leave open is said to be so."""
+    """Yield the rows of the inertia behind the spring; a quantity that the data leave open is marked."""
     shaft = document["compliant"]
     if shaft is None:
         return
     yield "shaft", "compliant: J above is the motor's side, J_r"
-    if all(shaft[key] is None for _, key, _ in COMPLIANT):      # nobody looked below the motor
+    if all(shaft[key] is None for _, key, _ in COMPLIANT):      # nothing below the motor was measured
         return
     for title, key, unit in COMPLIANT:
         part = shaft[key]
@@ -103,7 +103,7 @@ def compliant_rows(document: Mapping[str, Any]) -> Iterator[Row]:
 
 
 def impedance_rows(document: Mapping[str, Any]) -> Iterator[Row]:
-    """What the drive's own speed loop is, where that was measured; |r| where a string was named."""
+    """Yield the rows of the drive's speed loop, if measured; |r| if a string was given."""
     found = document.get("impedance")
     if found is None:
         return
@@ -132,7 +132,7 @@ _BY = {"offset": "torque offset", "reference": "speed reference"}
 
 
 def opinion_rows(document: Mapping[str, Any]) -> Iterator[Row]:
-    """Every second opinion, and whether it agrees with the result."""
+    """Yield every cross-check, and whether it agrees with the result."""
     for opinion in document["second_opinions"]:
         word, style = _AGREES[opinion["agrees"]]
         value = estimate_text(opinion["inertia_kg_m2"], "kg·m²")
@@ -149,7 +149,7 @@ def friction_rows(document: Mapping[str, Any], to_a_line: int = 2) -> Iterator[R
 
 
 def budget_table(budget: Sequence[Mapping[str, Any]], value: float, notes: bool = True) -> Table:
-    """Where the interval comes from, line by line, largest first; ``notes``: and what is meant."""
+    """Return the uncertainty budget, largest contribution first; ``notes``: with explanations."""
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim", no_wrap=True)
     table.add_column(justify="right", no_wrap=True)
@@ -238,10 +238,10 @@ def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
     body: list[RenderableType] = [rows, Text()]
     if inertia is not None and document["budget"]:
         body += [budget_table(document["budget"], inertia["value"], not narrow), Text()]
-    body.append(Text(sentence(document["reason"])))
+    body.append(Text(coded_reason(sentence(document["reason"]), document)))
     if document["advice"]:
         body.append(Text(sentence(document["advice"]), style="italic"))
-    body += [Text(f"! {warning}", style="yellow") for warning in document["warnings"]]
+    body += [Text(f"! {warning}", style="yellow") for warning in coded_warnings(document)]
     body.append(Text(f"log: {document['log']}", style="dim", overflow="fold"))
     title = "J at the motor shaft" if narrow else "moment of inertia at the motor shaft"
     title += f" · {SIMULATED}" if document["simulated"] else ""

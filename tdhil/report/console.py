@@ -26,12 +26,12 @@ class PlainConsole(Console):
                 yield segment
 
     def on_broken_pipe(self) -> None:
-        """Leave it to whoever prints: rich would end the process with 1, which is a mistake of this program."""
+        """Leave a broken pipe to the caller: rich would end the process with 1, the code of an internal error."""
         raise  # noqa: PLE0704 (rich calls this where it has caught the BrokenPipeError)
 
 
 def names_and_texts(rows: Iterable[tuple[str, RenderableType]], *, quiet: bool = False) -> Table:
-    """Names, dim, and beside each what it is, folded where the console ends; ``quiet``: that dim, too."""
+    """Return names, dim, each with its text, folded at the console's width; ``quiet``: the text is dim too."""
     grid = Table.grid(padding=(0, 2))
     grid.add_column(style="dim", no_wrap=True)
     grid.add_column(style="dim" if quiet else None, overflow="fold")

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
+from profiles import MessageCode, entry_of, with_code
+from tdhil.calibration import CalibrationUnusable, StoredCalibration
 from tdhil.estimation import Identification, InertiaEstimate
 from tdhil.recording import Recording
 from tdhil.version import __version__
@@ -27,6 +29,7 @@ def result_document(
         "model": found.model,
         "reason": found.reason,
         "advice": found.advice,
+        "code": found.entry.code,
         "inertia_kg_m2": _inertia(found.inertia),
         "inertia_main_shaft_kg_m2": _at_main_shaft(found.inertia, recording.gear_ratio),
         "gear_ratio": recording.gear_ratio,
@@ -50,10 +53,12 @@ def result_document(
         "periods_used": found.periods_used,
         "samples_used": found.samples_used,
         "warnings": list(found.warnings),
+        "warning_codes": [entry_of(one, MessageCode.RESULT_WARNING).code for one in found.warnings],
         "simulated": recording.simulated,
         "complete": recording.complete,
         "ended": _mapping(run.get("ended")),
         **provenance(run),
+        "torque_calibration": _calibration(run.get("torque_calibration")),
         "log": log,
         "cycles": run.get("counters"),
         "cycle": run.get("cycle"),
@@ -69,6 +74,30 @@ def result_document(
     cleaned = _finite(document)
     assert isinstance(cleaned, dict)
     return cleaned
+
+
+def _calibration(stored: Any) -> dict[str, Any] | None:
+    """Of the torque calibration in the log: the factor and the date; None without one."""
+    if stored is None:
+        return None
+    try:
+        found = StoredCalibration.of(stored)
+    except CalibrationUnusable:
+        return None
+    return {"factor": found.factor, "low": found.low, "high": found.high, "rel_sd": found.rel_sd, "date": found.date}
+
+
+def coded_reason(reason: str, document: Mapping[str, Any]) -> str:
+    """Return the reason of a verdict with its code; without one for a valid result, which has nothing to look up."""
+    code = str(document.get("code", ""))
+    return with_code(reason, "" if code == MessageCode.VALID.code else code)
+
+
+def coded_warnings(document: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the warnings of a result as a person sees them, with their codes; a document of before 0.3 has none."""
+    codes = [str(code) for code in document.get("warning_codes", ())]
+    warnings = [str(one) for one in document["warnings"]]
+    return tuple(map(with_code, warnings, codes + [""] * (len(warnings) - len(codes))))
 
 
 def provenance(run: Mapping[str, Any]) -> dict[str, Any]:

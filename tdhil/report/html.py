@@ -11,7 +11,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 from tdhil.recording import Recording
 from tdhil.report.blocks import WIDTH_IN, Picture, Report, report_of
 from tdhil.report.page import inline_svg, require_extra
@@ -29,16 +29,22 @@ def check_report_path(path: Path, log: Path, where: str = "--report") -> None:
     """Before anything moves: can a report be made, and put there? Never over an older file. Raises UsageError."""
     require_extra(where)
     if path.resolve() == log.resolve():
-        raise UsageError("is the log itself", where=f"{where} {path}", next_step="Such as report.html or report.pdf")
+        raise UsageError("is the log itself", where=f"{where} {path}", next_step="Such as report.html or report.pdf",
+                         entry=MessageCode.SAME_FILE_TWICE)
     if path.is_dir():
-        raise UsageError("is a folder; a report is a file", where=f"{where} {path}", next_step="Such as report.html")
+        raise UsageError("is a folder; a report is a file", where=f"{where} {path}", next_step="Such as report.html",
+                         entry=MessageCode.FILE_NOT_WRITABLE)
     if path.exists() and (path.is_file() or path.is_symlink()):
         raise UsageError("is there already, and is left as it is", where=f"{where} {path}",
-                         next_step=f"Name another file, such as {fresh(path).name}, or move that one away")
+                         next_step=f"Name another file, such as {fresh(path).name}, or move that one away",
+                         entry=MessageCode.FILE_EXISTS)
     if path.suffix.lower() not in _SUFFIXES and not path.exists():      # what exists here is a device
-        raise UsageError("ends neither in .html nor in .pdf", where=f"{where} {path}", next_step="Such as report.html")
+        raise UsageError("ends neither in .html nor in .pdf", where=f"{where} {path}",
+                         next_step="Name the file report.html or report.pdf",
+                         entry=MessageCode.VALUE_NOT_ALLOWED)
     if not path.parent.is_dir():
-        raise UsageError("there is no such folder", where=f"{where} {path}", next_step=f"Make {path.parent} first")
+        raise UsageError("there is no such folder", where=f"{where} {path}", next_step=f"Make {path.parent} first",
+                         entry=MessageCode.FILE_NOT_WRITABLE)
 
 
 def fresh(path: Path) -> Path:
@@ -62,6 +68,7 @@ def write_report(document: Mapping[str, Any], recording: Recording, path: Path) 
             f"can't be written ({error.strerror or error})",
             where=f"--report {path}",
             next_step=f"The run and its log are whole: tdhil replay {document['log']} --report {path.name}",
+            entry=MessageCode.FILE_NOT_WRITABLE,
         ) from error
 
 
@@ -70,7 +77,8 @@ def write_blocks(report: Report, path: Path) -> Path:
     try:
         return _put(report, path)
     except OSError as error:
-        raise UsageError(f"can't be written ({error.strerror or error})", where=f"--report {path}") from error
+        raise UsageError(f"can't be written ({error.strerror or error})", where=f"--report {path}",
+                         entry=MessageCode.FILE_NOT_WRITABLE) from error
 
 
 def _put(report: Report, path: Path) -> Path:
@@ -88,7 +96,7 @@ def _put(report: Report, path: Path) -> Path:
 
 
 def sha256_of(path: Path) -> str:
-    """Of the file as it is now, in hex; '' where it can't be read."""
+    """Return the file's hash in hex; '' if it can't be read."""
     try:
         with path.open("rb") as file:
             return file_digest(file, "sha256").hexdigest()

@@ -24,7 +24,7 @@ from tdhil.report.console import PlainConsole
 from tdhil.report.document import SIMULATED
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Paints in a thread of its own, so that a terminal that takes nothing (Ctrl-S, a pty nobody reads) holds up nobody.
+# Output in a thread of its own, so that a blocked terminal (Ctrl-S, a pty without reader) blocks no other thread.
 #
 # Whoever asks only leaves a note and goes on: lines are kept in order, up to a number of them, and of pictures the
 # latest only. The thread is a daemon: it may be stuck in a write for ever, and the process still ends.
@@ -33,7 +33,7 @@ from tdhil.report.document import SIMULATED
 Job = Callable[[], None]
 
 MOST_LINES = 500
-"""Of a terminal that has stopped taking them, the oldest are dropped."""
+"""Longest queue of a terminal that accepts no lines; the oldest lines are dropped."""
 
 
 class Painter:
@@ -50,7 +50,7 @@ class Painter:
         self._ending = False
 
     def line(self, job: Job) -> None:
-        """Do this after what was asked for before. Raises what failed earlier."""
+        """Queue this job after earlier ones. Raises an error of an earlier job."""
         self._check()
         self._lines.append(job)
         self._begin()
@@ -62,7 +62,7 @@ class Painter:
         self._begin()
 
     def line_after_picture(self, job: Job) -> None:
-        """Do this after all that was asked for before, a picture that still waits included. Raises as `line` does."""
+        """Queue this job after all earlier ones, including a waiting picture. Raises as `line` does."""
         picture, self._picture = self._picture, None
         if picture is not None:
             self.line(picture)
@@ -78,7 +78,7 @@ class Painter:
         return done.wait(timeout_s)
 
     def end(self) -> None:
-        """Let the thread go once all is done; whatever is asked for afterwards begins a new one."""
+        """End the thread after all jobs; a later job starts a new one."""
         self._ending = True
         self._wake.set()
 
@@ -98,7 +98,7 @@ class Painter:
         while True:
             self._wake.wait()
             self._wake.clear()
-            # Taken first: what they wait for was asked for before they came.
+            # Taken first: their predecessors were queued before them.
             waiting = [self._waiting.popleft() for _ in range(len(self._waiting))]
             while self._lines or self._picture is not None:
                 while self._lines:
@@ -126,7 +126,7 @@ class Painter:
 # ---------------------------------------------------------------------------------------------------------------------
 
 class PlannedMotion(Protocol):
-    """What is shown of a plan of stage 5."""
+    """Displayed part of a plan of stage 5."""
 
     @property
     def kind(self) -> str: ...
@@ -159,7 +159,7 @@ _SWITCH_S = 0.0005
 
 @dataclass(frozen=True)
 class LiveView:
-    """What there is to show at one moment; never changed, only replaced."""
+    """Displayed content at one moment; never changed, only replaced."""
 
     expected_s: Mapping[str, float]
     ended: Mapping[str, Stage] = field(default_factory=dict)
@@ -199,9 +199,9 @@ class LiveDisplay:
         sys.setswitchinterval(self._usual_s)
 
     def pause(self) -> None:
-        """Leave the terminal to somebody else (a prompt); the next stage or cycle takes it back.
+        """Release the terminal for a prompt; the next stage or cycle takes it back.
 
-        Waits until all is written, but not for ever.
+        Waits until all is written, with a limit.
         """
         view = self._view = replace(self._view, taken=False)
         # A picture that came behind would take the terminal back, and what is printed next stand on its last line.

@@ -1,4 +1,4 @@
-"""What every HTML page of ours shares: its style, its pictures as SVG, and the word for what must be installed."""
+"""Common parts of every HTML page: style, pictures as SVG, and the message on missing packages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tdhil import version
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 
 if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
@@ -38,9 +38,10 @@ th { background: #f4f4f4; font-weight: 600 }
 
 
 def install_command() -> str:
-    """What installs the extra `report` here: into this environment, from the clone, or by its packages' names.
+    """Return the command that installs the extra `report` here: into this environment, from the clone, or by package
+    names.
 
-    This package stands in no index, so its own name would find nothing.
+    This package is in no index, so its own name would not be found.
     """
     python = shlex.quote(sys.executable or "python")
     clone = Path(version.__file__).resolve().parent.parent
@@ -67,6 +68,7 @@ def require_extra(where: str) -> None:
         raise UsageError(
             f"a report needs {' and '.join(missing)}, not installed here", where=where,
             next_step=f"Install: {install_command()}",
+            entry=MessageCode.PACKAGE_MISSING,
         )
 
 

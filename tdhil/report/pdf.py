@@ -85,7 +85,7 @@ class _Sheets:
         self.at += height
 
     def room(self, space: float = 0.0) -> float:
-        """What is left on this sheet below a space."""
+        """Return the height left on this sheet below a space."""
         return BOTTOM - self.at - space if self.figures else BOTTOM - TOP
 
     def new(self) -> None:
@@ -105,7 +105,7 @@ class _Sheets:
 
     @property
     def fresh(self) -> bool:
-        """Is nothing on the last sheet yet?"""
+        """Return whether the last sheet is still empty."""
         return bool(self.figures) and self.at == self._top
 
     def foot(self, figure: Figure, left: str, right: str) -> None:
@@ -290,7 +290,7 @@ class _TableRow:
         self.height = max(1, *(len(cell) for cell in self.cells)) * SMALL * _LEADING + 4.0
 
     def draw(self, on: _Sheets, y: float) -> None:
-        """From its top."""
+        """Draw from the top of the block."""
         if self.head:
             on.box(y, self.height, LEFT, INNER, "#f1f1f1")
         x = LEFT

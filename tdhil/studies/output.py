@@ -101,7 +101,7 @@ DPI = 120
 
 @dataclass(frozen=True)
 class Written:
-    """Where everything is. ``picture`` is None where none was drawn; ``without_matplotlib`` says whether that's why."""
+    """Paths of the files. ``picture``: None if none was drawn; ``without_matplotlib``: whether that is the reason."""
 
     folder: Path
     tables: tuple[Path, ...]
@@ -116,7 +116,7 @@ class Written:
 
 
 def write_study(outcome: StudyOutcome, settings: BaseModel, folder: Path) -> Written:
-    """Write into ``folder``, made if need be; what is there under the same names is replaced."""
+    """Write into ``folder``, created if needed. Files of the same names are replaced."""
     folder.mkdir(parents=True, exist_ok=True)
     tables = tuple(_csv(table, folder) for table in outcome.tables)
     own = _settings(outcome.name, settings, folder)

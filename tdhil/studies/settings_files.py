@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, Field, ValidationError, create_model
 
 from profiles import DataFileError, DataModel, Problem, load_model, load_with_lines, messages_of, read_tree
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 from tdhil.studies.paper import SYMBOLS, full_name
 from tdhil.studies.study import Study
 
@@ -39,7 +39,8 @@ def load_study_file(path: Path, studies: Mapping[str, Study]) -> tuple[Study, An
     name = envelope.value.study
     if name not in studies:
         line = envelope.lines.get(("study",), 0)
-        raise DataFileError((Problem(str(path), line, f"study: no study '{name[:40]}'; known: {', '.join(studies)}"),))
+        raise DataFileError((Problem(str(path), line, f"study: no study '{name[:40]}'; known: {', '.join(studies)}"),),
+                            entry=MessageCode.STUDY_SETTING_WRONG)
     model = studies[name].settings_model
     if not envelope.value.settings:
         return studies[name], model()
@@ -57,7 +58,8 @@ def with_assignments(settings: M, assignments: Iterable[str]) -> M:
     for assignment in assignments:
         name, sign, text = (part.strip() for part in assignment.partition("="))
         if not (name and sign and text):
-            raise UsageError(f"--set {assignment}: name=value is wanted", next_step="For example --set Kp=3000")
+            raise UsageError(f"--set {assignment}: name=value is wanted", next_step="For example --set Kp=3000",
+                             entry=MessageCode.STUDY_SETTING_WRONG)
         *sections, last = name.split(".")
         field = last if sections else _field(name, settings)
         if not sections:
@@ -65,12 +67,13 @@ def with_assignments(settings: M, assignments: Iterable[str]) -> M:
         tree = read_tree(f"value: {text}", "--set")
         if tree.problems or not isinstance(tree.data, dict) or list(tree.data) != ["value"]:
             why = tree.problems[0].message if tree.problems else "one value is wanted"
-            raise UsageError(f"--set {assignment}: {why}")
+            raise UsageError(f"--set {assignment}: {why}", entry=MessageCode.STUDY_SETTING_WRONG)
         place: Any = data
         for section in sections:
             place = place.get(section) if isinstance(place, dict) else None
         if not isinstance(place, dict):
-            raise UsageError(f"--set {assignment}: there is no section '{'.'.join(sections)}'")
+            raise UsageError(f"--set {assignment}: there is no section '{'.'.join(sections)}'",
+                             entry=MessageCode.STUDY_SETTING_WRONG)
         place[field] = tree.data["value"]
     try:
         return type(settings).model_validate_json(json.dumps(data), strict=True)
@@ -79,7 +82,8 @@ def with_assignments(settings: M, assignments: Iterable[str]) -> M:
             f"{'.'.join(str(part) for part in path)}: {message}" if path else message
             for path, message in messages_of(error, data, type(settings))
         ]
-        raise UsageError("--set " + "; ".join(told), next_step=f"Symbols: {', '.join(SYMBOLS)}") from None
+        raise UsageError("--set " + "; ".join(told), next_step=f"Symbols: {', '.join(SYMBOLS)}",
+                         entry=MessageCode.STUDY_SETTING_WRONG) from None
 
 
 def _field(name: str, settings: BaseModel) -> str:
@@ -89,9 +93,10 @@ def _field(name: str, settings: BaseModel) -> str:
 
 
 def _refuse_varied(settings: BaseModel, field: str, assignment: str) -> None:
-    """What varies from run to run has its levels; one value for all runs would silently do nothing."""
+    """Refuse one value for a setting that varies between runs: its levels apply, and the value would have no effect."""
     if field in getattr(settings, "varied", ()):
         raise UsageError(
             f"--set {assignment}: {field} is what this study varies from run to run",
             next_step="Change its levels: 'factors' of a design, 'values' of a sweep",
+            entry=MessageCode.STUDY_SETTING_WRONG,
         )

@@ -1,4 +1,4 @@
-"""What every study returns: tables, statements that hold or don't, a document for machines, and a picture."""
+"""The result of every study: tables, statements that hold or don't, a document for machines, and a picture."""
 
 from __future__ import annotations
 

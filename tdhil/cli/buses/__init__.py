@@ -1,1 +1,1 @@
-"""What is particular to one bus: its options, opening a drive on it, scanning it, checking it."""
+"""One module for each bus: its options, opening a drive on it, scanning it, checking it."""

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from profiles import MessageCode
 from tdhil.cli.scan_common import BusCommands, FoundDrive, ValueSeen
 
 if TYPE_CHECKING:
@@ -18,20 +19,20 @@ LISTEN_S = 1.0
 
 
 class CanopenCommands(BusCommands):
-    """Every node of a bus is asked; a drive is looked at by SDO."""
+    """Scans every node of a bus; checks a drive by SDO."""
 
     address, address_flag = "node", "--node"
     to_fill_in = "bus and node"
 
     def add_scan_arguments(self, scan: argparse._ArgumentGroup) -> None:
-        """How long to listen."""
+        """Add the option for the listening time."""
         scan.add_argument("--listen", type=_seconds, default=LISTEN_S, metavar="S",
                           help=f"CANopen: how long to wait for answers and heartbeats (default {LISTEN_S:g} s)")
 
     def scan(
         self, plan: PeerPlan, connection: Connection, options: RunOptions, asked: argparse.Namespace
     ) -> tuple[tuple[FoundDrive, ...], list[str]]:
-        """Who answers an SDO, and who is only heard."""
+        """Return the nodes that answer SDO requests, and remarks on the others."""
         from drivers import CommunicationLost
         from tdhil.cli.buses.canopen_scan import ask_all, identify_all
         from tdhil.session.buses import canopen
@@ -41,26 +42,26 @@ class CanopenCommands(BusCommands):
             found = identify_all(link, heard)
             heard.error_frames = link.error_frames
         silent = sorted(set(heard.states) - set(heard.device_types))
-        remarks = [f"node {node} sends heartbeats ({heard.states[node]}) and answers no SDO" for node in silent]
+        remarks = [f"node {node} sends heartbeats ({heard.states[node]}) but answers no SDO request" for node in silent]
         if heard.error_frames:
-            remarks.append(f"{heard.error_frames} error frames came: check bit rate, termination and cable")
+            remarks.append(f"{heard.error_frames} error frames were received: check bit rate, termination and cable")
         if found:
             return found, remarks
         if heard.error_frames:
-            what = f"no node answers, and {heard.error_frames} error frames came"
+            what = f"no node answers, and {heard.error_frames} error frames were received"
             step = "The bit rate is most likely wrong (-b): compare it with the drives'; else termination or cable"
         elif heard.frames:
-            what = f"no node answers, though {heard.frames} frames were heard" + "".join(f"; {one}" for one in remarks)
-            step = "Is a drive stopped by NMT, or is this a bus of another protocol? Look with candump"
+            what = f"no node answers, but {heard.frames} frames were received" + "".join(f"; {one}" for one in remarks)
+            step = "Check with candump whether a drive is stopped by NMT, or the bus uses another protocol"
         else:
-            what = "no node answers, and nothing was heard"
+            what = "no node answers, and no frame was received"
             step = "Check that a drive is powered, the bit rate (-b), the cable and its termination (60 ohms)"
-        raise CommunicationLost(what, where=link.name, next_step=step)
+        raise CommunicationLost(what, where=link.name, next_step=step, entry=MessageCode.BUS_FAILED)
 
     def findings(
         self, plan: PeerPlan, connection: Connection, options: RunOptions, rig: Rig | None, seen: list[ValueSeen]
     ) -> Iterator[DoctorFinding]:
-        """Link or bit rate, adapter, drive."""
+        """Yield findings on link or bit rate, adapter and drive."""
         from drivers import TdhilError
         from tdhil.cli.buses import canopen_doctor
         from tdhil.cli.doctor_finding import attempted, of_error, ok
@@ -74,7 +75,7 @@ class CanopenCommands(BusCommands):
             found = attempted("link", lambda: canopen_doctor.link_findings(link_report(bus.channel), bus.channel))
             yield from found
             if found and found[-1].name == "link" and found[-1].grade == "bad":
-                return                                     # there is no such link: opening it would say the same
+                return                                     # the link does not exist: opening it would report the same
         elif not plan.embedded:
             yield canopen_doctor.rate_finding(bus.bitrate, bus.source("bitrate"))
         try:
@@ -87,11 +88,11 @@ class CanopenCommands(BusCommands):
             yield of_error("adapter", error)
 
     def wanted(self, connection: Connection, options: RunOptions) -> int | None:
-        """As --node or rig.yaml has it."""
+        """Return the node of --node or rig.yaml."""
         return options.node
 
     def section(self, found: FoundDrive, connection: Connection) -> Mapping[str, Any]:
-        """python-can's options that were in force."""
+        """Return python-can's options in force."""
         settings = {name: setting.value for name, setting in connection.line.settings.items()}
         own = ("interface", "channel", "bitrate")
         simple = {name: value for name, value in settings.items() if isinstance(value, str | int | float | bool)}
@@ -100,12 +101,12 @@ class CanopenCommands(BusCommands):
         return {**line, "options": more} if more else line
 
     def blank(self, profile: Profile) -> tuple[str, ...]:
-        """Bus and node."""
+        """Return blank lines for bus and node."""
         return ("#bus: {interface: socketcan, channel: can0, bitrate: 500k}    # python-can's own names",
                 "#node:    # CANopen node number, 1 to 127")
 
     def keys(self, found: FoundDrive) -> Mapping[str, Any]:
-        """The node."""
+        """Return the node."""
         return {"node": found.address}
 
 

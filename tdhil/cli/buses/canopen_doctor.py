@@ -18,22 +18,22 @@ if TYPE_CHECKING:
 _STATES: dict[str, tuple[Grade, str]] = {
     "ERROR-ACTIVE": ("ok", ""),
     "ERROR-WARNING": ("note", "Errors add up: check bit rate, termination (60 ohms between CAN_H and CAN_L) and cable"),
-    "ERROR-PASSIVE": ("bad", "Check bit rate, termination (60 ohms between CAN_H and CAN_L), and who else is there"),
-    "BUS-OFF": ("bad", "Mend cable or bit rate, then: sudo ip link set {0} down && sudo ip link set {0} up"),
+    "ERROR-PASSIVE": ("bad", "Check bit rate, termination (60 ohms between CAN_H and CAN_L), and other nodes"),
+    "BUS-OFF": ("bad", "Correct cable or bit rate, then: sudo ip link set {0} down && sudo ip link set {0} up"),
     "STOPPED": ("bad", "Bring it up: sudo ip link set {0} up type can bitrate 500000"),
 }
 _UNKNOWN_STATE: tuple[Grade, str] = ("note", "")
 
 
 def link_findings(text: str | None, channel: str) -> Iterator[DoctorFinding]:
-    """What ``ip -details -json link show`` says of a SocketCAN link; None where it can't be asked."""
+    """Yield findings from ``ip -details -json link show`` for a SocketCAN link; ``text`` is None without ``ip``."""
     link = _link(text, channel)
     if link is None:
-        yield note("link", f"{channel}: can't be asked (no ip, or no answer)", "Try: ip -details link show " + channel)
+        yield note("link", f"{channel}: can't be read (no ip, or no answer)", "Try: ip -details link show " + channel)
         return
     data = _below(link, "linkinfo", "info_data")
     rate = _below(data, "bittiming").get("bitrate")
-    yield ok("bit rate", f"{rate} bit/s, as the link has it") if rate else note("bit rate", f"{channel} has none")
+    yield ok("bit rate", f"{rate} bit/s, set in the link") if rate else note("bit rate", f"{channel} has none")
     state = data.get("state")
     if isinstance(state, str):
         grade, step = _STATES.get(state, _UNKNOWN_STATE)
@@ -44,21 +44,21 @@ def link_findings(text: str | None, channel: str) -> Iterator[DoctorFinding]:
         text = f"errors sent {sent}, received {received} (128 is error-passive)"
         clean = sent == 0 and received == 0
         yield ok("error counters", text) if clean else note(
-            "error counters", text, "Look whether they grow: ip -details -statistics link show " + channel
+            "error counters", text, "Check whether they grow: ip -details -statistics link show " + channel
         )
 
 
 def rate_finding(bitrate: int | None, source: str) -> DoctorFinding:
-    """Of an adapter that sets the bit rate itself."""
+    """Return the finding for an adapter that sets the bit rate itself."""
     if bitrate is None:
-        return note("bit rate", "not named: the interface's own default", "Name the bus's with -b, such as -b 500000")
+        return note("bit rate", "not given: the interface's own default", "Give the bus's with -b, such as -b 500000")
     return ok("bit rate", f"{bitrate} bit/s ({source})")
 
 
 def drive_findings(
     bus: can.BusABC, profile: CanopenProfile, node: int, rated_torque_nm: float | None
 ) -> Iterator[DoctorFinding]:
-    """The drive itself. Raises CommunicationLost where it doesn't answer; nothing is written."""
+    """Yield findings on the drive. Raises CommunicationLost if it does not answer; nothing is written."""
     link = CanLink(bus, MonotonicClock())
     objects = Objects(link, node)
     try:
@@ -66,12 +66,12 @@ def drive_findings(
     except CommunicationLost as error:
         if not link.error_frames:
             raise
-        yield bad("drive", f"{error.what}, and {link.error_frames} error frames came",
-                  "The bit rate is most likely wrong: compare it with the drive's; else termination or cable")
+        yield bad("drive", f"{error.what}, and {link.error_frames} error frames were received",
+                  "The bit rate is most likely wrong: compare it with the drive's; check cable and termination")
         return
-    kind = "a CiA 402 drive" if device & 0xFFFF == 402 else f"device type {device:08X}h, which is no CiA 402 drive"
+    kind = "a CiA 402 drive" if device & 0xFFFF == 402 else f"device type {device:08X}h, which is not a CiA 402 drive"
     answers = f"node {node} answers: {kind}"
-    yield ok("drive", answers) if device & 0xFFFF == 402 else bad("drive", answers, "Look with tdhil scan who is who")
+    yield ok("drive", answers) if device & 0xFFFF == 402 else bad("drive", answers, "See tdhil scan")
     yield from _identity(objects, profile)
     yield from _watchdog(objects, profile)
     yield _modes(objects, profile)
@@ -81,31 +81,31 @@ def drive_findings(
     yield from map(of_check, table.checks)
     yield _state(objects)
     if link.error_frames:
-        yield note("error frames", f"{link.error_frames} seen", "Check bit rate, termination and cable")
+        yield note("error frames", f"{link.error_frames} received", "Check bit rate, termination and cable")
 
 
 def _identity(objects: Objects, profile: CanopenProfile) -> Iterator[DoctorFinding]:
     found = {part: objects.read_if_there(0x1018, sub) for sub, part in ((1, "vendor"), (2, "product"), (3, "revision"))}
-    text = ", ".join(f"{part} {value:X}h" for part, value in found.items() if value is not None) or "not told"
+    text = ", ".join(f"{part} {value:X}h" for part, value in found.items() if value is not None) or "not reported"
     wrong = [
         f"{part} {wanted:X}h"
         for part in found
         if (wanted := getattr(profile.identity, part)) is not None and wanted != found[part]
     ]
-    yield bad("identity", f"{text}; profile {profile.name} wants {', '.join(wrong)}", "Choose its own with --profile") \
+    yield bad("identity", f"{text}; profile {profile.name} needs {', '.join(wrong)}", "Choose its own with --profile") \
         if wrong else ok("identity", text)
     try:
         marked = objects.read_bytes(MARKER_INDEX, 1).decode("ascii", "replace").rstrip("\0") == MARKER_TEXT
     except ObjectRefused:
         marked = False
-    yield note("peer", "SIMULATED: bears the simulator's marker") if marked else ok("peer", "no simulator")
+    yield note("peer", "SIMULATED: it has the simulator's marker") if marked else ok("peer", "not a simulator")
 
 
 def _watchdog(objects: Objects, profile: CanopenProfile) -> Iterator[DoctorFinding]:
     dog = profile.watchdog
     if dog.kind == "none":
-        yield bad("watchdog", f"profile {profile.name} knows none",
-                  f"A host that dies would leave the shaft turning: identify takes it by name only, {NO_WATCHDOG_FLAG}")
+        yield bad("watchdog", f"profile {profile.name} names none",
+                  f"If the host fails, the shaft keeps turning: identify accepts this only with {NO_WATCHDOG_FLAG}")
         return
     wanted = [(0x100C, 0), (0x100D, 0)] if dog.kind == "node_guarding" else [(dog.consumer_index, dog.consumer_sub)]
     if dog.reaction_index is not None:
@@ -113,21 +113,21 @@ def _watchdog(objects: Objects, profile: CanopenProfile) -> Iterator[DoctorFindi
     for at in wanted:
         try:
             value = objects.read_bytes(*at)
-            yield ok("watchdog", f"{name(*at)} is there and reads {int.from_bytes(value, 'little'):X}h")
+            yield ok("watchdog", f"{name(*at)} exists and reads {int.from_bytes(value, 'little'):X}h")
         except ObjectRefused:
             step = "Choose the drive's own profile: without a watchdog nothing is moved, "
-            step += f"or by name only, {NO_WATCHDOG_FLAG}"
+            step += f"unless accepted with {NO_WATCHDOG_FLAG}"
             yield bad("watchdog", f"the drive has no {name(*at)}", step)
 
 
 def _modes(objects: Objects, profile: CanopenProfile) -> DoctorFinding:
     supported = objects.read_if_there(0x6502)
     if supported is None:
-        return note("modes", "the drive does not tell which it has (6502h)")
+        return note("modes", "the drive does not report its modes (6502h)")
     has = [code for code in (*profile.modes.speed, *profile.modes.torque) if code < 1 or supported >> code - 1 & 1]
     speed = [code for code in has if code in profile.modes.speed]
-    text = f"of the profile's: speed {speed or 'none'}, torque {[code for code in has if code not in speed] or 'none'}"
-    return ok("modes", text) if speed else bad("modes", text, "None regulates speed: is this the drive's profile?")
+    text = f"profile: speed {speed or 'none'}, torque {[code for code in has if code not in speed] or 'none'}"
+    return ok("modes", text) if speed else bad("modes", text, "None controls speed: check the profile")
 
 
 def _state(objects: Objects) -> DoctorFinding:
@@ -135,9 +135,9 @@ def _state(objects: Objects) -> DoctorFinding:
     if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
         code = objects.read_if_there(0x603F)
         known = f", error code {code:04X}h" if code is not None else ""
-        return bad("state", f"{state.value}{known}", "Clear its cause, then start a run with --reset-fault")
+        return bad("state", f"{state.value}{known}", "Remove its cause, then start a run with --reset-fault")
     if state is State.OPERATION_ENABLED:
-        return bad("state", "operation enabled: somebody else drives it", "Take that master off the bus first")
+        return bad("state", "operation enabled: another master controls it", "Take that master off the bus first")
     return ok("state", state.value)
 
 
@@ -151,7 +151,7 @@ def _link(text: str | None, channel: str) -> dict[str, Any] | None:
 
 
 def _below(data: dict[str, Any], *keys: str) -> dict[str, Any]:
-    """The section below these keys; empty where there is none."""
+    """Return the section below these keys; empty if there is none."""
     found: Any = data
     for key in keys:
         found = found.get(key) if isinstance(found, dict) else None

@@ -1,6 +1,6 @@
-"""Who is on a CAN bus: every node is asked for its device type (1000h) at once, then whoever answers for 1018h.
+"""The nodes of a CAN bus: all receive a request for the device type (1000h) at once, those that answer one for 1018h.
 
-Reads only. The 127 requests take 0.2 s; whatever is heard meanwhile (heartbeats, boot-ups, error frames) counts.
+Reads only. The 127 requests take 0.2 s. Everything received meanwhile (heartbeats, boot-ups, error frames) counts.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from drivers import CommunicationLost, MonotonicClock, ObjectRefused
 from drivers.canopen import CanLink, Objects
-from profiles import MARKER_INDEX, MARKER_TEXT, load_profile, profile_names, visible
+from profiles import MARKER_INDEX, MARKER_TEXT, MessageCode, load_profile, profile_names, visible
 from profiles.canopen import CanopenProfile
 from tdhil.cli.scan_common import FoundDrive
 
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 ASK_DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
 """SDO: initiate upload of 1000h (CiA 301)."""
 PACE_S = 0.0015
-"""Between two requests: a frame at 125 kbit/s, so that no transmit queue overflows."""
+"""Interval between two requests, s: one frame at 125 kbit/s, so that no transmit queue overflows."""
 FULL_TRIES, FULL_PAUSE_S = 20, 0.01
-"""A transmit queue that is full empties, if anybody acknowledges the frames."""
+"""Time for a full transmit queue to empty, s, if another node acknowledges the frames."""
 _STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
 _CIA402 = 402
 
 
 @dataclass
 class Heard:
-    """What came while everybody was asked."""
+    """Everything received during the scan."""
 
     device_types: dict[int, int] = field(default_factory=dict)     # node → 1000h
     states: dict[int, str] = field(default_factory=dict)           # node → its NMT state, from heartbeats
@@ -57,14 +57,14 @@ def ask_all(bus: can.BusABC, nodes: Iterable[int], wait_s: float) -> tuple[CanLi
 
 
 def identify_all(link: CanLink, heard: Heard) -> tuple[FoundDrive, ...]:
-    """Name and profile of everybody who answered."""
+    """Return name and profile of every node that answered."""
     profiles = [profile for name in profile_names() if isinstance(profile := load_profile(name), CanopenProfile)]
     return tuple(_identify(link, node, heard, profiles) for node in sorted(heard.device_types))
 
 
 def match(device_type: int, identity: tuple[int | None, int | None, int | None],
           profiles: Iterable[CanopenProfile]) -> tuple[str | None, str]:
-    """(profile, why): the one whose identity (vendor, product, revision of 1018h) fits best."""
+    """Return (profile, reason): the one whose identity (vendor, product, revision of 1018h) fits best."""
     best, most = None, 0
     for profile in profiles:
         wanted = (profile.identity.vendor, profile.identity.product, profile.identity.revision)
@@ -74,8 +74,8 @@ def match(device_type: int, identity: tuple[int | None, int | None, int | None],
     if best is not None:
         return best, ("vendor", "vendor and product", "vendor, product and revision")[most - 1]
     if device_type & 0xFFFF == _CIA402:
-        return "generic/cia402", "a CiA 402 drive that no profile names: check every unit"
-    return None, f"no CiA 402 drive (device type {device_type:08X}h)"
+        return "generic/cia402", "a CiA 402 drive without a profile of its own: check every unit"
+    return None, f"not a CiA 402 drive (device type {device_type:08X}h)"
 
 
 def _identify(link: CanLink, node: int, heard: Heard, profiles: list[CanopenProfile]) -> FoundDrive:
@@ -87,12 +87,12 @@ def _identify(link: CanLink, node: int, heard: Heard, profiles: list[CanopenProf
         title = _text(objects, 0x1008)
         simulated = _text(objects, MARKER_INDEX, 1) == MARKER_TEXT
     except CommunicationLost:
-        values += [None] * (4 - len(values))           # it answered once and fell silent: what is known is shown
+        values += [None] * (4 - len(values))           # it answered once and then no more: show what is known
     vendor, product, revision, serial = values
     profile, why = match(heard.device_types[node], (vendor, product, revision), profiles)
     parts = (("vendor", vendor), ("product", product), ("revision", revision), ("serial", serial))
     identity = ", ".join(f"{part} {value:X}h" for part, value in parts if value is not None)
-    return FoundDrive("canopen", node, title, identity or "not told (1018h)", simulated, profile, why,
+    return FoundDrive("canopen", node, title, identity or "not reported (1018h)", simulated, profile, why,
                       heard.states.get(node, ""))
 
 
@@ -110,8 +110,9 @@ def _send(link: CanLink, identifier: int, heard: Heard) -> None:
         except CommunicationLost as error:
             if attempt + 1 == FULL_TRIES:
                 raise CommunicationLost(
-                    f"{error.what}: nobody acknowledges our frames", where=error.where,
-                    next_step="Is a drive powered and connected, and is its bit rate the bus's (-b)? Check termination",
+                f"{error.what}: no other node acknowledges the frames", where=error.where,
+                next_step="Check that a drive is powered and connected, the bit rate of the bus (-b), and termination",
+                entry=MessageCode.BUS_FAILED,
                 ) from error
             with contextlib.suppress(CommunicationLost):
                 _listen(link, FULL_PAUSE_S, heard)
@@ -127,7 +128,7 @@ def _listen(link: CanLink, seconds: float, heard: Heard) -> None:
 
 
 def _answered(heard: Heard, node: int, data: bytes) -> None:
-    """Any answer of its SDO server shows that it is there; one that refuses 1000h has type 0."""
+    """Note an answer of an SDO server: the node exists; one that refuses 1000h has type 0."""
     if len(data) == 8 and data[1:4] == ASK_DEVICE_TYPE[1:4]:
         heard.device_types[node] = int.from_bytes(data[4:8], "little") if data[0] & 0xE0 == 0x40 else 0
 

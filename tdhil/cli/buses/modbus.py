@@ -18,19 +18,20 @@ if TYPE_CHECKING:
 
 
 class ModbusCommands(BusCommands):
-    """Units are asked one by one, on a serial line at its usual settings; a drive is looked at register by register."""
+    """Scans units one by one, on a serial line at its usual settings; checks a drive register by register."""
 
     address, address_flag = "unit", "--unit"
     to_fill_in = "modbus"
 
     def add_scan_arguments(self, scan: argparse._ArgumentGroup) -> None:
-        """Which units to ask."""
-        scan.add_argument("--units", metavar="N-M", help="Modbus units to ask, as 1-10,247 (default 1-5; TCP: and 255)")
+        """Add the option for the units."""
+        scan.add_argument("--units", metavar="N-M",
+                          help="Modbus units to scan, such as 1-10,247 (default 1-5; TCP: and 255)")
 
     def scan(
         self, plan: PeerPlan, connection: Connection, options: RunOptions, asked: argparse.Namespace
     ) -> tuple[tuple[FoundDrive, ...], list[str]]:
-        """Everybody at the first setting of the line at which anybody answers."""
+        """Return all units at the first line setting at which a unit answers."""
         from tdhil.cli.buses.modbus_scan import UNITS_RTU, UNITS_TCP, parse_units, scan_lines
         from tdhil.config import Origin
         from tdhil.errors import UsageError
@@ -49,7 +50,7 @@ class ModbusCommands(BusCommands):
     def findings(
         self, plan: PeerPlan, connection: Connection, options: RunOptions, rig: Rig | None, seen: list[ValueSeen]
     ) -> Iterator[DoctorFinding]:
-        """Line, drive, and each register of the profile."""
+        """Yield findings on line, drive, and each register of the profile."""
         from drivers import Clock, MonotonicClock, SteppedClock, TdhilError
         from tdhil.cli.buses import modbus_doctor
         from tdhil.cli.doctor_finding import attempted, of_error, ok
@@ -72,19 +73,19 @@ class ModbusCommands(BusCommands):
             yield of_error("line", error)
 
     def wanted(self, connection: Connection, options: RunOptions) -> int | None:
-        """As --unit has it: the profile's, or rig.yaml's, is but where to begin."""
+        """Return the unit of --unit. The unit of the profile or rig.yaml is only the first one to try."""
         from tdhil.config import Origin
 
         line = connection.line
         return line.value("unit") if line.origin("unit") is Origin.COMMAND_LINE else None
 
     def section(self, found: FoundDrive, connection: Connection) -> Mapping[str, Any]:
-        """How the line was set when the drive answered, and its unit."""
+        """Return the line setting at which the drive answered, and its unit."""
         return {**found.line, "unit": found.address}
 
 
     def blank(self, profile: Profile) -> tuple[str, ...]:
-        """A line of the kind that the drive has, as it leaves the factory."""
+        """Return a blank line with the drive's factory settings."""
         assert isinstance(profile, ModbusProfile)
         line = profile.line
         ways = {

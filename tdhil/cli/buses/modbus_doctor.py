@@ -1,4 +1,4 @@
-"""A Modbus drive, read only: does it answer, is it simulated, and each register of its profile beside its meaning."""
+"""Read-only checks of a Modbus drive: answers, simulator marker, and each register of its profile."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tdhil.cli.profile_text import RegisterUse, register_uses, unit_text, watchd
 
 @dataclass(frozen=True)
 class RegisterSeen:
-    """What stands in one register: ``counts``, and ``value`` in its unit; ``error`` where it can't be read."""
+    """The content of one register: ``counts``, and ``value`` in its unit; ``error`` if it can't be read."""
 
     use: RegisterUse
     counts: int | None
@@ -37,19 +37,19 @@ class RegisterSeen:
 
     @property
     def shown(self) -> str:
-        """The value in its unit, bits in hexadecimal."""
+        """Return the value in its unit, bits in hexadecimal."""
         if self.counts is None:
             return self.error
         if self.use.per_lsb is None:
             return f"{self.counts & 0xFFFF:04X}h"
-        return f"{self.value:.9g} {self.use.unit}".strip() if self.value is not None else "scale not known"
+        return f"{self.value:.9g} {self.use.unit}".strip() if self.value is not None else "scale unknown"
 
     def cells(self) -> tuple[str, str, str, str]:
-        """Address, counts, value, meaning."""
+        """Return address, counts, value and meaning."""
         return self.use.address, "-" if self.counts is None else str(self.counts), self.shown, self.use.meaning
 
     def plain(self) -> dict[str, Any]:
-        """As the JSON document has it."""
+        """Return it as in the JSON document."""
         return {
             "name": self.use.name, "address": self.use.register.address, "table": self.use.register.table,
             "meaning": self.use.meaning, "counts": self.counts, "value": self.value, "unit": self.use.unit,
@@ -58,12 +58,12 @@ class RegisterSeen:
 
 
 def access_of(link: Link, profile: ModbusProfile, unit: int) -> RegisterAccess:
-    """The drive's registers, for reading."""
+    """Return the drive's registers, for reading."""
     return RegisterAccess(link, unit, profile.line.word_order, frozenset(profile.cycle.functions))
 
 
 def read_registers(access: RegisterAccess, profile: ModbusProfile, given: dict[str, float]) -> tuple[RegisterSeen, ...]:
-    """Every register of the profile, one by one: one that is refused hides no other."""
+    """Read every register of the profile, one by one: a refused one hides no other."""
     uses = register_uses(profile)
     counts: dict[str, int] = {}
     errors: dict[int, str] = {}
@@ -89,23 +89,23 @@ def drive_findings(
     access: RegisterAccess, profile: ModbusProfile, unit: int, given: dict[str, float], rated_torque_nm: float | None,
     keep: Callable[[tuple[RegisterSeen, ...]], None],
 ) -> Iterator[DoctorFinding]:
-    """Raises CommunicationLost where it doesn't answer. ``keep`` gets what stands in the registers."""
+    """Yield findings on the drive. Raises CommunicationLost without an answer. ``keep`` receives the registers."""
     try:
         word = access.read(profile.cycle.status.register_)
         yield ok("drive", f"unit {unit} answers")
         yield _state(profile, word & 0xFFFF)
     except ObjectRefused as error:
         yield bad("drive", f"unit {unit} answers, but {error.where}: {error.what}",
-                  error.next_step or "Is this the drive of this profile? See tdhil scan")
+                  error.next_step or "Check with tdhil scan that the profile fits the drive")
     simulated = read_marker(access).simulated
-    yield note("peer", "SIMULATED: bears the simulator's marker") if simulated else ok("peer", "no simulator")
+    yield note("peer", "SIMULATED: it has the simulator's marker") if simulated else ok("peer", "not a simulator")
     found = read_registers(access, profile, given)
     keep(found)
     refused = [one for one in found if one.counts is None]
     if refused:
         first = refused[0]
         said = f"{len(refused)} of {len(found)} can't be read, such as {first.use.address}: {first.error}"
-        yield bad("registers", said, f"Compare them with the drive's manual; is {profile.name} its profile?")
+        yield bad("registers", said, f"Compare them with the drive's manual; check that {profile.name} is its profile")
     else:
         yield ok("registers", f"all {len(found)} of profile {profile.name} can be read")
     table = PreflightTable()
@@ -129,15 +129,15 @@ def _value(use: RegisterUse, raw: int | None, values: Mapping[str, float]) -> fl
 
 
 def _state(profile: ModbusProfile, word: int) -> DoctorFinding:
-    """As the status word shows it."""
+    """Return the finding on the state in the status word."""
     state = power_state(decode(profile.control, word))
     said = f"{state.value} (status word {word:04X}h)"
     if state is PowerState.FAULT:
-        return bad("state", said, "Clear its cause, then start a run with --reset-fault")
+        return bad("state", said, "Remove its cause, then start a run with --reset-fault")
     if state is PowerState.ENABLED:
-        return bad("state", f"{said}: somebody else drives it", "Disable it there first")
+        return bad("state", f"{said}: another master controls it", "Disable it there first")
     if profile.control.remote is not None and not seen(profile.control.remote, word):
-        return bad("state", f"{said}: the field bus has no control",
+        return bad("state", f"{said}: the fieldbus has no control",
                    "Switch the drive from its panel (local) to remote, and check its command source")
     return ok("state", said)
 
@@ -145,15 +145,15 @@ def _state(profile: ModbusProfile, word: int) -> DoctorFinding:
 def _watchdog(profile: ModbusProfile, values: Mapping[str, float]) -> DoctorFinding:
     dog = profile.watchdog
     if dog.kind == "none":
-        return bad("watchdog", f"profile {profile.name} knows none",
-                   "A host that dies would leave the shaft turning: "
-                   f"identify takes it by name only, {NO_WATCHDOG_FLAG}")
+        return bad("watchdog", f"profile {profile.name} names none",
+                   "If the host fails, the shaft keeps turning: "
+                   f"identify accepts this only with {NO_WATCHDOG_FLAG}")
     parameter: Parameter | None = profile.parameter(dog.parameter) if dog.parameter is not None else None
     if parameter is None:
         return note("watchdog", watchdog_text(profile))
     value = values.get(parameter.name)
     if value is None:
         return bad("watchdog", f"{parameter.title} can't be read", "Compare its address with the drive's manual")
-    set_by = "a run sets and gives it back" if parameter.set_to is not None else "set by hand"
+    set_by = "a run sets and restores it" if parameter.set_to is not None else "set by hand"
     return ok("watchdog", f"{parameter.title}: {value:g} {unit_text(parameter.unit)} ({set_by}), "
                           f"then {dog.reaction.replace('_', ' ')}")

@@ -24,7 +24,7 @@ from drivers.modbus import (
     read_marker,
     settle,
 )
-from profiles import load_profile, profile_names, visible
+from profiles import MessageCode, load_profile, profile_names, visible
 from profiles.modbus import ModbusProfile, Register
 from tdhil.cli.profile_text import register_uses
 from tdhil.cli.scan_common import FoundDrive
@@ -38,24 +38,26 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Who is on a Modbus line: a read of one register each, then the device identification and what the profiles expect.
+# The units of a Modbus line: a read of one register each, then the device identification and what the profiles expect.
 #
-# Reads only (functions 3, 4 and 43/14). Whoever answers is there, also with an exception.
+# Reads only (functions 3, 4 and 43/14). Every answer shows a unit, also an exception.
 
 
 ANSWER_S = 0.25
-"""For one reply: at 9600 baud a request and its reply take 17 ms, and drives turn around in 5 to 100 ms."""
+"""Timeout for one reply, s: at 9600 baud a request and its reply take 17 ms, and drives turn around in 5 to 100 ms."""
 UNITS_TCP, UNITS_RTU = "1-5,255", "1-5"
 BAUDS = (19200, 9600, 38400, 115200, 57600)
 FORMATS = (("E", 1), ("N", 1), ("N", 2))
-"""Parity and stop bits as drives leave the factory, the most common first."""
+"""Usual factory settings of parity and stop bits, the most common first."""
 _IDENTIFY = bytes((0x2B, 0x0E, 0x01, 0x00))
 """Function 43, MEI 14: read device identification, the basic stream (Modbus Application Protocol, section 6.21)."""
 
 
 @dataclass(frozen=True)
 class ProfileFit:
-    """How well a profile suits a drive: all its registers answer, and its name plate fits (None: it names none)."""
+    """How well a profile suits a drive: whether all its registers answer and its name plate fits (None: it has
+    none).
+    """
 
     profile: str
     plate: bool | None
@@ -63,7 +65,7 @@ class ProfileFit:
 
 
 def parse_units(text: str) -> tuple[int, ...]:
-    """``1-5,247`` → 1 2 3 4 5 247. ValueError for anything else, and beyond 0 to 255."""
+    """Parse ``1-5,247`` → 1 2 3 4 5 247. Raises ValueError for other text and numbers beyond 0 to 255."""
     found: list[int] = []
     for part in text.split(","):
         first, dash, last = part.partition("-")
@@ -75,7 +77,7 @@ def parse_units(text: str) -> tuple[int, ...]:
 
 
 def probe(link: Link, units: Iterable[int]) -> tuple[list[int], int]:
-    """(units that answer, how many replies could not be read). Raises LinkLost where the line is gone."""
+    """Return (units that answer, number of unreadable replies). Raises LinkLost if the line is lost."""
     present, garbled = [], 0
     for unit in units:
         try:
@@ -89,7 +91,7 @@ def probe(link: Link, units: Iterable[int]) -> tuple[list[int], int]:
 
 
 def identify(link: Link, unit: int, transport: str, line: dict[str, Any]) -> FoundDrive:
-    """Name and profile of a unit that answered."""
+    """Return name and profile of a unit that answered."""
     vendor, product, revision = device_identification(link, unit)
     said = " ".join(part for part in (vendor, product, revision) if part)
     plain = RegisterAccess(link, unit, "high_first", frozenset({READ_HOLDING}))
@@ -98,12 +100,12 @@ def identify(link: Link, unit: int, transport: str, line: dict[str, Any]) -> Fou
         simulated = read_marker(plain).simulated
     fits = [fit for profile in _profiles(transport) if (fit := _fit(link, unit, profile, vendor)) is not None]
     profile, why = choose(fits)
-    return FoundDrive("modbus", unit, product or vendor or "Modbus device", said or "not told (function 43)", simulated,
+    return FoundDrive("modbus", unit, product or vendor or "Modbus device", said or "unknown (function 43)", simulated,
                       profile, why, line=line)
 
 
 def choose(fits: Sequence[ProfileFit]) -> tuple[str | None, str]:
-    """(profile, why): by name and name plate. Registers that merely answer are no reason."""
+    """Return (profile, reason): by name and name plate. Registers that only answer are no reason."""
     good = [fit for fit in fits if fit.plate is not False]
     ranked = sorted(good, key=lambda fit: (fit.plate is True, fit.named), reverse=True)
     if ranked and (ranked[0].plate or ranked[0].named):
@@ -113,12 +115,12 @@ def choose(fits: Sequence[ProfileFit]) -> tuple[str | None, str]:
         return best.profile, "all registers answer, and " + " and ".join(reasons)
     if good:
         names = ", ".join(fit.profile for fit in good)
-        return None, f"the registers of {names} answer, which proves nothing: choose by the drive's type plate"
-    return None, "no profile's registers all answer: copy profiles/generic/modbus.yaml and describe it"
+        return None, f"the registers of {names} answer, which is no proof: choose by the drive's name plate"
+    return None, "no profile fits, all have registers without an answer: copy profiles/generic/modbus.yaml and adapt it"
 
 
 def device_identification(link: Link, unit: int) -> tuple[str, str, str]:
-    """Vendor, product code and revision by function 43; empty where the drive doesn't know it."""
+    """Return vendor, product code and revision by function 43; empty if the drive does not support it."""
     try:
         pdu = link.transact(unit, _IDENTIFY, ANSWER_S).pdu
     except (NoReply, BadReply):
@@ -127,7 +129,7 @@ def device_identification(link: Link, unit: int) -> tuple[str, str, str]:
 
 
 def parse_identification(pdu: bytes) -> tuple[str, str, str]:
-    """A reply of function 43/14: 2B 0E 01 conformity more next count, then id, length, text of each object."""
+    """Parse a reply of function 43/14: 2B 0E 01 conformity more next count, then id, length, text of each object."""
     found = {0: "", 1: "", 2: ""}
     if len(pdu) < 7 or pdu[:2] != _IDENTIFY[:2]:
         return "", "", ""
@@ -147,7 +149,7 @@ def _profiles(transport: str) -> list[ModbusProfile]:
 
 
 def _fit(link: Link, unit: int, profile: ModbusProfile, vendor: str) -> ProfileFit | None:
-    """None as soon as one of the profile's registers can't be read."""
+    """Return the fit; None if one of the profile's registers can't be read."""
     counts: dict[str, int] = {}
     access = RegisterAccess(link, unit, profile.line.word_order, frozenset(profile.cycle.functions))
     for use in register_uses(profile):
@@ -162,7 +164,7 @@ def _fit(link: Link, unit: int, profile: ModbusProfile, vendor: str) -> ProfileF
 
 
 def _read_once(access: RegisterAccess, register: Register, profile: ModbusProfile) -> int:
-    """Without the patience of a preflight: a scan asks many that aren't there."""
+    """Read once, without the retries of a preflight: a scan reads many registers that do not exist."""
     function = READ_HOLDING if register.table == "holding" else READ_INPUT
     words = access.once(read(function, register.address, register.count), ANSWER_S).words
     return from_words(words, register.type, profile.line.word_order)
@@ -184,13 +186,13 @@ def _plate(profile: ModbusProfile, counts: dict[str, int]) -> bool | None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 SCAN = "scan"
-"""Where a setting of the line came from that was tried."""
+"""Source of a line setting that the scan tried."""
 
 
 def scan_lines(
     plan: PeerPlan, connection: Connection, units: tuple[int, ...], say: Callable[[str], None]
 ) -> tuple[tuple[FoundDrive, ...], list[str]]:
-    """Everybody on the first line setting at which anybody answers. Raises CommunicationLost if nobody does."""
+    """Return all units at the first line setting with an answer. Raises CommunicationLost without any answer."""
     garbled = tried = 0
     where = ""
     refused: SettingsRefused | None = None
@@ -208,23 +210,24 @@ def scan_lines(
                     found = _identify(line.link, present, setting, transports[0] if plan.embedded else "")
                     return found, [f"{spoiled} replies could not be read"] if spoiled else []
         except SettingsRefused as error:
-            refused = error                                # this adapter has no such setting; others may do
+            refused = error                                # this adapter has no such setting; others may work
     if refused is not None and not tried:
         raise refused
     asked = f"units {', '.join(map(str, units))}" + (f" at {tried} settings of the line" if tried > 1 else "")
     if garbled:
         raise CommunicationLost(
-            f"nobody answers so that it can be read ({asked}), but {garbled} garbled replies came", where=where,
+            f"no readable answer ({asked}), but {garbled} garbled replies were received", where=where,
             next_step="Check baud rate and parity at the drive, the polarity of the wires, termination and shielding",
+            entry=MessageCode.BAD_REPLY,
         )
-    step = "Check the drive's unit number (--units 1-247 asks all), that Modbus TCP is on, and its address"
+    step = "Check the drive's unit number (--units 1-247 scans all), that Modbus TCP is on, and its address"
     if config_of(connection).serial is not None:
-        step = "Check the drive's unit number (--units 1-247 asks all), its baud rate, the two wires and their polarity"
-    raise CommunicationLost(f"nobody answers ({asked})", where=where, next_step=step)
+        step = "Check the drive's unit number (--units 1-247 scans all), baud rate, the two wires and their polarity"
+    raise CommunicationLost(f"no unit answers ({asked})", where=where, next_step=step, entry=MessageCode.NO_REPLY)
 
 
 def _identify(link: Link, units: list[int], setting: ModbusConfig, embedded: str) -> tuple[FoundDrive, ...]:
-    """``embedded``: the transport of an embedded simulator, '' of a real line."""
+    """Identify the units. ``embedded``: the transport of an embedded simulator, '' of a real line."""
     transport = embedded or ("rtu" if setting.serial is not None else "tcp")
     serial = not embedded and setting.serial is not None
     names = ("serial", "baud", "parity", "stop_bits") if serial else ("host", "port")
@@ -234,7 +237,7 @@ def _identify(link: Link, units: list[int], setting: ModbusConfig, embedded: str
 
 
 def _settings(plan: PeerPlan, line: ModbusConfig) -> Iterator[ModbusConfig]:
-    """What was said first; on a serial line then the usual ones, as far as nobody named them."""
+    """Yield the given settings first; on a serial line then the usual ones for settings that are not given."""
     yield line
     if plan.embedded or line.serial is None:
         return
@@ -254,5 +257,5 @@ def _settings(plan: PeerPlan, line: ModbusConfig) -> Iterator[ModbusConfig]:
 
 
 def _said(line: ModbusConfig, name: str) -> bool:
-    """On the command line or in rig.yaml, not by the profile."""
+    """Return whether it is given on the command line or in rig.yaml, not by the profile."""
     return line.origin(name) in (Origin.COMMAND_LINE, Origin.RIG_FILE)

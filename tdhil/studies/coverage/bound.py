@@ -156,7 +156,7 @@ def information(
 
 
 def bound_of(fisher: FloatArray) -> float | None:
-    """Least standard deviation of the first parameter; None where the parameters can't be told apart."""
+    """Least standard deviation of the first parameter; None if the parameters can't be separated."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(fisher), 1e-300))
     scaled = fisher * np.outer(scale, scale)
     if float(np.linalg.eigvalsh(scaled)[0]) < _SINGULAR:

@@ -1,4 +1,4 @@
-"""What a plant of the coverage benchmark is made of: shaft, what its drive does to its reports, noise, reading.
+"""The parts of a plant of the coverage benchmark: shaft, effects of the drive on its reports, noise, reading.
 
 Data only, with the frequency responses that follow from them. Nothing here is shared with the estimator.
 """
@@ -120,7 +120,7 @@ class CoveragePlant:
 
     @property
     def bound_applies(self) -> bool:
-        """Is the RMSE held against the Cramér-Rao bound?"""
+        """Return whether the RMSE is compared with the Cramér-Rao bound."""
         return self.model_true and not self.degenerate
 
     @property

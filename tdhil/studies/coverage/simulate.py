@@ -1,4 +1,4 @@
-"""From a plant and seeds to recordings. Every run has its own random stream: how runs are grouped changes nothing."""
+"""Recordings from a plant and seeds. Every run has its own random stream, so grouping changes nothing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.errors import TdhilError
+from tdhil.errors import MessageCode, TdhilError
 from tdhil.estimation import Options, identify
 from tdhil.process_pool import Loss, Pool, TaskLimits
 from tdhil.recording import Excitation, Recording, Segment
@@ -17,7 +17,7 @@ from tdhil.runner.excitation import MotionLimits, Plan, PlanRequest, RigGuess, m
 from tdhil.studies.coverage.plants import CoveragePlant, FloatArray, ReportFilter
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What the shaft is asked to do: a plan of stage 5 per run, each from its own rough inertia, on one time grid.
+# The motion of the shaft: a plan of stage 5 per run, each from its own rough inertia, on one time grid.
 
 
 ROUGH_ERROR = 0.15        # the rough inertia is wrong by up to this share, uniformly, either way
@@ -38,7 +38,7 @@ class SimulatedMotion:
 
 
 def rough_guess(plant: CoveragePlant, shares: FloatArray) -> RigGuess:
-    """What stages 1 to 4 would have left behind; ``shares`` (2,) in [−1, 1]: how wrong inertia and friction are."""
+    """Return the results of stages 1 to 4; ``shares`` (2,) in [−1, 1]: errors of inertia and friction."""
     friction = 1.0 + _FRICTION_ERROR * float(shares[1])
     return RigGuess(
         plant.inertia_kg_m2 * (1.0 + ROUGH_ERROR * float(shares[0])),
@@ -126,7 +126,7 @@ _LEAST_DELAY_S = 0.005
 
 @dataclass(frozen=True)
 class SimulatedShaft:
-    """What truly happened, (steps, runs): speed in rad/s, torque at the shaft in N·m; row n at n·step_s."""
+    """The true motion, (steps, runs): speed in rad/s, torque at the shaft in N·m; row n at n·step_s."""
 
     speed: FloatArray
     torque: FloatArray
@@ -219,7 +219,7 @@ def simulate(plant: CoveragePlant, seeds: list[tuple[int, ...]], periods: int) -
 
 
 def quiet_shaft(plant: CoveragePlant, shares: FloatArray, periods: int) -> tuple[SimulatedMotion, SimulatedShaft]:
-    """What would happen without any noise, for rough inertias wrong by ``shares`` (runs,) of the largest error."""
+    """Return the motion without any noise, for rough inertias wrong by ``shares`` (runs,) of the largest error."""
     asked = motion(plant, [rough_guess(plant, np.array([share, 0.0])) for share in shares], periods)
     return asked, turn(plant, asked, np.zeros_like(asked.target), np.zeros_like(asked.target))
 
@@ -303,7 +303,7 @@ GROUP = 20     # runs simulated together: some 200 MB
 
 @dataclass(frozen=True)
 class SimulatedRun:
-    """What identification said of one run; ``value``, ``low``, ``high`` in kg·m², None where it gave no number."""
+    """The identification of one run; ``value``, ``low``, ``high`` in kg·m², None if it gave no number."""
 
     plant: str
     number: int
@@ -361,7 +361,7 @@ def _head(run: SimulatedRun) -> tuple[str, int, float, str, str]:
 
 
 def run_all(wanted: list[SimulationTask], processes: int) -> Iterator[tuple[SimulatedRun, ...]]:
-    """Groups as they are done, in no particular order. What is under way when this is interrupted is dropped."""
+    """Yield groups when they are done, in no particular order. An interruption drops unfinished groups."""
     if processes <= 1:
         return map(run_task, wanted)
     return _by_several(wanted, processes)
@@ -375,5 +375,6 @@ def _by_several(wanted: list[SimulationTask], processes: int) -> Iterator[tuple[
                 raise TdhilError(
                     f"a process that worked for it died: {result.text}", where=f"plant {task.plant.name}",
                     next_step="If memory was short, let fewer of them work at a time, such as --set processes=1",
+                    entry=MessageCode.WORKER_PROCESS_LOST,
                 )
             yield result

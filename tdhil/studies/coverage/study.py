@@ -75,7 +75,7 @@ class PlantFigures:
 
     @property
     def over_unknown(self) -> float | None:
-        """RMSE over the root of the bound of whoever doesn't know the filters' structure; not where friction bends."""
+        """Return RMSE over the root of the bound for an unknown filter structure; None with nonlinear friction."""
         if self.rmse is None or not self.bound_unknown or self.plant.bend is not None:
             return None
         return self.rmse / self.bound_unknown
@@ -133,7 +133,7 @@ def figures_of(plant: CoveragePlant, runs: Sequence[SimulatedRun], bounds: Bound
 
 
 def covers(found: PlantFigures, nominal: float) -> bool | None:
-    """Is the lower bound of the miss rate at most the nominal rate?"""
+    """Return whether the lower bound of the miss rate is at most the nominal rate."""
     return None if found.miss_rate is None else found.miss_low <= nominal
 
 
@@ -145,7 +145,7 @@ def not_too_wide(found: PlantFigures, nominal: float) -> bool | None:
 
 
 def answers(found: PlantFigures) -> bool | None:
-    """Is a number refused in 2 % of the runs at most (lower 99 % bound)? Only where the model is the truth."""
+    """Return whether at most 2 % of the runs give no number (lower 99 % bound). Only if the model is the truth."""
     if not found.plant.model_true or found.runs == 0:
         return None
     return clopper_pearson(found.refused, found.runs)[0] <= MOST_REFUSED
@@ -164,7 +164,7 @@ def efficient(found: PlantFigures) -> bool | None:
 
 
 def efficient_unknowing(found: PlantFigures) -> bool | None:
-    """RMSE ≤ 1.3 × the bound of whoever doesn't know the filters' structure."""
+    """Return whether RMSE ≤ 1.3 × the bound for an unknown filter structure."""
     return None if found.over_unknown is None else found.over_unknown <= _OVER_UNKNOWN
 
 
@@ -260,7 +260,7 @@ def _row(one: PlantFigures, quantile: float) -> tuple[Cell, ...]:
 
 
 def about_table(found: Sequence[PlantFigures]) -> ResultTable:
-    """What each plant is."""
+    """Return the table of the plants' properties."""
     columns = ("plant", "about", "speed_delay_s", "torque_delay_s", "skew_s", "rate_hz", "run_s")
     rows = tuple(
         (
@@ -417,7 +417,7 @@ def _told(duration_s: float) -> str:
 
 
 def cut_short(outcome: StudyOutcome, done: int, total: int) -> StudyOutcome:
-    """The same, saying everywhere that it is not all that was asked for."""
+    """Return the same, marked everywhere as incomplete."""
     return replace(
         outcome,
         title=f"{outcome.title} (interrupted: {done} of {total} runs)",

@@ -1,6 +1,7 @@
-"""What a field study asks of a bench: one run of the rig through drive, bus, runner and guard; a Recording back.
+"""The interface of a bench for field studies: one run of the rig through drive, bus, runner and guard; a Recording
+back.
 
-A study knows neither bus nor drive nor simulator: whoever puts the program together hands in a `FieldBench`.
+A study knows neither bus nor drive nor simulator: the command line passes in a `FieldBench`.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def gain(
 
 
 def tones_with_steady_rise(rig: SimulatedRig, kp: float, ki_values: tuple[float, ...]) -> tuple[int, int]:
-    """At how many of how many tones from 0.05 to 1 Hz |gain − 1| rises throughout ``ki_values`` (figure 21)."""
+    """Return at how many of how many tones from 0.05 to 1 Hz |gain − 1| rises over ``ki_values`` (figure 21)."""
     tones = np.linspace(0.05, 1.0, 96)
     grid = np.linspace(min(ki_values), max(ki_values), 60)
     away = np.abs(gain(rig, tones[:, None], kp, grid[None, :], reported=True) - 1.0)

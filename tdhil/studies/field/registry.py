@@ -10,5 +10,5 @@ from tdhil.studies.study import Study
 
 
 def field_studies(bench: FieldBench) -> tuple[Study, ...]:
-    """In the paper's order."""
+    """The field studies, in the paper's order."""
     return (LoopScatter(bench), KpSweep(bench), KiSweep(bench), FieldSlopes(bench), ToneSweep(bench))

@@ -15,7 +15,7 @@ Gains = Annotated[tuple[Positive, ...], Field(min_length=3, max_length=24)]
 
 
 class SimulatedRig(DataModel):
-    """The rig at the other end of the bus. Identification is told none of it.
+    """The rig at the other end of the bus. Identification receives none of it.
 
     The reporting lags are those that reproduce the published slopes with one inertia (notes: 0.403 and 0.151 s); J, B
     and Coulomb friction of the real rig are not published.
@@ -31,10 +31,10 @@ class SimulatedRig(DataModel):
 
 
 class FieldSettings(DataModel):
-    """What every field study can be told."""
+    """Settings of every field study."""
 
     seed: int = Field(default=1, ge=0, le=2**31 - 1000, description="repeats the whole study, to the last sample")
-    rate_hz: float = Field(default=100.0, ge=20, le=500, description="cycles a second")
+    rate_hz: float = Field(default=100.0, ge=20, le=500, description="cycles per second")
     torque_limit_nm: Positive = Field(default=400.0, description="N·m; of drive, plan and guard")
     rig: SimulatedRig = SimulatedRig()
 

@@ -190,7 +190,7 @@ def _joint_statements(
 
 
 def _open(records: list[Record]) -> list[Statement]:
-    """Where the paper contradicts itself, or leaves out what would decide."""
+    """Return contradictions and missing data in the paper."""
     lowest = min(records, key=lambda record: record.hertz)
     level = f"{lowest.points.fit.intercept_nm:.1f} N·m at a mean of {lowest.mean_speed_rad_s:.2f} rad/s"
     return [

@@ -1,4 +1,4 @@
-"""What one recorded sine says: amplitude in, amplitude out, and the paper's scatter of torque over acceleration."""
+"""Evaluation of one recorded sine: amplitude in, amplitude out, and the paper's scatter of torque over acceleration."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ SETTLE_S = 10.0
 
 @dataclass(frozen=True)
 class Amplitudes:
-    """Of the commanded and of the reported speed, rad/s; ``sd_rad_s`` is the output's standard deviation."""
+    """Amplitudes of the commanded and the reported speed, rad/s; ``sd_rad_s`` is the output's standard deviation."""
 
     input_rad_s: float
     output_rad_s: float
@@ -104,7 +104,7 @@ def sine_run(
 def swept_amplitudes(
     bench: FieldBench, settings: AmplitudeSettings, runs: Sequence[tuple[float, float, float, str]], progress: Progress
 ) -> tuple[tuple[Amplitudes, ...], float]:
-    """One run for each (tone, P, I, what it is called), each with a seed of its own; and their simulated seconds."""
+    """Run each (tone, P, I, name), each with a seed of its own; and their simulated seconds."""
     found, simulated_s = [], 0.0
     for index, (hertz, kp, ki, text) in enumerate(runs):
         wish = sine_run(settings, hertz, kp, ki, settings.seed + index)
@@ -122,7 +122,7 @@ def excited(recording: Recording) -> Samples:
 
 
 def amplitudes(recording: Recording) -> Amplitudes:
-    """By the Fourier coefficient of each whole period, averaged over the periods."""
+    """Return the amplitude from the Fourier coefficient of each whole period, averaged over the periods."""
     assert recording.excitation is not None
     samples = usable_samples(recording)
     (stretch,) = stretches(samples, recording.excitation.segments)

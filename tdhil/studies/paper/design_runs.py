@@ -40,7 +40,7 @@ from tdhil.studies.study import Progress
 
 
 def closed_form_inertia(run: LoopSettings) -> float | None:
-    """What the fit over all samples gives, about; None for references other than a sine."""
+    """Return approximately what the fit over all samples gives; None for references other than a sine."""
     if run.signal != "sine":
         return None
     inertia, viscous, offset, duration = run.inertia_kg_m2, run.viscous_nm_s_rad, run.offset_rad_s, run.duration_s
@@ -90,7 +90,7 @@ def recording_of(
 def identified(
     settings: LoopSettings, time_s: FloatArray, speed_rad_s: FloatArray, torque_nm: FloatArray
 ) -> Identification | None:
-    """None for motions that are not a sine."""
+    """Return tdhil's own identification of a run; None for motions that are not a sine."""
     if settings.signal != "sine":
         return None
     return identify(recording_of(settings, time_s, speed_rad_s, torque_nm), Options())
@@ -138,7 +138,7 @@ class DesignResult:
 
     @property
     def ranks(self) -> tuple[int, ...]:
-        """Of the factors, 1 for the largest range."""
+        """Return the ranks of the factors, 1 for the largest range."""
         return ranking([effect.range for effect in self.effects])
 
 

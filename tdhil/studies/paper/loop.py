@@ -56,7 +56,7 @@ class LoopSettings(DataModel):
     coulomb_nm: NonNegative = 82.4
     """Coulomb torque, the limit of Dahl's bristle (printed as N/m, is N·m)."""
     dahl_stiffness_nm_rad: Positive = 5000.0
-    """Of Dahl's bristle (printed as N/m, is N·m/rad)."""
+    """Stiffness of Dahl's bristle (printed as N/m, is N·m/rad)."""
     friction: Literal["dahl", "coulomb"] = "dahl"
     kp_nm_s_rad: NonNegative = 15000.0
     ki_nm_rad: NonNegative = 9000.0
@@ -65,7 +65,7 @@ class LoopSettings(DataModel):
     offset_rad_s: float = 2.0 * pi
     signal: Literal["sine", "step", "chirp", "multisine"] = "sine"
     chirp_end_hz: Positive = 2.0
-    """Where a chirp ends that begins at `frequency_hz`."""
+    """End frequency of a chirp that begins at `frequency_hz`, Hz."""
     noise_power_nm2_s: NonNegative = 1.0e-4
     """Spectral density of the torque disturbance, (N·m)²·s (printed as (N·m)²)."""
     duration_s: Positive = 10.0
@@ -100,7 +100,7 @@ FACTORS = (
     "inertia_kg_m2", "viscous_nm_s_rad", "coulomb_nm", "dahl_stiffness_nm_rad", "kp_nm_s_rad", "ki_nm_rad",
     "frequency_hz", "amplitude_rad_s", "offset_rad_s", "noise_power_nm2_s",
 )
-"""What may differ from run to run of one design."""
+"""Values that may differ between the runs of one design."""
 
 SYMBOLS = {
     "J": "inertia_kg_m2", "B": "viscous_nm_s_rad", "Fc": "coulomb_nm", "sigma": "dahl_stiffness_nm_rad",
@@ -130,7 +130,7 @@ def changed(settings: LoopSettings, **values: object) -> LoopSettings:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What the loop is asked to follow, in rad/s: sine with offset (equation 8), step (equation 9), chirp, multisine.
+# References of the loop, in rad/s: sine with offset (equation 8), step (equation 9), chirp, multisine.
 
 
 FloatArray = NDArray[np.float64]
@@ -220,7 +220,9 @@ class MultisineReference:
 
 
 def reference_of(run: LoopSettings) -> Reference:
-    """What ``run`` asks for. The step goes from the offset to offset + amplitude at a quarter of the period (3.4.3)."""
+    """Return the reference of ``run``. The step goes from the offset to offset + amplitude at a quarter of the period
+    (3.4.3).
+    """
     if run.signal == "step":
         return StepReference(run.offset_rad_s, run.offset_rad_s + run.amplitude_rad_s, 0.25 / run.frequency_hz)
     if run.signal == "chirp":
@@ -238,7 +240,7 @@ _PROGRESS_STEPS = 500
 
 @dataclass(frozen=True)
 class LoopRecord:
-    """What was logged: one row per sample (the first at t = 0), one column per run."""
+    """The logged samples: one row per sample (the first at t = 0), one column per run."""
 
     time_s: FloatArray
     reference_rad_s: FloatArray

@@ -48,7 +48,7 @@ def shipped_arrays() -> dict[str, Rows]:
 
 
 def fault_of(rows: Sequence[Sequence[int]]) -> str | None:
-    """What keeps ``rows`` from being an orthogonal array, in words; None if nothing does."""
+    """Return why ``rows`` is not an orthogonal array, in words; None if it is one."""
     if not rows or not rows[0]:
         return "the array is empty"
     if len(rows) > MAX_RUNS:
@@ -126,7 +126,7 @@ def ranking(ranges: Sequence[float]) -> tuple[int, ...]:
 
 
 def is_saturated(rows: RangeRows) -> bool:
-    """Whether the level means fix every run: 1 + Σ(levels − 1) = runs."""
+    """Return whether the level means determine every run: 1 + Σ(levels − 1) = runs."""
     levels = np.asarray(rows)
     return 1 + sum(len(np.unique(column)) - 1 for column in levels.T) == len(levels)
 
@@ -206,7 +206,7 @@ class DesignSettings(LoopSettings):
 
 
 def _unfit(factors: tuple[Factor, ...], rows: Rows) -> list[Finding]:
-    """What is wrong with factors on this array."""
+    """Return the errors of factors on this array."""
     findings: list[Finding] = []
     if not factors:
         return [("factors", "a design needs at least one factor")]

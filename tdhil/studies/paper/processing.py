@@ -1,4 +1,4 @@
-"""From samples to figures: the paper's section 4.3 (α, line, J) and 3.4.1 (amplitude, gain, phase)."""
+"""Evaluation of samples: the paper's section 4.3 (α, line, J) and 3.4.1 (amplitude, gain, phase)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def torque_line(time_s: FloatArray, speed_rad_s: FloatArray, torque_nm: FloatArr
     """
     fit = line_fit(backward_difference(time_s, speed_rad_s), torque_nm[1:])
     if fit is None:
-        raise ValueError("the speed never changes: no inertia can be told from it")
+        raise ValueError("the speed never changes, so it gives no inertia")
     return fit
 
 
@@ -87,10 +87,10 @@ class Response:
     amplitude_out_rad_s: float
     gain: float
     lag_zeros_deg: float
-    """By zero crossing."""
+    """Phase lag from the zero crossings, degrees."""
     gain_fundamental: float
     lag_fundamental_deg: float
-    """By the fundamental's Fourier coefficient, which noise and harmonics hardly touch."""
+    """Phase lag from the fundamental's Fourier coefficient, degrees: robust against noise and harmonics."""
 
     @property
     def amplitude_difference_rad_s(self) -> float:

@@ -1,4 +1,4 @@
-"""What section 3.4 says about figures 9, 10, 12 and 13, and whether it holds here."""
+"""The statements of section 3.4 about figures 9, 10, 12 and 13, and whether they hold here."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _column(points: Sequence[SweepPoint], name: str) -> list[float]:
 
 
 def _lag_moves(points: Sequence[SweepPoint], *, up: bool) -> bool:
-    """By both ways of measuring it."""
+    """Return whether the lag moves in this direction by both ways of measuring."""
     moves = grows if up else falls
     return moves(_column(points, "lag_fundamental_deg")) and moves(_column(points, "lag_zeros_deg"))
 

@@ -1,4 +1,4 @@
-"""What sections 4.4 and 3.4.2 say about Tables 6 and 7, and whether it holds here."""
+"""The statements of sections 4.4 and 3.4.2 about Tables 6 and 7, and whether they hold here."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tdhil.studies.paper.published import PublishedDesign
 from tdhil.studies.study import Statement
 
 BOUNDS_KG_M2 = {"table6": 1.1, "table7": 0.5}
-"""What the RMS over the recovered runs may be at most."""
+"""Largest RMS over the recovered runs."""
 
 _OWN_BOUND = 0.001
 
@@ -44,7 +44,7 @@ def _order(ranges: list[float], letters: list[str]) -> str:
 
 
 def ranks_statement(result: DesignResult, paper: PublishedDesign) -> Statement:
-    """Whether the factors rank as published."""
+    """Return whether the factors rank as published."""
     letters = [factor.letter for factor in paper.factors]
     theirs, ours = [factor.range_kg_m2 for factor in paper.factors], [effect.range for effect in result.effects]
     # B and C of Table 6 differ by 0.18 kg·m², less than our runs' own deviation: their order is asked apart.

@@ -87,7 +87,7 @@ class DesignStudy(OverDesign):
 
 
 def published_for(name: str, settings: DesignSettings) -> PublishedDesign | None:
-    """What is printed for this design; None once its array or its factors are others."""
+    """Return the published values for this design; None if its array or its factors differ."""
     paper = published().design(name)
     same = type(settings)(array=paper.array, factors=paper.as_factors).rows == settings.rows
     theirs = [(factor.field, factor.levels) for factor in paper.as_factors]
@@ -95,7 +95,7 @@ def published_for(name: str, settings: DesignSettings) -> PublishedDesign | None
 
 
 def rms_deviation(result: DesignResult, paper: PublishedDesign) -> float:
-    """Of our runs from the recovered published ones, kg·m²."""
+    """Return the RMS deviation of our runs from the recovered published ones, kg·m²."""
     pairs = zip(result.inertias, paper.runs_kg_m2, strict=True)
     return sqrt(sum((ours - theirs) ** 2 for ours, theirs in pairs) / len(result.runs))
 
@@ -149,7 +149,7 @@ def effect_document(settings: DesignSettings, result: DesignResult) -> list[dict
 
 
 def _own(run: DesignRun) -> dict[str, Any] | None:
-    """What this tool itself concludes, for machines."""
+    """Return tdhil's own conclusions, as plain data."""
     found = run.identification
     if found is None:
         return None

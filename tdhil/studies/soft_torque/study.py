@@ -1,7 +1,7 @@
 """`tdhil study soft-torque`: what J is for, on one string: controllers, errors of J, stick-slip with and without.
 
 The figures stand beside those of an earlier prototype (a chain of 50 lumps stepped in time; here: exact lines and
-characteristics). What differs is told with its reason.
+characteristics). Each difference is reported with its reason.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from tdhil.soft_torque import (
     TuneCase,
     critical_speeds,
     largest_stable_share,
+    linear_limit,
     lowest_turning,
     reflection_at,
     simulate,
@@ -48,7 +49,7 @@ if TYPE_CHECKING:
 
 INERTIA_KG_M2 = 1500.0
 ERRORS = (-0.20, -0.0056, 0.0056, 0.04, 0.126, 0.76)
-"""Of the J that is believed: −20 %, repeatability, torque scale, the paper's method, the spread of its slopes."""
+"""Errors of the assumed J: −20 %, repeatability, torque scale, the paper's method, the spread of its slopes."""
 SHARE_ERRORS = (0.0, 0.04, 0.126, 0.76)
 SHORT_LAGS_S = (0.005, 0.002, 0.001)
 IDEAL = "ideal, Z = ζ"
@@ -70,7 +71,6 @@ class SoftTorqueSettings(DataModel):
     highest_rpm: float = Field(default=240.0, gt=20.0, le=1000.0)
     lowest_rpm: float = Field(default=8.0, gt=0.0)
     start_ramp_rpm_s: float = Field(default=5.0, gt=0.0)
-    onset_from_rpm: float = Field(default=210.0, gt=10.0)
     shown_at_rpm: float = Field(default=100.0, gt=1.0, description="set speed of the pictures")
     beside: bool = Field(default=True, description="also other ramps and beginnings, for what hangs on them")
 
@@ -92,16 +92,16 @@ class SoftTorqueSettings(DataModel):
         """How critical speeds are looked for."""
         coarse = 8.0 * self.resolution_rpm
         return Search(self.highest_rpm, self.lowest_rpm, coarse, self.resolution_rpm, self.duration_s,
-                      min(20.0, 0.3 * self.duration_s), self.start_ramp_rpm_s, self.onset_from_rpm)
+                      min(20.0, 0.3 * self.duration_s), self.start_ramp_rpm_s)
 
 
 @dataclass(frozen=True)
 class PrototypeResult:
-    """What the prototype gave for one controller."""
+    """Values of the prototype for one controller; the linear limit: the eigenvalues of a chain of 50 lumps."""
 
     reflection: float
     dampings: tuple[float, ...]
-    onset_rpm: float
+    linear_rpm: float
     start_rpm: float
     cure_rpm: float
 
@@ -118,16 +118,18 @@ class ControllerRow:
     dampings: tuple[float, ...]
     modes_hz: tuple[float, ...]
     critical: CriticalSpeeds | None = None
+    linear_rpm: float | None = None
+    """Linear stability limit."""
 
 
 EXPECTED: Mapping[str, PrototypeResult] = {
-    "stiff, phase margin 60°": PrototypeResult(0.992, (0.036,), 24, 170, 183),
-    "the paper's 300/300, scaled to J": PrototypeResult(0.932, (0.062,), 22, 106, 133),
-    "soft a = 1": PrototypeResult(0.046, (0.059, 0.083), 21, 71, 72),
-    "soft a = 0.25": PrototypeResult(0.593, (0.23, 0.27), 22, 58, 57),
-    "a = 0.35 at 0.84 f₁": PrototypeResult(0.537, (0.14, 0.28), 27, 48, 46),
-    "the same, half of J compensated": PrototypeResult(0.477, (0.26, 0.53), 29, 40, 40),
-    IDEAL: PrototypeResult(0.0, (0.80,), 35, 30, 20),
+    "stiff, phase margin 60°": PrototypeResult(0.992, (0.036,), 53.8, 148, 183),
+    "the paper's 300/300, scaled to J": PrototypeResult(0.932, (0.062,), 50.8, 106, 133),
+    "soft a = 1": PrototypeResult(0.046, (0.059, 0.083), 47.0, 71, 72),
+    "soft a = 0.25": PrototypeResult(0.593, (0.23, 0.27), 41.5, 58, 57),
+    "a = 0.35 at 0.84 f₁": PrototypeResult(0.537, (0.14, 0.28), 39.4, 48, 46),
+    "the same, half of J compensated": PrototypeResult(0.477, (0.26, 0.53), 40.8, 40, 40),
+    IDEAL: PrototypeResult(0.0, (0.80,), 35.9, 30, 20),
 }
 
 ERROR_ROWS: Mapping[str, tuple[float | None, ...]] = {
@@ -164,7 +166,8 @@ def controllers(settings: SoftTorqueSettings) -> list[ControllerRow]:
         reflected = reflection_at(machine, law, string, np.array([held[0]]))[0]
         rows.append(ControllerRow(name, machine, law, EXPECTED[name], float(reflected),
                                   tuple(sorted(mode.damping for mode in swinging)),
-                                  tuple(mode.frequency_hz for mode in swinging)))
+                                  tuple(mode.frequency_hz for mode in swinging),
+                                  linear_rpm=linear_limit(string, machine, law) / RPM))
     return rows
 
 
@@ -189,7 +192,7 @@ class SoftTorqueStudy:
         beside: tuple[ResultTable, ...] = ()
         if settings.beside:
             progress(0.75, "other ramps and beginnings")
-            beside = (start_by_ramp(rows[:4], settings), onset_by_beginning(rows, settings))
+            beside = (start_by_ramp(rows[:4], settings),)
         progress(0.92, "how much of J can be compensated")
         shares = {name: largest_shares(settings, lags) for name, lags in
                   (("33 ms", settings.inner_lags_s), ("8 ms", SHORT_LAGS_S))}
@@ -263,19 +266,6 @@ def start_by_ramp(rows: Sequence[ControllerRow], settings: SoftTorqueSettings) -
     return ResultTable("start_by_ramp", ("controller", *(f"rpm_at_{ramp:g}_rpm_s" for ramp in ramps)), tuple(cells))
 
 
-def onset_by_beginning(rows: Sequence[ControllerRow], settings: SoftTorqueSettings) -> ResultTable:
-    """Onset by the set speed that the fall begins at."""
-    starts = np.array([100.0, 130.0, 150.0, 170.0, 190.0, 210.0, 240.0])
-    begin = np.tile(starts * RPM, (len(rows), 1))
-    trace = simulate(settings.string(), [(row.drive, row.law) for row in rows], Begin("turning", begin),
-                     np.zeros_like(begin), RPM, float(starts.max()), keep_every_s=1000.0)
-    onset = starts[None, :] - trace.first_stuck_s
-    cells: list[tuple[Cell, ...]] = [
-        (row.name, *(float(one) if np.isfinite(one) else None for one in onset[k])) for k, row in enumerate(rows)]
-    columns = ("controller", *(f"rpm_from_{start:.0f}" for start in starts))
-    return ResultTable("onset_by_beginning", columns, tuple(cells))
-
-
 def stick_slip(rows: Sequence[ControllerRow], settings: SoftTorqueSettings) -> tuple[tuple[str, ...], SimulationTrace]:
     """Bit and top under three of them, from a stuck bit."""
     taken = (rows[0], rows[1], rows[3])
@@ -294,10 +284,10 @@ def controller_table(rows: Sequence[ControllerRow]) -> ResultTable:
     def cells(row: ControllerRow) -> tuple[Cell, ...]:
         speeds = row.critical
         return (row.name, row.law.gain_nm_s_rad, row.law.integral_nm_rad, row.law.compensated_kg_m2, row.reflection,
-                *((speeds.onset_rpm, speeds.start_rpm, speeds.cure_rpm) if speeds else (None, None, None)))
+                *((row.linear_rpm, speeds.start_rpm, speeds.cure_rpm) if speeds else (None, None, None)))
 
-    return ResultTable("controllers", ("controller", "P_nm_s_rad", "I_nm_rad", "Jc_kg_m2", "reflection", "onset_rpm",
-                                       "start_rpm", "cure_rpm"), tuple(cells(row) for row in rows))
+    return ResultTable("controllers", ("controller", "P_nm_s_rad", "I_nm_rad", "Jc_kg_m2", "reflection",
+                                       "linear_limit_rpm", "start_rpm", "cure_rpm"), tuple(cells(row) for row in rows))
 
 
 def modes_table(rows: Sequence[ControllerRow]) -> ResultTable:
@@ -318,7 +308,7 @@ def error_table(errors: Mapping[str, Sequence[float | None]]) -> ResultTable:
 
 
 def share_table(shares: Mapping[str, Sequence[float]]) -> ResultTable:
-    """What can be compensated."""
+    """Return the table of the largest share of J that can be compensated."""
     names = tuple(f"J_{100 * error:+.3g}_%" for error in SHARE_ERRORS)
     rows: tuple[tuple[Cell, ...], ...] = tuple((name, *row) for name, row in shares.items())
     return ResultTable("largest_stable_share", ("inner_lag", *names), rows)
@@ -347,18 +337,18 @@ def controller_statements(rows: Sequence[ControllerRow]) -> list[Statement]:
 def _speeds(row: ControllerRow, critical: CriticalSpeeds) -> Statement:
     expected = row.expected
     pairs = {
-        "onset": (critical.onset_rpm, expected.onset_rpm), "start": (critical.start_rpm, expected.start_rpm),
+        "linear limit": (row.linear_rpm, expected.linear_rpm), "start": (critical.start_rpm, expected.start_rpm),
         "cure": (critical.cure_rpm, expected.cure_rpm),
     }
     off = [name for name, (ours, theirs) in pairs.items() if ours is None or abs(ours - theirs) > SPEED_WITHIN_RPM]
     text = " / ".join("none" if ours is None else f"{ours:.0f}" for ours, _ in pairs.values())
     if off and row.name == IDEAL:
         text += (": the impedance alone doesn't say what holds the mean torque; here it is an integral of 10 N·m/rad. "
-                 "With none, and 5 kN·m of it from the beginning, the cure is 20 rpm; with 20 N·m/rad the onset is 35")
+                 "With none, and 5 kN·m of it from the beginning, the cure is 20 rpm")
     elif off:
         text += f": under a loop that hardly damps {' and '.join(off)} hangs on how it begins; see the tables beside"
-    return Statement(f"{row.name}: onset / start / cure, rpm",
-                     f"{expected.onset_rpm:.0f} / {expected.start_rpm:.0f} / {expected.cure_rpm:.0f}", text, not off)
+    return Statement(f"{row.name}: linear limit / start / cure, rpm",
+                     f"{expected.linear_rpm:.0f} / {expected.start_rpm:.0f} / {expected.cure_rpm:.0f}", text, not off)
 
 
 def error_statements(errors: Mapping[str, Sequence[float | None]]) -> list[Statement]:
