@@ -1,7 +1,7 @@
-"""The rigs of a site as a service: runs as processes of their own, their memory on files, and a web before them.
+"""The rigs of a site as a service: runs as separate processes, files as storage, and a web interface.
 
-The web opens no drive's bus. A run is a process of its own, today's Runner with its guard and its stop; it writes
-run.mcap, and the web reads that as it grows.
+The web opens no drive's bus. A run is a process of its own, with the same Runner, guard and stop as on the command
+line. It writes run.mcap, and the web reads this file as it grows.
 """
 
 from typing import TYPE_CHECKING

@@ -1,9 +1,9 @@
-"""Who asks, and what he may: by a session's cookie, by a machine's token, or by sitting at this computer.
+"""Identity and rights of a client: by a session cookie, by a machine's token, or on this computer itself.
 
-All of it is answered from memory: no request, and no stop above all, waits for a file here.
+All of it is answered from memory: no request, and above all no stop, waits for a file here.
 
-* Without accounts, on loopback: whoever sits there, with every role.
-* With accounts: nobody without a login. Its end takes everything from a page but the stop.
+* Without accounts, on loopback: every user of this computer has every role.
+* With accounts: a login is required. When it ends, its page may still stop, and nothing else.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from tdhil.service.schemas import CSRF_HEADER
 from tdhil.service.store import read_json, write_json
 
 SESSION_S: Final = 12 * 3600.0
-"""A shift."""
+"""Duration of a login, s: one shift."""
 STOPS_S: Final = 7 * 86400.0
-"""So long after its end a session's page can still stop."""
+"""Time after its end in which a session's page can still stop, s."""
 READ_S: Final = 1.0
 SOCKET_LOOK_S: Final = 2.0
-"""So often it is looked whether who opened a socket may still have it."""
+"""Interval at which the rights of an open socket are checked, s."""
 COOKIE: Final = "__Host-tdhil"
 CSRF_COOKIE: Final = "__Host-tdhil-csrf"
 STOPS: Final = frozenset({"stop", "stop_rig"})
-"""The routes that are never refused to somebody who is known."""
+"""Routes that are never refused to a known client."""
 _MOST_SESSIONS: Final = 5000
 _PROXIES: Final = ("forwarded", "x-forwarded-for", "x-real-ip", "via")
 _ENGINEER_S: Final = ("accept_unverified", "accept_wider_limit", "accept_speed_unit")
@@ -51,9 +51,9 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Principal:
-    """Who asks. ``name`` is what the audit says; ``session``: a login's own name, '' for a token and at this computer.
+    """A client. ``name`` appears in the audit; ``session``: of a login, '' for a token and on this computer.
 
-    ``known``: by a password or a token. ``csrf``: what a change has to bring along, '' where nothing.
+    ``known``: by a password or a token. ``csrf``: the token that a change must contain, '' if none.
     """
 
     name: str
@@ -70,7 +70,7 @@ NOBODY: Final = Principal("nobody", frozenset(), may_stop=False)
 
 @dataclass(frozen=True)
 class Session:
-    """A login: ``since`` of the password that it was made with; times as of `time.time`."""
+    """A login: ``since`` is that of the password it was made with; times as of `time.time`."""
 
     user: str
     since: str
@@ -79,10 +79,10 @@ class Session:
 
 
 class Tries:
-    """How often a password may be tried in a minute: by one address 5 times for a name, and 20 times for all.
+    """Limits of password tries in a minute: from one address 5 for one name, and 20 for all names.
 
-    For a name, 30 times from all addresses that it never came from: who tries from elsewhere keeps nobody away from
-    where he logs in, but may keep him from logging in at a new place for as long as he goes on.
+    For one name 30 from all addresses that never logged in with it. So an attacker elsewhere never blocks a login from
+    a known address, but may block one from a new address while the attack lasts.
     """
 
     WINDOW_S: Final = 60.0
@@ -96,7 +96,7 @@ class Tries:
         self._lock = threading.Lock()
 
     def begin(self, name: str, address: str) -> None:
-        """Count one, before its password is looked at. Raises TooManyTries."""
+        """Count one try, before its password is checked. Raises TooManyTries."""
         with self._lock:
             now_s = self._clock()
             if len(self._tried) > self._MOST:
@@ -112,7 +112,7 @@ class Tries:
                 one.append(now_s)
 
     def good(self, name: str, address: str) -> None:
-        """It was the password."""
+        """Note a correct password."""
         with self._lock:
             if len(self._good) > self._MOST:
                 self._good.clear()
@@ -137,7 +137,7 @@ class RequestPace:
         self._lock = threading.Lock()
 
     def begin(self, who: str, address: str, rig: str) -> None:
-        """Count one. Raises TooManyRuns; then it doesn't count."""
+        """Count one request. Raises TooManyRuns for a request above the limit, and does not count it."""
         with self._lock:
             now_s = self._clock()
             longest_s = self.LIMITS[-1][0]
@@ -161,7 +161,7 @@ class RequestPace:
 
 
 class Access:
-    """Of one service, for any thread. ``login``: are there accounts, so that nobody gets in without?"""
+    """The access control of one service, for any thread. ``login``: accounts exist, and a login is required."""
 
     def __init__(
         self, folder: Path, *, login: bool = False, say: Say = lambda text: None,
@@ -195,13 +195,13 @@ class Access:
             self.refresh()
 
     def refresh(self, *, first: bool = False) -> None:
-        """Read the accounts if they were changed; where they can't be read, those of before hold."""
+        """Read the accounts if they were changed. If they can't be read, the former ones stay in force."""
         try:
             before, found = self.accounts.changed()
         except TdhilError as error:
             if str(error) != self._trouble:
                 self._trouble = str(error)
-                self._say(f"the accounts stay as they were: {error}")
+                self._say(f"the accounts can't be read, the former ones stay in force: {error}")
             return
         self._trouble = ""
         if found is not before and not first:
@@ -211,7 +211,7 @@ class Access:
     # -- who asks ----------------------------------------------------------------------------------------------------
 
     def who(self, connection: HTTPConnection) -> Principal:
-        """Without touching a file. Who brings a token that nobody knows is nobody, also at this computer."""
+        """Return the client, without touching a file. An unknown token gives no rights, also on this computer."""
         accounts = self.accounts.known
         if (token := token_in(connection)) is not None:
             if (found := accounts.of_token(token)) is None:
@@ -219,7 +219,7 @@ class Access:
             return Principal(f"{found.name} (token)", role_at_least(found.role), known=True)
         if not self.login:
             if any(name in connection.headers for name in _PROXIES):
-                return NOBODY                      # from who knows where, by way of this computer
+                return NOBODY                      # from an unknown place, through a proxy on this computer
             return Principal("local", frozenset({"viewer"})) if accounts else LOCAL
         cookie = _cookie(connection, COOKIE)
         return NOBODY if cookie is None else self._of_session(cookie, accounts)
@@ -244,12 +244,12 @@ class Access:
     # -- login -------------------------------------------------------------------------------------------------------
 
     def log_in(self, name: str, password: str, address: str) -> tuple[str, Principal]:
-        """The cookie's value, and whose it is. Slow on purpose. Raises TooManyTries and NotLoggedIn."""
+        """Return the cookie's value and its client. Slow on purpose. Raises TooManyTries and NotLoggedIn."""
         self.tries.begin(name, address)
         user = self.accounts.known.users.get(name)
         good = matches(password, None if user is None else user.password)
         if user is None or not good:
-            raise NotLoggedIn("name and password don't go together", where="login")
+            raise NotLoggedIn("name or password is wrong", where="login")
         self.tries.good(name, address)
         cookie, now_s = secrets.token_urlsafe(32), self._clock()
         with self._lock:
@@ -261,14 +261,14 @@ class Access:
         return cookie, self._of_session(cookie, self.accounts.known)
 
     def log_out(self, connection: HTTPConnection) -> None:
-        """Here and now, and after a restart."""
+        """End the session now, also for the time after a restart."""
         if (cookie := _cookie(connection, COOKIE)) is not None:
             with self._lock:
                 self._sessions = {one: it for one, it in self._sessions.items() if one != _hash(cookie)}
             self._save()
 
     def ends_s(self, who: Principal) -> float | None:
-        """When his session ends, as of `time.time`; None without one."""
+        """Return the end of the client's session, as of `time.time`; None without one."""
         return next((it.ends_s for one, it in self._sessions.items() if who.session and one.startswith(who.session)),
                     None)
 
@@ -278,17 +278,17 @@ class Access:
             try:
                 write_json(self._path, plain, mode=0o600)
             except OSError as error:
-                self._say(f"the logins can't be written, and end with this process: {error}")
+                self._say(f"the logins can't be written and will end with this process: {error}")
 
 
 def principal(connection: HTTPConnection) -> Principal:
-    """Who asks, as the middleware has found."""
+    """Return the client that the middleware found."""
     found: Principal = connection.scope.get("user", NOBODY)
     return found
 
 
 def set_cookies(response: Response, connection: HTTPConnection, cookie: str | None) -> None:
-    """Of a login; None: take them back. The browser forgets them when it is closed."""
+    """Set the cookies of a login; None deletes them. The browser forgets them when it is closed."""
     for name, value, hidden in ((COOKIE, cookie or "", True),
                                 (CSRF_COOKIE, "" if cookie is None else csrf_of(cookie), False)):
         response.set_cookie(_named(name, connection), value, max_age=None if cookie else 0, path="/", secure=True,
@@ -296,41 +296,44 @@ def set_cookies(response: Response, connection: HTTPConnection, cookie: str | No
 
 
 def csrf_of(cookie: str) -> str:
-    """What a page of this session sends along with a change; its script reads it in a cookie of its own.
+    """Return the token that a page of this session sends with each change. Its script reads it in a separate cookie.
 
-    So a page from before a new login has the new one, and its stop gets through.
+    So a page from before a new login has the new token, and its stop is accepted.
     """
     return hmac.new(cookie.encode(), b"csrf", hashlib.sha256).hexdigest()[:32]
 
 
 def require(who: Principal, role: Role | None, *, route: str, open_here: bool, csrf: str | None = None) -> None:
-    """``role``: None is anybody; ``csrf``: what came along with a change. Raises NotLoggedIn and NotAllowed."""
+    """Check the rights. ``role``: None allows every client; ``csrf``: sent with a change. Raises NotLoggedIn and
+    NotAllowed.
+    """
     if role is None:
         return
     if role not in who.roles and not (route in STOPS and who.may_stop):
         if who.roles:
-            raise NotAllowed(f"{who.name} is no {role}", where=route,
-                             next_step=f"Ask somebody who is {role}" if who.known or not open_here else
+            raise NotAllowed(f"{who.name} does not have the role {role}", where=route,
+                             next_step=f"Ask a user with the role {role}" if who.known or not open_here else
                              "Users were added: start tdhil serve again, with --tls-cert and --tls-key")
         raise NotLoggedIn(
-            "the login has ended" if who.known else "nobody knows who asks", where=route,
-            next_step="What comes through a proxy, or with a token that isn't known, is refused" if open_here
-            else "Log in again; a stop still gets through" if who.known else "Log in, or send a token",
+            "the login has ended" if who.known else "the client is not logged in", where=route,
+            next_step="A request through a proxy, or with an unknown token, is refused" if open_here
+            else "Log in again; a stop is still accepted" if who.known else "Log in, or send a token",
         )
     if who.csrf and csrf is not None and not hmac.compare_digest(csrf.encode(), who.csrf.encode()):
-        raise NotAllowed("this came from no page of this login", where=CSRF_HEADER, next_step="Load the page again")
+        raise NotAllowed("this request did not come from a page of this login", where=CSRF_HEADER,
+                         next_step="Load the page again")
 
 
 def require_options(who: Principal, options: Mapping[str, Any]) -> None:
-    """What an engineer alone may ask for. Raises NotAllowed."""
+    """Check options that only an engineer may request. Raises NotAllowed."""
     for name in _ENGINEER_S:
         if options.get(name) and "engineer" not in who.roles:
-            raise NotAllowed(f"{who.name} is no engineer, and takes nothing upon himself that nobody verified",
+            raise NotAllowed(f"{who.name} is not an engineer; only an engineer may accept unverified entries",
                              where=name, next_step="Ask an engineer")
 
 
 def token_in(connection: HTTPConnection) -> str | None:
-    """What came as a machine's token; a WebSocket may bring it as ?token=…, since browsers send it no header."""
+    """Return a machine's token. A WebSocket may send it as ?token=…, since browsers add no header to it."""
     if (given := connection.headers.get("authorization")) is not None:
         kind, _, token = given.partition(" ")
         return token.strip() if kind.lower() == "bearer" else ""
@@ -339,7 +342,7 @@ def token_in(connection: HTTPConnection) -> str | None:
 
 
 def address_of(connection: HTTPConnection) -> str:
-    """Whence, for the rate limit; of IPv6 the network, which is one customer's."""
+    """Return the address for the rate limit; for IPv6 the network, which belongs to one customer."""
     host = "?" if connection.client is None else connection.client.host
     with suppress(ValueError):
         address = ipaddress.ip_address(host.partition("%")[0])
@@ -354,7 +357,7 @@ def _cookie(connection: HTTPConnection, name: str) -> str | None:
 
 
 def _named(name: str, connection: HTTPConnection) -> str:
-    """With the port in it: a browser gives the cookies of a host to all of its ports."""
+    """Return the cookie's name with the port: a browser sends the cookies of a host to all of its ports."""
     port = None
     with suppress(ValueError):
         port = urlsplit(f"//{connection.headers.get('host', '')}").port

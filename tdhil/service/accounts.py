@@ -1,7 +1,7 @@
-"""Who there is: people with passwords, machines with tokens; `accounts.json` in the service's folder.
+"""Accounts: users with passwords, machines with tokens; `accounts.json` in the service's folder.
 
-Of a password only what scrypt makes of it is kept, of a token its hash. The web reads the file once a second, beside
-everything else, and keeps what it read last where it can't be read any more: no request waits for a disk.
+The file keeps scrypt hashes of passwords and hashes of tokens. The web reads the file once a second in a thread. If it
+can't be read, the last content stays in force. No request waits for a disk.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
-from tdhil.errors import LogError, UsageError
+from tdhil.errors import LogError, MessageCode, UsageError
 from tdhil.service.run_state import NotThere, now
 from tdhil.service.store import write_json
 
 Role = Literal["viewer", "operator", "engineer", "admin"]
 ROLES: Final[tuple[Role, ...]] = get_args(Role)
-"""From the least to the most; each may what those before it may."""
+"""Roles from least to most rights; each includes the rights of those before it."""
 FILE: Final = "accounts.json"
 NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]{0,31}")
 _RESERVED: Final = frozenset({"local", "service", "somebody", "nobody", "terminal"})
-"""The audit says these of others than people."""
+"""Names that the audit uses for others than users."""
 SHORTEST: Final = 10
-"""Characters of a password."""
+"""Shortest password, characters."""
 LONGEST: Final = 200
 _N, _R, _P, _BYTES = 2**15, 8, 3, 32
 _MOST_N, _MOST_R, _MOST_P = 2**17, 16, 8
@@ -40,13 +40,13 @@ TOKEN: Final = "tdhil_"
 
 
 def role_at_least(role: Role) -> frozenset[str]:
-    """The role, and those below it."""
+    """Return the role and those below it."""
     return frozenset(ROLES[: ROLES.index(role) + 1])
 
 
 @dataclass(frozen=True)
 class User:
-    """A person. ``password``: as `scrypt` makes it; ``since``: when it was set, which ends what began before."""
+    """A user. ``password``: from `scrypt`; ``since``: when it was set; sessions from before that end."""
 
     name: str
     role: Role
@@ -56,7 +56,7 @@ class User:
 
 @dataclass(frozen=True)
 class Token:
-    """A machine. ``sha256`` of the token, which was shown once."""
+    """A machine's token. ``sha256`` of the token, which was shown once."""
 
     name: str
     role: Role
@@ -66,7 +66,7 @@ class Token:
 
 @dataclass(frozen=True)
 class Accounts:
-    """All of them, by name."""
+    """All users and tokens, by name."""
 
     users: Mapping[str, User] = field(default_factory=dict)
     tokens: Mapping[str, Token] = field(default_factory=dict)
@@ -75,19 +75,19 @@ class Accounts:
         return bool(self.users or self.tokens)
 
     def of_token(self, token: str) -> Token | None:
-        """Whose it is."""
+        """Return the entry of this token; None if it is unknown."""
         digest = hashlib.sha256(token.encode()).hexdigest()
         return next((one for one in self.tokens.values() if hmac.compare_digest(one.sha256, digest)), None)
 
 
 def scrypt(password: str) -> str:
-    """What is kept of a password: ``scrypt$N$r$p$salt$key`` (RFC 7914): 32 MB, and some 0.3 s."""
+    """Return the hash of a password, ``scrypt$N$r$p$salt$key`` (RFC 7914): 32 MB, about 0.3 s."""
     salt = secrets.token_bytes(16)
     return f"scrypt${_N}${_R}${_P}${salt.hex()}${_derive(password, salt, _N, _R, _P).hex()}"
 
 
 def matches(password: str, kept: str | None) -> bool:
-    """Is it the password? Takes as long where there is nobody of that name, so that time tells no names."""
+    """Return whether the password is right. An unknown name takes as long, so that the time reveals no names."""
     nobody = f"scrypt${_N}${_R}${_P}${bytes(16).hex()}${bytes(_BYTES).hex()}"
     kind, n, r, p, salt, key = (kept or nobody).split("$")
     found = _derive(password[:LONGEST], bytes.fromhex(salt), int(n), int(r), int(p))
@@ -101,26 +101,27 @@ def _derive(password: str, salt: bytes, n: int, r: int, p: int) -> bytes:
 
 
 def require_password(password: str, name: str) -> None:
-    """Raises UsageError for one that is too easily guessed."""
+    """Raise UsageError for a password that is too easy to guess."""
     if not SHORTEST <= len(password) <= LONGEST:
         raise UsageError(f"must have {SHORTEST} to {LONGEST} characters", where="password",
-                         next_step="A few words that don't belong together will do")
+                         next_step="Use a few words that don't belong together", entry=MessageCode.ACCOUNT_WRONG)
     if password.lower().strip("0123456789 !.") in (name, "password", "tdhil") or len(set(password)) < 5:
-        raise UsageError("is one of the first that would be tried", where="password",
-                         next_step="A few words that don't belong together will do")
+        raise UsageError("is too easy to guess", where="password",
+                         next_step="Use a few words that don't belong together", entry=MessageCode.ACCOUNT_WRONG)
 
 
 def _require_name(name: str) -> None:
     if not NAME.fullmatch(name) or name in _RESERVED:
-        raise UsageError("must be 1 to 32 of a-z, 0-9, '.', '_' and '-', and no word of the audit's own"
-                         f" ({', '.join(sorted(_RESERVED))})", where=f"name {name[:40]!r}")
+        raise UsageError("must be 1 to 32 of a-z, 0-9, '.', '_' and '-', and none of the audit's own names"
+                         f" ({', '.join(sorted(_RESERVED))})", where=f"name {name[:40]!r}",
+                         entry=MessageCode.ACCOUNT_WRONG)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 
 
 class AccountsFile:
-    """The file, for any thread and for any process: who changes it holds a lock as long."""
+    """The accounts file, for any thread and any process. A change holds a lock."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / FILE
@@ -130,11 +131,11 @@ class AccountsFile:
 
     @property
     def known(self) -> Accounts:
-        """As it was read last; no file is touched."""
+        """Return the accounts as read last; no file is touched."""
         return self._known
 
     def read(self) -> Accounts:
-        """As it is now. Raises UsageError where it can't be read; `known` stays what it was."""
+        """Return the accounts of the present file. Raises UsageError if it can't be read; `known` stays unchanged."""
         with self._lock:
             try:
                 looked = self.path.stat()
@@ -142,32 +143,33 @@ class AccountsFile:
                 if stamp != self._stamp:
                     self._known, self._stamp = _accounts_of(self.path.read_bytes()), stamp
             except (FileNotFoundError, NotADirectoryError):
-                if self._stamp is not None:        # it was there: whoever took it away didn't remove the users
-                    raise UsageError("the accounts have gone", where=str(self.path),
-                                     next_step="Bring them back") from None
+                if self._stamp is not None:        # it existed before: deleting the file does not remove the users
+                    raise UsageError("the accounts file has disappeared", where=str(self.path),
+                                     next_step="Restore it") from None
             except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
                 raise UsageError(f"the accounts can't be read ({str(error)[:100]})", where=str(self.path),
-                                 next_step="Bring back a copy, or delete it and add the users again") from error
+                                 next_step="Restore a copy, or delete it and add the users again") from error
             return self._known
 
     def changed(self) -> tuple[Accounts, Accounts]:
-        """What was known, and what is now: different where another process changed it. Raises UsageError."""
+        """Return the accounts before and now; they differ if another process changed them. Raises UsageError."""
         with self._lock:
             return self._known, self.read()
 
     def add_user(self, name: str, role: Role, password: str) -> User:
-        """Raises UsageError."""
+        """Add a user. Raises UsageError."""
         _require_name(name)
         require_password(password, name)
         made = User(name, role, scrypt(password), now())
         with self._changing() as accounts:
             if name in accounts.users:
-                raise UsageError("there is such a user", where=name, next_step="Remove him first, or set a password")
+                raise UsageError("this user already exists", where=name,
+                                 next_step="Remove the user first, or set a password", entry=MessageCode.ACCOUNT_WRONG)
             self._write(replace(accounts, users={**accounts.users, name: made}))
         return made
 
     def set_password(self, name: str, password: str) -> User:
-        """Ends all that the user had open. Raises NotThere and UsageError."""
+        """Set a password, and end all sessions of the user. Raises NotThere and UsageError."""
         require_password(password, name)
         kept = scrypt(password)
         with self._changing() as accounts:
@@ -176,34 +178,36 @@ class AccountsFile:
         return made
 
     def remove_user(self, name: str, *, keep_admin: bool = False) -> None:
-        """Raises NotThere; with ``keep_admin`` UsageError for the last one."""
+        """Remove a user. Raises NotThere; with ``keep_admin`` UsageError for the last admin."""
         with self._changing() as accounts:
             gone = _there(accounts.users, name)
             left = {one: user for one, user in accounts.users.items() if one != name}
             if keep_admin and gone.role == "admin" and all(one.role != "admin" for one in left.values()):
-                raise UsageError("is the last admin", where=name, next_step="Use tdhil serve users remove")
+                raise UsageError("is the last admin", where=name, next_step="Use tdhil serve users remove",
+                                 entry=MessageCode.ACCOUNT_WRONG)
             self._write(replace(accounts, users=left))
 
     def add_token(self, name: str, role: Role) -> str:
-        """The token itself, which is kept nowhere. Raises UsageError."""
+        """Add a token. Return it; only its hash is stored. Raises UsageError."""
         _require_name(name)
         token = TOKEN + secrets.token_urlsafe(32)
         made = Token(name, role, hashlib.sha256(token.encode()).hexdigest(), now())
         with self._changing() as accounts:
             if name in accounts.tokens:
-                raise UsageError("there is such a token", where=name, next_step="Remove it first")
+                raise UsageError("this token already exists", where=name, next_step="Remove it first",
+                                 entry=MessageCode.ACCOUNT_WRONG)
             self._write(replace(accounts, tokens={**accounts.tokens, name: made}))
         return token
 
     def remove_token(self, name: str) -> None:
-        """Raises NotThere."""
+        """Remove a token. Raises NotThere."""
         with self._changing() as accounts:
             _there(accounts.tokens, name)
             self._write(replace(accounts, tokens={one: it for one, it in accounts.tokens.items() if one != name}))
 
     @contextmanager
     def _changing(self) -> Iterator[Accounts]:
-        """One after the other, here and on the terminal. Raises LogError where the folder can't be written."""
+        """Lock the file against other changes, also from a terminal. Raises LogError if the folder can't be written."""
         import fcntl
 
         try:
@@ -218,13 +222,13 @@ class AccountsFile:
             os.close(descriptor)
 
     def _write(self, accounts: Accounts) -> None:
-        with self._lock:                   # nobody takes this for another process's change
+        with self._lock:                   # so that this does not count as another process's change
             try:
                 write_json(self.path, {
                     "users": {name: _plain(one) for name, one in sorted(accounts.users.items())},
                     "tokens": {name: _plain(one) for name, one in sorted(accounts.tokens.items())},
                 }, mode=0o600)
-                if os.geteuid() == 0:      # by root for a service that isn't: it has to read them
+                if os.geteuid() == 0:      # written by root: the service's own user must be able to read them
                     owner = self.path.parent.stat()
                     for path in (self.path, self.path.with_suffix(".lock")):
                         os.chown(path, owner.st_uid, owner.st_gid)
@@ -239,25 +243,26 @@ def _plain(one: User | Token) -> dict[str, Any]:
 
 def _there(found: Mapping[str, Any], name: str) -> Any:
     if name not in found:
-        raise NotThere("there is no such account", where=name[:40], next_step=f"There are {', '.join(found) or 'none'}")
+        raise NotThere("this account does not exist", where=name[:40],
+                       next_step=f"Accounts: {', '.join(found) or 'none'}")
     return found[name]
 
 
 def _accounts_of(data: bytes) -> Accounts:
-    """Raises ValueError, TypeError or KeyError for what is none."""
+    """Parse the accounts. Raises ValueError, TypeError or KeyError for other data."""
     plain = json.loads(data)
     users = {name: User(name, **one) for name, one in plain["users"].items()}
     tokens = {name: Token(name, **one) for name, one in plain["tokens"].items()}
     everybody: tuple[User | Token, ...] = (*users.values(), *tokens.values())
     for one in everybody:
         if not NAME.fullmatch(one.name) or one.role not in ROLES or not isinstance(one.since, str):
-            raise ValueError(f"{one.name[:40]!r} is no account")
+            raise ValueError(f"{one.name[:40]!r} is not a valid account")
     for user in users.values():
         kind, n, r, p, salt, key = user.password.split("$")
         sane = 0 < int(n) <= _MOST_N and 0 < int(r) <= _MOST_R and 0 < int(p) <= _MOST_P
         if kind != "scrypt" or not sane or len(bytes.fromhex(salt)) < 16 or len(bytes.fromhex(key)) != _BYTES:
-            raise ValueError(f"the password of {user.name} is none")
+            raise ValueError(f"the password hash of {user.name} is not valid")
     for token in tokens.values():
         if not re.fullmatch(r"[0-9a-f]{64}", token.sha256):
-            raise ValueError(f"the token {token.name} is none")
+            raise ValueError(f"the hash of token {token.name} is not valid")
     return Accounts(users, tokens)

@@ -1,6 +1,6 @@
-"""Who is there while a run of the service goes: keeps its status, sees it go by, and asks for the code.
+"""The operator of a run in the service: keeps the run's status, watches the run, and requests the code.
 
-Nothing here holds the control loop up: what it sees it notes, and a thread writes the notes down.
+Nothing here delays the control loop: it takes notes, and a thread writes them to disk.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from drivers import Command, Mode, PowerState, Preflight, PreflightRefused, Sample
 from profiles import visible
-from tdhil.errors import TdhilError
+from tdhil.errors import MessageCode, TdhilError
 from tdhil.service.run_state import Check, Confirmation, NotSo, State, Status, Watch, now
 from tdhil.service.store import Store, write_json
 
@@ -29,25 +29,25 @@ if TYPE_CHECKING:
     from tdhil.runner import Display, Idle, StopRequest, Task
 
 CODE_S: Final = 60.0
-"""So long a code is good, once."""
+"""Time for which a code is valid, once, s."""
 TRIES: Final = 3
 LEASE_S: Final = 5.0
-"""So long a watched run goes on without its page, which renews the lease every second."""
+"""Time for which a watched run continues without its page, s. The page renews the lease every second."""
 SILENT_S: Final = 2.0
-"""After so long without a word of the page, the run's status says so."""
+"""Time without a message of the page after which the run's status shows it, s."""
 LEASE_LOOK_S: Final = 0.05
 WATCH: Final = "watch"
-"""An event of the log: who watches a watched run, and who doesn't."""
+"""Event kind in the log: whether a watched run is watched."""
 WATCHED: Final = {
-    None: "its page is there", "hidden": "its page is hidden", "closed": "its page was closed, or loads anew",
-    "silent": "nothing is heard of its page",
+    None: "its page is open", "hidden": "its page is hidden", "closed": "its page was closed or reloaded",
+    "silent": "its page sends nothing",
 }
 EXPECTED_S: Final = {"setup": 10.0, "speed": 50.0, "torque": 15.0, "hold": 15.0, "acquire": 300.0}
 
 class Board:
-    """The run's status; whoever changes it is done at once, a thread writes it down.
+    """The run's status. A change returns at once, and a thread writes it to disk.
 
-    Some of the disk is reserved for it: how a run ended is told even where the disk has run full, which ends it.
+    Some disk space is reserved for it: a full disk ends a run, and its last status is still written.
     """
 
     def __init__(self, store: Store, status: Status) -> None:
@@ -65,7 +65,7 @@ class Board:
         return self._status
 
     def change(self, step: Callable[[Status], Status]) -> None:
-        """A step that can't be is left out: what a page shows never ends a run."""
+        """Apply a step; ignore an impossible one. A display error never ends a run."""
         with self._lock, suppress(NotSo):
             self._status = step(self._status)
         self._wake.set()
@@ -86,7 +86,7 @@ class Board:
         self.change(lambda status: replace(status, stop=replace(status.stop, seen=status.stop.seen or at)))
 
     def close(self) -> None:
-        """All of it is written, or can't be."""
+        """Wait until all of it is written, or can't be."""
         self._end = True
         self._wake.set()
         self._thread.join(10.0)
@@ -100,8 +100,8 @@ class Board:
             status = self._status
             try:
                 self._store.save(status)
-            except OSError as error:           # a full disk: the run ends by its log, not by this
-                tell(f"the state can't be written: {error}")
+            except OSError as error:           # a full disk: the log ends the run, not this
+                tell(f"the run's status can't be written: {error}")
                 if self._end:
                     return
                 time.sleep(0.5)
@@ -111,24 +111,22 @@ class Board:
 
 
 def tell(text: str) -> None:
-    """A line for process.log; where its disk is full, for nobody."""
+    """Print a line for process.log. It is lost if the disk is full."""
     with suppress(OSError, ValueError):
         print(text, file=sys.stderr, flush=True)  # noqa: T201
 
 
 class Watcher:
-    """Sees the run as it goes. `cycle` is called in the control loop: it keeps two things in mind, and puts into the
-    log what others left for it.
-    """
+    """Follows the run. The control loop calls `cycle`, which sets two flags and writes waiting remarks to the log."""
 
     def __init__(self, board: Board, stop: StopRequest | None = None) -> None:
         self._board, self._stop = board, stop
-        self._looking = False          # for the drive's answer to a stop
+        self._looking = False          # waiting for the drive's answer to a stop
         self._remarks: deque[str] = deque()
         self.log: RunLog | None = None
 
     def asked_to_stop(self, who: str) -> None:
-        """A stop was asked for: note it, and the first sample of a drive that brakes."""
+        """Note a requested stop, and later the first sample of the braking drive."""
         self._looking = True
         at = now()
 
@@ -140,7 +138,7 @@ class Watcher:
         self._board.change(step)
 
     def remark(self, text: str) -> None:
-        """For the log, with the next cycle. From any thread."""
+        """Write a text to the log with the next cycle. Any thread may call it."""
         self._remarks.append(text)
 
     def preflight(self, preflight: Preflight) -> None:
@@ -167,7 +165,7 @@ class Watcher:
 
     def cycle(self, command: Command, sample: Sample) -> None:
         if self._stop is not None and self._stop.signum is not None:
-            if not self._stop.why:             # by a signal; whoever comes by the socket is noted there
+            if not self._stop.why:             # by a signal; a stop over the socket is noted there
                 self.asked_to_stop("a signal")
             self._stop = None
         if self._remarks and self.log is not None:
@@ -196,7 +194,7 @@ class Watcher:
 
 
 class Confirming:
-    """The code of one run: six digits, once, for so long, for one plan on one rig as it was found."""
+    """The code of one run: six digits, valid once, for `CODE_S`, for one plan on one rig in its present state."""
 
     def __init__(self, binding: str, still_so: Callable[[], None], *, watched: bool = False,
                  clock: Callable[[], float] = time.monotonic) -> None:
@@ -216,44 +214,53 @@ class Confirming:
         return self._until_s - self._clock()
 
     def look(self) -> bool:
-        """Was it confirmed? Raises PreflightRefused once it can't be any more."""
+        """Return whether it is confirmed. Raises PreflightRefused once it can't be any more."""
         with self._lock:
             if self.confirmed_by is not None:
                 return True
             if self.void is None and self.left_s <= 0.0:
                 self.void = PreflightRefused(
-                    f"not confirmed within {CODE_S:g} s", where="code", next_step="Nothing has moved; ask for it again"
+                    f"the code was not entered within {CODE_S:g} s", where="code",
+                    next_step="Nothing has moved; request the run again",
+                    entry=MessageCode.CODE_REFUSED,
                 )
             if self.void is not None:
                 raise self.void
             return False
 
     def take(self, code: str, binding: str | None, who: str, lease_key: str = "") -> None:
-        """Raises PreflightRefused for what isn't the code for this; after some tries it is void."""
+        """Check a code. Raises PreflightRefused for a wrong one; after `TRIES` wrong codes it is void."""
         self.look()
         with self._lock:
             if self.confirmed_by is not None:
-                raise PreflightRefused("the code was used already", where="code")
+                raise PreflightRefused("the code has already been used", where="code", entry=MessageCode.CODE_REFUSED)
             if self.watched and not lease_key:
-                raise PreflightRefused("this rig moves only while the page that confirms is watched", where="lease",
-                                       next_step="Confirm it on the run's live page, and stay there")
+                raise PreflightRefused("this rig moves only while the operator watches the page that confirmed",
+                                       where="lease",
+                                       next_step="Confirm the run on its live page, and keep this page open",
+                                       entry=MessageCode.CODE_REFUSED)
             try:
                 self._still_so()
-            except TdhilError as error:                # changed, or not to be read any more
-                self.void = PreflightRefused(error.what, where=error.where, next_step=error.next_step)
+            except TdhilError as error:                # changed, or no longer readable
+                self.void = PreflightRefused(error.what, where=error.where, next_step=error.next_step,
+                                             entry=MessageCode.CHANGED_MEANWHILE)
                 raise self.void from error
             if binding is not None and not _same(binding, self.binding):
-                self.void = PreflightRefused("the confirmation is for another plan, rig or setting", where="binding",
-                                             next_step="Nothing has moved; ask for it again")
+                self.void = PreflightRefused("the confirmation belongs to another plan, rig or setting",
+                                             where="binding",
+                                             next_step="Nothing has moved; request the run again",
+                                             entry=MessageCode.CODE_REFUSED)
                 raise self.void
             if not _same(code, self.code):
                 self._tries -= 1
                 if self._tries <= 0:
-                    self.void = PreflightRefused(f"{TRIES} wrong codes", where="code",
-                                                 next_step="Nothing has moved; ask for it again")
+                    self.void = PreflightRefused(f"{TRIES} wrong codes were entered, which is the limit", where="code",
+                                                 next_step="Nothing has moved; request the run again",
+                                                 entry=MessageCode.CODE_REFUSED)
                     raise self.void
-                raise PreflightRefused("that isn't the code", where="code",
-                                       next_step="It stands on the terminals of tdhil serve and tdhil attend")
+                raise PreflightRefused("the code is wrong", where="code",
+                                       next_step="Read the code on the terminal of tdhil serve or tdhil attend",
+                                       entry=MessageCode.CODE_REFUSED)
             self.lease_key = lease_key
             self.confirmed_by = who
 
@@ -263,10 +270,10 @@ def _same(one: str, other: str) -> bool:
 
 
 class Lease:
-    """A watched run goes on as long as the page that confirmed it says every second that it is seen.
+    """Keeps a watched run going while the page that confirmed it reports every second that it is visible.
 
-    On a clock and in a thread of its own: neither control time nor the web has a part in it. ``change`` is told of
-    each change, ``lost`` once, at the end; ``needed`` says whether a shaft may still move.
+    It uses its own clock and thread: neither control time nor the web affects it. ``change`` receives each change,
+    ``lost`` is called once, at the end; ``needed`` returns whether a shaft may still move.
     """
 
     def __init__(
@@ -281,26 +288,27 @@ class Lease:
         change(self.watch)
 
     def start(self) -> None:
-        """Look at the clock from now on, until `end`."""
+        """Check the clock from now on, until `end`."""
         threading.Thread(target=self._hold, name="lease", daemon=True).start()
 
     def end(self) -> None:
-        """Nothing moves any more."""
+        """End the lease: nothing moves any more."""
         self._end.set()
 
     def renew(self, key: str, who: str, *, new_key: str = "", gone: str = "") -> Watch:
-        """The page is there, or says how it goes. ``new_key``: it was loaded anew, and the old key is void.
+        """Renew the lease; ``gone``: the page was hidden or closed. ``new_key``: it was reloaded; the old key is void.
 
-        Raises PreflightRefused where another page has the lease, and where it was lost: it never comes back.
+        Raises PreflightRefused if another page has the lease. A lost lease never returns.
         """
         self.look()
         with self._lock:
             if self.watch.lost is not None or not self._needed():
-                raise PreflightRefused("it has ended: nothing brings it back", where="lease")
-            known = _same(key, self._key) or (new_key != "" and _same(new_key, self._key))   # an answer may be lost
+                raise PreflightRefused("the lease has ended and can't be renewed", where="lease",
+                                       entry=MessageCode.CODE_REFUSED)
+            known = _same(key, self._key) or (new_key != "" and _same(new_key, self._key))   # a reply may be lost
             if who != self.watch.by or not known:
                 raise PreflightRefused("another page watches this run", where="lease",
-                                       next_step="Stop works from every page")
+                                       next_step="Stop works from every page", entry=MessageCode.CODE_REFUSED)
             if gone:
                 if self.watch.how != "closed":         # closing hides it too, and either may come first
                     self._know(gone=self.watch.gone or now(), how=gone)
@@ -312,7 +320,7 @@ class Lease:
             return self.watch
 
     def look(self) -> None:
-        """Lose it where it is time."""
+        """End the lease if the page was silent for `LEASE_S`."""
         with self._lock:
             silent_s = self._clock() - self._heard_s
             if self.watch.lost is not None or silent_s < SILENT_S or not self._needed():
@@ -323,7 +331,7 @@ class Lease:
                 return
             watch = self.watch
             self.watch = replace(watch, lost=now(), gone=watch.gone or now(), how=watch.how or "silent")
-            self._lost(self.watch)     # first of all
+            self._lost(self.watch)     # first, before anything slow
             self._change(self.watch)
 
     def _know(self, **known: Any) -> None:
@@ -337,8 +345,8 @@ class Lease:
 
 
 class ServiceOperator:
-    """Who is there: whoever types in the code that is shown at the rig. A simulated drive asks nobody, unless its rig
-    is watched: then everything is as on a real one.
+    """The operator who enters the code shown at the rig. A simulated drive needs no code, unless its rig is watched:
+    then everything is as for a real drive.
     """
 
     def __init__(
@@ -366,13 +374,13 @@ class ServiceOperator:
         confirming = self._bind(preflight)
         text = motion_summary(preflight, task.limits, task.request, unverified)
         if self._watched:
-            text += ("  [ ] somebody watches the page that confirms, for the whole run: the shaft brakes once it is\n"
-                     f"      hidden or closed for {LEASE_S:g} s\n")
+            text += ("  [ ] an operator watches the page that confirms, for the whole run: the shaft brakes once it\n"
+                     f"      is hidden or closed for {LEASE_S:g} s\n")
         expires = datetime.fromtimestamp(time.time() + CODE_S, UTC).isoformat(timespec="milliseconds")
         self.confirming = confirming
         self._board.to(State.AWAITING, confirmation=Confirmation(confirming.binding, text, expires))
         while not confirming.look():
-            idle()                     # the drive's watchdog is fed meanwhile, and a stop is seen
+            idle()                     # meanwhile the drive's watchdog is fed, and a stop is detected
         if self._watched:
             self.lease = Lease(
                 confirming.lease_key, confirming.confirmed_by or "", change=self._note_watch, lost=self._unwatched,
@@ -392,9 +400,10 @@ class ServiceOperator:
 
     def confirm_speed(self, speed_rad_s: float, why: str, idle: Idle) -> None:
         raise PreflightRefused(
-            f"nobody is there to see whether the shaft turns at {speed_rad_s:.3g} rad/s ({why})", where="service",
-            next_step="Run it once at the rig (tdhil identify); say in the profile where the drive tells its angle"
-            " (position); or take the unit of speed by name: accept_speed_unit",
+            f"no operator can confirm that the shaft turns at {speed_rad_s:.3g} rad/s ({why})", where="service",
+            next_step="Run it once at the rig (tdhil identify). Or name the drive's position object in the profile"
+            " (position). Or accept the unit of speed by name: accept_speed_unit",
+            entry=MessageCode.SPEED_UNIT_NOT_SEEN,
         )
 
     def say(self, text: str) -> None:

@@ -6,15 +6,15 @@
     audit/head.json                number and hash of the last line, sealed
     audit.key                      the key, and the anchor: number and hash of the last line; mode 0600
 
-A line's hash is an HMAC-SHA256 with the key. Without the key, each of these is found: a line that was changed, taken
-out, put in or added; lines cut off at the end, also with a rewritten or an older head.json; the whole folder `audit`
-deleted or put back from an older copy.
+A line's hash is an HMAC-SHA256 with the key. Without the key, each of these changes is detected: a line was changed,
+removed, inserted or added; lines were cut off at the end, also with a rewritten or an older head.json; the whole folder
+`audit` was deleted or replaced by an older copy.
 
-What can't be held: a user of this computer who can read ``audit.key`` (the service's own user, root) can write another
-chain that holds. Where ``audit.key`` is deleted together with the folder, a new chain begins; where it is deleted
-alone, and the lines are written anew without a key, they are taken for lines from before there was one: the time at
-which the key was made, and the line "audit key made", then come too late. Only a head that was exported before shows
-each of these: `Audit.verify` takes it. So export it at times, to another computer.
+Limits: a user of this computer who can read ``audit.key`` (the service's own user, root) can write another valid chain.
+If ``audit.key`` is deleted together with the folder, a new chain begins. If only the key is deleted, and the lines are
+written anew without a key, they count as lines from before the first key. Then the time of the key, and the line "audit
+key made", are too late. Only a head that was exported before reveals each of these: `Audit.verify` takes it. So export
+it from time to time, to another computer.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Broken:
-    """Where the chain doesn't hold: the file, its line (from 1), and why."""
+    """The place where the chain is broken: the file, its line (from 1), and why."""
 
     file: str
     line: int
@@ -80,14 +80,14 @@ class ChainHead:
         """Read ``NUMBER:HASH``, as it is exported. Raises UsageError."""
         found = _HEAD.fullmatch(text.strip())
         if found is None:
-            raise UsageError("is no head of an audit", where=f"head {text[:80]!r}",
-                             next_step="It is NUMBER:HASH, as tdhil serve audit prints it")
+            raise UsageError("is not a head of an audit", where=f"head {text[:80]!r}",
+                             next_step="Give NUMBER:HASH, as tdhil serve audit prints it")
         return ChainHead(int(found[1]), found[2])
 
 
 @dataclass(frozen=True)
 class _Seal:
-    """The key, and the anchor. ``plain``: so many lines are older than the key, and have a hash without it."""
+    """The key and the anchor. ``plain``: number of lines older than the key, which have a hash without it."""
 
     key: bytes
     made: str
@@ -95,13 +95,13 @@ class _Seal:
     anchor: ChainHead
 
     def hash_of(self, entry: Entry) -> str:
-        """What the line's hash must be."""
+        """Return the hash that the line must have."""
         plain = {name: value for name, value in asdict(entry).items() if name != "hash"}
         text = json.dumps(plain, ensure_ascii=False, sort_keys=True).encode()
         return hashlib.sha256(text).hexdigest() if entry.number <= self.plain else self._mac(b"line", text)
 
     def of_head(self, head: ChainHead) -> str:
-        """What seals a head."""
+        """Return the seal of a head."""
         return self._mac(b"head", str(head).encode())
 
     def _mac(self, kind: bytes, text: bytes) -> str:
@@ -119,7 +119,7 @@ class Audit:
         self._last: ChainHead | None = None
 
     def begin(self) -> None:
-        """Make the key where there is none; lines from before it are taken as they are. Raises OSError."""
+        """Make the key if there is none. Lines from before it are accepted unchecked. Raises OSError."""
         with self._lock:
             self._sealed()
 
@@ -131,27 +131,27 @@ class Audit:
             self._add(self._sealed(), who, what, run, rig, details)
 
     def head(self) -> ChainHead | None:
-        """The last line, to be kept elsewhere; None where there is none, or the chain's end doesn't hold."""
+        """Return the last line, for export; None if there is none, or if the chain's end is broken."""
         with self._lock:
             seal = self._seal or self._read()
             found = None if seal is None else self._end(seal)
         return found if found is not None and found.number > 0 else None
 
     def made(self) -> str | None:
-        """When the key was made; None without one. A later time than the first line's was once another key."""
+        """Return when the key was made; None without one. If it is later than the first line, the key was replaced."""
         seal = self._seal or self._read()
         return None if seal is None else seal.made
 
     def entries(self) -> Iterator[Entry]:
-        """All that can be read, in order."""
+        """Yield all readable entries in order."""
         for _, _, entry in self._lines():
             if isinstance(entry, Entry):
                 yield entry
 
     def verify(self, kept: ChainHead | None = None) -> Broken | None:
-        """The first place where a line was changed, taken out or put in; None where the chain holds.
+        """Return the first place where a line was changed, removed or inserted; None if the chain is intact.
 
-        ``kept``: a head that was exported before, which must be one of the lines.
+        ``kept``: a head that was exported before. It must be one of the lines.
         """
         with self._lock:
             return self._verify(self._seal or self._read(), kept)
@@ -162,7 +162,7 @@ class Audit:
             if isinstance(entry, str):
                 return Broken(file, line, entry)
             if seal is None:
-                return Broken(file, line, f"the chain has no key that can be read ({KEY_FILE})")
+                return Broken(file, line, f"the key of the chain can't be read ({KEY_FILE})")
             if entry.number != number + 1 or entry.before != before:
                 return Broken(file, line, "it doesn't follow the line before")
             if not hmac.compare_digest(seal.hash_of(entry).encode(), entry.hash.encode()):
@@ -170,27 +170,27 @@ class Audit:
             number, earlier, before, at = entry.number, before, entry.hash, (file, line)
             found = found or ChainHead(number, before) == kept
         if not found and kept is not None:
-            return Broken(*at, f"the chain doesn't have line {kept.number} as it was exported")
+            return Broken(*at, f"line {kept.number} differs from the exported head")
         if seal is None:
             return None
-        # A killed process may leave a line whose head or anchor wasn't written; never a head without its line.
+        # A killed process may leave a line without its head or anchor, but never a head without its line.
         ends = (ChainHead(number, before), ChainHead(number - 1, earlier))
         if seal.anchor not in ends:
             return Broken(*at,
-                               f"the chain ends with line {number}, and {KEY_FILE} has seen line {seal.anchor.number}")
+                          f"the chain ends with line {number}, but {KEY_FILE} records line {seal.anchor.number}")
         plain = read_json(self._folder / "head.json") or {}
         head = ChainHead(plain.get("number", 0), plain.get("hash", FIRST))
         mac = plain.get("mac")
-        # The head of lines from before there was a key has no seal.
+        # A head from before the first key has no seal.
         sealed = isinstance(mac, str) and hmac.compare_digest(mac.encode(), seal.of_head(head).encode())
         if head not in ends or not (sealed or head.number <= seal.plain):
-            return Broken(*at, f"the chain ends with line {number}, and head.json is not its head")
+            return Broken(*at, f"the chain ends with line {number}, but head.json names another head")
         return None
 
     def _add(
         self, seal: _Seal, who: str, what: str, run: str | None, rig: str | None, details: Mapping[str, Any]
     ) -> None:
-        last = self._last or self._end(seal) or seal.anchor        # an end that doesn't hold is never made to
+        last = self._last or self._end(seal) or seal.anchor        # a broken end is never repaired
         at = now()
         entry = Entry(last.number + 1, at, who[:80], what, run, rig, details, last.hash)
         entry = replace(entry, hash=seal.hash_of(entry))
@@ -204,7 +204,7 @@ class Audit:
         self._write(self._seal)
 
     def _sealed(self) -> _Seal:
-        """The seal; made where there is none. Raises OSError where it can't be read, or written."""
+        """Return the seal; make one if there is none. Raises OSError if it can't be read or written."""
         if self._seal is None:
             self._seal = self._read()
         if self._seal is None:
@@ -235,7 +235,7 @@ class Audit:
         write_json(self._key_path, plain, mode=0o600)
 
     def _end(self, seal: _Seal) -> ChainHead | None:
-        """The last line, if it is the anchor, or the one that follows it; None where the end doesn't hold."""
+        """Return the last line, if it is the anchor or follows it; None if the end is broken."""
         last: Entry | None = None
         for entry in self.entries():
             last = entry

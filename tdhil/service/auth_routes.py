@@ -1,6 +1,6 @@
-"""What the API says of who is who: logins, users and machines. Passwords are looked at one at a time.
+"""The routes for logins, users and machines. Passwords are checked one at a time.
 
-Each of `ANSWERS` is called with the site, the request and its body, as the web's own are.
+Each of `ANSWERS` is called with the site, the request and its body, like the web's own routes.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import anyio
 from starlette.responses import JSONResponse, Response
 
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 from tdhil.service.access import Principal, address_of, principal, set_cookies
 from tdhil.service.accounts import ROLES, Token, User
 from tdhil.service.middleware import Answer, Site, off
@@ -37,8 +37,8 @@ async def _me(site: Site, request: Request, body: Any) -> MeView:
 
 async def _login(site: Site, request: Request, body: Any) -> Response:
     if not site.access.login:
-        raise UsageError("there is nobody to log in as", where="login",
-                         next_step="Add a user on the terminal: tdhil serve users add")
+        raise UsageError("this service has no accounts", where="login",
+                         next_step="Add a user on the terminal: tdhil serve users add", entry=MessageCode.ACCOUNT_WRONG)
     cookie, who = await _slowly(site, request, body.name.strip().lower()[:64], body.password)
     site.supervisor.note(who.name, "logged in", None, None, address=address_of(request))
     response = JSONResponse(plain(_me_view(site, who), MeView))
@@ -47,7 +47,7 @@ async def _login(site: Site, request: Request, body: Any) -> Response:
 
 
 async def _slowly(site: Site, request: Request, name: str, password: str) -> tuple[str, Principal]:
-    """A password is looked at. Raises NotLoggedIn and TooManyTries."""
+    """Check a password. Raises NotLoggedIn and TooManyTries."""
     address = address_of(request)
     if site.logins.statistics().tasks_waiting >= 10:
         raise TooManyTries(10.0)
@@ -73,21 +73,22 @@ async def _logout(site: Site, request: Request, body: Any) -> Response:
 async def _password(site: Site, request: Request, body: Any) -> MeView:
     who = principal(request)
     if not who.session:
-        raise UsageError("only who logged in has a password", where="password")
+        raise UsageError("only a logged-in user has a password", where="password", entry=MessageCode.ACCOUNT_WRONG)
     try:
         await _slowly(site, request, who.name, body.old)
     except NotLoggedIn:
-        raise UsageError("that isn't the old password", where="old") from None
+        raise UsageError("the old password is wrong", where="old", entry=MessageCode.ACCOUNT_WRONG) from None
     await _account(site, request, lambda: site.access.accounts.set_password(who.name, body.new), "password set",
                    who.name)
     return _me_view(site, site.access.who(request))
 
 
 async def _account(site: Site, request: Request, change: Callable[[], T], what: str, name: str) -> T:
-    """Change an account, one at a time, and say by whom. Raises UsageError."""
+    """Change an account, one at a time, and note it in the audit. Raises UsageError."""
     if not site.access.login:
         raise UsageError("the first user is added on the terminal", where="accounts",
-                         next_step="tdhil serve users add NAME --role admin; then start with a certificate")
+                         next_step="tdhil serve users add NAME --role admin; then start with a certificate",
+                         entry=MessageCode.ACCOUNT_WRONG)
     found: T = await anyio.to_thread.run_sync(change, limiter=site.logins)
     site.supervisor.note(principal(request).name, what, None, None, name=name)
     return found
@@ -142,4 +143,4 @@ ANSWERS: Final[Mapping[str, Answer]] = {
         _me, _login, _logout, _password, _accounts, _add_user, _set_password, _remove_user, _add_token, _remove_token,
     )
 }
-"""By the routes' names."""
+"""Answers by route name."""

@@ -1,4 +1,4 @@
-"""Speaks to a service from Python: ``tdhil.Client("http://127.0.0.1:8420")``. Needs the standard library alone."""
+"""Client of a service: ``tdhil.Client("http://127.0.0.1:8420")``. It needs the standard library only."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from typing import Any, Final
 from urllib.parse import quote, urlencode
 
 from drivers import CommunicationLost
-from tdhil.errors import TdhilError, UsageError
+from profiles import message_of
+from tdhil.errors import MessageCode, TdhilError, UsageError
 
 _API: Final = "/api/v1"
 _ENDED: Final = frozenset({"done", "refused", "stopped", "failed", "stop_not_confirmed", "interrupted"})
 
 
 class ServiceError(TdhilError):
-    """What the service said no to: ``kind`` and ``exit_code`` as of its error tree, ``status`` of HTTP.
+    """A refusal by the service: ``kind`` and ``exit_code`` from its error tree, HTTP ``status``.
 
-    ``holder``: who has the rig, where that is why.
+    ``holder``: the run that holds the rig, if that is the reason.
     """
 
     def __init__(self, status: int, body: Mapping[str, Any]) -> None:
@@ -32,22 +33,23 @@ class ServiceError(TdhilError):
         self.status = status
         self.kind = str(told.get("kind", ""))
         self.exit_code = told.get("exit_code", 1)
+        self.entry = message_of(str(told.get("code", ""))) or self.entry
         self.holder = body.get("holder")
 
 
 class _NowhereElse(urllib.request.HTTPRedirectHandler):
-    """A token goes to nobody else."""
+    """Follow no redirect: the token goes to no other server."""
 
     def redirect_request(self, *_: Any) -> None:
         return None
 
 
 class Client:
-    """One service. Answers are the documents of its API (``/api/v1/openapi.json`` describes them).
+    """One service. Replies are the documents of its API (``/api/v1/openapi.json`` describes them).
 
-    ``token``: of `tdhil serve tokens add`; it goes over TLS alone. ``ca``: whose certificates are believed (a PEM
-    file; None: those of the system). Raises ServiceError for what it refuses, CommunicationLost where it can't be
-    reached, and UsageError for a token that would go over an open line.
+    ``token``: of `tdhil serve tokens add`; it is sent over TLS only. ``ca``: certificates to trust (a PEM file; None:
+    those of the system). Raises ServiceError for a refusal, CommunicationLost if the service can't be reached, and
+    UsageError for a token without TLS.
     """
 
     def __init__(
@@ -57,11 +59,11 @@ class Client:
         self._url = url.rstrip("/")
         self._timeout_s = timeout_s
         if token is not None and not self._url.startswith("https://"):
-            raise UsageError("a token goes over TLS alone", where=self._url[:100], next_step="Name it https://…")
+            raise UsageError("a token is sent over TLS only", where=self._url[:100], next_step="Use https://…")
         self._headers = {"Content-Type": "application/json"}
         if token is not None:
             self._headers["Authorization"] = f"Bearer {token}"
-        # No proxy, and no answer that leads elsewhere: the service is where it is.
+        # No proxy and no redirect: the service is at the given address.
         handlers: list[urllib.request.BaseHandler] = [urllib.request.ProxyHandler({}), _NowhereElse()]
         if ca is not None:
             try:
@@ -71,11 +73,11 @@ class Client:
         self._opener = urllib.request.build_opener(*handlers)
 
     def me(self) -> dict[str, Any]:
-        """Who asks, as the service sees it: ``name`` and ``roles``."""
+        """Return this client as the service identifies it: ``name`` and ``roles``."""
         return self._object("GET", "/me")
 
     def rigs(self) -> list[dict[str, Any]]:
-        """The rigs, each with its ``id``, its state and who has it."""
+        """Return the rigs, each with its ``id``, its state and its present run."""
         found: list[dict[str, Any]] = self._json("GET", "/rigs")
         return found
 
@@ -83,27 +85,27 @@ class Client:
         return self._object("GET", f"/rigs/{quote(rig, safe='')}")
 
     def trend(self, rig: str) -> dict[str, Any]:
-        """Its results over time, and whether they changed: the document of ``tdhil trend --json``."""
+        """Return a rig's results over time, and whether they changed: the document of ``tdhil trend --json``."""
         found: dict[str, Any] = self._object("GET", f"/rigs/{quote(rig, safe='')}/trend")["trend"]
         return found
 
     def compare(self, *runs: str) -> dict[str, Any]:
-        """Runs side by side: the document of ``tdhil compare --json``."""
+        """Return a comparison of runs: the document of ``tdhil compare --json``."""
         asked = urlencode({"runs": ",".join(runs)})
         found: dict[str, Any] = self._object("GET", f"/runs/compare?{asked}")["comparison"]
         return found
 
     def plan(self, rig: str, **options: Any) -> dict[str, Any]:
-        """What a run with these options would do, and what to expect of it; nothing is connected to."""
+        """Return the plan of a run with these options, and its expected result. Nothing is connected."""
         return self._object("POST", f"/rigs/{quote(rig, safe='')}/plan", options)
 
     def start(self, rig: str, *, key: str | None = None, **options: Any) -> dict[str, Any]:
-        """Ask for a run, with the command line's options. ``key``: the same one never begins a second run."""
+        """Request a run, with the command line's options. ``key``: the same key never starts a second run."""
         headers = {} if key is None else {"Idempotency-Key": key}
         return self._object("POST", f"/rigs/{quote(rig, safe='')}/runs", options, headers)
 
     def runs(self, *, rig: str | None = None, state: str | None = None, limit: int = 100) -> list[dict[str, Any]]:
-        """The runs, the newest first."""
+        """Return the runs, the newest first."""
         asked = {name: value for name, value in (("rig", rig), ("state", state), ("limit", limit)) if value is not None}
         found: list[dict[str, Any]] = self._json("GET", f"/runs?{urlencode(asked)}")
         return found
@@ -112,19 +114,19 @@ class Client:
         return self._object("GET", f"/runs/{quote(run, safe='')}")
 
     def confirm(self, run: str, code: str, binding: str | None = None) -> dict[str, Any]:
-        """Let it move: with the six digits that are shown at the rig."""
+        """Confirm motion with the six digits that are shown at the rig."""
         return self._object("POST", f"/runs/{quote(run, safe='')}/confirm", {"code": code, "binding": binding})
 
     def stop(self, run: str) -> dict[str, Any]:
-        """Have the run brake. This is no emergency stop: it needs network, computer, cable and drive."""
+        """Stop the run. This is no emergency stop: it needs network, computer, cable and drive."""
         return self._object("POST", f"/runs/{quote(run, safe='')}/stop", {})
 
     def stop_rig(self, rig: str) -> dict[str, Any]:
-        """The same for whatever moves the rig; where no run does, ``tdhil stop`` on its drive."""
+        """Stop the rig's present run. Without a run, ``tdhil stop`` acts on its drive."""
         return self._object("POST", f"/rigs/{quote(rig, safe='')}/stop", {})
 
     def replay(self, run: str, **asked: Any) -> dict[str, Any]:
-        """Identify again with another ``model``, ``tolerance`` or ``confidence``; comes back when it is done."""
+        """Identify again with another ``model``, ``tolerance`` or ``confidence``; return when it is done."""
         found = self._object("POST", f"/runs/{quote(run, safe='')}/replays", asked)
         while found["state"] == "waiting":
             time.sleep(0.2)
@@ -132,9 +134,9 @@ class Client:
         return found
 
     def fleet(self, folder: str = "", *, below: str = "", **settings: Any) -> dict[str, Any]:
-        """Identify many logs again, the service's own runs or a folder of ``--logs``; comes back when that has ended.
+        """Identify many logs again, the service's own runs or a folder of ``--logs``; return when it has ended.
 
-        ``settings``: ``model``, ``tolerance``, ``confidence``. The same again does what is left.
+        ``settings``: ``model``, ``tolerance``, ``confidence``. The same request again continues with the rest.
         """
         found = self._object("POST", "/fleets", {"folder": folder, "below": below, **settings})
         while found["state"] == "running":
@@ -143,7 +145,7 @@ class Client:
         return found
 
     def fleet_rows(self, fleet: str, start: int = 0, limit: int = 200) -> list[dict[str, Any]]:
-        """A row a log, as `tdhil.fleet.FleetRow`."""
+        """Return one row per log, as `tdhil.fleet.FleetRow`."""
         asked = urlencode({"from": start, "limit": limit})
         found: list[dict[str, Any]] = self._json("GET", f"/fleets/{quote(fleet, safe='')}/rows?{asked}")
         return found
@@ -152,7 +154,9 @@ class Client:
         self, run: str, *, every_s: float = 0.2, timeout_s: float | None = None,
         seen: Callable[[dict[str, Any]], None] = lambda run: None,
     ) -> dict[str, Any]:
-        """The run once it has ended; ``seen`` gets it at every look. Raises TimeoutError; the run goes on then."""
+        """Return the run once it has ended; ``seen`` receives it at every poll. Raises TimeoutError; the run
+        continues.
+        """
         end_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             found = self.run(run)
@@ -164,7 +168,7 @@ class Client:
             time.sleep(every_s)
 
     def download(self, run: str, name: str, path: str | Path) -> Path:
-        """``log.mcap``, ``report.html``, ``report.pdf`` or ``result.json`` of a run, as a file that isn't there yet."""
+        """Save ``log.mcap``, ``report.html``, ``report.pdf`` or ``result.json`` of a run as a new file."""
         target = Path(path)
         with self._open("GET", f"/runs/{quote(run, safe='')}/{quote(name, safe='')}") as answer, \
                 target.open("xb") as file:
@@ -173,7 +177,7 @@ class Client:
         return target
 
     def audit(self, limit: int = 200, *, head: str | None = None) -> dict[str, Any]:
-        """The latest lines, and whether the chain holds. ``head``: one that was kept, which the chain must have."""
+        """Return the latest lines, and whether the chain is intact. ``head``: an exported head to check against."""
         asked = {"limit": limit} if head is None else {"limit": limit, "head": head}
         return self._object("GET", f"/audit?{urlencode(asked)}")
 
@@ -209,4 +213,5 @@ class Client:
             raise CommunicationLost(
                 f"the service can't be reached ({getattr(error, 'reason', error)})", where=self._url,
                 next_step="Is tdhil serve running there? If a shaft turns, use the hard-wired stop",
+                entry=MessageCode.SERVER_UNREACHABLE,
             ) from error

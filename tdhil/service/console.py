@@ -1,6 +1,6 @@
-"""The rig's own console: shows whoever stands there the code of a run that waits for it.
+"""The rig's own console: shows the code of a waiting run to the operator at the rig.
 
-The code comes by the run's socket, which belongs to one user of this computer; over HTTP there is no way to it.
+The code comes over the run's socket, which belongs to one user of this computer. HTTP never delivers it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tdhil.service.store import Store
 
 EVERY_S: Final = 0.25
 NEWEST: Final = 50
-"""So many runs back one may wait: a rig has one at a time."""
+"""Number of newest runs that are checked: a rig has one run at a time."""
 
 
 class Console:
@@ -33,7 +33,7 @@ class Console:
         self._shown: dict[str, str] = {}
 
     def show(self, run: str, status: Status) -> None:
-        """The code of a run that waits for it, if it is another one than was shown last."""
+        """Show the code of a waiting run, if it differs from the last one shown."""
         with suppress(RunRefused, CommunicationLost):
             found = ask(self._store.place(run), {"do": "code"})
             code = found.get("code")
@@ -42,17 +42,17 @@ class Console:
                 text = status.confirmation.text if status.confirmation is not None else ""
                 by = visible(self._store.request(run).asked_by)
                 rig = f"{status.rig}, SIMULATED" if status.simulated else status.rig
-                self._say(f"{text}\nRig {rig}. Asked for by {by}, run {run}. To let it move, type this code into the"
+                self._say(f"{text}\nRig {rig}. Requested by {by}, run {run}. To let it move, type this code into the"
                           f" page within {found['left_s']:.0f} s:   {code[:3]} {code[3:]}\n")
 
     def forget(self, run: str) -> bool:
-        """Was its code shown?"""
+        """Forget a run. Return whether its code was shown."""
         return self._shown.pop(run, None) is not None
 
     def look(self) -> None:
-        """Show what waits now, and say what became of what waited."""
+        """Show the codes of waiting runs, and report the outcome of earlier ones."""
         for run in islice(self._store.ids(), NEWEST):
-            with suppress(Exception):          # being made, or gone
+            with suppress(Exception):          # being created, or deleted
                 self._look_at(run)
 
     def _look_at(self, run: str) -> None:
@@ -72,15 +72,15 @@ class Console:
 
 
 def attend(data: Path, say: Callable[[str], None], going: Callable[[], bool] = lambda: True) -> None:
-    """Show the codes of the service that has this folder, in another terminal than its own.
+    """Show the codes of the service with this folder in another terminal.
 
-    Raises UsageError where the folder is none of a service, or can't be read.
+    Raises UsageError if the folder belongs to no service, or can't be read.
     """
     store = Store(data.resolve())
     if not store.runs.is_dir() or not os.access(store.runs, os.R_OK | os.X_OK):
-        raise UsageError("there are no runs of a service here that this user may read", where=f"--data {data}",
-                         next_step="Name the folder of tdhil serve, and be its user (sudo -u USER tdhil attend)")
-    say(f"The codes of {store.folder} are shown here. Ctrl-C ends this, and no run.")
+        raise UsageError("this folder has no service runs that this user may read", where=f"--data {data}",
+                         next_step="Name the folder of tdhil serve, and run as its user (sudo -u USER tdhil attend)")
+    say(f"The codes of {store.folder} are shown here. Ctrl-C ends this display. Runs continue.")
     console = Console(store, say)
     while going():
         console.look()

@@ -1,10 +1,10 @@
 """The door of the service: accept connections, limit them, and always let one more in.
 
 An idle connection costs one descriptor and a few hundred bytes here. It reaches the HTTP server with its first complete
-header (plain HTTP), or with its first byte (TLS). So thousands of idle connections keep nobody from a Stop:
+header (plain HTTP), or with its first byte (TLS). So thousands of idle connections do not block a Stop:
 
 * There is a limit for connections that wait, and one for connections that are served; of one address and of all.
-* Where a limit is reached, the oldest idle connection is closed, and the new one is let in.
+* If a limit is reached, the oldest idle connection is closed, and the new one is let in.
 * A header, or the rest of a request, takes at most `HEADERS_S`.
 * Half of the process's descriptors stay free of connections: a Stop needs some for sockets and files of its own.
 """
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 HEADERS_S: Final = 10.0
 """Longest time for a header, for a TLS handshake, and for the rest of a request. A slow radio link takes 1 s."""
 LOOK_S: Final = 0.5
-"""Interval between two looks for what has taken too long."""
+"""Interval between two checks for connections that have taken too long, s."""
 AT_ONCE: Final = 64
 """Connections accepted in one turn of the event loop: some 5 ms of work, then others get theirs."""
 BACKLOG: Final = 4096
@@ -35,7 +35,7 @@ BACKLOG: Final = 4096
 HEADER_LIMIT: Final = 32 * 1024
 """Bytes of a header, as of the HTTP server behind."""
 MOST_DESCRIPTORS: Final = 65_536
-"""More are not taken where the system grants more."""
+"""Most descriptors to use, even if the system grants more."""
 MOST: Final = 4096
 """Connections of each kind, however many descriptors there are."""
 PAUSE_S: Final = 0.05
@@ -74,7 +74,7 @@ def raise_limit() -> int:
 
 
 class Seldom:
-    """A line at most once a second; the next one gives the number of lines left out."""
+    """Prints a line at most once a second. The next line gives the number of lines left out."""
 
     EVERY_S: Final = 1.0
 
@@ -120,7 +120,7 @@ class _Served:
 
     @property
     def gone(self) -> bool:
-        """Is its descriptor free again?"""
+        """Return whether its descriptor is free again."""
         return self.peer.fileno() == -1
 
     @property
@@ -137,7 +137,7 @@ class _Served:
         return 1 if self.protocol.scope["method"] in ("GET", "HEAD") else 2
 
     def close(self) -> None:
-        """At once; what is on its way is lost."""
+        """Close it at once. Data in transit are lost."""
         if self.transport is not None:
             self.transport.abort()
         elif self.task is not None:
@@ -154,7 +154,7 @@ class Door:
         self._listening, self._room, self._tls, self._clock = listening, room, tls, clock
         self._complain = Seldom(say, clock)
         self._waiting: dict[_Waiting, None] = {}                   # the oldest first
-        self._headers = selectors.DefaultSelector()    # the event loop's own costs three times as much for each of them
+        self._headers = selectors.DefaultSelector()    # the event loop's own selector costs three times as much
         self._waiting_of: dict[str, dict[_Waiting, None]] = {}
         self._served: dict[_Served, None] = {}
         self._served_of: dict[str, dict[_Served, None]] = {}
@@ -182,7 +182,7 @@ class Door:
         self._look_again = self._loop.call_later(LOOK_S, self._look)
 
     def close(self) -> None:
-        """Accept no more, and drop what waits. Connections that are served stay the HTTP server's."""
+        """Accept no more, and drop waiting connections. The HTTP server keeps those that are served."""
         if not self._open:
             return
         self._open = False
@@ -255,7 +255,7 @@ class Door:
             self._hear(key.data)
 
     def _hear(self, one: _Waiting) -> None:
-        """Take a piece of the header; with TLS the first byte is enough, and stays where it is."""
+        """Read a part of the header. With TLS the first byte is enough, and stays unread."""
         if self._tls is None:
             try:
                 piece = one.peer.recv(HEADER_LIMIT)
@@ -308,7 +308,7 @@ class Door:
             self._served_of.pop(one.address, None)
 
     def _close_one(self, among: dict[_Served, None]) -> bool:
-        """Close the oldest of the lowest rank, unless one is gone already. Was a living one closed?"""
+        """Close the oldest of the lowest rank, unless one is closed already. Return whether an open one was closed."""
         if gone := [one for one in among if one.gone]:
             for one in gone:
                 self._remove(one)
@@ -321,7 +321,7 @@ class Door:
         return True
 
     def _look(self) -> None:
-        """Close what has taken too long."""
+        """Close connections that have taken too long."""
         now_s = self._clock()
         for waits in tuple(self._waiting):
             if now_s - waits.since_s < HEADERS_S:

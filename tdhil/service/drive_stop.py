@@ -1,8 +1,8 @@
 """`tdhil stop` on the drive of one run: ``python -m tdhil.service.drive_stop CONNECTION [IDENTITY]``.
 
-CONNECTION is the run's connection.json, so that the stop goes where the run's setpoints went, whatever the rig's file
-says by now. IDENTITY is vendor, product, revision and serial number of the run's drive, with commas between. A process
-of its own: the web opens no bus. It prints one JSON object; the exit code is 0 at standstill of that drive, else 8.
+CONNECTION is the run's connection.json. So the stop goes to the drive of the run, even if the rig's file has changed.
+IDENTITY is vendor, product, revision and serial number of the run's drive, with commas between. It is a process of its
+own, because the web opens no bus. It prints one JSON object; the exit code is 0 at standstill of that drive, else 8.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tdhil.service.store import read_json
 
 
 def stop(path: Path, identity: tuple[int, ...]) -> dict[str, Any]:
-    """Stop the drive first. Then read who it is. Never raises: what failed is in ``error``."""
+    """Stop the drive first. Then read its identity. Raises nothing: a failure is in ``error``."""
     from tdhil.session import connection_of_kept
 
     clock = MonotonicClock()
@@ -33,7 +33,7 @@ def stop(path: Path, identity: tuple[int, ...]) -> dict[str, Any]:
                 now = read()
                 there = (now.vendor, now.product, now.revision, now.serial)
                 same, found = there == identity, ", ".join(map(str, there))
-    except Exception as failed:        # an adapter's driver raises what it likes
+    except Exception as failed:        # an adapter's driver may raise anything
         error = str(failed) if isinstance(failed, TdhilError) else f"{type(failed).__name__}: {failed}"
     at_rest = report is not None and report.ended is Ended.AT_REST
     ended = "not reached" if report is None else report.ended.value
@@ -41,7 +41,7 @@ def stop(path: Path, identity: tuple[int, ...]) -> dict[str, Any]:
 
 
 def main(arguments: list[str]) -> int:
-    """The exit code."""
+    """Stop the drive of the arguments. Return the exit code."""
     identity = tuple(int(one) for one in arguments[1].split(",")) if len(arguments) > 1 else ()
     found = stop(Path(arguments[0]), identity)
     print(json.dumps(found, ensure_ascii=False))  # noqa: T201

@@ -1,9 +1,9 @@
-"""Many logs identified again, from a page: one process at a time, nicer than all else, held while a shaft turns.
+"""Many logs identified again from a page: one process at a time, at the lowest priority, held while a shaft turns.
 
-``python -m tdhil.service.fleets FOLDER`` is that process: `tdhil.fleet` over what request.json in the folder names.
-What it does stands on its stdout, a line of JSON each; a line on its stdin says whether it may go on, and the end of
-its stdin ends it, so that a web that dies leaves nothing behind that computes. What is done is kept: the same question
-again does the rest.
+``python -m tdhil.service.fleets FOLDER`` is that process: `tdhil.fleet` with the request.json in the folder. It writes
+its progress to stdout, one line of JSON each. A line on its stdin allows it to continue or holds it. The end of stdin
+ends it, so that no computation stays behind if the web fails. Finished work is kept: the same request again does the
+rest.
 
 ::
 
@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 from tdhil.service.run_state import Conflict, NotThere, Told, now
 from tdhil.service.store import Store, read_json, write_json
 
@@ -34,15 +34,15 @@ if TYPE_CHECKING:
     from tdhil.fleet import FleetRow
 
 RUNS: Final = ""
-"""The name of the folder of the service's own runs: no other is called so."""
+"""Name of the folder of the service's own runs. No other folder has this name."""
 TABLE: Final = "fleet.csv"
 LOOK_S: Final = 0.3
-"""So often it is looked whether a shaft turns."""
+"""Interval of the check whether a shaft turns, s."""
 
 
 @dataclass(frozen=True)
 class FleetView:
-    """Many logs, and how far they are. ``held``: they wait until no shaft turns; ``left_s``: an estimate.
+    """The state of a fleet request. ``held``: it waits until no shaft turns; ``left_s``: an estimate.
 
     ``summary`` is the document of `tdhil fleet --json`.
     """
@@ -65,7 +65,7 @@ class FleetView:
 
 @dataclass
 class _Going:
-    """One that computes now."""
+    """A fleet request that is being computed."""
 
     view: FleetView
     process: subprocess.Popen[bytes]
@@ -77,7 +77,7 @@ class _Going:
 
 
 class Fleets:
-    """For any thread. ``folders``: where logs may be looked for, by the names under which they are asked for."""
+    """All fleet requests, for any thread. ``folders``: permitted folders of logs, by their names in a request."""
 
     def __init__(self, store: Store, folders: Mapping[str, Path], turning: Callable[[], bool]) -> None:
         self.folders = {RUNS: store.folder, **folders}
@@ -88,21 +88,21 @@ class Fleets:
         self._going: _Going | None = None
 
     def all(self) -> list[FleetView]:
-        """The last one that was asked for first."""
+        """Return all fleet requests, the newest first."""
         with suppress(OSError):
             found = [view for one in self._places.iterdir() if (view := self._view(one.name)) is not None]
             return sorted(found, key=lambda view: view.asked, reverse=True)
         return []
 
     def get(self, fleet: str) -> FleetView:
-        """Raises NotThere."""
+        """Return one fleet request. Raises NotThere."""
         found = self._view(fleet) if fleet.isalnum() else None
         if found is None:
-            raise NotThere("there is no such fleet", where=f"fleet {fleet[:40]}", next_step="See the list of fleets")
+            raise NotThere("this fleet does not exist", where=f"fleet {fleet[:40]}", next_step="See the list of fleets")
         return found
 
     def ask(self, folder: str, below: str, settings: Mapping[str, Any], who: str) -> FleetView:
-        """Begin, or go on with what was asked for before. Raises UsageError, and Conflict while another one goes."""
+        """Start, or continue an earlier request. Raises UsageError, and Conflict while another one runs."""
         self._check(folder, below)
         plain = {"folder": folder, "below": below, "settings": dict(settings)}
         fleet = hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:12]
@@ -129,7 +129,7 @@ class Fleets:
         return view
 
     def stop(self, fleet: str) -> FleetView:
-        """End it soon; what is done is kept. Raises NotThere."""
+        """End it soon; finished rows are kept. Raises NotThere."""
         view = self.get(fleet)
         going = self._going
         if going is not None and going.view.id == fleet:
@@ -137,7 +137,7 @@ class Fleets:
         return view
 
     def rows(self, fleet: str, start: int, limit: int) -> list[dict[str, Any]]:
-        """Of the table (`tdhil.fleet.FleetRow`); as long as it goes, those that came since it began.
+        """Return rows of the table (`tdhil.fleet.FleetRow`); while it runs, only those since its start.
 
         Raises NotThere and UsageError.
         """
@@ -151,15 +151,16 @@ class Fleets:
         return [asdict(row) for row in read_table(table)[start : start + limit]] if table.exists() else []
 
     def table(self, fleet: str) -> Path:
-        """The file. Raises NotThere."""
+        """Return the table's file. Raises NotThere."""
         self.get(fleet)
         path = self._places / fleet / TABLE
         if not path.is_file():
-            raise NotThere("there is no table yet", where=f"fleet {fleet}", next_step="It comes when it has ended")
+            raise NotThere("the table does not exist yet", where=f"fleet {fleet}",
+                           next_step="Wait until the fleet has ended")
         return path
 
     def close(self) -> None:
-        """End what goes, and wait for its table, some seconds."""
+        """End the present request, and wait up to 5 s for its table."""
         if (going := self._going) is not None:
             self._end(going)
             going.ended.wait(5.0)
@@ -169,15 +170,18 @@ class Fleets:
     def _check(self, folder: str, below: str) -> None:
         if folder not in self.folders:
             there = ", ".join(filter(None, self.folders)) or "none"
-            raise UsageError("is no folder of this service", where=folder[:60],
-                             next_step=f"There are: {there}. More: tdhil serve --logs DIR")
+            raise UsageError("is not a folder of this service", where=folder[:60],
+                             next_step=f"Folders: {there}. Add one with tdhil serve --logs DIR",
+                             entry=MessageCode.REQUEST_WRONG)
         root = self.folders[folder].resolve()
         if folder == RUNS:
             root = self._runs
             if below:
-                raise UsageError("the service's runs are taken all together", where="below", next_step="Leave it out")
+                raise UsageError("the service's runs can only be used all together", where="below",
+                                 next_step="Remove it", entry=MessageCode.REQUEST_WRONG)
             if next(root.glob("*/run.mcap"), None) is None:
-                raise UsageError("no run has a log yet", where=root.name, next_step="Start a run")
+                raise UsageError("no run has a log yet", where=root.name, next_step="Start a run",
+                                 entry=MessageCode.NOT_READY)
             return
         try:
             inside = (root / below).resolve()
@@ -185,7 +189,8 @@ class Fleets:
         except (OSError, ValueError):
             found = False
         if not found:
-            raise UsageError("is no folder in there", where=f"below {below[:60]}", next_step="Name one inside")
+            raise UsageError("is not a folder inside it", where=f"below {below[:60]}",
+                             next_step="Name a folder inside it", entry=MessageCode.REQUEST_WRONG)
 
     def _view(self, fleet: str) -> FleetView | None:
         going = self._going
@@ -207,7 +212,7 @@ class Fleets:
             return None
 
     def _gate(self, going: _Going) -> None:
-        """Says whether it may go on. What it has in hand it finishes: a second a process, at nice 19."""
+        """Allow or hold the process. It finishes work in progress: about a second per process, at nice 19."""
         told = None
         assert going.process.stdin is not None
         while True:
@@ -263,16 +268,16 @@ class Fleets:
 
 
 class _Teller:
-    """Says on stdout what is done, and waits while it is told to hold."""
+    """Writes progress to stdout, and waits while it is held."""
 
     def __init__(self) -> None:
         self._out = os.fdopen(os.dup(1), "w")
-        os.dup2(2, 1)                      # what libraries print is none of it
+        os.dup2(2, 1)                      # output of libraries goes to stderr
         self._go = threading.Event()
         threading.Thread(target=self._hear, daemon=True).start()
 
     def say(self, **plain: Any) -> None:
-        with suppress(BrokenPipeError):    # the web is gone: so is stdin, which ends this
+        with suppress(BrokenPipeError):    # the web has ended: stdin has too, which ends this process
             self._out.write(json.dumps(plain) + "\n")
             self._out.flush()
 
@@ -282,7 +287,7 @@ class _Teller:
 
     def done(self, row: FleetRow) -> None:
         self.say(row=asdict(row))
-        self._go.wait()                    # the pool's processes are given nothing new meanwhile
+        self._go.wait()                    # the pool's processes get no new work meanwhile
 
     def _hear(self) -> None:
         for line in sys.stdin:
@@ -291,7 +296,7 @@ class _Teller:
 
 
 def main(folder: Path) -> int:
-    """0: what came of it is told."""
+    """Compute the request of this folder and write its outcome to stdout. Return 0."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with suppress(OSError, AttributeError):
         os.nice(19)

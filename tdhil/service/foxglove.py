@@ -1,9 +1,9 @@
-"""The Foxglove WebSocket protocol, to read only: the log of a rig's run as it grows, for Foxglove and Lichtblick.
+"""The Foxglove WebSocket protocol, read only: the log of a rig's run as it grows, for Foxglove and Lichtblick.
 
-A viewer gets the log's own bytes under the log's own schemas, each channel from the start of the run, whenever it is
-subscribed to. Every viewer reads the file at its own pace, so that none holds anything up and none needs a queue: the
-log is what it waits in. Who stays behind for longer than `LATE_S` gets no more of what comes in every cycle until he
-has caught up, and is told how much that was. Source: github.com/foxglove/ws-protocol, docs/spec.md.
+A viewer receives the log's own bytes under the log's own schemas. Each channel starts at the beginning of the run,
+whenever it is subscribed to. Every viewer reads the file at its own pace, so no viewer delays another and none needs a
+queue. A viewer that is late by more than `LATE_S` gets no more messages of every cycle until it has caught up, and a
+status with the number left out. Source: github.com/foxglove/ws-protocol, docs/spec.md.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from tdhil.recording import (
 )
 
 PROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""The sub-protocols; what is spoken of them is the same."""
+"""The sub-protocols. The part used here is the same in both."""
 EVERY_S: Final = 0.1
 LOOK_S: Final = 1.0
-"""So often it is looked whether a run that says nothing is still the rig's."""
+"""Interval of the check whether a silent run is still the rig's run, s."""
 LATE_S: Final = 10.0
 FIRST_S: Final = 60.0
-"""What may be needed for all that was logged before one came."""
+"""Time allowed for the part of the log from before the subscription, s."""
 _EACH_CYCLE: Final = frozenset({SAMPLE, COMMAND, CAN, MODBUS, VIRTUAL_STRING})
 _DATA: Final = Struct("<BIQ")              # opcode 1, subscription, log time in ns; then the message
 _INFO, _WARNING, _ERROR = 0, 1, 2
@@ -49,7 +49,7 @@ _WAITS: Final = "run"
 
 @dataclass(frozen=True)
 class Running:
-    """The run that a rig has."""
+    """The present run of a rig."""
 
     run: str
     log: Path
@@ -58,19 +58,19 @@ class Running:
 
 @dataclass
 class _ChannelReader:
-    """Of some channels that were subscribed to together; joins the others where it has caught up with them."""
+    """Reader of channels that were subscribed together. It joins the other readers once it has caught up."""
 
     tail: LogTail
     wanted: dict[int, int]                 # channel: subscription
-    until_s: float                         # monotonic; behind for longer than that is too slow
+    until_s: float                         # monotonic; a reader that is late after this is too slow
     left_out: int = 0
 
 
 @dataclass
 class Relay:
-    """What one viewer of one rig is told. ``current``: the rig's run, looked up in a thread.
+    """The messages to one viewer of one rig. ``current``: the rig's run, looked up in a thread.
 
-    ``simulated``: is the rig, as long as no run says it of itself?
+    ``simulated``: whether the rig is simulated, until a run states it.
     """
 
     rig: str
@@ -84,7 +84,7 @@ class Relay:
     _readers: list[_ChannelReader] = field(default_factory=list)
 
     async def hear(self, said: str | bytes) -> None:
-        """Something that the viewer says: what it wants and no longer wants; everything else is refused in words."""
+        """Handle a message of the viewer: subscribe or unsubscribe. Everything else is refused with a text."""
         try:
             asked: Any = json.loads(said) if isinstance(said, str) else {"op": "a binary message"}
             if asked["op"] == "subscribe":
@@ -93,18 +93,18 @@ class Relay:
             elif asked["op"] == "unsubscribe":
                 self._unsubscribe({int(one) for one in asked["subscriptionIds"]})
             else:
-                await self._status(_ERROR, f"{str(asked['op'])[:40]}: here one can only read")
+                await self._status(_ERROR, f"{str(asked['op'])[:40]}: this connection is read only")
         except (ValueError, TypeError, KeyError, RecursionError):
-            await self._status(_ERROR, "this is no message of the protocol")
+            await self._status(_ERROR, "this is not a message of the protocol")
 
     async def run(self) -> None:
-        """Tell, until it is cancelled."""
+        """Send, until it is cancelled."""
         running = await anyio.to_thread.run_sync(self.current)
         await self._introduce(running)
         while True:
             if running is not None:
                 await self._follow(running)
-                await self._status(_INFO, f"rig {self.rig}: the run has ended, the next one is waited for", _WAITS)
+                await self._status(_INFO, f"rig {self.rig}: the run has ended; waiting for the next one", _WAITS)
             running = await self._next(running)
             await self._say({"op": "removeStatus", "statusIds": [_WAITS]})
             await self._introduce(running)
@@ -113,9 +113,9 @@ class Relay:
 
     async def _subscribe(self, subscription: int, channel: int) -> None:
         if channel not in CHANNELS or not 0 <= subscription < 2**32:
-            await self._status(_ERROR, f"there is no channel {channel}")
+            await self._status(_ERROR, f"channel {channel} does not exist")
         elif channel in self._wanted:
-            await self._status(_WARNING, f"channel {channel} is subscribed to already")
+            await self._status(_WARNING, f"channel {channel} is already subscribed")
         else:
             self._wanted[channel] = subscription
             self._new.add(channel)
@@ -127,10 +127,10 @@ class Relay:
             for reader in self._readers:
                 reader.wanted.pop(channel, None)
 
-    # -- what it is told ---------------------------------------------------------------------------------------------
+    # -- messages to it ---------------------------------------------------------------------------------------------
 
     async def _introduce(self, running: Running | None) -> None:
-        """Who speaks; a session of its own for each run, so that a viewer begins anew with it."""
+        """Send name and channels. Each run is a new session, so that a viewer starts again with it."""
         simulated = " SIMULATED" if (self.simulated if running is None else running.simulated) else ""
         run = None if running is None else running.run
         metadata = {"rig": self.rig, "run": run or "", "simulated": str(bool(simulated)).lower()}
@@ -138,7 +138,7 @@ class Relay:
                          "metadata": metadata, "sessionId": run or "no run"})
         await self._say({"op": "advertise", "channels": _channels()})
         if running is None:
-            await self._status(_INFO, f"rig {self.rig} has no run: the channels wait for one", _WAITS)
+            await self._status(_INFO, f"rig {self.rig} has no run; waiting for one", _WAITS)
 
     async def _next(self, before: Running | None) -> Running:
         while True:
@@ -148,7 +148,7 @@ class Relay:
             await anyio.sleep(5.0 * EVERY_S)
 
     async def _follow(self, running: Running) -> None:
-        """The run's log, until it is closed, or the rig has this run no more and nothing is left to read."""
+        """Send the run's log until it is closed, or until the rig has another run and nothing is left to read."""
         self._readers, self._new = [], set(self._wanted)
         looked_s, gone = self.clock(), False
         while True:
@@ -169,7 +169,7 @@ class Relay:
                 await anyio.sleep(EVERY_S)
 
     async def _forward(self, reader: _ChannelReader) -> bool:
-        """What has come in its channels; is there more at once?"""
+        """Send new messages of its channels. Return whether more can be read at once."""
         looked_s = self.clock()
         came: LogChunks = await anyio.to_thread.run_sync(reader.tail.read_chunks)
         for chunk in came.chunks:
@@ -185,7 +185,7 @@ class Relay:
         if not came.more:
             reader.until_s = max(reader.until_s, looked_s + LATE_S)
             if reader.left_out:
-                await self._status(_WARNING, f"too slow: {reader.left_out} messages of every cycle were left out")
+                await self._status(_WARNING, f"viewer too slow: {reader.left_out} messages of every cycle left out")
                 reader.left_out = 0
         return came.more
 

@@ -1,6 +1,6 @@
-"""What a page sees of a run as it goes: its log, read as it grows, and its status. Nothing here reaches the run.
+"""The live data of a run for pages: its log, read as it grows, and its status. Nothing here reaches the run.
 
-One feed a run, however many look. Whoever is too slow to take it is let go, and comes again.
+There is one feed per run, for any number of viewers. A viewer that is too slow is disconnected, and connects again.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from tdhil.service.run_state import Status
 
 EVERY_S: Final = 0.1
 HEARTBEAT_S: Final = 0.5
-SPACING_S: Final = 0.04                # control time between two samples that are shown
-MOST: Final = 12_000                   # samples kept for who comes late; beyond, every other one goes
+SPACING_S: Final = 0.04                # control time between two displayed samples
+MOST: Final = 12_000                   # samples kept for late viewers; above it, every other one is dropped
 EVENTS: Final = 500
 WAITING: Final = 100                   # messages for one viewer, some ten seconds' worth
 
@@ -30,7 +30,7 @@ Viewer = asyncio.Queue[dict[str, Any] | None]
 
 
 class LivePicture:
-    """The run so far, thin enough to be drawn. Pure."""
+    """The run so far, thinned for drawing. Pure."""
 
     def __init__(self) -> None:
         self.samples = np.empty((0, 3))
@@ -46,7 +46,7 @@ class LivePicture:
         self._next_s = -math.inf
 
     def take(self, news: LogNews, at_s: float) -> dict[str, Any]:
-        """Put in what came; what of it a viewer is to be told."""
+        """Add new data. Return the part that viewers receive."""
         shown: dict[str, Any] = {}
         if len(news.samples):
             self.last_s, self.arrived_s = float(news.samples[-1, 0]), at_s
@@ -71,11 +71,11 @@ class LivePicture:
         return shown
 
     def whole(self) -> dict[str, Any]:
-        """For who comes now."""
+        """Return everything so far, for a new viewer."""
         return {"samples": columns(self.samples), "events": self.events, "stages": self.stages, "limits": self.limits}
 
     def age_s(self, wall_s: float, mono_s: float) -> float | None:
-        """Of the latest sample; in stepped time, which runs ahead of the clock, since it arrived."""
+        """Return the age of the latest sample, s; in stepped time, which runs ahead of the clock, since its arrival."""
         if self.last_s is None or self.arrived_s is None:
             return None
         if self.stepped or not self.epoch_ns:
@@ -92,14 +92,14 @@ class LivePicture:
 
 
 def columns(samples: np.ndarray[Any, Any]) -> list[list[float | None]]:
-    """[time], [speed], [torque], rounded to what a picture shows; None for what is no number."""
+    """Return [time], [speed], [torque], rounded for display; None for a value that is not finite."""
     return [
         [round(value, 5) if math.isfinite(value) else None for value in column] for column in samples.T.tolist()
     ]
 
 
 class Feed:
-    """Of one run. `watch` gives a queue that begins with everything so far; None in it: come again."""
+    """The feed of one run. `watch` returns a queue that starts with everything so far; None in it: connect again."""
 
     def __init__(self, path: Path, status: Callable[[], Status]) -> None:
         self._tail = LogTail(path)
@@ -139,7 +139,7 @@ class Feed:
     def _look(self) -> tuple[LogNews, Status | None]:
         try:
             status = self._read_status()
-        except Exception:              # being written, or gone: the next look tells
+        except Exception:              # being written, or deleted: the next check shows it
             status = None
         return self._tail.read(), status
 
@@ -159,7 +159,7 @@ class Feed:
 
 
 class Feeds:
-    """Those that somebody looks at, and some that somebody has looked at."""
+    """The feeds that have viewers, and the latest ones that had."""
 
     def __init__(self, most: int = 20) -> None:
         self._feeds: dict[str, Feed] = {}

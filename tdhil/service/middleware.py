@@ -1,4 +1,4 @@
-"""What stands between HTTP and the service: who may knock, what was sent, and an error of the tree as an answer."""
+"""Between HTTP and the service: permitted hosts and origins, checked bodies, and errors as HTTP replies."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from drivers import CommunicationLost, DataFileError, PreflightRefused
-from tdhil.errors import ExitCode, LogError, TdhilError, UsageError
+from tdhil.errors import ExitCode, LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.access import Access, token_in
 from tdhil.service.run_channel import RunRefused
 from tdhil.service.run_state import (
@@ -45,13 +45,13 @@ POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
     "form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
 )
-"""Of every page: nothing from elsewhere, and no script or style in the page itself."""
+"""Content security policy of every page: nothing from elsewhere, no script or style in the page itself."""
 _NONE: Final[Mapping[str, str]] = MappingProxyType({})
-_BROKEN_HINT: Final = "The terminal of tdhil serve says more"
+_BROKEN_HINT: Final = "See the terminal of tdhil serve"
 
 
 class Site(Protocol):
-    """What an answer has to do with: the service behind the web, and what the web lends."""
+    """The interface of an answer: the service behind the web, and helpers of the web."""
 
     store: Store
     supervisor: Supervisor
@@ -60,17 +60,17 @@ class Site(Protocol):
     logins: anyio.CapacityLimiter
 
     async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """A piece of arithmetic, one at a time: its document. Raises Refused."""
+        """Compute one task, one at a time. Return its document. Raises Refused."""
 
     async def file(self, request: Request, name: str, media: str) -> Response:
-        """A file of the run, as a download. Raises NotThere."""
+        """Return a file of the run as a download. Raises NotThere."""
 
 
 Answer = Callable[[Site, Request, Any], Awaitable[Any]]
 
 
 class RequestGuard:
-    """Before everything: a known host, no other site's page, and the headers of every answer."""
+    """First check: a known host, no page of another site, and the headers of every reply."""
 
     def __init__(self, app: ASGIApp, hosts: frozenset[str], viewers: frozenset[str] = frozenset()) -> None:
         self._app, self._hosts, self._viewers = app, hosts, viewers
@@ -92,10 +92,10 @@ class RequestGuard:
     def _wrong(self, connection: HTTPConnection, *, changes: bool) -> NotAllowed | None:
         host = connection.headers.get("host", "")
         if _name_of(host) not in self._hosts:
-            return NotAllowed("this name is none of this service's", where=f"host {host[:100]}",
-                              next_step=f"Open it as {', '.join(sorted(self._hosts))}")
+            return NotAllowed("this host name does not belong to the service", where=f"host {host[:100]}",
+                              next_step=f"Use {', '.join(sorted(self._hosts))}")
         if connection.scope["type"] == "websocket" and token_in(connection) is not None:
-            return None                # a token comes with no page by itself; without it nothing else counts
+            return None                # no page sends a token by itself, and without it nothing else counts
         origin = connection.headers.get("origin")
         if origin in self._viewers and connection.scope["type"] == "websocket" and "/foxglove/" in connection.url.path:
             return None
@@ -103,7 +103,7 @@ class RequestGuard:
             urlsplit(origin).scheme not in ("http", "https") or urlsplit(origin).netloc.lower() != host.lower()
         )
         if changes and (elsewhere or connection.headers.get("sec-fetch-site") in ("cross-site", "same-site")):
-            return NotAllowed("a page of another site asked for this", where=f"origin {(origin or '?')[:100]}")
+            return NotAllowed("a page of another site sent this request", where=f"origin {(origin or '?')[:100]}")
         return None
 
 
@@ -129,7 +129,7 @@ async def _with_headers(send: Send, message: Message) -> None:
 
 
 def status_of(error: BaseException) -> int:
-    """The HTTP status of an error of the tree."""
+    """Return the HTTP status of an error of the tree."""
     if isinstance(error, HTTPException):
         return int(error.status_code)
     for kind, status in (
@@ -145,18 +145,20 @@ def status_of(error: BaseException) -> int:
 
 
 def told_of(error: BaseException) -> ErrorView:
-    """The body of an error."""
+    """Return the body of an error."""
     if isinstance(error, RunRefused):
         return ErrorView(error.told)
     if isinstance(error, HTTPException):
-        return ErrorView(Told("UsageError", error.detail, error.detail, "", "", int(ExitCode.USAGE)))
+        return ErrorView(Told("UsageError", error.detail, error.detail, "", "", int(ExitCode.USAGE),
+                              MessageCode.REQUEST_WRONG.code))
     if not isinstance(error, TdhilError):
-        return ErrorView(Told("InternalError", "internal error", "internal error", "", _BROKEN_HINT, 1))
+        return ErrorView(Told("InternalError", "internal error", "internal error", "", _BROKEN_HINT, 1,
+                              MessageCode.INTERNAL_ERROR.code))
     return ErrorView(Told.of(error), getattr(error, "holder", None) if isinstance(error, Conflict) else None)
 
 
 def error_response(error: BaseException, status: int | None = None, headers: Mapping[str, str] = _NONE) -> Response:
-    """The whole answer. ``status``: where it is another than the error's own."""
+    """Return the whole reply. ``status``: if it differs from the error's own."""
     headers = {**headers, **({"www-authenticate": "Bearer"} if isinstance(error, NotLoggedIn) else {})}
     if isinstance(error, TooManyTries):
         headers["retry-after"] = f"{error.wait_s:.0f}"
@@ -164,23 +166,26 @@ def error_response(error: BaseException, status: int | None = None, headers: Map
 
 
 async def body_of(request: Request, route: Route) -> Any:
-    """What was sent, checked. Raises UsageError."""
+    """Return the checked body of the request. Raises UsageError."""
     if route.method == "GET":
         return None
     data = b""
     async for piece in request.stream():
         data += piece
         if len(data) > BODY_LIMIT:
-            raise UsageError(f"more than {BODY_LIMIT} bytes", where="body")
+            raise UsageError(f"the body is longer than the limit of {BODY_LIMIT} bytes", where="body",
+                             entry=MessageCode.REQUEST_WRONG)
     media = request.headers.get("content-type", "application/json").split(";")[0].strip().lower()
     if media != "application/json":
-        raise UsageError("must be JSON", where=f"content-type {media[:60]}", next_step="Say application/json")
+        raise UsageError("must be JSON", where=f"content-type {media[:60]}", next_step="Use application/json",
+                         entry=MessageCode.REQUEST_WRONG)
     try:
         sent = json.loads(data or b"{}", parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
-        raise UsageError(f"no JSON ({str(error)[:100]})", where="body") from None
+        raise UsageError(f"is not JSON ({str(error)[:100]})", where="body", entry=MessageCode.REQUEST_WRONG) from None
     if not isinstance(sent, dict):
-        raise UsageError("must be an object", where="body", next_step='Such as {"seed": 7}')
+        raise UsageError("must be an object", where="body", next_step='Send an object, such as {"seed": 7}',
+                         entry=MessageCode.REQUEST_WRONG)
     if route.body == OPTIONS:
         return sent
     try:
@@ -190,15 +195,16 @@ async def body_of(request: Request, route: Route) -> Any:
         where = ".".join(map(str, first["loc"]))[:60] or "body"
         if first["type"] == "unexpected_keyword_argument":
             known = ", ".join(one.name for one in fields(route.body))
-            raise UsageError("is nothing that is asked for here", where=where, next_step=f"There are {known}") from None
-        raise UsageError(first["msg"], where=where) from None
+            raise UsageError("is not a field of this request", where=where, next_step=f"Fields: {known}",
+                             entry=MessageCode.REQUEST_WRONG) from None
+        raise UsageError(first["msg"], where=where, entry=MessageCode.REQUEST_WRONG) from None
 
 
 def _no_number(name: str) -> Any:
-    raise ValueError(f"{name} is no number in JSON")
+    raise ValueError(f"{name} is not a number in JSON")
 
 
 async def off(work: Callable[[], T]) -> T:
-    """In a thread: files may be slow."""
+    """Run it in a thread: files may be slow."""
     found: T = await anyio.to_thread.run_sync(work)
     return found

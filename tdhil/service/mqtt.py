@@ -1,13 +1,13 @@
-"""States and results of the rigs for others on the site, by MQTT. Nothing is subscribed to: no command comes in here.
+"""States and results of the rigs for other systems, over MQTT. tdhil subscribes to nothing: no command comes in here.
 
 ::
 
-    <prefix>/status                  online; offline when the service has gone, which the broker says by itself
-    <prefix>/rigs/<rig>/state        what the rig is doing, and its run's state and stage
+    <prefix>/status                  online; offline when the service has ended; the broker then sets it itself
+    <prefix>/rigs/<rig>/state        state of the rig, and state and stage of its run
     <prefix>/rigs/<rig>/result       its latest result, as in the list of runs
 
-JSON, retained, QoS 1. Only the latest counts, so that nothing is queued: a broker that was away is told everything
-anew. It has threads of its own; nothing else waits for it.
+JSON, retained, QoS 1. Only the latest message counts, so nothing is queued: after a lost connection all topics are sent
+again. It has its own threads; nothing else waits for it.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import unquote, urlsplit
 
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
 
 EVERY_S: Final = 1.0
-"""So often it is looked what has changed."""
+"""Polling interval, s."""
 RETRY_S: Final = (1, 60)
-"""Between two tries to reach a broker, at first and at most."""
+"""Shortest and longest interval between two tries to reach a broker, s."""
 PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 USER, PASSWORD, PASSWORD_FILE, CA_FILE = (
     f"TDHIL_MQTT_{name}" for name in ("USER", "PASSWORD", "PASSWORD_FILE", "CA_FILE"))
@@ -43,7 +43,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Broker:
-    """Where, and under which topic. ``password`` is shown nowhere."""
+    """Address of a broker, and the prefix of the topics. ``password`` is never shown."""
 
     host: str
     port: int
@@ -55,21 +55,24 @@ class Broker:
 
     @staticmethod
     def of(url: str, environment: Mapping[str, str] = os.environ) -> Broker:
-        """From ``mqtt[s]://[user@]host[:port][/prefix]``. Raises UsageError, and never shows what may be a password."""
+        """Parse ``mqtt[s]://[user@]host[:port][/prefix]``. Raises UsageError, and never shows a possible password."""
         try:
             parts = urlsplit(url)
             port, host = parts.port, parts.hostname
         except ValueError:
-            raise UsageError("is no address", where="--mqtt", next_step="Such as mqtt://host:1883/site") from None
+            raise UsageError("is not a valid address", where="--mqtt", next_step="Use mqtt://host:1883/site",
+                             entry=MessageCode.SERVICE_OPTION_WRONG) from None
         if parts.password is not None:
-            raise UsageError("a password doesn't belong on a command line, which everybody can read", where="--mqtt",
-                             next_step=f"Put it into a file, and name that in {PASSWORD_FILE}")
+            raise UsageError("a password must not be on the command line, which every user can read", where="--mqtt",
+                             next_step=f"Put it into a file, and name the file in {PASSWORD_FILE}",
+                             entry=MessageCode.SERVICE_OPTION_WRONG)
         if parts.scheme not in PORTS or not host or parts.query or parts.fragment:
-            raise UsageError("must be mqtt:// or mqtts://, a host, and no more than a port and a prefix",
-                             where="--mqtt", next_step="Such as mqtt://host:1883/site")
+            raise UsageError("must be mqtt:// or mqtts://, a host, and optionally a port and a prefix",
+                             where="--mqtt", next_step="Use mqtt://host:1883/site",
+                             entry=MessageCode.SERVICE_OPTION_WRONG)
         prefix = unquote(parts.path).strip("/") or "tdhil"
         if set(prefix) & set("+#\0") or prefix.startswith("$") or "//" in prefix:
-            raise UsageError("+, #, // and a $ at its beginning have no place in a prefix", where=f"--mqtt …/{prefix}")
+            raise UsageError("a prefix must not contain +, # or //, nor begin with $", where=f"--mqtt …/{prefix}")
         user = unquote(parts.username) if parts.username else environment.get(USER)
         return Broker(host, port or PORTS[parts.scheme], parts.scheme == "mqtts", prefix, user,
                       _password(environment), environment.get(CA_FILE))
@@ -86,23 +89,24 @@ def _password(environment: Mapping[str, str]) -> str | None:
     except (OSError, ValueError) as error:
         raise UsageError(f"can't be read ({getattr(error, 'strerror', None) or 'no text'})",
                          where=f"{PASSWORD_FILE} {name}",
-                         next_step="It holds the password alone, and its owner only may read it") from None
+                         next_step="The file must contain only the password, readable by its owner only",
+                         entry=MessageCode.SERVICE_OPTION_WRONG) from None
 
 
 class Publisher:
-    """Tells a broker what ``look`` gives, topic by topic, whenever it has changed; from `start` to `close`.
+    """Publishes the values of ``look`` to a broker, topic by topic, whenever they change; from `start` to `close`.
 
-    Raises UsageError where the extra is missing, or what TLS needs can't be read.
+    Raises UsageError if the extra is missing, or a TLS file can't be read.
     """
 
     def __init__(self, broker: Broker, look: Callable[[], Mapping[str, Any]], say: Say = lambda text: None) -> None:
         if find_spec("paho") is None:
             raise UsageError("--mqtt needs paho-mqtt, not installed here",
-                             next_step="Install: pip install 'tdhil[mqtt]'")
+                             next_step="Install: pip install 'tdhil[mqtt]'", entry=MessageCode.PACKAGE_MISSING)
         self._broker, self._look, self._say = broker, look, say
         self._told: dict[str, str] = {}
         self._connected, self._end = threading.Event(), threading.Event()
-        self._silent = False               # it was said that the broker can't be reached
+        self._silent = False               # the lost connection was reported
         self._client = self._make()
         self._thread = threading.Thread(target=self._run, name="mqtt", daemon=True)
 
@@ -120,25 +124,26 @@ class Publisher:
             try:
                 found.tls_set(self._broker.ca_file)
             except (OSError, ssl.SSLError) as error:
-                raise UsageError(f"can't be taken ({getattr(error, 'strerror', None) or error})",
-                                 where=f"{CA_FILE} {self._broker.ca_file}") from None
+                raise UsageError(f"can't be read as certificates ({getattr(error, 'strerror', None) or error})",
+                                 where=f"{CA_FILE} {self._broker.ca_file}",
+                                 entry=MessageCode.SERVICE_OPTION_WRONG) from None
         found.on_connect = self._on_connect
-        # paho doesn't say why: a certificate that nobody vouches for comes to the same.
+        # paho gives no reason: an untrusted certificate looks the same.
         why = "can't be reached" + (", or its certificate isn't trusted" if self._broker.tls else "")
         found.on_connect_fail = lambda client, data: self._away(why)
         found.on_disconnect = lambda client, data, flags, reason, properties: self._away(str(reason))
         return found
 
     def start(self) -> None:
-        """Begin to tell; comes back at once, whether or not the broker is there."""
+        """Start publishing. Returns at once, also if the broker can't be reached."""
         if self._broker.password is not None and not self._broker.tls:
-            self._say("MQTT: the password goes to the broker unencrypted; mqtts:// wouldn't do that")
+            self._say("MQTT: the password is sent to the broker unencrypted. Use mqtts:// to encrypt it")
         self._client.connect_async(self._broker.host, self._broker.port, _KEEPALIVE_S)
         self._client.loop_start()
         self._thread.start()
 
     def close(self) -> None:
-        """Say goodbye, if the broker is there to hear it; within a second."""
+        """Publish "offline" if the broker is connected, within a second."""
         self._end.set()
         if self._connected.is_set():
             with suppress(RuntimeError, ValueError):
@@ -152,15 +157,15 @@ class Publisher:
             self._away(str(reason))
             return
         self._silent = False
-        self._told.clear()                 # whatever the broker has kept may be from before
+        self._told.clear()                 # retained messages may be out of date
         self._connected.set()
-        self._say(f"MQTT: {self._broker} is told states and results")
+        self._say(f"MQTT: states and results are sent to {self._broker}")
 
     def _away(self, why: str) -> None:
         self._connected.clear()
         if not self._silent and not self._end.is_set():
             self._silent = True
-            self._say(f"MQTT: {self._broker}: {why}; it is tried again, and nothing waits for it")
+            self._say(f"MQTT: {self._broker}: {why}; tdhil tries again. Runs are not affected")
 
     # -- in its own --------------------------------------------------------------------------------------------------
 
@@ -171,7 +176,7 @@ class Publisher:
                 try:
                     self._tell()
                     trouble = ""
-                except Exception as error:     # of one look: the next one tells
+                except Exception as error:     # of one poll: the next one reports
                     trouble = f"MQTT: {type(error).__name__}: {error}"
                 if trouble not in ("", said):
                     self._say(trouble)
@@ -180,7 +185,7 @@ class Publisher:
     def _tell(self) -> None:
         news = {"status": ONLINE} | {
             topic: json.dumps(plain, allow_nan=False) for topic, plain in self._look().items()}
-        gone = dict.fromkeys(self._told.keys() - news.keys(), "")      # an empty one takes a retained one away
+        gone = dict.fromkeys(self._told.keys() - news.keys(), "")      # an empty message deletes a retained one
         for topic, text in (news | gone).items():
             if self._told.get(topic) != text and self._connected.is_set():
                 self._publish(topic, text)

@@ -1,7 +1,7 @@
-"""Between web and run: a Unix socket in the run's folder, a line of JSON each way; and the lock that says it lives.
+"""Between web and run: a Unix socket in the run's folder, a line of JSON each way; and the lock of a living run.
 
-The socket belongs to one user (mode 0600). The lock is held by the run's process for as long as it lives: the web took
-it before the process began, and handed it on, so that there is no moment at which a living run looks dead.
+The socket belongs to one user (mode 0600). The run's process holds the lock while it lives. The web takes the lock
+before the process starts, and passes it on, so that a living run never looks dead.
 """
 
 from __future__ import annotations
@@ -19,31 +19,33 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from drivers import CommunicationLost
-from tdhil.errors import TdhilError
+from profiles import message_of
+from tdhil.errors import MessageCode, TdhilError
 from tdhil.service.run_state import Told
 
 SOCKET: Final = "control.sock"
 LOCK: Final = "alive.lock"
 STOP_FILE: Final = "stop.json"
-"""A wish to stop from before the run's process listened."""
+"""Stop request from before the run's process listens."""
 LONGEST: Final = 64 * 1024
 _PATH_LIMIT: Final = 100               # of a socket's path; the system has 108
 Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
 class RunRefused(TdhilError):
-    """What the run said no to; ``told`` is its own error."""
+    """A refusal by the run; ``told`` is its own error."""
 
     def __init__(self, told: Told) -> None:
         super().__init__(told.what, where=told.where, next_step=told.next_step)
         self.told = told
         self.exit_code = told.exit_code
+        self.entry = message_of(told.code) or self.entry
 
 
 class ChannelListener:
-    """The run's end. Each request is answered in a thread of its own: no slow client holds another up.
+    """The run's end of the channel. Each request has its own thread: no slow client delays another.
 
-    Some threads wait for requests from the beginning, since to start one takes 200 ms on a busy computer.
+    Some threads wait for requests in advance, because starting one takes 200 ms on a busy computer.
     """
 
     SPARE: Final = 2
@@ -102,13 +104,13 @@ class ChannelListener:
             try:
                 asked = json.loads(_line(peer))
                 answer: Mapping[str, Any] = self._answer(asked if isinstance(asked, dict) else {})
-            except Exception as error:         # whatever came over the wire: the run goes on
+            except Exception as error:         # whatever arrived: the run continues
                 answer = {"error": Told.of(error).__dict__}
             peer.sendall(json.dumps(answer).encode() + b"\n")
 
 
 def ask(folder: Path, request: Mapping[str, Any], *, timeout_s: float = 2.0) -> dict[str, Any]:
-    """What the run answers. Raises Refused with its own error, and CommunicationLost where nobody answers in time."""
+    """Return the run's answer. Raises RunRefused with its error, and CommunicationLost without a timely answer."""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as peer:
             peer.settimeout(timeout_s)
@@ -118,8 +120,9 @@ def ask(folder: Path, request: Mapping[str, Any], *, timeout_s: float = 2.0) -> 
             found: dict[str, Any] = json.loads(_line(peer))
     except (OSError, ValueError) as error:
         raise CommunicationLost(
-            f"the run's process doesn't answer ({error})", where=f"run {folder.name}",
+            f"the run's process does not answer ({error})", where=f"run {folder.name}",
             next_step="If the shaft turns, use the hard-wired stop",
+            entry=MessageCode.SERVER_UNREACHABLE,
         ) from error
     if found.get("error"):
         raise RunRefused(Told(**found["error"]))
@@ -135,7 +138,7 @@ def _line(peer: socket.socket) -> bytes:
 
 @contextmanager
 def _short(path: Path) -> Iterator[str]:
-    """The path, or where it is too long for a socket, a way through the open folder."""
+    """Yield the path, or if it is too long for a socket, a path through the open folder."""
     if len(os.fsencode(path)) < _PATH_LIMIT:
         yield str(path)
         return
@@ -147,7 +150,7 @@ def _short(path: Path) -> Iterator[str]:
 
 
 def take_life(folder: Path) -> int:
-    """A descriptor that holds the run's lock, for its process to inherit; the caller closes its own."""
+    """Return a descriptor that holds the run's lock, for its process to inherit; the caller closes its own."""
     import fcntl
 
     descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -160,7 +163,7 @@ def take_life(folder: Path) -> int:
 
 
 def lives(folder: Path) -> bool:
-    """Does the run's process live? Where that can't be known (no descriptor left, say) it isn't given up for dead."""
+    """Return whether the run's process lives; True if that is unknown (such as without a free descriptor)."""
     import fcntl
 
     try:
@@ -179,7 +182,7 @@ def lives(folder: Path) -> bool:
 
 
 def stands_still(pid: int) -> bool:
-    """Was the process stopped, by SIGSTOP or a debugger? False where that can't be known."""
+    """Return whether the process is suspended, by SIGSTOP or a debugger. False if that is unknown."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][:1] in ("T", "t")
     except OSError:
@@ -187,7 +190,7 @@ def stands_still(pid: int) -> bool:
 
 
 def send_signal(pid: int, folder: Path, number: int) -> bool:
-    """Send it to the run's process, by a descriptor, so that it reaches no other process of that number."""
+    """Send a signal to the run's process through a descriptor, so that it reaches no other process of that number."""
     if sys.platform != "linux":
         return False
     try:
@@ -195,7 +198,7 @@ def send_signal(pid: int, folder: Path, number: int) -> bool:
     except OSError:
         return False
     try:
-        if not lives(folder):              # after the descriptor was made: it is this run's process, or none
+        if not lives(folder):              # after the descriptor was made: it is this run's process or none
             return False
         signal.pidfd_send_signal(descriptor, number)
         return True

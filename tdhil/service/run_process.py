@@ -1,9 +1,9 @@
-"""The process of one run: today's Runner, its log, and a socket for those who confirm, stop or look.
+"""The process of one run: the same Runner as on the command line, its log, and a socket to confirm, stop or read
+status.
 
-``python -m tdhil.service.run_process FOLDER`` with the run's folder, in which request.json stands. It is a session of
-its own: what becomes of the web doesn't touch it. SIGTERM is a stop here as for `tdhil identify`, the second road
-beside the socket. Nothing that the control loop does waits for a file or a socket: it leaves notes, and a thread
-writes them down.
+``python -m tdhil.service.run_process FOLDER`` with the run's folder, which contains request.json. It is a session of
+its own: a failure of the web does not affect it. SIGTERM is a stop here as for `tdhil identify`, besides the socket.
+The control loop never waits for a file or a socket: it takes notes, and a thread writes them to disk.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers import Preflight, PreflightRefused
-from profiles import visible
+from profiles import MessageCode, visible
 from tdhil.service.attendance import (
     EXPECTED_S,
     LEASE_S,
@@ -38,13 +38,13 @@ if TYPE_CHECKING:
     from tdhil.runner import RunOutcome
 
 NICE: Final = 5
-"""Of a simulated run in stepped time, which takes all the processor that it gets."""
+"""Nice value of a simulated run in stepped time, which takes all the processor time it can get."""
 UNWATCHED: Final = "nobody watched"
-"""Who asked for the stop of a watched run whose page was gone."""
+"""Origin of the stop of a watched run whose page was closed."""
 
 
 class RunProcess:
-    """One run from its request to its result; `serve` is the whole of it."""
+    """One run from its request to its result; `serve` runs all of it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder.resolve()
@@ -63,7 +63,7 @@ class RunProcess:
         )
 
     def serve(self) -> int:
-        """Run it; the exit code, as of `tdhil identify`."""
+        """Run it. Return the exit code, as of `tdhil identify`."""
         from tdhil.session import stop_on_signals
 
         with stop_on_signals(self.stop), ChannelListener(self.folder, self.answer):
@@ -79,14 +79,14 @@ class RunProcess:
     # -- the socket ----------------------------------------------------------------------------------------------
 
     def answer(self, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """One request's. Called in a thread of the socket."""
+        """Answer one request. Called in a thread of the socket."""
         what, who = asked.get("do"), str(asked.get("by", "somebody"))[:80]
         if what == "stop":
-            self._stop(f"{visible(who)} asked for a stop", who)
+            self._stop(f"{visible(who)} requested a stop", who)
             return {"status": self.board.status.plain()}
         if what == "lease":
             if (lease := self.operator_interface.lease) is None:
-                raise PreflightRefused("nobody watches this run", where="lease")
+                raise PreflightRefused("this run is not watched", where="lease")
             watch = lease.renew(str(asked.get("key", "")), who, new_key=str(asked.get("new_key") or ""),
                                 gone=str(asked.get("gone") or ""))
             return {"watch": asdict(watch)}
@@ -94,7 +94,7 @@ class RunProcess:
             confirming = self.operator_interface.confirming
             if confirming is None:
                 raise PreflightRefused("there is nothing to confirm", where="run",
-                                       next_step="A simulated rig asks nobody; a real one asks after its preflight")
+                                       next_step="A simulated rig needs no code. A real one shows it after preflight")
             confirming.take(str(asked.get("code", "")), asked.get("binding"), who, str(asked.get("lease") or ""))
             return {"status": self.board.status.plain()}
         if what == "code":
@@ -106,11 +106,11 @@ class RunProcess:
         return {"status": self.board.status.plain()}
 
     def _stop(self, why: str, who: str) -> None:
-        self.stop.ask(signal.SIGTERM, why)     # first of all; the control loop sees it in its next cycle
+        self.stop.ask(signal.SIGTERM, why)     # first; the control loop reads it in its next cycle
         self.watcher.asked_to_stop(who)
 
     def _unwatched(self, watch: Watch) -> None:
-        self._stop(f"nobody watched the run for {LEASE_S:g} s ({WATCHED[watch.how]})", UNWATCHED)
+        self._stop(f"the run was not watched for {LEASE_S:g} s ({WATCHED[watch.how]})", UNWATCHED)
 
     # -- the run -------------------------------------------------------------------------------------------------
 
@@ -121,13 +121,14 @@ class RunProcess:
         return Confirming(binding, self._refuse_changed, watched=self.watched)
 
     def _refuse_changed(self) -> None:
-        """Rig file and profile are what they were. Raises PreflightRefused."""
+        """Raise PreflightRefused if the rig file or the profile has changed."""
         path = Path(self.request.rig_file)
         refuse_changed(path, self.request.rig_sha256)
         _, connection = read_rig(path).way(self.request.options)
         if connection.profile != self._asked.connection.profile:
-            raise PreflightRefused("the drive's profile was changed after the run was asked for",
-                                   where=connection.profile.name, next_step="Ask for it again; nothing has moved")
+            raise PreflightRefused("the drive's profile was changed after the run was requested",
+                                   where=connection.profile.name, next_step="Nothing has moved; request the run again",
+                                   entry=MessageCode.CHANGED_MEANWHILE)
 
     def _run(self) -> int:
         from tdhil.report import has_extra
@@ -136,19 +137,19 @@ class RunProcess:
         os.chdir(self.folder)
         path = Path(self.request.rig_file)
         rig = read_rig(path)
-        refuse_changed(path, self.request.rig_sha256)      # after it was read: what was read is what was requested
+        refuse_changed(path, self.request.rig_sha256)      # after reading: so the read file is the requested one
         self.stop.check(next_step="Nothing has moved")
         self.board.to(State.PREFLIGHT)
         self._asked = asked = run_request(rig, self.request.options, left_in=self.store.folder)
         if asked.peer.stepped:
             with suppress(OSError):
                 os.nice(NICE)
-        if self.watched or not asked.peer.embedded:        # who confirms is told what is planned, and confirms that
+        if self.watched or not asked.peer.embedded:        # the confirmation shows the plan and is bound to it
             self._plan = plan_of(rig, self.request.options)
             write_json(self.folder / "plan.json", self._plan)
             self.board.know(expected_half_width=self._plan["expected_half_width"],
                             expected_s={**EXPECTED_S, "acquire": self._plan["duration_s"] + 5.0})
-        if not asked.peer.embedded:        # before its bus is opened: a later stop goes to this drive and no other
+        if not asked.peer.embedded:        # before its bus is opened: a later stop goes to this drive only
             write_json(self.folder / CONNECTION_FILE, kept_connection(asked.options, asked.connection))
         report = has_extra()
         self.stop.check(next_step="Nothing has moved")
@@ -176,13 +177,13 @@ class RunProcess:
         return int(found.exit_code)
 
     def _row(self, document: Mapping[str, Any], torque_scale_rel_sd: float) -> None:
-        """The run as a line of its rig's history."""
+        """Write the run as a row of its rig's history."""
         from tdhil.fleet import FleetSettings, row_of
 
         try:
             row = row_of(self.request.id, document, settings=FleetSettings(), torque_scale_rel_sd=torque_scale_rel_sd)
             write_json(self.folder / "row.json", asdict(replace(row, rig=self.request.rig)))
-        except Exception as error:             # the result stands without it
+        except Exception as error:             # the result is valid without it
             tell(f"the history can't be written: {error}")
 
     def _report(self, document: Mapping[str, Any], recording: Any) -> None:
@@ -207,7 +208,7 @@ class RunProcess:
         return int(code)
 
     def _failed(self, error: BaseException) -> int:
-        """Something before or after the motion; the Runner itself never raises."""
+        """End after an error before or after the motion. The Runner itself never raises."""
         import traceback
 
         from tdhil.errors import TdhilError, exit_code
@@ -231,13 +232,13 @@ class RunProcess:
 
 
 def _cut_short(code: int, stop_confirmed: bool | None) -> State:
-    """The end of a run that has no result, whatever its exit code: a log that broke off is `partial` to a terminal."""
+    """Return the end state of a run without a result. On a terminal a log that broke off is `partial`."""
     state = end_of(code, stop_confirmed=stop_confirmed)
     return State.FAILED if state is State.DONE else state
 
 
 def main(arguments: list[str]) -> int:
-    """The exit code."""
+    """Run the run of this folder. Return the exit code."""
     return RunProcess(Path(arguments[0])).serve()
 
 

@@ -1,4 +1,4 @@
-"""What a run of the service is at each moment: its states, which may follow which, and what each knows. Pure.
+"""The states of a run in the service: which state may follow which, and the data of each. Pure.
 
 ::
 
@@ -6,7 +6,7 @@
                                                                              ↘ refused | stopped | failed
     whenever the run's process or the drive is lost:                           interrupted | stop_not_confirmed
 
-There is no queue of motions, no pause and no way back: a run that has ended is ended.
+There is no queue of motions, no pause and no way back: an ended run stays ended.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from enum import StrEnum
 from typing import Any
 
 from drivers import CommunicationLost, PreflightRefused
-from tdhil.errors import HIGHEST_SIGNAL, SIGNALS, ExitCode, TdhilError
+from tdhil.errors import HIGHEST_SIGNAL, SIGNALS, ExitCode, MessageCode, TdhilError
 
 
 class State(StrEnum):
-    """Of one run."""
+    """State of one run."""
 
     REQUESTED = "requested"
     PREFLIGHT = "preflight"
@@ -31,11 +31,11 @@ class State(StrEnum):
     STOPPING = "stopping"
     IDENTIFYING = "identifying"
     DONE = "done"
-    REFUSED = "refused"                    # before anything moved, or by a probe of sign or unit
-    STOPPED = "stopped"                    # somebody asked for it, and the shaft was seen at rest
-    FAILED = "failed"                      # something went wrong, and the shaft was seen at rest
+    REFUSED = "refused"                    # before motion, or by the sign probe or unit check
+    STOPPED = "stopped"                    # stopped on request, standstill confirmed
+    FAILED = "failed"                      # an error, standstill confirmed
     STOP_NOT_CONFIRMED = "stop_not_confirmed"
-    INTERRUPTED = "interrupted"            # the run's process was lost; what then was seen of the shaft is said
+    INTERRUPTED = "interrupted"            # the run's process was lost; the error states how the shaft ended
 
 
 _LOST = {State.INTERRUPTED, State.STOP_NOT_CONFIRMED}
@@ -51,16 +51,16 @@ FOLLOWS: Mapping[State, frozenset[State]] = {
 }
 ENDED = frozenset(state for state, after in FOLLOWS.items() if not after)
 MAY_TURN = frozenset({State.MOVING, State.STOPPING})
-"""The shaft may be turning."""
+"""States in which the shaft may turn."""
 
 
 class NotSo(ValueError):
-    """A state that can't follow the one before: a mistake of this program."""
+    """A state that can't follow the one before: an error in this program."""
 
 
 @dataclass(frozen=True)
 class Told:
-    """An error of the tree as a file and a page have it."""
+    """An error of the tree, as data for a file or a page."""
 
     kind: str
     message: str
@@ -68,20 +68,21 @@ class Told:
     where: str
     next_step: str
     exit_code: int
+    code: str = ""
 
     @staticmethod
     def of(error: BaseException) -> Told:
-        from tdhil.errors import exit_code
+        from tdhil.errors import code_of, exit_code
 
         what, where, next_step = str(error), "", ""
         if isinstance(error, TdhilError):
             what, where, next_step = error.what, error.where, error.next_step
-        return Told(type(error).__name__, str(error), what, where, next_step, int(exit_code(error)))
+        return Told(type(error).__name__, str(error), what, where, next_step, int(exit_code(error)), code_of(error))
 
 
 @dataclass(frozen=True)
 class Stop:
-    """What became of a wish to stop: each time as ISO 8601 in UTC, None as long as it hasn't come.
+    """The progress of a stop: each time as ISO 8601 in UTC, None until it is reached.
 
     ``seen``: the drive was in quick stop, or had been commanded to zero speed.
     """
@@ -107,7 +108,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Confirmation:
-    """What is waited for: ``binding`` is the SHA-256 of all that the code is good for."""
+    """The requested confirmation: ``binding`` is the SHA-256 of everything that the code is valid for."""
 
     binding: str
     text: str
@@ -116,10 +117,10 @@ class Confirmation:
 
 @dataclass(frozen=True)
 class Watch:
-    """Who watches a run that brakes as soon as nobody does.
+    """The watching user of a run that stops when it is not watched.
 
-    ``gone``: since when its page has not been seen, by what itself or its silence said (``how``: hidden, closed,
-    silent); None while it is there. ``lost``: when it was too long, and the run was made to brake.
+    ``gone``: since when its page is not visible, as reported by the page or its silence (``how``: hidden, closed,
+    silent); None while it is visible. ``lost``: when this lasted too long, and the run was stopped.
     """
 
     by: str
@@ -131,7 +132,7 @@ class Watch:
 
 @dataclass(frozen=True)
 class Entered:
-    """A state (of `moving` with its stage) and when it began."""
+    """A state (`moving` with its stage) and its start."""
 
     state: State
     at: str
@@ -140,7 +141,7 @@ class Entered:
 
 @dataclass(frozen=True)
 class Status:
-    """Everything that is known of a run besides its samples; state.json. Times are ISO 8601 in UTC."""
+    """All data of a run except its samples; state.json. Times are ISO 8601 in UTC."""
 
     id: str
     rig: str
@@ -182,18 +183,18 @@ class Status:
         return self.state in ENDED
 
     def to(self, state: State, at: str, stage: str | None = None, **known: Any) -> Status:
-        """The status after this step. Raises NotSo where it can't follow."""
+        """Return the status after this step. Raises NotSo if it can't follow."""
         if state not in FOLLOWS[self.state]:
             raise NotSo(f"{self.id}: {state} after {self.state}")
         return replace(self, history=(*self.history, Entered(state, at, stage)), **known)
 
     def plain(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return it as plain data for JSON."""
         return {**asdict(self), "state": self.state.value, "stage": self.stage, "at": self.at}
 
     @staticmethod
     def of_plain(plain: Mapping[str, Any]) -> Status:
-        """Raises ValueError, TypeError or KeyError for what is none."""
+        """Read a status. Raises ValueError, TypeError or KeyError for other data."""
         known = {name: value for name, value in plain.items() if name not in ("state", "stage", "at")}
         history = tuple(Entered(State(one["state"]), one["at"], one.get("stage")) for one in known.pop("history"))
         if not history:
@@ -209,7 +210,7 @@ class Status:
 
 
 def end_of(exit_code: int, *, stop_confirmed: bool | None) -> State:
-    """The state in which a run ends that has this exit code. ``stop_confirmed``: None where nothing was enabled."""
+    """Return the end state for an exit code. ``stop_confirmed``: None if the drive was not enabled."""
     if stop_confirmed is False or exit_code == ExitCode.STOP_NOT_CONFIRMED:
         return State.STOP_NOT_CONFIRMED
     if exit_code in (ExitCode.OK, ExitCode.PARTIAL, ExitCode.NOT_IDENTIFIABLE):
@@ -222,7 +223,7 @@ def end_of(exit_code: int, *, stop_confirmed: bool | None) -> State:
 
 
 def way_to(status: Status, end: State, at: str, **known: Any) -> Status:
-    """The status at its end, by way of the states that nobody has told of."""
+    """Return the status at its end, with the unreported states in between."""
     if end not in FOLLOWS[status.state]:
         for between in (State.STOPPING, State.IDENTIFYING):
             if between in FOLLOWS[status.state]:
@@ -233,12 +234,12 @@ def way_to(status: Status, end: State, at: str, **known: Any) -> Status:
 
 
 def now() -> str:
-    """Wall clock, ISO 8601 in UTC, to the millisecond."""
+    """Return the wall clock, ISO 8601 in UTC, to the millisecond."""
     return iso(datetime.now(UTC).timestamp())
 
 
 def iso(time_s: float) -> str:
-    """A time as of `time.time`, the same way."""
+    """Return a time as of `time.time` in the same format."""
     return datetime.fromtimestamp(time_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
@@ -249,71 +250,82 @@ def iso(time_s: float) -> str:
 #
 #     TdhilError
 #     ├── NotThere                    no such rig, run or file                                  exit 2, HTTP 404
-#     ├── NotAllowed                  another host, another origin, not over HTTP, not his role exit 4, HTTP 403
-#     │   ├── NotLoggedIn             nobody knows who asks                                     exit 4, HTTP 401
-#     │   └── TooManyTries            of passwords; ``wait_s`` says how long                    exit 4, HTTP 429
-#     │       └── TooManyRuns         of those that show a code                                 exit 4, HTTP 429
+#     ├── NotAllowed                  other host or origin, not over HTTP, other role needed exit 4, HTTP 403
+#     │   ├── NotLoggedIn             the client is not logged in                               exit 4, HTTP 401
+#     │   └── TooManyTries            too many passwords; retry after ``wait_s``                exit 4, HTTP 429
+#     │       └── TooManyRuns         too many runs that show a code                            exit 4, HTTP 429
 #     ├── NoRoom                      the disk is full                                          exit 4, HTTP 507
 #     ├── CommunicationLost
-#     │   └── NotReacting             the run's process stands still                            exit 5, HTTP 504
+#     │   └── NotReacting             the run's process is suspended                            exit 5, HTTP 504
 #     └── PreflightRefused
-#         └── Conflict                another run has the rig; the code is void                 exit 4, HTTP 409
+#         └── Conflict                another run uses the rig; the code is void                exit 4, HTTP 409
 
 
 class NotThere(TdhilError):
-    """No such rig, run or file."""
+    """The rig, run or file does not exist."""
+
+    entry = MessageCode.NOT_FOUND
 
     exit_code = ExitCode.USAGE
 
 
 class NotAllowed(TdhilError):
-    """May not be had from there, or not over HTTP at all."""
+    """Refusal for this client or origin, or over HTTP in general."""
+
+    entry = MessageCode.NOT_ALLOWED
 
     exit_code = ExitCode.REFUSED
 
 
 class NotLoggedIn(NotAllowed):
-    """Nobody knows who asks."""
+    """The client is not logged in."""
 
 
 class TooManyTries(NotAllowed):
-    """Of passwords. ``wait_s``: then again."""
+    """Too many password tries. ``wait_s``: time until the next one, s."""
 
     def __init__(self, wait_s: float) -> None:
         self.wait_s = wait_s
-        super().__init__("too many tries", where="login", next_step=f"Again in {wait_s:.0f} s."
-                         " Who is logged in already can stop all the same; so does the hard-wired stop")
+        super().__init__("too many login attempts", where="login", next_step=f"Try again in {wait_s:.0f} s."
+                         " A logged-in user can still stop, and so can the hard-wired stop")
 
 
 class TooManyRuns(TooManyTries):
-    """Of those that show a code at the rig."""
+    """Too many requested runs that show a code at the rig."""
 
     def __init__(self, wait_s: float, rig: str) -> None:
         NotAllowed.__init__(
             self, "too many runs that show a code were requested", where=f"rig {rig}",
-            next_step=f"Nothing was started. Again in {wait_s:.0f} s, or run it at the rig: tdhil identify")
+            next_step=f"Nothing was started. Try again in {wait_s:.0f} s, or run it at the rig: tdhil identify")
         self.wait_s = wait_s
 
 
 class NoRoom(TdhilError):
     """The disk is full."""
 
+    entry = MessageCode.SERVICE_DISK_FULL
+
     exit_code = ExitCode.REFUSED
 
 
 class NotReacting(CommunicationLost):
-    """The run's process stands still: what was asked of it is not done by it."""
+    """The run's process is suspended and does not carry out the request."""
+
+    entry = MessageCode.RUN_NOT_REACTING
 
 
 class Conflict(PreflightRefused):
-    """It can't be now: another run has the rig, or the run is beyond that. ``holder``: who has it, in words."""
+    """Conflict: another run uses the rig, or the run is past that state. ``holder``: in words."""
 
-    def __init__(self, what: str, *, where: str = "", next_step: str = "", holder: str | None = None) -> None:
-        super().__init__(what, where=where, next_step=next_step)
+    entry = MessageCode.CONFLICT
+
+    def __init__(self, what: str, *, where: str = "", next_step: str = "", holder: str | None = None,
+                 entry: MessageCode | None = None) -> None:
+        super().__init__(what, where=where, next_step=next_step, entry=entry)
         self.holder = holder
 
 
 def blocking(statuses: Iterable[Status], signed_off: Iterable[str]) -> Status | None:
-    """The run whose stop nobody confirmed and nobody has signed off: its rig moves for no one."""
+    """Return the run whose stop is neither confirmed nor signed off. It blocks its rig."""
     off = set(signed_off)
     return next((one for one in statuses if one.state is State.STOP_NOT_CONFIRMED and one.id not in off), None)

@@ -1,6 +1,6 @@
-"""What the API says of runs that are over, and of what might go wrong in one: pictures, samples, many logs, rehearsals.
+"""The routes for ended runs, fleets and rehearsals: pictures, samples, many logs, faults.
 
-Each of `ANSWERS` is called with the site, the request and its body, as the web's own are.
+Each of `ANSWERS` is called with the site, the request and its body, like the web's own routes.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from starlette.responses import FileResponse, Response
 
 from tdhil.config import ASKED_AGAIN, resolve
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 from tdhil.service.access import principal
 from tdhil.service.fleets import TABLE, FleetView
 from tdhil.service.middleware import Answer, Site, off
@@ -37,7 +37,7 @@ async def _picture(site: Site, request: Request, body: None) -> Response:
     number = request.path_params["number"]
     found = await _shown(site, request.path_params["run"])
     if not number.isdecimal() or int(number) >= len(found):
-        raise NotThere("there is no such picture", where=f"run {request.path_params['run']}")
+        raise NotThere("this picture does not exist", where=f"run {request.path_params['run']}")
     said = {"content-security-policy": _PICTURE_POLICY}
     return Response(found[int(number)].svg, media_type="image/svg+xml", headers=said)
 
@@ -53,12 +53,13 @@ async def _shown(site: Site, run: str) -> tuple[ShownPicture, ...]:
 
 
 async def _samples(site: Site, request: Request, body: None) -> Response:
-    """Made when it is first asked for."""
+    """Return the samples as CSV, made at the first request."""
     run = request.path_params["run"]
     folder = await off(lambda: site.store.place(run))
     if not (folder / "samples.csv").exists() and (folder / "run.mcap").exists():
         if not site.store.status(run).ended:
-            raise UsageError("the run has no finished log", where=f"run {run}", next_step="Wait until it has ended")
+            raise UsageError("the run has no finished log", where=f"run {run}", next_step="Wait until it has ended",
+                             entry=MessageCode.NOT_READY)
         await site.work("samples", run, {})
     return await site.file(request, "samples.csv", "text/csv")
 
@@ -68,8 +69,8 @@ async def _faults(site: Site, request: Request, body: None) -> list[FaultView]:
 
     rig = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
     if not rig.simulated:
-        raise NotAllowed("only a simulated rig can be spoilt", where=f"rig {rig.id}",
-                         next_step="Rehearse on a rig whose file says run: {simulate: true}")
+        raise NotAllowed("faults can be rehearsed only on a simulated rig", where=f"rig {rig.id}",
+                         next_step="Use a rig whose file contains run: {simulate: true}")
     kind = bus_kind(rig.way()[1].drive)
     return [FaultView(one.name, one.summary, one.row, one.value, one.takes, one.from_start) for one in kind.faults()]
 
@@ -87,7 +88,7 @@ async def _fleet(site: Site, request: Request, body: None) -> FleetView:
 
 
 def settings_of(body: ReplayBody | FleetBody) -> dict[str, Any]:
-    """What a log is to be identified with, as a run is asked for it. Raises UsageError for what no run would take."""
+    """Return the settings of an identification. Raises UsageError for values that no run would accept."""
     given = {one.name: getattr(body, one.name) for one in ASKED_AGAIN}
     found = options_of(given)
     resolve(found, None)
@@ -112,9 +113,9 @@ async def _fleet_rows(site: Site, request: Request, body: None) -> list[dict[str
     query = request.query_params
     start, limit = query.get("from", "0"), query.get("limit", "200")
     if not start.isdecimal() or len(start) > 9:
-        raise UsageError("must be a number", where="from")
+        raise UsageError("must be a number", where="from", entry=MessageCode.REQUEST_WRONG)
     if not limit.isdecimal() or not 1 <= int(limit) <= 1000:
-        raise UsageError("must be 1 to 1000", where="limit")
+        raise UsageError("must be 1 to 1000", where="limit", entry=MessageCode.REQUEST_WRONG)
     return await off(lambda: site.fleets.rows(request.path_params["fleet"], int(start), int(limit)))
 
 
@@ -131,4 +132,4 @@ ANSWERS: Final[Mapping[str, Answer]] = {
         _fleet_table,
     )
 }
-"""By the routes' names."""
+"""Answers by route name."""

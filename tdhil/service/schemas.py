@@ -1,7 +1,7 @@
-"""What the service answers, as types, and the document that describes them all (OpenAPI 3.1).
+"""The types of the service's replies, and the document that describes them (OpenAPI 3.1).
 
-One table of routes: the web serves what stands in it, and the document is made from it. `role` says who may; on
-loopback without accounts, everybody has every role.
+There is one table of routes: the web serves it, and the document is made from it. `role` states the least role. On
+loopback without accounts, every client has every role.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from tdhil.service.start_request import TAKEN, option_schema
 from tdhil.service.store import Summary
 from tdhil.version import __version__
 
-# mypy takes these for plain dataclasses; pydantic makes the schemas from their annotations.
+# For mypy these are plain dataclasses; pydantic makes the schemas from their annotations.
 
 
 @dataclass(frozen=True)
 class RigView:
-    """A rig. ``state``: may it be asked to move, and if not why; ``holder``: who has it, in words."""
+    """A rig. ``state``: whether a run may be started, and if not why; ``holder``: its present user, in words."""
 
     id: str
     name: str
@@ -46,7 +46,7 @@ class RigView:
 
 @dataclass(frozen=True)
 class RigFileView:
-    """A rig's file as it is; ``editable``: the keys that may be changed over HTTP."""
+    """A rig's present file; ``editable``: the keys that may be changed over HTTP."""
 
     rig: str
     text: str
@@ -56,7 +56,7 @@ class RigFileView:
 
 @dataclass(frozen=True)
 class ReplayView:
-    """A replay: what it was asked for, and what came of it."""
+    """A replay: its settings and its result."""
 
     name: str
     asked: dict[str, Any]
@@ -69,7 +69,7 @@ class ReplayView:
 
 @dataclass(frozen=True)
 class RunView:
-    """A run, with everything but its samples. ``result``: as of `tdhil identify --json`; ``files``: to download."""
+    """A run with all data except its samples. ``result``: as of `tdhil identify --json`; ``files``: to download."""
 
     id: str
     rig: str
@@ -102,7 +102,7 @@ class RunView:
 
 @dataclass(frozen=True)
 class PlanView:
-    """What is planned, and what to expect of it: the document of `tdhil identify --dry-run --json`."""
+    """The plan and its expected result: the document of `tdhil identify --dry-run --json`."""
 
     rig: str
     rig_sha256: str
@@ -119,7 +119,7 @@ class TrendView:
 
 @dataclass(frozen=True)
 class CompareView:
-    """Runs side by side: the document of `tdhil compare --json`."""
+    """A comparison of runs: the document of `tdhil compare --json`."""
 
     runs: list[str]
     comparison: dict[str, Any]
@@ -136,10 +136,10 @@ class PictureView:
 
 @dataclass(frozen=True)
 class FaultView:
-    """A fault to rehearse, written ``NAME@STAGE+2s=VALUE``. ``row`` of docs/faults.md; 0: it has none.
+    """A fault to rehearse, written ``NAME@STAGE+2s=VALUE``. ``row`` of docs/reference/faults.md; 0: it has none.
 
-    ``value`` is what it is taken for where none is said; ``takes`` says what it is, '' where there is none.
-    ``from_start``: it has no moment, and goes on for good.
+    ``value``: the default value if none is given; ``takes``: the meaning of the value, '' if there is none.
+    ``from_start``: it has no start time and lasts for the whole run.
     """
 
     name: str
@@ -152,7 +152,7 @@ class FaultView:
 
 @dataclass(frozen=True)
 class StoppedView:
-    """A stop of a rig: its runs, and where it has none, what `tdhil stop` saw (exit code 0: at rest)."""
+    """A stop of a rig: its runs, or without a run the outcome of `tdhil stop` (exit code 0: standstill)."""
 
     rig: str
     runs: list[str]
@@ -162,7 +162,7 @@ class StoppedView:
 
 @dataclass(frozen=True)
 class LeaseView:
-    """Who watches a watched run, for so many seconds more if nothing is heard of his page."""
+    """The watching user of a watched run. Without a message of the page the lease ends after ``lease_s``."""
 
     run: str
     watch: Watch
@@ -171,10 +171,10 @@ class LeaseView:
 
 @dataclass(frozen=True)
 class AuditView:
-    """The latest lines, the newest first; ``broken``: where the chain of all of them doesn't hold.
+    """The latest lines, the newest first; ``broken``: the place where the chain is broken.
 
-    ``head``: the last line as NUMBER:HASH, to be kept on another computer and sent as ``head`` later; None where the
-    chain's end doesn't hold. ``key_made``: when the chain's key was made.
+    ``head``: the last line as NUMBER:HASH, to keep on another computer and send as ``head`` later; None if the chain's
+    end is broken. ``key_made``: when the chain's key was made.
     """
 
     entries: list[Entry]
@@ -185,7 +185,7 @@ class AuditView:
 
 @dataclass(frozen=True)
 class HealthView:
-    """Is it there, and what is it doing? ``live``: the runs that have not ended; empty for who is not logged in."""
+    """The health of the service. ``live``: runs that have not ended; empty for a client that is not logged in."""
 
     status: Literal["ok"]
     version: str
@@ -195,7 +195,7 @@ class HealthView:
 
 @dataclass(frozen=True)
 class MeView:
-    """Who asks, as the service sees him. ``ends``: when a login does."""
+    """The client as the service identifies it. ``ends``: end of the login."""
 
     name: str
     roles: list[Role]
@@ -205,7 +205,7 @@ class MeView:
 
 @dataclass(frozen=True)
 class AccountView:
-    """A person or a machine. ``since``: when the password was set, or the token made."""
+    """A user or a machine. ``since``: when the password was set, or the token made."""
 
     name: str
     role: Role
@@ -214,7 +214,7 @@ class AccountView:
 
 @dataclass(frozen=True)
 class AccountsView:
-    """All of them."""
+    """All users and tokens."""
 
     users: list[AccountView]
     tokens: list[AccountView]
@@ -222,7 +222,7 @@ class AccountsView:
 
 @dataclass(frozen=True)
 class TokenView:
-    """A new token. It is shown this once."""
+    """A new token. It is shown only once."""
 
     name: str
     role: Role
@@ -231,7 +231,7 @@ class TokenView:
 
 @dataclass(frozen=True)
 class ErrorView:
-    """What went wrong, as the error tree says it."""
+    """An error of the error tree."""
 
     error: Told
     holder: str | None = None
@@ -241,16 +241,16 @@ class ErrorView:
 
 
 class Body:
-    """What is sent has no more in it than what is known here: a key that is misspelt is refused, not passed over."""
+    """A request body. An unknown key is refused, not ignored."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
 
 @dataclass(frozen=True)
 class ConfirmBody(Body):
-    """The six digits; ``binding`` is the hash that was shown with the plan, if the sender has it.
+    """The six digits; ``binding``: the hash that was shown with the plan, if the sender has it.
 
-    ``lease``: where the rig is watched, a random key of 16 to 200 characters, which only its sender knows and renews.
+    ``lease``: for a watched rig a random key of 16 to 200 characters, which only its sender knows and renews.
     """
 
     code: str
@@ -260,7 +260,7 @@ class ConfirmBody(Body):
 
 @dataclass(frozen=True)
 class LeaseBody(Body):
-    """The page with this key is seen; or how it goes. ``new_key``: from now on that one, and the old one is void."""
+    """The page with this key is visible; ``gone``: it is hidden or closed. ``new_key`` replaces the old key."""
 
     key: str
     new_key: str | None = None
@@ -269,14 +269,14 @@ class LeaseBody(Body):
 
 @dataclass(frozen=True)
 class SignOffBody(Body):
-    """Who saw the shaft at rest says so."""
+    """The statement of a user who saw the shaft at standstill."""
 
     note: str
 
 
 @dataclass(frozen=True)
 class ReplayBody(Body):
-    """None: as the run had it. A share is a number, or a text such as ``1%``."""
+    """Settings of a replay. None: as in the run. A share is a number, or a text such as ``1%``."""
 
     model: str | None = None
     tolerance: float | str | None = None
@@ -285,7 +285,7 @@ class ReplayBody(Body):
 
 @dataclass(frozen=True)
 class RigFileBody(Body):
-    """The whole file; ``sha256``: of the one that it is to replace."""
+    """The whole new file; ``sha256``: hash of the file that it replaces."""
 
     text: str
     sha256: str
@@ -293,7 +293,7 @@ class RigFileBody(Body):
 
 @dataclass(frozen=True)
 class LoginBody(Body):
-    """A person's."""
+    """Login of a user."""
 
     name: str
     password: str
@@ -301,7 +301,7 @@ class LoginBody(Body):
 
 @dataclass(frozen=True)
 class PasswordBody(Body):
-    """One's own: the old one and the new."""
+    """Change of the user's own password."""
 
     old: str
     new: str
@@ -309,7 +309,7 @@ class PasswordBody(Body):
 
 @dataclass(frozen=True)
 class UserBody(Body):
-    """Somebody new."""
+    """A new user."""
 
     name: str
     role: Role
@@ -318,14 +318,14 @@ class UserBody(Body):
 
 @dataclass(frozen=True)
 class NewPasswordBody(Body):
-    """Somebody else's, by an admin."""
+    """A new password for a user, set by an admin."""
 
     password: str
 
 
 @dataclass(frozen=True)
 class TokenBody(Body):
-    """A machine's."""
+    """A new token for a machine."""
 
     name: str
     role: Role
@@ -333,9 +333,9 @@ class TokenBody(Body):
 
 @dataclass(frozen=True)
 class FleetBody(Body):
-    """Which logs, and with what; None: as each run had it.
+    """Logs to identify again, and settings; None: as in each run.
 
-    ``folder`` of `/fleets/folders`, '' for the service's own runs; ``below``: a folder inside of it.
+    ``folder`` of `/fleets/folders`, '' for the service's own runs; ``below``: a folder inside it.
     """
 
     folder: str = ""
@@ -347,18 +347,18 @@ class FleetBody(Body):
 
 @dataclass(frozen=True)
 class Nothing:
-    """An empty object will do."""
+    """An empty object."""
 
 
 OPTIONS: Final = "Options"
-"""The body of a run that is asked for: an object with the command line's options."""
+"""The body of a requested run: an object with the command line's options."""
 
 
 @dataclass(frozen=True)
 class Route:
-    """One road into the service. ``answers``: by HTTP status, a type of above, or a media type for a file.
+    """One route of the service. ``answers``: by HTTP status, a type of above, or a media type for a file.
 
-    ``role``: the least that may; None: anybody, also without a login. Who is known may always stop.
+    ``role``: the least role; None: every client, also without a login. A known client may always stop.
     """
 
     method: Literal["GET", "POST"]
@@ -373,7 +373,7 @@ class Route:
     headers: Mapping[str, str] = field(default_factory=dict)
 
 
-_RANGE: Final = {"Range": "a piece of it, such as bytes=0-99"}
+_RANGE: Final = {"Range": "a part of it, such as bytes=0-99"}
 
 
 def _file(media: str) -> Mapping[int, Any]:
@@ -383,83 +383,85 @@ def _file(media: str) -> Mapping[int, Any]:
 ROUTES: Final = (
     Route("GET", "/rigs", "rigs", "The rigs of this site", "viewer", {200: list[RigView]}),
     Route("GET", "/rigs/{rig}", "rig", "One rig", "viewer", {200: RigView}, errors=(404,)),
-    Route("GET", "/rigs/{rig}/file", "rig_file", "Its file", "viewer", {200: RigFileView}, errors=(404, 422)),
-    Route("POST", "/rigs/{rig}/file", "edit_rig", "Another text of its file: limits and what else is no way to a drive",
+    Route("GET", "/rigs/{rig}/file", "rig_file", "A rig's file", "viewer", {200: RigFileView}, errors=(404, 422)),
+    Route("POST", "/rigs/{rig}/file", "edit_rig", "Change a rig's file (not the drive's address)",
           "engineer", {200: RigFileView}, RigFileBody, (404, 409, 422, 503)),
     Route("GET", "/rigs/{rig}/trend", "trend", "J, friction and lags over time, and whether they changed", "viewer",
           {200: TrendView}, errors=(404, 422)),
-    Route("POST", "/rigs/{rig}/plan", "plan", "Plan a run; nothing is connected to", "viewer", {200: PlanView},
+    Route("POST", "/rigs/{rig}/plan", "plan", "Plan a run; nothing is connected", "viewer", {200: PlanView},
           OPTIONS, (403, 404, 409, 422)),
-    Route("POST", "/rigs/{rig}/runs", "start", "Ask for a run", "operator", {201: RunView, 200: RunView}, OPTIONS,
+    Route("POST", "/rigs/{rig}/runs", "start", "Request a run", "operator", {201: RunView, 200: RunView}, OPTIONS,
           (403, 404, 409, 422, 429, 503, 507),
-          headers={"Idempotency-Key": "the same key gives the same run, and no second one"}),
-    Route("POST", "/rigs/{rig}/stop", "stop_rig", "Stop the rig's run; without one, tdhil stop on its drive, which"
-          " takes an operator where no tdhil moves it", "viewer", {200: StoppedView}, Nothing, (403, 404, 503, 504)),
+          headers={"Idempotency-Key": "the same key returns the same run and never starts a second one"}),
+    Route("POST", "/rigs/{rig}/stop", "stop_rig", "Stop the rig's run; without a run, tdhil stop on its drive, which"
+          " needs an operator if no tdhil moves it", "viewer", {200: StoppedView}, Nothing, (403, 404, 503, 504)),
     Route("GET", "/runs", "runs", "The runs, the newest first", "viewer", {200: list[Summary]},
-          query={"rig": "of this rig only", "state": "in this state only", "limit": "at most so many (100)"}),
-    Route("GET", "/runs/compare", "compare", "Runs side by side", "viewer", {200: CompareView}, errors=(404, 422),
-          query={"runs": "two to eight, with commas between"}),
+          query={"rig": "runs of this rig only", "state": "runs in this state only",
+                 "limit": "most runs to return (100)"}),
+    Route("GET", "/runs/compare", "compare", "Compare runs", "viewer", {200: CompareView}, errors=(404, 422),
+          query={"runs": "two to eight runs, separated by commas"}),
     Route("GET", "/runs/{run}", "run", "One run", "viewer", {200: RunView}, errors=(404,)),
-    Route("POST", "/runs/{run}/confirm", "confirm", "Let it move, with the code shown at the rig", "operator",
+    Route("POST", "/runs/{run}/confirm", "confirm", "Confirm motion with the code shown at the rig", "operator",
           {200: RunView}, ConfirmBody, (403, 404, 409, 422)),
-    Route("POST", "/runs/{run}/lease", "renew", "Say, once a second, that the page of a watched run is seen",
+    Route("POST", "/runs/{run}/lease", "renew", "Report once a second that the page of a watched run is visible",
           "operator", {200: LeaseView}, LeaseBody, (403, 404, 409, 422, 503)),
-    Route("POST", "/runs/{run}/stop", "stop", "Have it brake. This is no emergency stop", "viewer", {200: RunView},
+    Route("POST", "/runs/{run}/stop", "stop", "Stop the run. This is no emergency stop", "viewer", {200: RunView},
           Nothing, (403, 404, 503, 504)),
-    Route("POST", "/runs/{run}/sign-off", "sign_off", "Take a stop that wasn't confirmed upon oneself", "engineer",
+    Route("POST", "/runs/{run}/sign-off", "sign_off", "Sign off a stop that was not confirmed", "engineer",
           {200: RunView}, SignOffBody, (403, 404, 409, 422)),
-    Route("POST", "/runs/{run}/replays", "ask_replay", "Identify again; the first result stays", "operator",
+    Route("POST", "/runs/{run}/replays", "ask_replay", "Identify again; the first result is kept", "operator",
           {202: ReplayView}, ReplayBody, (403, 404, 422)),
     Route("GET", "/runs/{run}/replays/{replay}", "replay", "One replay", "viewer", {200: ReplayView}, errors=(404,)),
     Route("GET", "/runs/{run}/log.mcap", "log", "The log; also while it grows (Range)", "viewer",
           _file("application/octet-stream"), errors=(404,), headers=_RANGE),
     Route("GET", "/runs/{run}/report.html", "report", "The report", "viewer", _file("text/html"), errors=(404,),
           headers=_RANGE),
-    Route("GET", "/runs/{run}/report.pdf", "report_pdf", "The report on A4, made when it is first asked for", "viewer",
+    Route("GET", "/runs/{run}/report.pdf", "report_pdf", "The report on A4, made at the first request", "viewer",
           _file("application/pdf"), errors=(404, 422), headers=_RANGE),
     Route("GET", "/runs/{run}/result.json", "result", "The result", "viewer",
           _file("application/json"), errors=(404,), headers=_RANGE),
-    Route("GET", "/runs/{run}/samples.csv", "samples", "Every sample with its command; made when first asked for",
+    Route("GET", "/runs/{run}/samples.csv", "samples", "Every sample with its command; made at the first request",
           "viewer", _file("text/csv"), errors=(404, 422), headers=_RANGE),
     Route("GET", "/runs/{run}/pictures", "pictures", "The report's pictures", "viewer", {200: list[PictureView]},
           errors=(404,)),
-    Route("GET", "/runs/{run}/pictures/{number}", "picture", "One of them", "viewer", {200: "image/svg+xml"},
+    Route("GET", "/runs/{run}/pictures/{number}", "picture", "One of the pictures", "viewer", {200: "image/svg+xml"},
           errors=(404,)),
-    Route("GET", "/rigs/{rig}/faults", "faults", "What can be rehearsed on a simulated rig", "viewer",
+    Route("GET", "/rigs/{rig}/faults", "faults", "Faults that can be rehearsed on a simulated rig", "viewer",
           {200: list[FaultView]}, errors=(403, 404)),
-    Route("GET", "/fleets", "fleets", "Many logs identified again, the latest first", "viewer", {200: list[FleetView]}),
-    Route("GET", "/fleets/folders", "fleet_folders", "Where logs may be", "viewer", {200: list[str]}),
-    Route("POST", "/fleets", "ask_fleet", "Identify many logs again; the same question does what is left of it",
+    Route("GET", "/fleets", "fleets", "Fleet requests (many logs identified again), the newest first", "viewer",
+          {200: list[FleetView]}),
+    Route("GET", "/fleets/folders", "fleet_folders", "Folders of logs", "viewer", {200: list[str]}),
+    Route("POST", "/fleets", "ask_fleet", "Identify many logs again; the same request continues with the rest",
           "operator", {202: FleetView}, FleetBody, (403, 409, 422)),
-    Route("GET", "/fleets/{fleet}", "fleet", "How far it is, and what came of it", "viewer", {200: FleetView},
+    Route("GET", "/fleets/{fleet}", "fleet", "Progress and results of a fleet request", "viewer", {200: FleetView},
           errors=(404,)),
-    Route("POST", "/fleets/{fleet}/stop", "stop_fleet", "End it; what is done is kept", "operator", {200: FleetView},
+    Route("POST", "/fleets/{fleet}/stop", "stop_fleet", "End it; finished rows are kept", "operator", {200: FleetView},
           Nothing, (403, 404)),
-    Route("GET", "/fleets/{fleet}/rows", "fleet_rows", "A row a log; while it goes, those that came since it began",
+    Route("GET", "/fleets/{fleet}/rows", "fleet_rows", "One row per log; while it runs, only the rows since its start",
           "viewer", {200: list[dict[str, Any]]}, errors=(404, 422),
-          query={"from": "leave out so many (0)", "limit": "at most so many (200)"}),
-    Route("GET", "/fleets/{fleet}/fleet.csv", "fleet_table", "The table", "viewer",
+          query={"from": "first row (0)", "limit": "most rows to return (200)"}),
+    Route("GET", "/fleets/{fleet}/fleet.csv", "fleet_table", "The table of a fleet request", "viewer",
           _file("text/csv"), errors=(404,), headers=_RANGE),
-    Route("GET", "/audit", "audit", "Who asked, confirmed, stopped, downloaded", "admin", {200: AuditView},
-          query={"limit": "at most so many lines (200)", "head": "NUMBER:HASH of before, which the chain must have"}),
+    Route("GET", "/audit", "audit", "The audit: requests, confirmations, stops, downloads", "admin", {200: AuditView},
+          query={"limit": "most lines to return (200)", "head": "an exported NUMBER:HASH to check the chain against"}),
     Route("POST", "/login", "login", "Name and password for a session, in two cookies", None, {200: MeView}, LoginBody,
           (401, 403, 422, 429)),
     Route("POST", "/logout", "logout", "End the session", None, {200: MeView}, Nothing, (403, 422)),
-    Route("GET", "/me", "me", "Who asks?", None, {200: MeView}),
-    Route("POST", "/password", "password", "One's own password; ends all of one's sessions", "viewer", {200: MeView},
-          PasswordBody, (422, 429, 503)),
-    Route("GET", "/accounts", "accounts", "People and machines", "admin", {200: AccountsView}),
-    Route("POST", "/users", "add_user", "Somebody new", "admin", {201: AccountView}, UserBody, (422, 503)),
-    Route("POST", "/users/{user}/password", "set_password", "Another password; ends all of his sessions", "admin",
+    Route("GET", "/me", "me", "The client as the service identifies it", None, {200: MeView}),
+    Route("POST", "/password", "password", "Change the user's own password; ends all sessions of the user", "viewer",
+          {200: MeView}, PasswordBody, (422, 429, 503)),
+    Route("GET", "/accounts", "accounts", "Users and machines", "admin", {200: AccountsView}),
+    Route("POST", "/users", "add_user", "Add a user", "admin", {201: AccountView}, UserBody, (422, 503)),
+    Route("POST", "/users/{user}/password", "set_password", "Set a user's password; ends the user's sessions", "admin",
           {200: AccountView}, NewPasswordBody, (404, 422, 503)),
-    Route("POST", "/users/{user}/remove", "remove_user", "Somebody less", "admin", {200: AccountsView}, Nothing,
+    Route("POST", "/users/{user}/remove", "remove_user", "Remove a user", "admin", {200: AccountsView}, Nothing,
           (404, 422, 503)),
-    Route("POST", "/tokens", "add_token", "A machine's token, which is shown this once", "admin", {201: TokenView},
+    Route("POST", "/tokens", "add_token", "Add a machine's token, which is shown only once", "admin", {201: TokenView},
           TokenBody, (422, 503)),
-    Route("POST", "/tokens/{token}/remove", "remove_token", "A token less", "admin", {200: AccountsView}, Nothing,
+    Route("POST", "/tokens/{token}/remove", "remove_token", "Remove a token", "admin", {200: AccountsView}, Nothing,
           (404, 422, 503)),
-    Route("GET", "/healthz", "health", "Is it there?", None, {200: HealthView}),
-    Route("GET", "/metrics", "metrics", "For Prometheus", "viewer", {200: "text/plain"}),
+    Route("GET", "/healthz", "health", "Health of the service", None, {200: HealthView}),
+    Route("GET", "/metrics", "metrics", "Metrics for Prometheus", "viewer", {200: "text/plain"}),
     Route("GET", "/openapi.json", "openapi", "This document", None, {200: "application/json"}),
 )
 
@@ -469,7 +471,7 @@ CSRF_HEADER: Final = "X-CSRF-Token"
 
 @dataclass(frozen=True)
 class Socket:
-    """A WebSocket; ``protocols``: the sub-protocols of which a client must offer one, where there are any."""
+    """A WebSocket; ``protocols``: a client must offer one of these sub-protocols, if there are any."""
 
     path: str
     name: str
@@ -479,27 +481,27 @@ class Socket:
 
 
 SOCKETS: Final = (
-    Socket("/live/{run}", "watch", "A run from its start and as it goes: hello, then news (JSON)", "viewer"),
+    Socket("/live/{run}", "watch", "A run from its start, live: hello, then news (JSON)", "viewer"),
     Socket("/foxglove/{rig}", "foxglove", "The log of the rig's run as it grows, for Foxglove and Lichtblick", "viewer",
            PROTOCOLS),
 )
-"""They stand at the root, too."""
+"""WebSockets, also available at the root."""
 
 
 @cache
 def adapter(kind: Any) -> TypeAdapter[Any]:
-    """Pydantic's of a type of above."""
+    """Return pydantic's adapter of a type of above."""
     return TypeAdapter(kind)
 
 
 def plain(value: Any, kind: Any) -> Any:
-    """For JSON."""
+    """Return a value as plain data for JSON."""
     return adapter(kind).dump_python(value, mode="json")
 
 
 @cache
 def document() -> dict[str, Any]:
-    """The OpenAPI document."""
+    """Return the OpenAPI document."""
     schemas: dict[str, Any] = {}
 
     def security(role: Role | None) -> dict[str, Any]:
@@ -531,7 +533,7 @@ def document() -> dict[str, Any]:
             {"name": part[1:-1], "in": "path", "required": True, "schema": {"type": "string"}}
             for part in route.path.split("/") if part.startswith("{")
         ]
-        changes = {CSRF_HEADER: "with a session: what its second cookie says"} if route.method != "GET" else {}
+        changes = {CSRF_HEADER: "with a session: the value of its second cookie"} if route.method != "GET" else {}
         for where, named in (("query", route.query), ("header", {**route.headers, **changes})):
             parameters += [{"name": name, "in": where, "description": text, "schema": {"type": "string"}}
                            for name, text in named.items()]
@@ -548,8 +550,8 @@ def document() -> dict[str, Any]:
             "operationId": one.name, "summary": one.summary, "x-websocket": list(one.protocols), **security(one.role),
             "parameters": [{"name": name, "in": "path", "required": True, "schema": {"type": "string"}},
                            {"name": "token", "in": "query", "schema": {"type": "string"},
-                            "description": "a machine's, where no header can be sent: browsers"}],
-            "responses": {"101": {"description": "a WebSocket; closed with 4401 for nobody, 4403 for a lesser role"},
+                            "description": "a machine's token, for browsers, which can't send a header"}],
+            "responses": {"101": {"description": "WebSocket; closed with 4401 without a login, 4403 for a lower role"},
                           **dict.fromkeys(("400", "401", "403", "404", "426"), error)},
         }}
     return {
@@ -558,8 +560,8 @@ def document() -> dict[str, Any]:
                  "description": "Runs that identify a moment of inertia. A stop over HTTP is no emergency stop."},
         "paths": paths,
         "components": {"schemas": schemas, "securitySchemes": {
-            "token": {"type": "http", "scheme": "bearer", "description": "a machine's: tdhil serve tokens add"},
+            "token": {"type": "http", "scheme": "bearer", "description": "a machine's token: tdhil serve tokens add"},
             "session": {"type": "apiKey", "in": "cookie", "name": "__Host-tdhil-8420",
-                        "description": "of POST /login; the number is the port of the address"},
+                        "description": "from POST /login; the number is the port of the address"},
         }},
     }

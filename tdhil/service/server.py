@@ -1,4 +1,4 @@
-"""`tdhil serve`: the web on one port, for as long as somebody lets it run."""
+"""`tdhil serve`: the web on one port, until it is ended."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tdhil.errors import ExitCode, UsageError
+from tdhil.errors import ExitCode, MessageCode, UsageError
 
 if TYPE_CHECKING:
     import uvicorn
@@ -26,21 +26,21 @@ if TYPE_CHECKING:
 NEEDED = ("starlette", "uvicorn", "websockets", "prometheus_client", "jinja2")
 HOST, PORT = "127.0.0.1", 8420
 ON_ITS_WAY = 64 * 1024
-"""Bytes for one connection that the system takes beyond what it can send now. With more, a viewer on a slow line would
-be asked, behind all of that, whether it is still there, and be cut off before it comes to it."""
+"""Bytes per connection that the system buffers beyond what it can send now. With more, a keep-alive ping would wait
+behind all of that on a slow line, and the viewer would be disconnected before it reads the ping."""
 SILENT_S = 60.0
-"""Who has not answered for so long has gone."""
+"""Time without an answer after which a viewer counts as disconnected, s."""
 Say = Callable[[str], None]
 
 
 def require_service() -> None:
-    """Raises UsageError where the extra isn't installed, or the system has no locks and sockets as they are needed."""
+    """Raise UsageError if the extra is not installed, or the system lacks the needed locks and sockets."""
     if sys.platform == "win32":
         raise UsageError("tdhil serve needs Linux or another POSIX system", next_step="Use tdhil identify here")
     missing = [name.replace("_", "-") for name in NEEDED if find_spec(name) is None]
     if missing:
         raise UsageError(f"the service needs {', '.join(missing)}, not installed here",
-                         next_step="Install: pip install 'tdhil[service]'")
+                         next_step="Install: pip install 'tdhil[service]'", entry=MessageCode.PACKAGE_MISSING)
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Tls:
     key: Path
 
     def context(self) -> ssl.SSLContext:
-        """Raises UsageError where they don't serve."""
+        """Return the TLS context. Raises UsageError if the files are unusable."""
         found = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         try:
             found.load_cert_chain(self.cert, self.key, password=_no_password)
@@ -59,7 +59,8 @@ class Tls:
             raise UsageError(
                 f"certificate and key can't be used ({getattr(error, 'strerror', None) or error})",
                 where=f"--tls-cert {self.cert} --tls-key {self.key}",
-                next_step="Both are PEM, belong together, and the key has no password",
+                next_step="Both must be PEM and belong together, and the key must have no password",
+                entry=MessageCode.SERVICE_OPTION_WRONG,
             ) from error
         return found
 
@@ -69,20 +70,24 @@ def _no_password() -> str:
 
 
 def require_way(host: str, *, tls: bool, accounts: bool) -> None:
-    """Whoever reaches more than this computer, or has users, has TLS and a login. Raises UsageError."""
+    """Raise UsageError unless an address beyond this computer, or a service with users, has TLS and a login."""
     if _loopback(host) and not accounts:
         return
     if not tls:
         raise UsageError(
-            "there are users, and a password goes over no open line" if accounts else
-            "whoever reaches this address could move a shaft: it takes a login, and TLS", where=f"--host {host}",
-            next_step="Name --tls-cert and --tls-key" if accounts else
-            "Add a user (tdhil serve users add), name --tls-cert and --tls-key; or take 127.0.0.1 and tunnel:"
+            "there are users, and a password must not be sent without TLS" if accounts else
+            "every computer that reaches this address could move a shaft: it needs a login and TLS",
+            where=f"--host {host}",
+            next_step="Add --tls-cert and --tls-key" if accounts else
+            "Add a user (tdhil serve users add), --tls-cert and --tls-key; or use 127.0.0.1 and a tunnel:"
             " ssh -L 8420:127.0.0.1:8420 HOST",
+            entry=MessageCode.SERVICE_NEEDS_LOGIN,
         )
     if not accounts:
-        raise UsageError("whoever reaches this address could move a shaft: it takes a login, and there is no user yet",
-                         where=f"--host {host}", next_step="Add one: tdhil serve users add NAME --role admin")
+        raise UsageError("every computer that reaches this address could move a shaft: it needs a login, but there is"
+                         " no user yet", where=f"--host {host}",
+                         next_step="Add one: tdhil serve users add NAME --role admin",
+                         entry=MessageCode.SERVICE_NEEDS_LOGIN)
 
 
 def _loopback(host: str) -> bool:
@@ -93,13 +98,14 @@ def _loopback(host: str) -> bool:
 
 
 def _names(host: str, more: Sequence[str]) -> frozenset[str]:
-    """By which names the service may be reached. Raises UsageError."""
+    """Return the names under which the service may be reached. Raises UsageError."""
     for name in more:
         with suppress(ValueError):
             ipaddress.ip_address(name)
             continue
         if not re.fullmatch(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*", name):
-            raise UsageError("must be a host's name or address, without a port", where=f"--allowed-host {name[:60]}")
+            raise UsageError("must be a host's name or address, without a port", where=f"--allowed-host {name[:60]}",
+                             entry=MessageCode.SERVICE_OPTION_WRONG)
     everywhere = host in ("0.0.0.0", "::", "")
     own = socket.gethostname() if everywhere else host
     return frozenset(one.lower() for one in ("127.0.0.1", "localhost", "::1", own, *more))
@@ -110,14 +116,13 @@ def serve(
     mqtt: str | None = None, tls: Tls | None = None, names: Sequence[str] = (),
     logs: Sequence[Path] = (),
 ) -> int:
-    """Serve until SIGINT or SIGTERM; then live runs brake first. The exit code.
+    """Serve until SIGINT or SIGTERM; then live runs are stopped first. Return the exit code.
 
     ``viewers``: origins of Foxglove or Lichtblick in a browser, which may read logs as they grow.
-    ``mqtt``: the address of a broker that is told states and results.
-    ``names``: more names of this host; ``logs``: folders whose logs a fleet may go through, beside the service's runs.
+    ``mqtt``: the address of a broker that receives states and results.
+    ``names``: more names of this host; ``logs``: folders of logs for fleet requests, besides the service's runs.
 
-    Raises UsageError for what can't be served, accounts that can't be read among it, and LogUnopened for a folder that
-    can't be made.
+    Raises UsageError for unusable arguments or unreadable accounts, and LogUnopened for a folder that can't be made.
     """
     require_service()
     from tdhil.service.accounts import AccountsFile
@@ -129,13 +134,16 @@ def serve(
     allowed = _names(host, names)
     for one in viewers:
         if not re.fullmatch(r"[a-z][a-z0-9+.-]*://[^/?#\s]*", one):
-            raise UsageError("must be where pages come from: scheme, host and port", where=f"--viewer {one[:100]}",
-                             next_step="Such as http://localhost:8080, or file://")
+            raise UsageError("must be an origin of pages: scheme, host and port", where=f"--viewer {one[:100]}",
+                             next_step="For example http://localhost:8080, or file://",
+                             entry=MessageCode.SERVICE_OPTION_WRONG)
     if rigs is not None and not rigs.is_dir():
-        raise UsageError("there is no such folder", where=f"--rigs {rigs}", next_step="It has a file for each rig")
+        raise UsageError("this folder does not exist", where=f"--rigs {rigs}", next_step="Name a folder of rig files",
+                         entry=MessageCode.FILE_NOT_FOUND)
     for folder in logs:
         if not folder.is_dir():
-            raise UsageError("there is no such folder", where=f"--logs {folder}", next_step="It has logs of runs in it")
+            raise UsageError("this folder does not exist", where=f"--logs {folder}", next_step="Name a folder of logs",
+                             entry=MessageCode.FILE_NOT_FOUND)
 
     from tdhil.service.access import Access
     from tdhil.service.audit import Audit
@@ -160,13 +168,13 @@ def serve(
     shown = f"[{host}]" if ":" in host else host
     say(f"tdhil serve: {'http' if tls is None else 'https'}://{shown}:{at}   (runs: {store.folder})")
     if not _loopback(host):
-        say(f"It answers to {', '.join(sorted(allowed))}; name others with --allowed-host.")
+        say(f"Accepted host names: {', '.join(sorted(allowed))}. Add others with --allowed-host.")
     if supervisor.rigs.built_in:
-        say("No rig file is there: two simulated rigs to play with. Nothing real moves.")
+        say("There is no rig file. Two simulated rigs are available. No real shaft moves.")
     if left_out := supervisor.rigs.left_out:
-        say(f"Left out, as no rig's file is called so: {', '.join(left_out)}."
-            " It is NAME.yaml, of letters, digits, _, . and -")
-    say("A stop over HTTP is no emergency stop: keep the hard-wired one within reach. Ctrl-C brakes what moves.")
+        say(f"Ignored, because the name is not that of a rig file: {', '.join(left_out)}."
+            " Use NAME.yaml, with letters, digits, _, . and -")
+    say("A stop over HTTP is no emergency stop: keep the hard-wired stop within reach. Ctrl-C stops all runs.")
     if publisher is not None:
         publisher.start()
     try:
@@ -178,21 +186,22 @@ def serve(
         alone.close()
     left = sorted({*supervisor.live(), *supervisor.not_at_rest})
     if left:
-        say(f"NOT at rest, as far as is known: {', '.join(left)}. Use the hard-wired stop.")
+        say(f"Standstill NOT confirmed: {', '.join(left)}. Use the hard-wired stop.")
         return int(ExitCode.STOP_NOT_CONFIRMED)
     return int(ExitCode.OK)
 
 
 def require_folder(data: Path) -> None:
-    """Who asks of a folder that isn't there has misspelt it. Raises UsageError."""
+    """Raise UsageError if the folder does not exist: it is probably misspelt."""
     if not data.is_dir():
-        raise UsageError("there is no such folder", where=f"--data {data}", next_step="Name the service's own")
+        raise UsageError("this folder does not exist", where=f"--data {data}", next_step="Name the service's folder",
+                         entry=MessageCode.FILE_NOT_FOUND)
 
 
 def check_idle(data: Path, say: Say) -> int:
-    """May the program be replaced now? Exit code 4, and who is in the way, where a run of this folder lives, where a
-    shaft was not seen at rest and nobody has signed it off, or whatever tdhil of this computer holds a drive. Asks
-    files and locks; neither the web nor a drive. Raises UsageError where the folder isn't there.
+    """Return whether the program may be replaced now, as an exit code. The code is 4, with the reasons, if a run of
+    this folder is alive, if a stop is neither confirmed nor signed off, or if any tdhil of this computer holds a drive.
+    It reads files and locks, and uses neither the web nor a drive. Raises UsageError if the folder does not exist.
     """
     from tdhil.service.run_channel import lives
     from tdhil.service.run_state import State
@@ -207,7 +216,7 @@ def check_idle(data: Path, say: Say) -> int:
         if lives(store.place(run)):
             busy.append(f"run {run} has not ended")
         elif store.status(run).state is State.STOP_NOT_CONFIRMED and store.signed_off(run) is None:
-            busy.append(f"run {run} was not seen at rest, and nobody has signed that it is")
+            busy.append(f"the stop of run {run} is neither confirmed nor signed off")
     for one in busy:
         say(f"not idle: {one}")
     return int(ExitCode.REFUSED if busy else ExitCode.OK)
@@ -224,16 +233,16 @@ def _uvicorn(
         app, log_level="warning", access_log=False, http="h11", ws="websockets-sansio",
         ws_max_size=4096, ws_ping_interval=10.0, ws_ping_timeout=SILENT_S, timeout_graceful_shutdown=2, lifespan="on",
         server_header=False, date_header=True,
-        h11_max_incomplete_event_size=2 * HEADER_LIMIT, proxy_headers=False,      # who asks is who is connected
+        h11_max_incomplete_event_size=2 * HEADER_LIMIT, proxy_headers=False,      # the client is the connected address
         ssl_certfile=None if tls is None else tls.cert, ssl_keyfile=None if tls is None else tls.key,
     )
     if tls is not None:
         config.load()
-        config.ssl = tls.context()             # the one that was looked at, with the ciphers of Python
+        config.ssl = tls.context()             # the checked one, with the ciphers of Python
     door = Door(listening, room, say, tls=config.ssl if tls is not None else None)
 
     class Server(uvicorn.Server):  # type: ignore[misc]
-        """uvicorn behind our own door: it accepts nothing itself."""
+        """uvicorn behind tdhil's `Door`: it accepts no connection itself."""
 
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
             await super().startup(sockets=[])
@@ -246,7 +255,7 @@ def _uvicorn(
 
     server = Server(config)
     former = {number: signal.signal(number, _ender(server, brake, say)) for number in (signal.SIGINT, signal.SIGTERM)}
-    object.__setattr__(server, "capture_signals", _nothing_captured)       # SIGTERM brakes before it ends anything
+    object.__setattr__(server, "capture_signals", _nothing_captured)       # SIGTERM stops the runs first
     try:
         server.run(sockets=[listening])
     finally:
@@ -261,14 +270,14 @@ def _nothing_captured() -> Any:
 
 
 def _ender(server: uvicorn.Server, brake: Callable[[str], bool], say: Say) -> Callable[[int, Any], None]:
-    """Brakes first, in a thread, with the pages still there to show it; then ends."""
+    """Return a handler that stops the runs in a thread while pages are still served, then ends the server."""
     import threading
 
     begun = threading.Event()
 
     def end() -> None:
         if not brake("service ending"):
-            say("not every run has come to its end in time")
+            say("some runs have not ended in time")
         server.should_exit = True
 
     def handler(number: int, frame: Any) -> None:
@@ -285,32 +294,33 @@ def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     found = socket.socket(family, socket.SOCK_STREAM)
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    if hasattr(socket, "TCP_NOTSENT_LOWAT"):       # who reads slowly has little on its way: see ON_ITS_WAY
+    if hasattr(socket, "TCP_NOTSENT_LOWAT"):       # small buffer for slow readers: see ON_ITS_WAY
         found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, ON_ITS_WAY)
     try:
         found.bind((host, port))
     except (OSError, OverflowError) as error:
         found.close()
-        raise UsageError(f"can't be listened on ({getattr(error, 'strerror', None) or error})",
+        raise UsageError(f"this address can't be opened ({getattr(error, 'strerror', None) or error})",
                          where=f"{host}:{port}",
-                         next_step="Is tdhil serve running already? Name another --port") from error
+                         next_step="Is tdhil serve running already? Name another --port",
+                         entry=MessageCode.SERVICE_OPTION_WRONG) from error
     found.listen(BACKLOG)
     return found
 
 
 def _alone(folder: Path) -> Any:
-    """One service a folder: held as long as it runs. Raises UsageError."""
+    """Lock the folder while the service runs: one service per folder. Raises UsageError."""
     import fcntl
 
     try:
         file = (folder / "service.lock").open("a")
     except OSError as error:
         raise UsageError(f"can't be written ({error.strerror or error})", where=f"--data {folder}",
-                         next_step="Name a folder that can be") from error
+                         next_step="Name a writable folder", entry=MessageCode.FILE_NOT_WRITABLE) from error
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         file.close()
-        raise UsageError("another tdhil serve has this folder", where=f"--data {folder}",
-                         next_step="Use that one, or name another folder") from None
+        raise UsageError("another tdhil serve uses this folder", where=f"--data {folder}",
+                         next_step="Use that service, or name another folder", entry=MessageCode.NOT_READY) from None
     return file

@@ -1,7 +1,7 @@
-"""From what was asked for over HTTP to a run: the options of the command line, as an object, on a rig's own file.
+"""A run from a request over HTTP: the options of the command line, as an object, on a rig's own file.
 
-Where a drive is, and what it is, the rig's file says alone: nothing that comes over HTTP names a bus, a host, a device
-or a file. What only a person at the shaft can answer for is refused.
+Only the rig's file states the drive's address and type: nothing over HTTP names a bus, a host, a device or a file.
+Options that only an operator at the shaft can decide are refused.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from tdhil.config import (
     parse_rig,
     resolve,
 )
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 from tdhil.service.run_state import NotAllowed, NotThere
 from tdhil.session import Connection, address_of, connection_of
 
@@ -39,16 +39,16 @@ if TYPE_CHECKING:
 
 RIG_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 BUILT_IN: Final = Path(__file__).with_name("rigs")
-"""Two simulated rigs, for where nobody has any."""
+"""Folder of two simulated rigs, used if there are no rig files."""
 
 TAKEN: Final = MappingProxyType({one.name: one for one in OPTIONS if one.api is True})
-"""The options that may come over HTTP, by their names."""
+"""Options that HTTP accepts, by name."""
 _NAMES: Final = {one.flag.removeprefix("--").replace("-", "_"): one.name for one in OPTIONS}
-"""The options by their flags' names, as the command line has them."""
+"""Option names by the names of their flags."""
 
 
 def options_of(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """The options by their names in Python. Raises UsageError and NotAllowed, naming the option."""
+    """Return the options by name. Raises UsageError and NotAllowed, with the option."""
     found: dict[str, Any] = {}
     for given, value in asked.items():
         name = str(given).removeprefix("--").replace("-", "_")
@@ -57,15 +57,15 @@ def options_of(asked: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(reason, str) and value not in (None, False):
             raise NotAllowed(reason, where=name, next_step="Run it at the rig: tdhil identify")
         if name not in TAKEN:
-            raise UsageError("is no option of a run here", where=str(given)[:60],
-                             next_step=f"There are {', '.join(sorted(TAKEN))}")
+            raise UsageError("is not an option of a run over HTTP", where=str(given)[:60],
+                             next_step=f"Options: {', '.join(sorted(TAKEN))}", entry=MessageCode.REQUEST_WRONG)
         if value is not None:
             found[name] = _value(TAKEN[name], value)
     return found
 
 
 def _value(option: Option, value: Any) -> Any:
-    """The value as the command line would have it; what is left for rig.yaml's own checks goes through."""
+    """Return the value as the command line would parse it. rig.yaml's own checks follow later."""
     where = option.name
     if option.unit is not None:
         if isinstance(value, str):
@@ -74,30 +74,32 @@ def _value(option: Option, value: Any) -> Any:
             except ValueError as error:
                 raise UsageError(str(error), where=where) from None
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise UsageError("must be a number, or a text with a unit", where=where)
+            raise UsageError("must be a number, or a text with a unit", where=where, entry=MessageCode.REQUEST_WRONG)
         return float(value)
     if option.joined:
         values = [value] if isinstance(value, str) else value
         if not isinstance(values, list) or not all(isinstance(one, str) for one in values):
-            raise UsageError("must be a text, or a list of texts", where=where)
+            raise UsageError("must be a text, or a list of texts", where=where, entry=MessageCode.REQUEST_WRONG)
         if option.allowed and (wrong := set(values) - set(option.allowed)):
             *first, last = option.allowed
-            raise UsageError(f"knows {', '.join(first)} and {last}, not {', '.join(sorted(wrong))[:60]}", where=where)
+            raise UsageError(f"must be {', '.join(first)} or {last}, not {', '.join(sorted(wrong))[:60]}", where=where,
+                             entry=MessageCode.REQUEST_WRONG)
         return values
     if option.longest is not None and not (isinstance(value, str) and len(value) <= option.longest):
-        raise UsageError(f"must be a text of at most {option.longest} characters", where=where)
+        raise UsageError(f"must be a text of at most {option.longest} characters", where=where,
+                         entry=MessageCode.REQUEST_WRONG)
     if option.kind is bool and not isinstance(value, bool):
-        raise UsageError("must be true or false", where=where)
+        raise UsageError("must be true or false", where=where, entry=MessageCode.REQUEST_WRONG)
     return value
 
 
 def _taken(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Keep only the options that may come over HTTP, also of a request that was read from a file."""
+    """Keep only the options that HTTP accepts, also for a request from a file."""
     return {name: value for name, value in asked.items() if name in TAKEN}
 
 
 def option_schema(option: Option) -> dict[str, Any]:
-    """The JSON schema of an option's value, as `options_of` takes it."""
+    """Return the JSON schema of an option's value, as `options_of` accepts it."""
     text: dict[str, Any] = {"type": "string"}
     if option.allowed:
         text["enum"] = list(option.allowed)
@@ -114,7 +116,7 @@ def option_schema(option: Option) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class RigFile:
-    """One rig of the site, as its file has it now. ``problem``: why it can't be used, '' where it can."""
+    """One rig of the site, from its present file. ``problem``: why it can't be used, '' if it can."""
 
     id: str
     path: Path
@@ -131,16 +133,16 @@ class RigFile:
         return "never" if self.rig is None else self.rig.service.motion
 
     def way(self, asked: Mapping[str, Any] | None = None) -> tuple[RunOptions, Connection]:
-        """Its options and the way to its drive. Raises UsageError and DataFileError."""
+        """Return its options and the connection to its drive. Raises UsageError and DataFileError."""
         if self.rig is None:
-            raise UsageError(self.problem, next_step="Mend the rig's file")
+            raise UsageError(self.problem, next_step="Correct the rig's file")
         cli = _taken(asked or {})
         options, connection = connection_of(cli, self.rig, resolve(cli, self.rig))
         return options, connection
 
     @property
     def simulated(self) -> bool:
-        """Is the embedded simulator meant? A real one where that can't be told."""
+        """Return whether the embedded simulator is meant. A rig with an unusable file counts as real."""
         try:
             options, connection = self.way()
         except (UsageError, DataFileError):
@@ -149,7 +151,7 @@ class RigFile:
 
     @property
     def address(self) -> str | None:
-        """The drive's, as `tdhil.session.hold` locks it; None for a simulated one, or where it can't be told."""
+        """Return the drive's address, as `tdhil.session.hold` locks it; None if it is simulated or unknown."""
         try:
             options, connection = self.way()
         except (UsageError, DataFileError):
@@ -158,7 +160,7 @@ class RigFile:
 
 
 class Rigs:
-    """The rig files of a folder, read again when they change; the built-in ones where it has none."""
+    """The rig files of a folder, read again when they change; the built-in ones if it has none."""
 
     def __init__(self, folder: Path | None) -> None:
         self.folder = folder
@@ -170,21 +172,21 @@ class Rigs:
 
     @property
     def left_out(self) -> list[str]:
-        """Files that were meant as a rig's, and whose names are none."""
+        """Return YAML files whose names are not valid for a rig."""
         found = () if self.folder is None else self.folder.glob("*.y*ml")
         return sorted(one.name for one in found if one.suffix != ".yaml" or not RIG_ID.fullmatch(one.stem))
 
     def all(self) -> list[RigFile]:
-        """By their ids."""
+        """Return all rigs, by id."""
         folder = BUILT_IN if self.built_in or self.folder is None else self.folder
         paths = sorted(path for path in folder.glob("*.yaml") if RIG_ID.fullmatch(path.stem))
         return [self._read(path) for path in paths]
 
     def get(self, rig: str) -> RigFile:
-        """Raises NotThere."""
+        """Return one rig. Raises NotThere."""
         found = next((one for one in self.all() if one.id == rig), None)
         if found is None:
-            raise NotThere("there is no such rig", where=f"rig {rig[:64]}", next_step="See the list of rigs")
+            raise NotThere("this rig does not exist", where=f"rig {rig[:64]}", next_step="See the list of rigs")
         return found
 
     def _read(self, path: Path) -> RigFile:
@@ -200,7 +202,7 @@ class Rigs:
 
 
 def read_rig(path: Path) -> RigFile:
-    """What the file says now, and its hash. Raises OSError."""
+    """Return the present content of the file and its hash. Raises OSError."""
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     try:
         return RigFile(path.stem, path, digest, load_rig(path))
@@ -212,42 +214,42 @@ EDITABLE: Final = frozenset({
     "name", "limits", "gear", "load", "make_up_torque_nm", "torque_ramp_nm_s", "drive_data", "expected",
     "reference_inertia_kg_m2", "accept_unverified", "rate_hz",
 })
-"""Of a rig's file, what may be edited over HTTP. Not where its drive is, nor what it is, nor who may move it how."""
+"""Keys of a rig's file that HTTP may change: not the drive's address, nor its type, nor the rules of motion."""
 
 
 def edited(old: str, text: str, name: str) -> tuple[str, ...]:
-    """The keys in which the text differs from the rig's file as it was. Raises DataFileError and NotAllowed."""
+    """Return the keys in which the text differs from the former file. Raises DataFileError and NotAllowed."""
     wanted = parse_rig(text, name)
     before, after = parse_rig(old, name).model_dump(), wanted.model_dump()
     keys = tuple(sorted(key for key in before if before[key] != after[key]))
     if beyond := [key for key in keys if key not in EDITABLE]:
-        raise NotAllowed("isn't changed over HTTP: where a drive is, what it is and who may move it stands at the rig",
+        raise NotAllowed("can't be changed over HTTP: the drive's address and type and the rules of motion",
                          where=wanted.source(beyond[0]) or f"{name}: {', '.join(beyond)}",
                          next_step="Edit the file on the service's computer")
     return keys
 
 
 def require_motion(rig: RigFile) -> None:
-    """May anybody ask for motion of this rig over HTTP? Raises UsageError and NotAllowed."""
+    """Raise UsageError or NotAllowed if motion of this rig can't be requested over HTTP."""
     if rig.rig is None:
-        raise UsageError(rig.problem, next_step="Mend the rig's file")
+        raise UsageError(rig.problem, next_step="Correct the rig's file")
     if rig.simulated or rig.motion != "never":
         return
     where = rig.rig.source("service.motion") or rig.path.name
-    raise NotAllowed("this rig is never moved from afar (service.motion: never)", where=where,
-                     next_step="Run it at the rig: tdhil identify. Or say service: {motion: attended} in its file")
+    raise NotAllowed("this rig can't be moved over HTTP (service.motion: never)", where=where,
+                     next_step="Run it at the rig: tdhil identify. Or set service: {motion: attended} in its file")
 
 
 def require_unwatched(rig: RigFile) -> None:
-    """Of who hasn't said who he is. Raises NotAllowed."""
+    """Refuse a watched rig for a client that is not logged in. Raises NotAllowed."""
     if rig.motion == "watched" and not rig.simulated:
         where = (rig.rig and rig.rig.source("service.motion")) or rig.path.name
-        raise NotAllowed("this rig moves only while somebody who has logged in watches it (service.motion: watched)",
-                         where=where, next_step="Take motion: attended where nobody logs in")
+        raise NotAllowed("this rig moves only while a logged-in user watches it (service.motion: watched)",
+                         where=where, next_step="Log in. On a service without accounts set motion: attended")
 
 
 def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None = None) -> RunRequest:
-    """What the command line would make of it, by the same functions and in the same order.
+    """Return the request that the command line would make, by the same functions in the same order.
 
     Raises UsageError, DataFileError and PreflightRefused.
     """
@@ -262,7 +264,7 @@ def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None 
     if not peer.embedded:
         for one in OPTIONS:
             if one.group is Topic.SIMULATED and asked.get(one.name):
-                raise UsageError("is for a simulated rig", where=one.name)
+                raise UsageError("is for a simulated rig", where=one.name, entry=MessageCode.REQUEST_WRONG)
     return RunRequest.of(
         options, connection, replace(peer, left_in=left_in), rig.rig, overrides=Overrides.of(asked),
         operator=details.operator, note=details.note,
@@ -271,7 +273,7 @@ def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None 
 
 
 def plan_of(rig: RigFile, asked: Mapping[str, Any]) -> dict[str, Any]:
-    """The plan, what it rests on and what to expect of it; nothing is connected to. Raises as `run_request`."""
+    """Return the plan, its assumptions and its expected result. Nothing is connected. Raises as `run_request`."""
     from tdhil.session import plan_document, plan_dry
 
     options, connection = rig.way(asked)
@@ -284,7 +286,7 @@ def plan_of(rig: RigFile, asked: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def binding_of(request: RunRequest, rig_sha256: str, preflight: Any, plan: Mapping[str, Any]) -> str:
-    """SHA-256 of all that a confirmation is for: rig file, profile, options, what preflight found, and the plan."""
+    """Return the SHA-256 of all that a confirmation is valid for: rig file, profile, options, preflight, plan."""
     plain = {
         "rig": rig_sha256,
         "profile": request.connection.profile.model_dump(mode="json", by_alias=True),
@@ -297,7 +299,7 @@ def binding_of(request: RunRequest, rig_sha256: str, preflight: Any, plan: Mappi
 
 
 def is_as_it_was(path: Path, sha256: str) -> bool:
-    """Is the rig's file still there, with the content of this hash?"""
+    """Return whether the rig's file still exists with the content of this hash."""
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest() == sha256
     except OSError:
@@ -305,7 +307,8 @@ def is_as_it_was(path: Path, sha256: str) -> bool:
 
 
 def refuse_changed(path: Path, sha256: str) -> None:
-    """The rig's file is what it was when the run was asked for. Raises PreflightRefused."""
+    """Raise PreflightRefused if the rig's file has changed since the run was requested."""
     if not is_as_it_was(path, sha256):
-        raise PreflightRefused("the rig's file was changed after the run was asked for", where=path.name,
-                               next_step="Ask for it again; nothing has moved")
+        raise PreflightRefused("the rig's file was changed after the run was requested", where=path.name,
+                               next_step="Nothing has moved; request the run again",
+                               entry=MessageCode.CHANGED_MEANWHILE)

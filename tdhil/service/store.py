@@ -1,4 +1,4 @@
-"""The service's memory, on files: they are the truth. The index beside them can be deleted, and is made again.
+"""The service's data in files. The index beside them can be deleted, and is then made again.
 
 ::
 
@@ -26,17 +26,17 @@ from tdhil.errors import LogUnopened
 from tdhil.service.run_state import NotThere, State, Status, now
 
 ID: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[0-9a-f]{6}")
-"""Of a run: date, time (UTC), and what keeps two of one second apart."""
+"""Id of a run: date, time (UTC), and a random part."""
 _FILE_LIMIT: Final = 16 * 2**20
 RESERVE: Final = 2**16
-"""Bytes of the disk that are kept for how a run ended."""
+"""Disk space reserved for the final status of a run, bytes."""
 CONNECTION_FILE: Final = "connection.json"
-"""In a run's folder: where its drive is, for a stop of it (`tdhil.session.kept`)."""
+"""File in a run's folder: the address of its drive, for a later stop (`tdhil.session.kept`)."""
 _RESERVE, _USED = ".reserve", ".state.json"
 
 
 def write_whole(path: Path, data: bytes, mode: int | None = None) -> None:
-    """It has its old content or the new, also after a loss of power; ``mode``: who may read it. Raises OSError."""
+    """Write a file atomically, also against loss of power; ``mode``: its permissions. Raises OSError."""
     beside = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}")
     try:
         with beside.open("wb") as file:
@@ -53,12 +53,12 @@ def write_whole(path: Path, data: bytes, mode: int | None = None) -> None:
 
 
 def write_json(path: Path, plain: Mapping[str, Any], mode: int | None = None) -> None:
-    """The same, of a JSON object."""
+    """Write a JSON object atomically."""
     write_whole(path, json.dumps(plain, ensure_ascii=False, indent=1, allow_nan=False).encode() + b"\n", mode)
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
-    """The object in the file; None where there is none that can be read."""
+    """Return the object in the file; None if it can't be read."""
     with suppress(OSError, ValueError, RecursionError):
         if path.stat().st_size <= _FILE_LIMIT:
             found = json.loads(path.read_bytes())
@@ -67,7 +67,7 @@ def read_json(path: Path) -> dict[str, Any] | None:
 
 
 def _sync_folder(folder: Path) -> None:
-    with suppress(OSError):                # not every file system takes it
+    with suppress(OSError):                # not every file system supports it
         descriptor = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(descriptor)
@@ -80,7 +80,7 @@ def _sync_folder(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class StoredRequest:
-    """What was asked for; request.json. ``options`` as they came, ``motion`` as the rig has it."""
+    """The request of a run; request.json. ``options`` as received, ``motion`` as in the rig's file."""
 
     id: str
     rig: str
@@ -100,7 +100,7 @@ class StoredRequest:
 
 @dataclass(frozen=True)
 class Summary:
-    """A line of the list of runs."""
+    """A row of the list of runs."""
 
     id: str
     rig: str
@@ -118,7 +118,7 @@ class Summary:
 
 
 def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any] | None) -> Summary:
-    """Of what the files say."""
+    """Return the row of a run from its files."""
     inertia = (result or {}).get("inertia_kg_m2") or {}
     return Summary(
         request.id, request.rig, status.state.value, request.asked, request.asked_by,
@@ -130,7 +130,7 @@ def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any]
 
 
 class Store:
-    """The folder of one service. Its methods are for any thread."""
+    """The folder of one service. Any thread may call its methods."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -138,7 +138,7 @@ class Store:
         self._lock = threading.Lock()
 
     def prepare(self) -> None:
-        """Make the folders. Raises LogUnopened where they can't be written."""
+        """Make the folders. Raises LogUnopened if they can't be written."""
         try:
             for path in (self.runs, self.folder / "audit"):
                 path.mkdir(parents=True, exist_ok=True, mode=0o750)
@@ -147,7 +147,7 @@ class Store:
                               next_step="Name a folder for the runs with --data") from error
 
     def new_id(self) -> str:
-        """An id, and its folder."""
+        """Return a new id, and make its folder."""
         while True:
             found = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
             with suppress(FileExistsError):
@@ -155,20 +155,20 @@ class Store:
                 return found
 
     def place(self, run: str) -> Path:
-        """The run's folder. Raises NotThere; a name that is no id names no folder."""
+        """Return the run's folder. Raises NotThere, also for a name that is not an id."""
         path = self.runs / run if ID.fullmatch(run) else None
         if path is None or not path.is_dir():
-            raise NotThere("there is no such run", where=f"run {run[:40]}", next_step="See the list of runs")
+            raise NotThere("this run does not exist", where=f"run {run[:40]}", next_step="See the list of runs")
         return path
 
     def ids(self) -> list[str]:
-        """All runs, the newest first."""
+        """Return all runs, the newest first."""
         with suppress(OSError):
             return sorted((one.name for one in self.runs.iterdir() if ID.fullmatch(one.name)), reverse=True)
         return []
 
     def request(self, run: str) -> StoredRequest:
-        """Raises NotThere where the run never got as far."""
+        """Return the run's request. Raises NotThere if the run has none."""
         plain = read_json(self.place(run) / "request.json")
         try:
             return StoredRequest.of_plain(plain or {})
@@ -176,7 +176,7 @@ class Store:
             raise NotThere("the run has no request", where=f"run {run}") from None
 
     def status(self, run: str) -> Status:
-        """As its file has it; that of a file that can't be read is ``interrupted``."""
+        """Return the status in its file; ``interrupted`` if the file can't be read."""
         folder = self.place(run)
         plain = read_json(folder / _USED) or read_json(folder / "state.json")
         try:
@@ -192,20 +192,20 @@ class Store:
         return summary_of(self.request(run), self.status(run), self.result(run))
 
     def summaries(self) -> Iterator[Summary]:
-        """Of every run that has a request, from the files."""
+        """Yield the row of every run that has a request, from the files."""
         for run in self.ids():
             with suppress(NotThere):
                 yield self.summary(run)
 
     def begin(self, request: StoredRequest) -> Status:
-        """Write down what was asked for. Raises OSError."""
+        """Write the request. Raises OSError."""
         status = Status.begun(request.id, request.rig, request.asked)
         write_json(self.runs / request.id / "request.json", asdict(request))
         self.save(status)
         return status
 
     def save(self, status: Status) -> None:
-        """Where the disk is full, into what was reserved on it. Raises OSError where that isn't there, either."""
+        """Write the status; on a full disk into the reserved space. Raises OSError if that is missing, too."""
         folder, plain = self.runs / status.id, status.plain()
         try:
             write_json(folder / "state.json", plain)
@@ -214,7 +214,7 @@ class Store:
             text = json.dumps(plain, ensure_ascii=False).encode().ljust(RESERVE)
             if kept is None or len(text) > RESERVE:
                 raise
-            with kept.open("r+b") as file:         # in place: that takes no room
+            with kept.open("r+b") as file:         # in place: this needs no new disk space
                 file.write(text)
                 file.flush()
                 os.fsync(file.fileno())
@@ -223,31 +223,31 @@ class Store:
             (folder / _USED).unlink(missing_ok=True)
 
     def reserve(self, run: str) -> None:
-        """Keep some of the disk for the run's state, until `release`; where there is none left, nothing is."""
+        """Reserve disk space for the run's status until `release`; none if the disk is full."""
         with suppress(OSError):
             (self.runs / run / _RESERVE).write_bytes(b" " * RESERVE)
 
     def release(self, run: str) -> None:
-        """What was kept and not needed."""
+        """Free the reserved space."""
         with suppress(OSError):
             (self.runs / run / _RESERVE).unlink(missing_ok=True)
 
     def signed_off(self, run: str) -> dict[str, Any] | None:
-        """Who took a stop that wasn't confirmed upon himself."""
+        """Return who signed off a stop that was not confirmed."""
         return read_json(self.place(run) / "signed_off.json")
 
     def sign_off(self, run: str, who: str, note: str) -> None:
         write_json(self.place(run) / "signed_off.json", {"by": who, "at": now(), "note": note})
 
     def replays(self, run: str) -> list[tuple[str, dict[str, Any]]]:
-        """(name, document) of each, in the order in which they were made."""
+        """Return (name, document) of each replay, in the order of creation."""
         folder = self.place(run) / "replays"
         found = [(path.stem, read_json(path)) for path in sorted(folder.glob("[0-9]*.json"))]
         return [(name, plain) for name, plain in found if plain is not None]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The index: for lists and filters, over thousands of runs. Nothing waits for it that has to do with a shaft.
+# The index: for lists and filters over thousands of runs. Nothing that concerns a shaft waits for it.
 
 
 _COLUMNS: Final = tuple(Summary.__dataclass_fields__)
@@ -255,7 +255,7 @@ _VERSION: Final = 1
 
 
 class Index:
-    """index.sqlite; with a rollback journal, since files beside it may be lost when it is copied. For any thread."""
+    """index.sqlite, with a rollback journal: files beside it may be lost in a copy. For any thread."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -263,12 +263,12 @@ class Index:
         self._lock = threading.Lock()
 
     def put(self, summary: Summary) -> None:
-        """Raises sqlite3.Error where it is locked or the disk is full: the files have it all the same."""
+        """Add or replace a row. Raises sqlite3.Error if it is locked or the disk is full; the files stay correct."""
         with self._lock, closing(self._open()) as base, base:
             self._put(base, summary)
 
     def find(self, *, rig: str | None = None, state: str | None = None, limit: int = 100) -> list[Summary]:
-        """The newest first. Raises sqlite3.Error."""
+        """Return matching rows, the newest first. Raises sqlite3.Error."""
         where = [f"{name} = ?" for name, value in (("rig", rig), ("state", state)) if value is not None]
         values = [value for value in (rig, state) if value is not None]
         clause = f"where {' and '.join(where)}" if where else ""
@@ -279,7 +279,7 @@ class Index:
         return [Summary(**{**dict(zip(_COLUMNS, row, strict=True)), "simulated": bool(row[6])}) for row in rows]
 
     def rebuild(self) -> int:
-        """Make it again from the files; how many runs are in it."""
+        """Make it again from the files. Return the number of runs."""
         with self._lock:
             self._path.unlink(missing_ok=True)
             with closing(self._open(filled=False)) as base, base:

@@ -1,7 +1,7 @@
-"""Holds the runs of one service: begins each as a process, finds them again, and sees to those that died.
+"""Supervises the runs of one service: starts each as a process, finds them again, and handles those that died.
 
-It opens no drive's bus. What it knows of a run stands in the run's folder; whether one lives, its lock says. So a web
-that was killed finds everything again, and nothing moves by that.
+It opens no drive's bus. Its data on a run are in the run's folder; the run's lock shows whether the run is alive. So a
+web that was killed finds everything again after a restart, and nothing moves by that.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from queue import SimpleQueue
 from typing import Any, Final
 
 from drivers import CommunicationLost
-from tdhil.errors import ExitCode, LogError, UsageError
+from tdhil.errors import ExitCode, LogError, MessageCode, UsageError
 from tdhil.service.access import RequestPace
 from tdhil.service.audit import Audit
 from tdhil.service.console import Console
@@ -49,30 +49,30 @@ from tdhil.service.store import CONNECTION_FILE, Index, Store, StoredRequest, re
 from tdhil.session import Holder, holder_of, holders
 
 LOOK_S: Final = 0.2
-"""So often it is looked whether a run still lives."""
+"""Interval of the check whether a run is alive, s."""
 INDEX_LOOKS: Final = 10
-"""Every so many looks what the index didn't take is tried again."""
+"""Number of checks after which a failed index entry is tried again."""
 STOP_S: Final = 60.0
-"""What `tdhil stop` may take for a shaft that turns on."""
+"""Longest duration of `tdhil stop` for a shaft that keeps turning, s."""
 KEYS: Final = 500
-"""So many runs back an Idempotency-Key is known."""
-SIMULATED_STOP: Final = "nothing turns: the drive is simulated, and ended with its run"
+"""Number of newest runs whose Idempotency-Key is known."""
+SIMULATED_STOP: Final = "no real shaft turns: the simulated drive ended with its run"
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Asked:
-    """A run that was asked for. ``new``: it was not asked for before with the same key."""
+    """A requested run. ``new``: it was not requested before with the same key."""
 
     request: StoredRequest
     new: bool
 
 
 class Jobs:
-    """Small jobs, done one after the other in one thread, which is there from the beginning.
+    """Small jobs, done one after the other in one thread, which is started in advance.
 
-    `add` waits for nothing. A thread for each job would not do: to start one takes 200 ms on a busy computer, and the
-    answer to a Stop would wait for it.
+    `add` waits for nothing. A new thread per job would be too slow: it takes 200 ms to start on a busy computer, and
+    the reply to a Stop would wait for it.
     """
 
     def __init__(self, name: str, say: Say) -> None:
@@ -80,11 +80,11 @@ class Jobs:
         threading.Thread(target=self._work, args=(self._jobs, say), name=name, daemon=True).start()
 
     def add(self, job: Callable[[], None]) -> None:
-        """Do it after those that were added before."""
+        """Add a job after the earlier ones."""
         self._jobs.put(job)
 
     def finish(self, within_s: float) -> bool:
-        """Wait until all that was added is done. Is it?"""
+        """Wait until all jobs are done. Return whether they are."""
         done = threading.Event()
         self._jobs.put(done.set)
         return done.wait(within_s)
@@ -94,12 +94,12 @@ class Jobs:
         while True:
             try:
                 jobs.get()()
-            except Exception as error:         # of one job: the others are done all the same
+            except Exception as error:         # of one job: the others are still done
                 say(f"{type(error).__name__}: {error}")
 
 
 class Supervisor:
-    """For any thread. ``say``: a line on the terminal of `tdhil serve`."""
+    """The supervisor of all runs, for any thread. ``say`` prints a line on the terminal of `tdhil serve`."""
 
     def __init__(
         self, store: Store, rigs: Rigs, audit: Audit, index: Index, *, say: Say = lambda text: None,
@@ -110,27 +110,27 @@ class Supervisor:
         self._command = command or (lambda folder: [sys.executable, "-m", "tdhil.service.run_process", str(folder)])
         self._asking = threading.Lock()
         self._children: dict[str, subprocess.Popen[bytes]] = {}
-        self._live: dict[str, None] = {}               # in the order in which they began
+        self._live: dict[str, None] = {}               # in the order of their start
         self._console = Console(store, say)
         self._lost: set[str] = set()
-        self._stops: dict[str, tuple[str, str]] = {}   # (who, when) asked a frozen run to stop
-        self._unconfirmed: dict[str, Status] = {}      # runs whose stop nobody saw through
+        self._stops: dict[str, tuple[str, str]] = {}   # (who, when) requested the stop of a suspended run
+        self._unconfirmed: dict[str, Status] = {}      # runs whose stop was not confirmed
         self._unindexed: set[str] = set()
         self._to_index: set[str] = set()               # those that have just ended
         self._braking = False
         self.pace = RequestPace()
-        self.not_at_rest: list[str] = []               # of those that `brake` stopped
+        self.not_at_rest: list[str] = []               # of the runs that `brake` stopped
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
         self._begun: list[threading.Thread] = []
         self._notes = Jobs("audit", say)
-        self._indexing = Jobs("index", say)            # of its own: it may be locked for long
+        self._indexing = Jobs("index", say)            # separate: it may be locked for long
         self._being_indexed: set[str] = set()
 
     # -- begin and end of the service ----------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Find the runs that live, see to those that don't any more, and go on looking."""
+        """Find the runs that are alive, handle those that died, and keep checking."""
         for run in self.store.ids():
             with suppress(Exception):
                 status = self.store.status(run)
@@ -139,12 +139,12 @@ class Supervisor:
                 elif status.state is State.STOP_NOT_CONFIRMED:
                     self._unconfirmed[run] = status
         self._in_background(self._begin_audit)
-        self._in_background(self._rebuild_index)       # what a web that was killed left out of it
+        self._in_background(self._rebuild_index)       # entries that a killed web did not write
         self._thread = threading.Thread(target=self._look, name="runs", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Look no more. Runs go on."""
+        """Stop supervising. Runs continue."""
         self._end.set()
         if self._thread is not None:
             self._thread.join(5.0)
@@ -154,19 +154,19 @@ class Supervisor:
         self._indexing.finish(5.0)
 
     def brake(self, who: str, within_s: float = STOP_S) -> bool:
-        """Begin no more runs, ask all to stop, and wait until they have ended; have they?
+        """Start no more runs, stop all, and wait until they have ended. Return whether they have.
 
-        `not_at_rest` has those of which nobody knows that they are, ended or not.
+        `not_at_rest` lists the runs without a confirmed standstill, ended or not.
         """
-        with self._asking:             # who is about to begin one has begun it, and it is among those that are stopped
+        with self._asking:             # a run that is being started is started first, and is then stopped, too
             self._braking = True
         stopping = self.live()
         for run in stopping:
             with suppress(Exception):
                 self.stop(run, who)
         if stopping:
-            self.say(f"Braking: run {', '.join(stopping)}. It waits for rest, {within_s:.0f} s at most."
-                      " If a shaft turns on, use the hard-wired stop.")
+            self.say(f"Stopping run {', '.join(stopping)}. tdhil waits {within_s:.0f} s at most for standstill."
+                     " If a shaft keeps turning, use the hard-wired stop.")
         end_s = time.monotonic() + within_s
         while self.live() and time.monotonic() < end_s:
             time.sleep(LOOK_S)
@@ -177,18 +177,18 @@ class Supervisor:
                 self.not_at_rest.append(run)
         return not self.live()
 
-    # -- what is asked for ---------------------------------------------------------------------------------------
+    # -- requests ------------------------------------------------------------------------------------------------
 
     def live(self) -> list[str]:
-        """The runs that haven't ended."""
+        """Return the runs that have not ended."""
         return list(self._live)
 
     def ahead_of_the_index(self) -> list[str]:
-        """The runs that are not, or not any more, what the index says of them."""
+        """Return the runs whose index entry is missing or out of date."""
         return [*{*self._live, *self._to_index, *self._unindexed}]
 
     def run_of(self, rig_id: str) -> str | None:
-        """The run that has the rig."""
+        """Return the present run of a rig."""
         for run in self.live():
             with suppress(NotThere):
                 if self.store.request(run).rig == rig_id and not self.store.status(run).ended:
@@ -198,18 +198,18 @@ class Supervisor:
     def start_run(
         self, rig_id: str, asked: Mapping[str, Any], who: str, key: str | None = None, address: str = "",
     ) -> Asked:
-        """Begin a run. Raises NotThere, NotAllowed, UsageError, DataFileError, NoRoom for a full disk, and Conflict,
-        naming the holder. ``address``: from where it was requested.
+        """Start a run. Raises NotThere, NotAllowed, UsageError, DataFileError, NoRoom for a full disk, and Conflict
+        with the holder. ``address``: the client's.
         """
         options = options_of(asked)
         rig = self.rigs.get(rig_id)
         require_motion(rig)
-        rig.way(options)               # what the options contradict is said now, not by the run
+        rig.way(options)               # contradicting options are reported now, not by the run
         with self._asking:
             if key is not None and (before := self._by_key(rig_id, key, who)) is not None:
                 if dict(before.options) != options:
                     raise Conflict("this key was used for another request", where="Idempotency-Key",
-                                   next_step="Take a new key")
+                                   next_step="Use a new key")
                 return Asked(before, new=False)
             if self._braking:
                 raise Conflict("the service is ending", next_step="Start tdhil serve again")
@@ -231,7 +231,7 @@ class Supervisor:
         return Asked(request, new=True)
 
     def _write_down(self, request: StoredRequest) -> StoredRequest:
-        """Give the run an id and a folder. Raises NoRoom, and LogError where the folder can't be written."""
+        """Give the run an id and a folder. Raises NoRoom, and LogError if the folder can't be written."""
         run = ""
         try:
             run = self.store.new_id()
@@ -240,18 +240,18 @@ class Supervisor:
         except OSError as error:
             if run:
                 shutil.rmtree(self.store.runs / run, ignore_errors=True)
-            what = f"the run can't be written down ({error.strerror or error})"
+            what = f"the run's request can't be written ({error.strerror or error})"
             where = f"--data {self.store.folder}"
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise NoRoom(what, where=where, next_step="Nothing was started. Free some of the disk") from error
-            raise LogError(what, where=where, next_step="Nothing was started. See to that folder") from error
+                raise NoRoom(what, where=where, next_step="Nothing was started. Free some disk space") from error
+            raise LogError(what, where=where, next_step="Nothing was started. Check that folder") from error
         return request
 
     def refuse_busy(self, rig: RigFile) -> None:
-        """Raises Conflict where the rig has a run, is held by another program, or waits for a signature."""
+        """Raise Conflict if the rig has a run, is held by another program, or needs a sign-off."""
         run = self.run_of(rig.id)
         if run is not None:
-            raise Conflict(f"run {run} has this rig", where=f"rig {rig.id}", holder=f"run {run}",
+            raise Conflict(f"run {run} uses this rig", where=f"rig {rig.id}", holder=f"run {run}",
                            next_step="Wait until it has ended, or stop it")
         holder = self.holder(rig)
         if holder is not None:
@@ -260,30 +260,31 @@ class Supervisor:
         bad = self.blocked(rig.id)
         if bad is not None:
             raise Conflict(
-                f"the stop of run {bad} was not confirmed, and nobody has signed it off", where=f"rig {rig.id}",
-                holder=f"run {bad}", next_step="See that the shaft is at rest and the drive is well, then sign it off",
+                f"the stop of run {bad} was neither confirmed nor signed off", where=f"rig {rig.id}",
+                holder=f"run {bad}",
+                next_step="Check that the shaft is at standstill and the drive is in order, then sign it off",
             )
 
     @staticmethod
     def holder(rig: RigFile) -> Holder | None:
-        """Who holds the rig's drive by the lock."""
+        """Return the holder of the lock on the rig's drive."""
         return holder_of(rig.address)
 
     def nobody_moves(self, rig: RigFile) -> bool:
-        """Is it known that no tdhil of this computer moves the rig's real drive, and that no stop of it is open?"""
+        """Return whether certainly no tdhil of this computer moves the rig's real drive, and no sign-off is open."""
         address = rig.address
         return address is not None and holder_of(address) is None and self.blocked(rig.id) is None
 
     def blocked(self, rig_id: str) -> str | None:
-        """The run that blocks the rig until it is signed off."""
+        """Return the run that blocks the rig until it is signed off."""
         statuses = [one for one in tuple(self._unconfirmed.values()) if one.rig == rig_id]
         found = blocking(statuses, [one.id for one in statuses if self.store.signed_off(one.id) is not None])
         return None if found is None else found.id
 
     def confirm(self, run: str, code: str, binding: str | None, who: str, lease: str | None = None) -> Status:
-        """Hand the code on. Raises NotThere, Conflict (there is nothing to confirm; it isn't the code; it is void).
+        """Pass on the code. Raises NotThere, and Conflict (nothing to confirm; wrong code; void code).
 
-        ``lease``: the key of a page that will renew it, where the rig is watched.
+        ``lease``: the key of a page that will renew it, for a watched rig.
         """
         status, request = self.store.status(run), self.store.request(run)
         if status.ended or (request.simulated and request.motion != "watched"):
@@ -300,7 +301,7 @@ class Supervisor:
         return Status.of_plain(found["status"])
 
     def renew(self, run: str, key: str, who: str, *, new_key: str | None, gone: str | None) -> Watch:
-        """The page that confirmed a watched run is there, or goes. Raises NotThere, Conflict, CommunicationLost."""
+        """Pass on that the page of a watched run is visible or goes. Raises NotThere, Conflict, CommunicationLost."""
         asked = {"do": "lease", "key": key, "new_key": new_key, "gone": gone, "by": who}
         try:
             return Watch(**ask(self.store.place(run), asked)["watch"])
@@ -308,11 +309,11 @@ class Supervisor:
             raise Conflict(error.what, where=error.where, next_step=error.next_step) from error
 
     def stop(self, run: str, who: str) -> Status:
-        """Have the run brake. By the socket; where that doesn't answer, by SIGTERM; both return at once.
+        """Stop a run over its socket; if that does not answer, with SIGTERM. Both return at once.
 
-        A process that stands still (SIGSTOP, a debugger) can't brake, and must not go on later: it is killed, and its
-        drive is stopped as of any run whose process was lost (decision 0022). Raises NotReacting then, NotThere, and
-        CommunicationLost where neither reached it.
+        A suspended process (SIGSTOP, a debugger) can't stop the shaft, and must not continue later. It is killed, and
+        its drive is stopped as for any run whose process was lost (decision 0022). Raises NotReacting then, NotThere,
+        and CommunicationLost if neither reached it.
         """
         folder = self.store.place(run)
         wish = {"do": "stop", "by": who}
@@ -323,7 +324,7 @@ class Supervisor:
                 if (status := self.store.status(run)).ended:
                     return status
                 self._kill_frozen(status, who)
-                # Its process may be about to begin. It looks for this file once it listens: one of us sees the other.
+                # Its process may be starting. It reads this file once it listens, so one of both finds the other.
                 write_json(folder / STOP_FILE, {"by": who, "at": now()})
                 found = ask(folder, wish, timeout_s=1.0)
             status = Status.of_plain(found["status"])
@@ -339,7 +340,7 @@ class Supervisor:
         return status
 
     def _kill_frozen(self, status: Status, who: str) -> None:
-        """Kill the run's process if it stands still; `_look` does the rest. Raises NotReacting then."""
+        """Kill the run's process if it is suspended; `_look` does the rest. Raises NotReacting then."""
         if status.pid is None or not stands_still(status.pid):
             return
         self._stops[status.id] = (who, now())
@@ -350,14 +351,14 @@ class Supervisor:
         done = ("The service ended the process and sends tdhil stop to the run's drive" if killed else
                 "The service could not end the process, and sends nothing to the drive")
         raise NotReacting(
-            f"the run's process doesn't react: it was stopped, by SIGSTOP or a debugger. The drive's watchdog{watchdog}"
-            f" stops the shaft. {done}", where=f"run {status.id}",
-            next_step="See that the shaft comes to rest. If it turns, use the hard-wired stop")
+            "the run's process does not react: it is suspended, by SIGSTOP or a debugger."
+            f" The drive's watchdog{watchdog} stops the shaft. {done}", where=f"run {status.id}",
+            next_step="Check that the shaft comes to standstill. If it turns, use the hard-wired stop")
 
     def stop_drive(self, rig: RigFile, who: str) -> tuple[int, str]:
-        """`tdhil stop` on a rig that has no run of this service: its exit code, and what was seen.
+        """Run `tdhil stop` on a rig without a run of this service. Return its exit code and a text.
 
-        A rig that a run blocks has the drive of that run stopped, on the run's own connection.
+        If a run blocks the rig, the drive of that run is stopped, on the run's own connection.
         """
         self.note(who, "stop asked", None, rig.id)
         if (bad := self.blocked(rig.id)) is not None:
@@ -369,9 +370,9 @@ class Supervisor:
         return int(ExitCode.OK if seen else ExitCode.STOP_NOT_CONFIRMED), said
 
     def _stop_drive_of(self, request: StoredRequest, status: Status) -> tuple[bool, str]:
-        """Stop the drive of a run, on the run's own connection. Was it seen at rest, and what is there to say?
+        """Stop the drive of a run on the run's own connection. Return whether standstill was confirmed, and a text.
 
-        Never seen at rest where the rig's file was changed since: nobody knows then which shaft that was.
+        It is never confirmed if the rig's file has changed since: then it is unknown which shaft that was.
         """
         if request.simulated:
             return True, SIMULATED_STOP
@@ -383,14 +384,14 @@ class Supervisor:
             seen, said = _stop_seen([sys.executable, "-m", "tdhil.service.drive_stop", str(kept), *identity])
             if same:
                 return seen, said
-            return False, (f"{said}, on the connection that the run had ({_address_in(kept)}); {changed}, so tdhil"
+            return False, (f"{said}, on the connection that the run used ({_address_in(kept)}); {changed}, so tdhil"
                            " can't know whether this is still the rig's shaft")
         if not same:
-            return False, f"{changed}, and the run had not kept where its drive is: no stop was sent"
+            return False, f"{changed}, and the run stored no address of its drive: no stop was sent"
         return _stop_seen(_tdhil_stop(path))
 
     def sign_off(self, run: str, who: str, note: str) -> None:
-        """Take a stop that wasn't confirmed upon oneself. Raises NotThere and Conflict."""
+        """Sign off a stop that was not confirmed. Raises NotThere and Conflict."""
         status = self.store.status(run)
         if status.state is not State.STOP_NOT_CONFIRMED:
             raise Conflict(f"there is nothing to sign off: the run is {status.state}", where=f"run {run}")
@@ -398,20 +399,21 @@ class Supervisor:
         self.note(who, "signed off", run, status.rig, note=note)
 
     def edit_rig(self, rig_id: str, text: str, sha256: str, who: str) -> RigFile:
-        """Put the text in place of the rig's file of this hash; the old one is kept.
+        """Replace the rig's file of this hash by the text; the old one is kept.
 
-        Raises NotThere and UsageError, DataFileError and NotAllowed for a text that won't do, Conflict where the file
-        is another one by now or the rig is in use, and LogError where it can't be written.
+        Raises NotThere; UsageError, DataFileError and NotAllowed for an unacceptable text; Conflict if the file has
+        changed or the rig is in use; LogError if it can't be written.
         """
-        with self._asking:                     # and nobody begins a run meanwhile
+        with self._asking:                     # so that no run starts meanwhile
             rig = self.rigs.get(rig_id)
             if self.rigs.built_in:
-                raise UsageError("this rig comes with the program", where=f"rig {rig_id}",
-                                 next_step="Name a folder of your own: tdhil serve --rigs")
+                raise UsageError("this rig is part of tdhil and can't be changed", where=f"rig {rig_id}",
+                                 next_step="Use your own folder: tdhil serve --rigs")
             self.refuse_busy(rig)
             before = rig.path.read_bytes()
             if sha256 != hashlib.sha256(before).hexdigest():
-                raise Conflict("the rig's file was changed meanwhile", where=rig.path.name, next_step="Load it again")
+                raise Conflict("the rig's file was changed meanwhile", where=rig.path.name, next_step="Load it again",
+                               entry=MessageCode.CHANGED_MEANWHILE)
             keys = edited(before.decode("utf-8", "replace"), text, rig.path.name)
             try:
                 kept = self.store.folder / "rigs" / rig.id / f"{sha256}.yaml"
@@ -458,7 +460,7 @@ class Supervisor:
             for run in self.live():
                 try:
                     self._look_at(run)
-                except Exception as error:     # of one run: the others are looked after all the same
+                except Exception as error:     # of one run: the others are still supervised
                     self.say(f"run {run}: {type(error).__name__}: {error}")
 
     def _look_at(self, run: str) -> None:
@@ -467,13 +469,13 @@ class Supervisor:
         status = self.store.status(run)
         if status.ended:
             if alive and run in self._children and self._children[run].poll() is None:
-                return                         # it has said how it ended, and is about to end
+                return                         # it has written its final status, and is about to end
             self._settle(run, status)
         elif not alive:
-            status = self.store.status(run)    # it may have ended between the two looks
+            status = self.store.status(run)    # it may have ended between the two checks
             if status.ended:
                 self._settle(run, status)
-            elif run not in self._lost:        # in a thread: a drive that doesn't answer keeps nobody else waiting
+            elif run not in self._lost:        # in a thread: a silent drive delays nothing else
                 self._lost.add(run)
                 self._in_background(lambda: self._settle(run, self._died(run, status)))
         elif status.state is State.AWAITING:
@@ -493,14 +495,15 @@ class Supervisor:
         self.note("service", f"ended: {status.state}", run, status.rig, exit_code=status.exit_code, **watched)
 
     def _died(self, run: str, status: Status) -> Status:
-        """The run's process is gone. First the shaft, then the rest."""
+        """Handle a run whose process is gone: first stop the drive, then the rest."""
         request = self.store.request(run)
         self.say(f"run {run}: its process is gone; stopping the drive")
         seen, said = self._stop_drive_of(request, status)
         state = State.INTERRUPTED if seen else State.STOP_NOT_CONFIRMED
         what = f"the process of the run was lost while it was {status.state}; {said}"
-        next_step = "" if seen else "Use the hard-wired stop. See that every shaft is at rest, then sign it off"
-        told = Told("CommunicationLost", what, what, f"run {run}", next_step, int(ExitCode.COMMUNICATION))
+        next_step = "" if seen else "Use the hard-wired stop. Check that every shaft is at standstill, then sign it off"
+        told = Told("CommunicationLost", what, what, f"run {run}", next_step, int(ExitCode.COMMUNICATION),
+                    MessageCode.COMMUNICATION_LOST.code)
         by, asked = self._stops.pop(run, (status.stop.by, status.stop.asked))
         first = {} if status.stop.asked is not None else {"by": by, "asked": asked}
         stop = replace(status.stop, confirmed=seen, at_rest=now() if seen else None, **first)
@@ -512,7 +515,7 @@ class Supervisor:
         return status
 
     def _save(self, status: Status) -> None:
-        """At last: as long as the disk is full, nobody takes the rig."""
+        """Save the status, however long it takes: while the disk is full, the rig stays blocked."""
         told = False
         while not self._end.is_set():
             try:
@@ -525,7 +528,7 @@ class Supervisor:
                 self._end.wait(1.0)
 
     def _recover(self, run: str) -> None:
-        """What the log of a lost run still holds, as a clean copy and as a result."""
+        """Recover the log of a lost run as a clean copy, and identify from it."""
         found = self.work("recover", run, {})
         if found.get("document"):
             with suppress(OSError):
@@ -533,7 +536,7 @@ class Supervisor:
         self._index(run)
 
     def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """A piece of arithmetic in a process of its own, nicer than all that moves. Raises Refused."""
+        """Compute a task in its own process, at a lower priority than all runs. Raises Refused."""
         command = [sys.executable, "-m", "tdhil.service.worker", what]
         question = {"folder": None if run is None else str(self.store.place(run)), **asked}
         done = subprocess.run(command, input=json.dumps(question).encode(), capture_output=True, check=False,
@@ -542,15 +545,16 @@ class Supervisor:
             found: dict[str, Any] = json.loads(done.stdout)
         except ValueError:
             text = done.stderr.decode("utf-8", "replace").strip().splitlines()
-            found = {"error": Told("Error", "the work failed", text[-1] if text else "", what, "", 1).__dict__}
+            found = {"error": Told("Error", "the work failed", text[-1] if text else "", what, "", 1,
+                                   MessageCode.WORKER_PROCESS_LOST.code).__dict__}
         if found.get("error"):
             raise RunRefused(Told(**found["error"]))
         return found
 
-    # -- what is written down of it: nothing that has to do with a shaft waits for it ----------------------------------
+    # -- records: nothing that concerns a shaft waits for them --------------------- ----------------------------------
 
     def note(self, who: str, what: str, run: str | None, rig: str | None, **details: Any) -> None:
-        """Into the audit, in time; nothing waits for it."""
+        """Write a line to the audit later; nothing waits for it."""
         def write() -> None:
             try:
                 self.audit.note(who, what, run=run, rig=rig, **details)
@@ -569,13 +573,13 @@ class Supervisor:
             self.say(f"the audit can't be written: {error}")
 
     def _index(self, run: str) -> None:
-        self._being_indexed.discard(run)       # first: what changes from here on is indexed once more
+        self._being_indexed.discard(run)       # first: later changes are indexed once more
         try:
             self.index.put(self.store.summary(run))
             self._unindexed.discard(run)
-        except Exception as error:             # locked, or a full disk: the files have it, and it is tried again
+        except Exception as error:             # locked, or a full disk: the files are complete; retry
             if run not in self._unindexed:
-                self.say(f"the index has to wait: {error}")
+                self.say(f"the index can't be written and is retried: {error}")
             self._unindexed.add(run)
         self._to_index.discard(run)
 
@@ -595,7 +599,7 @@ class Supervisor:
         self._begun = [one for one in self._begun if one.is_alive()] + [thread]
 
     def turning(self) -> bool:
-        """May a real shaft on this computer turn now: does a run of the service move, does anybody hold a drive?"""
+        """Return whether a real shaft of this computer may turn: a run moves, or a drive is held."""
         for run in self.live():
             with suppress(Exception):
                 if not self.store.request(run).simulated and self.store.status(run).state in MAY_TURN:
@@ -608,21 +612,21 @@ def _tdhil_stop(rig_file: Path) -> list[str]:
 
 
 def _stop_seen(command: list[str]) -> tuple[bool, str]:
-    """Run a stop in a process of its own (the web opens no bus): was the shaft seen at rest, and what is said of it?"""
+    """Run a stop in its own process (the web opens no bus). Return whether it confirmed standstill, and a text."""
     try:
         done = subprocess.run(command, capture_output=True, timeout=STOP_S, check=False,
                               stdin=subprocess.DEVNULL, start_new_session=True)
     except (OSError, subprocess.TimeoutExpired) as error:
         return False, f"tdhil stop: {error}"
     if done.returncode == ExitCode.OK:
-        return True, "tdhil stop saw the shaft at rest"
+        return True, "tdhil stop confirmed standstill"
     found: Any = None
     with suppress(ValueError):
         found = json.loads(done.stdout)
     if isinstance(found, dict) and found.get("same_drive") is False:
-        return False, (f"another drive is there than the run had (identity {found.get('identity')}): tdhil stop saw ITS"
-                       " shaft, and not that of the run")
-    return False, "tdhil stop did NOT see the shaft at rest"
+        return False, (f"the drive there has another identity ({found.get('identity')}) than the drive of the run:"
+                       " tdhil stop acted on ITS shaft, not on that of the run")
+    return False, "tdhil stop did NOT confirm standstill"
 
 
 def _address_in(kept: Path) -> str:

@@ -1,6 +1,6 @@
 """The web: the API, the live sockets and the pages, on one port. It opens no drive's bus and moves nothing itself.
 
-A stop never waits for arithmetic, a download or the index: it has threads of its own.
+A stop never waits for a computation, a download or the index: it has its own threads.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from tdhil.config import form_options
-from tdhil.errors import LogError, TdhilError, UsageError
+from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
 from tdhil.service import auth_routes, run_views
 from tdhil.service.access import (
     SOCKET_LOOK_S,
@@ -98,15 +98,15 @@ _ANSWERS: Final = {**run_views.ANSWERS, **auth_routes.ANSWERS}
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 _REPORT_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox allow-downloads"
 _OF_HERE: Final = re.compile(r"/(?![/\\])[\x21-\x5b\x5d-\x7e]*")
-"""Where a login may lead to."""
+"""Addresses to which a login may redirect."""
 STOPS: Final = 16
-"""Stops at once, each in a thread that nothing else has and that is there from the beginning."""
+"""Number of simultaneous stops, each in its own thread, which is started in advance."""
 _GONE: Final = suppress(WebSocketDisconnect, RuntimeError)
-"""Around what is said to a socket: who is at its other end may go in mid-word."""
+"""Used around messages to a socket: its other end may disconnect at any time."""
 
 
 class Web:
-    """The application around one supervisor. ``hosts``: by which names it may be reached; ``access``: who may what.
+    """The application around one supervisor. ``hosts``: accepted host names; ``access``: roles and logins.
 
     ``viewers``: origins (``http://localhost:8080``) whose pages may read logs by the Foxglove protocol, and no more.
     ``logs``: folders, by name, whose logs may be identified again.
@@ -123,22 +123,22 @@ class Web:
         self.feeds = Feeds()
         self._complain = Seldom(supervisor.say)
         self._stops = ThreadPoolExecutor(STOPS, "stop")
-        self._leases = anyio.CapacityLimiter(8)        # and so has a watched run's lease
-        self._works = anyio.CapacityLimiter(1)         # arithmetic that somebody waits for, one piece at a time
-        self._replays = anyio.CapacityLimiter(1)       # and what has time, so that no plan stands behind it
+        self._leases = anyio.CapacityLimiter(8)        # so has a watched run's lease
+        self._works = anyio.CapacityLimiter(1)         # computations that a page waits for, one at a time
+        self._replays = anyio.CapacityLimiter(1)       # slow ones, so that no plan waits behind them
         self.logins = anyio.CapacityLimiter(1)        # passwords too: each takes 32 MB
         self._waiting: dict[tuple[str, str], ReplayView] = {}
         self._made = threading.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
         self._registry = CollectorRegistry()
-        self._asked = Counter("tdhil_runs_asked", "Runs that were asked for", registry=self._registry)
-        self._stopped = Counter("tdhil_stops_asked", "Stops that were asked for", registry=self._registry)
+        self._asked = Counter("tdhil_runs_asked", "Runs that were requested", registry=self._registry)
+        self._stopped = Counter("tdhil_stops_asked", "Stops that were requested", registry=self._registry)
         self._live = Gauge("tdhil_runs_live", "Runs that have not ended", registry=self._registry)
         self._viewers = Gauge("tdhil_live_viewers", "Pages that watch a run", registry=self._registry)
         self._relays = 0
         self._relayed = Gauge("tdhil_foxglove_viewers", "Viewers that are sent a log as it grows",
                               registry=self._registry)
-        self._unsigned = Gauge("tdhil_rigs_blocked", "Rigs whose last stop nobody has signed off",
+        self._unsigned = Gauge("tdhil_rigs_blocked", "Rigs whose last stop is not signed off",
                                registry=self._registry)
         self._pages = Environment(
             loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
@@ -182,7 +182,7 @@ class Web:
     @asynccontextmanager
     async def _lifespan(self, app: Starlette) -> Any:
         self._begin_stops()
-        await off(_openapi_text)               # takes 0.4 s: now, and not while a stop waits
+        await off(_openapi_text)               # takes 0.4 s: now, not while a stop waits
         await anyio.to_thread.run_sync(self.access.start)
         await anyio.to_thread.run_sync(self.supervisor.start)
         try:
@@ -202,7 +202,7 @@ class Web:
     async def _failed(self, request: Request, error: Exception) -> Response:
         if isinstance(error, OSError) and error.errno in NO_DESCRIPTOR:
             error = LogError(f"the service has no descriptor left ({error.strerror})", where=request.url.path[:100],
-                             next_step="Ask again. Raise its limit of open files (LimitNOFILE, ulimit -n)")
+                             next_step="Repeat the request. Raise the limit of open files (LimitNOFILE, ulimit -n)")
             self._complain("A request failed: {}", error)
         elif not isinstance(error, TdhilError | HTTPException):
             import traceback
@@ -212,10 +212,11 @@ class Web:
         if isinstance(error, HTTPException) and error.status_code == 405:
             methods = ", ".join(sorted(self._methods(request)))
             error, status, headers = UsageError(
-                f"takes {methods}, and no {request.method[:20]}", where=path[:100]), 405, {"allow": methods}
+                f"supports {methods}, not {request.method[:20]}", where=path[:100],
+                                                entry=MessageCode.REQUEST_WRONG), 405, {"allow": methods}
         elif isinstance(error, HTTPException) and error.status_code == 404:
-            listed = f"{API}/openapi.json says what is" if path.startswith(API) else ""
-            error = NotThere("there is nothing here", where=path[:100], next_step=listed)
+            listed = f"See {API}/openapi.json" if path.startswith(API) else ""
+            error = NotThere("this address does not exist", where=path[:100], next_step=listed)
         if path.startswith(API) or request.method != "GET":
             return error_response(error, status, headers)
         if isinstance(error, NotLoggedIn) and self.access.login:       # a page
@@ -225,7 +226,7 @@ class Web:
         return self._render(request, "error.html", "", status_of(error), told=told)
 
     def _methods(self, request: Request) -> set[str]:
-        """What may be done at an address, by all of its routes."""
+        """Return the methods of an address, from all of its routes."""
         found = (one.methods for one in self.app.routes
                  if isinstance(one, Way) and one.matches(request.scope)[0] is not Match.NONE)
         return {method for methods in found for method in methods or ()}
@@ -243,7 +244,7 @@ class Web:
                 found = await answer(request, await body_of(request, route))
             except TdhilError as error:
                 return error_response(error)
-            except ClientDisconnect:           # in mid-request: no answer reaches it, and it is no error of ours
+            except ClientDisconnect:           # during the request: no reply can reach the client
                 return Response(status_code=400)
             if isinstance(found, Response):
                 return found
@@ -268,8 +269,8 @@ class Web:
     async def _edit_rig(self, request: Request, body: Any) -> RigFileView:
         rig, who = request.path_params["rig"], principal(request)
         if not who.known:
-            raise NotAllowed("a rig's file is edited by who is logged in", where=f"rig {rig}",
-                             next_step="Edit it where it is, or add users")
+            raise NotAllowed("only a logged-in user may edit a rig's file", where=f"rig {rig}",
+                             next_step="Edit the file on the service's computer, or add users")
         return await off(lambda: _file_view(self.supervisor.edit_rig(rig, body.text, body.sha256, who.name)))
 
     async def _plan(self, request: Request, body: dict[str, Any]) -> PlanView:
@@ -296,7 +297,8 @@ class Web:
     async def _compare(self, request: Request, body: Any) -> CompareView:
         runs = [one for one in request.query_params.get("runs", "").split(",") if one]
         if not 2 <= len(set(runs)) == len(runs) <= 8:
-            raise UsageError("name two to eight different runs", where="runs", next_step="?runs=ID,ID")
+            raise UsageError("name two to eight different runs", where="runs", next_step="?runs=ID,ID",
+                             entry=MessageCode.REQUEST_WRONG)
         for run in runs:
             if not (await off(partial(self.store.place, run)) / "run.mcap").is_file():
                 raise NotThere("this run has no log", where=f"run {run}")
@@ -306,7 +308,7 @@ class Web:
     async def _start(self, request: Request, body: dict[str, Any]) -> tuple[int, RunView]:
         key = request.headers.get("idempotency-key")
         if key is not None and not 1 <= len(key) <= 200:
-            raise UsageError("must have 1 to 200 characters", where="Idempotency-Key")
+            raise UsageError("must have 1 to 200 characters", where="Idempotency-Key", entry=MessageCode.REQUEST_WRONG)
         rig, who = request.path_params["rig"], principal(request)
 
         def check() -> None:
@@ -333,8 +335,8 @@ class Web:
                 self.supervisor.stop(run, who)
                 return StoppedView(rig_id, [run])
             if "operator" not in asking.roles and self.supervisor.nobody_moves(rig):
-                raise NotAllowed("no tdhil moves this rig: a stop would open its bus and act on a drive that something"
-                                 " else may run", where=f"rig {rig_id}",
+                raise NotAllowed("no tdhil moves this rig: a stop would open its bus and act on a drive that another"
+                                 " program may control", where=f"rig {rig_id}",
                                  next_step="Ask an operator. If the shaft turns, use the hard-wired stop")
             code, said = self.supervisor.stop_drive(rig, who)
             return StoppedView(rig_id, [], code, said)
@@ -345,10 +347,10 @@ class Web:
         query = request.query_params
         limit = query.get("limit", "100")
         if not limit.isdecimal() or not 1 <= int(limit) <= 1000:
-            raise UsageError("must be 1 to 1000", where="limit")
+            raise UsageError("must be 1 to 1000", where="limit", entry=MessageCode.REQUEST_WRONG)
         if (state := query.get("state")) is not None and state not in set(State):
-            raise UsageError(f"there is no state {state[:40]!r}", where="state",
-                             next_step=f"There are {', '.join(State)}")
+            raise UsageError(f"{state[:40]!r} is not a state", where="state",
+                             next_step=f"States: {', '.join(State)}", entry=MessageCode.REQUEST_WRONG)
         return await off(lambda: self.list_runs(query.get("rig"), state, int(limit)))
 
     async def _run(self, request: Request, body: Any) -> RunView:
@@ -379,7 +381,8 @@ class Web:
     async def _sign_off(self, request: Request, body: Any) -> RunView:
         run, who = request.path_params["run"], principal(request).name
         if not body.note.strip() or len(body.note) > 500:
-            raise UsageError("say in 1 to 500 characters what you saw", where="note")
+            raise UsageError("must be 1 to 500 characters: state what you saw", where="note",
+                             entry=MessageCode.REQUEST_WRONG)
         await off(lambda: self.supervisor.sign_off(run, who, body.note))
         return await off(lambda: self.run_view(run))
 
@@ -397,7 +400,8 @@ class Web:
     def _new_replay(self, run: str, asked: dict[str, Any], who: str) -> ReplayView:
         folder = self.store.place(run)
         if not self.store.status(run).ended or not (folder / "run.mcap").is_file():
-            raise UsageError("the run has no finished log", where=f"run {run}", next_step="Wait until it has ended")
+            raise UsageError("the run has no finished log", where=f"run {run}", next_step="Wait until it has ended",
+                             entry=MessageCode.NOT_READY)
         with self._made:
             (folder / "replays").mkdir(exist_ok=True)
             taken = [int(name) for name, _ in self.store.replays(run)] + [
@@ -407,7 +411,7 @@ class Web:
         return view
 
     async def _replay_later(self, run: str, view: ReplayView) -> None:
-        """A replay has time: it waits as long as a shaft of this service may turn."""
+        """Run a replay once no shaft of this service may turn."""
         while await off(self.supervisor.turning):
             await anyio.sleep(0.5)
         try:
@@ -428,7 +432,7 @@ class Web:
         run, name = request.path_params["run"], request.path_params["replay"]
         found = next((one for one in await off(lambda: self.replays(run)) if one.name == name), None)
         if found is None:
-            raise NotThere("there is no such replay", where=f"run {run[:40]}")
+            raise NotThere("this replay does not exist", where=f"run {run[:40]}")
         return found
 
     async def _log(self, request: Request, body: Any) -> Response:
@@ -447,7 +451,7 @@ class Web:
         return await self.file(request, "report.pdf", "application/pdf")
 
     async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """A piece of arithmetic, one at a time: its document. Raises Refused."""
+        """Compute a task, one at a time. Return its document. Raises Refused."""
         work, limiter = partial(self.supervisor.work, what, run, asked), self._works
         if what == "replay":
             limiter = self._replays
@@ -458,11 +462,11 @@ class Web:
         return await self.file(request, "result.json", "application/json")
 
     async def file(self, request: Request, name: str, media: str, *, shown: bool = False) -> Response:
-        """A file of the run, as a download (or ``shown``). Raises NotThere."""
+        """Return a file of the run, as a download (or ``shown``). Raises NotThere."""
         run, who = request.path_params["run"], principal(request).name
         path = (await off(lambda: self.store.place(run))) / name
         if not path.is_file():
-            raise NotThere(f"this run has no {name}", where=f"run {run}", next_step="It may come when it has ended")
+            raise NotThere(f"this run has no {name}", where=f"run {run}", next_step="Wait until the run has ended")
         rig = (await off(lambda: self.store.request(run))).rig
         if request.method == "GET":
             self.supervisor.note(who, f"downloaded {name}", run, rig)
@@ -476,7 +480,7 @@ class Web:
     async def _audit(self, request: Request, body: Any) -> AuditView:
         limit = request.query_params.get("limit", "200")
         if not limit.isdecimal() or not 1 <= int(limit) <= 5000:
-            raise UsageError("must be 1 to 5000", where="limit")
+            raise UsageError("must be 1 to 5000", where="limit", entry=MessageCode.REQUEST_WRONG)
 
         given = request.query_params.get("head")
         kept = None if given is None else ChainHead.of(given)
@@ -488,7 +492,7 @@ class Web:
 
         return await off(look)
 
-    # -- how it is ---------------------------------------------------------------------------------------------------
+    # -- health ---------------------------------------------------------------------------------------------------
 
     async def _health(self, request: Request, body: Any) -> HealthView:
         rigs = await off(self.supervisor.rigs.all)
@@ -506,10 +510,10 @@ class Web:
     async def _openapi(self, request: Request, body: Any) -> Response:
         return Response(_openapi_text(), media_type="application/json")
 
-    # -- what is shown of it -----------------------------------------------------------------------------------------
+    # -- views -----------------------------------------------------------------------------------------
 
     def rig_view(self, rig: RigFile) -> RigView:
-        """A rig, with who has it and its last run."""
+        """Return a rig, with its present user and its last run."""
         if rig.rig is None:
             return RigView(rig.id, rig.id, "unusable", False, "never", rig.problem)
         try:
@@ -534,7 +538,7 @@ class Web:
         )
 
     def list_runs(self, rig: str | None, state: str | None, limit: int) -> list[Summary]:
-        """From the index, or from the files where that can't be had, or lags behind, as with a live run."""
+        """Return runs from the index; from the files if it is not available or out of date, as for a live run."""
         live = self.supervisor.ahead_of_the_index()
         now_live = []
         for run in live:
@@ -549,13 +553,13 @@ class Web:
         return sorted(found, key=lambda one: one.id, reverse=True)[:limit]
 
     def replays(self, run: str) -> list[ReplayView]:
-        """Those that are made, and those that wait."""
+        """Return the finished replays and the waiting ones."""
         made = {name: adapter(ReplayView).validate_python(one) for name, one in self.store.replays(run)}
         waiting = {name: one for (at, name), one in tuple(self._waiting.items()) if at == run and name not in made}
         return [one for _, one in sorted((made | waiting).items())]
 
     def run_view(self, run: str, status: Status | None = None) -> RunView:
-        """Everything but the samples. ``status``: as the run itself has just said it. Raises NotThere."""
+        """Return a run without its samples. ``status``: if the run itself has just reported it. Raises NotThere."""
         request, folder = self.store.request(run), self.store.place(run)
         status = status or self.store.status(run)
         rig_name = request.rig
@@ -574,7 +578,7 @@ class Web:
         )
 
     def told(self) -> dict[str, Any]:
-        """What is told to a broker, by topic: of each rig its state, and the latest result that it has."""
+        """Return the messages for a broker, by topic: each rig's state and latest result."""
         found: dict[str, Any] = {}
         for rig in self.supervisor.rigs.all():
             view, run = self.rig_view(rig), None
@@ -596,7 +600,9 @@ class Web:
     def _socket(
         self, role: Role, serve: Callable[[WebSocket], Awaitable[None]]
     ) -> Callable[[WebSocket], Awaitable[None]]:
-        """A socket for who has the role, as long as he has it. Else it is closed: 4401 for nobody, 4403 for less."""
+        """Serve a socket while its client has the role. Otherwise close it: 4401 without a login, 4403 for a lower
+        role.
+        """
         async def allowed(socket: WebSocket) -> bool:
             who = self.access.who(socket)
             if role not in who.roles:
@@ -611,7 +617,7 @@ class Web:
 
         async def guarded(socket: WebSocket) -> None:
             if role not in self.access.who(socket).roles:
-                await socket.accept()          # only so does a page hear why
+                await socket.accept()          # only then does a page receive the reason
                 await allowed(socket)
                 return
             async with anyio.create_task_group() as both:
@@ -623,7 +629,7 @@ class Web:
         return guarded
 
     def _no_socket(self, role: Role) -> Callable[[Request], Awaitable[Response]]:
-        """Somebody asks for a socket's address as if it were a page."""
+        """Answer an ordinary request to a socket's address."""
         async def serve(request: Request) -> Response:
             path = request.url.path
             require(principal(request), role, route=path, open_here=not self.access.login)
@@ -648,14 +654,14 @@ class Web:
                 with _GONE:
                     while (message := await queue.get()) is not None:
                         await socket.send_text(json.dumps(message, allow_nan=False))
-                    await socket.close(1013, "too slow: come again")
+                    await socket.close(1013, "too slow: connect again")
                 both.cancel_scope.cancel()
         finally:
             feed.leave(queue)
 
     @staticmethod
     async def _listen(socket: WebSocket, scope: anyio.CancelScope) -> None:
-        """Nothing that a viewer sends is heard; only that it has gone."""
+        """Ignore what a viewer sends. Wait until it disconnects."""
         with _GONE:
             while True:
                 message = await socket.receive()
@@ -734,7 +740,7 @@ class Web:
 
 
 def _file_view(rig: RigFile) -> RigFileView:
-    """Raises UsageError."""
+    """Return the view of a rig's file. Raises UsageError."""
     try:
         data = rig.path.read_bytes()
         return RigFileView(rig.id, data.decode(), hashlib.sha256(data).hexdigest(), sorted(EDITABLE))
@@ -748,7 +754,7 @@ def _openapi_text() -> bytes:
 
 
 def _as_it_is(path: Path) -> Iterator[bytes]:
-    """A file that grows, up to where it ends now."""
+    """Yield a growing file up to its present end."""
     left = path.stat().st_size
     with path.open("rb") as file:
         while left > 0 and (piece := file.read(min(left, 2**16))):
@@ -758,4 +764,5 @@ def _as_it_is(path: Path) -> Iterator[bytes]:
 
 def _require_key(key: str | None, where: str) -> None:
     if key is not None and not 16 <= len(key) <= 200:
-        raise UsageError("must have 16 to 200 characters", where=where, next_step="Take a random one")
+        raise UsageError("must have 16 to 200 characters", where=where, next_step="Use a random key",
+                         entry=MessageCode.REQUEST_WRONG)

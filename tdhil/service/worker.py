@@ -1,6 +1,6 @@
-"""Arithmetic beside the web: ``python -m tdhil.service.worker plan|replay|…``, a question on stdin.
+"""Computations beside the web: ``python -m tdhil.service.worker plan|replay|…``, with a request on stdin.
 
-A process of its own, nicer than everything that moves: neither a page nor a stop waits for it.
+It is a process of its own, at a lower priority than every run: neither a page nor a stop waits for it.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from typing import Any, Final
 from tdhil.errors import UsageError
 from tdhil.service.run_state import Told
 
-NICE: Final = {"plan": 5, "trend": 5}      # somebody waits for it
+NICE: Final = {"plan": 5, "trend": 5}      # a page waits for it
 USUAL_NICE: Final = 19
 
 
 def plan(asked: dict[str, Any]) -> dict[str, Any]:
-    """The plan of a run on a rig as its file is now."""
+    """Return the plan of a run on a rig with its present file."""
     from tdhil.service.start_request import plan_of, read_rig
 
     return {"document": plan_of(read_rig(Path(asked["rig_file"])), asked["options"])}
 
 
 def replay(asked: dict[str, Any]) -> dict[str, Any]:
-    """The log again, with another model, tolerance or confidence."""
+    """Identify the log again, with another model, tolerance or confidence."""
     from tdhil.api import identify
     from tdhil.config import ASKED_AGAIN
     from tdhil.session import read
@@ -39,7 +39,7 @@ def replay(asked: dict[str, Any]) -> dict[str, Any]:
 
 
 def report(asked: dict[str, Any]) -> dict[str, Any]:
-    """The report of a run that has a result, as the file that is named."""
+    """Write the report of a run with a result to the named file."""
     from tdhil.report import require_extra, write_report
     from tdhil.session import read
 
@@ -56,7 +56,7 @@ def report(asked: dict[str, Any]) -> dict[str, Any]:
 
 
 def samples(asked: dict[str, Any]) -> dict[str, Any]:
-    """The run's samples as samples.csv, by `tdhil export`."""
+    """Write the run's samples as samples.csv, by `tdhil export`."""
     os.chdir(asked["folder"])
     beside = Path(f".{os.getpid()}-samples.csv")
     command = [sys.executable, "-m", "tdhil", "export", "run.mcap", "--to", "csv", "-o", str(beside)]
@@ -71,7 +71,7 @@ def samples(asked: dict[str, Any]) -> dict[str, Any]:
 
 
 def recover(asked: dict[str, Any]) -> dict[str, Any]:
-    """A clean copy of what a cut log holds, and what can be identified from it; no document where that is nothing."""
+    """Write a clean copy of a cut log, and identify from it; no document if that fails."""
     from tdhil.errors import LogError
     from tdhil.recording import examine, write_copy
 
@@ -85,14 +85,14 @@ def recover(asked: dict[str, Any]) -> dict[str, Any]:
 
 
 def trend(asked: dict[str, Any]) -> dict[str, Any]:
-    """What the rows of a rig's runs say over time."""
+    """Return the trend of a rig's runs."""
     from tdhil.fleet import FleetRow, trend_document
 
     return {"document": trend_document([FleetRow(**one) for one in asked["rows"]], asked["rig"])}
 
 
 def compare(asked: dict[str, Any]) -> dict[str, Any]:
-    """Some runs side by side, each identified from its log."""
+    """Compare some runs, each identified from its log."""
     from tdhil.fleet import FleetSettings, compare_document, identified
 
     os.chdir(asked["runs_folder"])
@@ -107,13 +107,13 @@ WORK: Final = {
 
 
 def main(arguments: list[str]) -> int:
-    """0; what went wrong is in the answer."""
+    """Do one task. Return 0; an error is in the answer."""
     with suppress(OSError, AttributeError):
         os.nice(NICE.get(arguments[0], USUAL_NICE))
-    with suppress(OSError):                    # where memory runs out, this goes before the web and before any run
+    with suppress(OSError):                    # if memory runs out, this ends before the web or any run
         Path("/proc/self/oom_score_adj").write_text("500")
     out = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)                          # what libraries print is no part of the answer
+    os.dup2(2, 1)                          # output of libraries is not part of the answer
     try:
         answer = WORK[arguments[0]](json.load(sys.stdin))
     except Exception as error:

@@ -1,19 +1,19 @@
-// The pages of tdhil serve. Everything that comes from elsewhere goes into the page as text, never as markup.
+// The pages of tdhil serve. Data from elsewhere are inserted as text, never as markup.
 "use strict";
 (() => {
   const API = "/api/v1";
-  const SILENT_MS = 2000;      // without an answer for so long a stop counts as not delivered, and values as old
+  const SILENT_MS = 2000;      // without an answer in this time, a stop counts as not delivered and values as old
   const UNDELIVERED = "NOT DELIVERED: use the hard-wired stop";
   const ENDED = ["done", "refused", "stopped", "failed", "stop_not_confirmed", "interrupted"];
   const STATES = {
-    requested: "asked for", preflight: "looking at the drive", awaiting_confirmation: "waits for the code",
+    requested: "requested", preflight: "preflight", awaiting_confirmation: "waiting for the code",
     moving: "moving", stopping: "stopping", identifying: "identifying", done: "done", refused: "refused",
-    stopped: "stopped, at rest", failed: "failed, at rest", stop_not_confirmed: "STOP NOT CONFIRMED",
+    stopped: "stopped, at standstill", failed: "failed, at standstill", stop_not_confirmed: "STOP NOT CONFIRMED",
     interrupted: "interrupted",
   };
   const byId = (id) => document.getElementById(id);
 
-  /** An element with attributes, and with texts and elements in it. */
+  /** Make an element with attributes, texts and child elements. */
   function el(tag, attributes = {}, ...inside) {
     const found = document.createElement(tag);
     for (const [name, value] of Object.entries(attributes)) {
@@ -30,7 +30,7 @@
 
   const may = (role) => (document.body.dataset.roles || "").split(" ").includes(role);
 
-  /** What a change brings along, as it is now: another page may have logged in anew meanwhile. */
+  /** Return the present token for a change: another page may have logged in again meanwhile. */
   function csrf() {
     const name = `__Host-tdhil-csrf-${location.port || 443}=`;
     const found = document.cookie.split("; ").find((one) => one.startsWith(name));
@@ -63,18 +63,18 @@
     if (bar.textContent !== (text || "")) bar.textContent = text || "";
   }
 
-  /** The page stays, with its Stop: only who asks for another one is asked to log in. */
+  /** Keep the page and its Stop. Only a request for another page leads to the login. */
   function loggedOut() {
     if (outside) return;
     const there = encodeURIComponent(location.pathname + location.search);
     away("");
     outside = true;
     byId("away").hidden = false;
-    show(byId("away"), "Your login has ended: what you see is old. Stop may still get through, and says so; if not, use the hard-wired stop. ", el("a", { href: `/login?next=${there}` }, "Log in"));
+    show(byId("away"), "Your login has ended: the values are old. Stop may still work, and this page reports the result. If not, use the hard-wired stop. ", el("a", { href: `/login?next=${there}` }, "Log in"));
     document.body.classList.add("stale");
   }
 
-  /** Again and again, and grey while nothing comes. */
+  /** Repeat a request. Grey the page while no answer comes. */
   function every(ms, look) {
     let last = Date.now();
     const go = async () => {
@@ -90,13 +90,13 @@
     setInterval(() => {
       const silent = Date.now() - last > ms + SILENT_MS;
       document.body.classList.toggle("stale", silent);
-      if (silent && !byId("away").textContent.includes(UNDELIVERED)) away("No answer from tdhil serve: what you see is old. A run that moves goes on, guarded, and one that is watched brakes; the hard-wired stop works.");
+      if (silent && !byId("away").textContent.includes(UNDELIVERED)) away("No answer from tdhil serve: the values are old. A moving run continues under its guard, and a watched run stops. The hard-wired stop works.");
       else if (byId("away").textContent.startsWith("No answer")) away("");
     }, 500);
   }
 
   const number = (value, digits = 4) => (value === null || value === undefined ? "–" : Number(value).toPrecision(digits).replace(/\.?0+$/, (m) => (m.includes(".") ? "" : m)));
-  /** A value with its interval, to as many places as that tells: two digits of its half, as the terminal's card. */
+  /** Format a value with its interval: two digits of the half-width, as on the terminal's card. */
   function interval(value, low, high) {
     if (value === null || value === undefined) return null;
     if (low === null || low === undefined || high === null || high === undefined) return number(value);
@@ -110,7 +110,7 @@
     return J ? withUnit(interval(J.value, J.low_total, J.high_total)) : null;
   }
   const percent = (share) => (share === null || share === undefined ? "" : `±${(100 * share).toPrecision(2)} %`);
-  /** This computer's own time, written so that no month is taken for a day. */
+  /** Format local time with an unambiguous month. */
   const two = (one, digits = 2) => String(one).padStart(digits, "0");
   const time = (at) => `${two(at.getHours())}:${two(at.getMinutes())}:${two(at.getSeconds())}`;
   const clock = (iso) => (iso ? `${time(new Date(iso))}.${two(new Date(iso).getMilliseconds(), 3)}` : "");
@@ -119,7 +119,7 @@
     const at = new Date(iso);
     return Number.isNaN(at.getTime()) ? iso : `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${time(at)}`;
   }
-  /** A quantity as it was typed, in this unit if it has none, for the service to check. */
+  /** Return a quantity as typed, with this unit if it has none. The service checks it. */
   function quantity(text, unit) {
     const typed = text.trim().replace(",", ".");
     return /[\d.]$/.test(typed) ? typed + unit : typed;
@@ -134,8 +134,8 @@
 
   function rigCard(rig) {
     const said = {
-      free: rig.simulated || rig.motion !== "never" ? "free" : `free; not moved from here (service.motion: ${rig.motion})`,
-      busy: "a run has it", held: `held by ${rig.holder}`, blocked: "blocked: a stop was not confirmed", unusable: rig.problem,
+      free: rig.simulated || rig.motion !== "never" ? "free" : `free; can't be moved from here (service.motion: ${rig.motion})`,
+      busy: "in use by a run", held: `held by ${rig.holder}`, blocked: "blocked: a stop was not confirmed", unusable: rig.problem,
     }[rig.state];
     const mayStart = may("operator") && rig.state === "free" && (rig.simulated || rig.motion !== "never");
     return el("article", { class: "card", "aria-labelledby": `rig-${rig.id}` },
@@ -155,7 +155,7 @@
   async function stopRig(rig) {
     const late = setTimeout(() => away(`Stop of ${rig.name} ${UNDELIVERED}`), SILENT_MS);
     try {
-      const found = await call("POST", `/rigs/${encodeURIComponent(rig.id)}/stop`, {}, {}, rig.run ? 10000 : 90000);      // without a run it is answered once rest was seen
+      const found = await call("POST", `/rigs/${encodeURIComponent(rig.id)}/stop`, {}, {}, rig.run ? 10000 : 90000);      // without a run the answer comes after standstill
       if (byId("away").textContent.includes(UNDELIVERED)) away("");
       if (found.runs.length) location.assign(`/runs/${found.runs[0]}/live`);
       else away(`${rig.name}: ${found.said}${found.exit_code === 0 ? "" : ". Use the hard-wired stop"}`);
@@ -178,7 +178,7 @@
 
   // -- start
 
-  /** The options of a form, by the names of their fields; an empty field is left out. */
+  /** Return the options of a form by field name, without empty fields. */
   function asked(form) {
     const found = {};
     for (const field of form.querySelectorAll("[name]:not(button)")) {
@@ -197,16 +197,16 @@
     const half = plan.expected_half_width;
     const rows = [
       ["expected interval of J (repeatability)", half === null ? "not predicted" : percent(half)],
-      ["time", `${span(plan.duration_s + 90)}, of it ${span(plan.duration_s)} of the motion that counts`],
+      ["time", `${span(plan.duration_s + 90)}, of which ${span(plan.duration_s)} are stage 5`],
       ["motion", `${plan.excitation} in ${plan.mode} mode`],
       ["speed, rad/s", `${number(plan.speed_rad_s.min, 3)} to ${number(plan.speed_rad_s.max, 3)} (limits ${number(plan.limits.speed_min_rad_s, 3)} to ${number(plan.limits.speed_max_rad_s, 3)})`],
       ["torque, N·m", `${number(plan.torque_nm.min, 3)} to ${number(plan.torque_nm.max, 3)} (limit ±${number(plan.limits.torque_nm, 3)})`],
     ];
-    const advice = plan.stopping && !plan.stopping.reachable ? el("p", { class: "alarm" }, `±${number(100 * plan.stopping.tolerance, 3)} % is not to be expected: ${plan.stopping.advice}`) : null;
+    const advice = plan.stopping && !plan.stopping.reachable ? el("p", { class: "alarm" }, `±${number(100 * plan.stopping.tolerance, 3)} % can't be reached: ${plan.stopping.advice}`) : null;
     return [
       el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text))))),
       advice || "",
-      el("p", { class: "dim" }, "Assumed for now: a run measures friction, inertia and noise first, and plans again from that."),
+      el("p", { class: "dim" }, "These values are assumed. A run first measures friction, inertia and noise, and then plans again."),
     ];
   }
 
@@ -217,7 +217,7 @@
     let key = null, keyFor = "";
     every(3000, async () => {
       const found = await call("GET", `/rigs/${encodeURIComponent(rig)}`);
-      const why = { busy: "A run has this rig.", held: `Held by ${found.holder}.`, blocked: "Blocked until a stop that was not confirmed is signed off." }[found.state];
+      const why = { busy: "A run uses this rig.", held: `Held by ${found.holder}.`, blocked: "Blocked until a stop that was not confirmed is signed off." }[found.state];
       byId("rig-state").textContent = why || "";
     });
     form.addEventListener("submit", async (event) => {
@@ -234,7 +234,7 @@
           byId("plan").hidden = false;
           show(byId("said"));
         } else {
-          const text = JSON.stringify(options);         // the same question twice is the same run
+          const text = JSON.stringify(options);         // the same request twice starts one run
           if (key === null || keyFor !== text) { key = crypto.randomUUID(); keyFor = text; }
           const run = await call("POST", `/rigs/${encodeURIComponent(rig)}/runs`, options, { "Idempotency-Key": key });
           location.assign(`/runs/${run.id}/live`);
@@ -350,7 +350,7 @@
       if (confirm) {
         byId("confirm-text").textContent = status.confirmation.text;
         const marks = { ok: "✓", note: "i" }, half = status.expected_half_width;
-        byId("confirm-expected").textContent = `Expected: ${half ? `J to ${percent(half)}, ` : ""}about ${span(Object.values(status.expected_s).reduce((sum, one) => sum + one, 0))}. ${status.identity}; if the host falls silent: ${status.safe_action}.`;
+        byId("confirm-expected").textContent = `Expected: ${half ? `J to ${percent(half)}, ` : ""}about ${span(Object.values(status.expected_s).reduce((sum, one) => sum + one, 0))}. ${status.identity}; if the host fails: ${status.safe_action}.`;
         show(byId("confirm-checks"), ...status.preflight.map((one) => el("tr", { class: one.outcome }, el("td", {}, marks[one.outcome] || "✗"), el("th", { scope: "row" }, one.name), el("td", {}, one.wanted), el("td", {}, one.found), el("td", {}, one.where))));
       }
       stopTimes();
@@ -362,19 +362,19 @@
       const steps = [];
       if (asking && !stop.asked) steps.push(el("li", {}, "asking …"));
       if (stop.asked) steps.push(el("li", {}, `asked ${clock(stop.asked)}`));
-      if (stop.asked && stop.seen) steps.push(el("li", {}, `→ seen by the drive ${clock(stop.seen)}`));
-      if (stop.at_rest) steps.push(el("li", {}, `${stop.asked ? "→ " : ""}at rest ${clock(stop.at_rest)}`));
-      if (stop.confirmed === false) steps.push(el("li", { class: "alarm" }, "NOT seen at rest: use the hard-wired stop"));
+      if (stop.asked && stop.seen) steps.push(el("li", {}, `→ drive reacted ${clock(stop.seen)}`));
+      if (stop.at_rest) steps.push(el("li", {}, `${stop.asked ? "→ " : ""}standstill ${clock(stop.at_rest)}`));
+      if (stop.confirmed === false) steps.push(el("li", { class: "alarm" }, "Standstill NOT confirmed: use the hard-wired stop"));
       show(byId("stop-times"), ...steps);
     }
 
-    /** Nobody has acknowledged the stop; or the run has, and its drive doesn't brake. */
+    /** The stop is not acknowledged; or the run acknowledged it, and its drive does not react. */
     function stopAlarm() {
       const stop = (status && status.stop) || {}, over = status && ENDED.includes(status.state);
       if (stop.asked || over) undelivered = false;
       const waits = stop.asked && !stop.seen && !stop.at_rest && !over && status.history.some((one) => one.state === "moving");
       unseen = waits ? unseen || Date.now() : null;
-      const text = undelivered ? UNDELIVERED : unseen && Date.now() - unseen > SILENT_MS ? "NOT SEEN BY THE DRIVE: use the hard-wired stop" : "";
+      const text = undelivered ? UNDELIVERED : unseen && Date.now() - unseen > SILENT_MS ? "THE DRIVE DOES NOT REACT: use the hard-wired stop" : "";
       byId("undelivered").hidden = !text;
       if (text && byId("undelivered").textContent !== text) byId("undelivered").textContent = text;
     }
@@ -389,7 +389,7 @@
           clearTimeout(late);
           undelivered = false;
         }
-        if (status) {              // the socket may have told more meanwhile: an answer that was overtaken undoes nothing
+        if (status) {              // the socket may have newer data: a late answer must not replace them
           const stop = Object.fromEntries(Object.entries(found.stop).map(([name, value]) => [name, value ?? status.stop[name]]));
           const newer = found.history.length >= status.history.length;
           status = { ...status, stop, ...(newer ? { state: found.state, stage: found.stage, history: found.history } : {}) };
@@ -404,13 +404,13 @@
       }
     });
 
-    // -- the lease of a watched run: held by the page that confirmed it, as long as it is seen
+    // -- the lease of a watched run: the page that confirmed it renews it while it is visible
 
     const heldAs = `tdhil-lease-${run}`;
     let key = null, newKey = null, renewing = false, mine = false, heard = 0;
-    try { key = sessionStorage.getItem(heldAs); } catch (error) { /* then a page that is loaded anew has lost it */ }
+    try { key = sessionStorage.getItem(heldAs); } catch (error) { /* then a reloaded page has lost it */ }
     mine = key !== null;
-    if (key) newKey = crypto.randomUUID();       // of two pages with one key, the later one has it
+    if (key) newKey = crypto.randomUUID();       // of two pages with one key, the later one gets it
     function hold(found) {
       key = found;
       mine = true;
@@ -442,10 +442,10 @@
       if (over) return;
       const unheard = mine && Date.now() - heard > SILENT_MS;
       where.className = watch.lost || watch.gone || unheard ? "alarm" : "";
-      const text = watch.lost ? `Nobody watched this run: it was braked at ${clock(watch.lost)}.`
-        : unheard ? "The run hears nothing of this page: it brakes 5 s after the last word."
-        : mine ? "You watch this run: once this page is hidden or closed for 5 s, the shaft brakes."
-        : `${watch.by} watches this run on another page${watch.gone ? `, which is ${watch.how} since ${clock(watch.gone)}` : ""}: it brakes 5 s after that is gone.`;
+      const text = watch.lost ? `This run was not watched: it was stopped at ${clock(watch.lost)}.`
+        : unheard ? "The run receives nothing from this page: it stops 5 s after the last message."
+        : mine ? "You watch this run. If this page is hidden or closed for 5 s, the shaft stops."
+        : `${watch.by} watches this run on another page${watch.gone ? `, which is ${watch.how} since ${clock(watch.gone)}` : ""}: the shaft stops 5 s after that page is hidden or closed.`;
       if (where.textContent !== text) where.textContent = text;
     }
 
@@ -483,7 +483,7 @@
       const real = age === null ? null : age + (now - message) / 1000;
       const old = silent || (running && ["moving", "stopping"].includes(status.state) && real !== null && real > SILENT_MS / 1000);
       document.body.classList.toggle("stale", Boolean(old && (running || silent)));
-      if (silent && message) away(`No connection to tdhil serve: what you see is old. ${watched ? "It brakes once nobody watches it" : "The run goes on, guarded"}; the hard-wired stop works.`);
+      if (silent && message) away(`No connection to tdhil serve: the values are old. ${watched ? "The run stops, because it is not watched" : "The run continues under its guard"}. The hard-wired stop works.`);
       else if (!silent) away("");
       byId("age").textContent = real === null ? "–" : running || silent ? (real < 10 ? `${real.toFixed(1)} s` : span(real)) : "ended";
       stopAlarm();
@@ -512,13 +512,13 @@
       if (now === shown) return;
       shown = now;
       byId("chain").className = found.broken ? "alarm" : "dim";
-      byId("chain").textContent = found.broken ? `The chain is BROKEN at ${found.broken.file}:${found.broken.line}: ${found.broken.why}` : `The chain of all lines holds. Its head, to be kept on another computer: ${found.head || "no line yet"}`;
+      byId("chain").textContent = found.broken ? `The chain is BROKEN at ${found.broken.file}:${found.broken.line}: ${found.broken.why}` : `The chain of all lines is intact. Keep its head on another computer: ${found.head || "no line yet"}`;
       show(byId("entries"), ...found.entries.map((one) => el("tr", {}, el("th", { scope: "row" }, when(one.at)), el("td", {}, one.who), el("td", {}, one.what), el("td", {}, one.rig || ""),
         el("td", {}, one.run ? el("a", { href: `/runs/${one.run}` }, one.run) : ""), el("td", {}, Object.keys(one.details).length ? JSON.stringify(one.details) : ""))));
     });
   }
 
-  // -- who is who
+  // -- accounts
 
   async function saying(where, work) {
     where.hidden = true;
@@ -539,7 +539,7 @@
         location.replace(next);
       });
     });
-    const me = await call("GET", "/me");     // a link from elsewhere comes without the cookie, this page's own request has it
+    const me = await call("GET", "/me");     // a link from another site has no cookie, this page's own request has it
     if (me.roles.length) location.replace(next);
   }
 
@@ -569,7 +569,7 @@
     const look = async () => fill(await call("GET", "/accounts"));
     sends("password", "/password", () => location.assign("/login"));
     sends("add-user", "/users", look);
-    sends("add-token", "/tokens", (made) => { show(byId("token"), `The token of ${made.name}, shown this once: `, el("code", {}, made.token)); look(); });
+    sends("add-token", "/tokens", (made) => { show(byId("token"), `The token of ${made.name}, shown only once: `, el("code", {}, made.token)); look(); });
     if (byId("users")) saying(said, look);
   }
 
@@ -584,7 +584,7 @@
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);
     try {
       (pages[document.body.dataset.page] || (() => {}))();
-    } finally {                 // until its script listens, a page takes neither click nor key: both would be lost
+    } finally {                 // until its script is ready, a page accepts neither click nor key: both would be lost
       byId("main").inert = false;
       const first = document.querySelector("[autofocus]");
       if (first) first.focus();

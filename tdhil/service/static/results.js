@@ -1,4 +1,4 @@
-// What came of runs: one, several side by side, a rig over time, many logs. As in app.js, what comes from elsewhere is text.
+// Results: one run, a comparison, a rig over time, many logs. As in app.js, data from elsewhere are inserted as text.
 "use strict";
 (() => {
   const { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, number, ofResult, pages, percent, show, span, when } = window.tdhil;
@@ -15,14 +15,14 @@
     const J = result.inertia_kg_m2;
     const estimate = (one, unit) => (one ? `${of(one)} ${unit}` : null);
     if (J) rows.push([`J, ${number(100 * (J.confidence ?? 0.95))} % interval to quote`, `${ofResult(result)}  ${percent(J.half_width_total_rel)}`], ["repeatability, this drive", `${of(J)} kg·m²  ${percent(J.repeatability_rel)}`]);
-    for (const [name, key, unit] of [["viscous friction", "viscous_nm_s_rad", "N·m·s/rad"], ["Coulomb friction", "coulomb_nm", "N·m"], ["lag of speed", "speed_lag_s", "s"], ["lag of torque", "torque_lag_s", "s"]]) {
+    for (const [name, key, unit] of [["viscous friction", "viscous_nm_s_rad", "N·m·s/rad"], ["Coulomb friction", "coulomb_nm", "N·m"], ["lag of reported speed", "speed_lag_s", "s"], ["lag of reported torque", "torque_lag_s", "s"]]) {
       const text = estimate(result[key], unit);
       if (text) rows.push([name, text]);
     }
     if (result.model) rows.push(["model", result.model]);
     for (const one of result.second_opinions || []) {
       const agrees = one.agrees === null ? "" : one.agrees ? ", agrees" : ", DISAGREES";
-      rows.push([`second opinion, ${one.route}`, `${estimate(one.inertia_kg_m2, "kg·m²")}${agrees}`]);
+      rows.push([`cross-check, ${one.route}`, `${estimate(one.inertia_kg_m2, "kg·m²")}${agrees}`]);
     }
     const card = el("div", { class: "card" },
       J ? el("p", { class: "figure" }, `J = ${ofResult(result)}`) : el("p", { class: "figure" }, result.verdict),
@@ -31,7 +31,7 @@
     parts.push(card);
     for (const one of result.warnings || []) parts.push(el("p", { class: "alarm" }, one));
     if ((result.budget || []).length) {
-      parts.push(el("h2", {}, "What makes it unsure"), region("What makes it unsure", el("table", {},
+      parts.push(el("h2", {}, "Uncertainty budget"), region("Uncertainty budget", el("table", {},
         el("tbody", {}, ...result.budget.map((one) => el("tr", {}, el("th", { scope: "row" }, one.source), el("td", {}, `± ${number(one.half_width_kg_m2, 2)} kg·m²`), el("td", { class: "dim" }, one.note)))))));
     }
     return parts;
@@ -49,14 +49,14 @@
   }
   const of = (one) => interval(one.value, one.low, one.high) ?? "–";
   const region = (label, table) => el("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": label }, table);
-  /** A table that is folded away. Cells are texts or elements. */
+  /** Make a collapsed table. Cells are texts or elements. */
   const numbers = (label, heads, rows) => el("details", {}, el("summary", {}, label), region(label, el("table", {},
     el("thead", {}, el("tr", {}, ...heads.map((one) => el("th", { scope: "col" }, one)))),
     el("tbody", {}, ...rows.map(([first, ...rest]) => el("tr", {}, el("th", { scope: "row" }, first), ...rest.map((one) => el("td", {}, one))))))));
 
   function runPage() {
     const id = document.body.dataset.run;
-    const kept = (run) => run.state + run.files.filter((one) => one !== "report.pdf").join();    // what the page was made with
+    const kept = (run) => run.state + run.files.filter((one) => one !== "report.pdf").join();    // content on which the page depends
     let shown = "", files = null;
     every(1500, async () => {
       const run = await call("GET", `/runs/${id}`);
@@ -113,7 +113,7 @@
     }
     every(3000, async () => {
       const runs = await call("GET", "/runs"), now = JSON.stringify(runs);
-      if (now === shown) return;                  // who is at a box with the keyboard stays there
+      if (now === shown) return;                  // keep the keyboard focus
       shown = now;
       show(byId("runs"), ...(runs.length ? runs.map((one) => {
         const box = el("input", { type: "checkbox", "aria-label": `compare ${one.rig}, ${when(one.asked)}`, checked: chosen.has(one.id), disabled: one.verdict === null });
@@ -129,9 +129,9 @@
 
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const ALIVE_MS = 3000;
-  const alive = () => every(ALIVE_MS, () => call("GET", "/healthz"));     // a page that asks only once says it when nobody is there any more
+  const alive = () => every(ALIVE_MS, () => call("GET", "/healthz"));     // a page with a single request also reports a lost service
 
-  /** What stands at an axis of time, by the distance of its marks in s: see uPlot's `axis.values`. */
+  /** Labels of a time axis, by the distance of its marks in s: see uPlot's `axis.values`. */
   const TIMES = [
     [365 * 86400, "{YYYY}", null, null, null, null, null, null, 1],
     [28 * 86400, "{YYYY}-{MM}", null, null, null, null, null, null, 1],
@@ -140,7 +140,7 @@
     [1, ":{ss}", "\n{YYYY}-{MM}-{DD} {HH}:{mm}", null, "\n{MM}-{DD} {HH}:{mm}", null, "\n{HH}:{mm}", null, 1],
   ];
 
-  /** Points with their intervals; series: [{colour, points: [{x, value, low, high}]}]. Drawn anew for another width or scheme. */
+  /** Points with their intervals; series: [{colour, points: [{x, value, low, high}]}]. Drawn again for another width or colour scheme. */
   function points(where, series, { label, time = false, marks = [] }) {
     const all = series.flatMap((one) => one.points);
     const xs = [...new Set(all.map((one) => one.x))].sort((a, b) => a - b);
@@ -168,7 +168,7 @@
           c.setLineDash([]);
           series.forEach((one, k) => {
             c.strokeStyle = c.fillStyle = colour(one.colour);
-            const shift = (k - (series.length - 1) / 2) * 5 * px;         // those at one place stand beside each other
+            const shift = (k - (series.length - 1) / 2) * 5 * px;         // points at one place are drawn side by side
             for (const point of one.points) {
               const x = self.valToPos(point.x, "x", true) + shift;
               if (point.low !== null && point.high !== null) {
@@ -207,7 +207,7 @@
         where.append(el("section", {}, el("h2", {}, `${quantity.name}, ${quantity.unit}`),
           el("p", { class: quantity.changes.length || quantity.drift ? "alarm" : "" }, quantity.text),
           ...quantity.changes.map((one) => el("p", {}, el("a", { href: `/compare?runs=${encodeURIComponent(one.before)},${encodeURIComponent(one.after)}` }, `Compare the runs before and after, ${when(one.before_date)} and ${when(one.after_date)}`))),
-          el("figure", {}, el("figcaption", {}, "each with its repeatability on this drive; dashed: a change"), plot),
+          el("figure", {}, el("figcaption", {}, "each point with its repeatability on this drive; dashed: a change"), plot),
           numbers(`${quantity.name} in numbers`, ["run", `${quantity.unit}, interval`], quantity.points.map((one) => [el("a", { href: `/runs/${encodeURIComponent(one.log)}` }, when(one.date)), of(one)]))));
         points(plot, [{ colour: "--c0", points: quantity.points.map((one) => ({ ...one, x: at(one.date) })) }],
           { time: true, marks: quantity.changes.map((one) => (at(one.before_date) + at(one.after_date)) / 2) });
@@ -215,7 +215,7 @@
     });
   }
 
-  // -- runs side by side
+  // -- comparison
 
   function comparePage() {
     const where = byId("compared"), runs = new URLSearchParams(location.search).get("runs") || "";
@@ -229,13 +229,13 @@
         return el("p", { class: told && told.differs ? "now alarm" : "now" }, dot(0), " ", names[0], " and ", dot(k + 1), ` ${names[k + 1]}: ${one.text}.`);
       });
       const others = comparison.differences.flatMap((one, k) => one.quantities.filter((other) => other.column !== "inertia_kg_m2").map((other) => [
-        `${other.name}, ${k + 2} against 1`, other.differs ? "differs" : "no difference seen",
+        `${other.name}, ${k + 2} against 1`, other.differs ? "differs" : "no significant difference",
         other.relative ? `${percentOf(other.change)} (${percentOf(other.low)} to ${percentOf(other.high)})` : `${number(other.change, 3)} (${number(other.low, 3)} to ${number(other.high, 3)}) ${other.unit}`]));
       const curve = (title, label, key, x) => {
         const series = comparison[key].map((found, k) => ({ colour: `--c${k}`, points: found.filter((one) => one.value !== null).map((one) => ({ ...one, x: one[x] })) }));
         if (!series.some((one) => one.points.length)) return [];
         const plot = el("div", { class: "plot", role: "img", "aria-label": title });
-        setTimeout(() => points(plot, series, { label }), 0);             // once it has a width
+        setTimeout(() => points(plot, series, { label }), 0);             // after it has a width
         return [el("h2", {}, title), el("p", { class: "row legend" }, ...names.map((name, k) => el("span", {}, dot(k), ` ${k + 1}: ${name}`))), el("figure", {}, plot),
           numbers(`${title}, in numbers`, [label, ...names], tabled(series))];
       };
@@ -244,17 +244,17 @@
           line("J, interval to quote, kg·m²", comparison.results.map((one) => interval(one.inertia_kg_m2, one.inertia_low_total_kg_m2, one.inertia_high_total_kg_m2) ?? "–")),
           line("J, repeatability, kg·m²", comparison.results.map((one) => interval(one.inertia_kg_m2, one.inertia_low_kg_m2, one.inertia_high_kg_m2) ?? "–")),
           line("verdict", comparison.results.map((one) => one.verdict))))),
-        others.length ? numbers("Friction and lags", ["quantity", "", "by how much"], others) : null,
-        ...curve("Apparent inertia, line by line, kg·m²", "frequency, Hz", "apparent_inertia", "hertz"),
+        others.length ? numbers("Friction and lags", ["quantity", "", "difference"], others) : null,
+        ...curve("Apparent inertia by frequency, kg·m²", "frequency, Hz", "apparent_inertia", "hertz"),
         ...curve("Friction, N·m", "speed, rad/s", "friction", "speed_rad_s"),
-        el("h2", {}, "Settings"), el("p", { class: "dim" }, "≠ marks what differs."),
+        el("h2", {}, "Settings"), el("p", { class: "dim" }, "≠ marks different settings."),
         region("Settings", el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...ids.map((id, k) => el("th", { scope: "col" }, dot(k), ` ${k + 1}`)))),
           el("tbody", {}, ...comparison.settings.map((one) => line(`${one.differs ? "≠ " : ""}${one.name}`, one.name === "date" ? one.values.map(when) : one.values.map((value) => ({ True: "yes", False: "no" }[value] ?? value)), one.differs))))));
     });
   }
   const percentOf = (share) => `${share > 0 ? "+" : ""}${(100 * share).toPrecision(2)} %`;
   const line = (name, values, marked = false) => el("tr", marked ? { class: "differs" } : {}, el("th", { scope: "row" }, name), ...values.map((one) => el("td", {}, one)));
-  /** A row for each place, a cell for each series; the mean where one has several points there. */
+  /** A row for each place, a cell for each series; the mean of several points at one place. */
   function tabled(series) {
     const xs = [...new Set(series.flatMap((one) => one.points.map((point) => Number(point.x.toPrecision(6)))))].sort((a, b) => a - b);
     return xs.map((x) => [number(x), ...series.map((one) => {
@@ -297,9 +297,9 @@
 
   // -- many logs
 
-  const FLEET = { running: "identifying", done: "done", interrupted: "ended before all was done", failed: "failed" };
-  const asWhat = (settings) => Object.entries(settings).map(([name, value]) => `${name} ${value}`).join(", ") || "as each run had it";
-  const stateOf = (one) => (one.held ? "waits: a shaft turns, or a drive is in use" : FLEET[one.state]) + (one.total ? `: ${one.done} of ${one.total} logs` : "") + (one.failed ? `, ${one.failed} failed` : "");
+  const FLEET = { running: "identifying", done: "done", interrupted: "ended early", failed: "failed" };
+  const asWhat = (settings) => Object.entries(settings).map(([name, value]) => `${name} ${value}`).join(", ") || "as in each run";
+  const stateOf = (one) => (one.held ? "waiting: a shaft turns, or a drive is in use" : FLEET[one.state]) + (one.total ? `: ${one.done} of ${one.total} logs` : "") + (one.failed ? `, ${one.failed} failed` : "");
 
   function fleetsPage() {
     const form = byId("ask");
@@ -332,7 +332,7 @@
       el("td", {}, row.rig || "", " ", badge(row.simulated) || ""), el("td", {}, when(row.date)), el("td", {}, row.error_kind ? `${row.error_kind}: ${row.error_text}` : `${row.verdict}${inPart(row)}`), el("td", {}, J), el("td", {}, was));
   }
 
-  // as FleetRow.part_text; rows of before know nothing of it
+  // as FleetRow.part_text; older rows have no such field
   function inPart(row) {
     if (row.aborted_stage || row.aborted_by) return `, aborted${row.aborted_stage ? ` in stage ${row.aborted_stage}` : ""}${row.aborted_by ? ` (${row.aborted_by})` : ""}`;
     return row.complete === false ? ", log cut short" : "";
@@ -340,11 +340,11 @@
 
   function fleetSummary(found) {
     const counts = [...Object.entries(found.verdicts), ...Object.entries(found.failed).map(([kind, count]) => [`failed: ${kind}`, count])];
-    const more = [["from a part of the run", (found.in_part || []).length], ["done before", found.done_before], ["other than the result in the log", found.changed.length], ["being written: left alone", found.live], ["CSV without a .yaml: left out", found.bare_traces], ["left to do", found.left]].filter(([, count]) => count);
+    const more = [["from a part of the run", (found.in_part || []).length], ["finished before", found.done_before], ["different from the result in the log", found.changed.length], ["skipped: being written", found.live], ["skipped: CSV without a .yaml", found.bare_traces], ["remaining", found.left]].filter(([, count]) => count);
     return [el("h2", {}, "Summary"), el("div", { class: "two" },
-      region("How many", el("table", {}, el("tbody", {}, ...[...counts, ...more].map(([name, count]) => line(name, [String(count)]))))),
-      el("div", {}, el("p", {}, `${found.logs} logs in ${span(found.wall_s)}, ${span(found.cpu_s)} of the processor.`),
-        found.slowest.length ? numbers("The slowest", ["log", "processor, s"], found.slowest.map((one) => [one.log, one.cpu_s.toFixed(2)])) : null))];
+      region("Number of logs", el("table", {}, el("tbody", {}, ...[...counts, ...more].map(([name, count]) => line(name, [String(count)]))))),
+      el("div", {}, el("p", {}, `${found.logs} logs in ${span(found.wall_s)}, ${span(found.cpu_s)} of processor time.`),
+        found.slowest.length ? numbers("The slowest", ["log", "processor time, s"], found.slowest.map((one) => [one.log, one.cpu_s.toFixed(2)])) : null))];
   }
 
   function fleetPage() {
@@ -359,7 +359,7 @@
     }
     every(1000, async () => {
       view = await call("GET", `/fleets/${id}`);
-      if (state !== null && view.state !== state) { count = 0; byId("rows").replaceChildren(); }      // the table has those of before, too
+      if (state !== null && view.state !== state) { count = 0; byId("rows").replaceChildren(); }      // the table also has the earlier rows
       state = view.state;
       const going = state === "running";
       byId("state").textContent = stateOf(view) + (going && view.left_s !== null ? `, about ${span(view.left_s)} left` : "");
