@@ -1,0 +1,299 @@
+"""Writes the reference pages that are made from code: ``python docs/made_pages.py``. A test fails if one is stale.
+
+| page | made from |
+|---|---|
+| reference/command-line.md | the parsers of `tdhil.cli` |
+| reference/exit-codes.md | `tdhil.errors.ExitCode` and the tree of errors |
+| reference/http-api.md | the OpenAPI document of `tdhil serve` |
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+REFERENCE = ROOT / "docs" / "reference"
+MADE = "<!-- Made by python docs/made_pages.py. Change the code, not this page. -->\n\n"
+
+_OF_PYTHON_CAN = {"interface", "channel", "bitrate", "fd", "data_bitrate", "timing", "bus_kwargs"}
+_MOST_CHOICES = 12
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The command line
+
+
+def command_line() -> str:
+    """The page of all commands and their options."""
+    from tdhil.cli.main import build_parser
+
+    out = [
+        MADE + "# Command line",
+        "",
+        "`tdhil COMMAND --help` shows the same at the terminal. `tdhil --version` shows the version.",
+        "",
+        "Options must be written out in full. Values may have a unit: `--tolerance 1%`, "
+        "`--max-time 5min`, `--amplitude 20rpm`.",
+        "",
+    ]
+    names = _commands(build_parser(None))
+    out += [
+        "| command | |",
+        "|---|---|",
+        *(f"| [`tdhil {name}`](#tdhil-{name}) | {_cell(about)} |" for name, about in names.items()),
+        "",
+    ]
+    for name, about in names.items():
+        out += _command(f"tdhil {name}", _choices(build_parser(name))[name], _sentence(about), 2)
+    return "\n".join(out).rstrip() + "\n"
+
+
+def _commands(parser: argparse.ArgumentParser) -> dict[str, str]:
+    (action,) = (one for one in parser._actions if isinstance(one, argparse._SubParsersAction))
+    return {one.dest: one.help or "" for one in action._choices_actions}
+
+
+def _choices(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            return dict(action.choices)
+    return {}
+
+
+def _command(title: str, parser: argparse.ArgumentParser, about: str, level: int) -> Iterator[str]:
+    yield from (f"{'#' * level} {title}", "", about, "")
+    python_can = False
+    for group in parser._action_groups:
+        shown = [
+            one
+            for one in group._group_actions
+            if one.help != argparse.SUPPRESS and not isinstance(one, argparse._HelpAction | argparse._SubParsersAction)
+        ]
+        python_can |= any(one.dest in _OF_PYTHON_CAN for one in shown)
+        shown = [one for one in shown if one.dest not in _OF_PYTHON_CAN]
+        if shown:
+            heading = {"options": "option", "positional arguments": "argument"}.get(group.title or "", group.title)
+            yield from (
+                f"| {_cell(heading or 'option')} | meaning |",
+                "|---|---|",
+                *(f"| {_usage(one)} | {_meaning(one, parser)} |" for one in shown),
+                "",
+            )
+    if python_can:
+        yield from (
+            "Bus options of python-can: `-i`, `-c`, `-b`, `--fd`, `--data-bitrate`, `--timing`, "
+            "`--bus-kwargs`, as `tdhil scan --help` shows them.",
+            "",
+        )
+    for name, sub in _choices(parser).items():
+        text = _commands(parser).get(name) or sub.description or ""
+        yield from _command(f"{title} {name}", sub, _sentence(text), level + 1)
+
+
+def _usage(action: argparse.Action) -> str:
+    value = action.metavar if isinstance(action.metavar, str) else action.dest.upper()
+    if not action.option_strings:
+        return f"`{value if isinstance(action.metavar, str) else action.dest}`"
+    takes = "" if action.nargs == 0 else f" {value}"
+    if action.choices is not None and action.metavar is None:
+        takes = " NAME"
+    return ", ".join(f"`{flag}{takes if flag == action.option_strings[-1] else ''}`" for flag in action.option_strings)
+
+
+def _meaning(action: argparse.Action, parser: argparse.ArgumentParser) -> str:
+    text = _cell(parser._get_formatter()._expand_help(action)) if action.help else ""
+    if action.choices is not None and len(list(action.choices)) <= _MOST_CHOICES:
+        named = ", ".join(f"`{one}`" for one in action.choices)
+        text = f"{text}: {named}" if text else named
+    return text
+
+
+def _cell(text: str) -> str:
+    """Text for a cell of a table: in one line; what looks like HTML or like another cell is escaped."""
+    return re.sub(r"\s+", " ", text).replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*").strip()
+
+
+def _sentence(text: str) -> str:
+    text = _cell(text)
+    return text if not text or text[-1] in ".?" else f"{text[0].upper()}{text[1:]}."
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Exit codes
+
+MEANING = {
+    0: ("a result", "Use it."),
+    1: ("internal error: a mistake in tdhil", "Send the archive of `tdhil support`."),
+    2: ("wrong use, or a mistake in a file", "Correct the option, or the line of the file, that the message names."),
+    3: (
+        "partial result: the log is incomplete, or the log or standard output broke off",
+        "Look at what is missing. Make room on the disk.",
+    ),
+    4: (
+        "refused before motion, or by the check of the torque's sign or of the speed's unit",
+        "Do what the message says. Nothing has moved, except in these checks.",
+    ),
+    5: ("communication lost; the shaft was stopped", "Check cable, termination, supply and the load of the computer."),
+    6: (
+        "drive fault, or reports of the drive that contradict each other; the shaft was stopped",
+        "Read the fault in the message and in the drive's manual.",
+    ),
+    7: (
+        "a limit was exceeded, or leaves no room for the excitation; the shaft was stopped",
+        "Lower the amplitude, or change the limit that the message names.",
+    ),
+    8: ("**the stop is not confirmed**", "**Use the hard-wired emergency stop.**"),
+    9: (
+        "`not_identifiable` or `model_rejected`; `tdhil evaluate`: no critical speed, or not that of the string",
+        "Run the motion that the card names.",
+    ),
+    10: (
+        "nothing can be recovered from a log, or nothing can be used of a trace",
+        "Look for another copy of the file.",
+    ),
+    11: (
+        "`tdhil tune`: the requested gains would make the string oscillate",
+        "Request a smaller `--a` or `--compensate`.",
+    ),
+    130: ("interrupted by Ctrl-C; the shaft was stopped", "Replay the log: what came before counts."),
+    143: (
+        "ended by SIGTERM, SIGHUP, SIGQUIT (Ctrl-\\\\) or SIGTSTP (Ctrl-Z); the shaft was stopped",
+        "Replay the log: what came before counts.",
+    ),
+}
+"""Exit code → what it means, what to do."""
+
+
+def exit_codes() -> str:
+    """The page of the exit codes, with the errors that end with each."""
+    from tdhil.errors import ExitCode
+
+    rows = [f"| {int(code)} | {MEANING[code][0]} | {MEANING[code][1]} |" for code in ExitCode]
+    return (
+        MADE
+        + "\n".join(
+            [
+                "# Exit codes",
+                "",
+                "The exit code of the process says how a command ended. The JSON document has it as `exit_code`.",
+                "",
+                "| exit | meaning | what to do |",
+                "|---|---|---|",
+                *rows,
+                "",
+                "128 + n means that another signal n ended the run. The shaft was stopped.",
+                "",
+                "A message has three parts: what happened, with "
+                "value and limit; what tdhil did; what to do next. The classes of errors are listed under "
+                "[errors](python/errors.md).",
+            ]
+        )
+        + "\n"
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The HTTP API
+
+
+HTTP_HEAD = r"""
+Everything is JSON. A run is requested with the options of `tdhil identify` as an object:
+
+```sh
+curl -X POST -H 'Content-Type: application/json' -H 'Idempotency-Key: 1' \
+    -d '{"seed": 7, "tolerance": "1%"}' \
+    http://127.0.0.1:8420/api/v1/rigs/simulated-canopen/runs
+```
+
+```python
+import tdhil
+
+service = tdhil.Client("http://127.0.0.1:8420")
+run = service.start("simulated-canopen", seed=7)
+found = service.wait(run["id"])
+found["result"]["inertia_kg_m2"]
+```
+
+The body of an error has the keys of the [errors](python/errors.md): `kind`, `message`, `what`, `where`, `next_step`,
+`exit_code`. An unknown key in a request is refused and named.
+
+| status | meaning |
+|---|---|
+| 405 | the address does not take this method; `Allow` lists those that it takes |
+| 409 | another process holds the drive; the body names the `holder` |
+| 429 | too many requests; `Retry-After` says when to try again |
+| 504, to a stop | the process of the run does not react; the body says what the service does |
+| 507 | the disk is full; no run starts |
+
+`WS /api/v1/live/<run>` sends a run from its start: `hello`, then `news` with samples (thinned to 25 a second), events,
+stages and the state of the run. `/metrics` is for Prometheus.
+"""
+
+
+def http_api() -> str:
+    """The page of the HTTP API, from its OpenAPI document."""
+    from tdhil.service.schemas import document
+
+    found = document()
+    out = [
+        MADE + "# HTTP API",
+        "",
+        "`tdhil serve` has this API. `/api/v1/openapi.json` is the same as an OpenAPI "
+        "document, with the schema of each body. [Run the service](../how-to/run-the-service.md) explains roles, "
+        "codes and limits.",
+        "",
+        HTTP_HEAD.strip(),
+        "",
+        "## Addresses",
+        "",
+    ]
+    for path, methods in found["paths"].items():
+        for method, one in methods.items():
+            out += [
+                f"### {method.upper()} {path}",
+                "",
+                _sentence(one.get("summary") or one.get("description") or ""),
+                "",
+            ]
+            out += [f"Role: {one['x-role']}.", ""] if "x-role" in one else []
+            out += list(_parameters(one))
+            answers: dict[str, list[str]] = {}
+            for code, answer in one.get("responses", {}).items():
+                answers.setdefault(_cell(answer.get("description", "")) + _schema(answer), []).append(code)
+            out += [
+                "| response | |",
+                "|---|---|",
+                *(f"| {', '.join(codes)} | {text} |" for text, codes in answers.items()),
+                "",
+            ]
+    return "\n".join(out).rstrip() + "\n"
+
+
+def _parameters(one: dict[str, Any]) -> Iterator[str]:
+    rows = [
+        f"| `{each['name']}` | {each['in']} | {_cell(each.get('description', ''))} |"
+        for each in one.get("parameters", ())
+    ]
+    if rows:
+        yield from ("| parameter | in | meaning |", "|---|---|---|", *rows, "")
+
+
+def _schema(answer: dict[str, Any]) -> str:
+    for media, body in answer.get("content", {}).items():
+        name = body.get("schema", {}).get("$ref", "").rpartition("/")[2]
+        return f" (`{name}`)" if name else f" ({media})" if media != "application/json" else ""
+    return ""
+
+
+PAGES = {"command-line.md": command_line, "exit-codes.md": exit_codes, "http-api.md": http_api}
+
+if __name__ == "__main__":
+    for name, make in PAGES.items():
+        (REFERENCE / name).write_text(make(), encoding="utf-8")
+        print(f"docs/reference/{name}")
