@@ -49,7 +49,7 @@ MOVING = 0.05           # of the record's highest speed: below, friction is no s
 
 @dataclass(frozen=True)
 class Trace:
-    """What the drive reported, (N,): s, rad/s, N·m."""
+    """Reported signals, (N,): s, rad/s, N·m."""
 
     time_s: FloatArray
     speed: FloatArray
@@ -127,7 +127,7 @@ def least_squares(trace: Trace) -> Answer:
     alpha = np.gradient(speed, step)
     keep = np.zeros(len(speed), np.bool_)
     keep[:: max(1, math.floor(0.5 / (cut_hz * step)))] = True
-    reach = math.ceil(0.5 / (cut_hz * step))                  # what the filter smears of ends and standstills stays out
+    reach = math.ceil(0.5 / (cut_hz * step))                  # leaves out the filter's smear of ends and standstills
     still = np.pad(~even.moving, reach, constant_values=True)
     keep &= signal.convolve(still.astype(np.float64), np.ones(2 * reach + 1), "valid") < 0.5
     columns = np.column_stack((alpha, speed, np.sign(speed)))[keep]
@@ -320,7 +320,7 @@ def main() -> None:
         folder = asked.keep or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
         random_rigs.make(folder, wanted)
-        for method in methods:                       # what is imported at the first record is no record's time
+        for method in methods:                       # imports at the first record do not count
             judged(method, random_rigs.written(folder, *wanted[0]), *wanted[0][:2])
         rows = []
         with asked.out.open("w", encoding="utf-8") if asked.out else contextlib.nullcontext() as out:

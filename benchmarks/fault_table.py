@@ -1,4 +1,4 @@
-"""Runs the fault table's own tests and writes docs/faults.md from what they saw: ``python benchmarks/fault_table.py``.
+"""Runs the fault table's own tests and writes docs/reference/faults.md from what they saw.
 
 Each row: the fault, what must happen, what was seen, the plant time from the fault to the last movement of the true
 shaft, the log's fate, the exit code, and the tests. `--keep FILE` keeps what was seen, `--from FILE` runs nothing.
@@ -20,16 +20,20 @@ from tests.faults.rows import ROWS  # noqa: E402
 
 HEAD = """# The faults, and what a run does about each
 
-The first fifty were asked for; those beyond were found by trying. Made by `python benchmarks/fault_table.py` from the
-tests that it names; a rehearsal of any scripted row is `tdhil identify --simulate --fault NAME@STAGE+2s` (`--fault
-list` shows the names). `NAME@stop` begins when the drive is first commanded to come to rest. Lying reports, sensors and
-power stages have a table of their own: `sim_bus/reports.py`.
+The first fifty faults were required. The others were found by trials. `python benchmarks/fault_table.py` makes this
+page from the tests that it names.
 
-**QS** the one stop sequence: quick stop, standstill seen, trapped torque down, only then disable · **WD** the drive's
-own watchdog stops the shaft · **R** refused before the shaft has moved · **M** the run goes on, and what was degraded
-is marked. *To rest* is plant time from the fault to the last movement of the simulated shaft (0.02 rad/s), from some
-4 rad/s unless the row says otherwise, on a ramp of 2 rad/s². A dash: nothing moved, or nothing had to stop. *Exit*: how
-the process may end.
+You can rehearse any scripted row: `tdhil identify --simulate --fault NAME@STAGE+2s` (`--fault list` shows the names).
+`NAME@stop` begins when the drive is first commanded to stop. `sim_bus/reports.py` has a table of its own, with faults
+of reports, sensors and power stages.
+
+* **QS**: the one stop sequence. It is quick stop, confirmed standstill, trapped torque brought down, and then disable.
+* **WD**: the drive's own watchdog stops the shaft.
+* **R**: refused before the shaft has moved.
+* **M**: the run continues, and the degraded part is marked.
+* *To rest*: plant time from the fault to the last movement of the simulated shaft (0.02 rad/s). Unless the row states
+  otherwise, it begins at some 4 rad/s, on a ramp of 2 rad/s². A dash: nothing moved, or nothing had to stop.
+* *Exit*: how the process may end.
 
 """
 
@@ -74,7 +78,7 @@ def with_row(text, new, number):
 
 
 def _codes(found, stated):
-    """What the row itself says, where that holds all that was seen: a case of another round may end otherwise."""
+    """Return the codes of the row itself, if they hold all that was seen: another case may end otherwise."""
     return stated if set(found) <= set(stated.split(", ")) else ", ".join(dict.fromkeys(found))
 
 
@@ -95,11 +99,11 @@ def main():
             path.unlink(missing_ok=True)
             code = run_tests(path.absolute(), options.only)
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    page, text = ROOT / "docs" / "faults.md", HEAD + table(lines)
+    page, text = ROOT / "docs" / "reference" / "faults.md", HEAD + table(lines)
     if options.only is not None:
         text = with_row(page.read_text(encoding="utf-8"), text, options.only)
     page.write_text(text, encoding="utf-8")
-    print(f"docs/faults.md: {len(lines)} observations of {len({line['row'] for line in lines})} rows")
+    print(f"docs/reference/faults.md: {len(lines)} observations of {len({line['row'] for line in lines})} rows")
     return code
 
 

@@ -1,4 +1,4 @@
-"""A thousand logs of twenty rigs, ten of them poisoned: the same table by every road, whoever is killed; what it costs.
+"""A thousand logs of twenty rigs, ten of them invalid: every way gives the same table, in spite of kills; the cost.
 
     python benchmarks/fleet_thousand.py [--logs 1000] [--roads pool one dask] [--kills 50] [--folder DIR]
     python benchmarks/fleet_thousand.py --quick [--interrupt 20]

@@ -35,7 +35,7 @@ class TooLong(BaseException):
 
 
 def run(parser: Parser, inputs: int, seed: int, first: int, seconds: float, findings: Path) -> int:
-    """How many findings; they are told and kept."""
+    """Return the number of findings; each is printed and saved."""
     corpus = parser.corpus()
     told = {"taken": 0, "refused": 0}
     found: set[str] = set()
@@ -47,7 +47,7 @@ def run(parser: Parser, inputs: int, seed: int, first: int, seconds: float, find
     logging.disable()
     with tempfile.TemporaryDirectory(prefix="fuzz-", dir=SHM if SHM.is_dir() else None) as folder:
         path = Path(folder) / f"input{parser.suffix}"
-        for data in corpus:                # imports and caches before memory is looked at
+        for data in corpus:                # imports and caches before memory is measured
             told[try_one(parser, data, path)] += 0
         before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         for number in range(first, first + inputs):

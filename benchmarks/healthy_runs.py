@@ -35,7 +35,7 @@ from profiles.library import load_profile, profile_names  # noqa: E402
 from sim_bus.shaft_judge import read_shaft  # noqa: E402
 
 ALARM = "Contradict"
-"""In the class name of what the observer raises."""
+"""Part of the class name of the observer's errors."""
 
 WIDER = 1e-9
 """An interval counts as wider from this relative difference on."""
@@ -49,7 +49,7 @@ STRING_FROM_KG_M2 = 300.0
 
 @dataclass(frozen=True)
 class Rig:
-    """What a seed has drawn: plant.yaml and rig.yaml as mappings, and how tdhil is called."""
+    """Rig drawn from a seed: plant.yaml and rig.yaml as mappings, and the command line."""
 
     seed: int
     profile: str
@@ -198,7 +198,7 @@ def work(seed: int) -> dict[str, Any]:
 
 
 def results(seeds: Sequence[int], jobs: int) -> Iterator[dict[str, Any]]:
-    """In their order."""
+    """Yield results in the order of the seeds."""
     if jobs <= 1:
         yield from map(work, seeds)
         return

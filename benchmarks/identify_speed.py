@@ -1,4 +1,4 @@
-"""What identifying an hour at 1 kHz costs, against one least-squares fit of three columns on the same arrays.
+"""Cost of identifying an hour at 1 kHz, against one least-squares fit of three columns on the same arrays.
 
     python benchmarks/identify_speed.py [--hours 1.0] [--rate 1000] [--out identify_speed.json]
 

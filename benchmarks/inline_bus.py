@@ -1,4 +1,4 @@
-"""What a stepped cycle costs with the simulator in the host's own thread, against a thread of its own.
+"""Cost of a stepped cycle with the simulator in the host's own thread, against a thread of its own.
 
     python benchmarks/inline_bus.py [--cycles 5000] [--rounds 3] [--require 1.5]
 

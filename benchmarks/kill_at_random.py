@@ -82,7 +82,7 @@ class Plan:
 
 @dataclass
 class Outcome:
-    """What came of a trial. Times in s of plant time, ``missing_s`` as the module says, ``took_s`` of wall time."""
+    """Result of a trial. Times in s of plant time, ``missing_s`` as in the module's text, ``took_s`` of wall time."""
 
     plan: Plan
     wrong: list[str]
@@ -163,7 +163,7 @@ def _check_shaft(found: Outcome, shaft: Shaft) -> None:
             wrong.append("the shaft turned without having been enabled")
         return
     lost_s = shaft.events("host heartbeat lost")[-1]
-    silent_s = _silent_from(shaft) or lost_s - plan.watchdog_s        # in real time nobody notes the last frame
+    silent_s = _silent_from(shaft) or lost_s - plan.watchdog_s        # in real time the last frame is not recorded
     found.speed_rad_s = shaft.speed_at(silent_s)
     found.lost_s = lost_s - silent_s
     found.rest_s = max(0.0, shaft.at_rest_from() - silent_s)

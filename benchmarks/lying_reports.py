@@ -85,7 +85,7 @@ def work(task: tuple[int, float, str | None]) -> dict[str, Any]:
 
 
 def results(tasks: Sequence[tuple[int, float, str | None]], jobs: int) -> Iterator[dict[str, Any]]:
-    """In their order."""
+    """Yield results in the order of the tasks."""
     if jobs <= 1:
         yield from map(work, tasks)
         return

@@ -76,7 +76,11 @@ SUBJECTS = {
     "string_release": _run("string_release", *_STOP),
     "speed_check": _run("speed_check", "test_speed_check.py", "test_angles.py", "test_five_stages.py"),
     "preconditions": _run("preconditions", "test_stop_string.py", within="_LETS_GO refuse_with_string"),
-    "observer": _run("observer", "test_observer.py", "test_standstill.py"),
+    **{
+        f"observer/{name}": _run(f"observer/{name}", "test_observer.py", "test_standstill.py")
+        for name in ("observer", "momentum_balance", "position_way", "repeated_feedback", "revival", "runaway",
+                     "shaft_bounds", "torque_following", "unanswered_torque")
+    },
     "standstill": _run("standstill", "test_standstill.py", "test_stop_feedback.py"),
     "control_loop": _run("control_loop", "test_control_loop.py", "test_deaf.py", "test_run_goes_wrong.py"),
     "steady": _run("stages/steady", "test_steady.py"),
@@ -226,7 +230,7 @@ NAMED: tuple[tuple[str, str, str], ...] = (
 """(subject, what stands there, what it becomes): lines that could be changed unnoticed once, and what came anew."""
 
 LONGEST_S, LONGEST = 90, 4
-"""A mutant that loops for ever counts as found: after so long, and after so many times what the tests take as it is."""
+"""Time limit of a mutant, s, and as a multiple of the tests' usual time: an endless loop counts as found."""
 
 _FALLS_THROUGH = "the function's last line: what falls off its end gives None, which its only caller takes alike"
 _POWER = "shows after a loss of power alone"
@@ -357,7 +361,7 @@ class Counted(ast.NodeTransformer):
 
 
 def run_tests(subject: str, changed: Changed) -> int:
-    """In this very process: pytest's exit code."""
+    """Run pytest in this process. Return its exit code."""
     import pytest
 
     forget(SUBJECTS[subject].module)
@@ -369,7 +373,7 @@ def run_tests(subject: str, changed: Changed) -> int:
 
 
 def preload() -> None:
-    """What every child needs and no mutant changes."""
+    """Import everything that each child needs and no mutant changes."""
     sys.path[:0] = [str(ROOT)]
     import hypothesis
     import numpy
@@ -388,7 +392,7 @@ def preload() -> None:
 
 
 def forget(module: str) -> None:
-    """A subject that is loaded already: all of ours is, so that nobody holds on to what it was."""
+    """Unload our modules, so that none keeps a reference to a loaded subject."""
     if module in sys.modules:
         for name in [name for name in sys.modules if name.split(".")[0] in OURS]:
             del sys.modules[name]
@@ -457,7 +461,7 @@ def delete_all(
 
 
 def as_it_is(subject: str) -> float | None:
-    """How long a mutant may take, by what the tests take on what is there; None where they fail on that."""
+    """Return the time limit of a mutant from the time of the unchanged tests; None if they fail."""
     tree = ast.parse(path_of(subject).read_text("utf-8"))
     begun_s = time.monotonic()
     _, status = os.waitpid(fork(subject, Changed(SUBJECTS[subject].module, tree, path_of(subject))), 0)

@@ -1,7 +1,7 @@
 """Endless random rigs, read as CSV traces: how far off, how wide, how often refused, and does the interval cover?
 
     python benchmarks/random_rigs.py [--rigs 60] [--records 1] [--first 0] [--cause stribeck] [--motion multisine]
-                                     [--keep DIR] [--out records.jsonl]
+                                     [--mixed] [--keep DIR] [--out records.jsonl]
 
 Each rig is drawn from its own seed: J from 0.01 to 3000 kg·m², friction of one of several laws, what its drive makes of
 its reports, how it is sampled, what disturbs it. `CAUSES` name what a rig has that makes identifying it hard; they take
@@ -77,13 +77,14 @@ class Rig:
     speed_noise: float
     torque_noise: float
     reverses: bool
+    mixed_with: str = ""
 
     @property
     def step(self) -> float:
         return 0.0025 * self.pace
 
     def friction(self, speed: float) -> float:
-        """At a positive speed."""
+        """Return the friction torque at a positive speed, N·m."""
         return (self.coulomb[0] + self.viscous * speed + self.square * speed * speed
                 + self.bell * math.exp(-((speed / self.bell_width) ** 2)))
 
@@ -91,8 +92,8 @@ class Rig:
 # -- rigs ----------------------------------------------------------------------------------------------------
 
 
-def draw(number: int) -> Rig:
-    """The rig of this number; its cause goes round."""
+def draw(number: int, mixed: bool = False) -> Rig:
+    """The rig of this number; its cause goes round. ``mixed``: a second cause, drawn at random, comes on top."""
     rng = np.random.default_rng([number, 20261])
     cause = CAUSES[number % len(CAUSES)]
     log_j = rng.uniform(math.log10(30.0), math.log10(3000.0)) if cause == "coarse" else rng.uniform(-2.0, 3.48)
@@ -115,6 +116,10 @@ def draw(number: int) -> Rig:
         0.0003 * noisy * top, 0.003 * noisy * limit, bool(rng.random() < 0.3),
     )
     CHANGES[cause](rig, rng)
+    if mixed:
+        second = CAUSES[int(np.random.default_rng([number, 20262]).integers(len(CAUSES)))]
+        CHANGES[second](rig, rng)
+        rig.mixed_with = second
     return rig
 
 
@@ -202,7 +207,7 @@ CAUSES = tuple(CHANGES)
 
 @dataclass
 class Script:
-    """What is asked for at every step, (steps,): who rules, target speed, feed-forward torque."""
+    """Request at every step, (steps,): controlled quantity, target speed, feed-forward torque."""
 
     regime: np.ndarray
     target: np.ndarray
@@ -285,7 +290,7 @@ def pulses(rig: Rig, rng: np.random.Generator) -> Script:
 
 
 def starts(rig: Rig, rng: np.random.Generator) -> Script:
-    """From standstill: up, held, coasting to rest or nearly so, a wait."""
+    """Make a script from standstill: up, held, coasting to rest or nearly so, a wait."""
     t = _time(rig, 140.0)
     regime, target = np.full(len(t), OFF), np.zeros(len(t))
     begin = 1.0
@@ -541,11 +546,12 @@ def main() -> int:
     parser.add_argument("--records", type=int, default=1, help="of each motion")
     parser.add_argument("--first", type=int, default=0, help="number of the first rig")
     parser.add_argument("--cause", choices=CAUSES, help="only rigs with this")
+    parser.add_argument("--mixed", action="store_true", help="rigs with a second cause, drawn at random")
     parser.add_argument("--motion", choices=MOTIONS, help="only this motion")
     parser.add_argument("--keep", type=Path, help="a folder for the traces, read again if they are there")
     parser.add_argument("--out", type=Path, help="every record as a line of JSON")
     asked = parser.parse_args()
-    rigs = [draw(number) for number in range(asked.first, asked.first + asked.rigs)]
+    rigs = [draw(number, asked.mixed) for number in range(asked.first, asked.first + asked.rigs)]
     wanted = [(rig, motion, record) for rig in rigs for motion in MOTIONS for record in range(asked.records)
               if asked.cause in (None, rig.cause) and asked.motion in (None, motion)]
     rows: list[Row] = []

@@ -35,7 +35,7 @@ ROOT = Path(__file__).parents[1]
 TRUE_J = 104.0                 # of the simulated rig (sim_bus.params)
 MOTION = ("--frequency", "0.2", "--periods", "4")
 ALLOWED_MISSED = 0.01
-HOG = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"    # ends with whoever began it
+HOG = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"    # ends with its parent
 SECONDS_A_RUN = 240
 
 
@@ -78,7 +78,7 @@ def interval(j: Any) -> tuple[float, float, float] | None:
 
 
 class Tally:
-    """Of all runs so far."""
+    """Counts of all runs so far."""
 
     def __init__(self) -> None:
         self.runs = self.late = self.cycles = self.missed = self.told = self.covered = 0
@@ -166,7 +166,7 @@ def ordinary() -> None:
 
 @contextmanager
 def beside(hogs: int) -> Iterator[None]:
-    """So many busy loops."""
+    """Run this number of busy loops meanwhile."""
     with ExitStack() as stack:
         for _ in range(hogs):
             # Ordinary, whatever the runs are.

@@ -1,4 +1,4 @@
-"""What a replay costs, CPU seconds: reading by each route, from the cache, identifying, and a whole `tdhil replay`.
+"""Cost of a replay, CPU seconds: reading by each way, from the cache, identifying, and a whole `tdhil replay`.
 
     python benchmarks/replay_speed.py [--log run.mcap] [--rounds 7]
 

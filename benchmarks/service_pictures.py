@@ -1,4 +1,4 @@
-"""Draws docs/service.png and docs/service-result.png: the pages of a run as it goes, and of its result.
+"""Draws docs/images/service.png and docs/images/service-result.png: the pages of a run as it goes, and of its result.
 
 ::
 
@@ -40,7 +40,7 @@ def save(page: Any, path: Path) -> None:
 def main() -> None:
     """One run, looked at twice."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path, nargs="?", default=Path(__file__).parents[1] / "docs")
+    parser.add_argument("folder", type=Path, nargs="?", default=Path(__file__).parents[1] / "docs" / "images")
     parser.add_argument("--width", type=int, default=900, metavar="PX")
     parser.add_argument("--seconds", type=float, default=2.0,
                         help="of acquiring, by this computer's clock (default 2; more where it is busy)")

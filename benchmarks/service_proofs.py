@@ -1,4 +1,4 @@
-"""What `tdhil serve` promises of its safe path, with the service as processes and simulated rigs; 1 where it doesn't.
+"""Tests of the safe path of `tdhil serve`, with the service as processes and simulated rigs; exit code 1 if one fails.
 
     python benchmarks/service_proofs.py kill [--full]      # the web is killed at random moments of runs
     python benchmarks/service_proofs.py stop [--full]      # a stop over HTTP beside all that could be in its way
@@ -74,7 +74,7 @@ TMPFS_MB = 400                     # a log isn't begun where less than 200 MB ar
 
 
 def load() -> str:
-    """Of this machine, for whoever reads the figures."""
+    """Return the load of this machine, for the reader of the figures."""
     return f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
 
 
@@ -89,7 +89,7 @@ def stage_of(server: Server, run: str) -> str | None:
 
 
 def ended_early(server: Server, run: str) -> bool:
-    """Never; a run that has ended is told of."""
+    """Report a run that has ended; it should not."""
     if (found := server.client.run(run))["state"] in ENDED:
         raise SystemExit(f"run {run} is {found['state']}: {found['error']}")
     return False
@@ -323,7 +323,7 @@ def cycles(folder: Path, turns: int, seconds: float) -> bool:
         wait_for("motion", lambda: ended_early(server, run) or stage_of(server, run) == "speed")
         for _ in range(turns):
             with viewers(server, run):
-                time.sleep(2.0)                # whoever comes gets all of it so far
+                time.sleep(2.0)                # a new viewer gets all of it so far
                 begun, used_s = time.time(), cpu_s(server.process.pid)
                 time.sleep(seconds)
                 spans.append((True, begun, time.time()))
@@ -365,7 +365,7 @@ def cycles(folder: Path, turns: int, seconds: float) -> bool:
 
 
 def braking(trace: Path, since: int) -> bool:
-    """Does a later row of the simulator's trace have the drive told to stop?"""
+    """Return whether a later row of the simulator's trace has a stop request for the drive."""
     rows = trace.read_text()[since:].splitlines()
     return any("quick stop" in row for row in rows)
 
@@ -413,7 +413,7 @@ def addresses(count: int) -> list[str]:
 
 
 def keep_idle(port: int, count: int) -> None:
-    """So many connections, in a process of its own, until it is ended; each second a line says what there is."""
+    """Hold this number of connections in a process until it is ended; print their number each second."""
     import resource
     import selectors
     import socket

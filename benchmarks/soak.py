@@ -46,7 +46,7 @@ FATES = ("fault", "fault", "fault", "Ctrl-C")
 
 @dataclass(frozen=True)
 class Standing:
-    """What this process holds."""
+    """Resources of this process."""
 
     threads: int
     sockets: int
@@ -57,7 +57,7 @@ class Standing:
 def standing() -> Standing:
     gc.collect()
     with contextlib.suppress(AttributeError, OSError):
-        ctypes.CDLL(None).malloc_trim(0)               # glibc: what is free goes back, so that only what is held counts
+        ctypes.CDLL(None).malloc_trim(0)               # glibc: free memory is returned, so that only used memory counts
     targets = []
     for entry in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):
@@ -217,7 +217,7 @@ def one_run(bus: str, number: int, seed: int, course: Course, folder: Path) -> D
 
 
 def slope(values: list[int]) -> float:
-    """Of the straight line through them, per step."""
+    """Return the slope of the straight line through the values, per step."""
     import numpy as np
 
     return float(np.polyfit(np.arange(len(values)), np.array(values, float), 1)[0]) if len(values) > 1 else 0.0

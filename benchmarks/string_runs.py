@@ -50,12 +50,12 @@ CASES = {
     "bit-prbs": ("plant_stick_slip.yaml", ON_BOTTOM),
 }
 BIT_NOISE = "noise: {bottom_load_nm: 500.0}\n"
-"""Of the cases `bit` and `bit-prbs`: what the bit scatters by."""
+"""Random load of the bit in the cases `bit` and `bit-prbs`."""
 
 
 @dataclass
 class Tally:
-    """Of one case."""
+    """Counts of one case."""
 
     runs: int = 0
     errors: list[float] = field(default_factory=list)

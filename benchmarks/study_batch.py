@@ -1,4 +1,4 @@
-"""What a simulated second of the paper's loop costs, and how that grows with the number of runs side by side.
+"""Cost of a simulated second of the paper's loop, and its growth with the number of parallel runs.
 
     python benchmarks/study_batch.py [--steps 5000]
 

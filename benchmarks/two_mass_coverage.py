@@ -38,7 +38,7 @@ MOST_MISSES = 0.05
 
 
 def stated(seed: int) -> LagPrior:
-    """What a manual may say: as wrong as its own deviation allows."""
+    """Return a manual's statement of the lags, with a random error of its own deviation."""
     wrong = np.random.default_rng([seed, 1]).standard_normal(2)
     return LagPrior(LAGS_S[0] * (1.0 + LAG_REL_SD * wrong[0]), LAGS_S[0] * LAG_REL_SD,
                     LAGS_S[1] * (1.0 + LAG_REL_SD * wrong[1]), LAGS_S[1] * LAG_REL_SD, "the manual")

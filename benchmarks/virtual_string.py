@@ -55,7 +55,7 @@ SETTLE_S = 20.0
 
 
 def params(law: SpeedController, *, real: bool, lags_s: tuple[float, float] = (0.40, 0.15)) -> RigParams:
-    """Of the simulated drive: with a string on it, or a rigid shaft."""
+    """Return parameters of the simulated drive: with a string, or a rigid shaft."""
     drive = DriveParams(rated_torque_nm=20_000, torque_limit_nm=30_000, speed_limit_rpm=250,
                         speed_gain_nm_s_rad=law.gain_nm_s_rad, speed_integral_gain_nm_rad=law.integral_nm_rad)
     shaft = {"inertia_kg_m2": 1500.0, "viscous_nm_s_rad": 8.0, "coulomb_nm": 60.0}
@@ -65,7 +65,7 @@ def params(law: SpeedController, *, real: bool, lags_s: tuple[float, float] = (0
 
 
 def really_turns(law: SpeedController, set_rpm: float, seed: int) -> bool:
-    """Does a bit that is about to break away end turning within 60 s, below a top that turns at full speed?"""
+    """Return whether a bit near breakaway turns after 60 s, below a top that turns at full speed."""
     inverter = Inverter(params(law, real=True), np.random.default_rng(seed))
     control, speed = inverter.control, set_rpm * RPM
     control.speed(speed)

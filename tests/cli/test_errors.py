@@ -75,7 +75,9 @@ def test_what_cant_be_understood_is_a_document_where_one_was_asked_for(
     shown = capsys.readouterr()
     document = json.loads(shown.out)
     assert (document["exit_code"], document["error"]["kind"]) == (2, "UsageError")
-    assert shown.err == f"tdhil: {document['error']['message']}\n"
+    error = document["error"]
+    assert error["code"].startswith("TDH-2")
+    assert shown.err == f"tdhil: {error['message']} [{error['code']}]\n"
 
 
 @pytest.mark.parametrize(("typed", "meant"), [("flet", "Did you mean 'fleet'? "), ("xyzzy", "")])
@@ -83,7 +85,7 @@ def test_a_command_that_there_is_not_is_named_with_what_was_meant(
     typed: str, meant: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([typed, "logs"]) == 2
-    assert capsys.readouterr().err == f"tdhil: there is no command '{typed}'. {meant}See tdhil --help\n"
+    assert capsys.readouterr().err == f"tdhil: there is no command '{typed}'. {meant}See tdhil --help [TDH-201]\n"
 
 
 def test_without_json_a_wrong_value_is_a_line_on_stderr_alone(capsys: pytest.CaptureFixture[str]) -> None:

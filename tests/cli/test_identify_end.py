@@ -91,7 +91,7 @@ def test_the_document_says_the_same(ends, stop, code, said):
     got, out, _ = ends(CAUSES["limit"][0], stop, ExitCode.OK, "--json")
     document = json.loads(out)
     assert got == document["exit_code"] == code
-    assert document["error"] == {"kind": "LimitHit", "message": str(CAUSES["limit"][0])}
+    assert document["error"] == {"kind": "LimitHit", "message": str(CAUSES["limit"][0]), "code": "TDH-700"}
     assert said in document["stop"] and document["log"] == "run.mcap"
     assert document["stages"] == [
         {"name": "setup", "outcome": "ok", "duration_s": 3.0},

@@ -32,7 +32,7 @@ def test_the_confirmation_says_it_and_asks_for_somebody_at_the_stop() -> None:
     assert "--accept" not in armed
     unarmed = motion_summary(preflight(0.0), LIMITS, ExcitationRequest())
     assert "watchdog        NONE, accepted by --accept-no-watchdog: the drive will not stop by itself" in unarmed
-    assert "[ ] somebody stands at that stop for the whole run" in unarmed
+    assert "[ ] an operator stays at that stop for the whole run" in unarmed
     assert unarmed.count("[ ]") == armed.count("[ ]") + 1
 
 

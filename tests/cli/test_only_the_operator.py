@@ -39,7 +39,7 @@ def test_a_file_does_not_confirm(tmp_path, capsys, monkeypatch, value):
     assert main(["identify", "--rig", str(path), "-i", "socketcan", "-c", "can0"]) == 2
     said = capsys.readouterr().err
     assert "rig.yaml:11:" in said
-    assert "a file never speaks for who stands at the shaft" in said
+    assert "belongs to one run, never to a file" in said
     assert "--yes" in said
     assert not list(tmp_path.glob("*.mcap"))
 
@@ -86,7 +86,7 @@ def test_no_standard_input_is_nobody_at_the_prompt(monkeypatch):
     monkeypatch.setattr("tdhil.session.confirm.motion_summary", lambda *_: "")
     task = SimpleNamespace(limits=MachineLimits, request=ExcitationRequest)
     preflight = SimpleNamespace(identity=Identity(1, 2, 3, 4, "drive", False))
-    with pytest.raises(PreflightRefused, match="nobody is there"):
+    with pytest.raises(PreflightRefused, match="no operator can confirm"):
         confirm_motion(
             task, preflight, lambda: None, yes=False, console=Console(quiet=True), pause_display=lambda: None
         )

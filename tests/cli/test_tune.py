@@ -13,7 +13,7 @@ from tdhil.cli.main import main
 from tdhil.errors import ExitCode
 from tdhil.report import showcase_of, tuning_document, write_tuning_report
 from tdhil.report.tuning import TunedFor, tuning_report
-from tdhil.soft_torque import CriticalSpeeds, Interval, Search, TuneCase, tune
+from tdhil.soft_torque import CriticalSpeeds, DrawnValues, Interval, Search, TuneCase, tune
 from tests.soft_torque.cases import DRIVE, STRING
 
 STRING_YAML = Path(__file__).parents[2] / "examples" / "string.yaml"
@@ -85,11 +85,11 @@ def test_the_terminal_says_what_it_rests_on_and_what_to_type(tuned):
     (("--loop", "bus", "--a", "1.5"), {}, 11, "is beyond ζ/(ω² J Στ)"),
     ((), {"inertia_kg_m2": None, "verdict": "not_identifiable"}, 11, "no J to tune for (not_identifiable)"),
     ((), {"inertia_kg_m2": None, "verdict": "not_identifiable", "impedance": {"verdict": "valid"}}, 11,
-     "as --impedance"),
+     "with --impedance"),
     ((), {"verdict": "model_rejected"}, 11, "no J to tune for (model_rejected)"),
-    (("--loop", "bus"), {"speed_lag_s": None}, 2, "how late the reported speed is"),
+    (("--loop", "bus"), {"speed_lag_s": None}, 2, "no lag of the reported speed"),
     (("--a", "20"), {}, 2, "--a: 20: must be from 0.01 to 10"),
-    (("--inner-lags", "0"), {}, 2, "no lag at all"),
+    (("--inner-lags", "0"), {}, 2, "there is no lag in the drive's loop"),
     (("--profile", "nobody/none"), {}, 2, "nobody/none"),
 ])
 def test_what_is_refused(tuned, words, said, code, message):
@@ -121,11 +121,11 @@ def test_without_a_string_k_and_j_l_are_as_the_result_has_them(tuned):
     assert document["string"]["modes_hz"][0] == pytest.approx(0.1299, rel=1e-4)
     assert document["string"]["name"] == "k and J_L as identified (two-mass)"
     soft = document["controllers"][1]
-    # the exact string of the reference case has 0.28; and I = ω² J has what is open of ω
-    assert soft["least_damping"]["value"] == pytest.approx(0.28, abs=0.02)
+    # I = (φω)² J has what is open of ω
+    assert soft["least_damping"]["value"] > 0.1
     own = soft["integral_nm_rad_by_inertia"]
     assert own["low"] / own["value"] == pytest.approx(1.0 - math.hypot(0.04, 0.029), abs=0.002)
-    assert any("name the pipe in a string.yaml" in warning for warning in document["warnings"])
+    assert any("describe the pipe in a string.yaml" in warning for warning in document["warnings"])
     # nothing that rests on waves which nobody has seen
     assert [one["kind"] for one in document["controllers"] if one["refused"]] == ["compensated", "broadband"]
     code, document, _ = tuned("--compensate", "0.2", string=None, compliant=compliant())
@@ -134,7 +134,7 @@ def test_without_a_string_k_and_j_l_are_as_the_result_has_them(tuned):
 
 @pytest.mark.parametrize(("said", "words"), [
     ({}, "--string is missing, and the result is of a rigid shaft"),
-    ({"compliant": compliant(stiffness_nm_rad=None)}, "leaves the spring's stiffness or its swing open"),
+    ({"compliant": compliant(stiffness_nm_rad=None)}, "does not determine the spring's stiffness or load"),
 ])
 def test_without_either_the_string_is_asked_for(tuned, said, words):
     code, document, _ = tuned(string=None, **said)
@@ -144,7 +144,7 @@ def test_without_either_the_string_is_asked_for(tuned, said, words):
 
 def test_files_that_are_none_are_named(tmp_path, capsys):
     wrong = tmp_path / "wrong.json"
-    for text, message in (("{}", "no result of tdhil identify"), ("not json", "neither a log nor JSON")):
+    for text, message in (("{}", "not a result of tdhil identify"), ("not json", "neither a log nor JSON")):
         wrong.write_text(text, encoding="utf-8")
         assert main(["tune", str(wrong), "--string", str(STRING_YAML)]) == ExitCode.USAGE
         assert message in capsys.readouterr().err
@@ -160,16 +160,20 @@ def test_files_that_are_none_are_named(tmp_path, capsys):
 def test_the_page_has_the_pictures_and_the_speeds(tmp_path):
     """Stick-slip is shown at a set speed between the two cure speeds, here given and not searched for."""
     pytest.importorskip("matplotlib")
-    tuning = tune(TuneCase(STRING, DRIVE, Interval(1500.0, 1440.0, 1560.0), 60.0, 0.2, 0.4), None)
-    speeds = {"stiff": CriticalSpeeds(None, 150.0, 24.0), "soft": CriticalSpeeds(61.0, 62.0, 22.0)}
+    tuning = tune(TuneCase(STRING, DRIVE, Interval(1500.0, 1440.0, 1560.0)), None)
+    speeds = {"stiff": CriticalSpeeds(None, 150.0), "soft": CriticalSpeeds(61.0, 62.0)}
+    noisy = {"stiff": DrawnValues((180.0, 170.0)), "soft": DrawnValues((60.0, 66.0))}
     tuning = replace(tuning, searched=Search(highest_rpm=160.0), tuned=tuple(
-        replace(one, critical=speeds[one.kind], critical_low=speeds[one.kind], critical_high=speeds[one.kind])
+        replace(one, critical=speeds[one.kind], critical_along=(speeds[one.kind],) * 5, cure=noisy[one.kind],
+                start=noisy[one.kind], linear_limit=noisy[one.kind])
         for one in tuning.tuned if one.kind in speeds))
     document = tuning_document(tuning, TunedFor("result.json", True, None, 1.0, "drive", "as stated"))
     json.dumps(document, allow_nan=False)
     stiff, soft = document["controllers"][:2]
     assert stiff["critical_rpm"]["cure"]["value"] is None      # above all that were tried
-    assert soft["critical_rpm"]["cure"] == {"value": 61.0, "low": 61.0, "high": 61.0}
+    cure = soft["critical_rpm"]["cure"]
+    assert cure["value"] == 61.0
+    assert 58.5 < cure["low"] < 60.0 and 62.0 < cure["high"] < 63.5      # the simulation's own error
     showcase = showcase_of(tuning, seconds=20.0)
     assert showcase is not None
     assert 61.0 < showcase.set_rpm < 160.0
@@ -236,12 +240,66 @@ def test_stated_lags_go_before_measured_ones(tuned, measured):
 
 
 @pytest.mark.parametrize(("said", "code", "words"), [
-    ({"impedance": None}, ExitCode.USAGE, "wasn't measured"),
+    ({"impedance": None}, ExitCode.USAGE, "did not measure"),
     ({"impedance": impedance(verdict="model_rejected", reason="a reference filter")}, 11, "a reference filter"),
-    ({"impedance": impedance(gain_nm_s_rad=None)}, ExitCode.USAGE, "no number"),
+    ({"impedance": impedance(gain_nm_s_rad=None)}, ExitCode.USAGE, "not a number"),
     ({"gear_ratio": 4.0}, ExitCode.USAGE, "gear ratio"),
 ])
 def test_what_is_no_measured_impedance_of_this_shaft_is_refused(tuned, measured, said, code, words):
     found, _, err = tuned(*measured(**said), as_json=False)
     assert found == code
     assert words in err
+
+
+def test_the_first_sentence_says_what_changes(tuned):
+    """Typed gains are a row like the others, and the sentence compares with them."""
+    code, document, _ = tuned("--present", "40", "30")
+    assert code == 0
+    assert [one["kind"] for one in document["controllers"]][:2] == ["present", "stiff"]
+    assert document["controllers"][0]["at_main_shaft"]["gain_nm_s_rad"] == pytest.approx(4000.0)
+    sentence = document["advice"]["sentence"]
+    assert sentence.startswith("Type in the soft gains. Compared with the present gains:")
+    assert "phase margin" in sentence and "°" in sentence
+    _, text, _ = tuned("--present", "40", "30", as_json=False)
+    assert " ".join(text.split()).startswith(sentence)
+
+
+def test_a_very_soft_request_is_refused_with_its_margin(tuned):
+    """a = 5 damps by 0.02, less than the stiff loop: it ends with 11, and says which margin is missing."""
+    code, document, _ = tuned("--a", "5")
+    assert code == 11
+    assert "a = 5 leaves too little margin: phase margin" in document["error"]["message"]
+    assert "(limit 30°)" in document["error"]["message"]
+
+
+def test_thin_present_gains_are_told_in_words(tuned):
+    """Gains that lose all phase somewhere in the sampled cases are named with the number and the limit."""
+    code, text, _ = tuned("--present", "2.965", "9.993", as_json=False)
+    assert code == 0
+    assert "present: thin margins, phase margin" in " ".join(text.split())
+
+
+def test_other_margins_can_be_asked_for(tuned):
+    _, document, _ = tuned("--margins", "45", "9", "50ms")
+    assert document["required_margins"] == {"phase_deg": 45.0, "gain_db": 9.0, "dead_time_s": 0.05}
+    for one in document["controllers"]:
+        if not one["refused"] and one["kind"] != "stiff":
+            assert one["margins"]["worst"]["phase_deg"] >= 45.0
+    code, document, _ = tuned("--margins", "45", "much", "50ms")
+    assert code == ExitCode.USAGE and "--margins 30 6 20ms" in document["error"]["message"]
+
+
+def test_an_identified_pipe_keeps_its_impedance(tuned):
+    """k, f and J_L known to 0.3 % leave one uniform pipe: ζ 296 of the reference case, and compensation is possible."""
+    def near(value):
+        return interval(value, value * 0.997, value * 1.003)
+
+    shaft = {"stiffness_nm_rad": near(3.1412), "antiresonance_hz": near(0.129948),
+             "damping_nm_s_rad": None, "load_inertia_kg_m2": near(3.74)}
+    code, document, _ = tuned(string=None, model="string", compliant=shaft)
+    assert code == 0
+    assert document["string"]["impedance_nm_s_rad"] == pytest.approx(296.5, rel=0.01)
+    assert document["string"]["echo_s"] == pytest.approx(1.888, rel=0.01)
+    compensated = next(one for one in document["controllers"] if one["kind"] == "compensated")
+    assert not compensated["refused"] or "margin" in compensated["refused"]
+    assert any("the pipe is the one" in warning for warning in document["warnings"])

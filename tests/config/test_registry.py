@@ -128,7 +128,7 @@ def test_what_a_toy_excitation_says_of_itself_is_heeded():
         refuse_hopeless(ExcitationRequest("stairs"), ("speed",), LIMITS, GUESS, KNOWN)
     string = MachineLimits(0.5, 10.0, 400.0, 900.0, load="string", torque_ramp_nm_s=50.0)
     refuse_by_plan(string, ExcitationRequest("two-tones"), lets_go=False)
-    with pytest.raises(tdhil.TdhilError, match="stairs was asked for, and a drill string"):
+    with pytest.raises(tdhil.TdhilError, match="stairs is not possible with a drill string"):
         refuse_by_plan(string, ExcitationRequest("stairs"), lets_go=False)
 
 
@@ -365,7 +365,7 @@ def test_a_run_on_a_toy_bus_goes_all_the_way(toy_bus, capsys):
     assert (logged["drive"], logged["profile"]["name"]) == ("toy", "wood/toy")
     assert [frame.data for frame in read_frames(Path("run.mcap"))] == [b"hello"]
     assert main(["export", "run.mcap", "--to", "candump"]) == 2           # the toy's frames are no CAN frames
-    assert "has no CAN frames in it" in capsys.readouterr().err
+    assert "contains no CAN frames" in capsys.readouterr().err
 
 
 def test_scan_and_doctor_ask_the_toy_bus(toy_bus, capsys):
@@ -382,7 +382,7 @@ def test_scan_and_doctor_ask_the_toy_bus(toy_bus, capsys):
     assert main(["profiles", "show", "toy.yaml"]) == 0
     assert "A toy of wood" in capsys.readouterr().out
     assert main(["rig", "new", "new.yaml", "--profile", "toy.yaml", "--load", "none"]) == 0
-    assert "where the drive is: a peg" in capsys.readouterr().err
+    assert "the drive's address: a peg" in capsys.readouterr().err
     assert "#peg:" in Path("new.yaml").read_text()
 
 
@@ -391,16 +391,16 @@ def test_the_command_line_tells_a_toy_from_the_other_buses(toy_bus, capsys):
     assert main(["stop", "--peg", "7"]) == 8
     assert "peg 7: nobody there" in capsys.readouterr().err
     for arguments, said in (
-        (["--drive", "toy", "--host", "a"], "--host: belongs to Modbus. A Toy drive is named by --peg"),
-        (["--drive", "modbus", "--peg", "7"], "--peg: belongs to Toy."),
+        (["--drive", "toy", "--host", "a"], "belongs to Modbus, but the drive is on Toy. Name a Toy drive with --peg"),
+        (["--drive", "modbus", "--peg", "7"], "--peg: belongs to Toy, but"),
         (["--drive", "toy", "--profile", "generic/modbus"], "is a profile for modbus, and --drive says toy"),
-        (["--peg", "7", "--stepped"], "a Toy line has no SYNC to step by"),
+        (["--peg", "7", "--stepped"], "a Toy line has no SYNC, so it can't be stepped"),
     ):
         assert main(["identify", *arguments]) == 2
         assert said in " ".join(capsys.readouterr().err.split())
     Path("wired.yaml").write_text("drive: toy\nbus: {interface: socketcan, channel: can0}\n")
     assert main(["identify", "--rig", "wired.yaml"]) == 2
-    assert "wired.yaml:2: bus: says where a drive is, but the drive is on toy" in capsys.readouterr().err
+    assert "wired.yaml:2: bus: gives a drive's address, but the drive is on toy" in capsys.readouterr().err
     assert main(["identify", "--fault", "list"]) == 0
     assert "--drive toy\n\nbite: the toy bites" in capsys.readouterr().out
 

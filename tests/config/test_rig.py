@@ -59,6 +59,9 @@ run:
   model: two-mass
   impedance: offset
   string_impedance_nm_s_rad: 296.5
+  simulated_torque_scale: 1.05
+  simulated_speed_scale: 0.99
+  simulated_added_inertia_kg_m2: 55
 accept_unverified: [watchdog, likely]
 modbus: {host: 192.0.2.10, port: 5020, unit: 7}
 """
@@ -101,7 +104,7 @@ def test_an_almost_empty_rig_will_do(tmp_path: Path) -> None:
         ("speed_min_rad_s: 1", "speed_min_rad_s: 9", 7, "must be below speed_max_rad_s, which is 8.5"),
         ("speed_min_rad_s: 1", "speed_min_rad_s: -1", 7, "allow_reverse"),
         ("probe_torque_nm: 150", "probe_torque_nm: 500", 13, "must not be above torque_nm"),
-        ("quick_stop_rad_s2: 2", "quick_stop_rad_s2: 0.05", 11, "in 170 s; more than 90 s is no stop: give 0.094"),
+        ("quick_stop_rad_s2: 2", "quick_stop_rad_s2: 0.05", 11, "in 170 s, more than the limit of 90 s: give 0.094"),
         ("make_up_torque_nm: 900", "make_up_torque_nm: 400", 9, "must be below make_up_torque_nm, which is 400"),
         ("torque_ramp_nm_s: 50\n", "", 16, "string needs 'torque_ramp_nm_s'"),
         ("watchdog_s: 0.25", "watchdog_s: 0.02", 12, "at least 5 cycles (0.025 s"),
@@ -114,11 +117,11 @@ def test_an_almost_empty_rig_will_do(tmp_path: Path) -> None:
         ("allow_reverse: false", "allow_reverse: off", 19, "write false"),
         ("ratio: 10.5", "ratio: 0", 15, "at least 1e-06"),
         ("confidence: 0.99", "confidence: 95", 34, "less than 1"),
-        ("accept_unverified: [watchdog, likely]", "accept_unverified: likely", 47, "a list"),
-        ("unit: 7}", "unit: 256}", 48, "at most 255"),
-        ("unit: 7}", "serial: /dev/ttyUSB0}", 48, "exclude each other"),
-        ("host: 192.0.2.10, port: 5020, unit: 7", "serial: /dev/ttyUSB0, unit: 250", 48, "1 to 247 on a serial line"),
-        ("host: 192.0.2.10, port: 5020", "serial: /dev/ttyUSB0, parity: none", 48, "'N', 'E' or 'O'"),
+        ("accept_unverified: [watchdog, likely]", "accept_unverified: likely", 50, "a list"),
+        ("unit: 7}", "unit: 256}", 51, "at most 255"),
+        ("unit: 7}", "serial: /dev/ttyUSB0}", 51, "exclude each other"),
+        ("host: 192.0.2.10, port: 5020, unit: 7", "serial: /dev/ttyUSB0, unit: 250", 51, "1 to 247 on a serial line"),
+        ("host: 192.0.2.10, port: 5020", "serial: /dev/ttyUSB0, parity: none", 51, "'N', 'E' or 'O'"),
         ("  speed_lag_s: 0.4\n", "  speed_lag_s: 0.4\n  parameters: {speed_scaling: fast}\n", 24, "a number"),
     ],
 )

@@ -122,7 +122,7 @@ def test_a_place_on_the_other_bus_is_no_wish_for_the_simulator(tmp_path, monkeyp
     (problem,) = caught.value.problems
     section, line = OTHER_BUS[text]
     assert problem.line == line
-    assert problem.message.startswith(f"{section}: says where a drive is")
+    assert problem.message.startswith(f"{section}: gives a drive's address")
     assert "--simulate" in problem.message
 
 

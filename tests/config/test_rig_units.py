@@ -68,7 +68,7 @@ def test_a_key_in_the_manual_s_unit(tmp_path, ours, key, written, value):
     ({"torque_nm": "1e308"}, "", 4, "must be at most 1e+07"),
     ({}, "run: {seed: 500k}", 10, "a number alone: this key has no unit"),
     ({}, "run: {periods: 5 periods}", 10, "a number alone: this key has no unit"),
-    ({}, "bus: {bitrate: 500}", 10, "500 bit/s is none of CAN's; 500k is one: 500000"),
+    ({}, "bus: {bitrate: 500}", 10, "500 bit/s is not a CAN bit rate; 500k is one: 500000"),
     ({}, "bus: {bitrate: 240k}", 10, "the nearest is 250000"),
     ({}, "bus: {bitrate: 15 min}", 10, "a bit rate is wanted"),
 ])
@@ -119,7 +119,7 @@ def test_the_command_line_and_the_environment_know_the_same_rates(monkeypatch, t
     from tdhil.session.buses.can_bus import bus_config
 
     monkeypatch.setenv("HOME", str(tmp_path))
-    with pytest.raises(UsageError, match="500 bit/s is none of CAN's"):
+    with pytest.raises(UsageError, match="500 bit/s is not a CAN bit rate"):
         bus_config({"interface": "socketcan", "bitrate": 500})
     monkeypatch.setenv("CAN_BITRATE", "500")
     with pytest.raises(UsageError, match=r"CAN_BITRATE: bitrate 500 bit/s"):

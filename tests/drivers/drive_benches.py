@@ -34,6 +34,7 @@ class TamperedBus:
     def __init__(self, bus):
         self._bus = bus
         self.channel_info = bus.channel_info
+        self.answers_at_once = getattr(bus, "answers_at_once", False)
         self.coming = deque()
         self.change = lambda message: [message]       # what a frame becomes
         self.on_sync = lambda: None

@@ -121,6 +121,19 @@ def test_in_stepped_time_a_peer_that_says_nothing_is_dead_in_the_end(wire, link,
         assert fake_time.now_s - begin_s == pytest.approx(waits_s, abs=1e-6)
 
 
+def test_a_stepped_peer_that_answers_at_once_is_not_waited_for(wire, frames, fake_time):
+    wire.answers_at_once = True
+    link, begun_s = CanLink(wire, SteppedClock(), frames.append), fake_time.monotonic()
+    link.asks = True
+    wire.put(0x181, b"\x01")
+    wire.put(0x281, b"\x02")
+    assert not link.await_answer(lambda: False, PEER_DEAD_S)
+    assert [frame.identifier for frame in frames] == [0x181, 0x281]
+    wire.put(0x181, b"\x03")
+    assert link.await_answer(lambda: len(frames) == 3, PEER_DEAD_S)
+    assert fake_time.monotonic() == begun_s
+
+
 def test_a_babbling_bus_does_not_hold_the_loop(wire, link, fake_time):
     def babble(timeout):
         fake_time.sleep(0.0001)

@@ -51,9 +51,9 @@ REMAPPED = ((0x1800, 1, DISABLED | 0x181), (0x1A00, 0, 0), (0x1A00, 2, 0x6074001
 
 @pytest.mark.parametrize(("writes", "where", "words"), [
     (REMAPPED, "1A00h:2", ("TPDO1 mapping", "60770010h", "60740010h")),
-    (((0x1800, 3, 1),), "1800h:3", ("TPDO1", "0 was set, 1 stands")),
-    (((0x1800, 5, 7),), "1800h:5", ("TPDO1", "0 was set, 7 stands")),
-    (((0x1801, 2, 100),), "1801h:2", ("TPDO2", "5 was set, 100 (64h) stands")),
+    (((0x1800, 3, 1),), "1800h:3", ("TPDO1", "0 was set, 1 is there now")),
+    (((0x1800, 5, 7),), "1800h:5", ("TPDO1", "0 was set, 7 is there now")),
+    (((0x1801, 2, 100),), "1801h:2", ("TPDO2", "5 was set, 100 (64h) is there now")),
     (((0x1801, 1, DISABLED | 0x281),), "1801h:1", ("TPDO2", "80000281h")),
 ])
 def test_what_the_panel_changes_is_found_within_a_round_and_named(run, writes, where, words):

@@ -92,7 +92,7 @@ def test_pre_operational_and_start_in_quick_succession_are_noticed(drive, wire, 
     """No heartbeat shows it: the drive is operational again when the next one comes."""
     wire.put(0x000, bytes((0x80, target)))
     wire.put(0x000, bytes((0x01, target)))
-    with pytest.raises(CommunicationLost, match="NMT state pre-operational, by a command"):
+    with pytest.raises(CommunicationLost, match="another master put the drive into NMT state pre-operational"):
         cycles(drive, wire, 3)
     assert [line for line in drive.remarks() if "NMT start" in line]
 
@@ -101,4 +101,4 @@ def test_commands_to_other_nodes_and_a_start_are_no_trouble(drive, wire):
     wire.put(0x000, bytes((0x80, 5)))
     wire.put(0x000, bytes((0x01, 0)))
     assert cycles(drive, wire, 20) is PowerState.ENABLED
-    assert drive.remarks() == ("somebody else sent NMT start to all nodes",)
+    assert drive.remarks() == ("another master sent NMT start to all nodes",)

@@ -51,5 +51,5 @@ def test_reading(wire, peer, profile):
     assert (found.speed_lag_s, found.torque_lag_s) == (pytest.approx(0.4), None)
     assert "2504h" in found.source
     assert notes == [
-        ("speed filter", "400 ms", "2504h"), ("torque filter", "the drive does not tell", "2505h"),
+        ("speed filter", "400 ms", "2504h"), ("torque filter", "not reported by the drive", "2505h"),
     ]

@@ -98,7 +98,7 @@ def test_a_stall_is_told_before_what_the_drive_did_meanwhile(drive, peer, wire, 
 def test_a_short_stall_is_told_before_a_heartbeat_that_is_missing(drive, peer, wire, fake_time):
     """0.2 s are borne; but the drive's heartbeat, which stops then, is not the drive's alone to answer for."""
     fake_time.sleep(0.2)
-    with pytest.raises(CommunicationLost, match=r"still for 0\.20 s; after that: the drive's heart") as e:
+    with pytest.raises(CommunicationLost, match=r"still for 0\.20 s. After that: the drive's heart") as e:
         for _ in range(200):
             drive.exchange(TURN)
     assert e.value.next_step == LOWER_THE_RATE
@@ -115,14 +115,14 @@ def test_a_watchdog_that_acted_on_many_late_cycles_is_told_with_them(drive, wire
             drive.exchange(TURN)
     assert caught.value.what.startswith("host or adapter late ("), caught.value.what
     assert "8130h" in caught.value.what
-    assert caught.value.where == "host or bus, as node 1 tells it"
+    assert caught.value.where == "host or bus, reported by node 1"
     assert caught.value.next_step == LOWER_THE_RATE
 
 
 def test_a_watchdog_that_acted_though_the_loop_was_in_time_is_the_hosts_or_the_buss(drive, wire):
     """The frames were sent; whether they came through nobody here can tell, but it isn't the drive's doing."""
     wire.put(0x081, bytes.fromhex("3081110000000000"))
-    with pytest.raises(CommunicationLost, match=r"^host or bus, as node 1 tells it: the drive's watchdog has acted"):
+    with pytest.raises(CommunicationLost, match=r"^host or bus, reported by node 1: the drive's watchdog has tripped"):
         for _ in range(5):
             drive.exchange(TURN)
 
@@ -296,6 +296,6 @@ def test_a_long_stall_and_a_bus_that_is_off_on_waking(drive, peer, wire, fake_ti
     assert any("bus-off" in text for text in told)
     assert [data for data in wire.of(0x201) if data[0] & 0x0F == 0x0F] == [], "an enabling word after a stall"
     wire.sent.clear()
-    with pytest.raises(CommunicationLost, match="bus-off: nothing is sent"):
+    with pytest.raises(CommunicationLost, match="bus-off: transmission has ended"):
         drive.poll()
     assert wire.sent == []

@@ -69,7 +69,7 @@ def test_no_number_is_left(make, wire, peer):
         wire.put(0x700 + number, b"\x05", 0.5)
     drive = make(MonotonicClock())
     drive.connect()
-    with pytest.raises(PreflightRefused, match="none is left"):
+    with pytest.raises(PreflightRefused, match="none is free"):
         drive.preflight(LIMITS)
 
 
@@ -79,7 +79,7 @@ def test_one_that_comes_before_motion_is_refused(make, wire):
     go(drive, wire, 0.5)
     wire.put(0x77F, b"\x05")
     go(drive, wire, 0.1)
-    with pytest.raises(PreflightRefused, match="bears this host's number 127"):
+    with pytest.raises(PreflightRefused, match="uses this host's number 127"):
         drive.enable(Mode.SPEED)
 
 
@@ -92,7 +92,7 @@ def test_one_that_comes_in_motion_ends_the_run_with_its_second_beat(make, wire):
     assert any("77Fh" in line for line in drive.remarks())
     assert drive.remarks() == ()
     wire.put(0x77F, b"\x05")
-    with pytest.raises(CommunicationLost, match=r"77Fh.*would feed the drive's watchdog for a dead host"):
+    with pytest.raises(CommunicationLost, match=r"77Fh.*would feed the drive's watchdog if this host fails"):
         go(drive, wire, 0.1)
 
 
@@ -131,7 +131,7 @@ def test_a_setting_that_somebody_changes_in_motion_ends_the_run(running, wire, p
     assert f"{index:04X}h" in caught.value.where
     assert f"{before}" in caught.value.what
     assert f"{value}" in caught.value.what
-    assert "somebody else" in caught.value.what
+    assert "another master" in caught.value.what
 
 
 def test_the_watchdog_and_what_a_stop_rests_on_are_asked_for_every_other_second(running, wire):
@@ -173,7 +173,7 @@ def test_a_drive_that_answers_no_sdo_from_the_beginning_runs_on_and_that_is_told
     drive.enable(Mode.SPEED)
     go(drive, wire, 30.0)
     (line,) = drive.remarks()
-    assert "not read back in motion" in line
+    assert "were not read back" in line
 
 
 def test_one_that_has_answered_and_falls_silent_for_good_is_lost(running, wire, peer):
@@ -241,7 +241,7 @@ def test_stray_writes_are_told_and_a_third_is_a_second_master(running, wire):
     wire.put(0x601, bytes.fromhex("2f60600004000000"))
     go(running, wire, 1.0)
     assert running.remarks() == (
-        "somebody else wrote 6040h = 6h by SDO", "somebody else wrote 6060h = 4h by SDO",
+        "another master wrote 6040h = 6h by SDO", "another master wrote 6060h = 4h by SDO",
     )
     assert [line[:13] for line in running.summary()] == ["6040h = 6h wa", "6060h = 4h wa"]
     wire.put(0x601, bytes.fromhex("2b40600006000000"))
@@ -389,7 +389,7 @@ def test_a_quick_stop_that_is_undone_is_made_to_stand(running, wire, peer):
     assert peer.machine.state == "quick stop active"
     assert peer.value(0x1400, 1) >> 31
     assert peer.value(0x1401, 1) >> 31
-    assert any("did not stand" in line for line in running.remarks())
+    assert any("reversed or not executed" in line for line in running.remarks())
     running.disable()
     go(running, wire, 0.5)
     assert peer.machine.state == "switch on disabled"

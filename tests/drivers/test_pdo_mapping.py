@@ -61,7 +61,7 @@ def test_a_fixed_mapping_that_says_yes(objects, peer):
     with pytest.raises(PreflightRefused, match="60400010h") as caught:
         write_pdo(objects, 1, layout(Slow(demand=True))[0])
     assert caught.value.where == "1600h"
-    assert "fix their mapping" in caught.value.next_step
+    assert "mapping of this drive may be fixed" in caught.value.next_step
 
 
 @pytest.mark.parametrize("sub", [1, 2])

@@ -123,7 +123,7 @@ def test_where_only_the_host_limits_torque_the_table_says_so(make):
     found = found_with(make(UnlimitedBench))
     note = next(check for check in found.checks if check.name == "torque limit")
     assert note.outcome is Outcome.NOTE
-    assert "host alone limits it" in note.found
+    assert "only the guard and the setpoint" in note.found
 
 
 # -- torque of 32 bits: it shares TPDO1 with the speed, and the statusword comes in TPDO2 ------------------------------

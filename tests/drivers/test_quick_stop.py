@@ -167,7 +167,7 @@ def test_another_master_is_told(wire, scripted, foreign):
     target.ask(1)
     (said,) = target.remarks()
     frames, syncs = (0, 1) if foreign == 0x080 else (1, 0)
-    assert f"{frames} of its frames to node 1 and {syncs} SYNC" in said
+    assert f"{frames} frames to node 1 and {syncs} SYNC" in said
 
 
 @pytest.mark.parametrize("other_steps", [False, True])

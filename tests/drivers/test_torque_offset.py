@@ -72,7 +72,7 @@ def test_it_is_zero_in_torque_mode(bench):
 def test_it_is_refused_where_nobody_asked_for_it():
     bench = CanopenBench()
     run = turning(bench)
-    with pytest.raises(CommandRejected, match="not prepared"):
+    with pytest.raises(CommandRejected, match="none is mapped"):
         push(run, 1.0)
     assert all(len(frame.data) == 1 for frame in bench.frames if frame.identifier == 0x301)
     bench.close()

@@ -32,7 +32,8 @@ def closed_form(
     rng = np.random.default_rng(seed)
     omega = 2.0 * np.pi * np.array(lines)
     s = 1j * omega
-    speed_lines = np.array(amplitudes) * np.exp(1j * np.array([0.3, 1.7, 4.0, 5.1][: len(lines)]))
+    phases = np.array([0.3, 1.7, 4.0, 5.1, 2.4, 0.9, 5.6, 3.1, 1.2, 4.6])
+    speed_lines = np.array(amplitudes) * np.exp(1j * phases[: len(lines)])
     through = (inertia * s + viscous) * (1 + speed_lag * s) / (1 + torque_lag * s) * np.exp(-skew * s)
     times, speeds, torques, segments = [], [], [], []
     begin = 0.0

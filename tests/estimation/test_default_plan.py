@@ -49,11 +49,13 @@ TRUTHS = {
     "torque through two poles": {"speed_poles": (0.1,), "torque_poles": (0.25, 0.25)},
     "the long lag on torque": {"speed_poles": (0.1,), "torque_poles": (0.4,)},
 }
-LONG = ("two poles", "matched", "two long poles", "three poles", "torque through two poles")
+MARKS = dict.fromkeys(
+    ("two poles", "matched", "two long poles", "three poles", "torque through two poles"), pytest.mark.long
+) | dict.fromkeys(("moving average alone", "the long lag on torque"), pytest.mark.heavy)
 
 
 @pytest.mark.parametrize("name", [
-    pytest.param(name, marks=pytest.mark.long if name in LONG else ()) for name in TRUTHS
+    pytest.param(name, marks=MARKS.get(name, ())) for name in TRUTHS
 ])
 def test_covers_other_reporting_filters(default_run, name):
     _, motion, _, shaft = default_run

@@ -80,6 +80,7 @@ def test_its_own_interval_covers(usual, route):
     assert half.mean() < 0.04 * TRUE
 
 
+@pytest.mark.heavy
 def test_disagreement_by_chance_comes_once_in_a_hundred_runs(usual):
     said_no = sum((found[:, 3] == 0.0).astype(int) for found in usual.values())
     runs = len(usual_runs())

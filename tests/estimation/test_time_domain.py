@@ -142,7 +142,9 @@ def test_the_wide_band_is_left_where_the_model_is_doubtful_in_it_or_untested(mon
     assert solved.bins == len((wide if said == 0.5 else narrow).problem.bins)
 
 
-@pytest.mark.parametrize(("gain", "followed"), [(0.0, (0.0, 0.1)), (5.0, (0.0, 0.2)), (40.0, (0.95, 1.0))])
+@pytest.mark.parametrize(("gain", "followed"), [
+    (0.0, (0.0, 0.1)), pytest.param(5.0, (0.0, 0.2), marks=pytest.mark.heavy), (40.0, (0.95, 1.0)),
+])
 def test_the_value_follows_a_structure_of_the_filters_as_far_as_it_weighs(monkeypatch, gain, followed):
     """Two shapes more that lower −2 ln L by 5 are nothing: the value had gone over to theirs from 4 on."""
     recording = simulate(FIELD, "torque pulses", [3])[0]

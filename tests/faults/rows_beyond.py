@@ -3,13 +3,14 @@
 from tests.faults.row import HERE, Row
 
 LATE: dict[int, Row] = {
-    51: Row("adapter or host late: the answers of many SYNCs come in a burst", "counted as late; nobody else is blamed",
-            "0, 5", ("tests/drivers/test_late_host.py::test_an_adapter_that_hands_everything_on_at_once_is_nobody_else",
-                     "tests/drivers/test_feedback.py::test_a_late_answer_is_never_another_syncs",
-                     "tests/drivers/test_feedback.py::test_somebody_who_sends_too_is_found_however_late_the_host_was"),
+    51: Row("adapter or host late: the answers of many SYNCs come in a burst",
+            "counted as late; no other master is blamed", "0, 5",
+            ("tests/drivers/test_late_host.py::test_an_adapter_that_hands_everything_on_at_once_is_nobody_else",
+             "tests/drivers/test_feedback.py::test_a_late_answer_is_never_another_syncs",
+             "tests/drivers/test_feedback.py::test_somebody_who_sends_too_is_found_however_late_the_host_was"),
             "each answer is given to its own SYNC, or the cycle has no sample; more answers than SYNCs are foreign"),
     52: Row("host stood still (SIGSTOP, load): the drive's silence and its watchdog's word follow",
-            "the stall is told first", "5",
+            "the stall is reported first", "5",
             ("tests/drivers/test_late_host.py::test_a_stall_is_told_before_what_the_drive_did_meanwhile",
              "tests/drivers/test_late_host.py::test_a_short_stall_is_told_before_a_heartbeat_that_is_missing",
              "tests/drivers/test_late_host.py::test_half_of_the_watchdogs_time_is_the_longest_stall"),
@@ -23,7 +24,7 @@ LATE: dict[int, Row] = {
              "tests/drivers/test_drive_faults.py::test_in_stepped_time_what_is_lost_is_lost_on_any_computer",
              "tests/drivers/test_drive_faults.py::test_a_dead_peer_ends_a_wait_and_costs_little_from_then_on"),
             "the peer is asked whether anything is still to come; nothing but a dead one (4 s) ends a wait"),
-    55: Row("this computer doesn't hold the profile's rate", "a lower one, chosen and said before motion", "0",
+    55: Row("this computer doesn't hold the profile's rate", "a lower one, chosen and reported before motion", "0",
             ("tests/runner/test_choose_rate.py::"
              "test_the_highest_rate_whose_half_period_is_longer_than_the_delay",
              "tests/runner/test_choose_rate.py::test_the_runner_tries_before_motion_and_goes_on_at_that_rate"),
@@ -50,11 +51,11 @@ SECOND_MASTER: dict[int, Row] = {
     60: Row("a second master's setpoints by SDO, or by another fieldbus", "QS, at rest", "5",
             (f"{SECOND}test_noticed_and_stopped",
              f"{OTHER_MASTER}test_a_speed_in_the_drive_that_is_not_ours_ends_the_run")),
-    61: Row("a stray SDO that the cycle undoes", "told in log, result and at the end", "0, 9",
+    61: Row("a stray SDO that the cycle undoes", "reported in log, in the result and at the end", "0, 9",
             (f"{SECOND}test_stray_writes_that_the_cycle_undoes_are_told",)),
     62: Row("a second master undoes the quick stop again and again", "the host falls silent and looks on; WD", "5",
             (f"{SECOND}test_a_quick_stop_that_is_undone_again_and_again_is_left_to_the_watchdog",)),
-    63: Row("`tdhil stop` in torque mode, where the drive's quick stop lets go", "speed mode at zero first", "0",
+    63: Row("`tdhil stop` in torque mode, on a drive that its quick stop disables", "speed mode at zero first", "0",
             ("tests/drivers/test_quick_stop.py::test_in_torque_mode_it_is_braked_and_never_let_go_while_it_turns",),
             "braked to rest, never off while it turned"),
     64: Row("the drive's own limits are tighter than rig.yaml's", "they stay, or R; widened by name only", "0, 4",
@@ -78,24 +79,26 @@ MODBUS: dict[int, Row] = {
     67: Row(
         "another master writes control word and setpoints over Modbus in motion, 5 to 100 times a second",
         "noticed by reading them back; QS that stands against it (stop word repeated, the drive's own speed limit"
-        " lowered along the ramp); 8 where that one still commands at the end", "5, 8",
+        " lowered along the ramp); 8 if that master still commands at the end", "5, 8",
         (HERE + "test_modbus_second_master.py::test_row_67_another_master_commands",),
     ),
     68: Row(
-        "somebody sets the Modbus watchdog, its reaction or a limit in motion",
+        "another master sets the Modbus watchdog, its reaction or a limit in motion",
         "read back during the run: QS, naming register, old and new value", "5",
         (HERE + "test_modbus_second_master.py::test_row_68_somebody_changes_a_setting_in_motion",),
     ),
     69: Row(
         "the drive's own torque or speed limit, or quick stop, is tighter than rig.yaml's (Modbus)",
-        "it stays and the run keeps within it; made wider by name only, old and new value told, given back", "",
+        "it stays and the run keeps within it; made wider by name only; old and new value are reported; "
+        "restored at the end", "",
         ("tests/drivers/test_modbus_preflight.py::test_limits_that_are_tighter_stay_and_the_run_keeps_within_them",
          "tests/drivers/test_modbus_preflight.py::test_a_limit_is_widened_by_name_no_other_with_it_and_given_back"),
         "kept as found; `--accept-wider-limit torque`: 0.375 of rated torque (was 0.1 …: wider, accepted by …)",
     ),
     70: Row(
         "`tdhil stop` in torque mode where a quick stop doesn't decelerate, and where the drive's watchdog coasts",
-        "speed mode at zero first, the stop word again while the shaft turns: braked to rest, never let go", "0",
+        "speed mode at zero first, the stop word again while the shaft turns: braked to standstill, "
+        "never disabled while it turns", "0",
         ("tests/drivers/test_modbus_quick_stop.py::test_it_brakes_to_rest_and_never_lets_go",),
         "every shipped Modbus profile, in each of its modes",
     ),
@@ -125,9 +128,9 @@ UNITS: dict[int, Row] = {
     74: Row("profile's unit of speed too small by 2 to 10, and no object of the drive contradicts it",
             "found at walking pace by the drive's angle, with its factor; the true shaft stays below speed_max", "4",
             (HERE + "test_speed_unit.py::test_the_angle_shows_a_unit_that_is_too_small",)),
-    75: Row("the same in a drive that tells no angle", "the operator is asked at speed_max/20; his no ends it", "4",
+    75: Row("the same in a drive that reports no angle", "tdhil asks the operator at speed_max/20; a no ends it", "4",
             (HERE + "test_speed_unit.py::test_without_an_angle_the_operator_says_no",)),
-    76: Row("the same, with nobody at a terminal", "R at that speed, unless the unit is taken by name", "4",
+    76: Row("the same, without a terminal", "R at that speed, unless the unit is accepted by name", "4",
             (HERE + "test_speed_unit.py::test_without_an_angle_and_with_nobody_there",)),
     77: Row("the drive's angle counts against its reported speed", "R, naming the sign", "4",
             (HERE + "test_speed_unit.py::test_an_angle_that_counts_backwards",)),
@@ -136,15 +139,15 @@ UNITS: dict[int, Row] = {
 }
 
 STAGES: dict[int, Row] = {
-    79: Row("a drill string, and a drive whose quick stop lets go of it", "R", "4",
+    79: Row("a drill string, and a drive whose quick stop releases it", "R", "4",
             ("tests/faults/test_stage_rows.py::test_a_string_and_a_quick_stop_that_lets_go",
              "tests/runner/test_stop_string.py::test_what_a_string_forbids",
              "tests/drivers/test_preflight.py::test_whether_a_quick_stop_holds_the_shaft")),
-    80: Row("somebody else drives the shaft on against the quick stop", "the drive is fed no more: WD", "as its cause",
+    80: Row("another master drives the shaft against the quick stop", "the drive is fed no more: WD", "as its cause",
             ("tests/runner/test_stop_polls.py::"
              "test_a_shaft_that_somebody_drives_on_is_left_to_the_watchdog_and_watched",),
             "no slower for 3 s: no sign of life goes out any more, the drive's watchdog stops it, and that is seen"),
-    81: Row("a scripted fault whose moment the run does not reach", "said at the end", "as without",
+    81: Row("a scripted fault whose moment the run does not reach", "reported at the end", "as without",
             ("tests/faults/test_stage_rows.py::test_a_fault_that_never_comes_is_said",)),
     82: Row("a mode that is lost in motion", "QS", "6",
             ("tests/faults/test_stage_rows.py::test_a_mode_that_is_lost_in_motion",
@@ -153,7 +156,7 @@ STAGES: dict[int, Row] = {
             ("tests/faults/test_stage_rows.py::test_a_shaft_that_does_not_follow_in_speed_mode",
              "tests/runner/test_guard_follows.py::test_a_shaft_that_stays_at_another_speed_trips",
              "tests/runner/test_guard_follows.py::test_no_rig_that_does_what_it_can_trips")),
-    84: Row("a log that is removed, cut short, or whose thread dies", "said at once: QS", "3",
+    84: Row("a log that is removed, cut short, or whose thread dies", "reported at once: QS", "3",
             ("tests/faults/test_stage_rows.py::test_a_log_that_is_taken_away",
              "tests/recording/test_writer.py::test_a_log_that_was_taken_away_is_told_at_once",
              "tests/recording/test_writer.py::test_a_log_whose_thread_died_is_told_within_a_second")),
@@ -177,7 +180,7 @@ COMMAND_LINE: dict[int, Row] = {
     87: Row("a bit rate that CAN doesn't have (500 for 500k)", "refused wherever it stands; the nearest is named", "2",
             ("tests/config/test_rig_units.py::test_the_command_line_and_the_environment_know_the_same_rates",
              "tests/config/test_rig_units.py::test_bit_rates_that_can_does_not_have"),
-            "500 bit/s is none of CAN's; 500k is one"),
+            "500 bit/s is not a CAN bit rate; 500k is one"),
     88: Row("two runs log into one folder", "a live log is never moved; the second takes a name of its own and says it",
             "-", (f"{FILES}test_a_live_log_is_never_moved", f"{FILES}test_runs_begun_at_once_share_no_file",
                   f"{FILES}test_a_second_run_in_the_folder_of_a_live_one_says_where_its_log_is"),
@@ -210,7 +213,7 @@ LOG: dict[int, Row] = {
              ("tests/path/test_replay_ended.py::test_an_aborted_run_is_a_partial_result",
               "tests/estimation/test_aborted.py::test_whatever_follows_the_abort_the_result_is_the_same"),
              "result with a warning that names stage and cause"),
-    94: Row("replay of a run that was refused, or ended in setup", "its refusal is said", "the run's own",
+    94: Row("replay of a run that was refused, or ended in setup", "its refusal is reported", "the run's own",
              ("tests/path/test_replay_ended.py::test_a_refused_run_says_its_refusal",),
              "what, where, and the next step"),
     95: Row("replay on another kind of processor", "numbers the same to 1e-9, words the same", "the run's own",
@@ -229,14 +232,14 @@ SOFT_TORQUE: dict[int, Row] = {
             ("tests/path/test_virtual_string.py::"
              "test_a_fault_while_the_bit_sticks_and_slips_ends_with_a_shaft_at_rest",
              f"{VIRTUAL}test_what_befalls_the_drive_ends_the_stage_and_the_shaft_comes_to_rest"),
-            "at rest; the drive is never let go while it turns, and nothing but braking comes after the stop began"),
+            "at rest; the drive is never disabled while it turns, and nothing but braking comes after the stop began"),
     98: Row("virtual string: SIGKILL of the host while the bit sticks and slips", "WD", "-",
             ("tests/path/test_virtual_string.py::"
              "test_a_host_killed_while_the_bit_sticks_and_slips_leaves_the_shaft_to_the_drive_s_watchdog",),
             "the last torque stands for the watchdog's time, then the drive brakes; the log is replayed as cut short"),
     99: Row("virtual string: the loop puts energy into the shaft, or swings more than string and bit could", "QS", "7",
             (f"{VIRTUAL}test_energy_that_the_loop_puts_in_and_a_swing_beyond_string_and_bit_end_it",),
-            "energy beyond 5 % of what the wound-up string holds; 5 s of torque beyond what was simulated"),
+            "energy beyond 5 % of what the twisted string holds; 5 s of torque beyond what was simulated"),
     100: Row("virtual string: the torque limit acts", "the string is faded out; no result", "9",
              (f"{VIRTUAL}test_a_torque_limit_that_acts_fades_the_string_out_and_leaves_no_result",),
              "share of the string's torque falls to none, verdict invalid"),
@@ -258,14 +261,14 @@ SOFT_TORQUE: dict[int, Row] = {
              "-", ("tests/drivers/test_torque_offset.py::"
                    "test_what_a_dead_host_left_is_gone_with_the_next_run_and_with_a_stop_from_outside",),
              "cleared by the next run, and by tdhil stop"),
-    104: Row("impedance by the reference: a filter of it that nobody declared", "no result", "9",
+    104: Row("impedance by the reference: a filter of it that was not declared", "no result", "9",
              ("tests/estimation/test_impedance.py::test_a_reference_filter_that_nobody_declared_is_refused",),
              "model_rejected, with its time constant"),
 }
 
 STRING, SESSION = "tests/runner/test_stop_string.py::", "tests/session/"
 BETWEEN: dict[int, Row] = {
-    105: Row("Modbus: a status word that makes no sense (zeros of a gateway for a cycle, a pattern nobody knows)",
+    105: Row("Modbus: a status word that makes no sense (zeros of a gateway for a cycle, an unknown pattern)",
              "QS; never off while the shaft may turn", "6",
              ("tests/drivers/test_modbus_drive.py::test_one_status_word_that_makes_no_sense_lets_no_shaft_go",
               "tests/drivers/test_modbus_drive.py::"
@@ -279,7 +282,7 @@ BETWEEN: dict[int, Row] = {
               "tests/drivers/test_preflight.py::test_a_drive_that_is_not_in_fault_is_not_reset",
               "tests/drivers/test_modbus_preflight.py::test_a_drive_that_is_not_in_fault_is_not_reset"),
              "neither mode nor quick-stop option is touched; fault words go to a drive in fault only"),
-    107: Row("a run on a drive that an earlier stop left holding a wound-up drill string", "R, nothing written", "4",
+    107: Row("a run on a drive that an earlier stop left holding a twisted drill string", "R, nothing written", "4",
              ("tests/drivers/test_preflight.py::"
               "test_a_string_that_is_held_wound_up_is_not_let_go_by_the_next_run",
               "tests/drivers/test_modbus_preflight.py::"
@@ -305,7 +308,7 @@ BETWEEN: dict[int, Row] = {
              (f"{SESSION}test_confirm_speed.py::test_a_terminal_that_takes_nothing_holds_no_cycle_up",
               f"{SESSION}test_confirm_speed.py::test_what_was_typed_before_the_question_is_no_answer"),
              "another thread prints and waits; what was typed before is thrown away"),
-    112: Row("`tdhil stop`: the drive refuses what comes before the quick stop, or shows a state nobody knows",
+    112: Row("`tdhil stop`: the drive refuses what comes before the quick stop, or shows an unknown state",
              "the word is written all the same", "0, 8",
              ("tests/drivers/test_quick_stop.py::"
               "test_whatever_the_drive_refuses_before_it_the_quick_stop_is_written",

@@ -86,8 +86,10 @@ IN_STAGES = [(*case, "speed") for case in ENDS] + [(*case, "acquire") for case i
 
 
 @pytest.mark.parametrize(
-    ("row", "name", "becomes", "requests", "code", "words", "stage"), IN_STAGES,
-    ids=[f"{case[1]} in {case[-1]}" for case in IN_STAGES],
+    ("row", "name", "becomes", "requests", "code", "words", "stage"), [
+        pytest.param(*case, id=f"{case[1]} in {case[-1]}", marks=pytest.mark.heavy if case[-1] == "acquire" else ())
+        for case in IN_STAGES
+    ],
 )
 def test_it_ends_with_the_shaft_at_rest(
     row, name, becomes, requests, code, words, stage, line, monkeypatch, tmp_path, seen
@@ -114,7 +116,7 @@ SURVIVES = [
 # tests/drivers/test_modbus_drive.py has all five of them, cycle by cycle.
 @pytest.mark.parametrize(("row", "name", "becomes", "requests"), [
     pytest.param(*case, id=case[1],
-                 marks=() if case[1] in ("busy, twice", "one late reply") else pytest.mark.heavy)
+                 marks=() if case[1] == "one late reply" else pytest.mark.heavy)
     for case in SURVIVES
 ])
 def test_it_is_survived(row, name, becomes, requests, line, monkeypatch, tmp_path, seen):

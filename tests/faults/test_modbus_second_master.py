@@ -74,8 +74,8 @@ def test_row_66_refused_unless_taken_by_name(tmp_path, no_bus_of_the_user, seen)
     message = refused.document["error"]["message"]
     assert "any request" in message and "will not stop by itself" in message and BY_NAME in message
     said = " ".join(taken.err.split())
-    assert "no answer to a dead host" in said and "every other client of this drive is switched off" in said
-    assert "nobody is there to confirm" in taken.document["error"]["message"]
+    assert "may not detect a dead host" in said and "every other client of this drive is switched off" in said
+    assert "no operator can confirm" in taken.document["error"]["message"]
     shaft = Shaft.read(trace)
     assert abs(shaft.speed_rad_s).max() < TURNING_RAD_S and "operation enabled" not in set(shaft.state)
     seen(66, message, None, "whole", 4)

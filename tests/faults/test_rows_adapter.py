@@ -71,7 +71,7 @@ def test_row_14_error_passive(rehearse, adapter, monkeypatch, seen):
     stages = dict(run.done.outcomes)
     assert stages["speed"] == "degraded"
     assert stages["torque"] == "ok"
-    assert "error-passive: check bit rate" in run.done.err.replace("\n", " ").replace("  ", " ")
+    assert "error-passive. Check bit rate" in run.done.err.replace("\n", " ").replace("  ", " ")
     run.shaft.assert_at_rest()
     seen(14, "the run goes on; warned, and the stage is degraded: the adapter was error-passive", None,
          run.assert_log_whole(), run.done.code)

@@ -136,7 +136,8 @@ def test_row_35_time_and_travel(which, rehearse, tmp_path, seen):
     )
     run = rehearse("--rig", rig)
     begun_s = run.shaft.events("state: quick stop active")[0] - 0.04
-    code, *words = {"time": (7, "longer than 20 s", "limits.time_s"), "travel": (4, "travelled", "sign probe")}[which]
+    code, *words = {"time": (7, "longer than the limit of 20 s", "limits.time_s"),
+                    "travel": (4, "without a clear direction", "sign probe")}[which]
     run.assert_ended(code, *words)
     seen(35, run.message, run.assert_stopped(begun_s, NOTICED_AT_ONCE_S), run.assert_log_whole(), code)
 

@@ -11,13 +11,13 @@ from tdhil.recording.log_reader import read_run
 IN_MOTION = "@speed+15s"       # at 4 rad/s
 
 STOPPED = (
-    (56, "foreign-heartbeat" + IN_MOTION, 1.1, ("77Fh", "watchdog for a dead host")),
-    (56, "foreign-heartbeat" + IN_MOTION + "=20s", 20.2, ("77Fh", "watchdog for a dead host")),
-    (57, "tool-writes" + IN_MOTION, 0.2, ("1016h:1", "8323572 (7F01F4h) was set, 0 stands there now")),
-    (57, "tool-writes" + IN_MOTION + "=6007h=0", 0.2, ("6007h", "3 was set, 0 stands")),
+    (56, "foreign-heartbeat" + IN_MOTION, 1.1, ("77Fh", "watchdog if this host fails")),
+    (56, "foreign-heartbeat" + IN_MOTION + "=20s", 20.2, ("77Fh", "watchdog if this host fails")),
+    (57, "tool-writes" + IN_MOTION, 0.2, ("1016h:1", "8323572 (7F01F4h) was set, 0 is there now")),
+    (57, "tool-writes" + IN_MOTION + "=6007h=0", 0.2, ("6007h", "3 was set, 0 is there now")),
     (58, "setting-changed" + IN_MOTION, 6.2, ("6007h", "the watchdog's reaction was changed")),
     (58, "setting-changed" + IN_MOTION + "=1016h:1=0", 6.2, ("1016h:1", "the drive's watchdog was changed")),
-    (58, "setting-changed" + IN_MOTION + "=605Ah=0", 6.2, ("605Ah", "6 was set, 0 stands")),
+    (58, "setting-changed" + IN_MOTION + "=605Ah=0", 6.2, ("605Ah", "6 was set, 0 is there now")),
     (59, "foreign-setpoints" + IN_MOTION, 0.1, ("RPDO4, 501h", "second master")),
     (60, "sdo-master" + IN_MOTION, 0.1, ("by SDO", "second master")),
 )
@@ -39,7 +39,7 @@ def test_a_number_that_is_taken_from_the_start_is_not_the_host_s(rehearse, seen)
     assert run.done.document.get("error") is None, run.done.err
     preflight = [event.text for event in read_run(run.log).events if event.kind == "preflight"]
     (line,) = [text for text in preflight if text.startswith("host's node number")]
-    assert "126, since another node bears 127" in line
+    assert "126, because another node uses 127" in line
     run.shaft.assert_at_rest()
     seen(56, f"`foreign-heartbeat`: {line}", None, run.assert_log_whole(), run.done.code)
 
@@ -51,11 +51,12 @@ def test_stray_writes_that_the_cycle_undoes_are_told(rehearse, seen):
     )
     assert run.done.document.get("error") is None, run.done.err
     warnings = " ".join(run.done.document["warnings"])
-    for text in ("6040h = 6h was written by somebody else, 1 time", "6060h = 4h was written by somebody else, 1 time"):
+    for text in ("6040h = 6h was written by another master, 1 time",
+                 "6060h = 4h was written by another master, 1 time"):
         assert text in warnings
         assert text in run.done.err
     events = [event.text for event in read_run(run.log).events if event.kind == "bus"]
-    assert events == ["somebody else wrote 6040h = 6h by SDO", "somebody else wrote 6060h = 4h by SDO"]
+    assert events == ["another master wrote 6040h = 6h by SDO", "another master wrote 6060h = 4h by SDO"]
     assert run.shaft.at_rest_from() <= run.shaft.time_s[-1] - 1.0
     seen(61, f"told at the end: {warnings}", None, run.assert_log_whole(), run.done.code)
 

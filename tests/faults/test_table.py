@@ -8,7 +8,7 @@ import pytest
 from tests.faults.rows import FIFTY, ROWS
 
 ROOT = Path(__file__).parents[2]
-TABLE = ROOT / "docs" / "faults.md"
+TABLE = ROOT / "docs" / "reference" / "faults.md"
 
 
 @pytest.fixture(scope="module")

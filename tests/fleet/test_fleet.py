@@ -419,9 +419,9 @@ def test_the_command(few, tmp_path, capsys, monkeypatch):
     assert sum(document["verdicts"].values()) == 4
     assert main(arguments) == 3
     text = capsys.readouterr().out
-    assert "7 logs (7 of them done before)" in text
+    assert "7 logs (7 of them finished before)" in text
     assert "empty.mcap: the file is empty" in text
-    assert "left out: 1 CSV file without" in text
+    assert "skipped: 1 CSV file without" in text
     for wrong in (["--jobs", "0"], ["--confidence", "1.5"], ["--time-limit", "0"], ["--memory-limit", "1"]):
         assert main(["fleet", str(few), "--out", str(out), *wrong]) == 2
     assert main(["fleet", str(few), "--out", str(tmp_path / "fleet.txt")]) == 2
@@ -430,7 +430,7 @@ def test_the_command(few, tmp_path, capsys, monkeypatch):
     assert f"there is no such file or folder. Did you mean {few}?" in capsys.readouterr().err
     fleet_command._print(FleetSummary((), out, left=2, wall_s=1.0, interrupted=True), as_json=False)
     assert capsys.readouterr().out.startswith(
-        f"0 of 2 logs in 1.0 s: {out}\ninterrupted: 2 left to do, by the same command again\n")
+        f"0 of 2 logs in 1.0 s: {out}\ninterrupted: 2 remaining; run the same command again\n")
     assert main(["watch", str(few), "--out", str(out), "--once", "--jobs", "1"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 7
 

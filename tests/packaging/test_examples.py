@@ -34,7 +34,7 @@ def keys(model: type[BaseModel], prefix: str = "") -> dict[str, Any]:
 
 
 def rows() -> dict[str, list[str]]:
-    text = (ROOT / "docs" / "rig.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "rig.md").read_text(encoding="utf-8")
     found = re.findall(r"^\| `([a-z_.0-9]+)` \| (.*) \|$", text, re.MULTILINE)
     assert len(found) == len({key for key, _ in found})
     return {key: [cell.strip() for cell in rest.split(" | ")] for key, rest in found}
@@ -70,7 +70,8 @@ def test_the_examples_show_every_key_but_those_for_trying_things_out():
     missing = {key for key in keys(Rig) if not re.search(rf"^[# ]*{key.split('.')[-1]}:", text, re.MULTILINE)}
     assert missing == {"bus.options", "run.mode", "run.frequency_hz", "run.amplitude_rad_s", "run.offset_rad_s",
                        "run.periods", "run.seed", "run.simulate", "run.real_time", "run.stepped",
-                       "run.json", "run.plant", "run.trace"}
+                       "run.json", "run.plant", "run.trace", "run.simulated_torque_scale",
+                       "run.simulated_speed_scale", "run.simulated_added_inertia_kg_m2"}
 
 
 def test_rig_example_is_valid_with_its_commented_keys_too(tmp_path):
@@ -84,7 +85,7 @@ def test_rig_example_is_valid_with_its_commented_keys_too(tmp_path):
 
 
 def _indented(line: str) -> str:
-    inside = ("lag", "filter", "temperature", "length", "diameter", "tolerance")
+    inside = ("lag", "filter", "temperature", "length", "diameter", "tolerance", "calibration")
     return ("  " if any(word in line for word in inside) else "") + line
 
 

@@ -22,7 +22,7 @@ def hooks():
 def test_the_front_door_is_documented_name_by_name():
     from tdhil import api
 
-    page = (ROOT / "docs" / "api" / "index.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "python" / "index.md").read_text(encoding="utf-8")
     assert set(re.findall(r"^::: tdhil\.api\.(\w+)$", page, re.MULTILINE)) == set(api.__all__)
 
 
@@ -44,17 +44,19 @@ def test_the_page_on_rig_yaml_names_every_choice(option):
     parser = build_parser("identify")
     (commands,) = [action for action in parser._actions if action.dest == "command"]
     (choices,) = [action.choices for action in commands.choices["identify"]._actions if action.dest == option]
-    text = (ROOT / "docs" / "rig.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "rig.md").read_text(encoding="utf-8")
     (row,) = re.findall(rf"^\| `(?:run\.)?{option}` .*$", text, re.MULTILINE)
     assert [name for name in choices if f"`{name}`" not in row] == []
 
 
 def test_a_link_to_a_file_of_the_repository_leads_to_its_page(hooks):
-    assert hooks.relinked("[a](docs/rig.md#bus)", "", "index.md") == "[a](rig.md#bus)"
+    assert hooks.relinked("[a](docs/reference/rig.md#bus)", "", "index.md") == (
+        "[a](reference/rig.md#bus)")
     assert hooks.relinked("[a](../README.md)", "docs", "rig.md") == "[a](index.md)"
-    assert hooks.relinked("[a](../../examples/rig.yaml)", "docs/api", "api/index.md") == (
+    assert hooks.relinked("[a](../../examples/rig.yaml)", "docs/reference", "reference/rig.md") == (
         "[a](../repository/examples/rig.yaml.md)")
-    for same in ("[a](https://example.org/x)", "[a](no-such-file.md)", "[a](#here)", "```\n[a](docs/rig.md)\n```\n"):
+    fenced = "```\n[a](docs/reference/rig.md)\n```\n"
+    for same in ("[a](https://example.org/x)", "[a](no-such-file.md)", "[a](#here)", fenced):
         assert hooks.relinked(same, "", "index.md") == same
 
 

@@ -27,6 +27,7 @@ from tdhil.cli.main import main
 
 STAGES = ("setup", "speed", "torque", "hold", "acquire")
 QUICK = ("--rate", 50)    # a fifth of the drive's usual rate, and of the cycles to compute
+SHORT = ("--simulate", *QUICK, "--seed", 1, "--periods", 3)
 TOO_MUCH = ("--excitation", "sine", "--frequency", 0.2, "--amplitude", 3)
 """A motion that a lighter shaft could do: a run finds out in stage 2 that this one can't, and ends there with 7."""
 HANGS_S = 600.0           # wall time after which something is taken to hang, on however busy a computer

@@ -28,7 +28,7 @@ def assert_found(done, shaft, where):
     assert done.code == 4, done.err
     message = done.document["error"]["message"]
     assert f"braking probe, {where}" in message
-    assert "takes a negative torque for a positive one" in message
+    assert "inverts a negative torque setpoint" in message
     assert "Correct the profile or the drive's settings" in message
     assert "Traceback" not in done.err
     assert done.outcomes[-1] == ("torque", "aborted")

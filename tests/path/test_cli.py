@@ -10,9 +10,8 @@ import pytest
 from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.params import RigParams
 from tdhil.recording.log_reader import read_run, read_samples
-from tests.path.path_runs import QUICK, TOO_MUCH, Shaft, Terminal, clean_environment, identify, tdhil
+from tests.path.path_runs import QUICK, SHORT, TOO_MUCH, Shaft, Terminal, clean_environment, identify, tdhil
 
-SHORT = ("--simulate", *QUICK, "--seed", 1, "--periods", 3)
 KEYS = {
     "verdict", "model", "inertia_kg_m2", "inertia_main_shaft_kg_m2", "reference_inertia_kg_m2", "viscous_nm_s_rad",
     "coulomb_nm", "speed_lag_s", "torque_lag_s", "skew_s", "paper", "simulated", "log", "stages",
@@ -48,8 +47,8 @@ def test_stdout_is_one_json_document_with_the_promised_keys(tmp_path):
     assert "rig.yaml:4" in done.err                               # which value came from where
 
 
-def test_a_seed_repeats_result_and_samples(tmp_path):
-    runs = [identify(tmp_path, *SHORT, log=name) for name in ("a.mcap", "b.mcap")]
+def test_a_seed_repeats_result_and_samples(short_run, tmp_path):
+    runs = [short_run, identify(tmp_path, *SHORT)]
     same = {"log": "", "date": ""}
     assert runs[0].document | same == runs[1].document | same
     assert list(read_samples(runs[0].log)) == list(read_samples(runs[1].log))
@@ -162,7 +161,8 @@ def test_a_log_that_is_not_there_is_a_wrong_command_line(tmp_path):
     assert "none.mcap" in done.err
     done = tdhil("replay", tmp_path)
     assert done.code == 2
-    assert f"is a folder. Name one log in it, or all of them: tdhil fleet {tmp_path} --out fleet.csv" in done.err
+    step = f"Name one log in it, or identify all of them: tdhil fleet {tmp_path} --out fleet.csv"
+    assert f"is a folder. {step}" in done.err
 
 
 def test_no_server_to_talk_to(tmp_path):
@@ -290,6 +290,7 @@ def test_another_plant_is_another_result(tmp_path):
 # -- the terminal --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_eighty_columns_are_enough(tmp_path):
     command = (sys.executable, "-m", "tdhil", "identify", *SHORT)
     with Terminal(*command, columns=80, cwd=tmp_path) as terminal:

@@ -46,7 +46,7 @@ def test_the_inertia_of_the_simulated_rig(run):
     assert inertia["low"] < 104.0 < inertia["high"]
     assert document["simulated"] is True
     assert run.outcomes == [(name, "ok") for name in ("setup", "speed", "torque", "hold", "acquire")]
-    assert "SIMULATED: embedded Modbus drive and rig (as asked for), stepped time, seed 1" in run.err
+    assert "SIMULATED: embedded Modbus drive and rig (as requested), stepped time, seed 1" in run.err
 
 
 def test_its_replay_is_identical(run):
@@ -67,6 +67,7 @@ def test_the_log_says_how_the_drive_was_spoken_to(run):
     assert {True, False} == {frame.outgoing for frame in frames}
 
 
+@pytest.mark.heavy
 def test_a_seed_repeats_it(tmp_path):
     runs = [identify(tmp_path, "--profile", "generic/modbus", *QUICK, *TOO_MUCH, "--seed", 3, log=name)
             for name in ("a.mcap", "b.mcap")]
@@ -206,8 +207,8 @@ def test_what_nobody_verified_is_refused_and_nothing_was_written(tmp_path, real)
 def test_what_was_taken_by_name_stands_in_the_prompt(tmp_path, real):
     done = identify(tmp_path, *real, "--accept-unverified", "likely", "--accept-unverified", "watchdog")
     assert done.code == 4
-    assert "nobody is there to confirm" in done.err
-    assert "although nobody verified it" in done.err
+    assert "no operator can confirm" in done.err
+    assert "although unverified" in done.err
     assert "watchdog (unverified): this project's own map" in done.err
     kept = read_run(done.log).configuration["unverified"]
     assert [line.split(":")[0] for line in kept] == ["line (likely)", "watchdog (unverified)"]

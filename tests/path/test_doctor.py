@@ -45,7 +45,7 @@ def test_it_works_with_nothing_connected():
             "drive"} <= set(found)
     assert grades(done, "drive") == {"note"}
     assert "no CAN bus is configured" in done.out
-    assert done.out.splitlines()[-1] == "nothing stands in the way"
+    assert done.out.splitlines()[-1] == "no obstacle was found"
     assert "Traceback" not in done.err
 
 
@@ -108,7 +108,7 @@ def test_timer_and_scheduling():
     assert max(late_s) == pytest.approx(0.01)
     found = jitter_finding(late_s)
     assert found.grade == "note"
-    assert "0.10 ms late, at worst 10.00 ms (of 50 times)" in found.said
+    assert "0.10 ms late, at worst 10.00 ms (in 50 tries)" in found.said
 
 
 def test_disk(tmp_path, monkeypatch):
@@ -132,7 +132,7 @@ def test_a_drive_on_the_bus_is_read_and_never_written_to(monkeypatch):
     assert bus.identifiers == {0x603}
     assert bus.only_reads
     assert "node 3 answers: a CiA 402 drive" in done.out
-    assert "1016h:1 is there" in done.out
+    assert "1016h:1 exists" in done.out
     assert "SIMULATED" in done.out
     assert grades(done, "bit rate") == {"note"}
 

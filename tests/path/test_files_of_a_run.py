@@ -77,7 +77,7 @@ def test_a_second_run_in_the_folder_of_a_live_one_says_where_its_log_is(tmp_path
     (own,) = [path for path in tmp_path.glob("run*.mcap") if path != held.path]
     assert done.document["log"] == str(own)
     assert own.name in done.err.replace("\n", "")
-    assert "another run is writing" in done.err
+    assert "another run writes" in done.err
     assert held.path == tmp_path / "run.mcap"
     assert read_run(own).complete
 
@@ -127,14 +127,14 @@ def bench(tmp_path):
 
 
 @pytest.mark.parametrize(("option", "name", "said"), [
-    ("--log", "rig.yaml", "is the file of --rig too"),
-    ("--log", "notes.txt", "is no log; it is left as it is"),
+    ("--log", "rig.yaml", "is also the file of --rig"),
+    ("--log", "notes.txt", "is not a log; it was left unchanged"),
     ("--report", "rig.yaml", "is there already"),
     ("--report", "run.mcap", "the log itself"),
     ("--report", "notes.txt", "is there already"),
     ("--report", "other.mcap", "is there already"),
-    ("--trace", "rig.yaml", "is the file of --rig too"),
-    ("--trace", "run.mcap", "is the file of --log too"),
+    ("--trace", "rig.yaml", "is also the file of --rig"),
+    ("--trace", "run.mcap", "is also the file of --log"),
     ("--trace", "notes.txt", "holds something else"),
     ("--trace", "other.mcap", "holds something else"),
 ])
@@ -187,7 +187,7 @@ def test_a_trace_goes_over_an_older_trace_only(tmp_path):
 def test_a_log_place_takes_no_foreign_file(tmp_path):
     path = tmp_path / "plan.yaml"
     path.write_text("kind: sine\n")
-    with pytest.raises(UsageError, match="is no log"):
+    with pytest.raises(UsageError, match="is not a log"):
         LogPlace(path).open(path)
     path.write_bytes(MAGIC)      # a log under another name is a log
     LogPlace(path).open(path).close()

@@ -160,7 +160,7 @@ def test_a_profile_is_begun_from_an_eds(tmp_path, monkeypatch):
     before = path.read_bytes()
     again = tdhil("profiles", "import", source)
     assert (again.code, path.read_bytes()) == (2, before)
-    assert "is there already and stays as it is; name another one with -o" in again.err
+    assert "already exists and was left unchanged; name another file with -o" in again.err
     document = tdhil("profiles", "import", source, "-o", "mine.yaml", "--json").document
     assert document["file"] == "mine.yaml"
     assert document["unverified"] == ["identity", "modes", "quick_stop", "torque", "watchdog"]
@@ -193,7 +193,7 @@ def test_a_broken_eds_is_a_line_and_no_profile(tmp_path, content, at):
 
 
 @pytest.mark.parametrize(("output", "words"), [
-    ("mine.txt", "ends in .yaml"), ("no/such/mine.yaml", "can't be written"),
+    ("mine.txt", "must end in .yaml"), ("no/such/mine.yaml", "can't be written"),
 ])
 def test_where_a_profile_cannot_go(tmp_path, output, words):
     done = tdhil("profiles", "import", profile_path("generic/cia402").parent / "cia402.eds", "-o", tmp_path / output)

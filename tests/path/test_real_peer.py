@@ -115,7 +115,7 @@ def test_without_a_terminal_and_without_yes_it_is_refused(tmp_path, drive, rig):
     assert "--yes" in done.err
     assert "preflight" in done.err                    # the table was shown
     assert "This run will move" in done.err
-    assert "although nobody verified it" in done.err
+    assert "although unverified" in done.err
     assert "torque (likely): CiA 402-2" in done.err
     assert "SIMULATED" not in done.err
     assert_untouched(drive)

@@ -11,19 +11,18 @@ import yaml
 
 from tdhil.recording.csv.excitation import load_excitation
 from tdhil.recording.log_reader import read_run
-from tests.path.path_runs import QUICK, identify, tdhil
+from tests.path.path_runs import tdhil
 
 pytestmark = pytest.mark.one_worker
 
 RPM = 2.0 * math.pi / 60.0
-DOC = Path(__file__).parents[2] / "docs" / "csv.md"
+DOC = Path(__file__).parents[2] / "docs" / "how-to" / "use-a-trace.md"
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run(short_run, tmp_path_factory):
     """A finished run, its Recording, and its excitation as a file."""
-    folder = tmp_path_factory.mktemp("run")
-    done = identify(folder, "--simulate", *QUICK, "--seed", 1, "--periods", 3)
+    folder, done = tmp_path_factory.mktemp("run"), short_run
     assert done.code == 0, done.err
     recording = read_run(done.log).recording
     segments = [
@@ -186,7 +185,7 @@ def test_an_unusable_file_ends_with_10_in_one_line(tmp_path):
     assert done.err.count("\n") == 1
 
 
-# -- docs/csv.md ---------------------------------------------------------------------------------------------
+# -- docs/how-to/use-a-trace.md ------------------------------------------------------------------------------
 
 
 def test_the_page_s_examples_do_what_it_says(tmp_path, monkeypatch):

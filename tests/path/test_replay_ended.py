@@ -6,6 +6,8 @@ import pytest
 
 from tests.path.path_runs import QUICK, identify, tdhil
 
+pytestmark = pytest.mark.one_worker      # its run is made once
+
 CANOPEN = ("--simulate", *QUICK, "--seed", 7)
 MODBUS = ("--drive", "modbus", "--simulate", "--seed", 7)
 

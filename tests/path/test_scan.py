@@ -106,14 +106,14 @@ def test_a_file_that_is_there_is_never_written_over(tmp_path):
     path.write_text("node: 3\n")
     done = tdhil("scan", "--simulate", *QUICK, "--write", path)
     assert done.code == 2
-    assert "not written over" in done.err
+    assert "not overwritten" in done.err
     assert path.read_text() == "node: 3\n"
 
 
 def test_nobody_there(monkeypatch):
     done = tdhil("scan", "-i", "virtual", "-c", "nobody", *QUICK)
     assert done.code == 5
-    assert "nothing was heard" in done.err
+    assert "no frame was received" in done.err
     assert "termination" in done.err
     assert len(done.err.splitlines()) == 1
 
@@ -168,11 +168,11 @@ def test_a_wrong_bit_rate(monkeypatch, command, bus):
     assert "Traceback" not in said
     if bus is Full:
         assert "No buffer space" in said
-        assert "adapter and cable" in said or "nobody acknowledges" in said
+        assert "adapter and cable" in said or "no other node acknowledges" in said
     elif command == "identify":
         assert "its node-ID and bit rate" in said
     else:
-        assert "error frames came" in said
+        assert "error frames were received" in said
         assert "bit rate is most likely wrong" in said
 
 
@@ -183,7 +183,7 @@ def test_a_profile_with_an_identity_is_matched_by_it(name):
     found, _ = match(0x00020192, (wanted.vendor, wanted.product, wanted.revision), profiles)
     assert found == name if wanted.vendor is not None else found == "generic/cia402"
     assert match(0x00020192, (0xDEAD, 1, 1), profiles)[0] == "generic/cia402"
-    assert match(0x00020191, (0xDEAD, 1, 1), profiles) == (None, "no CiA 402 drive (device type 00020191h)")
+    assert match(0x00020191, (0xDEAD, 1, 1), profiles) == (None, "not a CiA 402 drive (device type 00020191h)")
 
 
 # -- Modbus --------------------------------------------------------------------------------------------------
@@ -203,7 +203,7 @@ def test_a_profile_that_was_named_stands_in_the_starter(tmp_path):
     done = tdhil("scan", "--simulate", "--profile", "siemens/g120", "--write", tmp_path / "rig.yaml")
     assert done.code == 0, done.err
     text = (tmp_path / "rig.yaml").read_text(encoding="utf-8")
-    assert "profile: siemens/g120    # as named: --profile" in text
+    assert "profile: siemens/g120    # as given: --profile" in text
     assert "# - p1300" in text                                    # what to set at the drive
     assert filled(tmp_path / "rig.yaml").profile == "siemens/g120"
 
@@ -240,7 +240,7 @@ def test_what_is_said_of_the_line_is_not_tried_otherwise(monkeypatch):
     done = tdhil("scan", "--serial", "/dev/ttyUSB9", "--baud", 38400, "--parity", "O", "--unit", 1)
     assert done.code == 5
     assert opened == [(38400, "O", 1)]
-    assert "nobody answers (units 1)" in done.err
+    assert "no unit answers (units 1)" in done.err
 
 
 def test_garbled_replies_point_to_the_line(monkeypatch):

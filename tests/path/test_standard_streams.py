@@ -16,6 +16,8 @@ from tdhil.recording.log_reader import read_run
 from tdhil.session.conclusion import conclude
 from tests.path.path_runs import QUICK, clean_environment
 
+pytestmark = pytest.mark.one_worker      # its run is made once
+
 FULL = "/dev/full"
 
 
@@ -136,7 +138,7 @@ def test_ctrl_c_while_a_command_is_being_loaded(monkeypatch, capsys):
 
     monkeypatch.setattr("tdhil.cli.main._builder", interrupted)
     assert main(["identify"]) == 130
-    assert capsys.readouterr().err == "tdhil: interrupted\n"
+    assert capsys.readouterr().err == "tdhil: interrupted [TDH-1300]\n"
 
 
 @pytest.mark.parametrize("number", [errno.EMFILE, errno.ENOSPC, errno.EIO, errno.ENOMEM])
@@ -146,7 +148,8 @@ def test_what_the_system_refuses_is_said_in_one_line(monkeypatch, capsys, number
 
     monkeypatch.setattr("tdhil.cli.main._builder", refused)
     assert main(["identify"]) == 1
-    assert capsys.readouterr().err == "tdhil: the system refused: the system's word\n"
+    said = "tdhil: The operating system refused a request: the system's word [TDH-102]\n"
+    assert capsys.readouterr().err == said
 
 
 def test_an_unknown_model_in_a_log():

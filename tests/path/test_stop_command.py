@@ -114,7 +114,7 @@ def test_while_a_run_of_ours_is_under_way(tmp_path):
         ended = running.finish()
         shaft = drive.shaft
     assert done.code == 0, done.out
-    assert "another master is there" in done.out
+    assert "another master is on the bus" in done.out
     assert ended.code in (5, 6, 8), ended.err        # 5: the run saw a second master at work
     assert abs(shaft.speed_rad_s[-1]) < 0.05
     shaft.assert_never_let_go()
@@ -153,7 +153,7 @@ def test_a_master_that_enables_again_and_again_loses_its_rpdo(turning):
         assert other.stdout.readline() == "on\n"
         done = stop(drive)
     assert done.code == 0, done.out
-    assert "another master is there" in done.out
+    assert "another master is on the bus" in done.out
     assert "1400h:1 = 80000201h" in done.out
     assert drive.shaft.state[-1] == "quick stop active"
 
@@ -217,7 +217,7 @@ def test_a_drive_that_can_not_brake_is_still_turning(turning, monkeypatch):
     monkeypatch.setattr(quick_stop, "SLOWER", 0.5)
     done = stop(drive)
     assert done.code == 8
-    assert "NOT seen at rest" in done.out and SENTENCE in done.out
+    assert "Standstill was NOT observed" in done.out and SENTENCE in done.out
     assert drive.shaft.state[-1] == "quick stop active"
 
 

@@ -56,7 +56,7 @@ def aborted_stage(log):
 
 ALWAYS, HEAVY = (), pytest.mark.heavy
 SELDOM = {
-    ("SIGINT", "setup"): ALWAYS, ("SIGINT", "acquire"): HEAVY, ("SIGINT twice", "acquire"): ALWAYS,
+    ("SIGINT", "setup"): HEAVY, ("SIGINT", "acquire"): HEAVY, ("SIGINT twice", "acquire"): ALWAYS,
     ("SIGINT", "speed"): HEAVY, ("SIGINT", "torque"): HEAVY, ("SIGTERM", "speed"): HEAVY,
 }
 """What a signal and a stage are marked with; those that aren't here are long."""
@@ -66,7 +66,7 @@ SELDOM = {
     ("how", "stage"), [
         *(pytest.param(how, stage, marks=SELDOM.get((how, stage), pytest.mark.long))
           for how, stage in product(["SIGINT", "SIGTERM", "SIGINT twice"], STAGES)),
-        ("SIGHUP", "speed"),
+        pytest.param("SIGHUP", "speed", marks=HEAVY),
     ],
 )
 def test_a_signal_in_each_stage(tmp_path, how, stage):
@@ -130,8 +130,8 @@ def test_ctrl_c_in_real_time(tmp_path):
     assert read_run(done.log).complete
 
 
-@pytest.mark.parametrize("stage", [       # in stage 2, tests/faults/test_rows_process.py kills one as well
-    pytest.param("speed", marks=pytest.mark.heavy), pytest.param("hold", marks=pytest.mark.long), "acquire",
+@pytest.mark.parametrize("stage", [       # in stage 2 tests/faults/test_rows_process.py kills one
+    pytest.param("hold", marks=pytest.mark.long), pytest.param("acquire", marks=pytest.mark.heavy),
 ])
 def test_a_killed_host_leaves_the_shaft_to_the_drive_s_watchdog(tmp_path, stage):
     with peer(tmp_path, *STEPPED) as drive, host(tmp_path, *drive.options, "--stepped", *LONG) as running:
@@ -255,7 +255,9 @@ def test_an_exception_in_each_stage(tmp_path, monkeypatch, stage):
     assert done.code == 1
     assert "ZeroDivisionError" in done.err
     assert done.outcomes[-1] == (stage, "aborted")
-    assert done.document["error"] == {"kind": "ZeroDivisionError", "message": "made for this test"}
+    assert done.document["error"] == {
+        "kind": "ZeroDivisionError", "message": "made for this test", "code": "TDH-100",
+    }
     shaft = Shaft.read(trace)
     shaft.assert_enabled(True)
     begun_s = shaft.assert_stopped_within_settings()

@@ -155,6 +155,6 @@ def test_docs_names_the_folder():
     done = tdhil("docs")
     assert done.code == 0
     folder = Path(done.out.splitlines()[0])
-    assert (folder / "docs" / "rig.md").is_file()
+    assert (folder / "docs" / "reference" / "rig.md").is_file()
     assert (folder / "examples" / "rig.yaml").is_file()
-    assert "docs/rig.md" in done.out
+    assert "docs/reference/rig.md" in done.out

@@ -191,10 +191,10 @@ def test_a_dry_run_names_what_keeps_the_string_from_being_turned(files, change, 
 @pytest.mark.parametrize(("more", "rate", "code", "said"), [
     ((), 10, 4, "cycles a second"),
     (("--use", "broadband"), 50, 2, "nearly all of J"),
-    (("--use", "stiff"), 50, 2, "there is no stiff"),
-    (("--controller", "nowhere.json"), 50, 2, "no such file"),
-    (("--controller", EXAMPLES / "string.yaml"), 50, 2, "no JSON"),
-    (("--virtual-string", "longer"), 50, 2, "another string"),
+    (("--use", "stiff"), 50, 2, "contains no stiff"),
+    (("--controller", "nowhere.json"), 50, 2, "file does not exist"),
+    (("--controller", EXAMPLES / "string.yaml"), 50, 2, "is not JSON"),
+    (("--virtual-string", "longer"), 50, 2, "different string"),
     (("--own-loop", "--drive", "modbus"), 50, 4, "torque offset"),
 ])
 def test_what_can_not_be_evaluated_is_refused(files, more, rate, code, said):

@@ -20,7 +20,7 @@ def test_every_profile_that_ships_loads_under_its_own_name(name: str) -> None:
 
 @pytest.mark.parametrize("name", profile_names())
 def test_every_profile_that_ships_has_its_row_on_the_page(name: str) -> None:
-    text = (Path(__file__).parents[2] / "docs" / "profiles.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "reference" / "profiles.md").read_text(encoding="utf-8")
     rows = [line.split(" | ")[0] for line in text.split("## What ships")[1].splitlines() if line.startswith("| `")]
     assert f"| `{name}`" in rows
 

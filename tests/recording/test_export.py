@@ -129,10 +129,10 @@ def test_what_is_missing_is_said_in_one_line(log, tmp_path, capsys, monkeypatch)
         fill(writer, RecordingBuilder(), 5)
         writer.configuration({"drive": "modbus"}, {"simulated": FACTS["simulated"]})
     for arguments, said in (
-        ([str(log), "--to", "csv", "-o", str(there)], "is there already"),
+        ([str(log), "--to", "csv", "-o", str(there)], "already exists"),
         ([str(log), "--to", "parquet", "-o", str(tmp_path / "a")], "pip install 'duckdb"),
-        ([str(tmp_path / "no.mcap"), "--to", "csv"], "there is no such log"),
-        ([str(modbus), "--to", "candump", "-o", str(tmp_path / "b")], "has no CAN frames in it"),
+        ([str(tmp_path / "no.mcap"), "--to", "csv"], "this log does not exist"),
+        ([str(modbus), "--to", "candump", "-o", str(tmp_path / "b")], "contains no CAN frames"),
     ):
         assert main(["export", *arguments]) == 2
         err = capsys.readouterr().err

@@ -308,6 +308,21 @@ def test_a_cut_just_before_a_write_is_told_at_the_next(tmp_path, left):
         one_chunk()
 
 
+def test_a_file_that_was_cut_before_the_look_is_told_with_its_size(tmp_path):
+    path = tmp_path / "log.mcap"
+    container = Container(io.FileIO(path, "x+"))
+
+    def one_chunk():
+        container.add(min(CHANNELS), 1_000_000_000, bytes(100))
+        container.close_chunk()
+
+    one_chunk()
+    size = path.stat().st_size
+    os.truncate(path, size - 10)
+    with pytest.raises(LogGone, match=f"was cut to {size - 10} of {size} bytes"):
+        one_chunk()
+
+
 # -- a log that somebody takes away --------------------------------------------------------------------------------
 
 

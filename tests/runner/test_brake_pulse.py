@@ -81,10 +81,10 @@ def test_on_a_usual_rig_it_is_short_and_can_be_seen(period_s):
 
 @pytest.mark.parametrize(
     ("change", "why", "step"),
-    [({"guess": RigGuess(2.0, 8.0, 60.0)}, "400 N·m, the torque limit", "Lower limits.torque_nm to"),
+    [({"guess": RigGuess(2.0, 8.0, 60.0)}, "the torque limit of 400 N·m", "Lower limits.torque_nm to"),
      ({"limits": replace(LIMITS, torque_nm=20.0), "guess": RigGuess(3.0), "flowing": 15.0, "period_s": 0.1},
       "out of its window within 0.2 s", "--mode speed"),
-     ({"noise": 1.0}, "too little to tell", "--mode speed")],
+     ({"noise": 1.0}, "too little to detect", "--mode speed")],
 )
 def test_a_shaft_without_a_pulse_is_told_why(change, why, step):
     found = planned(**change)

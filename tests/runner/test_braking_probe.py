@@ -16,7 +16,7 @@ MISREAD = {
     "unsigned": lambda torque: torque if torque >= 0.0 else 400.0,        # a large number, held by the torque limit
     "magnitude": abs,
 }
-SAID = {"unsigned": "takes a negative torque for a positive one", "magnitude": "torque does not slow the shaft"}
+SAID = {"unsigned": "inverts a negative torque setpoint", "magnitude": "torque does not slow the shaft"}
 
 
 class Misreading(FakeDrive):

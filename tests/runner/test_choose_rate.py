@@ -47,7 +47,7 @@ def test_a_quiet_computer_holds_the_profiles_rate():
     assert drive.set == [(250.0, True), (250.0, False)]
     assert drive.tried == {250: CYCLES + WARM_UP}
     assert choice.text == (
-        "250 cycles a second: this computer holds them (p99.9 of 0.1 ms in 1000 cycles; --rate overrides)"
+        "250 cycles per second: this computer sustains them (p99.9 of 0.1 ms in 1000 cycles; --rate overrides)"
     )
 
 
@@ -61,7 +61,7 @@ def test_the_highest_rate_whose_half_period_is_longer_than_the_delay(late_s, rat
     assert drive.set[-1] == (rate, False)
     assert choice.taken.holds is (late_s < 1.0)
     assert ("instead of the profile's 250" in choice.text) is (rate < 250 and late_s < 1.0)
-    assert ("doesn't hold" in choice.text) is (rate < 250)
+    assert ("does not sustain" in choice.text) is (rate < 250)
 
 
 def test_one_late_cycle_of_a_thousand_is_borne_and_a_second_is_not():
@@ -96,8 +96,8 @@ def test_the_runner_tries_before_motion_and_goes_on_at_that_rate(world):
     calls = drive.calls
     assert calls.index("preflight") < calls.index("set_rate")
     assert max(k for k, call in enumerate(calls) if call == "set_rate") < calls.index("enable torque")
-    (line,) = [line for line in said if "cycles a second" in line]
-    assert line.startswith("25 cycles a second (p99.9 of")
+    (line,) = [line for line in said if "cycles per second" in line]
+    assert line.startswith("25 cycles per second (p99.9 of")
     assert ("rate", line) in here.log.events
     assert [one["rate_hz"] for one in here.log.run["rate_tried"]] == [50.0, 25.0]
     assert here.log.run["cycle"]["rate_hz"] == 25.0

@@ -72,7 +72,7 @@ def test_enable_waits_for_state_and_mode(world):
 
 def test_a_drive_that_stays_off_is_a_fault_after_a_time(world):
     here = world(FakeDrive(misbehave=lambda drive, sample: sample._replace(state=PowerState.READY)))
-    with pytest.raises(DriveFault, match="no torque mode within 3 s"):
+    with pytest.raises(DriveFault, match="torque mode was not enabled within 3 s"):
         here.bench.enable(Mode.TORQUE, Command(Mode.TORQUE, 0.0, 0.0))
     assert here.drive.cycles == 150
 

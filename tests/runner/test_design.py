@@ -199,6 +199,14 @@ def test_with_a_string_lines_of_equal_torque_reach_from_below_its_swing_to_above
     assert motor_sd(chosen.plan) < 0.2 * motor_sd(usual)
 
 
+def test_with_a_string_a_number_of_periods_does_not_change_the_lines():
+    known, wish = hung(periods=5)
+    plan = choose(STRING_LIMITS, STRING_GUESS, wish, known, 0.95).plan
+    planned = choose(STRING_LIMITS, STRING_GUESS, replace(wish, periods=None), known, 0.95).plan
+    assert plan.segments[0].reference.lines_hz == planned.segments[0].reference.lines_hz
+    assert {one.periods for one in plan.segments} == {5}
+
+
 def motor_sd(plan):
     """The bound of the shipped string's J_r, reports through filters of two poles and averages; per unit of noise."""
     shaft, m = StringShaft(), np.array([1500.0, 23.5, 588.5, 0.959, 1e-3, 15.5, 0.3645, 0.74])

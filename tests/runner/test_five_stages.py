@@ -122,7 +122,7 @@ def test_the_time_limit_ends_a_run(world):
     here = world(limits=replace(LIMITS, time_s=20.0))
     result = here.runner().run()
     assert isinstance(result.cause, LimitHit)
-    assert "longer than 20 s" in str(result.cause)
+    assert "longer than the limit of 20 s" in str(result.cause)
     assert_at_rest(here, result)
 
 
@@ -155,4 +155,4 @@ def test_settings_that_could_not_be_given_back_are_in_the_log(world):
     here = world()
     here.drive.left = ("6072h: no answer",)
     assert here.runner().run().cause is None
-    assert any("6072h" in event[-1] and "not given back" in event[-1] for event in here.log.events)
+    assert any("6072h" in event[-1] and "not restored" in event[-1] for event in here.log.events)

@@ -38,7 +38,7 @@ def shown(rows, period_s=0.02, expected=PowerState.ENABLED):
             watch.check_sample(command, seen)
         except ModeNotConfirmed as error:
             assert exit_code(error) is ExitCode.DRIVE_FAULT
-            assert "lost its mode" in error.what and "mode display" in error.where and error.next_step
+            assert "left its mode" in error.what and "mode display" in error.where and error.next_step
             return k
     return None
 
@@ -53,7 +53,7 @@ def test_a_mode_that_is_lost_trips_once_it_can_be_no_late_frame(period_s, displa
     assert shown(seen + lost * (allowed + 5), period_s) == pytest.approx(20 + allowed, abs=1)
     # Undone meanwhile, again and again: that is the driver's to count.
     assert shown((seen + lost * 12) * 5, period_s) is None
-    what = "speed mode" if displayed else "none of those"
+    what = "speed mode" if displayed else "an unknown mode"
     with pytest.raises(ModeNotConfirmed, match=what):
         watch = watching(period_s=period_s)
         for k in range(2000):
@@ -123,7 +123,7 @@ def test_a_shaft_that_stays_at_another_speed_trips(limits, within_s, reported, p
     found = followed(lambda t: 3.0, lambda t, _: reported, 30.0, limits, period_s)
     assert found is not None
     assert within_s <= found[0] <= within_s + 1.0
-    assert f"3.000 rad/s commanded, {reported:.3f} rad/s reported, apart since 0.0 s" in found[1]
+    assert f"3.000 rad/s commanded, {reported:.3f} rad/s reported, deviating since 0.0 s" in found[1]
     assert "torque 90." in found[1] and "not at its limit of 400 N·m" in found[1]
     assert "panel, another master" in found[1]
 
@@ -145,7 +145,7 @@ def test_torque_at_its_limit_is_told_apart(active, torque, said):
 def test_one_that_loses_its_speed_is_told_since_when():
     found = followed(lambda t: 3.0, lambda t, _: 3.0 if t < 20.0 else 1.0, 60.0)
     assert found[0] == pytest.approx(20.5 + FOLLOW_S, abs=0.6)
-    assert "apart since 20." in found[1]
+    assert "deviating since 20." in found[1]
 
 
 def test_one_that_runs_away_from_it_trips_all_the_same():
@@ -216,7 +216,7 @@ class Rig:
         return max(0.0, self.reported)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     inertia=st.floats(20.0, 4000.0), torque_nm=st.floats(300.0, 400.0), lag_s=st.sampled_from([0.0, 0.15, 0.5]),
     ramp_rad_s2=st.sampled_from([0.1, 0.5, 5.0, math.inf]), period_s=PERIODS, rate=st.sampled_from([1.2, 4.8, 76.0]),
@@ -232,7 +232,7 @@ def test_no_rig_that_does_what_it_can_trips(inertia, torque_nm, lag_s, ramp_rad_
     assert followed(reference, rig, 240.0, period_s=period_s, torque=lambda t: 90.0) is None
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     hertz=st.sampled_from([0.02, 0.1, 0.5, 2.0]), amplitude=st.floats(0.3, 3.0), lag_s=st.sampled_from([0.0, 0.5]),
     inertia=st.sampled_from([50.0, 500.0, 2000.0]), period_s=PERIODS,
@@ -248,7 +248,7 @@ def test_no_excitation_that_a_rig_follows_as_well_as_it_can_trips(hertz, amplitu
 
 
 @given(period_s=st.floats(3.0, 12.0), depth=st.floats(0.3, 1.0))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_a_string_that_sticks_and_slips_does_not(period_s, depth):
     """The top drive is dragged down and let go, once in each swing."""
     def speed(t, wanted):

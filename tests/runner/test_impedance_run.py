@@ -131,9 +131,9 @@ def test_an_interrupt_takes_it_away_as_well():
     ("request_", "limits", "words"),
     [
         (replace(OFFSET, mode="torque"), RIG_LIMITS, "speed loop"),
-        (OFFSET, replace(RIG_LIMITS, load="string"), "nothing on its shaft"),
-        (replace(OFFSET, kind="sine"), RIG_LIMITS, "the measurement's own"),
-        (replace(OFFSET, frequency_hz=0.2), RIG_LIMITS, "the measurement's own"),
+        (OFFSET, replace(RIG_LIMITS, load="string"), "without a load"),
+        (replace(OFFSET, kind="sine"), RIG_LIMITS, "chooses its excited frequencies itself"),
+        (replace(OFFSET, frequency_hz=0.2), RIG_LIMITS, "chooses its excited frequencies itself"),
     ],
 )
 def test_what_it_can_not_be_measured_with_is_refused(request_, limits, words, measured):
@@ -145,7 +145,7 @@ def test_a_reference_that_comes_in_slow_steps_is_refused():
     slow = ExcitationRequest(impedance="reference")
     refuse_slow_reference(slow, 0.01)
     refuse_slow_reference(OFFSET, 0.05)
-    with pytest.raises(PreflightRefused, match="comes in steps"):
+    with pytest.raises(PreflightRefused, match="a filter of the reference could not be identified"):
         refuse_slow_reference(slow, 0.05)
 
 

@@ -58,7 +58,7 @@ def test_a_refused_preflight_moves_nothing_and_says_how_to_mend_it(world):
     asked = []
     result = here.runner(confirm=lambda *_: asked.append(1)).run()
     assert isinstance(result.cause, PreflightRefused)
-    assert "watchdog: wanted armed, found not armed (and 1 more" in str(result.cause)
+    assert "watchdog: required armed, found not armed (and 1 more" in str(result.cause)
     assert result.cause.next_step == "arm it"
     assert asked == []
     assert here.drive.cycles == 0
@@ -99,7 +99,7 @@ def test_a_locked_shaft_ends_the_probe(world):
     here = world(FakeDrive(shaft_locked=True))
     result = here.runner().run()
     assert isinstance(result.cause, PreflightRefused)
-    assert "did not move up to 200 N·m" in str(result.cause)
+    assert "did not move up to the limit of 200 N·m" in str(result.cause)
     assert max(command.torque_nm for command in here.drive.commands) == 200.0
     assert result.stop.confirmed
 
@@ -158,7 +158,7 @@ def test_a_plan_that_this_shaft_is_too_heavy_for_ends_in_its_own_words(world):
     outcome = here.runner(request).run()
     assert isinstance(outcome.cause, LimitHit)
     assert exit_code(outcome.cause) == 7
-    assert "as stages 2 and 3 have shown it" in outcome.cause.what
+    assert "that stages 2 and 3 measured" in outcome.cause.what
     assert "The shaft was stopped" in outcome.cause.next_step
     assert "--amplitude" in outcome.cause.next_step
     assert outcome.stop.confirmed

@@ -59,7 +59,7 @@ def test_the_rate_is_written_down_once_it_is_known():
     """`LineDrive.period_s` fails if anybody asks before preflight."""
     run = run_line(LineDrive(Line(0.1), modes=SPEED_ONLY), ExcitationRequest(periods=2))
     assert run.log.run["cycle"] == {"period_s": 0.1, "rate_hz": pytest.approx(10.0)}
-    assert ("rate", "10 cycles a second") in run.log.events
+    assert ("rate", "10 cycles per second") in run.log.events
     assert run.recording.stepped_setpoint.period_s == 0.1
     assert {"timing_half_width_s", "stepped_setpoint"} <= FACTS
 
@@ -89,7 +89,7 @@ def test_a_ramp_in_the_drive_is_seen_and_stayed_below():
     assert plan.limits.acceleration_rad_s2 == pytest.approx(0.8, rel=0.1)
     steepest = max(abs(b - a) for segment in plan.segments for a, b in _neighbours(segment.reference))
     assert steepest / 0.01 <= 0.8
-    assert any("speed ramp holds the shaft" in text for _, text in run.log.events)
+    assert any("speed ramp limits the shaft" in text for _, text in run.log.events)
     assert found.inertia.low <= TRUE_KG_M2 <= found.inertia.high
 
 

@@ -294,7 +294,7 @@ def test_above_a_string_a_speed_that_is_lost_gets_no_speed_control(world):
     assert {one.mode for one in here.drive.commands[begun:]} == {Mode.TORQUE}
     assert here.drive.commands[-1].torque_nm == 0.0
     assert abs(here.drive.disabled_at[0]) < 0.05, "friction had the time to stop it"
-    assert any("nobody saw it at rest" in line for line in report.trouble)
+    assert any("standstill was not seen" in line for line in report.trouble)
 
 
 def test_a_drive_that_does_not_follow_torque_mode_gets_the_quick_stop(world):

@@ -118,7 +118,7 @@ def test_a_drive_that_falls_out_while_it_lets_go():
     here.drive.misbehave = fault
     report = here.stop_sequence().run()
     assert not report.confirmed
-    assert any("while trapped torque is let go" in line for line in report.trouble)
+    assert any("during the release of trapped torque" in line for line in report.trouble)
     assert "still holds" in report.trouble[-1]
     assert "disable" not in here.drive.calls
 
@@ -382,15 +382,15 @@ def preflight_of(**change):
     ("limits", "request_", "preflight", "what"),
     [
         (STRING, ExcitationRequest(kind="coast-down"), {}, "coast-down"),
-        (replace(STRING, torque_ramp_nm_s=0.0), ExcitationRequest(), {}, "how fast"),
+        (replace(STRING, torque_ramp_nm_s=0.0), ExcitationRequest(), {}, "release rate"),
         (STRING, ExcitationRequest(), {"safe_action": "coast"}, "watchdog reaction is 'coast'"),
         (STRING, ExcitationRequest(), {"safe_action": "none"}, "watchdog reaction"),
         (STRING, ExcitationRequest(), {"safe_action": "none", "watchdog_s": 0.0}, "no watchdog is armed"),
         (replace(STRING, accept_no_watchdog=True), ExcitationRequest(), {"watchdog_s": 0.0}, "--accept-no-watchdog"),
         (STRING, ExcitationRequest(), {"safe_action": "fault_reaction"}, "watchdog reaction is 'fault_reaction'"),
-        (STRING, ExcitationRequest(), {"quick_stop_holds": False}, "lets go of it"),
+        (STRING, ExcitationRequest(), {"quick_stop_holds": False}, "would release it"),
         (STRING, ExcitationRequest(), {"fed_by_any_client": True, "identity": REAL}, "any client feeds"),
-        (STRING, ExcitationRequest(), {"quick_stop_holds": None}, "nobody knows"),
+        (STRING, ExcitationRequest(), {"quick_stop_holds": None}, "it is unknown"),
     ],
 )
 def test_what_a_string_forbids(limits, request_, preflight, what):

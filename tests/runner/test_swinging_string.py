@@ -133,14 +133,14 @@ def test_a_wrong_sign_over_a_ringing_string_is_still_refused():
     here = World(RingingDrive(unsigned=True), LIMITS)
     run = here.runner(ExcitationRequest(periods=2)).run()
     assert isinstance(run.cause, PreflightRefused), run.cause
-    assert "takes a negative torque for a positive one" in str(run.cause)
+    assert "inverts a negative torque setpoint" in str(run.cause)
     assert run.stop.confirmed
     assert all(abs(speed) < 0.05 for speed in here.drive.disabled_at)
 
 
 def test_a_string_that_sticks_and_slips_is_named_with_its_period_and_amplitude():
     here = ringing(bit_nm=1500.0)
-    with pytest.raises(LimitHit, match=r"sticks and slips at 3\.00 rad/s: .* every 5\.[1-5] s") as hit:
+    with pytest.raises(LimitHit, match=r"stick-slip at 3\.00 rad/s: .* every 5\.[1-5] s") as hit:
         calm_string(here.bench, LIMITS, 3.0, 0.5)
     assert "speed loop" not in str(hit.value)
     assert "Lift the bit off bottom" in str(hit.value)
@@ -153,7 +153,7 @@ def test_a_swing_that_noise_keeps_going_is_none_of_a_bit_that_sticks():
     calmed = calm_string(here.bench, limits, 3.0, 0.5)
     assert calmed.swing.regular > 0.6
     assert 80.0 < calmed.swing.torque_nm < 1800.0
-    assert any(kind == "string" and "gets no calmer" in text for kind, text in here.log.events)
+    assert any(kind == "string" and "does not decay" in text for kind, text in here.log.events)
 
 
 def seen(torque_nm=200.0, demand_nm=None, speed=3.0, time_s=0.0):
@@ -192,7 +192,7 @@ def test_there_is_no_pulse_where_the_string_hides_its_answer():
     swings = plan_pulse(LIMITS, guess, ControlAssumptions(), Before(2.9, 200.0, 0.03, 500.0), PERIOD_S)
     assert isinstance(calm, Pulse)
     assert isinstance(swings, NoPulse)
-    assert "swings by ±500 N·m" in swings.why
+    assert "oscillation of ±500 N·m" in swings.why
     assert isinstance(plan_pulse(replace(LIMITS, load="none"), guess, ControlAssumptions(),
                                  Before(2.9, 200.0, 0.03), PERIOD_S), Pulse)
 
@@ -227,7 +227,7 @@ def test_a_window_that_a_restless_string_fills_leaves_no_room_to_plan_in():
     here.guard.disturbed = Swing(1200.0, 3.2, 5.3, 0.9).told
     speed = SpeedResult(None, None, RigGuess(1500.0, 8.0, 60.0), None, None, (), swing=Swing(1200.0, 3.2, 5.3, 0.9))
     planner = StagePlanner(here.bench, here.log, here.display, print)
-    with pytest.raises(LimitHit, match=r"±1200 N·m every 5\.3 s, the top by ±3\.20 rad/s") as hit:
+    with pytest.raises(LimitHit, match=r"±1200 N·m every 5\.3 s, the top with ±3\.20 rad/s") as hit:
         planner.plan(Task(LIMITS, ExcitationRequest(), {}), speed, Mode.TORQUE, LagPrior())
     assert "off bottom" in hit.value.next_step
     assert "speed loop" not in str(hit.value)
@@ -247,7 +247,7 @@ def test_a_string_that_was_calm_before_is_seen_to_swing_where_the_probe_is_tried
         assert found.wander_rad_s > 0.1
         assert mean == pytest.approx(slow_speed(limits, found.wander_rad_s), abs=0.4)      # it swings, and yields
         assert mean > slow_speed(limits) + 0.5
-        assert "the string below swings by ±" in here.guard.disturbed
+        assert "the string below oscillates with ±" in here.guard.disturbed
 
 
 def test_whichever_swing_takes_the_shaft_further_counts():
@@ -278,7 +278,7 @@ def test_above_a_restless_string_it_is_said_before_stage_5_what_would_tell_more(
     said = []
     planner = StagePlanner(here.bench, here.log, here.display, said.append)
     planner.plan(Task(limits, ExcitationRequest(kind=kind), {}), speed, Mode.TORQUE, LagPrior())
-    assert sum("--excitation prbs asks only for the time before an echo" in one for one in said) == told
+    assert sum("--excitation prbs uses only the time before an echo" in one for one in said) == told
 
 
 class KeepingLog(FakeLog):

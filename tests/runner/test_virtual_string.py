@@ -146,7 +146,7 @@ def test_what_befalls_the_drive_ends_the_stage_and_the_shaft_comes_to_rest(world
 
 
 @pytest.mark.parametrize(("figure", "said"), [
-    ("put_in_j", "the loop's errors have put 1000000 J"), ("net_nm", "the loop swings by"),
+    ("put_in_j", "the loop's errors have put 1000000 J"), ("net_nm", "the loop oscillates with"),
 ])
 def test_energy_that_the_loop_puts_in_and_a_swing_beyond_string_and_bit_end_it(
     world, course, monkeypatch, figure, said
@@ -161,7 +161,7 @@ def test_energy_that_the_loop_puts_in_and_a_swing_beyond_string_and_bit_end_it(
 @pytest.mark.parametrize(("case", "limits", "cause", "said"), [
     (replace(BENCH, rig=replace(BENCH.rig, speed_lag_s=0.7)), ROOM, EvaluationRefused, "lags by"),
     (BENCH, replace(ROOM, torque_nm=300.0), EvaluationRefused, "its limit"),
-    (BENCH, replace(ROOM, time_s=400.0), PreflightRefused, "may take"),
+    (BENCH, replace(ROOM, time_s=400.0), PreflightRefused, "above the limit of 400 s"),
     (BENCH, replace(ROOM, load="string", torque_ramp_nm_s=50.0), PreflightRefused, "load is string"),
 ], ids=["lag", "torque", "time", "string"])
 def test_what_can_not_be_is_refused_before_anything_moves(world, case, limits, cause, said):

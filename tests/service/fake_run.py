@@ -48,7 +48,7 @@ def main(folder: Path) -> None:
             confirming.take(asked["code"], asked["binding"], asked["by"], asked.get("lease") or "")
         elif asked.get("do") == "lease":
             if not leases:
-                raise PreflightRefused("nobody watches this run")
+                raise PreflightRefused("this run is not watched")
             found = leases[0].renew(asked["key"], asked["by"], new_key=asked["new_key"] or "",
                                     gone=asked["gone"] or "")
             return {"watch": asdict(found)}

@@ -368,7 +368,7 @@ def test_a_stop_waits_for_no_password_no_lock_no_file_and_no_disk(guarded, monke
         fcntl.flock(locked, fcntl.LOCK_EX)
         path.write_text("{ broken")
         guarded.access.refresh()
-        assert "stay as they were" in guarded.service.said[-1]
+        assert "the former ones stay in force" in guarded.service.said[-1]
         path.unlink()
         guarded.access.refresh()
         answer = guarded("POST", f"/runs/{run}/stop", page, json={})
@@ -417,7 +417,7 @@ def test_two_who_ask_at_once_are_one_run(guarded):
 
 def test_who_confirms_is_told_from_who_asked(guarded):
     run = guarded.run("ask", "real", "operator")
-    said = f"Rig real. Asked for by operator, run {run}."
+    said = f"Rig real. Requested by operator, run {run}."
     wait_for("the code", lambda: any(said in one for one in guarded.service.said))
     code = {"json": {"code": "123456"}}
     assert guarded("POST", f"/runs/{run}/confirm", guarded.sessions["viewer"], **code).status_code == 403
@@ -450,14 +450,14 @@ def test_two_who_confirm_at_once_are_one_who_did(guarded):
 def test_what_nobody_verified_an_engineer_takes_upon_himself(guarded, option):
     refused = guarded("POST", "/rigs/a/runs", guarded.sessions["operator"], json=option)
     assert (refused.status_code, guarded.service.store.ids()) == (403, [])
-    assert "no engineer" in refused.json()["error"]["what"]
+    assert "not an engineer" in refused.json()["error"]["what"]
     assert guarded("POST", "/rigs/a/runs", guarded.sessions["engineer"], json=option).status_code == 201
 
 
 def test_nobody_takes_away_the_watchdog_over_http(guarded):
     for option in ("accept_no_watchdog", "accept_shared_watchdog"):
         refused = guarded("POST", "/rigs/a/runs", guarded.sessions["admin"], json={option: True})
-        assert "never taken over HTTP" in refused.json()["error"]["what"]
+        assert "never accepted over HTTP" in refused.json()["error"]["what"]
     assert guarded.service.store.ids() == []
 
 
@@ -480,7 +480,7 @@ def test_an_engineer_edits_a_rig_s_limits_and_nothing_that_leads_to_a_drive(guar
     for wrong in ("port: 2", "host: 192.0.2.9"):
         key, value = wrong.split(": ")
         text = before.replace({"port": f"port: {nobody_s_port}", "host": "host: 127.0.0.1"}[key], wrong)
-        assert "stands at the rig" in save(text, 403)["error"]["what"], value
+        assert "can't be changed over HTTP" in save(text, 403)["error"]["what"], value
     for more in ("allow_reverse: true\n", "run: {simulate: true}\n", "profile: ../../etc/passwd\n", "node: 3\n"):
         save(before + more, 403)
     save(before.replace("attended", "watched"), 403)
@@ -567,7 +567,7 @@ def test_an_admin_adds_and_removes_over_http(guarded):
         "name": "bert", "role": "king", "password": PASSWORD}).status_code == 422
     page = guarded.log_in("anna")
     changed = guarded("POST", "/password", page, json={"old": "wrong", "new": "yet another horse"})
-    assert (changed.status_code, changed.json()["error"]["what"]) == (422, "that isn't the old password")
+    assert (changed.status_code, changed.json()["error"]["what"]) == (422, "the old password is wrong")
     assert guarded("POST", "/password", page, json={"old": PASSWORD, "new": "yet another horse"}).status_code == 200
     assert guarded("GET", "/rigs", page).status_code == 401
     assert guarded("POST", "/users/anna/password", admin, json={"password": PASSWORD}).status_code == 200
@@ -692,7 +692,7 @@ def test_users_and_tokens_on_the_terminal(tmp_path, capsys, monkeypatch):
         return main(["serve", *arguments, *data])
 
     assert typed(f"{PASSWORD}\n", "users", "add", "anna", "--role", "admin") == 0
-    assert "asks for a login" in capsys.readouterr().err
+    assert "requires a login" in capsys.readouterr().err
     assert typed("short\n", "users", "add", "bert", "--role", "viewer") == ExitCode.USAGE
     assert typed(f"{PASSWORD}\n", "users", "add", "anna", "--role", "viewer") == ExitCode.USAGE
     assert typed("another horse\n", "users", "passwd", "anna") == 0
@@ -716,7 +716,7 @@ def test_everybody_stops_a_run_and_a_drive_that_tdhil_moves_and_an_operator_any_
     """Decision 0022: a stop of a drive that no tdhil moves opens its bus."""
     stopped: list[str] = []
     monkeypatch.setattr(guarded.service.supervisor, "stop_drive",
-                        lambda rig, who: stopped.append(who) or (0, "tdhil stop saw the shaft at rest"))
+                        lambda rig, who: stopped.append(who) or (0, "tdhil stop confirmed standstill"))
     viewers = (guarded.sessions["viewer"], guarded.of_token("viewer"), guarded.ended("admin"))
 
     def stop(headers, rig="real"):
@@ -728,7 +728,7 @@ def test_everybody_stops_a_run_and_a_drive_that_tdhil_moves_and_an_operator_any_
         assert "no tdhil moves this rig" in answer.json()["error"]["what"]
         assert "hard-wired stop" in answer.json()["error"]["next_step"]
     assert stopped == []
-    assert stop(guarded.sessions["operator"]).json()["said"] == "tdhil stop saw the shaft at rest"
+    assert stop(guarded.sessions["operator"]).json()["said"] == "tdhil stop confirmed standstill"
     with hold(guarded.service.supervisor.rigs.get("real").address):
         assert {stop(headers).status_code for headers in viewers} == {200}
     monkeypatch.setattr(guarded.service.supervisor, "blocked", lambda rig: "a run")

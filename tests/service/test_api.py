@@ -50,7 +50,7 @@ def test_what_others_build_on_is_there_and_described(call, client, route):
     answer = client.request(method, f"{API}{path.format(rig='no-rig', run='no-run')}")
     assert answer.status_code in {int(code) for code in described["responses"]}, answer.text
     if answer.status_code != 200:
-        assert answer.json()["error"]["what"] != "there is nothing here"
+        assert answer.json()["error"]["what"] != "this address does not exist"
     assert (answer.status_code == 426) is ("101" in described["responses"])
 
 
@@ -68,8 +68,8 @@ def test_what_an_address_does_not_take_is_told_with_what_it_takes(client, method
 
 def test_an_address_at_which_nothing_is_says_so(client):
     told = client.get(f"{API}/nosuch").json()["error"]
-    assert (told["where"], told["next_step"]) == (f"{API}/nosuch", f"{API}/openapi.json says what is")
-    assert "/nosuch: there is nothing here" in client.get("/nosuch").text
+    assert (told["where"], told["next_step"]) == (f"{API}/nosuch", f"See {API}/openapi.json")
+    assert "/nosuch: this address does not exist" in client.get("/nosuch").text
 
 
 def test_rigs_say_what_they_are(call):
@@ -335,7 +335,7 @@ def test_a_real_rig_moves_with_the_code_from_the_terminal_alone(call, service):
     assert "this moves" in shown
     binding = call("GET", f"/runs/{run}", 200)["confirmation"]["binding"]
     assert "123456" not in json.dumps(call("GET", f"/runs/{run}", 200))
-    assert "that isn't the code" in call("POST", f"/runs/{run}/confirm", 409, json={"code": "000000"})["error"]["what"]
+    assert "the code is wrong" in call("POST", f"/runs/{run}/confirm", 409, json={"code": "000000"})["error"]["what"]
     call("POST", f"/runs/{run}/confirm", 200, json={"code": "123 456", "binding": binding})
     service.wait(run, "done")
     call("POST", f"/runs/{run}/confirm", 409, json={"code": "123456"})          # once
@@ -358,13 +358,13 @@ def test_another_plan_or_three_wrong_codes_void_it(call, service, sent):
 
 
 def test_a_watched_run_moves_for_a_page_that_renews_its_lease_and_only_so_long(call, service):
-    assert "logged in" in call.start("watched", expect=403)["error"]["what"]       # a real one, and nobody has
+    assert "logged-in" in call.start("watched", expect=403)["error"]["what"]       # a real one, and nobody has
     run = call.start("rehearsed", what="patient")["id"]
     service.wait(run, "awaiting_confirmation")
     key, later = "k" * 16, "n" * 16
     code = {"code": "123456", "binding": "b" * 64}
     call("POST", f"/runs/{run}/lease", 409, json={"key": key})
-    assert "only while the page" in call("POST", f"/runs/{run}/confirm", 409, json=code)["error"]["what"]
+    assert "only while the operator watches" in call("POST", f"/runs/{run}/confirm", 409, json=code)["error"]["what"]
     call("POST", f"/runs/{run}/confirm", 422, json={**code, "lease": "short"})
     call("POST", f"/runs/{run}/confirm", 200, json={**code, "lease": key})
     service.wait(run, "moving")
@@ -392,25 +392,25 @@ def test_a_code_of_one_run_is_no_code_of_another(call, service):
 
 def test_a_rig_that_may_not_move_from_here(call):
     refused = call.start("never", expect=403)["error"]
-    assert "never moved from afar" in refused["what"]
+    assert "can't be moved over HTTP" in refused["what"]
     assert "never.yaml" in refused["where"]
 
 
 @pytest.mark.parametrize(("options", "status", "words"), [
-    ({"accept_no_watchdog": True}, 403, "never taken over HTTP"),
-    ({"accept-no-watchdog": True}, 403, "never taken over HTTP"),
-    ({"accept_shared_watchdog": True}, 403, "never taken over HTTP"),
-    ({"yes": True}, 403, "nothing replaces it"),
-    ({"log": "/etc/passwd"}, 422, "is no option"),
-    ({"profile": "../../x.yaml"}, 422, "is no option"),
-    ({"interface": "socketcan"}, 422, "is no option"),
-    ({"host": "192.0.2.1"}, 422, "is no option"),
-    ({"plant": "x"}, 422, "is no option"),
+    ({"accept_no_watchdog": True}, 403, "never accepted over HTTP"),
+    ({"accept-no-watchdog": True}, 403, "never accepted over HTTP"),
+    ({"accept_shared_watchdog": True}, 403, "never accepted over HTTP"),
+    ({"yes": True}, 403, "no option replaces it"),
+    ({"log": "/etc/passwd"}, 422, "is not an option"),
+    ({"profile": "../../x.yaml"}, 422, "is not an option"),
+    ({"interface": "socketcan"}, 422, "is not an option"),
+    ({"host": "192.0.2.1"}, 422, "is not an option"),
+    ({"plant": "x"}, 422, "is not an option"),
     ({"tolerance": "a lot"}, 422, "tolerance"),
     ({"tolerance": True}, 422, "must be a number"),
     ({"tolerance": 7}, 422, "--tolerance"),
     ({"excitation": "<script>"}, 422, "--excitation"),
-    ({"accept_wider_limit": "all"}, 422, "knows torque"),
+    ({"accept_wider_limit": "all"}, 422, "must be torque"),
     ({"note": 7}, 422, "must be a text"),
     ({"fault": {"a": 1}}, 422, "must be a text"),
     ({"seed": -1}, 422, "--seed"),
@@ -422,8 +422,8 @@ def test_options_that_are_refused_begin_nothing(call, service, options, status, 
 
 
 @pytest.mark.parametrize(("sent", "words"), [
-    (b"{", "no JSON"), (b"[]", "must be an object"), (b'{"seed": NaN}', "no number"), (b"\xff", "no JSON"),
-    (b"[" * 60000, "no JSON"), (b"1" * 70000, "more than"),
+    (b"{", "is not JSON"), (b"[]", "must be an object"), (b'{"seed": NaN}', "not a number"), (b"\xff", "is not JSON"),
+    (b"[" * 60000, "is not JSON"), (b"1" * 70000, "longer than the limit"),
 ])
 def test_what_is_no_request_is_refused(call, sent, words):
     refused = call("POST", "/rigs/a/runs", 422, content=sent, headers={"content-type": "application/json"})
@@ -544,7 +544,7 @@ def test_a_real_drive_that_no_stop_reaches_blocks_its_rig_until_somebody_signs(c
     assert "hard-wired stop" in call("GET", f"/runs/{run}", 200)["error"]["next_step"]
     wait_for("nobody live", lambda: not service.supervisor.live())
     refused = call.start("real", expect=409)
-    assert "nobody has signed it off" in refused["error"]["what"]
+    assert "neither confirmed nor signed off" in refused["error"]["what"]
     assert call("GET", "/rigs/real", 200)["state"] == "blocked"
     call("POST", f"/runs/{run}/sign-off", 422, json={"note": " "})
     call("POST", f"/runs/{run}/sign-off", 200, json={"note": "seen at rest, key out"})
@@ -575,7 +575,7 @@ def test_a_service_that_ends_begins_nothing_and_waits_for_rest(call, service):
     assert service.supervisor.brake("service ending")
     assert service.store.status(run).state is State.STOPPED
     assert service.supervisor.not_at_rest == [loose]
-    assert service.said[-3].startswith(f"Braking: run {run}, {loose}. It waits for rest")
+    assert service.said[-3].startswith(f"Stopping run {run}, {loose}. tdhil waits")
     assert service.said[-2:] == [f"run {run}: stopped", f"run {loose}: stop_not_confirmed"]
     assert "is ending" in call.start("b", expect=409)["error"]["what"]
 
@@ -670,8 +670,8 @@ def test_a_web_without_descriptors_answers_in_words_and_writes_one_line_a_second
 
 
 @pytest.mark.parametrize(("number", "status", "words"), [
-    (errno.ENOSPC, 507, "Free some of the disk"), (errno.EDQUOT, 507, "Free some of the disk"),
-    (errno.EROFS, 503, "See to that folder"),
+    (errno.ENOSPC, 507, "Free some disk space"), (errno.EDQUOT, 507, "Free some disk space"),
+    (errno.EROFS, 503, "Check that folder"),
 ])
 @pytest.mark.parametrize("at", ["new_id", "begin", "save"])
 def test_a_run_that_cannot_be_written_down_is_refused_in_words(call, service, monkeypatch, number, status, words, at):
@@ -700,7 +700,8 @@ def test_a_process_that_cannot_be_started_on_a_full_disk_is_refused_in_words(cal
 
 
 @pytest.mark.parametrize(("path", "fields"), [
-    ("/start/a", {"tolerance", "max_time_s", "excitation", "operator", "note", "seed", "fault", "real_time"}),
+    ("/start/a", {"tolerance", "max_time_s", "excitation", "operator", "note", "seed", "fault", "real_time",
+                  "simulated_torque_scale", "simulated_added_inertia_kg_m2"}),
     ("/start/real", {"tolerance", "max_time_s", "excitation", "operator", "note", "accept_unverified",
                      "accept_speed_unit", "reset_fault"}),
     ("/rehearse/a", {"stage", "after", "duration", "real_time"}),

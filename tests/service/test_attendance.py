@@ -72,7 +72,7 @@ def test_a_code_is_good_once_for_a_minute():
     assert not confirming.look()
     confirming.take(confirming.code, confirming.binding, "who")
     assert confirming.look()
-    with pytest.raises(PreflightRefused, match="used already"):
+    with pytest.raises(PreflightRefused, match="already been used"):
         confirming.take(confirming.code, None, "who")
 
 
@@ -81,7 +81,7 @@ def test_after_a_minute_it_is_void():
     confirming = Confirming("b" * 64, lambda: None, clock=clock)
     clock.now_s = CODE_S
     for _ in range(2):
-        with pytest.raises(PreflightRefused, match="not confirmed within 60 s"):
+        with pytest.raises(PreflightRefused, match="not entered within 60 s"):
             confirming.take(confirming.code, None, "who")
     with pytest.raises(PreflightRefused):
         confirming.look()
@@ -97,7 +97,7 @@ def test_so_it_is_for_another_plan_a_changed_file_and_after_three_tries():
         (Confirming("b" * 64, lambda: None), "nonsense", None, TRIES, "wrong codes"),
     ):
         for left in range(tries, 0, -1):
-            with pytest.raises(PreflightRefused, match=words if left == 1 else "isn't the code"):
+            with pytest.raises(PreflightRefused, match=words if left == 1 else "code is wrong"):
                 confirming.take(code or confirming.code, binding, "who")
         with pytest.raises(PreflightRefused, match=words):
             confirming.take(confirming.code, confirming.binding, "who")       # the right one comes too late
@@ -132,7 +132,7 @@ def test_nobody_confirms_and_nothing_moves(board, tmp_path):
     def idle() -> None:
         clock.now_s += 1.0
 
-    with pytest.raises(PreflightRefused, match="not confirmed"):
+    with pytest.raises(PreflightRefused, match="not entered"):
         there.confirm(TASK, preflight(simulated=False), idle, ())
     assert board.status.state is State.AWAITING
 
@@ -158,7 +158,7 @@ def test_a_simulated_shaft_asks_nobody(board, tmp_path):
 
 def test_a_speed_that_somebody_would_have_to_see_is_refused(board, tmp_path):
     there = operator_interface(board, tmp_path, Confirming("b" * 64, lambda: None))
-    with pytest.raises(PreflightRefused, match="nobody is there to see"):
+    with pytest.raises(PreflightRefused, match="no operator can confirm"):
         there.confirm_speed(1.0, "no angle", pytest.fail)
 
 
@@ -193,7 +193,7 @@ def test_a_lease_holds_as_long_as_it_is_renewed_and_is_lost_for_good_5_s_after()
     assert (lost.by, lost.how) == ("who", "silent")
     assert lost.since <= lost.gone <= lost.lost
     for key in (KEY, "x" * 16):
-        with pytest.raises(PreflightRefused, match="nothing brings it back"):
+        with pytest.raises(PreflightRefused, match="can't be renewed"):
             watched.lease.renew(key, "who")
     watched.at(100.0).look()
     assert len(watched.lost) == 1
@@ -201,7 +201,7 @@ def test_a_lease_holds_as_long_as_it_is_renewed_and_is_lost_for_good_5_s_after()
 
 def test_a_renewal_that_comes_too_late_is_none_even_where_nobody_looked_at_the_clock():
     watched = Watched()
-    with pytest.raises(PreflightRefused, match="nothing brings it back"):
+    with pytest.raises(PreflightRefused, match="can't be renewed"):
         watched.at(LEASE_S + 0.01).renew(KEY, "who")
     assert len(watched.lost) == 1
 
@@ -249,7 +249,7 @@ def test_a_watched_shaft_waits_for_a_page_that_stays_and_brakes_without(board, t
 
     def idle() -> None:
         if board.status.confirmation is not None:
-            with pytest.raises(PreflightRefused, match="only while the page"):
+            with pytest.raises(PreflightRefused, match="only while the operator watches"):
                 confirming.take(confirming.code, None, "who")
             confirming.take(confirming.code, None, "who", KEY)
 

@@ -78,7 +78,7 @@ def test_a_real_drive_moves_with_its_code_and_no_other(tmp_path):
         service.wait(second, "awaiting_confirmation")
         asked = f"run {second}. To let it move"
         shown = wait_for("the code", lambda: next((one for one in service.said if asked in one), None))
-        with pytest.raises(Conflict, match="isn't the code"):      # of the run before
+        with pytest.raises(Conflict, match="the code is wrong"):      # of the run before
             supervisor.confirm(second, code.replace(" ", "") if code not in shown else "000000", None, "local")
         (code,) = re.findall(r"(\d{3} \d{3})\n", shown)
         status = service.store.status(second)

@@ -60,7 +60,7 @@ def test_so_is_a_shaft_that_nobody_saw_at_rest_until_somebody_signs(service, cap
     service.wait(run, "stop_not_confirmed")
     wait_for("its end", lambda: not lives(service.store.place(run)))
     assert idle(service.store.folder) == ExitCode.REFUSED
-    assert "was not seen at rest" in capsys.readouterr().err
+    assert "neither confirmed nor signed off" in capsys.readouterr().err
     service.supervisor.sign_off(run, "test", "it stands")
     assert idle(service.store.folder) == ExitCode.OK
 

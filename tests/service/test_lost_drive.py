@@ -84,13 +84,13 @@ def test_a_rig_s_file_that_was_changed_meanwhile_leaves_the_stop_unconfirmed(ser
     assert stops.commands == [["tdhil.service.drive_stop", str(service.store.place(run) / CONNECTION_FILE)]]
     status = service.store.status(run)
     assert (status.state, status.stop.confirmed, status.stop.at_rest) == (State.STOP_NOT_CONFIRMED, False, None)
-    for words in ("tdhil stop saw the shaft at rest, on the connection that the run had (modbus tcp 127.0.0.1",
+    for words in ("tdhil stop confirmed standstill, on the connection that the run used (modbus tcp 127.0.0.1",
                   "real.yaml was changed or removed after the run was requested"):
         assert words in status.error.what
     assert "hard-wired stop" in status.error.next_step
     path.write_text(before)
     assert service.supervisor.blocked("real") == run
-    with pytest.raises(Conflict, match="nobody has signed it off"):
+    with pytest.raises(Conflict, match="neither confirmed nor signed off"):
         service.supervisor.start_run("real", {"note": "ask"}, "local")
     service.supervisor.sign_off(run, "anna", "both shafts at rest")
     assert service.supervisor.blocked("real") is None
@@ -113,26 +113,26 @@ def test_without_a_kept_connection_and_with_another_file_no_drive_is_stopped(ser
 
 def test_a_drive_that_was_not_seen_at_rest_blocks_its_rig_and_stop_goes_to_it(service, stops):
     """Its rig's Stop goes to the run's own drive, whatever the file says by then."""
-    stops.code, stops.said = 8, "no JSON"
+    stops.code, stops.said = 8, "is not JSON"
     run = lost_run(service)
     status = service.store.status(run)
     assert status.state is State.STOP_NOT_CONFIRMED
-    assert "did NOT see the shaft at rest" in status.error.what
+    assert "did NOT confirm standstill" in status.error.what
     rig = service.supervisor.rigs.get("real")
-    assert service.supervisor.stop_drive(rig, "anna") == (8, "tdhil stop did NOT see the shaft at rest")
+    assert service.supervisor.stop_drive(rig, "anna") == (8, "tdhil stop did NOT confirm standstill")
     stops.code = 0
-    assert service.supervisor.stop_drive(rig, "anna") == (0, "tdhil stop saw the shaft at rest")
+    assert service.supervisor.stop_drive(rig, "anna") == (0, "tdhil stop confirmed standstill")
     other_port(rig.path)
     code, said = service.supervisor.stop_drive(service.supervisor.rigs.get("real"), "anna")
     assert code == 8
-    assert "on the connection that the run had" in said
+    assert "on the connection that the run used" in said
     assert {tuple(one) for one in stops.commands} == {
         ("tdhil.service.drive_stop", str(service.store.place(run) / CONNECTION_FILE))}
     service.supervisor.sign_off(run, "anna", "at rest")
     service.supervisor.stop_drive(rig, "anna")
     assert stops.commands[-1] == ["tdhil", "stop", "--rig", str(rig.path), "--json"]
     stops.code = 8
-    assert service.supervisor.stop_drive(rig, "anna") == (8, "tdhil stop did NOT see the shaft at rest")
+    assert service.supervisor.stop_drive(rig, "anna") == (8, "tdhil stop did NOT confirm standstill")
     assert service.supervisor.stop_drive(service.supervisor.rigs.get("a"), "berta")[0] == 0
     wait_for("the audit", lambda: ("berta", "stop asked", None, "a") in {
         (one.who, one.what, one.run, one.rig) for one in service.audit.entries()})
@@ -149,7 +149,7 @@ def test_another_drive_at_the_run_s_address_is_not_the_run_s(service, stops, mon
     run = lost_run(service)
     assert stops.commands[0][2:] == ["1,2,3,4"]
     assert service.store.status(run).state is State.STOP_NOT_CONFIRMED
-    assert "another drive is there than the run had (identity 1, 2, 3, 99)" in service.store.status(run).error.what
+    assert "another identity (1, 2, 3, 99) than the drive of the run" in service.store.status(run).error.what
 
 
 # -- a process that stands still
@@ -163,7 +163,7 @@ def test_a_stop_to_a_process_that_stands_still_kills_it_and_says_that_nothing_wa
     pid = service.store.status(run).pid
     os.kill(pid, signal.SIGSTOP)
     told = call("POST", f"/runs/{run}/stop", 504, json={})["error"]
-    for words in ("doesn't react", "SIGSTOP", "watchdog (500 ms) stops the shaft", "sends tdhil stop"):
+    for words in ("does not react", "SIGSTOP", "watchdog (500 ms) stops the shaft", "sends tdhil stop"):
         assert words in told["what"]
     assert "hard-wired stop" in told["next_step"]
     service.wait(run, "interrupted")
@@ -182,7 +182,7 @@ def test_a_rig_whose_run_stands_still_answers_the_same(call, service):
     run = call.start("a", what="hold")["id"]
     service.wait(run, "moving")
     os.kill(service.store.status(run).pid, signal.SIGSTOP)
-    assert "doesn't react" in call("POST", "/rigs/a/stop", 504, json={})["error"]["what"]
+    assert "does not react" in call("POST", "/rigs/a/stop", 504, json={})["error"]["what"]
     service.wait(run, "interrupted")
 
 

@@ -65,7 +65,7 @@ def test_the_shaft_comes_to_rest_the_run_is_told_of_and_its_log_kept(tmp_path):
         service.supervisor.close()
     status = service.store.status(run)
     assert status.stop.confirmed is True
-    assert "tdhil stop saw the shaft at rest" in status.error.what
+    assert "tdhil stop confirmed standstill" in status.error.what
     assert status.history[-2].state is State.MOVING
     assert len(read_run(service.store.place(run) / "recovered.mcap").recording.time_s) > 10
     with pytest.raises(FileNotFoundError):

@@ -180,7 +180,7 @@ def test_from_the_rigs_to_a_result_by_keyboard_alone(page, served, monkeypatch):
     page.get_by_role("article", name="Rig a").get_by_role("link", name="Start").focus()
     page.keyboard.press("Enter")
     page.wait_for_url("**/start/a")
-    page.get_by_label("How tight").focus()
+    page.get_by_label("Tolerance: half-width").focus()
     page.keyboard.type("2,5")
     page.keyboard.press("Enter")       # as the first button would have it: a plan, and nothing begins by mistake
     page.get_by_role("row", name="expected interval of J").get_by_text("±2.1 %").wait_for()
@@ -202,9 +202,9 @@ def test_a_stop_says_when_it_was_asked_seen_and_at_rest(page, served):
     button = page.get_by_role("button", name="Stop", exact=True)
     button.focus()
     page.keyboard.press("Enter")
-    page.get_by_text("seen by the drive").wait_for()
+    page.get_by_text("drive reacted").wait_for()
     served.service.wait(run, "stopped")
-    page.get_by_text("stopped, at rest").wait_for()
+    page.get_by_text("stopped, at standstill").wait_for()
     assert not page.get_by_text("NOT DELIVERED").is_visible()
     assert button.is_disabled()
 
@@ -217,27 +217,27 @@ def test_an_answer_that_was_overtaken_undoes_nothing(page, served):
     def late(route: Any) -> None:
         answer = route.fetch()
         served.service.wait(run, "stopped")
-        page.get_by_text("stopped, at rest").wait_for()
+        page.get_by_text("stopped, at standstill").wait_for()
         route.fulfill(response=answer)
 
     page.route("**/stop", late)
     with page.expect_response("**/stop"):
         page.get_by_role("button", name="Stop", exact=True).click()
     page.wait_for_timeout(300)
-    assert page.get_by_text("stopped, at rest").is_visible()
+    assert page.get_by_text("stopped, at standstill").is_visible()
     assert page.get_by_role("button", name="Stop", exact=True).is_disabled()
 
 
 def test_a_drive_that_a_terminal_has_is_stopped_from_its_card(page, served, monkeypatch):
-    told = [(True, "tdhil stop saw the shaft at rest"), (False, "tdhil stop did NOT see the shaft at rest")]
+    told = [(True, "tdhil stop confirmed standstill"), (False, "tdhil stop did NOT confirm standstill")]
     monkeypatch.setattr("tdhil.service.supervisor._stop_seen", lambda command: told.pop(0))
     with hold(served.service.supervisor.rigs.get("real").address):
         page.goto("/")
         stop = page.get_by_role("article", name="real", exact=True).get_by_role("button", name="Stop")
         stop.click()
-        page.get_by_text("real: tdhil stop saw the shaft at rest").wait_for()
+        page.get_by_text("real: tdhil stop confirmed standstill").wait_for()
         stop.click()
-        page.get_by_text("real: tdhil stop did NOT see the shaft at rest. Use the hard-wired stop").wait_for()
+        page.get_by_text("real: tdhil stop did NOT confirm standstill. Use the hard-wired stop").wait_for()
 
 
 @pytest.mark.parametrize("way", ["offline", "mute"])
@@ -276,20 +276,20 @@ def test_six_tabs_and_a_stop_still_gets_through(page, served):
         one.goto(f"/runs/{run}/live")
     page.get_by_role("button", name="Stop", exact=True).click()
     served.service.wait(run, "stopped")
-    page.get_by_text("seen by the drive").wait_for()
+    page.get_by_text("drive reacted").wait_for()
 
 
 def test_the_code_is_asked_for_and_a_wrong_one_said(page, served):
     run = begin(served, "ask", "real")
     page.goto(f"/runs/{run}/live")
     page.get_by_text("this moves").wait_for()
-    page.get_by_text("Expected: J to ±1.3 %, about 2 min 10 s. A drive; if the host falls silent: quick").wait_for()
-    page.get_by_text("Preflight: what the drive").click()
+    page.get_by_text("Expected: J to ±1.3 %, about 2 min 10 s. A drive; if the host fails: quick").wait_for()
+    page.get_by_text("Preflight: values read from the drive").click()
     page.get_by_role("row", name="watchdog 500 ms 500 ms 1016h:1").wait_for()
-    field = page.get_by_label("The six digits")
+    field = page.get_by_label("Six digits")
     field.fill("000000")
     field.press("Enter")
-    page.get_by_text("that isn't the code").wait_for()
+    page.get_by_text("the code is wrong").wait_for()
     field.fill("123 456")
     field.press("Enter")
     served.service.wait(run, "done")
@@ -299,8 +299,8 @@ def watched_run(page: Any, served: Served) -> str:
     """It moves, and this page holds its lease."""
     run = begin(served, "ask", "rehearsed")
     page.goto(f"/runs/{run}/live")
-    page.get_by_label("The six digits").fill("123 456")
-    page.get_by_role("button", name="Let it move").click()
+    page.get_by_label("Six digits").fill("123 456")
+    page.get_by_role("button", name="Move the shaft").click()
     page.get_by_text("You watch this run").wait_for()
     return run
 
@@ -328,11 +328,11 @@ def test_a_watched_run_brakes_once_its_page_is_gone(page, served, way, how):
         other.goto(f"/runs/{run}/live")
         other.get_by_text("watches this run on another page").wait_for()
         page.close()
-        other.get_by_text("Nobody watched this run: it was braked").wait_for()     # to look is not to hold
+        other.get_by_text("This run was not watched: it was stopped").wait_for()     # to look is not to hold
     elif way == "offline":
         page.context.set_offline(True)
-        page.get_by_text("The run hears nothing of this page").wait_for()
-        page.get_by_text("It brakes once nobody watches it").wait_for()
+        page.get_by_text("The run receives nothing from this page").wait_for()
+        page.get_by_text("The run stops, because it is not watched").wait_for()
     else:
         page.evaluate(HIDE, True)
     assert lost(served, run) == how
@@ -380,7 +380,7 @@ def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, serv
     page.get_by_role("button", name="Stop", exact=True).click()
     page.reload()
     page.locator("li", has_text="asked ").wait_for()
-    page.get_by_text("seen by the drive").wait_for()
+    page.get_by_text("drive reacted").wait_for()
     assert not page.get_by_text("NOT DELIVERED").is_visible()
 
 
@@ -401,10 +401,10 @@ def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypat
                                                         "half_width_total_rel": 0.05}}
     monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": again})
     page.get_by_label("Model").select_option("rigid")
-    page.get_by_label("How tight").fill("a lot")
+    page.get_by_label("Tolerance: half-width").fill("a lot")
     page.get_by_role("button", name="Replay").click()
     page.get_by_text("tolerance: a number and its unit are wanted").wait_for()         # and it isn't passed over
-    page.get_by_label("How tight").fill("0,1")
+    page.get_by_label("Tolerance: half-width").fill("0,1")
     page.get_by_role("button", name="Replay").click()
     page.get_by_role("row", name="model rigid, tolerance 0.001").get_by_text("104.5 (99.0 to 110.0)").wait_for()
     page.get_by_role("row", name="the run itself").get_by_text("104.0 (100.0 to 108.0)").wait_for()
@@ -420,7 +420,7 @@ def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypat
     page.wait_for_url("**/compare?runs=*,*")
     page.goto("/rehearse/a")
     page.get_by_label("speed", exact=True).check()
-    page.get_by_label("So long after").fill("1.5")
+    page.get_by_label("Delay after").fill("1.5")
     page.get_by_label("internal-limit: share").fill("20%")
     page.get_by_role("button", name="Rehearse internal-limit").click()
     page.wait_for_url("**/live")
@@ -446,7 +446,7 @@ def test_a_newcomer_clicks_twice_and_has_a_result(browser, tmp_path):
         took_s = time.monotonic() - clicked_s
         page.locator(".pictures img").nth(4).evaluate("one => { one.loading = 'eager'; return one.decode() }")
         run = server.client.runs()[0]["id"]
-        page.get_by_label("How tight").fill("0.1")
+        page.get_by_label("Tolerance: half-width").fill("0.1")
         page.get_by_role("button", name="Replay").click()
         page.get_by_role("row", name="tolerance 0.001").get_by_text("valid_wide").wait_for()
         page.get_by_role("row", name="the run itself").get_by_role("cell", name="valid", exact=True).wait_for()
@@ -471,7 +471,7 @@ def test_a_page_says_when_nobody_answers_any_more(page, served, monkeypatch):
         page.goto(path)
         page.get_by_text(shown).first.wait_for()
         page.context.set_offline(True)
-        page.get_by_text("No answer from tdhil serve: what you see is old").wait_for()
+        page.get_by_text("No answer from tdhil serve: the values are old").wait_for()
         assert page.evaluate("document.body.classList.contains('stale')")
         page.context.set_offline(False)
         page.locator("body:not(.stale)").wait_for()

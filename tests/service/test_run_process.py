@@ -78,7 +78,7 @@ def test_a_rig_s_file_that_was_changed_before_the_process_began_ends_it(tmp_path
     assert State.PREFLIGHT not in asked.states
     if change == "another":
         assert asked.states[-1] is State.REFUSED
-        assert "was changed after the run was asked for" in asked.store.status(asked.run).error.what
+        assert "was changed after the run was requested" in asked.store.status(asked.run).error.what
     assert not list(asked.folder.glob("*.mcap"))
 
 
@@ -109,7 +109,7 @@ def test_a_run_that_cannot_keep_where_its_drive_is_opens_no_bus(tmp_path, nobody
 
 def test_what_comes_over_its_socket_has_an_answer_each(tmp_path):
     process = RunProcess(Asked(tmp_path, SIMULATED).folder)
-    for asked, words in (({"do": "lease", "key": "x"}, "nobody watches this run"),
+    for asked, words in (({"do": "lease", "key": "x"}, "this run is not watched"),
                          ({"do": "confirm", "code": "1"}, "nothing to confirm")):
         with pytest.raises(Exception, match=words):
             process.answer(asked)
@@ -168,7 +168,7 @@ def test_a_run_that_is_watched_no_more_is_stopped_by_nobody(tmp_path):
     process = RunProcess(Asked(tmp_path, SIMULATED, motion="watched").folder)
     assert process.watched
     process.operator_interface._unwatched(Watch("anna", now(), now(), "hidden", now()))
-    assert process.stop.why == "nobody watched the run for 5 s (its page is hidden)"
+    assert process.stop.why == "the run was not watched for 5 s (its page is hidden)"
     assert (process.stop.signum, process.board.status.stop.by) == (15, "nobody watched")
     process.board.close()
 

@@ -118,7 +118,7 @@ def test_a_run_outlives_its_web_and_is_one_result(tmp_path):
         assert [(one["log"], one["value"]) for one in inertia["points"]] == [
             (run, found["result"]["inertia_kg_m2"]["value"])]
         assert second.client.audit()["broken"] is None
-        assert second.client.rig("simulated-canopen")["last"]["inertia_kg_m2"] == pytest.approx(104.0, rel=0.02)
+        assert second.client.rig("simulated-canopen")["last"]["inertia_kg_m2"] == pytest.approx(1.05 * 104.0, rel=0.02)
     one = json.loads((folder / "result.json").read_bytes())
     assert one == found["result"]
 
@@ -166,7 +166,7 @@ def test_a_watched_run_moves_with_the_code_of_another_terminal_and_brakes_when_i
     rigs.mkdir()
     (rigs / "rig.yaml").write_text(f"rate_hz: 20\n{PATIENT}service: {{motion: watched}}\n")
     with served(data, "--rigs", str(rigs)) as server:
-        with pytest.raises(UsageError, match="no runs of a service"):
+        with pytest.raises(UsageError, match="no service runs"):
             attend(tmp_path, print)
         shown: list[str] = []
         going = threading.Event()
@@ -174,8 +174,8 @@ def test_a_watched_run_moves_with_the_code_of_another_terminal_and_brakes_when_i
         run = server.client.start("rig", real_time=True)["id"]
         (code,) = wait_for("the code", lambda: [one for text in shown for one in re.findall(r"(\d{3} \d{3})\n", text)])
         wait_for("the same on the other terminal", lambda: code in server.said())
-        assert "somebody watches the page" in shown[-1]
-        assert "Rig rig, SIMULATED. Asked for by local" in shown[-1]
+        assert "an operator watches the page" in shown[-1]
+        assert "Rig rig, SIMULATED. Requested by local" in shown[-1]
         assert 0.0 < Store(data).status(run).expected_half_width < 0.1
         key, post = "k" * 16, server.client._object
         binding = server.client.run(run)["confirmation"]["binding"]
@@ -195,8 +195,8 @@ def test_a_watched_run_moves_with_the_code_of_another_terminal_and_brakes_when_i
     assert (status.watch.by, status.watch.how) == ("local", "silent")
     log = read_run(data / "runs" / run / "run.mcap")
     told = [one.text for one in log.events if one.kind == "watch"]
-    assert told[:2] == ["its page is there", "nothing is heard of its page"]
-    assert status.error.what == "interrupted: nobody watched the run for 5 s (nothing is heard of its page)"
+    assert told[:2] == ["its page is open", "its page sends nothing"]
+    assert status.error.what == "interrupted: the run was not watched for 5 s (its page sends nothing)"
     assert [one.text for one in log.events if one.kind == "interrupted"] == [status.error.what]
     assert abs(log.recording.speed_rad_s[-1]) < 0.1
     assert max(log.recording.speed_rad_s) > 0.5
@@ -208,12 +208,12 @@ def test_another_host_without_login_and_tls_is_refused_in_words(host, capsys, tm
     monkeypatch.chdir(tmp_path)
     assert main(["serve", "--host", host]) == ExitCode.USAGE
     said = capsys.readouterr().err
-    assert "takes a login, and TLS" in said
+    assert "needs a login and TLS" in said
     assert "ssh -L" in said
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(UsageError, match="there is no user yet"):
         require_way(host, tls=True, accounts=False)
-    with pytest.raises(UsageError, match="takes a login"):
+    with pytest.raises(UsageError, match="needs a login"):
         require_way(host, tls=False, accounts=False)
     require_way(host, tls=True, accounts=True)
 
@@ -223,7 +223,7 @@ def test_this_computer_is_not_as_long_as_it_has_no_users(host):
     require_way(host, tls=False, accounts=False)
     require_way(host, tls=True, accounts=False)
     require_way(host, tls=True, accounts=True)
-    with pytest.raises(UsageError, match="goes over no open line"):
+    with pytest.raises(UsageError, match="must not be sent without TLS"):
         require_way(host, tls=False, accounts=True)
 
 
@@ -273,7 +273,7 @@ def known(client: tdhil.Client) -> bool:
 
 
 def test_a_token_goes_over_tls_alone():
-    with pytest.raises(UsageError, match="over TLS alone"):
+    with pytest.raises(UsageError, match="over TLS only"):
         tdhil.Client("http://127.0.0.1:8420", token="tdhil_x")
     with pytest.raises(UsageError, match="can't be read as certificates"):
         tdhil.Client("https://127.0.0.1:8420", token="tdhil_x", ca="/none.pem")
@@ -282,10 +282,10 @@ def test_a_token_goes_over_tls_alone():
 def test_one_service_a_folder_and_a_folder_of_rigs_that_is_there(tmp_path, capsys):
     from tdhil.service.server import _alone
 
-    with _alone(tmp_path), pytest.raises(UsageError, match="another tdhil serve has this folder"):
+    with _alone(tmp_path), pytest.raises(UsageError, match="another tdhil serve uses this folder"):
         _alone(tmp_path)
     assert main(["serve", "--rigs", str(tmp_path / "missing"), "--data", str(tmp_path)]) == ExitCode.USAGE
-    assert "no such folder" in capsys.readouterr().err
+    assert "this folder does not exist" in capsys.readouterr().err
     assert main(["serve", "--port", "99999", "--data", str(tmp_path)]) == ExitCode.USAGE
 
 
@@ -293,8 +293,8 @@ def test_one_service_a_folder_and_a_folder_of_rigs_that_is_there(tmp_path, capsy
     (["--data", "file"], "file: can't be made"), (["--data", "/proc/nothing"], "/proc/nothing: can't be made"),
     (["--data", "taken"], "taken: can't be written"), (["--data", "d", "--viewer", "foo"], "--viewer foo"),
     (["--data", "d", "--viewer", "http://a/b"], "--viewer http://a/b"),
-    (["--check-idle", "--data", "d"], "--data d: there is no such folder"),
-    (["users", "list", "--data", "d"], "--data d: there is no such folder"),
+    (["--check-idle", "--data", "d"], "--data d: this folder does not exist"),
+    (["users", "list", "--data", "d"], "--data d: this folder does not exist"),
     (["users", "add", "anna", "--role", "admin", "--data", "file/d"], "--data file/d: can't be made"),
 ])
 def test_what_cannot_be_served_is_said_in_words(tmp_path, capsys, monkeypatch, arguments, words):
@@ -311,7 +311,7 @@ def test_a_shaft_that_is_not_seen_at_rest_is_the_exit_code(tmp_path, capsys, mon
     monkeypatch.setattr("tdhil.service.server._uvicorn",
                         lambda app, listening, brake, *_: brake.__self__.not_at_rest.append("R1"))
     assert main(["serve", "--port", "0", "--data", str(tmp_path / "data")]) == ExitCode.STOP_NOT_CONFIRMED
-    assert "NOT at rest, as far as is known: R1. Use the hard-wired stop." in capsys.readouterr().err
+    assert "Standstill NOT confirmed: R1. Use the hard-wired stop." in capsys.readouterr().err
 
 
 def test_a_rig_whose_file_has_no_rig_s_name_is_said_to_be_left_out(tmp_path, capsys, monkeypatch):
@@ -319,7 +319,7 @@ def test_a_rig_whose_file_has_no_rig_s_name_is_said_to_be_left_out(tmp_path, cap
         (tmp_path / name).write_text("run: {simulate: true}\n")
     monkeypatch.setattr("tdhil.service.server._uvicorn", lambda *_: None)
     assert main(["serve", "--port", "0", "--rigs", str(tmp_path), "--data", str(tmp_path / "data")]) == ExitCode.OK
-    assert "Left out, as no rig's file is called so: b.yml, rig 7.yaml." in capsys.readouterr().err
+    assert "Ignored, because the name is not that of a rig file: b.yml, rig 7.yaml." in capsys.readouterr().err
 
 
 def test_a_client_says_what_the_service_says():

@@ -86,8 +86,8 @@ def test_a_service_that_brakes_begins_nothing_more(service):
     loose, run = begun(service, "loose"), begun(service, "hold", "b")
     assert service.supervisor.brake("the end")
     assert service.supervisor.not_at_rest == [loose]
-    assert service.said[0] == (f"Braking: run {loose}, {run}. It waits for rest, 60 s at most."
-                               " If a shaft turns on, use the hard-wired stop.")
+    assert service.said[0] == (f"Stopping run {loose}, {run}. tdhil waits 60 s at most for standstill."
+                               " If a shaft keeps turning, use the hard-wired stop.")
     assert {service.store.status(one).stop.by for one in (loose, run)} == {"the end"}
     with pytest.raises(Conflict, match="service is ending"):
         begun(service, "hold", "b")
@@ -125,8 +125,8 @@ def test_a_key_gives_its_run_for_the_same_request_of_the_same_user_and_rig(servi
 
 
 def test_a_run_of_a_rig_that_may_not_move_or_of_options_that_cannot_be_is_none(service):
-    for rig, options, wrong in (("never", {}, "never moved"), ("broken", {}, "broken.yaml"),
-                                ("a", {"excitation": "nosuch"}, "excitation"), ("nosuch", {}, "no such rig")):
+    for rig, options, wrong in (("never", {}, "can't be moved over HTTP"), ("broken", {}, "broken.yaml"),
+                                ("a", {"excitation": "nosuch"}, "excitation"), ("nosuch", {}, "does not exist")):
         with pytest.raises(Exception, match=wrong):
             service.supervisor.start_run(rig, options, "anna")
     assert service.store.ids() == []
@@ -199,9 +199,9 @@ def test_a_code_for_nothing_is_refused_and_noted(service):
     with pytest.raises(Conflict, match="nothing to confirm"):
         service.supervisor.confirm(run, "123456", None, "anna")
     real = begun(service, "ask", "real", "awaiting_confirmation")
-    with pytest.raises(Conflict, match="isn't the code"):
+    with pytest.raises(Conflict, match="the code is wrong"):
         service.supervisor.confirm(real, "000000", None, "anna")
-    with pytest.raises(Conflict, match="nobody watches"):
+    with pytest.raises(Conflict, match="is not watched"):
         service.supervisor.renew(real, "key", "anna", new_key=None, gone=None)
     assert service.supervisor.confirm(real, "123456", None, "berta").id == real
     service.wait(real, "done")
@@ -219,7 +219,7 @@ def test_a_signature_is_for_a_stop_that_was_not_confirmed_alone(service):
     with pytest.raises(Conflict, match="nothing to sign off: the run is stopped"):
         service.supervisor.sign_off(good, "anna", "at rest")
     assert service.store.signed_off(good) is None
-    with pytest.raises(Conflict, match="was not confirmed"):
+    with pytest.raises(Conflict, match="neither confirmed nor signed off"):
         begun(service)
     service.supervisor.sign_off(bad, "anna", "at rest")
     assert service.store.signed_off(bad)["note"] == "at rest"
@@ -232,7 +232,7 @@ def test_an_edit_waits_for_nobody_who_has_the_rig(service, monkeypatch, rigs):
     rig = service.supervisor.rigs.get("real")
     text = rig.path.read_text()
     run = begun(service, "ask", "real", "awaiting_confirmation")
-    with pytest.raises(Conflict, match="has this rig"):
+    with pytest.raises(Conflict, match="uses this rig"):
         service.supervisor.edit_rig("real", text, rig.sha256, "anna")
     service.supervisor.stop(run, "anna")
     service.wait(run, "stopped")
@@ -322,7 +322,7 @@ def test_arithmetic_that_fails_says_why(service, monkeypatch):
     with pytest.raises(RunRefused, match="nosuch") as refused:
         service.supervisor.work("plan", None, {"rig_file": "/nosuch/rig.yaml", "options": {}})
     assert refused.value.told.exit_code != 0
-    broken = SimpleNamespace(stdout=b"no JSON", stderr=b"first\nkilled\n")
+    broken = SimpleNamespace(stdout=b"is not JSON", stderr=b"first\nkilled\n")
     monkeypatch.setattr(supervisor_module.subprocess, "run", lambda *_, **__: broken)
     with pytest.raises(RunRefused) as refused:
         service.supervisor.work("plan", None, {})
@@ -343,9 +343,9 @@ def test_an_audit_or_an_index_that_cannot_be_written_is_said_and_holds_nothing_u
             patched.setattr(service.index, name, full)
         service.supervisor.start()
         run = begun(service, "done", "a", "done")
-        for words in ("the audit can't be written", "the index has to wait", "the index can't be made"):
+        for words in ("the audit can't be written", "the index can't be written", "the index can't be made"):
             wait_for(words, lambda words=words: any(words in one for one in service.said))
-        assert sum("the index has to wait" in one for one in service.said) == 1
+        assert sum("the index can't be written and is retried" in one for one in service.said) == 1
     wait_for("the index", lambda: [one.id for one in service.index.find()] == [run])
 
 

@@ -128,7 +128,7 @@ def test_a_link_with_another_bit_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     check_link(bus_config(cli("-i", "socketcan", "-c", "can0", "-b", "250000")))
     with pytest.raises(PreflightRefused) as caught:
         check_link(bus_config(cli("-i", "socketcan", "-c", "can0", "-b", "500000")))
-    assert "the link runs at 250000 bit/s, --bitrate says 500000" in str(caught.value)
+    assert "the CAN link runs at 250000 bit/s, but --bitrate requests 500000 bit/s" in str(caught.value)
     assert "sudo ip link set can0 down && sudo ip link set can0 up type can bitrate 500000" in str(caught.value)
 
 
@@ -218,5 +218,5 @@ def test_socketcand_opens_tuned(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_another_server_on_that_port(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(can_bus, "PROBE_S", 0.2)
-    with socket.create_server(("127.0.0.1", 0)) as silent, pytest.raises(CommunicationLost, match="no socketcand"):
+    with socket.create_server(("127.0.0.1", 0)) as silent, pytest.raises(CommunicationLost, match="not a socketcand"):
         open_bus(daemon(silent.getsockname()[1]))

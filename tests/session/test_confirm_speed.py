@@ -37,7 +37,7 @@ def ask(monkeypatch, typed, terminal=True, **options):
 
 def test_yes(monkeypatch):
     shown = ask(monkeypatch, "yes\n")
-    assert "Is it turning forward once every 12 s?" in shown
+    assert "Does it turn forward once every 12 s?" in shown
     assert "0.524 rad/s" in shown
     assert "tells no angle" in shown
 
@@ -48,13 +48,13 @@ def test_the_main_shaft_is_named_where_a_gear_is(monkeypatch):
 
 @pytest.mark.parametrize("typed", ["no\n", "\n", "", "MOVE\n", "yes it is\n", "ja\n"])
 def test_anything_else_is_a_no(monkeypatch, typed):
-    with pytest.raises(PreflightRefused, match="was not seen to turn forward once every 12 s") as caught:
+    with pytest.raises(PreflightRefused, match="not confirm that the shaft turns forward once every 12 s") as caught:
         ask(monkeypatch, typed)
     assert "speed scaling in the profile" in caught.value.next_step
 
 
 def test_nobody_at_a_terminal_is_no_yes(monkeypatch):
-    with pytest.raises(PreflightRefused, match="nobody is there to see") as caught:
+    with pytest.raises(PreflightRefused, match="no operator can confirm") as caught:
         ask(monkeypatch, "yes\n", terminal=False)
     assert "--accept-speed-unit" in caught.value.next_step
 
@@ -64,7 +64,7 @@ def test_a_program_in_the_background_is_refused_not_stopped(monkeypatch):
     terminal = Terminal()
     terminal.readline = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
     monkeypatch.setattr(sys, "stdin", terminal)
-    with pytest.raises(PreflightRefused, match="the terminal can't be asked: Input/output error"):
+    with pytest.raises(PreflightRefused, match="the terminal can't be read: Input/output error"):
         confirm_speed(1.0, "", lambda: None, console=Console(file=io.StringIO()), pause_display=lambda: None)
 
 
@@ -101,13 +101,13 @@ def test_what_was_typed_before_the_question_is_no_answer(monkeypatch):
     with os.fdopen(terminal, encoding="utf-8") as stdin, os.fdopen(operator, "wb", buffering=0):
         monkeypatch.setattr(sys, "stdin", stdin)
         os.write(operator, b"yes\n")
-        with pytest.raises(PreflightRefused, match="was not seen to turn"):
+        with pytest.raises(PreflightRefused, match="did not confirm that the shaft turns"):
             confirm_speed(1.0, "", idle, console=Console(file=io.StringIO()), pause_display=lambda: None)
 
 
 def test_no_terminal_at_all(monkeypatch):
     monkeypatch.setattr(sys, "stdin", None)
-    with pytest.raises(PreflightRefused, match="nobody is there"):
+    with pytest.raises(PreflightRefused, match="no operator can confirm"):
         confirm_speed(1.0, "", lambda: None, console=Console(file=io.StringIO()), pause_display=lambda: None)
 
 

@@ -156,14 +156,14 @@ def test_a_file_that_says_nothing_of_its_holder_still_holds(port, text):
     at = address(port)
     with hold(at):
         drive_lock._path(at).write_text(text)
-        with pytest.raises(DriveHeld, match="does not say"), hold(at):
+        with pytest.raises(DriveHeld, match="command line unknown"), hold(at):
             pass
 
 
 def test_no_lock_is_no_motion(port, monkeypatch, tmp_path):
     monkeypatch.setattr(drive_lock, "FOLDERS", ())
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
-    with pytest.raises(Exception, match="can't be known") as refused, hold(address(port)):
+    with pytest.raises(Exception, match="can't be locked against other programs") as refused, hold(address(port)):
         pass
     assert exit_code(refused.value) is ExitCode.REFUSED
 
@@ -220,7 +220,7 @@ def test_a_file_that_comes_and_goes_and_a_system_without_locks_are_no_motion(por
 
     with monkeypatch.context() as changed:
         changed.setattr(os, "open", comes_and_goes)
-        with pytest.raises(PreflightRefused, match="it comes and goes"), hold(at):
+        with pytest.raises(PreflightRefused, match="the file appears and disappears"), hold(at):
             pass
 
     def no_locks(descriptor, what):

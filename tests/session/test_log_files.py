@@ -58,7 +58,7 @@ def test_a_file_that_is_removed_is_saved(opened, tmp_path, monkeypatch, whole_fo
     place.follow()
     assert place.path.parent == (tmp_path if whole_folder else folder)
     assert place.path.read_bytes() == b"what was recorded"
-    assert "was removed in mid-run" in place.moved and str(place.path) in place.moved
+    assert "was removed during the run" in place.moved and str(place.path) in place.moved
     place.follow()                             # once
 
 

@@ -75,8 +75,8 @@ def test_the_command_line_s_serial_device_undoes_the_rig_s_host(tmp_path: Path) 
         ({"host": "a", "port": 0}, "--port: must be at least 1"),
         ({"serial": "/dev/ttyUSB0", "unit": 0}, "1 to 247"),
         ({"serial": "/dev/ttyUSB0", "baud": 1}, "--baud"),
-        ({"host": "a", "baud": 9600}, "--baud: means nothing without --serial"),
-        ({"port": 5020}, "--port: means nothing without --host"),
+        ({"host": "a", "baud": 9600}, "--baud: has no effect without --serial"),
+        ({"port": 5020}, "--port: has no effect without --host"),
     ],
 )
 def test_what_is_refused(cli: dict[str, Any], said: str) -> None:

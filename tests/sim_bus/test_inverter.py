@@ -214,3 +214,34 @@ def test_the_reference_filter_is_of_first_order_and_begins_at_the_speed_that_is(
     drive.control.speed(2.0)
     drive.step(DT)
     assert drive.speed_rad_s == pytest.approx(2.0, abs=0.01)
+
+
+def test_every_torque_of_the_drive_shares_its_wrong_unit() -> None:
+    drive = inverter(reporting=FAITHFUL.model_copy(update={"torque_scale": 1.05}))
+    drive.control.torque(210.0)
+    run(drive, 0.5)
+    assert drive.torque_nm == pytest.approx(200.0)
+    assert drive.reporting.torque_nm == pytest.approx(210.0)
+    assert drive.reported_demand_nm == pytest.approx(210.0)
+
+
+def test_speed_has_a_wrong_unit_and_the_position_counts_true_turns() -> None:
+    drive = inverter(reporting=FAITHFUL.model_copy(update={"speed_scale": 1.03}))
+    drive.control.speed(2.06)
+    run(drive, 30.0)
+    before = drive.reported_angle_rad
+    run(drive, 1.0)
+    assert drive.reporting.speed_rad_s == pytest.approx(2.06, abs=1e-3)
+    assert drive.speed_rad_s == pytest.approx(2.0, abs=1e-3)
+    assert drive.reported_angle_rad - before == pytest.approx(2.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", ["rigid", "two_mass", "string"])
+def test_an_added_body_is_part_of_the_inertia_at_the_motor(kind: str) -> None:
+    def angle(plant: dict[str, object]) -> float:
+        drive = inverter(plant=RigParams.model_validate({"plant": {"kind": kind, **plant}}).plant)
+        drive.control.torque(300.0)
+        run(drive, 1.0)
+        return drive.state.angle_rad
+
+    assert angle({"inertia_kg_m2": 100.0, "added_inertia_kg_m2": 55.0}) == angle({"inertia_kg_m2": 155.0})

@@ -45,7 +45,7 @@ UNITS = {"_kg_m2": "kg·m²", "_nm_s_rad": "N·m·s/rad", "_nm_rad": "N·m/rad",
 
 
 def rows() -> dict[str, tuple[str, str]]:
-    text = (ROOT / "docs" / "plant.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "plant.md").read_text(encoding="utf-8")
     found = re.findall(r"^\| `([a-z_.0-9]+\.[a-z_.0-9]+)` \| ([^|]*) \| ([^|]*) \| .+ \|$", text, re.MULTILINE)
     assert len(found) == len({key for key, *_ in found})
     return {key: (unit, default) for key, unit, default in found}

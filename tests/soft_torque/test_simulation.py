@@ -18,6 +18,7 @@ from tdhil.soft_torque import (
     critical_speeds,
     grid_of,
     lowest_turning,
+    lowest_turning_with_noise,
     reflection_at,
     simulate,
 )
@@ -35,6 +36,7 @@ from tests.soft_torque.cases import (
     lumped_chain,
     string_with,
 )
+from tests.soft_torque.chain_in_time import lowest_turning_of_chain
 
 SMOOTH = {"friction": "coulomb", "static_nm": None, "stribeck_speed_rad_s": None, "coulomb_nm": 0.0}
 """A bit without dry friction: everything is linear."""
@@ -67,7 +69,7 @@ def test_what_the_top_sends_back_is_what_theory_says(hertz):
     """A wave sent up to it, of one tone: the amplitude that comes down again, to 0.005."""
     drive = TopDrive(1500.0, 8.0, 0.0, DRIVE.inner_lags_s)
     grid = grid_of(string_with(drag=0.0))
-    top = _Top([(drive, law) for law in TABLE.values()], grid, 1)
+    top = _Top([(drive, law) for law in TABLE.values()], [grid] * len(TABLE), 1)
     time_s = grid.tick_s * (np.arange(round(24.0 / hertz / grid.tick_s)) + 0.5)
     sent = np.empty((time_s.size, len(TABLE)))
     still = np.zeros((len(TABLE), 1))
@@ -217,3 +219,37 @@ def test_steady_rotation_stays_steady():
     trace = simulate(STRING, [(DRIVE, SOFT_025)], Begin("turning", start), start, 1.0, 20.0, 0.5)
     assert np.ptp(trace.bit_rad_s) < 1e-6 * 120.0 * RPM
     assert np.isinf(trace.first_stuck_s).all()
+
+
+def test_dry_friction_along_the_string_against_the_chain():
+    """A deviated well: 1,500 N·m of dry friction on the wall moves cure speeds as in the chain of masses, to 5 %."""
+    from dataclasses import replace
+
+    line = replace(STRING.lines[0], coulomb_nm_m=0.5, static_nm_m=0.5)
+    string = replace(STRING, lines=(line,), bit=replace(STRING.bit, noise_nm=0.0))
+    laws = (SOFT_025, HALF)
+    found = lowest_turning_with_noise([string] * 2, [(DRIVE, law) for law in laws], [1, 1], "stuck", 7.7)
+    expected = lowest_turning_of_chain(
+        length_m=3000.0, polar_m4=np.pi / 32.0 * (0.127**4 - 0.1086**4), shear_pa=79.3e9, density=7850.0, drag=0.005,
+        bottom_inertia=374.0, bottom_viscous=20.0, coulomb_nm=2500.0, static_nm=5000.0, stribeck_rad_s=2.5,
+        noise_nm=0.0, noise_correlation_s=0.2, inertia=1500.0, viscous=8.0, dry_nm=60.0, lags_s=DRIVE.inner_lags_s,
+        laws=[(law.gain_nm_s_rad, law.integral_nm_rad, law.compensated_kg_m2, 0.05) for law in laws], seed=1,
+        period_s=7.7, wall_nm=1500.0)
+    assert found == pytest.approx(expected, rel=0.05)
+
+
+def test_a_string_on_the_wall_holds_what_it_was_wound_up_to():
+    """Below the static friction of its nodes nothing moves, above it the string turns: the file's side force counts."""
+    from tdhil.soft_torque import BottomEnd, PipeSection, StringFile, string_of
+
+    section = PipeSection(length_m=2000.0, outer_diameter_m=0.127, inner_diameter_m=0.1086, side_force_n_m=100.0)
+    string = string_of(StringFile(sections=(section,), bottom=BottomEnd(**{"inertia_kg_m2": 374.0, **BIT})))
+    assert string.lines[0].coulomb_nm_m == pytest.approx(0.2 * 100.0 * 0.0635)
+    assert string.lines[0].static_nm_m == pytest.approx(0.3 * 100.0 * 0.0635)
+    start = np.array([[120.0 * RPM]])
+    trace = simulate(string, [(DRIVE, SOFT_025)], Begin("turning", start), start, 1.0, 20.0, 0.5)
+    assert np.ptp(trace.bit_rad_s) < 1e-6 * 120.0 * RPM
+    friction_nm = 2000.0 * string.lines[0].coulomb_nm_m
+    free = simulate(STRING, [(DRIVE, SOFT_025)], Begin("turning", start), start, 1.0, 1.0, 0.5)
+    drag_nm = 5.0 * 120.0 * RPM      # 1,000 m of mud less than the reference case
+    assert trace.top_torque_nm[0, 0, 0] - free.top_torque_nm[0, 0, 0] == pytest.approx(friction_nm - drag_nm, rel=0.01)

@@ -7,6 +7,7 @@ import pytest
 
 from profiles import SpeedControllerParameters, load_profile
 from tdhil.soft_torque import (
+    NO_MARGINS,
     ClosedSystem,
     Interval,
     Moved,
@@ -19,11 +20,13 @@ from tdhil.soft_torque import (
     figures_at,
     largest_stable_share,
     least_damping,
+    loop_margins,
     lowest_turning,
     string_modes_hz,
     tune,
     tuned_controller,
 )
+from tdhil.soft_torque.candidates import gains, ranked_speeds
 from tests.soft_torque.cases import DRIVE, SOFT_025, STRING
 
 HELD = string_modes_hz(STRING)
@@ -39,26 +42,35 @@ def tuned():
     return {one.kind: one for one in tune(case(), search=None).tuned}
 
 
-def test_the_softness_that_is_chosen_damps_most(tuned):
-    """No a of a fine grid damps the lesser of the two modes more, and it lies where theory has it."""
-    soft = tuned["soft"]
-    assert 0.15 < soft.softness < 0.25
-    for softness in np.linspace(0.1, 1.0, 31):
-        law = tuned_controller(STRING, 1500.0, float(softness), HELD[0])
-        assert least_damping(case(), DRIVE, law, HELD) < soft.damping.value + 0.003
+def test_what_is_chosen_ranks_best_of_all_that_keep_the_margins(tuned):
+    """No gains of a finer grid that keep every margin on every truth have an estimated critical speed 5 % lower."""
+    own = case()
+    truths = own.truths()
+
+    def speed(law):
+        return float(np.exp(np.mean(np.log(ranked_speeds(truths[:6], [law])))))
+
+    best = speed(tuned["soft"].controller)
+    for softness in np.geomspace(0.1, 1.0, 7):
+        for factor in (0.65, 0.75, 0.85, 0.95):
+            law = gains(STRING, 1500.0, HELD[0], float(softness), factor)
+            if speed(law) < 0.95 * best:
+                margins = [loop_margins(truth.drive, law, truth.string) for truth in truths]
+                assert any(own.required.failed(one) for one in margins)
 
 
-def test_each_is_better_damped_than_the_one_before(tuned):
-    assert 5.0 * tuned["stiff"].damping.value < tuned["soft"].damping.value < tuned["compensated"].damping.value
+def test_each_is_better_damped_than_the_stiff_one(tuned):
+    assert 3.0 * tuned["stiff"].damping.value < min(tuned[kind].damping.value for kind in ("soft", "compensated"))
 
 
 def test_gains_are_what_the_recipe_says(tuned):
     soft, compensated = tuned["soft"].controller, tuned["compensated"]
-    omega = 2.0 * np.pi * HELD[0]
+    omega = 2.0 * np.pi * HELD[0] * tuned["soft"].frequency_factor
     assert soft.gain_nm_s_rad == pytest.approx(STRING.impedance_nm_s_rad / tuned["soft"].softness)
     assert soft.integral_nm_rad == pytest.approx(omega**2 * 1500.0)
     law = compensated.controller
-    assert law.integral_nm_rad == pytest.approx(omega**2 * (1500.0 - law.compensated_kg_m2))
+    own = 2.0 * np.pi * HELD[0] * compensated.frequency_factor
+    assert law.integral_nm_rad == pytest.approx(own**2 * (1500.0 - law.compensated_kg_m2))
     assert law.compensated_kg_m2 == pytest.approx(compensated.compensated_share * 1500.0)
     assert tuned["soft"].integral_nm_rad.low == pytest.approx(omega**2 * 1440.0)
 
@@ -109,7 +121,9 @@ def measured_lags(along=(0.0, 0.0)):
     return (*(np.array([0.021, 0.012]) + np.asarray(along) @ SPREAD).tolist(),)
 
 
-@pytest.mark.parametrize("kind", ["present", "soft", "compensated"])
+@pytest.mark.parametrize("kind", [
+    "soft", *(pytest.param(one, marks=pytest.mark.heavy) for one in ("present", "compensated")),
+])
 def test_measured_lags_and_gains_go_in_as_two_hundred_draws_of_all_of_them_do(kind):
     """95 % of the draws of J, of both lags as they hang together and of the present gains lie between the ends."""
     gain, integral = (1500.0, 1600.0, 1700.0), (900.0, 1000.0, 1100.0)
@@ -122,7 +136,8 @@ def test_measured_lags_and_gains_go_in_as_two_hundred_draws_of_all_of_them_do(ki
         (Moved(present=law(p=gain[0])), Moved(present=law(p=gain[2]))),
         (Moved(present=law(i=integral[0])), Moved(present=law(i=integral[2]))),
     )
-    believed = case(lags=measured_lags(), present=law(), also=also, softness=0.2, compensated_share=0.4)
+    believed = case(lags=measured_lags(), present=law(), also=also, softness=0.2, compensated_share=0.4,
+                    required=NO_MARGINS)
     one = {found.kind: found for found in tune(believed, search=None).tuned}[kind]
     rng, seen = np.random.default_rng(13), []
     for draw in rng.normal(size=(200, 5)) / 1.959964:
@@ -172,7 +187,7 @@ def test_more_compensation_than_the_interval_allows_is_refused_with_its_numbers(
     wide = Interval(1500.0, 850.0, 2640.0)
     with pytest.raises(TuningRefused, match=r"50 % of J compensated swings by itself if J is 850.*33 ms of lag"):
         tune(case(wide, compensated_share=0.5), search=None)
-    tune(case(compensated_share=0.5), search=None)      # and taken where J is known well enough
+    tune(case(compensated_share=0.5, required=NO_MARGINS), search=None)      # and taken where J is known well enough
 
 
 def test_where_nothing_soft_is_stable_it_is_refused_in_words():
@@ -188,11 +203,11 @@ def test_broadband_is_refused_behind_these_lags(tuned):
 
 
 def test_a_wrong_j_costs_what_the_notes_say(tuned):
-    """12.6 %: little; 76 %: half the damping of a soft loop, and a compensated one is not stable."""
+    """12.6 %: little; 76 %: half of J compensated is not stable."""
     small, large = tuned["soft"].wrong
-    assert small.stable
-    assert large.damping < 0.6 * tuned["soft"].damping.value
-    assert [one.stable for one in tuned["compensated"].wrong] == [True, False]
+    assert small.stable and large.stable
+    half = {one.kind: one for one in tune(case(compensated_share=0.5, softness=0.25, required=NO_MARGINS), None).tuned}
+    assert [one.stable for one in half["compensated"].wrong] == [True, False]
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -95,10 +95,10 @@ def test_list_as_json(studies):
 
 @pytest.mark.parametrize(("arguments", "said"), [
     (("tabel1",), "Did you mean 'table1'?"),
-    (("figure99999",), "tdhil study list names them"),
-    ((), "no study was named"),
-    (("list", "table1"), "'list' stands alone"),
-    (("paper", "table1"), "'paper' stands alone"),
+    (("figure99999",), "tdhil study list lists them"),
+    ((), "no study is named"),
+    (("list", "table1"), "'list' must be the only name"),
+    (("paper", "table1"), "'paper' must be the only name"),
 ])
 def test_a_name_that_is_none_ends_with_one_line_and_exit_2(studies, arguments, said):
     code, out, err = tdhil(*arguments)

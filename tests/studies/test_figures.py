@@ -43,6 +43,7 @@ def test_gain_and_phase_are_those_of_the_linear_loop(outcomes, name):
         assert one["phase_lag_fundamental_deg"] == pytest.approx(-np.degrees(np.angle(expected)), abs=0.2)
 
 
+@pytest.mark.heavy
 def test_figure9_attenuation_and_lag_grow_with_inertia(outcomes):
     found = outcomes["figure9"]
     assert list(column(found, "inertia_kg_m2")) == [450, 900, 1800, 2700]

@@ -33,7 +33,7 @@ def test_theory_gives_the_reference_table():
 
 def test_a_figure_that_is_off_is_told_with_its_reason():
     rows = controllers(SoftTorqueSettings())[:1]
-    found = [type(row)(**{**row.__dict__, "critical": CriticalSpeeds(183.0, 148.0, 24.0)}) for row in rows]
+    found = [type(row)(**{**row.__dict__, "critical": CriticalSpeeds(183.0, 170.0)}) for row in rows]
     statement = controller_statements(found)[1]
     assert statement.holds is False
     assert "start hangs on how it begins" in statement.ours
@@ -48,7 +48,7 @@ def test_it_runs_and_draws(monkeypatch):
     pytest.importorskip("matplotlib")
     from matplotlib.figure import Figure
 
-    found = CriticalSpeeds(50.0, 50.0, 25.0)
+    found = CriticalSpeeds(50.0, 50.0)
     monkeypatch.setattr(study, "critical_speeds", lambda string, loops, search: [found for _ in loops])
     monkeypatch.setattr(study, "lowest_turning", lambda string, loops, how, search: [50.0 for _ in loops])
     told: list[float] = []

@@ -1,0 +1,171 @@
+"""Random simulated drives through the whole path of a torque calibration: two runs each, then `tdhil calibrate torque`.
+
+    python benchmarks/torque_calibration.py [--runs 200] [--first 1] [--logs FOLDER] [--only-logs]
+
+Every drive has a torque scale that is wrong by up to ±8 % (uniform), a body of 5 to 100 % of its inertia, and random
+lags and friction; the friction of the run with the body is its own. Logs are kept in ``--logs`` and used again. Prints
+a line for each drive and, at the end, how often the intervals of the calibration factor and of J cover the truth, how
+wide they are, and what was refused. The exit code is 1 where a figure misses what is asked of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import yaml
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+LARGEST_SCALE_ERROR = 0.08
+ASSUMED_HALF_WIDTH = 0.0392
+"""Of J, as a share: 95 % of the 2 % (1 sd) that tdhil assumes of a torque scale."""
+LEAST_COVERED, MOST_COVERED = 0.93, 0.99
+WIDEST_HALF_BODY, WIDEST_EQUAL_BODY = 0.012, 0.009
+
+
+@dataclass(frozen=True)
+class RandomDrive:
+    """One drive of the study. ``plant``: its plant.yaml without the body; ``scale``: reported over true torque."""
+
+    seed: int
+    inertia_kg_m2: float
+    added_kg_m2: float
+    scale: float
+    plant: dict[str, Any]
+    plant_with: dict[str, Any]
+
+
+def random_drive(seed: int) -> RandomDrive:
+    """The drive of this seed."""
+    rng = np.random.default_rng([28, seed])
+    inertia = float(np.exp(rng.uniform(np.log(50.0), np.log(200.0))))
+    share = float(rng.uniform(0.05, 1.0))
+    scale = 1.0 + float(rng.uniform(-LARGEST_SCALE_ERROR, LARGEST_SCALE_ERROR))
+    shaft = {
+        "inertia_kg_m2": inertia, "viscous_nm_s_rad": float(rng.uniform(2.0, 15.0)),
+        "coulomb_nm": float(rng.uniform(20.0, 80.0)),
+    }
+    reporting = {
+        "speed_lag_s": float(rng.uniform(0.0, 0.6)), "torque_lag_s": float(rng.uniform(0.0, 0.3)),
+        "torque_scale": scale,
+    }
+    grown = {
+        **shaft, "added_inertia_kg_m2": share * inertia,
+        "viscous_nm_s_rad": shaft["viscous_nm_s_rad"] * float(rng.uniform(1.0, 1.3)),
+        "coulomb_nm": shaft["coulomb_nm"] * float(rng.uniform(1.0, 1.3)),
+    }
+    return RandomDrive(
+        seed, inertia, share * inertia, scale,
+        {"plant": shaft, "reporting": reporting}, {"plant": grown, "reporting": reporting},
+    )
+
+
+def recorded(drive: RandomDrive, folder: Path) -> tuple[Path, Path]:
+    """The two logs of this drive; made where they are not there yet."""
+    paths = folder / f"{drive.seed}-without.mcap", folder / f"{drive.seed}-with.mcap"
+    for number, (path, plant) in enumerate(zip(paths, (drive.plant, drive.plant_with), strict=True)):
+        if path.exists():
+            continue
+        file, fresh = path.with_suffix(".yaml"), path.with_suffix(".new")
+        file.write_text(yaml.safe_dump(plant), encoding="utf-8")
+        command = [sys.executable, "-m", "tdhil", "identify", "--simulate", "--rate", "100", "--plant", str(file),
+                   "--seed", str(2 * drive.seed + number), "--log", str(fresh), "--json"]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+        if not fresh.exists():
+            print(f"{path.name}: {done.stderr[-300:]}", flush=True)
+            continue
+        fresh.rename(path)
+    return paths
+
+
+def calibrated(drive: RandomDrive, paths: tuple[Path, Path]) -> dict[str, Any]:
+    """The document of `tdhil calibrate torque`, with the exit code."""
+    command = [sys.executable, "-m", "tdhil", "calibrate", "torque", *map(str, paths),
+               "--added", repr(drive.added_kg_m2), "--added-sd", "0", "--json"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    document: dict[str, Any] = json.loads(done.stdout) if done.stdout.strip() else {"error": done.stderr[-300:]}
+    return document | {"exit_code": done.returncode}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=200)
+    parser.add_argument("--first", type=int, default=1)
+    parser.add_argument("--logs", type=Path, default=Path("torque-calibration-logs"))
+    parser.add_argument("--only-logs", action="store_true", help="record, and calibrate nothing yet")
+    asked = parser.parse_args()
+    asked.logs.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for seed in range(asked.first, asked.first + asked.runs):
+        drive = random_drive(seed)
+        paths = recorded(drive, asked.logs.resolve())
+        if asked.only_logs:
+            print(f"{seed}: recorded", flush=True)
+            continue
+        rows.append(judged(drive, calibrated(drive, paths)))
+    return 0 if asked.only_logs else summary(rows)
+
+
+@dataclass(frozen=True)
+class CalibrationRow:
+    """What became of one drive. Half-widths are shares of the value; None: refused."""
+
+    share: float
+    verdict: str
+    covers_scale: bool | None
+    covers_inertia: bool | None
+    half_width: float | None
+
+
+def judged(drive: RandomDrive, document: dict[str, Any]) -> CalibrationRow:
+    """Held against the truth, and printed."""
+    share = drive.added_kg_m2 / drive.inertia_kg_m2
+    verdict = str(document.get("verdict", document.get("error", "no document")))
+    scale, inertia = document.get("calibration_factor"), document.get("inertia_kg_m2")
+    if not scale or not inertia:
+        row = CalibrationRow(share, verdict, None, None, None)
+    else:
+        half = 0.5 * (inertia["high"] - inertia["low"]) / inertia["value"]
+        row = CalibrationRow(
+            share, verdict, scale["low"] <= 1.0 / drive.scale <= scale["high"],
+            inertia["low"] <= drive.inertia_kg_m2 <= inertia["high"], half,
+        )
+        errors = scale["value"] * drive.scale - 1.0, inertia["value"] / drive.inertia_kg_m2 - 1.0
+        print(f"{drive.seed:4d} J_a/J {share:4.2f} κ {errors[0]:+.2%} J {errors[1]:+.2%} ± {half:.2%} "
+              f"{'' if row.covers_scale and row.covers_inertia else 'MISSED '}{verdict}", flush=True)
+        return row
+    print(f"{drive.seed:4d} J_a/J {share:4.2f} {verdict}: {document.get('reason', '')}", flush=True)
+    return row
+
+
+def summary(rows: list[CalibrationRow]) -> int:
+    """The figures at the end; 1 where one misses what is asked."""
+    told = [row for row in rows if row.half_width is not None]
+    wrong = 0
+    for name, covered in (("κ", [row.covers_scale for row in told]), ("J", [row.covers_inertia for row in told])):
+        share = sum(map(bool, covered)) / max(len(covered), 1)
+        print(f"{name}: {sum(map(bool, covered))} of {len(covered)} cover ({share:.1%}; "
+              f"{LEAST_COVERED:.0%} to {MOST_COVERED:.0%} asked)")
+        wrong |= len(rows) >= 200 and not LEAST_COVERED <= share <= MOST_COVERED
+    for least, widest in ((0.5, WIDEST_HALF_BODY), (0.9, WIDEST_EQUAL_BODY)):
+        widths = [row.half_width for row in told if row.share >= least and row.half_width is not None]
+        if widths:
+            print(f"J_a ≥ {least:g} J: median half-width {median(widths):.2%} of {len(widths)} (at most {widest:.1%})")
+            wrong |= median(widths) > widest
+    refused = [row for row in rows if row.half_width is None]
+    wide = [row for row in told if (row.half_width or 0.0) > ASSUMED_HALF_WIDTH]
+    print(f"{len(refused)} refused; {len(wide)} told though wider than ±{ASSUMED_HALF_WIDTH:.1%}")
+    return int(wrong or bool(wide))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

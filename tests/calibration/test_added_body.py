@@ -1,0 +1,181 @@
+"""Torque calibration by bodies of known inertia: the factor, the budget, and every trap."""
+
+from dataclasses import replace
+from math import hypot, sqrt
+
+import numpy as np
+import pytest
+
+from tdhil.calibration import BodyRun, CalibrationCase, calibrate_torque, plan_bodies
+from tdhil.errors import UsageError
+from tdhil.estimation import Verdict
+from tdhil.recording import Stage
+from tdhil.session import find_calibration, find_plan
+from tests.calibration.bodies import IDENTITY, INERTIA, SCALE, recording, run, two
+
+FACTOR = 1.0 / SCALE
+
+
+def case(values, bodies, noise=0.002, sds=None, **more):
+    values = np.asarray(values, dtype=float)
+    covariance = np.diag((noise * values) ** 2)
+    runs = tuple(BodyRun(f"run {k}", body, 0.0 if sds is None else sds[k]) for k, body in enumerate(bodies))
+    return CalibrationCase(runs, values, covariance, covariance, 50.0, None, **more)
+
+
+def test_the_factor_and_the_inertia_of_two_runs(tmp_path):
+    found = find_calibration(two(tmp_path), "motor").calibration
+    assert found.verdict is Verdict.VALID
+    assert found.factor.low <= FACTOR <= found.factor.high and found.factor.half_width_share < 0.02
+    assert found.inertia_kg_m2.low <= INERTIA <= found.inertia_kg_m2.high
+    assert found.inertia_kg_m2.value == pytest.approx(INERTIA, rel=0.01)
+    for quantity, name in ((found.factor, "of_factor"), (found.inertia_kg_m2, "of_inertia")):
+        squares = sqrt(sum(getattr(line, name) ** 2 for line in found.budget))
+        assert squares * quantity.value == pytest.approx(quantity.standard_uncertainty, rel=1e-6)
+
+
+def test_the_difference_of_two_runs_follows_the_closed_formulas():
+    found = calibrate_torque(case([100.0, 150.0], [0.0, 52.0], sds=[0.0, 0.1]))
+    assert found.factor.value == pytest.approx(52.0 / 50.0)
+    assert found.inertia_kg_m2.value == pytest.approx(52.0 * 100.0 / 50.0)
+    share = hypot((1.0 + 104.0 / 52.0) * sqrt(2.0) * 0.002, 0.1 / 52.0)
+    assert found.inertia_kg_m2.standard_uncertainty == pytest.approx(104.0 * share, rel=1e-9)
+
+
+@pytest.mark.heavy
+def test_three_bodies_are_tested_for_a_straight_line(tmp_path):
+    runs = [*two(tmp_path), run(tmp_path, "more.mcap", 110.0, recording(110.0, 3))]
+    straight = find_calibration(runs, "motor").calibration
+    assert straight.verdict is Verdict.VALID and straight.linearity.p_value > 0.01
+    runs[2] = replace(runs[2], added_kg_m2=120.0)
+    bent = find_calibration(runs, "motor").calibration
+    assert bent.verdict is Verdict.MODEL_REJECTED and "straight line" in bent.reason
+
+
+def test_bodies_that_were_exchanged(tmp_path):
+    without, loaded = two(tmp_path)
+    exchanged = [replace(loaded, added_kg_m2=0.0), replace(without, added_kg_m2=55.0)]
+    found = find_calibration(exchanged, "motor").calibration
+    assert found.factor is None and "exchanged" in found.reason
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize(("said", "at", "advice"), [(55.0 * 16.0, "motor", "--at main"), (55.0, "main", "--at motor")])
+def test_an_inertia_given_at_the_wrong_shaft(tmp_path, said, at, advice):
+    geared = [replace(one, record=replace(one.record, recording=replace(one.record.recording, gear_ratio=4.0)))
+              for one in two(tmp_path, said=said)]
+    found = find_calibration(geared, at).calibration
+    assert found.verdict is not Verdict.VALID and found.factor is None
+    assert advice in found.advice or "too small" in found.reason
+
+
+@pytest.mark.heavy
+def test_an_inertia_given_at_the_main_shaft(tmp_path):
+    geared = [replace(one, record=replace(one.record, recording=replace(one.record.recording, gear_ratio=4.0)))
+              for one in two(tmp_path, said=55.0 * 16.0)]
+    assert find_calibration(geared, "main").calibration.factor.value == pytest.approx(FACTOR, rel=0.02)
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("changed", [{"speed_lag": 0.30}, {"torque_lag": 0.25}, {"skew": 0.05}])
+def test_a_filter_that_changed_between_the_runs(tmp_path, changed):
+    found = find_calibration(two(tmp_path, with_body=recording(55.0, 2, **changed)), "motor").calibration
+    assert found.verdict is Verdict.MODEL_REJECTED and found.factor is None
+    assert "do not share the filters" in found.reason and ("lag of" in found.reason or "offset" in found.reason)
+
+
+def test_a_log_of_another_drive(tmp_path):
+    without, loaded = two(tmp_path)
+    other = run(tmp_path, "other.mcap", 55.0, loaded.record.recording, identity={**IDENTITY, "serial": 23})
+    with pytest.raises(UsageError, match="serial is 23"):
+        find_calibration([without, other], "motor")
+
+
+def test_a_setting_that_changed_between_the_runs(tmp_path):
+    without, loaded = two(tmp_path)
+    bench = {"drive_data": {"rated_torque_nm": 900.0}}
+    first = run(tmp_path, "a.mcap", 0.0, without.record.recording, bench={"drive_data": {"rated_torque_nm": 1000.0}})
+    with pytest.raises(UsageError, match="rated_torque_nm"):
+        find_calibration([first, run(tmp_path, "b.mcap", 55.0, loaded.record.recording, bench=bench)], "motor")
+
+
+def test_friction_may_grow_with_the_body(tmp_path):
+    grown = recording(55.0, 2, viscous=10.4, coulomb=78.0)
+    found = find_calibration(two(tmp_path, with_body=grown), "motor").calibration
+    assert found.verdict is Verdict.VALID and found.factor.low <= FACTOR <= found.factor.high
+
+
+@pytest.mark.heavy
+def test_a_run_that_was_aborted(tmp_path):
+    without, loaded = two(tmp_path)
+    ended = replace(loaded.record.recording, stages=(Stage("acquire", 0.0, 100.0, "aborted", "limit hit"),))
+    aborted = replace(loaded, record=replace(loaded.record, recording=ended))
+    found = find_calibration([without, aborted], "motor").calibration
+    assert found.verdict is Verdict.NOT_IDENTIFIABLE and "aborted in stage acquire" in found.reason
+    cut = replace(loaded, record=replace(loaded.record, recording=replace(loaded.record.recording, complete=False)))
+    assert "ends before the run" in find_calibration([without, cut], "motor").calibration.reason
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("slip_nm_s_rad", [60.0, 300.0])
+def test_a_body_that_slips_on_the_shaft(tmp_path, slip_nm_s_rad):
+    """Coupled by viscous friction alone: at low frequencies it turns as one, at high ones it stays behind."""
+    s = 2j * np.pi * np.array([0.1, 0.2, 0.3, 0.4])
+    body = 55.0 * s * slip_nm_s_rad / (55.0 * s + slip_nm_s_rad)
+    plain = recording(0.0, 2)
+    torque = plain.torque_nm.copy()
+    for segment in plain.excitation.segments:
+        inside = (plain.time_s >= segment.start_s) & (plain.time_s < segment.end_s)
+        t = plain.time_s[inside] - segment.start_s
+        for k, (amplitude, phase) in enumerate(zip(segment.amplitudes_rad_s, segment.phases_rad, strict=True)):
+            through = body[k] * (1 + 0.4 * s[k]) / (1 + 0.15 * s[k])
+            torque[inside] += SCALE * (through * amplitude * np.exp(1j * phase + s[k] * t)).real
+    found = find_calibration(two(tmp_path, with_body=replace(plain, torque_nm=torque)), "motor").calibration
+    assert found.verdict is not Verdict.VALID and found.factor is None
+
+
+def test_a_body_that_is_too_small_is_told_the_least_that_would_do(tmp_path):
+    small = two(tmp_path, 3.0, with_body=recording(3.0, 2, noise=20.0))
+    small[0] = run(tmp_path, "noisy.mcap", 0.0, recording(0.0, 1, noise=20.0))
+    found = find_calibration(small, "motor").calibration
+    assert found.verdict is Verdict.NOT_IDENTIFIABLE and "too small" in found.reason
+    least = found.least_added_kg_m2
+    assert 3.0 < least < 200.0 and f"{least:.3g} kg·m² or more" in found.advice
+
+
+def test_the_same_log_twice(tmp_path):
+    without, _ = two(tmp_path)
+    with pytest.raises(UsageError, match="same recording"):
+        find_calibration([without, replace(without, added_kg_m2=55.0)], "motor")
+
+
+@pytest.mark.heavy
+def test_an_uncertainty_that_is_not_stated_is_assumed_and_said(tmp_path):
+    runs = two(tmp_path)
+    runs[1] = replace(runs[1], added_sd_kg_m2=None)
+    found = find_calibration(runs, "motor")
+    assert any("--added-sd" in warning for warning in found.warnings)
+    assert any(line.source.startswith("body") for line in found.calibration.budget)
+
+
+def test_the_plan_says_which_body_and_how_long(tmp_path):
+    without, _ = two(tmp_path)
+    inertia, minutes, plans = find_plan(without.record, 0.01)
+    assert inertia == pytest.approx(SCALE * INERTIA, rel=0.02) and minutes == pytest.approx(140.0 / 60.0)
+    widths = [plan.half_width_share for plan in plans]
+    assert widths == sorted(widths, reverse=True)
+    twice = plan_bodies(100.0, 0.002, 4.0, 0.02, 0.0, sizes=(50.0,))[0]
+    assert twice.half_width_share == pytest.approx(1.95996 * 3.0 * sqrt(2.0) * 0.002, rel=1e-5)
+    assert twice.minutes == pytest.approx(4.0 * (twice.half_width_share / 0.02) ** 2)
+
+
+def test_intervals_cover_as_often_as_they_say():
+    rng, covered, many = np.random.default_rng(4), np.zeros(2, dtype=int), 2000
+    for _ in range(many):
+        true = np.array([104.0, 156.0]) / 0.96
+        made = case(true * (1.0 + 0.003 * rng.standard_normal(2)), [0.0, 52.0], 0.003)
+        body = BodyRun("run 1", 52.0 + 0.2 * rng.standard_normal(), 0.2)
+        found = calibrate_torque(replace(made, runs=(made.runs[0], body), degrees_of_freedom=1e6))
+        covered += [found.factor.low <= 0.96 <= found.factor.high,
+                    found.inertia_kg_m2.low <= 104.0 <= found.inertia_kg_m2.high]
+    assert np.all(covered > 0.935 * many) and np.all(covered < 0.965 * many)

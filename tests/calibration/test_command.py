@@ -1,0 +1,43 @@
+"""``tdhil calibrate torque``: usage errors end with 2, refusals with 9, and nothing is written over."""
+
+import pytest
+
+from tdhil.cli.main import main
+
+TRACE = "time_s,speed_rad_s,torque_nm\n" + "".join(f"{0.01 * k:.2f},4.0,90.{k % 10}\n" for k in range(300))
+
+
+@pytest.fixture
+def traces(tmp_path):
+    for name, text in (("a.csv", TRACE), ("b.csv", TRACE + "3.0,4.0,90.0\n")):
+        (tmp_path / name).write_text(text)
+    return [str(tmp_path / "a.csv"), str(tmp_path / "b.csv")]
+
+
+@pytest.mark.parametrize("more", [
+    [], ["--added", "0"], ["--added", "-5"], ["--added", "nan"], ["--added-sd", "0.1"], ["--body", "x"],
+    ["--body", "a.csv="], ["--added", "55", "--added-sd", "-1"], ["--added", "55", "--confidence", "2"],
+])
+def test_what_is_no_request_ends_with_2(traces, more, capsys):
+    assert main(["calibrate", "torque", *traces, *more]) == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_logs_without_a_result_end_with_9(traces, capsys):
+    assert main(["calibrate", "torque", *traces, "--added", "55"]) == 9
+    assert "can't be used" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_log_that_is_not_there_or_the_same_twice_ends_with_2(traces, tmp_path):
+    assert main(["calibrate", "torque", traces[0], str(tmp_path / "no.mcap"), "--added", "55"]) == 2
+    assert main(["calibrate", "torque", traces[0], traces[0], "--added", "55"]) == 2
+    assert main(["calibrate", "torque", traces[0], "--added", "55"]) == 2
+    assert main(["calibrate", "torque", "--plan"]) == 2
+
+
+def test_nothing_is_written_over(traces, tmp_path):
+    kept = tmp_path / "calibration.json"
+    kept.write_text("kept")
+    assert main(["calibrate", "torque", *traces, "--added", "55", "--save", str(kept)]) == 2
+    assert kept.read_text() == "kept"
+    assert main(["replay", traces[0], "--torque-calibration", str(kept)]) == 2

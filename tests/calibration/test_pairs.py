@@ -1,0 +1,101 @@
+"""Pairs of a reference sensor: York's line against scipy.odr, its coverage, hysteresis, and what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tdhil.calibration import TorquePairs, calibrate_pairs, line_with_errors_in_both
+from tdhil.cli.main import main
+from tdhil.errors import UsageError
+from tdhil.session import read_pairs
+
+
+def pairs(rng, factor=0.95, offset=1.5, many=8, hysteresis=0.0, x_sd=1.0, y_sd=0.8):
+    torque = np.concatenate([np.linspace(-200.0, 200.0, many), np.linspace(200.0, -200.0, many)])
+    direction = ("up",) * many + ("down",) * many
+    sign = np.array([1.0] * many + [-1.0] * many)
+    reference = factor * torque + offset + 0.5 * hysteresis * sign
+    return TorquePairs(
+        torque + x_sd * rng.standard_normal(len(torque)), np.full(len(torque), x_sd),
+        reference + y_sd * rng.standard_normal(len(torque)), np.full(len(torque), y_sd), direction)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_york_agrees_with_orthogonal_distance_regression(seed):
+    odr = pytest.importorskip("scipy.odr")
+    rng = np.random.default_rng(seed)
+    x = np.sort(rng.uniform(-200.0, 200.0, 12))
+    x_sd, y_sd = rng.uniform(0.5, 3.0, 12), rng.uniform(0.5, 3.0, 12)
+    y = 0.93 * x + 4.0 + y_sd * rng.standard_normal(12)
+    x = x + x_sd * rng.standard_normal(12)
+    slope, intercept, _, chi2 = line_with_errors_in_both(x, x_sd, y, y_sd)
+    fit = odr.ODR(odr.RealData(x, y, sx=x_sd, sy=y_sd), odr.Model(lambda beta, x: beta[0] * x + beta[1]),
+                  beta0=[1.0, 0.0], sstol=1e-15, partol=1e-15, maxit=500).run()
+    assert slope == pytest.approx(fit.beta[0], rel=1e-6)
+    assert intercept == pytest.approx(fit.beta[1], rel=1e-6, abs=1e-6)
+    assert chi2 == pytest.approx(fit.sum_square, rel=1e-6)
+
+
+@pytest.mark.parametrize("hysteresis", [0.0, 4.0])
+def test_the_interval_covers_with_errors_in_both_and_hysteresis(hysteresis):
+    rng, many = np.random.default_rng(11), 1000
+    covered = 0
+    for _ in range(many):
+        found = calibrate_pairs(pairs(rng, hysteresis=hysteresis))
+        covered += found.factor.low <= 0.95 <= found.factor.high
+    assert 0.93 * many <= covered
+
+
+def test_hysteresis_is_shown_and_widens_the_interval():
+    plain, wide = (calibrate_pairs(pairs(np.random.default_rng(2), hysteresis=one)) for one in (0.0, 10.0))
+    assert wide.hysteresis_nm == pytest.approx(10.0, abs=2.0) and abs(plain.hysteresis_nm) < 2.0
+    assert wide.factor.standard_uncertainty > 2.0 * plain.factor.standard_uncertainty
+
+
+def test_what_no_torque_scale_can_be_is_refused():
+    assert "no error of a torque scale" in calibrate_pairs(pairs(np.random.default_rng(3), factor=10.0)).refusal
+    assert "no error of a torque scale" in calibrate_pairs(pairs(np.random.default_rng(3), factor=-0.95)).refusal
+    assert calibrate_pairs(pairs(np.random.default_rng(3))).refusal == ""
+
+
+def test_a_reference_that_is_curved_is_refused():
+    rng = np.random.default_rng(4)
+    made = pairs(rng)
+    bent = TorquePairs(made.reported_nm, made.reported_sd_nm, made.reference_nm + 5e-4 * made.reported_nm**2,
+                       made.reference_sd_nm, made.direction)
+    assert "curved" in calibrate_pairs(bent).refusal
+
+
+def test_two_pairs_are_no_line():
+    two = np.array([1.0, 2.0])
+    with pytest.raises(ValueError, match="3 pairs"):
+        line_with_errors_in_both(two, two, two, two)
+
+
+HEADER = "reported_nm,reported_sd_nm,reference_nm,reference_sd_nm,direction\n"
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("a\n1\n", "no column reported_nm"), (HEADER, "fewer than three"), (HEADER + "1,1,nan,1,up\n", "is no number"),
+    (HEADER + "1,1,x,1,up\n", "reference_nm is no number"), (HEADER + "1,0,1,1,up\n", "must be above 0"),
+    (HEADER + "1,1,1,1,left\n", "neither up nor down"),
+])
+def test_what_are_no_pairs(tmp_path, text, words):
+    path = tmp_path / "pairs.csv"
+    path.write_text(text)
+    with pytest.raises(UsageError, match=words):
+        read_pairs(path)
+
+
+def test_the_command_prints_a_card_and_a_document(tmp_path, capsys):
+    path = tmp_path / "pairs.csv"
+    rows = [f"{x},1,{0.95 * x},0.5,{way}\n" for x in (0, 50, 100, 200) for way in ("up", "down")]
+    path.write_text(HEADER + "".join(rows))
+    assert main(["calibrate", "torque", "--pairs", str(path)]) == 0
+    assert "calibration factor" in capsys.readouterr().out
+    assert main(["calibrate", "torque", "--pairs", str(path), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["calibration_factor"]["value"] == pytest.approx(0.95)
+    assert main(["calibrate", "torque", "--pairs", str(path), "--added", "5"]) == 2
+    assert main(["calibrate", "torque", "--pairs", str(path), "--save", str(tmp_path / "c.json")]) == 2

@@ -1,0 +1,96 @@
+"""A calibration as a file: written, read, refused by name, applied to a recording, and carried by the log."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from drivers import PreflightRefused
+from tdhil.cli.calibrate import document_of
+from tdhil.errors import UsageError
+from tdhil.session import conclude, find_calibration, load_calibration, save_calibration, with_calibration
+from tdhil.session.stored_calibration import refuse_another_drive
+from tests.calibration.bodies import IDENTITY, INERTIA, SCALE, recording, two
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory):
+    return document_of(find_calibration(two(tmp_path_factory.mktemp("logs")), "motor"))
+
+
+RUN = {"identity": IDENTITY, "started": "2026-12-01T10:00:00+00:00"}
+
+
+def test_a_run_with_a_calibration_is_in_calibrated_torque(document):
+    plain = conclude(recording(0.0, 7), RUN, "run.mcap").identification
+    found = conclude(recording(0.0, 7), {**RUN, "torque_calibration": document}, "run.mcap")
+    inertia = found.identification.inertia
+    assert plain.inertia.value == pytest.approx(SCALE * INERTIA, rel=0.01)
+    assert inertia.low_total <= INERTIA <= inertia.high_total
+    assert inertia.high_total - inertia.low_total < 0.6 * (plain.inertia.high_total - plain.inertia.low_total)
+    assert found.identification.coulomb_nm.value == pytest.approx(60.0, rel=0.02)
+    assert "torque scale, calibrated 2026-11-23" in [line.source for line in found.identification.budget]
+    assert "tdhil calibrate torque" not in found.identification.advice
+    assert found.document["torque_calibration"]["factor"] == document["calibration_factor"]["value"]
+    assert conclude(recording(0.0, 7), RUN, "run.mcap").document["torque_calibration"] is None
+
+
+def test_the_file_is_read_again_and_never_written_over(document, tmp_path):
+    path = tmp_path / "calibration.json"
+    save_calibration(document, path)
+    assert load_calibration(path) == json.loads(path.read_text())
+    with pytest.raises(UsageError, match="is there already"):
+        save_calibration(document, path)
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("no JSON", "is no JSON"), ("[1]", "no calibration of"), ("{}", "no calibration of"),
+    ('{"kind": "torque_calibration", "calibration_factor": null}', "was refused"),
+    ('{"kind": "torque_calibration", "calibration_factor": {"value": NaN, "low": 1, "high": 1, "confidence": 0.95}}',
+     "no number"),
+    ('{"kind": "torque_calibration", "calibration_factor": {"value": 1, "low": 2, "high": 3, "confidence": 0.95}}',
+     "can't be"),
+])
+def test_what_is_no_calibration(tmp_path: Path, text, words):
+    path = tmp_path / "calibration.json"
+    path.write_text(text)
+    with pytest.raises(UsageError, match=words):
+        load_calibration(path)
+
+
+def test_a_file_that_is_not_there(tmp_path: Path):
+    with pytest.raises(UsageError, match="no such file"):
+        load_calibration(tmp_path / "calibration.json")
+
+
+def test_another_drive_is_refused_before_motion_and_never_calibrated(document):
+    other = {**IDENTITY, "serial": 23}
+    with pytest.raises(PreflightRefused, match="serial is 17, and 23"):
+        refuse_another_drive({"torque_calibration": document}, other)
+    refuse_another_drive({"torque_calibration": document}, IDENTITY)
+    found = conclude(recording(0.0, 7), {"identity": other, "torque_calibration": document}, "run.mcap").identification
+    assert found.inertia.value == pytest.approx(SCALE * INERTIA, rel=0.01)
+    assert any("not applied" in warning and "serial" in warning for warning in found.warnings)
+
+
+def test_an_old_calibration_is_named(document):
+    old = {**RUN, "started": "2028-01-01T00:00:00+00:00", "torque_calibration": {**document, "valid_days": 100.0}}
+    warnings = conclude(recording(0.0, 7), old, "run.mcap").identification.warnings
+    assert any("valid for 100" in warning for warning in warnings)
+
+
+def test_a_replay_takes_the_calibration_of_its_drive_only(document):
+    found = with_calibration(RUN, recording(0.0, 7), document, "calibration.json")
+    assert found["torque_calibration"] == document
+    with pytest.raises(UsageError, match="of another drive: its serial"):
+        with_calibration({"identity": {**IDENTITY, "serial": 23}}, recording(0.0, 7), document, "calibration.json")
+    with pytest.raises(UsageError, match="simulated"):
+        with_calibration(RUN, replace(recording(0.0, 7), simulated=False), document, "calibration.json")
+
+
+def test_a_log_that_was_calibrated_before_is_calibrated_from_the_drives_own_unit(document, tmp_path):
+    runs = [replace(one, record=replace(one.record, configuration={**one.record.configuration,
+                                                                   "torque_calibration": document}))
+            for one in two(tmp_path)]
+    assert find_calibration(runs, "motor").calibration.factor.value == document["calibration_factor"]["value"]

@@ -1,0 +1,57 @@
+"""The mean torque of stage 5 against the levels of stage 2: a torque scale that changed between them is found."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tdhil.estimation import Verdict, identify
+from tdhil.estimation.cross_checks.level_torque import LEAST, MOST, level_contradiction, level_torques
+from tdhil.estimation.samples import usable_samples
+from tests.estimation.stages_bench import Stages, run_stages
+
+BEGINS_S = 46.0           # stage 5 of the bench
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    return run_stages(Stages(periods=3), [1, 2], rate_hz=50.0)
+
+
+def scaled_in_stage_5(recording, factor):
+    share = np.where(recording.time_s >= BEGINS_S - 1.0, factor, 1.0)
+    return replace(recording, torque_nm=share * recording.torque_nm)
+
+
+def test_the_levels_account_for_the_mean_torque_of_a_healthy_run(recorded):
+    for recording in recorded:
+        seen = level_torques(recording, usable_samples(recording))
+        assert len(seen) == 2
+        assert all(0.95 < one.ratio < 1.05 for one in seen)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_torque_scale_that_halves_or_doubles_is_found(recorded, factor):
+    recording = scaled_in_stage_5(recorded[0], factor)
+    found = level_contradiction(recording, usable_samples(recording))
+    assert found is not None
+    assert "levels of stage 2" in found.reason
+
+
+@pytest.mark.parametrize("factor", [1.05 * LEAST, 0.95 * MOST])
+def test_a_load_that_changes_by_less_is_no_contradiction(recorded, factor):
+    recording = scaled_in_stage_5(recorded[0], factor)
+    assert level_contradiction(recording, usable_samples(recording)) is None
+
+
+def test_such_a_run_has_no_inertia(recorded):
+    found = identify(scaled_in_stage_5(recorded[1], 0.5))
+    assert found.inertia is None
+    assert found.verdict is Verdict.MODEL_REJECTED
+
+
+def test_one_level_or_none_says_nothing(recorded):
+    recording = recorded[0]
+    for levels in ((), recording.levels[:1], (recording.levels[0], recording.levels[0])):
+        other = replace(recording, levels=levels)
+        assert level_torques(other, usable_samples(other)) == ()

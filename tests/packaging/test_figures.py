@@ -1,0 +1,91 @@
+"""The figures of the pages are what their code draws."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "docs" / "figures"
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
+PIXELS = 1.0                      # of the figure: another processor's linear algebra rounds otherwise
+
+
+@pytest.fixture(scope="module")
+def figures():
+    sys.path.insert(0, str(FOLDER))
+    try:
+        spec = importlib.util.spec_from_file_location("figures_of_the_pages", FOLDER / "draw.py")
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(FOLDER))
+    return module
+
+
+def same(drawn: str, kept: str) -> bool:
+    """Same elements and same words; coordinates within a pixel."""
+    if NUMBER.sub("#", drawn) != NUMBER.sub("#", kept):
+        return False
+    pairs = zip(NUMBER.findall(drawn), NUMBER.findall(kept), strict=True)
+    return all(abs(float(a) - float(b)) <= PIXELS for a, b in pairs)
+
+
+def kept(figures, name: str) -> str:
+    return (figures.IMAGES / f"{name}.svg").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["slope_bends", "model_choice", "what_stops"])
+def test_figure_from_formulas(figures, name):
+    assert same(figures.FORMULA[name]().svg(), kept(figures, name)), f"stale: python docs/figures/draw.py {name}"
+
+
+@pytest.mark.heavy
+@pytest.mark.one_worker("figures")
+@pytest.mark.parametrize("name", ["five_stages", "uncertainty_budget"])
+def test_figure_from_a_run(figures, name):
+    assert same(figures.RUN[name]().svg(), kept(figures, name)), f"stale: python docs/figures/draw.py {name}"
+
+
+@pytest.mark.heavy
+@pytest.mark.one_worker("figures")
+def test_graphs_of_the_report_have_the_words_of_the_pictures(figures):
+    """Another version of matplotlib draws its curves otherwise; the words and ticks stay."""
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed (pip install '.[report]')")
+    for name in figures.GRAPHS:
+        words = re.findall(r"<text[^>]*>([^<]*)</text>", figures.graph(name))
+        assert words, name
+        assert words == re.findall(r"<text[^>]*>([^<]*)</text>", kept(figures, name)), f"stale: draw.py {name}"
+
+
+@pytest.mark.heavy
+@pytest.mark.one_worker("figures")
+def test_the_card_on_the_pages_is_that_of_the_run(figures):
+    for page in figures.WITH_CARD:
+        text = page.read_text(encoding="utf-8")
+        assert "<!-- card -->" in text
+        drawn, shown = (NUMBER.sub("#", one) for one in (figures.with_card(text), text))
+        assert drawn == shown, f"stale card on {page.name}: python docs/figures/draw.py card"
+
+
+@pytest.mark.heavy
+@pytest.mark.one_worker("figures")
+def test_the_page_on_the_json_document_names_every_key(figures):
+    page = (ROOT / "docs" / "reference" / "json.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`(\w+)`", "\n".join(line.split(" | ")[0] for line in page.splitlines() if "| `" in line)))
+    assert set(figures.run()[1]) - named == set()
+
+
+def test_every_figure_is_tried_here(figures):
+    assert set(figures.FORMULA) == {"slope_bends", "model_choice", "what_stops"}
+    assert set(figures.RUN) == {"five_stages", "uncertainty_budget"}
+
+
+def test_a_line_that_moved_is_seen():
+    assert same("<a x='1.0'/>", "<a x='1.4'/>")
+    assert not same("<a x='1.0'/>", "<a x='3.0'/>")
+    assert not same("<a x='1.0'>J</a>", "<a x='1.0'>K</a>")

@@ -1,0 +1,108 @@
+"""A drill string in time as a chain of masses and springs under bit noise: an oracle that shares nothing with the rest.
+
+Symplectic Euler: springs from angles, speeds from torques, angles from speeds. Lags step exactly for a constant input.
+No wave, no line, no delay, no matrix exponential.
+"""
+
+from __future__ import annotations
+
+from math import exp, pi, sqrt
+
+import numpy as np
+
+
+def lowest_turning_of_chain(
+    *, length_m, polar_m4, shear_pa, density, drag, bottom_inertia, bottom_viscous, coulomb_nm, static_nm,
+    stribeck_rad_s, noise_nm, noise_correlation_s, inertia, viscous, dry_nm, lags_s, laws, seed, period_s, lumps=30,
+    wall_nm=0.0, coarse=13, fine=8, lowest=10.0, highest=240.0,
+):
+    """Lowest set speed, rpm, of each law (P, I, J_c, filter) from which a stuck bit ends turning; infinite: none."""
+    speeds = np.geomspace(lowest, highest, coarse)
+
+    def turns(rpm):
+        return ends_turning(
+            length_m=length_m, polar_m4=polar_m4, shear_pa=shear_pa, density=density, drag=drag,
+            bottom_inertia=bottom_inertia, bottom_viscous=bottom_viscous, coulomb_nm=coulomb_nm, static_nm=static_nm,
+            stribeck_rad_s=stribeck_rad_s, noise_nm=noise_nm, noise_correlation_s=noise_correlation_s,
+            inertia=inertia, viscous=viscous, dry_nm=dry_nm, lags_s=lags_s, laws=laws, seed=seed, rpm=rpm,
+            period_s=period_s, lumps=lumps, wall_nm=wall_nm)
+
+    def first(row):
+        sticking = np.flatnonzero(~row)
+        return int(sticking[-1]) + 1 if sticking.size else 0
+
+    at = [first(row) for row in turns(np.tile(speeds, (len(laws), 1)))]
+    ratio = speeds[1] / speeds[0]
+    top = speeds[np.minimum(at, coarse - 1)]
+    grid = top[:, None] * ratio ** (np.arange(1, fine + 1) / fine - 1.0)
+    found = turns(grid)
+    found[:, -1] = True
+    return np.array([grid[k, first(found[k])] if at[k] < coarse else np.inf for k in range(len(laws))])
+
+
+def ends_turning(
+    *, length_m, polar_m4, shear_pa, density, drag, bottom_inertia, bottom_viscous, coulomb_nm, static_nm,
+    stribeck_rad_s, noise_nm, noise_correlation_s, inertia, viscous, dry_nm, lags_s, laws, seed, rpm, period_s, lumps,
+    wall_nm=0.0, periods=12.0, calm=3.0,
+):
+    """(laws, speeds): whether the bit, stuck at breakaway at first, does not stand still in the last periods."""
+    cell = length_m / lumps
+    spring = shear_pa * polar_m4 / cell
+    mass = np.full(lumps + 1, density * polar_m4 * cell)
+    loss = np.full(lumps + 1, drag * cell)
+    mass[[0, -1]] *= 0.5
+    loss[[0, -1]] *= 0.5
+    wall = np.full(lumps + 1, wall_nm / lumps)
+    wall[[0, -1]] *= 0.5
+    mass[0] += inertia
+    mass[-1] += bottom_inertia
+    loss[0] += viscous
+    loss[-1] += bottom_viscous
+    fastest = 2.0 * sqrt(spring / (density * polar_m4 * cell))
+    step = min(0.004, 0.25 / fastest)
+    target = (np.asarray(rpm) * pi / 30.0)
+    cases = target.size
+    laws = np.repeat(np.array(laws, dtype=float), target.shape[1], axis=0)
+    gain, integral, back, filter_s = laws.T
+    target = target.ravel()
+    angle = np.zeros((lumps + 1, cases))
+    angle[:] = (static_nm / spring) * np.arange(lumps, -1, -1)[:, None]
+    speed = np.zeros((lumps + 1, cases))
+    speed[0] = target
+    summed = np.full(cases, float(static_nm)) + viscous * target + dry_nm
+    lag = [summed.copy() for _ in lags_s]
+    keep = [exp(-step / tau) for tau in lags_s]
+    smooth, keep_filter = target.copy(), np.exp(-step / filter_s)
+    random = np.random.default_rng(seed)
+    slow = exp(-step / noise_correlation_s)
+    noise = random.standard_normal() * noise_nm
+    count = int(periods * period_s / step)
+    last = np.zeros(cases)
+    per_mass, per_loss = step / mass[:, None], loss[:, None]
+    draws = random.standard_normal(count) * noise_nm * sqrt(1.0 - slow * slow)
+    for k in range(count):
+        noise = slow * noise + draws[k]
+        torque = spring * (angle[:-1] - angle[1:])
+        top = speed[0]
+        error = target - top
+        summed += step * integral * error
+        demand = gain * error + summed + back * (top - smooth) / filter_s
+        smooth = keep_filter * smooth + (1.0 - keep_filter) * top
+        for number, one in enumerate(keep):
+            lag[number] = demand = one * lag[number] + (1.0 - one) * demand
+        net = -per_loss * speed
+        net[1:] += torque
+        net[:-1] -= torque
+        net[0] += demand - dry_nm * np.clip(top / 0.05, -1.0, 1.0)
+        if wall_nm:
+            net[1:-1] -= wall[1:-1, None] * np.tanh(speed[1:-1] / 0.05)
+        bit = speed[-1]
+        net[-1] -= noise
+        side = np.where(bit != 0.0, np.sign(bit), np.sign(net[-1]))
+        holds = (bit == 0.0) & (np.abs(net[-1]) <= static_nm)
+        net[-1] -= side * (coulomb_nm + (static_nm - coulomb_nm) * np.exp(-((bit / stribeck_rad_s) ** 2)))
+        speed += per_mass * net
+        speed[-1, holds | (speed[-1] * side < 0.0)] = 0.0
+        angle += step * speed
+        last[speed[-1] == 0.0] = k
+    return (last < count * (1.0 - calm / periods)).reshape(np.asarray(rpm).shape)

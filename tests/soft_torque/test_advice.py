@@ -1,0 +1,116 @@
+"""The advice: what it compares, when it says to keep what there is, and what its intervals hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf
+
+import numpy as np
+import pytest
+
+from tdhil.soft_torque import (
+    EXACT_STRING,
+    DrawnValues,
+    Interval,
+    RequiredMargins,
+    TopDrive,
+    TuneCase,
+    TuningRefused,
+    draw_truths,
+    loop_margins,
+    lowest_turning_with_noise,
+    tune,
+    tuned_controller,
+)
+from tests.soft_torque.cases import DRIVE, SOFT_035, SOFT_1, STRING, string_with
+
+J = Interval(1500.0, 1440.0, 1560.0)
+
+
+@pytest.fixture(scope="module")
+def beside_good_gains():
+    """The present gains are a = 0.35 at 0.84 f₁, which cure at 46 rpm: better than the most damping, 57 and more."""
+    return tune(TuneCase(STRING, DRIVE, J, present=SOFT_035, draws=6))
+
+
+def test_nothing_worse_than_the_present_gains_is_recommended(beside_good_gains):
+    """Under noise the row that is recommended, if any, is below the present one, on nearly every truth."""
+    advice = beside_good_gains.advice
+    present = beside_good_gains.by_kind("present")
+    assert advice.compared_with == "present"
+    if advice.kind is None:
+        assert advice.keep
+    else:
+        best = beside_good_gains.by_kind(advice.kind)
+        assert best.cure.median < present.cure.median
+        assert advice.better_share >= 0.8
+        assert not best.failed
+
+
+def test_the_soft_row_is_far_below_the_stiff_one(beside_good_gains):
+    """No more than 40 % of the stiff loop's critical speed under noise; the linear limit is lower than either."""
+    stiff, soft = (beside_good_gains.by_kind(kind) for kind in ("stiff", "soft"))
+    assert soft.cure.median < 0.4 * stiff.cure.median
+    assert soft.linear_limit.median < soft.cure.median
+    low, high = soft.cure.interval()
+    assert low < soft.cure.median < high
+
+
+def test_margins_hold_on_truths_that_were_not_drawn(beside_good_gains):
+    """On 100 further truths 95 % keep phase, gain and dead-time margin of the soft row."""
+    law = beside_good_gains.by_kind("soft").controller
+    truths = draw_truths(STRING, DRIVE, J, count=100, seed=77, lag_tolerance=0.1)
+    kept = [not RequiredMargins().failed(loop_margins(one.drive, law, one.string)) for one in truths]
+    assert np.mean(kept) >= 0.95
+
+
+def test_gains_with_thin_margins_are_not_green():
+    """a = 1 matches ζ and has 14° of phase margin: the row fails, and asking for it is refused."""
+    tuning = tune(TuneCase(STRING, DRIVE, J, present=SOFT_1), search=None)
+    present = tuning.by_kind("present")
+    assert any(words.startswith("phase margin") for words in present.failed)
+    with pytest.raises(TuningRefused, match=r"too little margin: phase margin \d+° \(limit 30°\)"):
+        tune(TuneCase(STRING, DRIVE, J, softness=1.6), search=None)
+
+
+def test_a_string_without_drag_is_refused_for_its_drag():
+    """Not for the lags: with the mud's drag the same request is taken."""
+    bare = string_with(drag=0.0)
+    with pytest.raises(TuningRefused, match="states no drag"):
+        tune(TuneCase(bare, DRIVE, J, compensated_share=0.6), search=None)
+    tune(TuneCase(STRING, DRIVE, J, compensated_share=0.1), search=None)
+
+
+def test_a_shear_modulus_of_the_field_lies_in_the_interval():
+    """G of 61 GPa raises the cure speed of fixed gains; draws with and without the string's tolerance show how much."""
+    law = tuned_controller(STRING, 1500.0, 0.19, 0.12995)
+
+    def cures(string):
+        truths = draw_truths(string, DRIVE, J, count=8)
+        return lowest_turning_with_noise([one.string for one in truths], [(one.drive, law) for one in truths],
+                                         [one.seed for one in truths], "stuck", 7.7)
+
+    wide, exact = cures(STRING), cures(replace(STRING, tolerance=EXACT_STRING))
+    assert np.ptp(np.log(wide)) > 2.0 * np.ptp(np.log(exact))
+
+
+def test_the_turning_point_of_a_kink_is_found():
+    """The least of two dampings has its largest value where they cross, between the values of J that are tried."""
+    light = TopDrive(104.126, 8.1, 60.0, DRIVE.inner_lags_s)
+    case = TuneCase(STRING, light, Interval(104.126, 80.0, 130.0))
+    from tdhil.soft_torque import figures_at, string_modes_hz
+
+    one = next(found for found in tune(case, search=None).tuned if found.kind == "soft")
+    assert one.controller is not None
+    held = string_modes_hz(STRING)
+    along = [figures_at(case, light.with_inertia(float(j)), one.controller, held)[2] for j in np.linspace(80, 130, 60)]
+    assert one.damping.high >= max(along) - 1e-3
+    assert one.damping.low <= min(along) + 1e-3
+
+
+def test_an_interval_of_draws_says_where_its_end_is_not_known():
+    low, high = DrawnValues((50.0, 60.0, inf)).interval()
+    assert low <= 50.0 and high is None
+    assert DrawnValues((inf, inf)).median is None
+    low, high = DrawnValues((8.0, 8.0, 8.1), 10.0).interval()      # no lower set speed was tried
+    assert (low, high) == (0.0, 10.0)

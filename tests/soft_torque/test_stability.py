@@ -1,0 +1,129 @@
+"""Margins, reserves and the linear limit against poles that are found in other ways."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tdhil.soft_torque import (
+    RPM,
+    ClosedSystem,
+    RootsLost,
+    SpeedController,
+    TopDrive,
+    linear_limit,
+    loop_margins,
+)
+from tdhil.soft_torque.roots import count_right_of
+from tests.soft_torque.cases import DRIVE, HALF, STIFF, STRING, TABLE, Pipe, lumped_chain, string_with
+
+
+def unstable_with(string, drive, law, dead_time_s, *, stuck=False):
+    """Whether a pole lies on the right with so much dead time in the loop: counted round a path, none guessed."""
+    def characteristic(s):
+        s = np.asarray(s, dtype=complex)
+        speed, torque = string.at_top(s, stuck=stuck)
+        lags = np.ones_like(s)
+        for lag in drive.inner_lags_s:
+            lags = lags * (1.0 + lag * s)
+        filtered = 1.0 + law.derivative_filter_s * s
+        control = (law.gain_nm_s_rad * s + law.integral_nm_rad) * filtered - law.compensated_kg_m2 * s * s
+        rotor = (drive.inertia_kg_m2 * s + drive.viscous_nm_s_rad) * speed + torque
+        return lags * filtered * s * rotor + control * np.exp(-s * dead_time_s) * speed
+
+    reach = ClosedSystem(string, drive, law).reach_rad_s()
+    pace = min(2.0 * np.pi / (50.0 * string.echo_s), 0.3 / max(dead_time_s, 1e-3))
+    try:
+        return count_right_of(characteristic, reach, pace, 40.0) > 0
+    except RootsLost:
+        return True
+
+
+def random_cases(count, seed):
+    """(string, drive, law) that are stable: strings of 700 to 5,500 m, all kinds of gains."""
+    random = np.random.default_rng(seed)
+    while count:
+        string = string_with(length_m=float(random.uniform(700, 5500)), drag=float(random.uniform(0.002, 0.01)),
+                             inertia_kg_m2=float(random.uniform(100, 600)))
+        inertia = float(random.uniform(300, 4000))
+        lags = tuple(random.uniform(0.002, 0.04, 3).tolist())
+        drive = TopDrive(inertia, 8.0, 60.0, lags)
+        share = float(random.choice([0.0, 0.0, random.uniform(0.05, 0.45)]))
+        omega = 2.0 * np.pi * 0.39 / string.echo_s * random.uniform(0.4, 1.3)
+        gain = string.impedance_nm_s_rad / np.exp(random.uniform(np.log(0.05), np.log(1.2)))
+        law = SpeedController(gain, omega**2 * inertia * (1.0 - share), share * inertia)
+        found = loop_margins(drive, law, string, stuck=False, exact=True)
+        if found.stable and found.dead_time_s < 3.0 and ClosedSystem(string, drive, law).is_stable():
+            count -= 1
+            yield string, drive, law, found
+
+
+def check_reserve(cases, points):
+    for string, drive, law, found in cases:
+        reserve = found.dead_time_s
+        for dead_time_s in np.linspace(0.0, reserve - 0.001, points) if reserve > 0.001 else ():
+            assert not unstable_with(string, drive, law, float(dead_time_s)), (law, reserve, dead_time_s)
+        assert unstable_with(string, drive, law, reserve + 0.001), (law, reserve)
+
+
+def test_the_dead_time_reserve_is_the_smallest_that_destabilises():
+    """Every dead time of a scan up to 1 ms below is stable, 1 ms above is not: random strings, drives and gains."""
+    check_reserve(random_cases(50, 1), 3)
+
+
+@pytest.mark.heavy
+def test_the_dead_time_reserve_on_many_controllers():
+    check_reserve(random_cases(500, 2), 25)
+
+
+@pytest.mark.parametrize(("law", "reserve_s"), [(HALF, 0.084), (STIFF, 0.0755)])
+def test_the_reserve_of_the_reference_card(law, reserve_s):
+    """An independent bisection near the first crossing has 84 ms (half of J compensated) and 75 to 76 ms (stiff)."""
+    found = loop_margins(DRIVE, law, STRING)
+    assert found.dead_time_s == pytest.approx(reserve_s, abs=0.005)
+    # one more lag: stable again for a larger one, so that a bisection may miss the first
+    lags = (*DRIVE.inner_lags_s, found.lag_s)
+    for factor, stable in ((0.98, True), (1.02, False)):
+        drive = replace(DRIVE, inner_lags_s=(*lags[:-1], factor * found.lag_s))
+        states, _, _ = lumped_chain([Pipe(3000.0, 0.127, 0.1086)], 374.0, 20.0, drive, law, stuck=False)
+        free = bool(np.linalg.eigvals(states).real.max() < 1e-9)
+        states, _, _ = lumped_chain([Pipe(3000.0, 0.127, 0.1086)], 374.0, 20.0, drive, law, stuck=True)
+        assert (free and bool(np.linalg.eigvals(states).real.max() < 1e-9)) is stable
+
+
+def test_the_gain_margin_of_half_the_inertia_compensated():
+    """With all gains times 1.3 the eigenvalues of the chain are unstable, and the margin is 2.3 dB, 1.30."""
+    found = loop_margins(DRIVE, HALF, STRING)
+    assert found.gain_db == pytest.approx(20.0 * np.log10(1.305), abs=0.1)
+
+    def unstable(factor):
+        law = SpeedController(*(factor * one for one in (847.1, 352.6, 750.0)))
+        states, _, _ = lumped_chain([Pipe(3000.0, 0.127, 0.1086, lumps=100)], 374.0, 20.0, DRIVE, law)
+        return bool(np.linalg.eigvals(states).real.max() > 1e-6)
+
+    assert [unstable(1.27), unstable(1.34)] == [False, True]
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_the_linear_limit_is_where_the_chain_becomes_unstable(name):
+    """The bit's slope there as negative friction in the chain of lumps: stable 2 % above, unstable 2 % below."""
+    law = TABLE[name]
+    limit = linear_limit(STRING, DRIVE, law)
+    assert 38.0 * RPM < limit < 55.0 * RPM
+
+    def unstable(speed):
+        slope = 2.0 * 2500.0 * speed / 2.5**2 * np.exp(-((speed / 2.5) ** 2))
+        states, _, _ = lumped_chain([Pipe(3000.0, 0.127, 0.1086)], 374.0, 20.0 - slope, DRIVE, law)
+        return bool(np.linalg.eigvals(states).real.max() > 1e-7)
+
+    assert [unstable(0.98 * limit), unstable(1.02 * limit)] == [True, False]
+
+
+def test_unstable_loops_have_no_margin():
+    law = SpeedController(847.1, 352.6, 1350.0)
+    assert not ClosedSystem(STRING, DRIVE, law).is_stable()
+    found = loop_margins(DRIVE, law, STRING)
+    assert not found.stable
+    assert (found.phase_deg, found.gain_db, found.dead_time_s) == (0.0, 0.0, 0.0)
