@@ -727,6 +727,10 @@ class MessageCode(Enum):
         915, "Two methods contradict each other",
         "A cross-check of the same run finds a clearly different inertia.",
         "Check load, friction and torque scale, and repeat the run.")
+    TORQUE_AT_SPEED_CHANGED = (
+        916, "The torque at one speed changed during the run",
+        "Steady rotation at the same speed takes far more or far less torque than before.",
+        "Check that torque keeps one scale in all stages and that the load stays the same. Repeat the run.")
 
     # --- 10xx: nothing readable in a file ----------------------------------------------------------------------------
     NOTHING_RECOVERABLE = (
