@@ -124,7 +124,7 @@ def test_a_fault_while_torque_is_let_go_ends_that_and_is_told_once():
 
     here.drive.misbehave = faults
     report = here.stop_sequence().run()
-    assert sum("while trapped torque is let go" in line for line in report.trouble) == 1
+    assert sum("during the release of trapped torque" in line for line in report.trouble) == 1
 
 
 @pytest.mark.parametrize(("follows", "most"), [(True, 2), (False, 0.5 / PERIOD_S + 1)])
