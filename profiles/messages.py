@@ -731,6 +731,10 @@ class MessageCode(Enum):
         916, "The torque at one speed changed during the run",
         "Steady rotation at the same speed takes far more or far less torque than before.",
         "Check that torque keeps one scale in all stages and that the load stays the same. Repeat the run.")
+    STRING_IMPEDANCE_DIFFERS = (
+        917, "The string's impedance is not that of the declared pipe",
+        "The waves travel as in the pipe, but torque over speed differs by a constant factor.",
+        "Check the pipe's diameters in rig.yaml, the rated torque and the speed unit.")
 
     # --- 10xx: nothing readable in a file ----------------------------------------------------------------------------
     NOTHING_RECOVERABLE = (

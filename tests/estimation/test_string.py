@@ -8,6 +8,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
+from profiles import MessageCode
 from tdhil.estimation import Verdict, identify
 from tdhil.estimation.frequency_domain.compliant_fit import chance_gain, fit_compliant, too_slow
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
@@ -87,6 +88,20 @@ def test_a_pipe_that_is_known_is_held_to_and_one_that_is_wrong_is_told():
     assert any("as rig.yaml says, to 3 %" in one for one in found.inertia.conditional_on)
     assert any("contradict the pipe's sizes in rig.yaml" in warning for warning in wrong.warnings)
     assert wrong.inertia.low <= plant.motor <= wrong.inertia.high
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_torque_scale_that_the_pipe_contradicts_leaves_no_inertia(factor):
+    """Every report agrees with the wrong scale; only the pipe's impedance does not. Its travel time does."""
+    plant = Pipe()
+    recording = run(plant, [4], noise=MILD, lag_prior=KNOWN, settle=8)[0]
+    pipe = KnownPipe(plant.inertia, plant.stiffness, 0.03, "rig.yaml")
+    found = identify(replace(recording, pipe=pipe, torque_nm=factor * recording.torque_nm))
+    assert found.verdict is Verdict.MODEL_REJECTED
+    assert found.entry is MessageCode.STRING_IMPEDANCE_DIFFERS
+    assert found.inertia is None and found.compliant is None
+    assert float(found.reason.split("has ")[1].split(" times")[0]) == pytest.approx(factor, rel=0.1)
 
 
 def test_waves_on_the_bench_meet_the_bench_s_own_impedance():

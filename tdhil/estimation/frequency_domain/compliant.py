@@ -71,6 +71,10 @@ _REPORTS = 3                 # unknown besides the shaft: two lags and the skew
 _BY_PIPE = 2                 # known where the pipe is: its inertia and its stiffness
 _SIGNIFICANT = 25.0          # |mean|² over its variance, as `SpectralLine.excited`
 _LEAST_LOAD = 0.01           # of the total: less hangs on one line's error
+_ANY_IMPEDANCE = 1.0         # relative sd of ζ that leaves it to the data
+_PIPE_RATIOS = (0.75, 1.33)
+"""Of ζ to the pipe's, where the waves' way is the pipe's. G of 61 instead of 79 GPa makes 0.88 of it, worn pipe and the
+torque's scale a tenth; what is beyond is a wrong scale or a wrong section."""
 _NEAR = (SLOWEST_SEEN, 2.0)  # where a swing can be seen, of the lowest and the highest line
 
 
@@ -80,6 +84,7 @@ class Chosen:
 
     ``pipe``: the fit takes the pipe for what its sizes say; ``other_pipe``: it doesn't, since the data contradict them.
     ``unlike_hz``: of lines that the mean speeds differ at, and that count by that difference.
+    ``impedance_ratio``: of the string to the pipe, where that alone is what contradicts the pipe.
     """
 
     fit: CompliantFit
@@ -88,6 +93,7 @@ class Chosen:
     pipe: Pipe | None = None
     other_pipe: bool = False
     unlike_hz: tuple[float, ...] = ()
+    impedance_ratio: float | None = None
 
 
 def usable_lines(every: tuple[SpectralLine, ...], least_nu: float) -> tuple[SpectralLine, ...]:
@@ -126,7 +132,14 @@ def choose(
         if not rejects(known.residual) and plausible(known):
             return Chosen(known, pipe=pipe)
         other = choose(asked, lines, constraint, priors, fixed, is_string=is_string)
-        return replace(other, other_pipe=True) if isinstance(other, Chosen) else other
+        if not isinstance(other, Chosen):
+            return other
+        scaled = KnownStringShaft(pipe, _ANY_IMPEDANCE)
+        fit = fit_compliant(scaled, lines, constraint, priors, fixed, near)
+        ratio = scaled.impedance_ratio(fit.mechanical)
+        least, most = _PIPE_RATIOS
+        found = not rejects(fit.residual) and plausible(fit) and not least <= ratio <= most
+        return replace(other, other_pipe=True, impedance_ratio=ratio if found else None)
     if compliant is not None:
         forced = fit_compliant(compliant(), lines, constraint, priors, fixed)
         return Chosen(forced, rejected=rejects(forced.residual))
@@ -460,6 +473,10 @@ def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Fi
         finding = replace(finding, preface=f"{rigid.contradicted}; ")
     elif rigid is not None and not case.recording.winds_up:
         finding = replace(finding, remark=", much better than the lags of a rigid shaft do")
+    if chosen.impedance_ratio is not None:
+        # a J that does not stand gets no further figures, as where the residuals contradict the model
+        return Finding(name, finding.words, fit.residual, lines=finding.lines,
+                       contradiction=_pipe_contradiction(chosen.impedance_ratio))
     if told.inertia.bounded:
         words = replace(finding.words, if_wide=_WHICH) if told.by_model else finding.words
         return replace(finding, inertia=told.inertia, budget=told.budget, words=words)
@@ -472,6 +489,18 @@ def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Fi
 
 def _told(total: Estimate | None) -> bool:
     return total is not None and total.bounded
+
+
+def _pipe_contradiction(ratio: float) -> Refusal:
+    least, most = _PIPE_RATIOS
+    return Refusal(
+        f"the string has {ratio:.2f} times the characteristic impedance of the pipe in rig.yaml (limits {least:g} to"
+        f" {most:g}), and its travel time is that of the pipe: the scale of torque or speed is wrong by this factor, or"
+        " the pipe's diameters are",
+        "compare the diameters in rig.yaml with the pipe, and the rated torque and the speed unit with the drive; then"
+        " run it again",
+        MessageCode.STRING_IMPEDANCE_DIFFERS,
+    )
 
 
 def _together(total: Estimate | None) -> str:

@@ -248,8 +248,15 @@ class KnownStringShaft(StringShaft):
 
     held = 0
 
-    def __init__(self, pipe: Pipe) -> None:
+    def __init__(self, pipe: Pipe, impedance_rel_sd: float | None = None) -> None:
+        """``impedance_rel_sd``: of ζ, in place of the pipe's own; the waves' way stays as sure as the pipe has it."""
         self.pipe = pipe
+        self.impedance_rel_sd = pipe.rel_sd if impedance_rel_sd is None else impedance_rel_sd
+
+    def impedance_ratio(self, m: FloatArray) -> float:
+        """Return ζ of the fit as a multiple of the pipe's."""
+        inertia = float(m[STRING_SHARE] * m[LOAD])
+        return math.sqrt(inertia * string_stiffness(m)) / self.pipe.impedance_nm_s_rad
 
     def beliefs(self, m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """With ln J_s = ln η + ln J_L, ln k = 2 ln ω_a + ln J_L + ln(1 − 2η/3)."""
@@ -260,7 +267,7 @@ class KnownStringShaft(StringShaft):
         by_inertia, by_spring = np.zeros(len(m)), np.zeros(len(m))
         by_inertia[STRING_SHARE], by_inertia[LOAD] = 1.0 / share, 1.0 / load
         by_spring[STRING_SHARE], by_spring[LOAD], by_spring[SWING] = -_RAYLEIGH / light, 1.0 / load, 2.0 / swing
-        sds = np.array([self.pipe.rel_sd, self.pipe.rel_sd / DELAY_SURER])
+        sds = np.array([self.impedance_rel_sd, self.pipe.rel_sd / DELAY_SURER])
         off = np.array([0.5 * (inertia + spring), 0.5 * (inertia - spring)]) / sds
         slopes = np.stack([0.5 * (by_inertia + by_spring), 0.5 * (by_inertia - by_spring)]) / sds[:, None]
         return off, slopes
