@@ -61,7 +61,7 @@ def run(combination: Combination, folder: Path, reaction_s: float) -> dict[str, 
     machine = JudgedMachine(program.inertia_kg_m2, program.coulomb_nm, combination.largest_torque_nm,
                             program.speed_max_rad_s, program.string)
     judged = judge(read_shaft(trace), outcome, machine, not_asked=excuse.rules if excuse else frozenset(),
-                   reaction_s=reaction_s)
+                   scale_change=combination.scale_change, reaction_s=reaction_s)
     return {
         "number": combination.number, "program": program.name, "fault": combination.fault, "where": combination.where,
         "moment": combination.moment or "start", "early_stop": combination.ends_early, "seed": combination.seed,

@@ -179,6 +179,10 @@ PROGRAMS: Mapping[str, CommandLine] = {one.name: one for one in (
 # Lies with their values. Amounts are shares of the rig's own limits.
 
 
+_FROM_START, _IN_STOP = frozenset({"", "setup+2s"}), frozenset({"stop", "stop+500ms"})
+_SCALES = ("-scale", "torque-constant")
+
+
 @dataclass(frozen=True)
 class LieWithValue:
     """A lie with a value; ``of``: the limit that an amount is a share of."""
@@ -257,6 +261,14 @@ class Combination:
         return "power stage" if self.told.name in _POWER_STAGE else "report"
 
     @property
+    def scale_change(self) -> float | None:
+        """Relative change of a scale in mid-run, as the larger of f − 1 and 1/f − 1; None: no such lie."""
+        if self.moment in _FROM_START or not self.told.name.endswith(_SCALES):
+            return None
+        factor = float(self.told.value)
+        return max(abs(factor - 1.0), abs(1.0 / factor - 1.0))
+
+    @property
     def ends_early(self) -> bool:
         """Something harmless stops the run; half of those whose lie begins in the stop, where the bus has it."""
         return self.moment.startswith("stop") and not self.program.modbus and self.number % 2 == 0
@@ -317,7 +329,6 @@ class Blind:
         )
 
 
-_FROM_START, _IN_STOP = frozenset({"", "setup+2s"}), frozenset({"stop", "stop+500ms"})
 UNKNOWABLE: tuple[Blind, ...] = (
     Blind(("torque-constant",), Unknowable(
         "demanded, reported and commanded torque agree, and all are the same factor off: J is that factor off",

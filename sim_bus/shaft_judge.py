@@ -3,7 +3,8 @@
 a  The host never disables a drive whose shaft turns. Excepted: no string hangs on it, the shaft accelerates against
    the quick stop, and the outcome says that the torque was removed.
 b  The shaft turns slower than `TURNING_RAD_S` when it is reported to be at rest.
-c  An inertia that is `valid` or `valid_wide` has the true one in its total interval.
+c  An inertia that is `valid` or `valid_wide` has the true one in its total interval. Excepted: a scale changed in the
+   run by less than the least change that the run says it can show.
 d  The true speed stays below 1.1 times the limit, and what torque limit and friction add in a reaction time.
 e  The process ends with a known exit code and a closed log.
 """
@@ -103,6 +104,8 @@ class ProcessOutcome:
     """It says that torque was removed from a turning shaft."""
     log_closed: bool
     message: str = ""
+    least_scale_change: float = 0.0
+    """The least relative change of a signal's scale that the run says it can show; 0: it says nothing."""
 
 
 def outcome_of(code: int, document: Mapping[str, Any] | None, said: str, *, log_closed: bool) -> ProcessOutcome:
@@ -115,6 +118,7 @@ def outcome_of(code: int, document: Mapping[str, Any] | None, said: str, *, log_
         code, "shaft at rest" in words or seen is not None, float(seen[1]) if seen else None, document.get("verdict"),
         inertia.get("low_total", -inf), inertia.get("high_total", inf), _REMOVED in words.lower(), log_closed,
         error.get("message") or document.get("stop") or document.get("reason") or words[-200:],
+        max((one.get("least_scale_change") or 0.0 for one in document.get("second_opinions") or ()), default=0.0),
     )
 
 
@@ -141,8 +145,10 @@ class Judged:
 
 
 def judge(shaft: TrueShaft, outcome: ProcessOutcome, machine: JudgedMachine, *, not_asked: frozenset[str] = frozenset(),
-          reaction_s: float = REACTION_S) -> Judged:
-    """Which rules a run broke."""
+          scale_change: float | None = None, reaction_s: float = REACTION_S) -> Judged:
+    """Which rules a run broke. ``scale_change``: relative change of a scale in mid-run, if that is the lie."""
+    if scale_change is not None and scale_change <= outcome.least_scale_change:
+        not_asked |= {"c"}
     seen: dict[str, str] = {}
     if said := _disabled(shaft, outcome, machine):
         seen["a"] = said

@@ -149,13 +149,15 @@ class SecondOpinion:
     """J by another route through the same run, with the interval that this route can vouch for.
 
     ``route``: speed change, coast-down, torque steps. ``agrees``: its interval and the result's overlap as two
-    independent ones of this confidence should; None where there is no result to agree with.
+    independent ones of this confidence should; None where there is no result to agree with. ``least_scale_change``: the
+    least relative change of a signal's scale at stage 5 that would contradict J; None where that is not known.
     """
 
     route: str
     inertia_kg_m2: Estimate
     agrees: bool | None
     note: str
+    least_scale_change: float | None = None
 
 
 @dataclass(frozen=True)

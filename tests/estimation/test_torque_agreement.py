@@ -161,8 +161,9 @@ def test_a_speed_whose_scale_changes_before_stage_5_is_never_valid(runs, factor)
 
 def test_the_least_change_of_a_scale_that_shows_is_told(runs):
     for one in runs:
-        note = identify(one).second_opinions[0].note
-        least = float(note.split("shows from ±")[1].split("%")[0]) / 100.0
+        opinion = identify(one).second_opinions[0]
+        least = opinion.least_scale_change
+        assert opinion.note.endswith(f"shows from ±{least:.0%} on")
         assert 0.05 <= least < 0.2
         speed = np.where(one.time_s < 43.0, 1.0, 1.0 - 1.8 * least) * one.speed_rad_s
         assert identify(replace(one, speed_rad_s=speed), Options(tolerance=0.2)).inertia is None

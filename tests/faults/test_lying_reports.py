@@ -32,5 +32,6 @@ def test_no_lie_is_believed(combination, tmp_path):
     outcome = outcome_of(done.code, document, done.err, log_closed=closed(log))
     machine = JudgedMachine(program.inertia_kg_m2, program.coulomb_nm, combination.largest_torque_nm,
                             program.speed_max_rad_s, program.string)
-    judged = judge(read_shaft(trace), outcome, machine, not_asked=excuse.rules if excuse else frozenset())
+    judged = judge(read_shaft(trace), outcome, machine, not_asked=excuse.rules if excuse else frozenset(),
+                   scale_change=combination.scale_change)
     assert judged.broken == {}, outcome.message

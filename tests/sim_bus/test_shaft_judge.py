@@ -61,6 +61,21 @@ def test_what_is_not_asked_is_excused_and_told():
     assert set(judged.broken) == {"a", "b"} and set(judged.excused) == {"c"}
 
 
+def test_a_change_of_scale_that_the_run_says_it_cannot_show_is_excused():
+    outcome = otherwise(low_total=101.0, high_total=120.0, least_scale_change=0.15)
+    assert judge(TURNED, outcome, RIG, scale_change=0.11).excused.keys() == {"c"}
+    assert judge(TURNED, outcome, RIG, scale_change=0.2).broken.keys() == {"c"}
+    assert judge(TURNED, outcome, RIG).broken.keys() == {"c"}
+    assert judge(TURNED, otherwise(low_total=101.0), RIG, scale_change=0.01).broken.keys() == {"c"}
+
+
+def test_only_a_scale_that_changes_in_mid_run_has_a_change():
+    changes = [(one.told, one.moment, one.scale_change) for one in product()]
+    assert all(change is None for lie, moment, change in changes
+               if moment in ("", "setup+2s") or not lie.name.endswith(("-scale", "torque-constant")))
+    assert {round(change, 3) for lie, _, change in changes if change and lie.value == "0.9"} == {0.111}
+
+
 def test_the_reaction_that_was_used_is_told():
     fast = shaft([(0, 0), (5, 13.0), (14, 0)])
     assert judge(fast, FINE, RIG).reaction_s == pytest.approx(0.5)       # 2 rad/s beyond 11, at 4 rad/s²

@@ -165,7 +165,7 @@ def _with_least_change(
     half = math.hypot(own.high - own.value, 0.5 * (reference.high - reference.low))
     least = max(_ALIKE, _times_wider(confidence, _CONTRADICTION / compared) * half / reference.value)
     note = f"{opinions[0].note}; a scale of speed or torque that changes at stage 5 shows from ±{least:.0%} on"
-    return (replace(opinions[0], note=note), *opinions[1:])
+    return (replace(opinions[0], note=note, least_scale_change=least), *opinions[1:])
 
 
 def disagreements(opinions: tuple[SecondOpinion, ...], finding: Finding) -> tuple[str, ...]:
