@@ -80,6 +80,11 @@ def add_options(parser: argparse.ArgumentParser, *groups: Topic) -> dict[Topic, 
     return sections
 
 
+def hide_rare(*actions: argparse.Action) -> None:
+    """Leave these options of a command, which stand in no table, to ``--help-all``."""
+    _RARE.update(actions)
+
+
 def add_settings(parser: argparse.ArgumentParser, whose: str) -> None:
     """Options of identifying a log again; ``whose`` settings are the default, such as ``the run's``."""
     for option in ASKED_AGAIN:

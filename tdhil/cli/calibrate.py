@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from profiles.quantities import INERTIA
 from tdhil.cli.arguments import add_option, amount, share
@@ -16,7 +16,7 @@ from tdhil.config import OPTION
 from tdhil.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from tdhil.session import CalibrationFound, CalibrationRun
+    from tdhil.session import CalibrationRun
 
 _EXAMPLE = "tdhil calibrate torque without.mcap with.mcap --added 55"
 _LARGEST = 1e9
@@ -88,10 +88,10 @@ def run_torque(namespace: argparse.Namespace) -> int:
             check_report_path(namespace.report, path)
     runs = _read(namespace, wanted)
     from tdhil.report import PlainConsole, print_calibration, stderr_console, write_calibration_report
-    from tdhil.session import find_calibration, save_calibration
+    from tdhil.session import document_of_calibration, find_calibration, save_calibration
 
     found = find_calibration(runs, namespace.at, confidence)
-    document = document_of(found)
+    document = document_of_calibration(found)
     if namespace.json:
         print_json(document)
     else:
@@ -176,26 +176,6 @@ def _read(namespace: argparse.Namespace, wanted: Wanted) -> list[CalibrationRun]
     for path, _, _ in wanted:
         require_file(path)
     return [CalibrationRun(read_recorded(namespace, path), added, sd) for path, added, sd in wanted]
-
-
-def document_of(found: CalibrationFound) -> dict[str, Any]:
-    """The document of a calibration."""
-    from tdhil.report import calibration_document
-    from tdhil.session import drive_identity, drive_settings, sha256_of_log
-
-    first = found.runs[0].record
-    runs = tuple(
-        {"log": run.record.log, "sha256": sha256_of_log(run.record), "date": run.record.configuration.get("started"),
-         "added_kg_m2": run.added_kg_m2, "added_sd_kg_m2": run.added_sd_kg_m2}
-        for run in found.runs
-    )
-    dates = [str(run["date"]) for run in runs if run["date"]]
-    return calibration_document(
-        found.calibration, runs, drive_identity(first.configuration),
-        drive_settings(first.configuration, first.recording),
-        date=max(dates) if dates else _now(), at=found.at,
-        confidence=found.confidence, simulated=first.recording.simulated, warnings=found.warnings,
-    )
 
 
 def _pairs(namespace: argparse.Namespace, confidence: float) -> int:

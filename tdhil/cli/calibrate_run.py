@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from profiles.quantities import INERTIA
-from tdhil.cli.arguments import amount
-from tdhil.config import load_rig, resolve
+from tdhil.cli.arguments import amount, hide_rare
+from tdhil.config import OPTION, load_rig, resolve
 from tdhil.errors import UsageError
 
 _EXAMPLE = "tdhil identify --calibrate --added 55"
@@ -19,12 +19,13 @@ Run = Callable[[argparse.Namespace, list[Path]], int]
 
 def add_calibrate_arguments(section: argparse._ActionsContainer) -> None:
     """Add the options of a calibration by two runs."""
-    section.add_argument("--calibrate", action="store_true",
-                         help="calibrate the torque: a run without a body, then a run with a body of --added")
-    section.add_argument("--added", type=amount(INERTIA), metavar="J",
-                         help="with --calibrate: inertia of the body at the motor shaft, kg·m²")
-    section.add_argument("--added-sd", type=amount(INERTIA), metavar="SD",
-                         help="its standard uncertainty, kg·m² (default 0.2 %% of it, assumed)")
+    hide_rare(
+        section.add_argument("--calibrate", action="store_true",
+                             help="calibrate the torque: a run without a body, then a run with a body of --added"),
+        section.add_argument("--added", type=amount(INERTIA), metavar="J",
+                             help="with --calibrate: inertia of the body at the motor shaft, kg·m²"),
+        section.add_argument("--added-sd", type=amount(INERTIA), metavar="SD",
+                             help="its standard uncertainty, kg·m² (default 0.2 %% of it, assumed)"))
 
 
 def check_calibrate(namespace: argparse.Namespace) -> None:
@@ -38,9 +39,9 @@ def check_calibrate(namespace: argparse.Namespace) -> None:
         return
     if namespace.added is None:
         raise UsageError("needs the inertia of the body", where="--calibrate", next_step=f"Such as: {_EXAMPLE}")
-    for flag, given in (("--dry-run", namespace.dry_run), ("--json", namespace.json),
-                        ("--report", namespace.report is not None), ("--trace", namespace.trace is not None),
-                        ("--fault", bool(namespace.fault))):
+    for flag, given in (("--dry-run", namespace.dry_run), (OPTION["json"].flag, namespace.json),
+                        ("--report", namespace.report is not None), (OPTION["trace"].flag, namespace.trace is not None),
+                        (OPTION["fault"].flag, bool(namespace.fault))):
         if given:
             raise UsageError("does not go with --calibrate", where=flag, next_step="Run both runs one by one, then:"
                              " tdhil calibrate torque without.mcap with.mcap --added J")
@@ -62,7 +63,7 @@ def run_calibration(namespace: argparse.Namespace, run: Run) -> int:
     first = Path(options.log)
     second = first.with_name(f"{first.stem}-with-body{first.suffix}")
     saved = first.with_name(f"{first.stem}-calibration.json")
-    check_log_path(second, "--log")
+    check_log_path(second, OPTION["log"].flag)
     if saved.exists():
         raise UsageError("is there already, and is left as it is", where=str(saved),
                          next_step="Move that file away, or name another log with --log")
@@ -80,17 +81,19 @@ def run_calibration(namespace: argparse.Namespace, run: Run) -> int:
     if code := run(namespace, logs):
         return code
     body = f"body of {namespace.added:g} kg·m²"
-    changed: dict[str, object] = {"log": str(second)}
+    again = argparse.Namespace(**vars(namespace))
+    again.log = str(second)
     if peer.embedded:
         step(2, f"{body} mounted on the simulated shaft")
         mounted = peer.plant.plant.added_inertia_kg_m2
-        changed |= {"simulated_added_inertia_kg_m2": mounted + namespace.added}
-        changed |= {} if options.seed is None else {"seed": options.seed + 1}
+        again.simulated_added_inertia_kg_m2 = mounted + namespace.added
+        if options.seed is not None:
+            again.seed = options.seed + 1
     else:
         step(2, f"mount the {body}")
         confirm_mounted(console, f"tdhil calibrate torque {logs[0]} with.mcap --added {namespace.added:g}")
     step(3, "run with the body")
-    if code := run(argparse.Namespace(**{**vars(namespace), **changed}), logs):
+    if code := run(again, logs):
         return code
     step(4, "calibration")
     return calibrate_two(logs[0], logs[1], namespace.added, namespace.added_sd, saved)

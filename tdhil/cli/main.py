@@ -50,7 +50,7 @@ _GROUPS: Final = {
         "scan": "list the drives on the bus; nothing is written to them",
         "rig": "write a rig.yaml to fill in, without a drive",
         "profiles": "show known drives, their settings and what is verified",
-        "calibrate": "compute the torque scale from a known body, the speed scale from turns",
+        "calibrate": "compute the scale of torque or speed from known quantities",
     },
     "what J is for": {
         "tune": "compute a speed controller that damps the drill string",

@@ -1,4 +1,4 @@
-"""The routes for ended runs, fleets and rehearsals: pictures, samples, many logs, faults.
+"""The routes for ended runs, calibrations, fleets and rehearsals: pictures, samples, many logs, faults.
 
 Each of `ANSWERS` is called with the site, the request and its body, like the web's own routes.
 """
@@ -16,7 +16,7 @@ from tdhil.service.access import principal
 from tdhil.service.fleets import TABLE, FleetView
 from tdhil.service.middleware import Answer, Site, off
 from tdhil.service.run_state import NotAllowed, NotThere
-from tdhil.service.schemas import FaultView, FleetBody, PictureView, ReplayBody
+from tdhil.service.schemas import CalibrationBody, CalibrationView, FaultView, FleetBody, PictureView, ReplayBody
 from tdhil.service.start_request import options_of
 
 if TYPE_CHECKING:
@@ -75,6 +75,37 @@ async def _faults(site: Site, request: Request, body: None) -> list[FaultView]:
     return [FaultView(one.name, one.summary, one.row, one.value, one.takes, one.from_start) for one in kind.faults()]
 
 
+_LARGEST: Final = 1e9
+"""kg·m²; no body has more."""
+
+
+async def _calibration(site: Site, request: Request, body: CalibrationBody) -> CalibrationView:
+    """Return the torque calibration from two ended runs of the rig."""
+    rig = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
+    sd = body.added_sd_kg_m2
+    if not 0.0 < body.added_kg_m2 <= _LARGEST:
+        raise UsageError(f"{body.added_kg_m2:g}: must be a positive number of kg·m²", where="added_kg_m2",
+                         entry=MessageCode.REQUEST_WRONG)
+    if sd is not None and not 0.0 <= sd <= _LARGEST:
+        raise UsageError(f"{sd:g}: must be a number of kg·m², not negative", where="added_sd_kg_m2",
+                         entry=MessageCode.REQUEST_WRONG)
+
+    def check() -> None:
+        for run in (body.without, body.with_body):
+            if site.store.request(run).rig != rig.id:
+                raise UsageError(f"is not a run of rig {rig.id}", where=f"run {run}",
+                                 next_step="Calibrate each drive by its own two runs", entry=MessageCode.REQUEST_WRONG)
+            if not site.store.status(run).ended or not (site.store.place(run) / "run.mcap").is_file():
+                raise UsageError("the run has no finished log", where=f"run {run}",
+                                 next_step="Wait until it has ended", entry=MessageCode.NOT_READY)
+
+    await off(check)
+    asked = {"without": body.without, "with_body": body.with_body, "added_kg_m2": body.added_kg_m2,
+             "added_sd_kg_m2": sd, "at": body.at}
+    site.supervisor.note(principal(request).name, "torque calibration asked", body.with_body, rig.id, **asked)
+    return CalibrationView(await site.work("calibrate", None, {**asked, "runs_folder": str(site.store.runs)}))
+
+
 async def _fleet_folders(site: Site, request: Request, body: None) -> list[str]:
     return list(site.fleets.folders)
 
@@ -128,8 +159,8 @@ async def _fleet_table(site: Site, request: Request, body: None) -> Response:
 
 ANSWERS: Final[Mapping[str, Answer]] = {
     one.__name__.removeprefix("_"): one for one in (
-        _pictures, _picture, _samples, _faults, _fleet_folders, _fleets, _fleet, _ask_fleet, _stop_fleet, _fleet_rows,
-        _fleet_table,
+        _calibration, _pictures, _picture, _samples, _faults, _fleet_folders, _fleets, _fleet, _ask_fleet, _stop_fleet,
+        _fleet_rows, _fleet_table,
     )
 }
 """Answers by route name."""

@@ -126,6 +126,13 @@ class CompareView:
 
 
 @dataclass(frozen=True)
+class CalibrationView:
+    """A torque calibration: the document of `tdhil calibrate torque --json`. It is not stored."""
+
+    calibration: dict[str, Any]
+
+
+@dataclass(frozen=True)
 class PictureView:
     """A picture of the report; ``caption`` says what it shows."""
 
@@ -284,6 +291,20 @@ class ReplayBody(Body):
 
 
 @dataclass(frozen=True)
+class CalibrationBody(Body):
+    """Two runs of the rig, and the inertia of the body of the second, kg·m², at the ``at`` shaft.
+
+    ``added_sd_kg_m2``: its standard uncertainty; None: assumed.
+    """
+
+    without: str
+    with_body: str
+    added_kg_m2: float
+    added_sd_kg_m2: float | None = None
+    at: Literal["motor", "main"] = "motor"
+
+
+@dataclass(frozen=True)
 class RigFileBody(Body):
     """The whole new file; ``sha256``: hash of the file that it replaces."""
 
@@ -388,6 +409,8 @@ ROUTES: Final = (
           "engineer", {200: RigFileView}, RigFileBody, (404, 409, 422, 503)),
     Route("GET", "/rigs/{rig}/trend", "trend", "J, friction and lags over time, and whether they changed", "viewer",
           {200: TrendView}, errors=(404, 422)),
+    Route("POST", "/rigs/{rig}/calibration", "calibration", "Calibrate the torque by two runs; nothing is connected,"
+          " and nothing is stored", "operator", {200: CalibrationView}, CalibrationBody, (403, 404, 422)),
     Route("POST", "/rigs/{rig}/plan", "plan", "Plan a run; nothing is connected", "viewer", {200: PlanView},
           OPTIONS, (403, 404, 409, 422)),
     Route("POST", "/rigs/{rig}/runs", "start", "Request a run", "operator", {201: RunView, 200: RunView}, OPTIONS,

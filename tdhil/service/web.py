@@ -164,6 +164,7 @@ class Web:
             Way("/runs", self._page("runs.html", "runs")),
             Way("/runs/{run}", self._page("run.html", "runs")),
             Way("/runs/{run}/live", self._page("live.html", "runs")),
+            Way("/calibrate/{rig}", self._page("calibrate.html", "rigs")),
             Way("/rehearse/{rig}", self._page("rehearse.html", "rigs")),
             Way("/compare", self._page("compare.html", "runs")),
             Way("/fleets", self._page("fleets.html", "fleets")),
@@ -453,7 +454,7 @@ class Web:
     async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
         """Compute a task, one at a time. Return its document. Raises Refused."""
         work, limiter = partial(self.supervisor.work, what, run, asked), self._works
-        if what == "replay":
+        if what in ("replay", "calibrate"):
             limiter = self._replays
         found: dict[str, Any] = (await anyio.to_thread.run_sync(work, limiter=limiter))["document"]
         return found

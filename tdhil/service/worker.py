@@ -100,9 +100,19 @@ def compare(asked: dict[str, Any]) -> dict[str, Any]:
                                                      FleetSettings()) for run in asked["runs"]])}
 
 
+def calibrate(asked: dict[str, Any]) -> dict[str, Any]:
+    """Return the torque calibration from a run without and a run with a body of known inertia."""
+    from tdhil.session import CalibrationRun, document_of_calibration, find_calibration, read
+
+    os.chdir(asked["runs_folder"])
+    bodies = ((asked["without"], 0.0, 0.0), (asked["with_body"], asked["added_kg_m2"], asked["added_sd_kg_m2"]))
+    runs = [CalibrationRun(read(Path(run) / "run.mcap"), added, sd) for run, added, sd in bodies]
+    return {"document": document_of_calibration(find_calibration(runs, asked["at"]))}
+
+
 WORK: Final = {
     "plan": plan, "replay": replay, "report": report, "samples": samples, "recover": recover, "trend": trend,
-    "compare": compare,
+    "compare": compare, "calibrate": calibrate,
 }
 
 

@@ -62,8 +62,8 @@ if TYPE_CHECKING:
     )
     from tdhil.session.torque_calibration import (
         ASSUMED_BODY_REL_SD as ASSUMED_BODY_REL_SD, CalibrationFound as CalibrationFound,
-        CalibrationRun as CalibrationRun, find_calibration as find_calibration, find_plan as find_plan,
-        read_pairs as read_pairs,
+        CalibrationRun as CalibrationRun, document_of_calibration as document_of_calibration,
+        find_calibration as find_calibration, find_plan as find_plan, read_pairs as read_pairs,
         sha256_of_log as sha256_of_log,
     )
 else:

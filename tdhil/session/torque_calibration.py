@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from hashlib import file_digest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -95,6 +96,25 @@ def find_calibration(runs: Sequence[CalibrationRun], at: str, confidence: float 
         max(run.record.recording.torque_scale_rel_sd for run in runs), ratio, confidence)
     return CalibrationFound(
         calibrate_torque(case), tuple(runs), tuple(identified), at, confidence, together, tuple(warnings))
+
+
+def document_of_calibration(found: CalibrationFound) -> dict[str, Any]:
+    """Return the document of a calibration: the result with its runs, the drive, and the date of the last run."""
+    from tdhil.report import calibration_document
+
+    first = found.runs[0].record
+    runs = tuple(
+        {"log": run.record.log, "sha256": sha256_of_log(run.record), "date": run.record.configuration.get("started"),
+         "added_kg_m2": run.added_kg_m2, "added_sd_kg_m2": run.added_sd_kg_m2}
+        for run in found.runs
+    )
+    dates = [str(run["date"]) for run in runs if run["date"]]
+    return calibration_document(
+        found.calibration, runs, drive_identity(first.configuration),
+        drive_settings(first.configuration, first.recording),
+        date=max(dates) if dates else datetime.now().astimezone().isoformat(timespec="seconds"), at=found.at,
+        confidence=found.confidence, simulated=first.recording.simulated, warnings=found.warnings,
+    )
 
 
 def find_plan(

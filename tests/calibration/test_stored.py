@@ -7,16 +7,22 @@ from pathlib import Path
 import pytest
 
 from drivers import PreflightRefused
-from tdhil.cli.calibrate import document_of
 from tdhil.errors import UsageError
-from tdhil.session import conclude, find_calibration, load_calibration, save_calibration, with_calibration
+from tdhil.session import (
+    conclude,
+    document_of_calibration,
+    find_calibration,
+    load_calibration,
+    save_calibration,
+    with_calibration,
+)
 from tdhil.session.stored_calibration import refuse_another_drive
 from tests.calibration.bodies import IDENTITY, INERTIA, SCALE, recording, two
 
 
 @pytest.fixture(scope="module")
 def document(tmp_path_factory):
-    return document_of(find_calibration(two(tmp_path_factory.mktemp("logs")), "motor"))
+    return document_of_calibration(find_calibration(two(tmp_path_factory.mktemp("logs")), "motor"))
 
 
 RUN = {"identity": IDENTITY, "started": "2026-12-01T10:00:00+00:00"}

@@ -6,6 +6,7 @@ Skipped where there is no Chromium (`TDHIL_CHROMIUM` names one, else the PATH) o
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import re
 import shutil
@@ -36,7 +37,7 @@ pytestmark = [
     pytest.mark.skipif(find_spec("playwright") is None, reason="no playwright: pip install -e '.[browser]'"),
 ]
 HOSTILE = "<script>window.pwned=1</script><b id=x>bold</b>"
-PAGES = ("/", "/start/a", "/rehearse/a", "/rigs/a", "/runs", "/fleets", "/audit")
+PAGES = ("/", "/start/a", "/calibrate/a", "/rehearse/a", "/rigs/a", "/runs", "/fleets", "/audit")
 PLAN = {
     "excitation": "multisine", "mode": "torque", "duration_s": 100.0, "expected_half_width": 0.021, "stopping": None,
     "speed_rad_s": {"min": 1.0, "max": 5.0}, "torque_nm": {"min": -10.0, "max": 50.0},
@@ -382,6 +383,46 @@ def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, serv
     page.locator("li", has_text="asked ").wait_for()
     page.get_by_text("drive reacted").wait_for()
     assert not page.get_by_text("NOT DELIVERED").is_visible()
+
+
+def test_the_steps_of_a_torque_calibration(page, served, monkeypatch):
+    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    other = second(served, run)
+    inertia = {"value": 109.0, "low_total": 105.0, "high_total": 113.0}
+    for one in (run, other):
+        write_json(served.service.store.place(one) / "result.json", {"verdict": "valid", "inertia_kg_m2": inertia})
+        served.service.supervisor.index.put(served.service.store.summary(one))
+    quantity = {**estimate(0.955), "coverage_factor": 2.0}
+    found = {"verdict": "valid", "reason": HOSTILE, "advice": "", "warnings": [HOSTILE], "calibration_factor": quantity,
+             "inertia_kg_m2": {**quantity, **estimate(104.0)}, "runs": [{"added_kg_m2": 55.0, "reported_kg_m2": 167.0}],
+             "budget": [{"source": HOSTILE, "of_factor": 0.002, "of_inertia": 0.003}]}
+    asked = []
+    monkeypatch.setattr(served.service.supervisor, "work",
+                        lambda what, run, more: asked.append(more) or {"document": found})
+    page.goto("/")
+    page.get_by_role("link", name="Calibrate").first.click()
+    page.wait_for_url("**/calibrate/a")
+    page.get_by_label("Run without the body").select_option(run)
+    page.get_by_label("Run with the body").select_option(run)
+    page.get_by_label("Inertia of the body").fill("55,0")
+    calibrate = page.get_by_role("button", name="Calibrate")
+    calibrate.click()
+    page.get_by_text("Choose two different runs.").wait_for()
+    page.get_by_label("Run with the body").select_option(other)
+    page.get_by_label("Inertia of the body").fill("much")
+    calibrate.click()
+    page.get_by_text("as a positive number of kg·m²").wait_for()
+    assert asked == []
+    page.get_by_label("Inertia of the body").fill("55,0")
+    calibrate.click()
+    page.get_by_text("κ = 0.9550 (0.9454 to 0.9646)").wait_for()
+    assert (asked[0]["without"], asked[0]["with_body"], asked[0]["added_kg_m2"]) == (run, other, 55.0)
+    with page.expect_download() as download:
+        page.get_by_role("link", name="calibration.json").click()
+    assert download.value.suggested_filename == "calibration.json"
+    assert json.loads(Path(download.value.path()).read_text("utf-8")) == found
+    assert page.evaluate("window.pwned") is None
 
 
 def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypatch):

@@ -157,3 +157,48 @@ def test_a_fleet_goes_through_no_other_folder(call, service, logs, body):
 def test_no_other_file_is_a_fleet(call):
     for name in ("nothing", "..", "%2e%2e", "..%2fruns"):
         assert call._client.get(f"/api/v1/fleets/{name}").status_code in (404, 405)
+
+
+def two_ended(call, service):
+    runs = []
+    for _ in range(2):
+        runs.append(call.start()["id"])
+        service.wait(runs[-1], "done")
+        wait_for("its end", lambda: not service.supervisor.live())
+    return runs
+
+
+def test_two_runs_of_a_rig_give_its_torque_calibration(call, service, monkeypatch):
+    without, loaded = two_ended(call, service)
+    asked = []
+    monkeypatch.setattr(service.supervisor, "work",
+                        lambda what, run, more: asked.append((what, more)) or {"document": {"verdict": "valid"}})
+    body = {"without": without, "with_body": loaded, "added_kg_m2": 55.0}
+    answer = call("POST", "/rigs/a/calibration", 200, json={**body, "added_sd_kg_m2": 0.1})
+    assert answer == {"calibration": {"verdict": "valid"}}
+    assert asked == [("calibrate", {**body, "added_sd_kg_m2": 0.1, "at": "motor",
+                                    "runs_folder": str(service.store.runs)})]
+    assert not list(service.store.folder.rglob("calibration*"))
+    for wrong in ({"added_kg_m2": 0.0}, {"added_kg_m2": -1.0}, {"added_kg_m2": "x"}, {"added_sd_kg_m2": -1.0},
+                  {"at": "bit"}, {"more": 1}):
+        call("POST", "/rigs/a/calibration", 422, json={**body, **wrong})
+    assert "not a run of rig b" in call("POST", "/rigs/b/calibration", 422, json=body)["error"]["message"]
+    call("POST", "/rigs/a/calibration", 404, json={**body, "without": "../../x"})
+    (service.store.place(loaded) / "run.mcap").unlink()
+    call("POST", "/rigs/a/calibration", 422, json=body)
+    assert len(asked) == 1
+
+
+def test_the_worker_calibrates_as_the_command_does(tmp_path, monkeypatch):
+    from tests.calibration import bodies
+
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+    logs = iter(one.record for one in bodies.two(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tdhil.session.read", lambda path: next(logs))
+    found = worker.calibrate({"runs_folder": str(tmp_path), "without": "one", "with_body": "two", "added_kg_m2": 55.0,
+                              "added_sd_kg_m2": None, "at": "motor"})["document"]
+    factor = found["calibration_factor"]
+    assert factor["low"] <= 1.0 / bodies.SCALE <= factor["high"]
+    assert any("--added-sd" in warning for warning in found["warnings"])

@@ -146,6 +146,7 @@
         mayStart ? el("a", { class: "button", href: `/start/${encodeURIComponent(rig.id)}` }, "Start") : null,
         rig.run ? el("a", { class: "button", href: `/runs/${rig.run}/live` }, "Live") : null,
         rig.run || rig.state === "held" || rig.state === "blocked" ? el("button", { type: "button", class: "danger", onclick: () => stopRig(rig) }, "Stop") : null,
+        may("operator") ? el("a", { class: "button quiet", href: `/calibrate/${encodeURIComponent(rig.id)}` }, "Calibrate") : null,
         may("operator") && rig.simulated && rig.state === "free" ? el("a", { class: "button quiet", href: `/rehearse/${encodeURIComponent(rig.id)}` }, "Rehearse") : null,
         rig.state !== "unusable" ? el("a", { class: "button quiet", href: `/rigs/${encodeURIComponent(rig.id)}` }, "History") : null,
         may("engineer") ? el("a", { class: "button quiet", href: `/rigs/${encodeURIComponent(rig.id)}/file` }, "File") : null,

@@ -295,6 +295,68 @@
     });
   }
 
+  // -- torque calibration
+
+  function calibratePage() {
+    const rig = document.body.dataset.rig, form = byId("calibrate"), runs = new Map();
+    if (!form) return;
+    const choices = [form.elements.without, form.elements.with_body];
+    const named = (run) => `${when(run.asked)}, ${run.verdict}: J as reported ${inertia(run)}`;
+    let shown = "";
+    every(2000, async () => {
+      const found = (await call("GET", `/runs?rig=${encodeURIComponent(rig)}&state=done`)).filter((run) => run.inertia_kg_m2 !== null), now = JSON.stringify(found);
+      if (now === shown) return;
+      shown = now;
+      for (const run of found) runs.set(run.id, run);
+      for (const choice of choices) {
+        const kept = choice.value;
+        show(choice, el("option", { value: "" }, found.length ? "choose a run" : "no run with a result yet"), ...found.map((run) => el("option", { value: run.id }, named(run))));
+        choice.value = runs.has(kept) ? kept : "";
+      }
+    });
+    const decimal = (name) => {
+      const text = form.elements[name].value.trim().replace(",", ".");
+      return text === "" ? null : Number(text);
+    };
+    form.addEventListener("submit", async (event) => {
+      event.preventDefault();
+      const added = decimal("added"), sd = decimal("added_sd"), button = form.querySelector("button");
+      const wrong = choices.some((one) => !one.value) ? "Choose both runs." : choices[0].value === choices[1].value ? "Choose two different runs."
+        : !(added > 0) ? "Give the inertia of the body as a positive number of kg·m²." : sd !== null && !(sd >= 0) ? "Give the standard uncertainty as a number of kg·m²." : "";
+      if (wrong) return show(byId("said"), el("p", { class: "alarm", role: "alert" }, wrong));
+      button.disabled = true;
+      show(byId("said"), el("p", { class: "dim" }, "Both logs are identified …"));
+      try {
+        const body = { without: choices[0].value, with_body: choices[1].value, added_kg_m2: added, added_sd_kg_m2: sd, at: form.elements.at.value };
+        const { calibration } = await call("POST", `/rigs/${encodeURIComponent(rig)}/calibration`, body, {}, 300000);
+        show(byId("said"), ...calibrated(calibration));
+      } catch (error) {
+        show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+      }
+      button.disabled = false;
+      byId("said").scrollIntoView({ block: "nearest" });
+    });
+  }
+
+  function calibrated(found) {
+    const factor = found.calibration_factor, J = found.inertia_kg_m2, share = (one) => percent(0.5 * (one.high - one.low) / one.value);
+    const rows = [["verdict", found.verdict]];
+    if (factor) rows.push(["calibration factor", `${of(factor)}  ${share(factor)}`], ["J without the body", `${of(J)} kg·m²  ${share(J)}`]);
+    for (const one of found.runs) if (one.reported_kg_m2 !== undefined) rows.push([`${number(one.added_kg_m2)} kg·m² added`, `${number(one.reported_kg_m2)} kg·m² as reported`]);
+    const parts = [el("div", { class: "card" }, el("p", { class: "figure" }, factor ? `κ = ${of(factor)}` : found.verdict),
+      region("Numbers", el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => line(name, [text]))))),
+      el("p", {}, found.reason), found.advice ? el("p", {}, found.advice) : null)];
+    for (const one of found.warnings) parts.push(el("p", { class: "alarm" }, one));
+    if (!factor) return parts;
+    parts.push(el("h3", {}, "Uncertainty budget"), region("Uncertainty budget", el("table", {},
+      el("thead", {}, el("tr", {}, ...["", "± % of κ", "± % of J"].map((one) => el("th", { scope: "col" }, one)))),
+      el("tbody", {}, ...found.budget.map((one) => line(one.source, [(100 * factor.coverage_factor * one.of_factor).toFixed(2), (100 * J.coverage_factor * one.of_inertia).toFixed(2)]))))));
+    const file = URL.createObjectURL(new Blob([`${JSON.stringify(found, null, 2)}\n`], { type: "application/json" }));
+    parts.push(el("p", {}, el("a", { class: "button", href: file, download: "calibration.json" }, "calibration.json")),
+      el("p", {}, "Put the file beside the rig's file, and name it there: drive_data: {torque_calibration: calibration.json}. Each later run is then in calibrated N·m."));
+    return parts;
+  }
+
   // -- many logs
 
   const FLEET = { running: "identifying", done: "done", interrupted: "ended early", failed: "failed" };
@@ -381,5 +443,5 @@
     byId("more").addEventListener("click", () => press(() => { wanted += 200; return rows(); }));
   }
 
-  Object.assign(pages, { run: runPage, runs: runsPage, history: historyPage, compare: comparePage, rehearse: rehearsePage, fleets: fleetsPage, fleet: fleetPage });
+  Object.assign(pages, { run: runPage, runs: runsPage, history: historyPage, compare: comparePage, calibrate: calibratePage, rehearse: rehearsePage, fleets: fleetsPage, fleet: fleetPage });
 })();
