@@ -479,10 +479,11 @@ def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProbl
     shows = _undeclared(problem, fitted, confidence) if asked.by == REFERENCE else None
     p_value = 1.0 if test is None else test.p_value
     if shows is not None:
+        told, expected = _filter_words(problem.declared_s, *shows)
         return replace(
-            bare, verdict=Verdict.MODEL_REJECTED, reference_filter_s=shows,
-            reason=f"the residuals contradict a speed loop without a reference filter (p = {p_value:.2g}): one of"
-            f" {shows.value:.3g} s ({shows.low:.3g} to {shows.high:.3g}) would explain them",
+            bare, verdict=Verdict.MODEL_REJECTED, reference_filter_s=shows[0],
+            reason=f"the residuals contradict a speed loop with {expected} (p = {p_value:.2g}): {told} would explain"
+            " them",
             advice="measure by the torque offset (--impedance offset), which a reference filter doesn't touch; or"
             " switch the filter off at the drive, or state it (drive_data.reference_filter_s in rig.yaml)",
         )
@@ -524,13 +525,33 @@ def _not_below_zero(one: Estimate) -> Estimate:
     return Estimate(one.value, max(one.low, 0.0), one.high)
 
 
-def _undeclared(problem: ImpedanceProblem, plain: FittedImpedance, confidence: float) -> Estimate | None:
-    """A reference filter that the data want, past chance."""
-    found = fit(problem, with_filter=True)
-    if plain.objective - found.objective < _REFERENCE_GAIN or not found.inside[REFERENCE_FILTER]:
+def _undeclared(
+    problem: ImpedanceProblem, plain: FittedImpedance, confidence: float
+) -> tuple[Estimate, bool] | None:
+    """Return the reference filter that the data want past chance, and whether it is in place of the declared one.
+
+    Else it is a further one. Of both the one that explains the data better is returned.
+    """
+    found = []
+    for instead in (False, True) if problem.declared_s > 0.0 else (False,):
+        wanted = replace(problem, declared_s=0.0) if instead else problem
+        fitted = fit(wanted, with_filter=True)
+        if plain.objective - fitted.objective >= _REFERENCE_GAIN and fitted.inside[REFERENCE_FILTER]:
+            found.append((fitted.objective, instead, wanted, fitted))
+    if not found:
         return None
-    spread = _ThetaSpread(problem, found, confidence)
-    return _not_below_zero(spread.around(lambda theta: theta[[REFERENCE_FILTER]])[0])
+    _, instead, wanted, fitted = min(found, key=lambda one: one[:2])
+    spread = _ThetaSpread(wanted, fitted, confidence)
+    return _not_below_zero(spread.around(lambda theta: theta[[REFERENCE_FILTER]])[0]), instead
+
+
+def _filter_words(declared_s: float, shows: Estimate, instead: bool) -> tuple[str, str]:
+    """(the filter that shows, the filter that was expected)."""
+    told = f"one of {shows.value:.3g} s ({shows.low:.3g} to {shows.high:.3g})"
+    if declared_s <= 0.0:
+        return told, "no reference filter"
+    expected = f"the declared reference filter of {declared_s:g} s"
+    return (told + " in place of it" if instead else told.replace("one", "a further one", 1) + " besides it"), expected
 
 
 def _points(

@@ -44,14 +44,16 @@ if TYPE_CHECKING:
         HIGHEST_NOISY_RPM as HIGHEST_NOISY_RPM, NOISY_RESOLUTION as NOISY_RESOLUTION,
         lowest_turning_with_noise as lowest_turning_with_noise, simulate as simulate,
     )
-    from tdhil.soft_torque.tuning import (
-        Advice as Advice, BAND_HZ as BAND_HZ, Moved as Moved, TUNING_REFUSED as TUNING_REFUSED,
-        TuneCase as TuneCase, Tuned as Tuned, Tuning as Tuning, TuningRefused as TuningRefused,
-        WrongInertia as WrongInertia, figures_at as figures_at, in_squares as in_squares,
-        largest_stable_share as largest_stable_share, least_damping as least_damping,
-        lowest_modes_below_hz as lowest_modes_below_hz, recipe_with as recipe_with,
-        string_modes_hz as string_modes_hz, tune as tune,
+    from tdhil.soft_torque.recipes import largest_stable_share as largest_stable_share
+    from tdhil.soft_torque.tune_case import (
+        Advice as Advice, Moved as Moved, TUNING_REFUSED as TUNING_REFUSED, TuneCase as TuneCase, Tuned as Tuned,
+        Tuning as Tuning, TuningRefused as TuningRefused, WrongInertia as WrongInertia,
     )
+    from tdhil.soft_torque.tuned_figures import (
+        BAND_HZ as BAND_HZ, figures_at as figures_at, in_squares as in_squares, least_damping as least_damping,
+        lowest_modes_below_hz as lowest_modes_below_hz, recipe_with as recipe_with, string_modes_hz as string_modes_hz,
+    )
+    from tdhil.soft_torque.tuning import tune as tune
     from tdhil.soft_torque.virtual_string import (
         COLUMNS as COLUMNS, ProgramCourse as ProgramCourse, HostController as HostController, HostLoop as HostLoop,
         RotorObserver as RotorObserver, Phase as Phase, SpeedProgram as SpeedProgram, IdentifiedRig as IdentifiedRig,

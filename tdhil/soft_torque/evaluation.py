@@ -15,7 +15,7 @@ from profiles import MessageCode, TdhilError
 from tdhil.soft_torque.controller import SpeedController, TopDrive
 from tdhil.soft_torque.drill_string import DrillString, StringTolerance
 from tdhil.soft_torque.simulation import LONGEST_TICK_S, RPM, Array, Begin, simulate
-from tdhil.soft_torque.tuning import lowest_modes_below_hz
+from tdhil.soft_torque.tuned_figures import lowest_modes_below_hz
 from tdhil.soft_torque.uncertainty import Interval
 from tdhil.soft_torque.virtual_string import COLUMNS, IdentifiedRig, Phase, SpeedProgram
 

@@ -92,6 +92,15 @@ def test_one_that_is_declared_is_taken_off():
     assert "a reference filter of 0.1 s" in seen.conditions
 
 
+def test_one_that_is_declared_wrongly_is_named_as_a_whole():
+    """Declared 0.2 s, true 0.3 s: the filter that is named is the true one, and it stands in place of the declared."""
+    drive = machine("the paper's", reference_filter=0.3)
+    seen = found(record(drive, "reference", seed=3, declared=0.2))
+    assert seen.verdict is Verdict.MODEL_REJECTED
+    assert holds(seen.reference_filter_s, 0.3, 2.0)
+    assert "the declared reference filter of 0.2 s" in seen.reason and "in place of it" in seen.reason
+
+
 def test_the_torque_offset_does_not_care_for_the_references_filter():
     seen = found(record(machine("soft, a = 0.25", reference_filter=0.1), "offset", seed=3))
     assert seen.verdict is Verdict.VALID

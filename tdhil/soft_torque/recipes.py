@@ -1,0 +1,230 @@
+"""Recipes of controllers: stiff, soft, compensated, broadband; those that keep the margins on every truth, best first.
+
+**Soft** compensates nothing: any drive takes it. **Compensated** gives back a part of the rotor's inertia.
+**Broadband** is full compensation and P = ζ as far as lags and margins allow. Where that is no more than a soft
+controller does, it is refused under this name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tdhil.soft_torque.candidates import (
+    SHARES,
+    SOFTNESSES,
+    Candidate,
+    candidates,
+    ranked_speeds,
+)
+from tdhil.soft_torque.controller import (
+    SpeedController,
+    softest_allowed,
+    stiff_controller,
+    tuned_controller,
+)
+from tdhil.soft_torque.drill_string import MUD_DRAG_NM_S_RAD_M
+from tdhil.soft_torque.stability import (
+    is_stable,
+)
+from tdhil.soft_torque.truth_margins import TruthMargins
+from tdhil.soft_torque.tune_case import (
+    TuneCase,
+    Tuned,
+    TuningRefused,
+)
+from tdhil.soft_torque.tuned_figures import (
+    BAND_HZ,
+    reflections,
+)
+
+RESERVE = 0.8
+"""Of the largest stable share of J, so much is compensated at most."""
+LAG_RESERVE = 0.9
+"""Of the softest a that the lags allow, so much is taken at most."""
+BROADBAND_BELOW = 0.8
+"""Mean |r| above which a controller isn't called broadband: a plain soft one has 0.94 on the reference case."""
+SEARCH_DRAWS = 6
+"""Truths on which candidates are ranked and finalists are simulated."""
+FINALISTS, MOST_TRIED = 5, 120
+"""Candidates of one kind that are simulated, and that are held against the margins before it is given up."""
+_WAVES_SUPPOSED = ("what inertia compensation does to the pipe's waves, and whether their losses keep it stable, is "
+                   "not known of a spring alone: the pipe has to be named (string.yaml)")
+
+
+def stiff(case: TuneCase) -> Tuned:
+    """Return the stiffest PI that keeps the stated phase margin on the bare drive."""
+    try:
+        return Tuned("stiff", stiff_controller(case.drive, case.phase_margin_deg))
+    except ValueError as error:
+        return Tuned("stiff", None, str(error))
+
+
+def soft(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> list[Tuned]:
+    """Best first; one that is refused if there is none. Raises `TuningRefused` where it was asked for."""
+    softest = softest_allowed(case.string, case.drive, held[0])
+    asked = case.softness
+    if asked is not None and asked >= softest:
+        raise TuningRefused(_toosoft(case, asked, softest, held), where=f"--a {asked:g}",
+                            next_step=f"Ask for less than {LAG_RESERVE * softest:.2g}, or find a shorter loop")
+    grid = [one for one in candidates(case.string, case.drive.inertia_kg_m2, held[0], (0.0,),
+                                      SOFTNESSES if asked is None else (asked,))
+            if asked is not None or one.softness <= LAG_RESERVE * softest_allowed(
+                case.string, case.drive, one.frequency_factor * held[0])]
+    kept = _within_margins(case, grid, samples)
+    if not kept:
+        tried = tuned_controller(case.string, case.drive.inertia_kg_m2, asked or 0.3, held[0])
+        words = _no_margin(case, samples, tried)
+        if asked is not None:
+            raise TuningRefused(f"a = {asked:g} leaves too little margin: {words}", where=f"--a {asked:g}",
+                                next_step="Ask for another a, leave --a out, or find a shorter loop")
+        return [Tuned("soft", None, f"no a keeps the margins; a = 0.3, for one: {words}", softest=softest)]
+    return [Tuned("soft", one.controller, softness=one.softness, frequency_factor=one.frequency_factor,
+                  softest=softest) for one in kept]
+
+
+def compensated(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> list[Tuned]:
+    """As `soft`, with a share of J compensated."""
+    asked = case.compensated_share
+    if case.string.supposed:
+        if asked:
+            raise TuningRefused(_WAVES_SUPPOSED, where=f"--compensate {asked:g}", next_step="--string string.yaml")
+        return [Tuned("compensated", None, _WAVES_SUPPOSED)]
+    largest = largest_stable_share(case, case.softness if case.softness is not None else 0.3, held)
+    if asked is not None and asked > largest:
+        raise TuningRefused(
+            f"{100 * asked:.0f} % of J compensated swings by itself if J is {_worst(case)}; at most "
+            f"{100 * largest:.0f} % is stable over J's interval behind {_lag_ms(case)} of lag{_no_drag(case)}",
+            where=f"--compensate {asked:g}",
+            next_step=f"Ask for {RESERVE * largest:.2f} or less, narrow J's interval, or find a shorter loop")
+    shares = tuple(share for share in SHARES if share <= RESERVE * largest) if asked is None else (asked,)
+    softnesses = SOFTNESSES if case.softness is None else (case.softness,)
+    grid = [one for one in candidates(case.string, case.drive.inertia_kg_m2, held[0], shares, softnesses)
+            if one.softness <= LAG_RESERVE * softest_allowed(case.string, case.drive, one.frequency_factor * held[0],
+                                                              one.share)]
+    kept = _within_margins(case, grid, samples)
+    if not kept:
+        share = asked if asked is not None else SHARES[0]
+        tried = tuned_controller(case.string, case.drive.inertia_kg_m2, case.softness or 0.3, held[0], share)
+        words = _no_margin(case, samples, tried)
+        if asked is not None:
+            raise TuningRefused(
+                f"{100 * asked:.0f} % of J compensated leaves too little margin: {words}",
+                where=f"--compensate {asked:g}",
+                next_step="Ask for less, allow less margin with --margins, or find a shorter loop")
+        return [Tuned("compensated", None, f"no share of J keeps the margins; {100 * share:.0f} %, for one: {words}",
+                      largest_share=largest)]
+    return [Tuned("compensated", one.controller, softness=one.softness, frequency_factor=one.frequency_factor,
+                  softest=softest_allowed(case.string, case.drive, one.frequency_factor * held[0], one.share),
+                  compensated_share=one.share, largest_share=largest) for one in kept]
+
+
+def _within_margins(case: TuneCase, grid: Sequence[Candidate], samples: TruthMargins) -> list[Candidate]:
+    """The `FINALISTS` that rank best of those that keep the margins on every truth."""
+    if not grid:
+        return []
+    speeds = ranked_speeds(samples.truths[:SEARCH_DRAWS], [one.controller for one in grid])
+    order = np.argsort(np.mean(np.log(np.maximum(speeds, 1e-3)), axis=1), kind="stable")
+    kept = []
+    for at in order[:MOST_TRIED]:
+        if samples.keeps(grid[at].controller, case.required):
+            kept.append(grid[at])
+            if len(kept) == FINALISTS:
+                break
+    return kept
+
+
+def _no_margin(case: TuneCase, samples: TruthMargins, law: SpeedController) -> str:
+    """What fails on the worst of the truths."""
+    worst = samples.every(law)
+    return ", ".join(case.required.failed(worst) or ("too soft for these lags",)) + (
+        f" over J's interval, string, bit and {_lag_ms(case)} of lag{_no_drag(case)}")
+
+
+def _no_drag(case: TuneCase) -> str:
+    """Words for a string that is stated to lose nothing, if that is why."""
+    if any(line.drag_nm_s_rad_m > 0.0 for line in case.string.lines):
+        return ""
+    return (". string.yaml states no drag (drag_nm_s_rad_m: 0): nothing takes energy out of the pipe's waves. Mud has "
+            f"about {MUD_DRAG_NM_S_RAD_M:g} N·m·s/rad per metre")
+
+
+def broadband(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> Tuned:
+    """Return the controller that reflects least over `BAND_HZ`, if it is more than a soft one."""
+    if case.string.supposed:
+        return Tuned("broadband", None, _WAVES_SUPPOSED)
+    best: tuple[float, float, float, float] | None = None
+    largest = 0.0
+    softness: float
+    for softness in np.geomspace(0.1, 1.0, 7):
+        here = largest_stable_share(case, float(softness), held)
+        largest = max(largest, here)
+        share = RESERVE * here
+        if softness > LAG_RESERVE * softest_allowed(case.string, case.drive, held[0], share) or share < 0.05:
+            continue
+        law = tuned_controller(case.string, case.drive.inertia_kg_m2, float(softness), held[0], share)
+        mean = reflections(case, case.drive, law, held[0])[1]
+        if best is None or mean < best[0]:
+            best = mean, float(softness), share, here
+    if best is None:
+        words = f"not even 5 % of J can be compensated over J's interval behind {_lag_ms(case)} of lag{_no_drag(case)}"
+        return Tuned("broadband", None, words, largest_share=largest)
+    mean, softness, share, here = best
+    if mean > BROADBAND_BELOW:
+        words = (f"|r| over {BAND_HZ[0]:g} to {BAND_HZ[1]:g} Hz comes down to {mean:.2f} at best, with "
+                 f"{100.0 * share:.0f} % of J compensated, all that {_lag_ms(case)} of lag in the loop and J's "
+                 "interval allow; matching needs nearly all of J")
+        return Tuned("broadband", None, words, largest_share=here)
+    softness = round(float(softness), 3)
+    law = tuned_controller(case.string, case.drive.inertia_kg_m2, softness, held[0], share)
+    thin = case.required.failed(samples.every(law))
+    if thin:
+        return Tuned("broadband", None, f"it would leave too little margin: {', '.join(thin)}", largest_share=here)
+    softest = softest_allowed(case.string, case.drive, held[0], share)
+    return Tuned("broadband", law, softness=softness, softest=softest, compensated_share=share, largest_share=here)
+
+
+def largest_stable_share(
+    case: TuneCase, softness: float, held_hz: Sequence[float], believed_upper: bool = True
+) -> float:
+    """The largest share of the believed J that is stable for every J of the interval, to 0.01; 0: none.
+
+    ``believed_upper``: also if J's upper end were believed.
+    """
+    low, high = 0.0, 1.0
+    while high - low > 0.01:
+        middle = 0.5 * (low + high)
+        stable = _stable_everywhere(case, softness, middle, held_hz, believed_upper)
+        low, high = (middle, high) if stable else (low, middle)
+    return low
+
+
+def _stable_everywhere(
+    case: TuneCase, softness: float, share: float, held: Sequence[float], believed_upper: bool = True
+) -> bool:
+    """Stable at both ends of J's interval, with the believed J's gains; and if its upper end is believed.
+
+    And whatever else is moved to an end of its interval, at J's lower end, which bears least compensation.
+    """
+    inertia = case.inertia_kg_m2
+    law = tuned_controller(case.string, inertia.value, softness, held[0], share)
+    upper = tuned_controller(case.string, inertia.high, softness, held[0], share)
+    wanted = [(inertia.low, law), (inertia.high, law), *([(inertia.value, upper)] if believed_upper else [])]
+    ends = [end for pair in case.moves(present=False) for end in pair]
+    return all(is_stable(case.string, case.drive.with_inertia(true), one) for true, one in wanted) and all(
+        is_stable(end.string, end.drive.with_inertia(inertia.low), law) for end in ends)
+
+
+def _toosoft(case: TuneCase, softness: float, softest: float, held: Sequence[float]) -> str:
+    return (f"a = {softness:.2g} is beyond ζ/(ω² J Στ) = {softest:.2g}: with {_lag_ms(case)} of lag in the loop and "
+            f"the string's lowest mode at {held[0]:.3g} Hz the drive would feed slow swings")
+
+
+def _lag_ms(case: TuneCase) -> str:
+    return f"{1e3 * case.drive.total_lag_s:.0f} ms"
+
+
+def _worst(case: TuneCase) -> str:
+    inertia = case.inertia_kg_m2
+    return f"{inertia.low:.4g} kg·m², the lower end of its interval, or {inertia.high:.4g} were believed, the upper"
