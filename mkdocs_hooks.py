@@ -1,8 +1,8 @@
-"""What the pages need beyond mkdocs: README and CONTRIBUTING among them, links out of docs/, and nothing from outside.
+"""Hooks of mkdocs: README and CONTRIBUTING as pages, links to files outside docs/, and a check for external content.
 
-The Markdown files are written for whoever reads them in a clone, where a link leads to any file. On the pages README.md
-and CONTRIBUTING.md stand beside those of docs/, and a link to any other file of the repository leads to a page that
-shows it. A link that leads nowhere is left alone, so that mkdocs warns of it, which ends a strict build.
+The Markdown files are written for a reader in a clone, where a link leads to any file. On the pages, README.md and
+CONTRIBUTING.md stand beside those of docs/, and a link to any other file of the repository leads to a page that shows
+it. A link without a target stays as it is: mkdocs then warns, and a strict build fails.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def linked(text: str, home: str) -> list[str]:
 
 
 def placed(path: str) -> str | None:
-    """Where a file of the repository stands among the pages; None for what has no page, such as a folder."""
+    """Return the place of a file among the pages; None if it has no page, such as a folder."""
     if path in PAGES:
         return PAGES[path]
     if path.startswith("docs/"):
@@ -65,7 +65,7 @@ def relinked(text: str, home: str, page: str) -> str:
 
 
 def loaded_from_elsewhere(text: str) -> list[str]:
-    """What a page or a style sheet would load from another machine; plain links to follow are none of it."""
+    """Return what a page or a style sheet would load from another machine. Plain links do not count."""
     return [match[0] for match in _LOADED.finditer(text)]
 
 

@@ -213,7 +213,8 @@ def ours(path: Path) -> Answer:
 
 
 PEERS: dict[str, Callable[[Trace], Answer]] = {
-    "the paper's method": paper, "least squares": least_squares, "WPILib SysId": wpilib, "SIPPY ARMAX": armax,
+    "acceleration regression (Xu 2026)": paper, "least squares": least_squares, "WPILib SysId": wpilib,
+    "SIPPY ARMAX": armax,
     "SIPPY PARSIM-K": parsim,
 }
 OURS = "tdhil"

@@ -188,7 +188,7 @@ def interrupted(asked: argparse.Namespace, folder: Path) -> None:
     rows, twice = read_table(out), Counter(Counter(calls.read_text().split("\n")[:-1]).values())
     logged, good = {row.log for row in rows}, sum(not row.failed for row in rows)
     print(f"{asked.interrupt} times Ctrl-C: exit codes {dict(codes)}; {len(rows)} rows of {len(logged)} logs, {good} "
-          f"results; begun so often: {dict(sorted(twice.items()))}")
+          f"results; number of starts: {dict(sorted(twice.items()))}")
 
 
 def cost(asked: argparse.Namespace, folder: Path) -> None:
@@ -247,7 +247,7 @@ def main() -> None:
     parser.add_argument("--kill-workers", action="store_true", help="kill Dask's own workers, too")
     parser.add_argument("--quick", action="store_true", help="the machinery alone: rows without identifying")
     parser.add_argument("--folder", type=Path, help="where logs and tables stay")
-    parser.add_argument("--interrupt", type=int, default=0, metavar="N", help="press Ctrl-C so often")
+    parser.add_argument("--interrupt", type=int, default=0, metavar="N", help="number of Ctrl-C")
     parser.add_argument("--cost", action="store_true")
     parser.add_argument("--copies", type=int, default=20)
     asked = parser.parse_args()

@@ -109,7 +109,7 @@ def main() -> int:
             machine = Machine(gain=gain, integral=integral, reference_filter=asked.filter)
             said = [in_closed_form(machine, "reference", seed)["verdict"] for seed in range(asked.seeds)]
             refused = said.count("model_rejected")
-            print(f"{name}, filter of {asked.filter:g} s unsaid: {refused}/{len(said)} refused", flush=True)
+            print(f"{name}, filter of {asked.filter:g} s undeclared: {refused}/{len(said)} refused", flush=True)
             bad |= refused < len(said)
     for name, (gain, integral) in settings.items() if asked.stepped else ():
         machine = Machine(gain=gain, integral=integral, control=DriveParams().control_period_s)

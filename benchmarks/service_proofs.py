@@ -264,7 +264,7 @@ def stop(folder: Path, times: int, disk: bool) -> bool:
                     continue
                 took_s.append(datetime.fromisoformat(status["stop"]["seen"]).timestamp() - asked_s)
                 print(f"stop {number + 1}: answered after {1e3 * (answered_s - asked_s):.0f} ms ({answer['state']}),"
-                      f" seen by the drive {1e3 * took_s[-1]:.0f} ms after it was asked for by {status['stop']['by']}",
+                      f" seen by the drive {1e3 * took_s[-1]:.0f} ms after the request of {status['stop']['by']}",
                       flush=True)
                 wait_for("its end", lambda run=run: state_of(server, run) in ENDED and not lives(data / "runs" / run))
                 for name in ("filler", "rest"):

@@ -27,7 +27,7 @@ sys.path.insert(0, str(ROOT))
 
 LARGEST_SCALE_ERROR = 0.08
 ASSUMED_HALF_WIDTH = 0.0392
-"""Of J, as a share: 95 % of the 2 % (1 sd) that tdhil assumes of a torque scale."""
+"""Share of J: half-width at 95 % of the 2 % (1 sd) that tdhil assumes for a torque scale."""
 LEAST_COVERED, MOST_COVERED = 0.93, 0.99
 WIDEST_HALF_BODY, WIDEST_EQUAL_BODY = 0.012, 0.009
 
@@ -117,7 +117,7 @@ def main() -> int:
 
 @dataclass(frozen=True)
 class CalibrationRow:
-    """What became of one drive. Half-widths are shares of the value; None: refused."""
+    """Result for one drive. Half-widths are shares of the value; None: refused."""
 
     share: float
     verdict: str

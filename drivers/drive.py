@@ -170,7 +170,7 @@ class Preflight:
     safe_action: str                   # reaction of the drive to a silent host
     filters: ReportingFilters = ReportingFilters()
     torque_setpoint: str = "torque setpoint"     # object or register that takes it
-    torque_offset_resolution_nm: float = 0.0     # one count of the torque offset; 0: not asked for, or there is none
+    torque_offset_resolution_nm: float = 0.0     # one count of the torque offset; 0: not requested, or there is none
     kept_torque_nm: float | None = None          # the drive's own limit, if it was tighter and stayed
     kept_speed_rad_s: float | None = None        # (`drivers.own_limits`)
     quick_stop_holds: bool | None = None   # the drive holds the shaft after a quick stop; None: unknown

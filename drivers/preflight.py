@@ -102,7 +102,7 @@ def check_nothing_held(table: PreflightTable, held_nm: float | None, limit_nm: f
                        where: str) -> bool:
     """Add a row of the torque held in quick stop, N·m; None: not reported. Return whether the shaft may be released."""
     most_nm = max(HELD_SHARE * limit_nm, HELD_COUNTS * count_nm)
-    found = "not told" if held_nm is None else f"{held_nm:.4g} N·m"
+    found = "not reported" if held_nm is None else f"{held_nm:.4g} N·m"
     return table.row(
         "torque held in quick stop", f"at most {most_nm:.3g} N·m", found,
         held_nm is not None and abs(held_nm) <= most_nm, where,

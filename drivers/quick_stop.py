@@ -125,15 +125,15 @@ def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_S) -> Bar
         if ended is None and now_s - begun_s > longest_s:
             ended = Ended.TURNING if last is not None else Ended.NO_ANSWER
         clock.wait_until(clock.now_s() + PAUSE_S)
-    let_go = () if coasted is None else (
-        f"its torque was off while the shaft still turned at {coasted.speed:.3g} {coasted.unit}: it ran out unbraked",
+    ran_out = () if coasted is None else (
+        f"the torque was off while the shaft still turned at {coasted.speed:.3g} {coasted.unit}: the shaft ran out",
     )
     no_state = () if not shown else (
-        f"the drive showed {shown}: a speed that comes with it is not believed, and the quick stop was asked for again",
+        f"the drive showed {shown}: tdhil ignored the speed beside it, and requested the quick stop again",
     )
     return BareStopReport(
         ended, first, last, clock.now_s() - begun_s, asked,
-        (*target.remarks(), *let_go, *no_state, *dict.fromkeys(troubles)),
+        (*target.remarks(), *ran_out, *no_state, *dict.fromkeys(troubles)),
     )
 
 

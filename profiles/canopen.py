@@ -142,7 +142,8 @@ class Speed(ProfileEntry):
     times: tuple[Name, ...] = Field(default=(), description="parameters whose values multiply the unit")
     over: tuple[Name, ...] = Field(default=(), description="parameters whose values divide the unit")
     si_unit: U32 | None = Field(
-        default=None, description="what 60A9h must read where the unit is that; null = not told there, not checked"
+        default=None,
+        description="what 60A9h must read where the unit is that; null = not reported, and not checked"
     )
     max_motor_speed_rpm_per_lsb: Positive | None = Field(description="unit of 6080h in rpm; null = no such object")
     acceleration_rpm_s_per_lsb: Positive | None = Field(description="unit of 6083h in rpm/s; null = no such object")
@@ -191,7 +192,7 @@ class Torque(ProfileEntry):
     """
 
     rated_torque_nm_per_lsb: Positive | None = Field(
-        description="unit of 6076h in N·m; null = not told by the drive: rig.yaml must (drive_data.rated_torque_nm)"
+        description="unit of 6076h in N·m; null = not reported: rig.yaml must state drive_data.rated_torque_nm"
     )
     rated: ObjectAt = Field(
         default=ObjectAt(index=0x6076, type="u32"), description="where what counts as rated torque stands instead"
@@ -278,7 +279,7 @@ class CanopenProfile(DriveProfile):
 
     bus: Literal["canopen"]
     eds: str | None = Field(default=None, description="an EDS file beside this one; null = none needed")
-    node: int = Field(default=1, ge=1, le=127, description="node number unless told otherwise")
+    node: int = Field(default=1, ge=1, le=127, description="node number unless the run states another")
     identity: IdentityEntry
     modes: Modes
     quick_stop: QuickStop
@@ -286,7 +287,7 @@ class CanopenProfile(DriveProfile):
     position: Position | None = Field(
         default=STANDARD_POSITION,
         description="the motor's angle, held against the reported speed; left out = 6064h and 608Fh where the drive "
-        "has them; null = none, and the operator is asked what he sees",
+        "has them; null = none; the operator then confirms the speed by sight",
     )
     torque: Torque
     torque_offset: TorqueOffset | None = Field(

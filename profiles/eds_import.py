@@ -212,8 +212,8 @@ class _Writer:
             yield from _comment(f"The file's 605Ah is {int(option.stands)}.")
         if not stays:
             yield from _comment(
-                "605Ah is not in the file, or doesn't take 6: the drive is taken to let go of the shaft once at "
-                "rest."
+                "605Ah is not in the file, or does not accept 6: tdhil assumes that the drive releases the shaft at "
+                "standstill."
             )
         if ramp is None:
             yield from _comment(
@@ -336,7 +336,7 @@ class _Writer:
                             (0x60A8, "SI unit position")):
             subs = [one for (at, sub), one in sorted(self._eds.objects.items()) if at == index and (sub or index in (
                 0x608B, 0x608C, 0x60A8))]
-            told = ", ".join("not told" if one.stands is None else f"{one.stands:.10g}" for one in subs)
+            told = ", ".join("not reported" if one.stands is None else f"{one.stands:.10g}" for one in subs)
             if subs:
                 yield f"{index:04X}h, {said}: {told}."
 
@@ -377,7 +377,7 @@ class _Writer:
         yield f"  max_torque_rated_per_lsb: {'null' if limit is None else '0.001'}"
         yield f"  slope_rated_s_per_lsb: {'null' if slope is None else '0.001'}"
         yield f"  has_demand: {'true' if demand is not None and demand.type == 'i16' and demand.mappable else 'false'}"
-        yield from self._entry(f"{self._file} for what is there; the units are CiA 402-2's", "unverified")
+        yield from self._entry(f"{self._file} for the objects that exist; CiA 402-2 for the units", "unverified")
 
     def _watchdog(self) -> Iterator[str]:
         consumer, guard, factor = self._eds.get(0x1016, 1), self._writable(0x100C, "u16"), self._writable(0x100D, "u8")

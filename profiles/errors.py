@@ -17,10 +17,10 @@ _FLAG: Final = re.compile(r"(?<![\w-])--?[a-z][a-z-]*(?![\w-])")
 
 
 class TdhilError(Exception):
-    """Root of every error a user can cause or meet.
+    """Root of each error that a user can cause or meet.
 
-    ``what`` happened, ``where`` (file:line, object, register, stage) and ``next_step``, what to do about it. Options
-    stand in them by their flags; ``spelling``: what whoever reads it calls those, flag by flag, where not so.
+    ``what`` happened, ``where`` (file:line, object, register, stage) and ``next_step``, the cure. Texts name options by
+    their flags; ``spelling`` maps a flag to its name in another interface (API, Python).
     ``entry``: the entry of the table of messages; without one, that of the class.
     """
 

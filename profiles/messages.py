@@ -383,7 +383,7 @@ class MessageCode(Enum):
         "Write them into rig.yaml (tdhil rig new), and name the file with --rig.")
     UNVERIFIED_PROFILE = (
         405, "The profile has entries that are not verified",
-        "Nobody has confirmed these entries on this drive; a wrong unit gives a wrong inertia.",
+        "The entries are not confirmed on this drive, and a wrong unit gives a wrong inertia.",
         "Compare them with the manual, then accept them with --accept-unverified.")
     SPEED_UNIT_NOT_SEEN = (
         406, "The unit of speed was not confirmed",

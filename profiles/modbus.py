@@ -201,7 +201,7 @@ class ModbusWatchdog(ProfileEntry):
         "unknown counts as any_request",
     )
     fed_by_confidence: Confidence = Field(
-        default="unverified", description="of fed_by alone: while nobody has verified it, it counts as any_request"
+        default="unverified", description="confidence of fed_by alone; below verified, it counts as any_request"
     )
     reaction: Literal["quick_stop", "ramp_stop", "fault_reaction", "coast", "none"] = Field(
         description="what the drive then does; coast = torque off and the shaft runs out"
@@ -209,12 +209,12 @@ class ModbusWatchdog(ProfileEntry):
     reaction_parameter: Name | None = Field(default=None, description="parameter that chooses it, with 'require'")
 
     request_counter: Register | None = Field(
-        default=None, description="counts the requests to this drive, whoever makes them; function 8 is tried besides"
+        default=None, description="counter of the requests to this drive from all clients; function 8 is also tried"
     )
 
     @property
     def fed_by_any_client(self) -> bool:
-        """Would a client that merely reads keep the drive running when this host has died, as far as anybody knows?"""
+        """Return whether a client that only reads may feed the watchdog after this host has died."""
         return self.kind != "none" and (
             self.fed_by in ("any_request", "unknown") or self.fed_by_confidence == "unverified"
         )
@@ -344,8 +344,8 @@ class ModbusProfile(DriveProfile):
     cycle: ModbusCycle
     position: Position | None = Field(
         default=None,
-        description="the motor's angle, held against the reported speed; null = none, and the operator is asked what "
-        "he sees",
+        description="the motor's angle, held against the reported speed; null = none; the operator then "
+        "confirms the speed by sight",
     )
     rated_torque: Name | None = Field(
         default=None, description="parameter in nm that is 100 % torque; null: rig.yaml drive_data.rated_torque_nm"

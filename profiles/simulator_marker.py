@@ -29,7 +29,7 @@ STAGE_NUMBERS = {"setup": 1, "speed": 2, "torque": 3, "hold": 4, "acquire": 5}
 
 CYCLE_ID = 0x6FE
 """Frames about the cycles of stepped time, between a host and a simulated drive only: in stepped time nothing is late,
-so nobody waits for so long and then goes on, which would make a run depend on how busy the computer is.
+so there is no time-out, which would make a run depend on the load of the computer.
 
 `CYCLES_END` (one byte, from a drive with scripted faults) says that from this SYNC on each cycle is ended by
 `CYCLE_OVER`, or `LAST_CYCLE_OVER` when that ends. `CYCLE_ASKED` and a number (from a host to which nothing comes) is

@@ -306,8 +306,8 @@ def _models_at(annotation: Any, path: KeyPath) -> Iterator[type[BaseModel]]:
 # ---------------------------------------------------------------------------------------------------------------------
 # Values with a unit, and keys in another unit than ours, become the ones that a model has: every manual speaks rpm.
 #
-# ``speed_max_rad_s: 100 rpm`` and ``speed_max_rpm: 100`` are both 10.47 rad/s. Only what the model refuses as it
-# stands is looked at, so that text stays text. What was converted is told (`Conversion`), for the reader to see both.
+# ``speed_max_rad_s: 100 rpm`` and ``speed_max_rpm: 100`` are both 10.47 rad/s. Only a value that the
+# model refuses is converted, so that text stays text. `Conversion` keeps both values for the reader.
 
 
 _NUMBERS = frozenset({"float_type", "int_type", "float_parsing", "int_parsing"})

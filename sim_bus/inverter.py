@@ -9,7 +9,7 @@
 The drive's own units of torque and speed may be wrong (`ReportingParams`). All its torques, commanded, demanded and
 reported, share the wrong unit, and so do commanded and reported speed; the position counts true turns.
 
-Owns no clock and no thread: whoever calls `step` says how much time goes by.
+It owns no clock and no thread: the caller of `step` states the time step.
 """
 
 from collections.abc import Callable, Iterator
@@ -148,16 +148,15 @@ class Reporting:
 #
 # Speed control: e = ramped reference − filtered speed, demand = K_p e + I, dI/dt = K_i e, clamped to the
 # torque limits; the integral stands still while the clamp holds and e would push further into it. The reference may be
-# smoothed first. A torque offset (CiA 402-2, 60B2h) is added to the demand, inside the clamp. The standard doesn't say
-# what becomes of it in a quick stop; here it goes on acting for as long as speed is regulated, which is the worse case
-# of the two for whoever stops the shaft.
+# smoothed first. A torque offset (CiA 402-2, 60B2h) is added to the demand, inside the clamp. The standard does not
+# define it in a quick stop. Here it acts for as long as speed is regulated, which is the worse case for the stop.
 #
 # Torque mode: demand = ramped torque − K_p x − I with x the speed beyond the limit and dI/dt = K_i x, I ≥ 0: nothing
 # happens below the limit, and in the long run the limit is held exactly. The same on the negative side.
 #
 # Switching: to speed, the integral starts at the torque demand that flows and a ramp at the actual speed;
-# to torque, a ramp starts at the torque demand that flows. A setpoint without ramp acts at once: whoever
-# switches seeds it.
+# to torque, a ramp starts at the torque demand that flows. A setpoint without ramp acts at once: the
+# caller that switches sets it first.
 #
 # Stopping: the ramp starts at the actual speed. Once the speed has come to zero the integral is dropped, which
 # until then held the braking torque and would drive the shaft backwards.

@@ -241,7 +241,7 @@ def run(
     """Run the five stages and the stop, and give what was recorded; the log is closed then, and the shaft at rest.
 
     ``confirm`` is asked once before a real shaft moves, with what will move in words; anything but True refuses. None:
-    it is typed at the terminal, and refused where there is none. A simulated drive asks nobody. ``options``: those of
+    it is typed at the terminal, and refused where there is none. A simulated drive needs none. ``options``: those of
     motion, result, control loop, overrides and log, such as ``log``, ``mode``, ``tolerance``, ``max_time_s``,
     ``operator``, ``note``, ``no_watchdog``; ``help(tdhil.run)`` lists them, the page on rig.yaml describes them.
     Ctrl-C is a stop, as on the command line, where this is the main thread; in another one give a ``stop``, and

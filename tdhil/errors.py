@@ -61,7 +61,7 @@ class ExitCode(IntEnum):
     STOP_NOT_CONFIRMED = 8      # use the hard-wired emergency stop
     NOT_IDENTIFIABLE = 9        # not identifiable, or the model was rejected
     NOTHING_RECOVERABLE = 10    # nothing recoverable in a log
-    TUNING_REFUSED = 11         # the gains that were asked for can't be recommended
+    TUNING_REFUSED = 11         # the requested gains cannot be recommended
     INTERRUPTED = 130           # Ctrl-C (SIGINT)
     TERMINATED = 143            # SIGTERM, SIGHUP, SIGQUIT (Ctrl-\), SIGTSTP (Ctrl-Z)
 
@@ -82,9 +82,9 @@ class UsageError(TdhilError):
 
 
 class Interrupted(TdhilError):
-    """Somebody, or the system, asked the program to end; raised once the shaft has been taken care of.
+    """The operator or the system ended the program; raised after the shaft was stopped.
 
-    ``why``: who or what it was, where more is known of it than a signal's name.
+    ``why``: the cause, if more is known than the name of a signal.
     """
 
     entry = MessageCode.INTERRUPTED
@@ -159,7 +159,7 @@ class LogError(TdhilError):
 
 
 class LogUnopened(LogError):
-    """There can be no file at the place that was named."""
+    """A log cannot be created at the named place."""
 
     entry = MessageCode.LOG_UNOPENED
 
@@ -211,7 +211,7 @@ class NothingRecorded(LogError):
 
 
 class CsvMisnamed(LogError):
-    """A column or a unit that was asked for is not there, or not clear: the command line can mend it."""
+    """A requested column or unit is missing or ambiguous; options of the command line can correct it."""
 
     entry = MessageCode.CSV_COLUMNS_UNCLEAR
 

@@ -290,7 +290,7 @@ def serve(memory_bytes: int | None) -> None:
         answers.flush()
         while True:
             function, task = pickle.loads(tasks.get())
-            if memory_bytes is not None and not limited:       # once what the function needs is loaded
+            if memory_bytes is not None and not limited:       # after the function has loaded its modules
                 _limit_memory(memory_bytes)
                 limited = True
             try:

@@ -255,7 +255,7 @@ def model_choice() -> Drawing:
 
 
 def what_stops() -> Drawing:
-    """What stops the shaft when what fails."""
+    """Draw the causes of a stop, and what stops the shaft."""
     drawing = Drawing(820, 490, "What stops the shaft when what fails")
     rows = (
         (

@@ -147,7 +147,7 @@ class ModbusDrive:
         self._since_mode_sent = self._since_mode_read = 0
         self._failing_since_s: float | None = None
         self._told_loss = self._told_other = False
-        self._out_of_operation = 0     # cycles so far, since nobody asks for it
+        self._out_of_operation = 0     # cycles since this run last requested operation
         self._heat = Heat(self._access, profile)
         self._other = OtherMaster(self._access, profile, self._plan)
         self._speed_limits: list[tuple[Register, float, int]] = []      # register, rad/s a count, counts as found
@@ -186,7 +186,7 @@ class ModbusDrive:
         if self._identity is None:
             raise PreflightRefused("preflight before connect", where="driver")
         table, access, profile = PreflightTable(), self._access, self._profile
-        table.note("identity", f"not told over Modbus; taken for {profile.name}, as --profile says", self._where)
+        table.note("identity", f"not reported over Modbus; --profile states {profile.name}", self._where)
         if limits.torque_offset:
             table.row(
                 "torque offset", "there", f"profile {profile.name} names no register that adds a torque", False,
@@ -596,8 +596,8 @@ class ModbusDrive:
                 if out >= SETTLED_CYCLES and not self._told_other:
                     self._told_other = True
                     raise CommunicationLost(
-                        f"the drive was enabled although this run doesn't ask for it, status"
-                        f" {self._feedback.status:04X}h: somebody else commands it",
+                        f"the drive is enabled, but this run does not request it (status"
+                        f" {self._feedback.status:04X}h): another master commands it",
                         where=f"{self._where}, {register_name(self._profile.cycle.control.register_)}",
                         next_step="Take the other master off the drive (PLC, panel, gateway)",
                         entry=MessageCode.FOREIGN_MASTER,

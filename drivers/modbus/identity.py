@@ -86,9 +86,9 @@ def refuse_if_driven(access: RegisterAccess, profile: ModbusProfile, where: str)
 def refuse_unless_stepped(marker: Marker) -> None:
     """Refuse stepped time for a peer that is not in stepped time. Raises PreflightRefused."""
     if not marker.stepped:
-        what = "lives in its own time" if marker.simulated else "does not bear the simulator's marker"
+        what = "runs in its own time" if marker.simulated else "has no marker of the simulator"
         raise PreflightRefused(
-            f"stepped time was asked for, but the peer {what}",
+            f"stepped time was requested, but the peer {what}",
             where=f"register {MARKER_REGISTER}",
             next_step="Leave --stepped out: a real shaft moves in real time",
             entry=MessageCode.NOT_THE_SIMULATOR,

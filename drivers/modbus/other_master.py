@@ -147,10 +147,10 @@ class OtherMaster:
                 last = from_words([self._sent[at][-1] for at in addresses], register.type, self._order)
                 other = from_words(words, register.type, self._order)
                 raise CommunicationLost(
-                    f"somebody else commands this drive: the {word.name} there is {word.shown(other)}, and this run"
-                    f" wrote {word.shown(last)}",
+                    f"another master commands this drive: the {word.name} in the drive is {word.shown(other)}, and this"
+                    f" run wrote {word.shown(last)}",
                     where=register_name(register),
-                    next_step=f"{_TAKE_OFF}; one master only may write control word and setpoints",
+                    next_step=f"{_TAKE_OFF}; only one master may write control word and setpoints",
                     entry=MessageCode.FOREIGN_MASTER,
                 )
 
@@ -162,10 +162,10 @@ class OtherMaster:
             now = self._number(register, span, found)
             if now != before:
                 raise CommunicationLost(
-                    f"somebody else changed a setting during the run: '{parameter.title}' was"
+                    f"another master changed a setting during the run: '{parameter.title}' was"
                     f" {self._shown(parameter, before)}, and is {self._shown(parameter, now)}",
                     where=register_name(register),
-                    next_step=f"{_TAKE_OFF}; see to this setting before the next run",
+                    next_step=f"{_TAKE_OFF}; check this setting before the next run",
                     entry=MessageCode.FOREIGN_MASTER,
                 )
 

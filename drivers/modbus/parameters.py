@@ -51,7 +51,7 @@ def read_parameters(
             elif needed(profile, parameter):
                 table.row(parameter.title, "readable", error.what, False, where, error.next_step)
             else:
-                table.note(parameter.title, f"not told: {error.what}", where)
+                table.note(parameter.title, f"not reported: {error.what}", where)
     values = settle(profile, counts, given)
     for parameter in profile.parameters:
         if parameter.name not in values and parameter.register_ is None and parameter.name in spared:

@@ -164,7 +164,7 @@ def words_of(request: bytes, reply: bytes, where: str = "") -> tuple[int, ...]:
     count = struct.unpack_from(">H", request, 3)[0]
     if len(reply) != 2 + 2 * count or reply[1] != 2 * count:
         said = f", its own count says {reply[1]}" if len(reply) > 1 else ""
-        raise _bad(f"{len(reply)} bytes{said}, where {2 + 2 * count} were asked for", where)
+        raise _bad(f"{len(reply)} bytes{said}, but {2 + 2 * count} were requested", where)
     return struct.unpack_from(f">{count}H", reply, 2)
 
 

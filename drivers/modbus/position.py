@@ -53,13 +53,13 @@ def find_angle(table: PreflightTable, access: RegisterAccess, profile: ModbusPro
     """Return the profile's angle register if the drive gives it; add a note in any case."""
     entry = profile.position
     if entry is None:
-        table.note(_TITLE, f"not told by this drive: {_ASKED}", "profile, position")
+        table.note(_TITLE, f"not reported by this drive: {_ASKED}", "profile, position")
         return None
     where = register_name(entry.register_)
     try:
         access.read(entry.register_)
     except PreflightRefused as error:
-        table.note(_TITLE, f"not told: {error.what}; {_ASKED}", where)
+        table.note(_TITLE, f"not reported: {error.what}; {_ASKED}", where)
         return None
     table.note(_TITLE, f"{entry.counts_per_turn:.10g} counts a turn, held against the speed in stage 2", where)
     return AngleRegister(entry, profile.line.word_order)

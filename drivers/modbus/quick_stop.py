@@ -140,13 +140,13 @@ class ModbusTarget:
         """Return remarks on the stop."""
         said = []
         if self._switching_since_s is not None:
-            said.append("a quick stop doesn't decelerate from torque mode: speed mode at zero was asked for first")
+            said.append("a quick stop does not decelerate from torque mode: tdhil requested speed mode first")
         if self._stayed_in_torque:
             said.append(
-                "the drive did not change to speed mode, and its quick stop may let go of the shaft in torque mode"
+                "the drive did not change to speed mode, and its quick stop may release the shaft in torque mode"
             )
         if self._driven:
-            said.append("the drive went on following somebody: another master is there; stop it too")
+            said.append("the drive went on following another master; stop that master too")
         return tuple(said)
 
     def _find_scale(self) -> float | None:

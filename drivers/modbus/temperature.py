@@ -14,7 +14,7 @@ from profiles import MessageCode
 from profiles.modbus import ModbusProfile, Temperature
 
 EVERY_S = 2.0
-UNWATCHED = "nobody watches it: this profile names no register for one; the drive trips by itself, and may then coast"
+UNWATCHED = "not monitored: the profile names no register; the drive trips by itself, and may then coast"
 
 
 class Heat:
@@ -49,7 +49,7 @@ class Heat:
             try:
                 self._row(table, one, self._access.read(one.register_))
             except PreflightRefused as error:
-                table.note(one.title, f"nobody watches it: {error.what}", register_name(one.register_))
+                table.note(one.title, f"not monitored: {error.what}", register_name(one.register_))
         self._next_s = self._access.clock.now_s()
 
     def _row(self, table: PreflightTable, one: Temperature, counts: int) -> None:
@@ -57,7 +57,7 @@ class Heat:
         where = register_name(one.register_)
         if one.too_hot is None and limit is None:
             step = "Give limits.temperature_c in rig.yaml, °C"
-            table.note(one.title, f"{_shown(one, counts)}, and no limit: nobody watches it", where, step)
+            table.note(one.title, f"{_shown(one, counts)}, no limit: not monitored", where, step)
             return
         self._watched.append(one)
         wanted = "not too hot" if limit is None else f"at most {_text(one, limit)}"

@@ -37,7 +37,7 @@ class Scene:
     rng: np.random.Generator
 
     def foreign(self, can_id: int, data: bytes) -> None:
-        """A frame of a third party: everybody on the bus hears it, the drive among them."""
+        """A frame of a third party: all nodes on the bus receive it, the drive among them."""
         self.put(can_id, data)
         self.node.on_frame(can_id, data)
 
@@ -327,7 +327,7 @@ class ForeignHeartbeat(Misbehaviour):
 
 
 class ToolWrites(Misbehaviour):
-    """A tool writes one object by SDO, once; everybody on the bus hears it."""
+    """A tool writes one object by SDO, once; all nodes on the bus receive it."""
 
     def __init__(self, index: int, sub: int, value: int, size: int) -> None:
         self._request = bytes((0x23 | (4 - size) << 2,)) + index.to_bytes(2, "little") + bytes((sub,)) + (
@@ -512,7 +512,7 @@ KINDS: Kinds[Misbehaviour] = Kinds({
     "replayed-feedback": FaultKind(26,
                                    "so many frames of a recording, taken at rest, go before each of the drive's own",
                               lambda v: Replayed(_frames(v)), "1", "FRAMES"),
-    "foreign-heartbeat": FaultKind(56, "another node bears the host's number: its heartbeat comes so often",
+    "foreign-heartbeat": FaultKind(56, "another node has the host's number: period of its heartbeat",
                                    lambda v: ForeignHeartbeat(seconds(v)), "1s", "TIME"),
     "tool-writes": FaultKind(57, "a tool writes an object by SDO, once",
                              lambda v: ToolWrites(*_written(v)), "1016h:1=0", "OBJECT=VALUE"),

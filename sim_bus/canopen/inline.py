@@ -6,13 +6,12 @@
                           ◄── returns
            bus.recv()     ◄── TPDO1, TPDO2, heartbeat …, in the order in which the drive said them
 
-All that a frame makes the drive say lies in the stations' queues when `send` returns. Which cycle an answer belongs to
+All replies to a frame are in the queues of the stations when `send` returns. Which cycle an answer belongs to
 then doesn't depend on how a computer shares its time, and a run repeats to the last frame of its log. The drive is
-that of `sim_bus.canopen.simulator.EmbeddedSimulator`: it says the same in the same order.
+that of `sim_bus.canopen.simulator.EmbeddedSimulator`: it sends the same frames in the same order.
 
-Plant time moves with the SYNC alone, and a host that pauses, however long, changes nothing, as there: nobody else is
-here to move time on. A drive that is taken out of stepped time (5FFEh:2) catches up with the wall clock whenever it
-hears something.
+Plant time moves with the SYNC alone, and a pause of the host of any length changes nothing, as there: nothing else
+advances the time. A drive that leaves stepped time (5FFEh:2) catches up with the wall clock when it receives a frame.
 """
 
 import time

@@ -22,7 +22,7 @@ class Frame(can.Message):
 
 
 class Sender:
-    """Sends; after an error frames are dropped until `revive`, and ``on_lost`` has been told once."""
+    """Sends; after an error frames are dropped until `revive`, and ``on_lost`` has been called once."""
 
     def __init__(self, bus: can.BusABC, on_lost: Callable[[BaseException], None]) -> None:
         self._bus_send = bus.send

@@ -3,8 +3,8 @@
 python-can's stock ``socketcand`` client talks to it (``tcp_tune=True`` on the client's side, otherwise Nagle and
 delayed acknowledgement leave 22 cycles a second). A frame goes to all other clients and local ports, never back.
 
-No thread of its own: whoever needs the bus calls `poll`, which moves frames for as long as it waits; a simulator
-does so through a `HubPort`. Bytes that a client doesn't fetch are kept up to a limit, then the client is dropped.
+It has no thread: the user of the bus calls `poll`, which moves frames while it waits. A simulator
+uses a `HubPort`. Bytes that a client does not fetch are kept up to a limit; then the client is disconnected.
 """
 
 import contextlib

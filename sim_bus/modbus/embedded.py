@@ -1,7 +1,7 @@
 """The simulated Modbus drive in the host's own process and time: no socket, no thread, no wall clock.
 
-A request takes its time on the line, the drive acts on it, and the reply takes its time back; whoever sent it waits, in
-control time, until the reply is complete, and that wait is what moves the plant.
+A request takes its time on the line, the drive acts on it, and the reply takes its time back. The sender waits in
+control time until the reply is complete, and this wait advances the plant.
 """
 
 from collections.abc import Mapping
@@ -170,9 +170,9 @@ class EmbeddedModbusDrive:
             self.machine.run_until(time_s)
 
     def run_on(self) -> None:
-        """The host has left: the plant goes on by itself until the shaft has been at rest for a while, or for long.
+        """Advance the plant without a host until the shaft has been at standstill for a while, or a long time is over.
 
-        What a drive does that nobody talks to any more is its watchdog's, and belongs into the trace.
+        The drive then acts by its watchdog, and the trace records it.
         """
         end_s, resting_s = self._time_s + LONGEST_S, 0.0
         while not self._closed and resting_s < RESTING_S and self._time_s < end_s:

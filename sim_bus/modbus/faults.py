@@ -322,7 +322,7 @@ def _wiring(summary: str, row: int = 44) -> FaultKind[Misbehaviour]:
 
 
 KINDS: Kinds[Misbehaviour] = Kinds({
-    "frozen-feedback": FaultKind(19, "speed and torque read as they last did; what is written goes through",
+    "frozen-feedback": FaultKind(19, "speed and torque keep their last values; writes still take effect",
                                  plain(FrozenReads)),
     "drive-fault": FaultKind(23, "fault state, after the drive's own fault reaction", plain(drive_fault)),
     "fault-at-start": FaultKind(30, "the drive is in fault when the host comes", plain(drive_fault)),

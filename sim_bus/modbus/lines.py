@@ -215,7 +215,7 @@ class TcpListener:
             for request in tcp_requests(buffer):
                 reply = serve(request._replace(connection=number))
                 if reply.connection:
-                    self._let_go(source, reset=reply.connection == "reset")
+                    self._end_connection(source, reset=reply.connection == "reset")
                     return
                 if reply.pdu is not None and not reply.crc_bits:
                     frame = tcp_reply(request, reply.pdu, reply.transaction_bits)
@@ -238,8 +238,8 @@ class TcpListener:
         self._clients.clear()
         self._server.close()
 
-    def _let_go(self, source: int, *, reset: bool) -> None:
-        """A connection dies: by a reset, or in silence and without an end."""
+    def _end_connection(self, source: int, *, reset: bool) -> None:
+        """End a connection by a reset, or without any message."""
         client, _, _ = self._clients.pop(source)
         if reset:
             client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)

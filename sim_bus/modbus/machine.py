@@ -1,7 +1,7 @@
-"""The simulated drive that wears a profile: registers, words, watchdog, loops and shaft, without its bus.
+"""Simulated drive with the interface of a profile: registers, words, watchdog, loops and shaft, without its bus.
 
 Plant and control move on the drive's own grid, the control period of plant.yaml; a request acts between two steps.
-Owns no clock: whoever calls `run_until` says how late it is.
+It owns no clock: the caller of `run_until` states the time.
 """
 
 from collections.abc import Callable

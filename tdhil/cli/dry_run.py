@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 
 def dry_run(
-    options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True, lets_go: bool = False
+    options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True, releases_after_stop: bool = False
 ) -> int:
     """Plan and print; exit code 0. Raises PreflightRefused if no plan is possible, as a run would.
 
-    ``can_torque``: the drive has a torque mode; without it stage 5 is planned in speed mode. ``lets_go``: by its
-    profile the drive is disabled after a quick stop.
+    ``can_torque``: the drive has a torque mode; without it stage 5 is planned in speed mode. ``releases_after_stop``:
+    its profile disables the drive after a quick stop.
     """
-    planned, figures, limits = plan_dry(options, rig, simulated, can_torque, lets_go)
+    planned, figures, limits = plan_dry(options, rig, simulated, can_torque, releases_after_stop)
     if options.json:
         plain = plan_document(planned, figures, limits)
         plain["simulated"] = simulated

@@ -112,8 +112,8 @@ def run_with(
             bench = suited(rig, plan_peer(options, connection).plant)
             rate_hz = options.rate_hz or connection.profile.usual_rate_hz
             return dry_run_course(options, bench, evaluation, simulated, rate_hz)
-        lets_go = connection.profile.quick_stop.ends == "off"
-        return dry_run(options, rig, simulated, connection.profile.can_torque, lets_go)
+        releases_after_stop = connection.profile.quick_stop.ends == "off"
+        return dry_run(options, rig, simulated, connection.profile.can_torque, releases_after_stop)
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
     show_settings(console, options, connection, peer, rig)
     details = RunDetails.of(vars(namespace))

@@ -15,7 +15,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class RegistryEntry:
-    """``at``: ``module:attribute`` of the object; ``text``: what it is.
+    """``at``: ``module:attribute`` of the object; ``text``: its description.
 
     Properties of an excitation for code that can't import it. ``periodic``: it has spectral lines and whole periods.
     ``plateaus``: the speed is constant for a time within each period. There its noise is low, and a flat stretch is no

@@ -34,7 +34,7 @@ class Case:
     """A recording, the options of its identification, and the results so far.
 
     ``recording``: up to the ``aborted`` stage, if one was. ``levels``: of the excited segments; None without any.
-    ``sound``: nothing is wrong with the data as such, so that a second opinion on them is worth having.
+    ``sound``: the data passed their own checks, so a cross-check with them makes sense.
     """
 
     recording: Recording
@@ -89,8 +89,8 @@ _NONE, _WORDLESS = Refusal("", ""), ModelWords()
 class Finding:
     """The result of one route for a case, in the same form for every route; `conclude` adds the verdict.
 
-    ``inertia``: as the data have it, bounded; None where the residuals contradict the model, of which then nothing else
-    is told, and where it can't be told, as the ``refusal`` says. ``conditions``: what J is conditional on besides the
+    ``inertia``: bounded estimate; None if the residuals contradict the model (which then gives nothing else), or if the
+    data do not determine it (``refusal``). ``conditions``: what J is conditional on besides the
     torque scale. ``bent``: the model has friction that is no straight line over speed. ``samples_used``: None for the
     case's own. ``preface`` and ``remark`` stand before and after the sentence on the model. ``reading_kg_m2``: by how
     much more J may be off on either side for the moment at which torque is read; ``advice``: instead of the usual.

@@ -8,16 +8,16 @@ from tdhil.estimation.frequency_domain import widened_most_by_scale, with_total
 from tdhil.estimation.result import Identification, InertiaEstimate, Options, Verdict
 from tdhil.recording import Stage
 
-_SHARPER = "identical filters on reported speed and torque, or known ones, would sharpen this further"
-_BY_SCALE = "a torque calibration (tdhil calibrate torque) would sharpen this most"
+_SHARPER = "identical filters on reported speed and torque, or known filters, would reduce the uncertainty further"
+_BY_SCALE = "a torque calibration (tdhil calibrate torque) would reduce the uncertainty most"
 
 
 def conclude(case: Case, finding: Finding) -> Identification:
-    """The verdict on whatever was found. An abort goes before all else that the data say: without it they might differ.
+    """Return the identification with its verdict. An aborted run is stated first, because it may have changed the data.
 
-    ``valid`` where the interval is as narrow as was asked for, ``valid_wide`` where it is bounded, ``model_rejected``
-    by the residuals' p-value or where another signal or route of the run contradicts J, ``not_identifiable`` where a
-    route had to refuse.
+    ``valid``: the interval is within the tolerance. ``valid_wide``: it is bounded, but wider. ``model_rejected``: the
+    p-value of the residuals, another signal or another route of the run contradicts J. ``not_identifiable``: a route
+    refused.
     """
     inertia = _inertia(case, finding)
     verdict, reason, advice, entry = _judged(case.options, finding, inertia)

@@ -11,8 +11,8 @@
 
 **Why that is enough.** The string takes τ from a drive whose reference stands: −τ/ω = Z. A torque offset acts where
 the string does, but for H_t, so that Z comes out of W alone, whatever J is; T besides tells J s + B, and so how Z is
-made up. From the reference Z follows from the loop's own gains only, so that whatever smooths the reference is taken
-for them: a filter that nobody declared is looked for, and where it shows the answer is refused.
+made up. From the reference Z follows from the loop's own gains only, so that a smoothing of the reference
+would be taken for them: the fit looks for an undeclared filter, and refuses the result if it finds one.
 
 **Lines.** Under speed control what disturbs the shaft dies away, and the scatter from period to period is mostly what
 one period hands over to the next: it cancels in their mean, and would be counted as error. So all P counted periods are
@@ -76,7 +76,7 @@ def measure_impedance(case: PeriodicCase) -> DriveImpedance:
     try:
         return _conclude(case, asked, problem)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
-        return refusal(asked, "the lines can't be told apart by any loop of P and I", _MORE)
+        return refusal(asked, "no speed loop of P and I is determined by these frequencies", _MORE)
 
 
 def refusal(asked: ImpedanceInput, reason: str, advice: str) -> DriveImpedance:
@@ -491,8 +491,8 @@ def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProbl
         return replace(
             bare, verdict=Verdict.MODEL_REJECTED,
             reason=f"the residuals contradict a rigid shaft under a speed loop of P and I (p = {p_value:.2g})",
-            advice="does a string or a brake hang on the shaft, has the loop another structure (a feed-forward, a ramp,"
-            " a notch), or do the reports have other filters than first-order lags?",
+            advice="Check three causes: a string or a brake on the shaft; another structure of the loop (feed-forward,"
+            " ramp, notch); report filters other than first-order lags.",
         )
     spread = _ThetaSpread(problem, fitted, confidence)
     gains = spread.around(

@@ -79,8 +79,7 @@ class InertiaEstimate:
     """Moment of inertia at the motor shaft, kg·m².
 
     ``low_total``/``high_total`` is the interval to quote: it includes the uncertainty of the drive's torque scale.
-    ``low``/``high`` hold if that scale is exact, and whatever else ``conditional_on`` names: how well another run on
-    this drive would repeat the value.
+    ``low``/``high`` (repeatability) hold if that scale is exact and the conditions in ``conditional_on`` are met.
     """
 
     value: float
@@ -190,7 +189,7 @@ class FrictionPoint:
 class Compliant:
     """A shaft that is not rigid: what turns behind the spring, kg·m², N·m/rad, N·m·s/rad, Hz.
 
-    ``total_inertia`` is J_r + J_L, known even where the two can't be told apart, if only from one side: then it is as
+    ``total_inertia`` is J_r + J_L, known even if the data do not separate them, if only from one side: then it is as
     wide as it is. A quantity that the data leave open is None. ``antiresonance_hz``: √(k/J_L)/2π, where the load swings
     and torque hardly moves the motor; ``resonance_hz``: where little torque moves both much.
     """

@@ -34,8 +34,8 @@ class RoughFriction:
     def opposing(self, speed_rad_s: float) -> "RoughFriction":
         """The same torque at this speed, from parts that both oppose a forward rotation.
 
-        A line through friction that falls with speed, or through two levels that a restless string shakes, has a part
-        that pushes; left out alone it would leave the other one too large by all that it takes away.
+        A line through friction that falls with speed, or through two levels that an oscillating string disturbs, has a
+        part that drives the shaft. Without it alone the other part would be too large.
         """
         torque_nm = max(0.0, self.coulomb_nm + self.viscous_nm_s_rad * speed_rad_s)
         if self.viscous_nm_s_rad < 0.0:

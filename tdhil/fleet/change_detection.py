@@ -1,4 +1,4 @@
-"""Did it change? Differences of two results, and changes in a history of them, with the shared torque scale taken out.
+"""Detection of changes: differences of two results, and changes in a history, without the shared torque scale.
 
 Pure: numbers in, numbers out. The terminal, a page and a web service use these same functions.
 
@@ -8,7 +8,7 @@ goes straight into J, into viscous and into Coulomb friction. With the true valu
     ln x_k = ln θ_k + s_d(k) + e_k,    s_d ~ N(0, σ_s²) once for each drive d,    e_k ~ N(0, σ_k²) for each run.
 
 The interval ``low`` to ``high`` (repeatability) is that of e_k alone; σ_k is half its width in ln x over the normal
-quantile of its confidence. A part of it (filters that nobody stated, say) is alike in runs on one rig; it is taken for
+quantile of its confidence. A part of it (unstated filters, for example) is alike in runs on one rig; it is taken for
 independent here, which makes differences wider than they are, not narrower. Quantities that torque doesn't scale (lags)
 or that may be zero (skew) go the same way without logarithm, with s = 0.
 
@@ -28,7 +28,7 @@ none (½), a step (¼, evenly over its places) and drift (¼) gives the probabil
 has less than 10 % in at most 1 of 9 histories without one (Markov's inequality); what happens is measured in
 ``benchmarks/trend_power.py``: 0 to 1.5 %.
 
-Only ever one step or drift is asked for at a time. Where there is a step, either side of it is asked again.
+The search is for one step or drift at a time. After a step, it searches on either side again.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ _PRIOR: Final = {"none": 0.5, "step": 0.25, "drift": 0.25}
 class Measured:
     """One result: ``low`` to ``high`` at ``confidence``, repeatability alone.
 
-    ``scale_rel_sd``: how right the torque scale is, 1 sd, 0 for what torque doesn't scale; ``drive``: whose scale it
-    is, None where that isn't known, and then it is nobody else's. ``time``: any measure of when, rising.
+    ``scale_rel_sd``: standard uncertainty of the torque scale, 0 for quantities without torque; ``drive``: the drive
+    with this scale; None if unknown, which equals no other. ``time``: any measure of time, rising.
     """
 
     value: float
@@ -109,8 +109,8 @@ def difference(before: Measured, after: Measured, confidence: float = 0.95) -> D
 
 @dataclass(frozen=True)
 class ChangePoint:
-    """A step between result ``at - 1`` and result ``at``. ``probability``: that there is a step at all in the stretch
-    that was looked at; ``here``: that it is at this place, if there is one. ``change`` as in `Difference`.
+    """A step between result ``at - 1`` and result ``at``. ``probability`` of any step in the examined
+    stretch; ``here``: probability of this place, given a step. ``change`` as in `Difference`.
     """
 
     at: int

@@ -125,7 +125,7 @@ def _done(distributed: Any, client: Any, futures: list[Any], stop: Callable[[], 
         empty_s = 0.0 if client.scheduler_info()["workers"] else empty_s + wait_s
         if empty_s >= _PATIENCE_S:
             raise TdhilError(
-                f"the cluster has had no worker for {empty_s:.0f} s; what is done is kept", where="fleet",
+                f"the cluster has had no worker for {empty_s:.0f} s; finished results are kept", where="fleet",
                 next_step="Start workers, and the same command again",
                 entry=MessageCode.WORKER_PROCESS_LOST,
             )
@@ -138,7 +138,7 @@ def _check(client: Any, address: str) -> int:
     try:
         theirs = client.run(versions, on_error="return")
     except Exception as error:
-        raise UsageError(f"its workers can't be asked for their versions: {error}", where=f"--scheduler {address}",
+        raise UsageError(f"the workers do not report their versions: {error}", where=f"--scheduler {address}",
                          next_step=f"Install tdhil {__version__} where they run",
                          entry=MessageCode.CLUSTER_UNUSABLE) from error
     if not theirs:
@@ -151,7 +151,7 @@ def _check(client: Any, address: str) -> int:
         odd = [f"{name} {found.get(name)} (here {one})" for name, one in wanted.items() if found.get(name) != one]
         if odd:
             raise UsageError(f"{worker} has {', '.join(odd)}", where=f"--scheduler {address}",
-                             next_step="Rows would differ by who reckoned them: install the same versions",
+                             next_step="Rows would depend on the worker: install the same versions",
                              entry=MessageCode.CLUSTER_UNUSABLE)
     return int(sum(client.nthreads().values()))
 

@@ -56,7 +56,7 @@ class Journal(AbstractContextManager["Journal"]):
             self._file.flush()
         except OSError as error:
             raise LogBroken(f"can't be written: {error.strerror or error}", where=str(self._path),
-                            next_step="Free some space, and start again: what is done is kept") from error
+                            next_step="Free some space, and start again: finished results are kept") from error
         self._learn(row, key, stamp)
 
     def close(self) -> None:
@@ -126,7 +126,7 @@ def write_table(rows: Sequence[FleetRow], path: Path) -> None:
         part.replace(path)
     except (OSError, sqlite3.Error) as error:
         raise LogBroken(f"the table can't be written: {error}", where=str(path),
-                        next_step="Free some space, and start again: what is done is kept") from error
+                        next_step="Free some space, and start again: finished results are kept") from error
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)

@@ -20,7 +20,7 @@ _SHOWN: Final = 5       # logs by name in a note
 
 @dataclass(frozen=True)
 class Quantity:
-    """A column of the table that is followed. ``scaled``: torque's scale is in it."""
+    """Column of the table that the trend follows. ``scaled``: the torque scale multiplies it."""
 
     name: str
     column: str
@@ -35,8 +35,8 @@ QUANTITIES: Final = (
     Quantity("viscous friction", "viscous_nm_s_rad", "viscous_low_nm_s_rad", "viscous_high_nm_s_rad", "N·m·s/rad",
              True),
     Quantity("Coulomb friction", "coulomb_nm", "coulomb_low_nm", "coulomb_high_nm", "N·m", True),
-    Quantity("lag of speed", "speed_lag_s", "speed_lag_low_s", "speed_lag_high_s", "s", False),
-    Quantity("lag of torque", "torque_lag_s", "torque_lag_low_s", "torque_lag_high_s", "s", False),
+    Quantity("lag of the reported speed", "speed_lag_s", "speed_lag_low_s", "speed_lag_high_s", "s", False),
+    Quantity("lag of the reported torque", "torque_lag_s", "torque_lag_low_s", "torque_lag_high_s", "s", False),
 )
 
 
@@ -234,8 +234,8 @@ def _settings(
         "torque limit, N·m": recording.torque_limit_nm,
         "speed window, rad/s": f"{limits['speed_min_rad_s']:g} to {limits['speed_max_rad_s']:g}"
         if {"speed_min_rad_s", "speed_max_rad_s"} <= set(limits) else None,
-        "stated lag of speed, s": prior.speed_lag_s,
-        "stated lag of torque, s": prior.torque_lag_s,
+        "stated lag of the reported speed, s": prior.speed_lag_s,
+        "stated lag of the reported torque, s": prior.torque_lag_s,
         "model": row.model,
         **{name: asked.get(name, OPTION[name].default) for name in ("confidence", "tolerance")},
         "recorded by": row.recorded_by,
@@ -299,6 +299,6 @@ def _compare_text(first: FleetRow, other: FleetRow, quantities: Sequence[Mapping
         else "two drives: the torque scale of each is in it")
     if told.shared_scale and not (first.drive_serial and other.drive_serial):
         scale = "no serial numbers: taken for one drive, whose torque scale cancels"
-    says = "differ" if told.differs else "can't be told apart"
+    says = "differ" if told.differs else "do not differ significantly"
     parts = "".join(f"; {row.log}: {row.part_text}" for row in (first, other) if row.part_text is not None)
     return f"the inertias {says}: {_change_text(told, 'kg·m²')} at {told.confidence:.0%}; {scale}{parts}"

@@ -325,7 +325,7 @@ class RunWriter:
 
     Raises `LogUnopened` and, where less than ``min_free_bytes`` are free, `LogRefused`.
 
-    When the thread fails (disk full, file removed or cut short by somebody), the next call raises `LogBroken`, once;
+    When the thread fails (disk full, file removed or cut short), the next call raises `LogBroken`, once;
     after that records are discarded, so that the stop sequence isn't disturbed by a log that is gone, and `close`
     raises it again.
     `frame` never raises: it is called from inside the drive's own input and output.

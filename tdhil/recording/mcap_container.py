@@ -1,6 +1,6 @@
 """The MCAP container, from records to chunks to the file.
 
-mcap's own writer costs some 7 µs a message and can't be told to take back a chunk that the disk refused; its
+mcap's own writer costs some 7 µs a message and cannot take back a chunk that the disk refused; its
 record classes are used for everything that is written once a chunk or less. A message stands in its chunk as
 
 ::

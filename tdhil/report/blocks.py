@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from tdhil.recording import Recording
 from tdhil.report.card import COMPLIANT, estimate_text, inertia_text, minutes, plus_minus, rounded, sentence
 from tdhil.report.document import SIMULATED, coded_reason, coded_warnings
+from tdhil.report.labels import ACCELERATION_REGRESSION, ESTIMATES, MOMENTUM_CROSS_CHECK, UNCERTAINTY_BUDGET
 
 if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
@@ -24,10 +25,10 @@ WIDTH_IN = 7.0
 
 _COLOURS = {"valid": "green", "valid_wide": "yellow", "not_identifiable": "red", "model_rejected": "red"}
 _VERDICTS = {
-    "valid": "valid: the repeatability is as good as was asked for",
-    "valid_wide": "valid, but wide: the intervals hold, and the repeatability is wider than was asked for",
-    "not_identifiable": "not identifiable: these data can't tell the inertia",
-    "model_rejected": "model rejected: these data contradict every model that was tried",
+    "valid": "valid: the repeatability is within the requested tolerance",
+    "valid_wide": "valid, but wide: the intervals hold, and the repeatability is wider than the tolerance",
+    "not_identifiable": "not identifiable: these data do not determine the inertia",
+    "model_rejected": "model rejected: the data contradict every candidate model",
 }
 
 
@@ -139,11 +140,11 @@ def _answer(document: Part) -> AnswerBox:
     value, lines = "No number", []
     if inertia is not None:
         value = f"{'J_r' if shaft else 'J'} = {inertia_text(inertia, '_total')}"
-        lines.append(f"at {100.0 * inertia['confidence']:g} % confidence, the drive's torque scale included")
+        lines.append(f"{100.0 * inertia['confidence']:g} % coverage interval, torque scale of the drive included")
         if shaft is not None:
             total = shaft["total_inertia_kg_m2"]
             open_or = "left open by the data" if total is None else f"= {estimate_text(total, 'kg·m²')}"
-            lines.append(f"of a compliant shaft's motor side; J_r + J_L {open_or}")
+            lines.append(f"J_r is the motor side of a compliant shaft; J_r + J_L {open_or}")
         if document["gear_ratio"] != 1.0:
             lines.append(f"at the main shaft {inertia_text(document['inertia_main_shaft_kg_m2'], '_total')}")
         if inertia["high_total"] > inertia["high"]:
@@ -163,8 +164,8 @@ def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Rep
 
     yield ReportSection("The run", (Pairs(tuple(_run_rows(document, recording))),))
     if len(recording.time_s):
-        picture = Picture(partial(draw_run, recording=recording), 2.9, "As reported, nothing smoothed. Green: steady "
-                          "levels. Blue: the excitation, its settling lighter.")
+        picture = Picture(partial(draw_run, recording=recording), 2.9, "Reported values, not smoothed. Green: "
+                          "operating points. Blue: excitation, its settling lighter.")
         yield ReportSection("Speed and torque", (picture,))
     if (impedance := document.get("impedance")) is not None:
         yield ReportSection("The drive's own impedance", tuple(_impedance(impedance)))
@@ -172,36 +173,36 @@ def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Rep
         rows = len(document["second_opinions"]) + 4
         picture = Picture(
             partial(draw_opinions, document=document), 0.55 + 0.2 * rows,
-            "The result, and what other routes through the same data say. A second opinion shares friction and torque "
-            "scale with the result, and little else: where the two differ by more than their intervals, one of the "
+            "The result beside other estimates from the same data. A momentum cross-check shares friction and torque "
+            "scale with the result, and little else. If the two differ by more than their intervals, one of the "
             "assumptions is wrong.", names_left=True,
         )
-        yield ReportSection("All that this run says of the inertia", (picture, *_opinions(document)))
+        yield ReportSection("Estimates of the inertia", (picture, *_opinions(document)))
     if document["lines"]:
         picture = Picture(
             partial(draw_lines, document=document), 3.0,
-            "At each excited frequency by itself the ratio of torque to acceleration looks like another inertia, "
-            "because the drive reports speed and torque late. The model explains all of them with one J, the band. "
-            "Below: what it leaves unexplained, in standard deviations; about 1 is chance.",
+            "Ratio of torque to acceleration at each excited frequency. It changes with frequency, because the drive "
+            "reports speed and torque late. The model explains all frequencies with one J (the band). Below: the "
+            "residuals of the model in standard deviations; values near 1 are noise.",
         )
-        yield ReportSection("Torque against acceleration, line by line", (picture,))
+        yield ReportSection("Torque over acceleration at each excited frequency", (picture,))
     if document["budget"]:
         picture = Picture(
             partial(draw_budget, document=document), 0.5 + 0.18 * len(document["budget"]),
-            "The half-width that each source alone would leave. They add up in squares, about. The torque scale counts "
-            "in the interval to quote, and not in the repeatability.", names_left=True,
+            "Half-width that each source alone contributes. The contributions add up approximately in squares. The "
+            "95 % coverage interval includes the torque scale; the repeatability does not.", names_left=True,
         )
-        yield ReportSection("What makes it unsure", (picture, _budget(document)))
+        yield ReportSection(UNCERTAINTY_BUDGET.capitalize(), (picture, _budget(document)))
     if document["friction_curve"]:
         picture = Picture(partial(draw_friction, document=document), 1.8,
-                          "Torque at steady speed, load included; no lag touches it.")
+                          "Torque at steady speed, load included. Lags do not affect it.")
         yield ReportSection("Friction over speed", (picture, _friction(document)))
     yield ReportSection("Numbers", tuple(_numbers(document)))
     if document["lines"]:
-        yield ReportSection("Lines", (_lines(document),))
+        yield ReportSection("Excited frequencies", (_lines(document),))
     if document["stages"]:
         yield ReportSection("Stages", (_stages(document),))
-    yield ReportSection("What it rests on", (Pairs(tuple(_grounds(document, recording, sha256))),))
+    yield ReportSection("Basis of the result", (Pairs(tuple(_grounds(document, recording, sha256))),))
 
 
 # -- what the run was ----------------------------------------------------------------------------------------
@@ -215,9 +216,9 @@ def _run_rows(document: Part, recording: Recording) -> Iterator[tuple[str, str]]
     if document["note"]:
         yield "note", document["note"]
     if drive:
-        yield "drive", drive["name"] or "no name of its own"
+        yield "drive", drive["name"] or "reports no name"
         yield "identity", ", ".join(f"{name} {drive[name]:X}h" for name in ("vendor", "product", "revision"))
-        yield "serial number", str(drive["serial"]) if drive["serial"] else "not told by the drive"
+        yield "serial number", str(drive["serial"]) if drive["serial"] else "not reported by the drive"
     if profile:
         yield "profile", profile["name"] + (f" ({profile['title']})" if profile.get("title") else "")
     if document["connection"]:
@@ -260,15 +261,6 @@ def _excitation(recording: Recording) -> str:
 
 # -- tables --------------------------------------------------------------------------------------------------
 
-_ESTIMATES = (
-    ("viscous friction B", "viscous_nm_s_rad", "N·m·s/rad"),
-    ("Coulomb friction T_c, constant load included", "coulomb_nm", "N·m"),
-    ("lag of the reported speed", "speed_lag_s", "s"),
-    ("lag of the reported torque", "torque_lag_s", "s"),
-    ("delay of the torque report behind the speed report", "skew_s", "s"),
-)
-
-
 _QUANTITIES = (Column("quantity", 0.52), Column("value", 0.12, True), Column("from", 0.12, True),
                Column("to", 0.12, True), Column("unit", 0.12))
 
@@ -287,28 +279,28 @@ def _numbers(document: Part) -> Iterator[Block]:
     if document["gear_ratio"] != 1.0:
         add(f"{side} at the main shaft, torque scale included", document["inertia_main_shaft_kg_m2"], "kg·m²", "_total")
     add(f"{side}: repeatability, this drive", inertia, "kg·m²")
-    for title, key, unit in _ESTIMATES:
-        add(title, document[key], unit)
+    for label in ESTIMATES:
+        add(label.name, document[label.key], label.unit)
     if shaft is not None:
         for title, key, unit in COMPLIANT:
             add(title, shaft[key], unit)
     if rows:
         yield Table(_QUANTITIES, tuple(rows))
-        yield Text("Where nothing is said of the torque scale it is taken for exact: such intervals compare runs on "
-                   "this drive.")
+        yield Text("Intervals without the note 'torque scale included' take the torque scale as exact. Use them to "
+                   "compare runs on this drive.")
 
 
 def _impedance(found: Part) -> Iterator[Block]:
-    """The picture, the loop's numbers, and what they rest on; or the refusal."""
+    """Yield the picture, the numbers of the loop and their conditions, or the refusal."""
     from tdhil.report.plots import draw_impedance
 
     if found["points"]:
         zeta = found["string_nm_s_rad"]
-        caption = ("What the drive's speed loop is to whatever hangs on its shaft, with nothing on it: "
-                   "Z = J s + B + H (P + I/s). Dots: what each line shows by itself.")
+        caption = ("Impedance of the drive's speed loop at the shaft, measured without load: "
+                   "Z = J s + B + H (P + I/s). Dots: impedance at each excited frequency.")
         if zeta:
-            caption += (" Below: the share of a wave that it sends back up a string of "
-                        f"{zeta:.4g} N·m·s/rad (at the motor), with its interval; 1 is a wall.")
+            caption += (" Below: reflection |r| at a string of "
+                        f"{zeta:.4g} N·m·s/rad (at the motor), with its interval. 1 reflects a wave completely.")
         yield Picture(partial(draw_impedance, found=found), 3.4 if zeta else 2.2, caption)
     rows = [
         (title, *rounded(part["value"], part["low"], part["high"]), unit)
@@ -324,19 +316,19 @@ _LOOP = (
     ("gain P of the drive's speed loop", "gain_nm_s_rad", "N·m·s/rad"),
     ("integral gain I", "integral_nm_rad", "N·m/rad"),
     ("lags inside the loop, together", "inner_lag_s", "s"),
-    ("of them, the torque's", "torque_lag_s", "s"),
-    ("and the speed's that it sees", "speed_filter_s", "s"),
-    ("inertia, as this has it", "inertia_kg_m2", "kg·m²"),
-    ("viscous friction, as this has it", "viscous_nm_s_rad", "N·m·s/rad"),
-    ("a reference filter that nobody declared", "reference_filter_s", "s"),
+    ("lag of the torque inside the loop", "torque_lag_s", "s"),
+    ("speed filter inside the loop", "speed_filter_s", "s"),
+    ("inertia, from the impedance", "inertia_kg_m2", "kg·m²"),
+    ("viscous friction, from the impedance", "viscous_nm_s_rad", "N·m·s/rad"),
+    ("reference filter, not declared", "reference_filter_s", "s"),
 )
 
 
 def _opinions(document: Part) -> Iterator[Block]:
     words = {True: "agrees", False: "does not agree", None: "nothing to compare with"}
     for one in document["second_opinions"]:
-        yield Text(f"{sentence(one['route'])[:-1]}: {estimate_text(one['inertia_kg_m2'], 'kg·m²')}, "
-                   f"{words[one['agrees']]}. {sentence(one['note'])}")
+        yield Text(f"{MOMENTUM_CROSS_CHECK.capitalize()}, {one['route']}: "
+                   f"{estimate_text(one['inertia_kg_m2'], 'kg·m²')}, {words[one['agrees']]}. {sentence(one['note'])}")
 
 
 def _budget(document: Part) -> Table:
@@ -352,7 +344,7 @@ def _budget(document: Part) -> Table:
 
 
 def _friction(document: Part) -> Table:
-    """Two points to a row: a curve may have many."""
+    """Return the friction points, two a row."""
     cells = [(f"{p['speed_rad_s']:.2f}", plus_minus(p["torque_nm"]["value"], _half(p["torque_nm"])))
              for p in document["friction_curve"]]
     middle = (len(cells) + 1) // 2
@@ -384,7 +376,7 @@ def _stages(document: Part) -> Table:
 def _grounds(document: Part, recording: Recording, sha256: str) -> Iterator[tuple[str, str]]:
     yield "model", document["model"]
     if (inertia := document["inertia_kg_m2"]) is not None:
-        yield "the repeatability holds if", "; ".join(inertia["conditional_on"])
+        yield "the repeatability is conditional on", "; ".join(inertia["conditional_on"])
         yield "confidence of every interval", f"{100.0 * inertia['confidence']:g} %"
     yield "torque scale, 1 sd", f"{100.0 * recording.torque_scale_rel_sd:g} %"
     if document["reference_inertia_kg_m2"] is not None:
@@ -392,12 +384,12 @@ def _grounds(document: Part, recording: Recording, sha256: str) -> Iterator[tupl
     if (paper := document["paper"]) is not None and paper["inertia_kg_m2"] is not None:
         r2 = "" if paper["r2"] is None else f", r² {paper['r2']:.3f}"
         raw = paper["raw_rate"]["inertia_kg_m2"]
-        yield "the paper's method", (f"{paper['inertia_kg_m2']:.5g} kg·m²{r2}"
+        yield ACCELERATION_REGRESSION, (f"{paper['inertia_kg_m2']:.5g} kg·m²{r2}"
                                      + ("" if raw is None else f"; at the raw rate {raw:.4g} kg·m²"))
     if (test := document["residual"]) is not None and test["p_value"] is not None:
         yield "residual test", f"p = {test['p_value']:.2g}, {test['degrees_of_freedom']:.3g} degrees of freedom"
-    yield "used", f"{document['periods_used']} periods, {document['samples_used']} samples"
-    yield "whole", "yes" if document["complete"] else "no: the log ended before the run did"
+    yield "data used", f"{document['periods_used']} periods, {document['samples_used']} samples"
+    yield "log complete", "yes" if document["complete"] else "no: the log ended before the run did"
     yield "log", document["log"]
     if sha256:
         yield "SHA-256 of the log", sha256
@@ -411,5 +403,5 @@ def _half(part: Part) -> float:
 
 
 def _as(value: float, half: float) -> str:
-    """With the decimals that the measured one beside it has."""
+    """Round ``value`` to the decimals of ``half``."""
     return plus_minus(value, half).split(" ")[0]

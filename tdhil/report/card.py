@@ -14,9 +14,10 @@ from rich.text import Text
 
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED, coded_reason, coded_warnings
+from tdhil.report.labels import ACCELERATION_REGRESSION, ESTIMATES, MOMENTUM_CROSS_CHECK, UNCERTAINTY_BUDGET
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Numbers as people read them: as many digits as the interval bears, and no more.
+# Numbers with as many digits as their interval justifies.
 
 
 def with_interval(value: float, low: float, high: float, unit: str) -> str:
@@ -69,7 +70,7 @@ def minutes(seconds: float) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The small tables of the result card: budget, second opinions, friction over speed, a compliant shaft.
+# The small tables of the result card: uncertainty budget, cross-checks, friction over speed, a compliant shaft.
 
 
 _AGREES = {True: ("agrees", "green"), False: ("DOES NOT AGREE", "bold red"), None: ("nothing to compare with", "dim")}
@@ -136,7 +137,7 @@ def opinion_rows(document: Mapping[str, Any]) -> Iterator[Row]:
     for opinion in document["second_opinions"]:
         word, style = _AGREES[opinion["agrees"]]
         value = estimate_text(opinion["inertia_kg_m2"], "kg·m²")
-        yield "second opinion", Text.assemble(f"{value}  ", (word, style), f", {opinion['route']}")
+        yield MOMENTUM_CROSS_CHECK, Text.assemble(f"{value}  ", (word, style), f", {opinion['route']}")
 
 
 def friction_rows(document: Mapping[str, Any], to_a_line: int = 2) -> Iterator[Row]:
@@ -156,7 +157,7 @@ def budget_table(budget: Sequence[Mapping[str, Any]], value: float, notes: bool 
     table.add_column(justify="right", no_wrap=True)
     if notes:
         table.add_column(style="dim", overflow="fold")
-    table.add_row(Text("what makes it unsure", style="italic"), Text("± kg·m²", style="dim"), Text("± %", style="dim"))
+    table.add_row(Text(UNCERTAINTY_BUDGET, style="italic"), Text("± kg·m²", style="dim"), Text("± %", style="dim"))
     for line in sorted(budget, key=lambda line: -(line["half_width_kg_m2"] or 0.0)):
         half, note = line["half_width_kg_m2"], (line["note"],) if notes else ()
         if half is None:
@@ -216,21 +217,15 @@ def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
             rows.add_row("repeatability", f"{inertia_text(inertia)}, this drive")
     if document["reference_inertia_kg_m2"] is not None:
         rows.add_row("reference J", f"{document['reference_inertia_kg_m2']:g} kg·m² (rig.yaml)")
-    for title, key, unit in (
-        ("viscous friction B", "viscous_nm_s_rad", "N·m·s/rad"),
-        ("Coulomb friction", "coulomb_nm", "N·m"),
-        ("lag of speed", "speed_lag_s", "s"),
-        ("lag of torque", "torque_lag_s", "s"),
-        ("skew", "skew_s", "s"),
-    ):
-        if (part := document[key]) is not None:
-            rows.add_row(title, estimate_text(part, unit))
+    for label in ESTIMATES:
+        if (part := document[label.key]) is not None:
+            rows.add_row(label.on_card, estimate_text(part, label.unit))
     more = (*impedance_rows(document), *compliant_rows(document), *friction_rows(document, 1 if narrow else 2),
             *opinion_rows(document))
     for title, text in more:
         rows.add_row(title, text)
     if (paper := document["paper"]) is not None and paper["inertia_kg_m2"] is not None:
-        rows.add_row("the paper's method", _paper_text(paper, inertia))
+        rows.add_row(ACCELERATION_REGRESSION.replace(" ", "\n", 1), _paper_text(paper, inertia))
     for stage in document.get("stages", ()):
         if stage["outcome"] == "skipped":
             rows.add_row(f"stage {stage['name']}", f"skipped: {stage.get('detail', '')}")
@@ -249,7 +244,7 @@ def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
 
 
 def _paper_text(paper: Mapping[str, Any], inertia: Mapping[str, Any] | None) -> str:
-    """The paper's own number, how far it is from ours, and what it becomes at the raw rate."""
+    """Return the slope, its distance from J in percent, r², and the slope at the raw rate."""
     parts = []
     if inertia is not None:
         parts.append(f"{100.0 * (paper['inertia_kg_m2'] / inertia['value'] - 1.0):+.1f} %")
@@ -258,7 +253,7 @@ def _paper_text(paper: Mapping[str, Any], inertia: Mapping[str, Any] | None) -> 
     raw = paper["raw_rate"]["inertia_kg_m2"]
     if raw is not None:
         parts.append(f"at the raw rate {raw:.4g}")
-    return f"{paper['inertia_kg_m2']:.5g} kg·m²  ({'; '.join(parts)})"
+    return f"{paper['inertia_kg_m2']:.5g} kg·m²\n{'; '.join(parts)}"
 
 
 def sentence(text: str) -> str:

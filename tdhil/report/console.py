@@ -1,4 +1,4 @@
-"""The console that everything for people goes through: foreign text stays text, whatever stands in it."""
+"""Console for all output to the operator: foreign text stays text, whatever it contains."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from profiles import visible
 
 
 class PlainConsole(Console):
-    """No markup in plain strings (a drive may be called ``[/]``), and no control character but rich's own."""
+    """Console without markup in plain strings (a drive may be called ``[/]``) and without control characters."""
 
     def __init__(self, file: TextIO | None = None, *, record: bool = False) -> None:
         super().__init__(file=file, highlight=False, markup=False, record=record)

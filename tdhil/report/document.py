@@ -77,7 +77,7 @@ def result_document(
 
 
 def _calibration(stored: Any) -> dict[str, Any] | None:
-    """Of the torque calibration in the log: the factor and the date; None without one."""
+    """Return factor and date of the torque calibration in the log; None without one."""
     if stored is None:
         return None
     try:

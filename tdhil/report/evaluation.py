@@ -170,7 +170,7 @@ def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Rep
                         for one in sorted(document["trials"], key=lambda one: float(one["set_rpm"])))),
         )))
     sections += [
-        ReportSection("What it rests on", (Pairs(tuple(_rests_on(document))),)),
+        ReportSection("Basis of the result", (Pairs(tuple(_rests_on(document))),)),
         ReportSection("Run", (Pairs(tuple(_run(document, sha256))),)),
     ]
     return Report(
@@ -220,7 +220,7 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
                      f"{rig['speed_lag_s']:.3g} s late; torques scaled by {loop['scale']:.3g}")
     yield "torque limit", ("never acted" if not loop["clamped_cycles"] else
                            f"acted in {loop['clamped_cycles']} cycles: the string's torque was cut off")
-    yield "torque that nobody commanded", f"{loop['unknown_rms_nm']:.0f} N·m rms"
+    yield "torque without a command", f"{loop['unknown_rms_nm']:.0f} N·m rms"
     yield "energy by the loop's own errors", f"{loop['put_in_j']:.0f} J at most"
     yield "reported speed beside the observer's", f"{loop['innovation_rms_rad_s']:.2g} rad/s rms"
 

@@ -26,7 +26,7 @@ from tdhil.report.document import SIMULATED
 # ---------------------------------------------------------------------------------------------------------------------
 # Output in a thread of its own, so that a blocked terminal (Ctrl-S, a pty without reader) blocks no other thread.
 #
-# Whoever asks only leaves a note and goes on: lines are kept in order, up to a number of them, and of pictures the
+# A caller only leaves a note and goes on: lines are kept in order, up to a number of them, and of pictures the
 # latest only. The thread is a daemon: it may be stuck in a write for ever, and the process still ends.
 
 
@@ -205,7 +205,7 @@ class LiveDisplay:
         """
         view = self._view = replace(self._view, taken=False)
         # A picture that came behind would take the terminal back, and what is printed next stand on its last line.
-        self._painter.line_after_picture(lambda: self._let_go(view))
+        self._painter.line_after_picture(lambda: self._release_picture(view))
         self._painter.flush(_LONGEST_FLUSH_S)
 
     def say(self, text: str) -> None:
@@ -217,7 +217,7 @@ class LiveDisplay:
         self._view = replace(self._view, simulated=preflight.identity.simulated)
         if self._show_preflight or preflight.refused or not preflight.identity.simulated:
             view = self._view
-            self._painter.line(lambda: self._let_go(view))
+            self._painter.line(lambda: self._release_picture(view))
             self._painter.line(lambda: self._console.print(preflight_table(preflight)))
 
     def stage_started(self, name: str, expected_s: float) -> None:
@@ -292,7 +292,7 @@ class LiveDisplay:
         if self._live is not None:
             self._live.update(picture(view), refresh=True)
 
-    def _let_go(self, view: LiveView) -> None:
+    def _release_picture(self, view: LiveView) -> None:
         if self._live is not None:
             self._live.update(picture(view), refresh=True)
             self._live.stop()

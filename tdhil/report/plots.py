@@ -101,7 +101,7 @@ def draw_lines(figure: FigureBase, document: Part) -> None:
         top.axhspan(inertia["low"], inertia["high"], color=OURS, alpha=0.18, lw=0)
         top.axhline(inertia["value"], color=OURS, lw=1.0, ls=":", label="J with its interval")
     if paper is not None and paper["inertia_kg_m2"] is not None:
-        top.axhline(paper["inertia_kg_m2"], color=PAPER, lw=1.2, ls="--", label="the paper's slope")
+        top.axhline(paper["inertia_kg_m2"], color=PAPER, lw=1.2, ls="--", label="acceleration regression")
     top.set_ylabel("Im(T/ω) / 2πf, kg·m²")
     top.legend(fontsize="small", loc="best")
     below.bar(hertz, [point["residual_sd"] for point in points], width=_width(hertz), color=QUIET)
@@ -171,7 +171,7 @@ def draw_friction(figure: FigureBase, document: Part) -> None:
 
 
 def draw_opinions(figure: FigureBase, document: Part) -> None:
-    """Every inertia that this run speaks of, on one axis."""
+    """Draw each estimate of the inertia from this run on one axis."""
     rows: list[tuple[str, Part, str]] = []
     inertia, paper = document["inertia_kg_m2"], document["paper"]
     if inertia is not None:
@@ -180,11 +180,11 @@ def draw_opinions(figure: FigureBase, document: Part) -> None:
         rows.append(("repeatability", inertia, QUIET))
     if document["compliant"] is not None and document["compliant"]["total_inertia_kg_m2"] is not None:
         rows.append(("J_r + J_L", document["compliant"]["total_inertia_kg_m2"], OURS))
-    rows += [(opinion["route"], opinion["inertia_kg_m2"], PAPER if opinion["agrees"] is False else DARK)
-             for opinion in document["second_opinions"]]
+    rows += [(f"cross-check, {opinion['route']}", opinion["inertia_kg_m2"],
+              PAPER if opinion["agrees"] is False else DARK) for opinion in document["second_opinions"]]
     if paper is not None and paper["inertia_kg_m2"] is not None:
         alone = paper["inertia_kg_m2"]
-        rows.append(("the paper's slope", {"value": alone, "low": alone, "high": alone}, PAPER))
+        rows.append(("acceleration regression", {"value": alone, "low": alone, "high": alone}, PAPER))
     axes = figure.subplots()
     for at, (_, part, colour) in enumerate(rows):
         axes.errorbar([part["value"]], [at], xerr=_bars([part]), fmt="o", color=colour, ms=6, capsize=4, lw=1.6)

@@ -58,7 +58,7 @@ from tdhil.runner.stages import (
     slow_down,
 )
 from tdhil.runner.stop import StopReport, StopSequence
-from tdhil.runner.task import Confirm, ConfirmSpeed, Display, MakeTask, RunOutcome, Say, Task, nobody_sees
+from tdhil.runner.task import Confirm, ConfirmSpeed, Display, MakeTask, RunOutcome, Say, Task, refuse_unconfirmed_speed
 from tdhil.soft_torque import EvaluationCase, SpeedProgram
 
 
@@ -80,7 +80,7 @@ class Runner:
         *,
         reset_fault: bool = False,
         say: Say = _nothing,
-        confirm_speed: ConfirmSpeed = nobody_sees,
+        confirm_speed: ConfirmSpeed = refuse_unconfirmed_speed,
     ) -> None:
         self._drive = drive
         self._make_task = make_task

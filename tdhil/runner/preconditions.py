@@ -232,10 +232,10 @@ _LETS_GO = ("coast", "none", "fault_reaction")
 """Watchdog reactions that release the string; a drive in fault switches its torque off (CiA 402)."""
 
 
-def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, lets_go: bool) -> None:
+def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, releases_after_stop: bool) -> None:
     """Raise PreflightRefused for refusals that need no drive, see `refuse_with_string`.
 
-    ``lets_go``: the drive is disabled after a quick stop, according to its profile.
+    ``releases_after_stop``: the drive is disabled after a quick stop, according to its profile.
     """
     if told_before_echo(request.kind) and limits.wave_impedance_nm_s_rad <= 0.0:
         raise PreflightRefused(
@@ -269,13 +269,13 @@ def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, lets_go: b
             next_step="Add torque_ramp_nm_s to rig.yaml, such as 50 (N·m/s)",
             entry=MessageCode.STRING_NOT_SAFE,
         )
-    if lets_go:
+    if releases_after_stop:
         _refuse_quick_stop(holds=False)
 
 
 def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, preflight: Preflight) -> None:
     """Raise PreflightRefused if a twisted string could lose its torque, or if a string is required and missing."""
-    refuse_by_plan(limits, request, lets_go=False)      # the drive's own value is checked below, after its watchdog
+    refuse_by_plan(limits, request, releases_after_stop=False)      # the value in the drive is checked below
     if not limits.winds_up:
         return
     if not preflight.watched:

@@ -22,7 +22,7 @@ from profiles import CodedText, MessageCode
 from tdhil.config import SPEED_UNIT_TOLERANCE
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
-from tdhil.runner.task import ConfirmSpeed, Say, nobody_sees
+from tdhil.runner.task import ConfirmSpeed, Say, refuse_unconfirmed_speed
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The drive's position compared with its reported speed. Pure.
@@ -200,7 +200,7 @@ _IF_RIGHT = "; if the speed is right, check its position entry (counts per turn)
 class SpeedWitness:
     """The operator who confirms the speed if there is no position. ``accepted``: the unit was accepted by name."""
 
-    confirm: ConfirmSpeed = nobody_sees
+    confirm: ConfirmSpeed = refuse_unconfirmed_speed
     simulated: bool = False
     accepted: bool = False
     say: Say = field(default=lambda _text: None)

@@ -73,7 +73,7 @@ ConfirmSpeed = Callable[[float, str, Idle], None]
 PreflightRefused if not. `Idle` is one cycle at that speed."""
 
 
-def nobody_sees(speed_rad_s: float, why: str, idle: Idle) -> None:
+def refuse_unconfirmed_speed(speed_rad_s: float, why: str, idle: Idle) -> None:
     """Refuse: a `ConfirmSpeed` without an operator."""
     raise PreflightRefused(
         f"no operator can confirm that the shaft turns at {speed_rad_s:.3g} rad/s ({why})",

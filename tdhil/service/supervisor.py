@@ -270,7 +270,7 @@ class Supervisor:
         """Return the holder of the lock on the rig's drive."""
         return holder_of(rig.address)
 
-    def nobody_moves(self, rig: RigFile) -> bool:
+    def certainly_idle(self, rig: RigFile) -> bool:
         """Return whether certainly no tdhil of this computer moves the rig's real drive, and no sign-off is open."""
         address = rig.address
         return address is not None and holder_of(address) is None and self.blocked(rig.id) is None

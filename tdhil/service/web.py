@@ -335,7 +335,7 @@ class Web:
             if (run := self.supervisor.run_of(rig_id)) is not None:
                 self.supervisor.stop(run, who)
                 return StoppedView(rig_id, [run])
-            if "operator" not in asking.roles and self.supervisor.nobody_moves(rig):
+            if "operator" not in asking.roles and self.supervisor.certainly_idle(rig):
                 raise NotAllowed("no tdhil moves this rig: a stop would open its bus and act on a drive that another"
                                  " program may control", where=f"rig {rig_id}",
                                  next_step="Ask an operator. If the shaft turns, use the hard-wired stop")

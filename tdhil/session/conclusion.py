@@ -14,9 +14,9 @@ from tdhil.recording import Recording
 from tdhil.session.stored_calibration import apply_calibration
 
 TORQUE_SCALE = "torque scale"
-"""The budget's line that a torque calibration sharpens."""
+"""Source in the uncertainty budget that a torque calibration reduces."""
 CALIBRATE = "tdhil calibrate torque"
-"""In the advice on a torque scale that was not calibrated."""
+"""Command in the advice on a torque scale without calibration."""
 
 
 def working_confidence_of(run: Mapping[str, Any], confidence: float) -> float:
@@ -100,7 +100,7 @@ def _dated(found: Identification, day: str) -> Identification:
         return found
     advice = found.advice
     if CALIBRATE in advice:
-        advice = "the torque calibration is most of the interval: a larger body, or longer runs, would sharpen it"
+        advice = "the torque calibration is most of the interval: a larger body, or longer runs, would reduce it"
     return replace(found, advice=advice, budget=tuple(
         replace(line, source=f"{TORQUE_SCALE}, calibrated {day}") if line.source == TORQUE_SCALE else line
         for line in found.budget))

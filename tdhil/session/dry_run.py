@@ -40,7 +40,7 @@ class Figure:
 
 
 def plan_dry(
-    options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True, lets_go: bool = False
+    options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True, releases_after_stop: bool = False
 ) -> tuple[Planned, tuple[Figure, ...], MachineLimits]:
     """Return the plan, the values that it uses, and the machine's limits."""
     from tdhil.runner import plan_acquisition, refuse_by_plan
@@ -48,7 +48,7 @@ def plan_dry(
 
     bench = bench_of(Identity(0, 0, 0, 0, "", simulated), rig)
     limits = machine_limits(bench)
-    refuse_by_plan(limits, excitation_request(options), lets_go)
+    refuse_by_plan(limits, excitation_request(options), releases_after_stop)
     guess, known, figures = _assumed(bench, limits)
     left_s = limits.time_s - BEFORE_ACQUIRE_S
     try:
@@ -149,8 +149,8 @@ def _assumed(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, DesignKnowled
     return guess, known, (
         *figures,
         Figure("disturbing torque (sd)", noise.load_sd_nm, "N·m", _source(bench, "expected.load_noise_nm")),
-        Figure("lag of reported speed", known.speed_lag_s, "s", _source(bench, "drive_data.speed_lag_s")),
-        Figure("lag of reported torque", known.torque_lag_s, "s", _source(bench, "drive_data.torque_lag_s")),
+        Figure("lag of the reported speed", known.speed_lag_s, "s", _source(bench, "drive_data.speed_lag_s")),
+        Figure("lag of the reported torque", known.torque_lag_s, "s", _source(bench, "drive_data.torque_lag_s")),
     )
 
 

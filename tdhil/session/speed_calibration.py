@@ -22,7 +22,7 @@ SECTION: Final = "speed_calibration"
 TURNS_SD, SECONDS_SD = 0.25, 0.3
 """Standard uncertainties of a count by eye: a quarter of a turn, and of a stopwatch by hand at both ends, s."""
 SPEED_REL_SD = 0.001
-"""Of a mean speed read from a display, where its uncertainty is not stated."""
+"""Assumed relative standard uncertainty of a mean speed that is read from a display."""
 
 
 @dataclass(frozen=True)

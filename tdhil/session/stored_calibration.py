@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 KEPT: Final = "torque_calibration"
 """Key of the log's configuration."""
 VALID_DAYS: Final = 365.0
-"""Of a calibration, where rig.yaml says nothing else."""
+"""Validity of a calibration in days, unless rig.yaml states another."""
 _LARGEST_FILE = 1 << 20
 _AGAIN = "Make one with: tdhil calibrate torque without.mcap with.mcap --added J --save calibration.json"
 

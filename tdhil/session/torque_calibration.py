@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tdhil.recording import Recording
 
 ASSUMED_BODY_REL_SD = 0.002
-"""Of a body whose uncertainty is not stated: a turned disc whose diameter is known to 0.05 % and mass to 0.1 %."""
+"""Assumed relative standard uncertainty of a body: a turned disc, diameter known to 0.05 % and mass to 0.1 %."""
 SETTINGS_ALIKE = 1e-6
 """Two logs' settings of the drive are the same within this share."""
 

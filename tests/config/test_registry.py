@@ -127,9 +127,9 @@ def test_what_a_toy_excitation_says_of_itself_is_heeded():
     with pytest.raises(PlanRefused, match="stairs needs a drive in torque mode: for the test's sake"):
         refuse_hopeless(ExcitationRequest("stairs"), ("speed",), LIMITS, GUESS, KNOWN)
     string = MachineLimits(0.5, 10.0, 400.0, 900.0, load="string", torque_ramp_nm_s=50.0)
-    refuse_by_plan(string, ExcitationRequest("two-tones"), lets_go=False)
+    refuse_by_plan(string, ExcitationRequest("two-tones"), releases_after_stop=False)
     with pytest.raises(tdhil.TdhilError, match="stairs is not possible with a drill string"):
-        refuse_by_plan(string, ExcitationRequest("stairs"), lets_go=False)
+        refuse_by_plan(string, ExcitationRequest("stairs"), releases_after_stop=False)
 
 
 @pytest.mark.usefixtures("toys")

@@ -77,4 +77,4 @@ def test_a_limit_that_nothing_would_hold_is_refused():
 def test_where_nobody_watches_that_is_said(temperatures):
     _, _, found = ready(temperatures)
     assert not found.refused
-    assert [check for check in found.checks if check.outcome is Outcome.NOTE and "nobody watches it" in check.found]
+    assert [check for check in found.checks if check.outcome is Outcome.NOTE and "not monitored" in check.found]

@@ -126,7 +126,7 @@ def test_row_67_another_master_commands(hz, pdu, stage, other, monkeypatch, tmp_
     acted = at(monkeypatch, stage, 5.0, lambda sample: other.begin(sample.time_s, 1.0 / hz, pdu))
     ended = run(tmp_path, "--drive", "modbus")
     assert ended.done.code in (5, 8), ended.done.err
-    ended.assert_ended(ended.done.code, "somebody else commands this drive", "this run wrote", "Take the other master")
+    ended.assert_ended(ended.done.code, "another master commands this drive", "this run wrote", "Take the other master")
     shaft = ended.shaft
     after = shaft.time_s >= acted[0]
     assert abs(shaft.speed_rad_s[after]).max() < 7.0
@@ -147,6 +147,6 @@ def test_row_68_somebody_changes_a_setting_in_motion(address, value, words, othe
     pdu = struct.pack(">BHH", 6, address, value)
     acted = at(monkeypatch, "speed", 5.0, lambda sample: other.begin(sample.time_s, 0.05, pdu, lasts_s=0.06))
     ended = run(tmp_path, "--drive", "modbus")
-    ended.assert_ended(5, "somebody else changed a setting during the run", *words)
+    ended.assert_ended(5, "another master changed a setting during the run", *words)
     standstill_s = ended.assert_stopped(acted[0], 2.0)
     seen(68, ended.message, standstill_s, ended.assert_log_whole(), 5)

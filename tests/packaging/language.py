@@ -139,7 +139,7 @@ def _words(name: str, line: int, text: str) -> Iterator[Finding]:
 def _long(name: str, line: int, text: str) -> Iterator[Finding]:
     if "</" in text or "{%" in text:      # a template of a page
         return
-    for sentence in re.split(r"(?<=[.;:!?])\s|\n", text):
+    for sentence in re.split(r"(?<=[.;:!?])(?:\*\*)?\s|\n", text):      # a bold sentence ends before its mark
         if len(sentence.split()) > MOST_WORDS:
             yield Finding(name, line, "long", sentence.strip()[:100])
 

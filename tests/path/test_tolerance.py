@@ -73,7 +73,7 @@ def test_a_dry_run_touches_nothing_and_names_what_it_assumes(tmp_path, monkeypat
     assert document["simulated"] is True
     source = {figure["name"]: figure["source"] for figure in document["rests_on"]}
     assert source["moment of inertia"] == source["disturbing torque (sd)"] == "rig.yaml:1"
-    assert source["viscous friction"] == source["lag of reported speed"] == "assumed"
+    assert source["viscous friction"] == source["lag of the reported speed"] == "assumed"
     assert 0.0 < document["expected_half_width"] < 0.05
     assert document["limits"]["speed_max_rad_s"] > document["speed_rad_s"]["max"]
     assert abs(document["torque_nm"]["max"]) < document["limits"]["torque_nm"]

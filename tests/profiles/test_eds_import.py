@@ -149,7 +149,7 @@ def test_encoder_counts_are_scaled_by_the_drives_own_objects(begin):
 @pytest.mark.parametrize(("drop", "section", "key", "value", "words"), [
     ((0x6072,), "torque", "max_torque_rated_per_lsb", None, "set_to: torque_limit"),
     ((0x6076,), "torque", "rated_torque_nm_per_lsb", None, "drive_data.rated_torque_nm"),
-    ((0x605A,), "quick_stop", "ends", "off", "let go of the shaft"),
+    ((0x605A,), "quick_stop", "ends", "off", "releases the shaft"),
     ((0x6007,), "watchdog", "reaction", "coast", "the worst is written here"),
     ((0x1016,), "watchdog", "kind", "none", "refused but by name"),
     ((0x6071,), "modes", "torque", (), "No torque mode: 6071h"),

@@ -37,7 +37,7 @@ def around(value, half):
 
 
 def full():
-    """A valid result of a compliant shaft; one second opinion agrees, one does not."""
+    """A valid result of a compliant shaft; one cross-check agrees, one does not."""
     points = ((2.9, 83.1, 1.5), (3.6, 88.8, 0.8), (5.5, 104.5, 2.8), (7.0, 116.2, 0.8))
     return Identification(
         verdict=Verdict.VALID,

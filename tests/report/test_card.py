@@ -30,7 +30,7 @@ def test_on_forty_columns_no_number_and_no_warning_is_cut_off():
     assert max(map(len, card.splitlines())) <= 40
     assert "J at the motor shaft · SIMULATED" in card
     assert "…" not in card
-    assert "what makes it unsure" in card
+    assert "uncertainty budget" in card
     assert "83.1 ± 1.5" in card
 
 
@@ -43,7 +43,8 @@ def test_every_part_is_shown():
         "130.0 (128.0 to 132.0) kg·m²", "500 (480 to 520) N·m/rad", "left open by the data",
         "2.90 rad/s: 83.1 ± 1.5", "7.00 rad/s: 116.20 ± 0.80",
         "130.6 (128.3 to 132.9) kg·m²  agrees, speed change", "DOES NOT AGREE, coast-down",
-        "what makes it unsure", "! friction <b>bends</b> & more",
+        "uncertainty budget", "momentum cross-check", "acceleration", "regression (Xu 2026)", "lag, reported speed",
+        "time offset", "! friction <b>bends</b> & more",
     ):
         assert wanted in card, wanted
     # the one to quote leads
@@ -74,7 +75,7 @@ def test_a_refusal_shows_nothing_that_is_not_there():
     card = shown(bare(), simulated=False)
     assert "not_identifiable" in card
     assert "Record for longer." in card
-    for unwanted in ("unsure", "friction", "second opinion", "kg·m²", "SIMULATED", "None"):
+    for unwanted in ("uncertainty budget", "friction", "cross-check", "regression", "kg·m²", "SIMULATED", "None"):
         assert unwanted not in card
 
 

@@ -116,7 +116,7 @@ def angle_ratios(recording: Recording) -> tuple[tuple[AngleRatio, ...], tuple[An
 
 
 def angle_contradiction(recording: Recording) -> Refusal | None:
-    """Return how the angle contradicts the speed that J rests on; None where it does not, or is not told."""
+    """Return how the angle contradicts the speed that J rests on; None if not, or without an angle."""
     steady, excited = angle_ratios(recording)
     for one in excited:
         if not recording.speed_unit_accepted and abs(one.value - 1.0) > SPEED_UNIT_TOLERANCE + one.half_width:

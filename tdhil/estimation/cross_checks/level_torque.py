@@ -31,7 +31,7 @@ _BEYOND = 0.25
 """How far the mean speed may lie beyond the levels, as a share of their distance: further out a line says little."""
 
 _SAME_SPEED = 0.03
-"""Of the greatest speed: two stretches that are closer have the same friction, to some percent."""
+"""Share of the greatest speed: stretches closer than this have the same friction, within some percent."""
 
 _CLEAR_SDS = 5.0
 """Standard deviations of the torque's block means by which the torque must differ."""

@@ -105,7 +105,7 @@ def fit_momentum(
         scale = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
         normal = (design / scale).T @ (design / scale)
         if np.linalg.cond(normal) > 1e12:
-            raise np.linalg.LinAlgError("friction and inertia can't be told apart")
+            raise np.linalg.LinAlgError("friction and inertia cannot be separated")
         spread: FloatArray = np.linalg.inv(normal) / np.outer(scale, scale)
         x: FloatArray = spread @ (design.T @ right)
         return x, spread, float(np.sum((right - design @ x) ** 2))

@@ -51,9 +51,9 @@ _ALIKE = 0.05
 
 
 def cross_checked(finding: Finding, case: Case) -> Finding:
-    """The finding with what else the run says. Without excited segments there is no friction curve. Never raises.
+    """Return the finding with cross-checks and friction curve. Never raises. The curve needs excited segments.
 
-    Not for data that were refused as such: a second opinion would be a number out of them (`Case.sound`).
+    Refused data get no cross-check, because it would give a number from them (`Case.sound`).
     """
     fitted = _fitted_opinions(case, finding)
     opinions = tuple(opinion for opinion, _ in fitted)
@@ -175,9 +175,9 @@ def disagreements(opinions: tuple[SecondOpinion, ...], finding: Finding) -> tupl
         return ()
     return tuple(
         CodedText(
-            f"a second opinion ({opinion.route}) does not agree: {opinion.inertia_kg_m2.value:.4g} "
+            f"the momentum cross-check ({opinion.route}) does not agree: {opinion.inertia_kg_m2.value:.4g} "
             f"({opinion.inertia_kg_m2.low:.4g} to {opinion.inertia_kg_m2.high:.4g}) kg·m² against "
-            f"{reference.value:.4g}; friction, load or the torque's scale may not be what the model takes them for",
+            f"{reference.value:.4g}; friction, load or the torque scale may differ from the model",
             MessageCode.CROSS_CHECK_DISAGREES,
         )
         for opinion in opinions

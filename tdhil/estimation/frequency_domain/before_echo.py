@@ -11,8 +11,8 @@ r is not the string's whole echo but what the bottom makes of *one* wave: what r
 the top, whose motion is measured, and is in a. So r is short, whatever the string's damping. It is unknown: next to
 nothing until 0.97 · 2L/v (`_UNEVEN`: pipes are worn, and mud drags along them), and from there anything of the size of
 a full reflection, dying away within 16 s. A dense line spectrum, 1/P apart, sees it over a whole period P. How
-the bit answers is fitted with the rest, and what it scatters by is noise like any other. A bit that sticks and slips
-answers in no such way, and is told by its swing.
+the bit answers is fitted with the rest, and what it scatters by is noise like any other. A bit in stick-slip
+does not answer in this way; its torsional oscillation shows it.
 
 The interval is that of the profile likelihood, over all bottoms and reports. Scatter from period to period counts what
 the string swings on from one period to the next as if it came anew each time (`unleaked`).
@@ -190,7 +190,7 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
     finding = Finding(
         model="string", words=_WORDS, residual=residual, lines=fitted_points(fitted, confidence),
         warnings=(CodedText(
-            "J is the motor's side of the string, J_r, from what it does before an echo comes back",
+            "J is J_r, the motor side of the string, from the time before an echo returns",
             MessageCode.MOTOR_SIDE_ONLY),),
         compliant=Compliant(None, None, None, None, None, None),
     )
@@ -231,8 +231,8 @@ def problem_of(
     shaft = EchoShaft(pipe, max(hertz, default=1.0))
     if not 1.0 / apart >= shaft.echo_s + _LASTS_S:
         raise Refused(
-            f"the lines are {apart:.3g} Hz apart: an echo after {shaft.echo_s:.2f} s can't be told from what was before"
-            f" it; {1.0 / (shaft.echo_s + _LASTS_S):.3g} Hz at most would do",
+            f"the lines are {apart:.3g} Hz apart; to separate an echo after {shaft.echo_s:.2f} s they must be at most"
+            f" {1.0 / (shaft.echo_s + _LASTS_S):.3g} Hz apart",
             "use a lower --frequency, or --excitation multisine",
             entry=MessageCode.ECHO_NOT_SEPARATED,
         )
@@ -402,7 +402,7 @@ def _budget(fitted: FittedModel, low: float, high: float, confidence: float, sca
         ("noise", half(VISCOUS, RESISTANCE, *echo, *lags), "scatter from period to period, the bit's noise in it"),
         ("echo", half(VISCOUS, RESISTANCE, *lags), "what the bottom makes of a wave"),
         ("string", half(*lags), "the pipe's resistance to waves, and the top's own friction"),
-        ("lags", half(), "time constants of the reports' filters"),
+        ("lags", half(), "time constants of the reporting filters"),
         ("lag structure", 0.5 * (high - low), "filters of two poles, moving averages"),
     )
     return (

@@ -73,8 +73,8 @@ _SIGNIFICANT = 25.0          # |mean|² over its variance, as `SpectralLine.exci
 _LEAST_LOAD = 0.01           # of the total: less hangs on one line's error
 _ANY_IMPEDANCE = 1.0         # relative sd of ζ that leaves it to the data
 _PIPE_RATIOS = (0.75, 1.33)
-"""Of ζ to the pipe's, where the waves' way is the pipe's. G of 61 instead of 79 GPa makes 0.88 of it, worn pipe and the
-torque's scale a tenth; what is beyond is a wrong scale or a wrong section."""
+"""Allowed ratios of ζ to that of the pipe, if the waves have the pipe's travel time. G of 61 instead of 79 GPa gives
+0.88; worn pipe and the torque scale change it by a tenth. A ratio beyond means a wrong scale or a wrong section."""
 _NEAR = (SLOWEST_SEEN, 2.0)  # where a swing can be seen, of the lowest and the highest line
 
 
@@ -372,12 +372,12 @@ def _budget(fit: CompliantFit, alone: Estimate, fixed: Estimate, confidence: flo
         return half_width_first_order(fit.fitted, INERTIA, confidence, known)
 
     grown = (
-        ("noise", half(*lags, *timing, *spring, *friction), "scatter from period to period, everything else known"),
+        ("noise", half(*lags, *timing, *spring, *friction), "scatter from period to period"),
         ("friction", half(*lags, *timing, *spring), "viscous friction at both ends and in the spring"),
         ("spring", half(*lags, *timing), "the load's inertia, the stiffness" + (
             ", the string's share" if fit.is_string else "")),
-        ("timing", half(*lags), "skew between speed and torque"),
-        ("lags", half(), "time constants of the reports' filters"),
+        ("timing", half(*lags), "time offset between speed and torque"),
+        ("lags", half(), "time constants of the reporting filters"),
         ("lag structure", 0.5 * (alone.high - alone.low), "filters of two poles, moving averages"),
         ("shaft model", 0.5 * (fixed.high - fixed.low), "a spring that weighs something: a string"),
     )
@@ -482,7 +482,7 @@ def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Fi
         return replace(finding, inertia=told.inertia, budget=told.budget, words=words)
     together = _together(told.shaft.total_inertia)
     return replace(finding, refusal=Refusal(
-        f"{finding.explained}, but the motor's inertia can't be told from the load's{together}",
+        f"{finding.explained}, but cannot separate the inertia of the motor from that of the load{together}",
         "excite lines on both sides of the resonance, and well above it, where the motor turns alone",
     ))
 

@@ -299,7 +299,7 @@ def with_total(
 def torque_scale_line(value: float, rel_sd: float, confidence: float) -> BudgetLine:
     """The last line of a budget."""
     half = scale_half_width(value, rel_sd, confidence)
-    return BudgetLine("torque scale", half, "of the drive; not in repeatability")
+    return BudgetLine("torque scale", half, "of the drive; not in the repeatability")
 
 
 def widened_most_by_scale(inertia: InertiaEstimate) -> bool:
@@ -328,13 +328,13 @@ def budget_of(
     half = 0.5 * (inertia.high - inertia.low)
     grown = (
         ("noise", half_width_first_order(fitted, INERTIA, confidence, (*lags, *timing, *friction)),
-         "scatter from period to period, everything else known"),
+         "scatter from period to period"),
         ("timing", half_width_first_order(fitted, INERTIA, confidence, (*lags, *friction)),
-         "skew between speed and torque"),
+         "time offset between speed and torque"),
         ("lags", half_width_first_order(fitted, INERTIA, confidence, friction),
-         "time constants of the reports' filters"),
+         "time constants of the reporting filters"),
         ("friction model", half_width_first_order(fitted, INERTIA, confidence),
-         "its slope" + ("" if fitted.problem.constraint is None else ", known from the levels of mean torque")),
+         "its slope" + ("" if fitted.problem.constraint is None else ", known from the operating points")),
         ("lag structure", half, "filters of two poles, moving averages"),
     )
     return (*grown_lines(grown, half), torque_scale_line(inertia.value, torque_scale_rel_sd, confidence))

@@ -279,7 +279,7 @@ def rigid_starts(problem: Likelihood) -> list[FloatArray]:
 def rigid_rivals(theta: FloatArray) -> list[FloatArray]:
     """Starts at which a rigid shaft's lag and the lag of its speed's report have changed places.
 
-    (J s + B)(1 + τ_w s) = (B τ_w s + B)(1 + (J/B) s): shaft and report can't be told apart if both J/B and τ_w are
+    (J s + B)(1 + τ_w s) = (B τ_w s + B)(1 + (J/B) s): shaft and report cannot be separated if both J/B and τ_w are
     plausible lags of a report. An answer has this rival, and so has an interval.
     """
     inertia, viscous, lag = theta[INERTIA], theta[VISCOUS], theta[2 + signal_filters.SPEED_LAG]

@@ -109,7 +109,7 @@ def refuse_count(lines: int, constraint: ViscousConstraint | None, priors: tuple
     missing = "more lines (a multisine)" if constraint is not None else "more lines about two mean speeds (a multisine)"
     return Refusal(
         f"{', '.join(sources)}, but there are five unknowns: inertia, viscous friction, the lags of the reported speed "
-        "and torque, and their skew",
+        "and torque, and their time offset",
         f"excite with {missing}, or state the drive's speed and torque filters with their uncertainty",
         entry=MessageCode.TOO_FEW_LINES,
     )
@@ -165,7 +165,7 @@ def _around(value: float, half: float) -> Estimate:
 
 RIGID = "rigid+lags"
 _OPEN = Refusal(
-    "the data leave the inertia open: it can't be told from the lags of the reported signals",
+    "the data leave the inertia open: they do not separate it from the lags of the reported signals",
     "excite with more amplitude at the lowest lines, for longer, and about two mean speeds",
 )
 
@@ -278,7 +278,7 @@ def _coulomb(levels: Levels, fitted: FittedModel, confidence: float) -> Estimate
 
 
 def rigid_finding(
-    result: RigidResult | None, case: Case, what: str = "a rigid shaft seen through reporting lags"
+    result: RigidResult | None, case: Case, what: str = "a rigid shaft with reporting lags"
 ) -> Finding | Refusal:
     """Return the finding of a rigid shaft; a refusal where its inertia stays open. ``what``: its name in messages."""
     if result is None or not (rejects(result.residual) or result.inertia.bounded):

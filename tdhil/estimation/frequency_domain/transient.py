@@ -12,7 +12,7 @@ shared by both signals and all segments, and a of each its own. A period that be
 
 and its net change, which is taken off the lines of speed as a ramp (`spectrum`), takes j/ω (1/P) {a e^(σpP) (e^(σP) −
 1) + …} off them, and B times that off those of torque. So all lines together tell the few a, also where a line lies so
-near a mode that it alone could not be told from it. Given σ, lines and a are linear (variable projection). Modes are
+near a mode that it alone could not be separated. Given σ, lines and a are linear (variable projection). Modes are
 added one by one, as long as they gain more than Schwarz's ln n for each of their parameters.
 """
 

@@ -155,7 +155,7 @@ _HIDDEN_S = 2.5        # before a stop, the reported speed may outlive the motio
 _LEAST_SKEW_SD_S = 1e-4
 _WIDE = {
     "noise": "change the speed more often or by more, or record for longer",
-    "friction model": "run at more speeds, so that friction is told from them",
+    "friction model": "run at more speeds, which determine the friction",
 }
 
 
@@ -175,7 +175,7 @@ def identify_record(case: Case) -> Finding:
     """
     if not shaft_model(case.options.model).lags:
         raise Refused(
-            "the paper's method takes the reported signals as they are; without periodic excitation nothing tests that",
+            "the acceleration regression uses the reported signals; without periodic excitation nothing tests this",
             "identify with the rigid model, which includes reporting lags",
         )
     check_signals(case.recording, case.samples)
@@ -236,7 +236,7 @@ def _is_open(inertia: Estimate) -> bool:
 def _finding(solved: Solved, case: Case) -> Finding:
     most = max(solved.budget, key=lambda line: line.half_width_kg_m2).source if solved.budget else ""
     words = ModelWords(
-        "a rigid shaft seen through reporting lags",
+        "a rigid shaft with reporting lags",
         "look for a compliant load, play, or friction that changes with speed or time; try slower motion",
         _WIDE.get(
             most, "state the filters of the drive's reported speed and torque with their uncertainty, or set them equal"

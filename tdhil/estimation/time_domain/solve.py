@@ -428,7 +428,7 @@ def _budget(
     known = "as stated" if stated else "nothing was stated of them"
     return (
         BudgetLine("noise", noise, "load disturbance and noise of both signals, were the lags known"),
-        BudgetLine("lags", lags, f"of the reported speed and torque, and their skew; {known}"),
+        BudgetLine("lags", lags, f"of the reported speed and torque, and their time offset; {known}"),
         BudgetLine("lag structure", structure, "one pole, two, an average or a delay"),
         BudgetLine("friction model", abs(shift), "friction with and without a part that grows with the speed's square"
                    + ("; it has one" if bent else "")),

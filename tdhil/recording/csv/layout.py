@@ -1,7 +1,7 @@
 """The header with its units, and where the numbers begin: all that is needed to read the rows.
 
 A unit is taken from ``--columns``, else from a row of units below the header, else from the column's name
-(``n_rpm``, ``Speed [rpm]``), else it is SI, which is told as an assumption. A file that contradicts itself is refused.
+(``n_rpm``, ``Speed [rpm]``), else SI, reported as an assumption. A file that contradicts itself is refused.
 """
 
 import difflib
@@ -19,7 +19,7 @@ from tdhil.recording.csv.text import decimal_sign, is_missing, looks_numeric, sp
 # Units that drives' tools write, and what each is in SI.
 #
 # A value in SI is value · factor; for shares of the rated torque the factor is of ``--rated-torque``. 1/s is a
-# revolution a second, as in data sheets; a tool that means rad/s by it has to be told so with ``--columns``.
+# revolution a second, as in data sheets; a tool that means rad/s by it needs ``--columns``.
 
 
 QUANTITIES = ("time", "speed", "torque")

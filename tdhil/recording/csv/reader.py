@@ -28,8 +28,8 @@ from tdhil.recording.recording import BoolArray, FloatArray, LagPrior, Recording
 # ---------------------------------------------------------------------------------------------------------------------
 # Rows to numbers: whole blocks by numpy where every row is as expected, cell by cell where one isn't.
 #
-# What is left out is counted by its cause, with the line of the first: a ragged row may be cut or may have decimal
-# commas between commas, and its columns can't be told apart.
+# Rows left out are counted by cause, with the line of the first: a ragged row may be cut or may have decimal
+# commas between commas, and its columns are ambiguous.
 
 
 LineArray = NDArray[np.int64]

@@ -15,14 +15,14 @@
     const J = result.inertia_kg_m2;
     const estimate = (one, unit) => (one ? `${of(one)} ${unit}` : null);
     if (J) rows.push([`J, ${number(100 * (J.confidence ?? 0.95))} % interval to quote`, `${ofResult(result)}  ${percent(J.half_width_total_rel)}`], ["repeatability, this drive", `${of(J)} kg·m²  ${percent(J.repeatability_rel)}`]);
-    for (const [name, key, unit] of [["viscous friction", "viscous_nm_s_rad", "N·m·s/rad"], ["Coulomb friction", "coulomb_nm", "N·m"], ["lag of reported speed", "speed_lag_s", "s"], ["lag of reported torque", "torque_lag_s", "s"]]) {
+    for (const [name, key, unit] of [["viscous friction B", "viscous_nm_s_rad", "N·m·s/rad"], ["Coulomb friction T_c, constant load included", "coulomb_nm", "N·m"], ["lag of the reported speed", "speed_lag_s", "s"], ["lag of the reported torque", "torque_lag_s", "s"], ["time offset between speed and torque", "skew_s", "s"]]) {
       const text = estimate(result[key], unit);
       if (text) rows.push([name, text]);
     }
     if (result.model) rows.push(["model", result.model]);
     for (const one of result.second_opinions || []) {
       const agrees = one.agrees === null ? "" : one.agrees ? ", agrees" : ", DISAGREES";
-      rows.push([`cross-check, ${one.route}`, `${estimate(one.inertia_kg_m2, "kg·m²")}${agrees}`]);
+      rows.push([`momentum cross-check, ${one.route}`, `${estimate(one.inertia_kg_m2, "kg·m²")}${agrees}`]);
     }
     const card = el("div", { class: "card" },
       J ? el("p", { class: "figure" }, `J = ${ofResult(result)}`) : el("p", { class: "figure" }, result.verdict),

@@ -20,14 +20,14 @@ and the mean torque T̄ = B ω̄ + T_c + r₀, E r₀² = S_0/(P L), adds (∂T�
 
 theta = (J, B, T_c, every lag, every average's width, the skew): derivatives by central differences.
 
-That bound knows how many poles and averages there are, and of which signal. Who doesn't, as nobody does before a drive
+That bound knows how many poles and averages there are, and of which signal. Who doesn't, as before a drive
 that states nothing, has more to tell apart: with P = Π (1 + τ s) of each report,
 
     ln H_T/H_w − d s = ln P_w − ln P_T + a(s; u) − d s,    theta = (J, B, T_c, p₁ and p₂ of P_w, of P_T, u, d),
 
 p₁ and p₂ the coefficients of s and s² in P, and u the square of an average's width, over either signal. What is
 plausible counts as measured: p₁ to 1 s, u to 1 s², and p₂ to the spread of what lies evenly between none, one pole, and
-p₁²/2, a Butterworth filter. Where poles are equal the first bound promises what nobody can have: to it they are one
+p₁²/2, a Butterworth filter. Where poles are equal the first bound promises more than is possible: to it they are one
 unknown, since to first order only their sum is seen (its information about each of them is singular).
 """
 
@@ -168,7 +168,7 @@ def bound_of(fisher: FloatArray) -> float | None:
 class Bounds:
     """Least standard deviations of J, kg·m²: where the filters' structure is known, and where it isn't.
 
-    Where the lags can't be told apart ``known`` takes them for known: that is the best estimator there, and no bound
+    Where the lags cannot be separated, ``known`` takes them for known: that is the best estimator there, and no bound
     for ours. ``unknown`` is never less: a plant may have more of a structure than its theta.
     """
 

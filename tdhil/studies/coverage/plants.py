@@ -97,7 +97,7 @@ class CoveragePlant:
     """J dω/dt + B ω + T_c + bend = T + load at positive speed, seen through two reports.
 
     ``lowest_hz``: lowest line of the multisine. ``model_true``: a first-order lag on either report and a skew are the
-    whole truth. ``degenerate``: the lags are equal or absent, so that they can't be told apart.
+    whole truth. ``degenerate``: the lags are equal or absent, so that they cannot be separated.
     """
 
     name: str

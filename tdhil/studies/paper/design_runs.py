@@ -159,7 +159,7 @@ def run_design(settings: DesignSettings, progress: Callable[[float], None]) -> D
 
 
 class OverDesign:
-    """A study over all runs of a design: what it is called, what can be set, and the runs themselves."""
+    """Study over all runs of a design: its name, its settings, and the runs."""
 
     def __init__(self, name: str, title: str, model: type[DesignSettings]) -> None:
         self.name = name
