@@ -88,7 +88,7 @@ _UNDETECTED = 0.01      # of the scatter of a segment's mean: less isn't looked 
 
 
 class PeriodInstants:
-    """Instants of a segment's periods, as many as are looked at, and the unit waves there.
+    """Instants of the first periods of a segment, and the unit waves there.
 
     Speed and torque are sampled at the same instants, so that each wave is computed once for both.
     """

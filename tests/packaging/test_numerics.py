@@ -18,13 +18,14 @@ used = numpy.f2py.get_include()
 numpy.testing.assert_allclose(scipy.special.ndtr(0.0), 0.5)
 import scipy.stats, scipy.optimize, scipy.interpolate
 print(json.dumps({"heavy": heavy, "include": used, "loaded": "numpy.testing._private.utils" in sys.modules,
-                  "threads": {name: os.environ.get(name) for name in %r}}))
-""" % (tuple(ONE_THREAD),)
+                  "threads": {name: os.environ.get(name) for name in sys.argv[1:]}}))
+"""
 
 
 def prepared(**variables: str) -> dict:
     free = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
-    done = subprocess.run([sys.executable, "-c", PROGRAM], env=free | variables, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, *ONE_THREAD], env=free | variables, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
