@@ -10,7 +10,6 @@ import sys
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
-from importlib.abc import InspectLoader
 from typing import Any
 
 
@@ -23,8 +22,8 @@ def lazy_face(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str
     @cache
     def homes() -> dict[str, str]:
         loader = sys.modules[package].__loader__
-        source = loader.get_source(package) if isinstance(loader, InspectLoader) else None
-        return names_by_type_checking(source or "")
+        source_of = getattr(loader, "get_source", None)     # importlib.abc, with the class of this protocol, loads much
+        return names_by_type_checking(source_of(package) or "" if source_of else "")
 
     def get(name: str) -> Any:
         if name not in homes():

@@ -255,14 +255,14 @@ class Lies:
 
     def last(self, signal: Feedback, true: float) -> float:
         """Return the last reported value of a quantity; the true one without distortion."""
-        return self._told.get(signal, true)
+        return self._told.get(signal, true) if self._told else true
 
     def word(self, signal: Feedback, read: Read, ones: float = -1) -> Read:
         """``read`` as the bus gets it; ``ones``: the number whose bits are all set (of a REAL32: no number)."""
         self._readers[signal] = read
+        chain = self._words.setdefault(signal, [])      # the list stays; `add_word` and `remove_word` change it
 
         def number() -> float:
-            chain = self._words.get(signal)
             return read() if not chain else chain[-1].number(read, ones, self._other)
 
         return number

@@ -3,9 +3,12 @@
 import sys
 from typing import NoReturn
 
+from tdhil.numerics import prepare
+
 
 def console() -> NoReturn:
     """Run the command. Ctrl-C while it is still being imported ends it without a traceback, too."""
+    prepare()
     try:
         from tdhil.cli.main import console as run
     except KeyboardInterrupt:

@@ -34,6 +34,7 @@ from struct import Struct
 from typing import Any, Final, Generic, Self, TypeVar
 
 from tdhil.errors import MessageCode, TdhilError
+from tdhil.numerics import ONE_THREAD, prepare
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -45,10 +46,6 @@ _KILLS: Final = 5
 _ASK_S: Final = 0.2             # interval of the check for a stop, s
 _START_S: Final = 60.0          # a process may take to begin, on a machine that is busy
 _STARTS: Final = 3              # processes in a row that end before they take a task: something is wrong with all
-ONE_CORE: Final = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-"""Environment of a process beside others: one core for linear algebra, so that sums are added in the same order on any
-machine, and rows are the same.
-"""
 
 
 @dataclass(frozen=True)
@@ -200,7 +197,7 @@ class _Worker:
         group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
         self._process = subprocess.Popen(
             [sys.executable, "-c", _PROGRAM.format(path=sys.path, memory=limits.memory_bytes)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=os.environ | ONE_CORE, **group,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=os.environ | ONE_THREAD, **group,
         )
         assert self._process.stdin is not None
         assert self._process.stdout is not None
@@ -280,6 +277,7 @@ def _signal_name(number: int) -> str:
 
 def serve(memory_bytes: int | None) -> None:
     """One task after the other, until the host closes the pipe or is gone."""
+    prepare()
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)                               # other output is not an answer
     limited = memory_bytes is None

@@ -40,9 +40,12 @@ def print_json(document: Mapping[str, Any]) -> None:
 
 def print_result(document: Mapping[str, Any], as_json: bool) -> None:
     """Print one JSON document, or the card, on stdout. If stdout fails, print the card on stderr and raise."""
-    from tdhil.report import PlainConsole, print_card, print_evaluation
+    from tdhil.report import PlainConsole
 
-    show = print_evaluation if _is_evaluation(document) else print_card
+    if _is_evaluation(document):
+        from tdhil.report import print_evaluation as show
+    else:
+        from tdhil.report import print_card as show
     try:
         if as_json:
             print_json(document)

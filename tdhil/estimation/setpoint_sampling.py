@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -66,12 +67,17 @@ def worst_share(stepped: SteppedSetpoint, torque_lag_s: float) -> float:
     return min(worst, _MOST) if math.isfinite(worst) else _MOST
 
 
+@lru_cache(maxsize=16)
 def _shares(stepped: SteppedSetpoint, torque_lag_s: float) -> FloatArray:
-    """(_FINE + 1,) J_read/J − 1 at the moments 0 to T after a step."""
+    """(_FINE + 1,) J_read/J − 1 at the moments 0 to T after a step.
+
+    Kept: the momentum cross-check asks for the same loops several times.
+    """
     _, answer = _answer(stepped, torque_lag_s)
     sums = stepped.period_s * answer.reshape(-1, _FINE).sum(axis=0)
     # Just before a step all is as at the step itself, but for the answer's own first moment.
     every: FloatArray = np.append(sums, sums[0] - stepped.period_s * answer[0]) - 1.0
+    every.flags.writeable = False
     return every
 
 

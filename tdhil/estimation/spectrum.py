@@ -20,6 +20,7 @@ and in torque mode, a disturbance is in both signals; only the cross term makes 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,13 +87,44 @@ _FEWEST = 3             # of them; fewer tell nothing
 _UNDETECTED = 0.01      # of the scatter of a segment's mean: less isn't looked at further
 
 
-def repeating_rounding(
-    periods: tuple[FloatArray, ...], times: tuple[FloatArray, ...], period_s: float, start_s: float,
-    lines_hz: tuple[float, ...], wave: NDArray[np.complex128], scatter: float, quantum: float,
-) -> float:
-    """E|·|² of what rounding to ``quantum`` leaves in the mean of a line, over periods' samples and their times.
+class PeriodInstants:
+    """Instants of the first periods of a segment, and the unit waves there.
 
-    ``wave`` (K,): the mean lines, from ``start_s`` on; ``scatter``: the least variance of a period's.
+    Speed and torque are sampled at the same instants, so that each wave is computed once for both.
+    """
+
+    def __init__(
+        self, times: tuple[FloatArray, ...], period_s: float, start_s: float, lines_hz: tuple[float, ...]
+    ) -> None:
+        self.looked_at = slice(max(2, _LOOKED_AT // len(times[0])))
+        self.period_s, self.lines_hz = period_s, lines_hz
+        self._angles = [2.0 * np.pi * (time - start_s) for time in times[self.looked_at]]
+        self._harmonics: FloatArray = np.zeros(0)
+        self._at_harmonics: list[NDArray[np.complex128]] = []
+
+    @cached_property
+    def at_lines(self) -> list[NDArray[np.complex128]]:
+        """e^(jω_k t) of each period, (N, K)."""
+        return [np.exp(1j * np.multiply.outer(angle, self.lines_hz)) for angle in self._angles]
+
+    def at_harmonics(self, harmonics: FloatArray) -> list[NDArray[np.complex128]]:
+        """2 e^(−jω_h t) of each period, (H, N), for H harmonics of the period."""
+        if not np.array_equal(harmonics, self._harmonics):
+            self._harmonics = harmonics
+            self._at_harmonics = [
+                np.asarray(2.0 * np.exp(-1j * np.multiply.outer(harmonics / self.period_s, angle)), np.complex128)
+                for angle in self._angles
+            ]
+        return self._at_harmonics
+
+
+def repeating_rounding(
+    periods: tuple[FloatArray, ...], instants: PeriodInstants, wave: NDArray[np.complex128], scatter: float,
+    quantum: float,
+) -> float:
+    """E|·|² of what rounding to ``quantum`` leaves in the mean of a line, over periods' samples and their instants.
+
+    ``wave`` (K,): the mean lines, from the segment's start on; ``scatter``: the least variance of a period's.
     """
     if not quantum > 0.0:
         return 0.0
@@ -100,22 +132,20 @@ def repeating_rounding(
     whole = 4.0 * quantum**2 / 12.0 / max(count, 1.0)
     if whole * len(periods) < _UNDETECTED * scatter:
         return 0.0
-    few = slice(max(2, _LOOKED_AT // len(periods[0])))
-    angles = [2.0 * np.pi * (time - start_s) for time in times[few]]
     rests = [
-        signal - (np.exp(1j * np.multiply.outer(angle, lines_hz)) @ wave).real
-        for signal, angle in zip(periods[few], angles, strict=True)
+        signal - (turned @ wave).real
+        for signal, turned in zip(periods[instants.looked_at], instants.at_lines, strict=True)
     ]
     rests = [rest - rest.mean() for rest in rests]
     noise = max(float(np.mean([np.var(rest) for rest in rests])) - _SURE * quantum**2 / 12.0, 0.0)
     smoothed = np.exp(-4.0 * np.pi**2 * _HARMONICS**2 * noise / quantum**2) / _HARMONICS**2
     most = whole * float(np.sum(smoothed) / np.sum(1.0 / _HARMONICS**2))
-    first, last = round(period_s * max(lines_hz)) + 1.0, 0.5 * count
+    first, last = round(instants.period_s * max(instants.lines_hz)) + 1.0, 0.5 * count
     if last < first + _FEWEST:
         return most
     harmonics = np.unique(np.round(np.geomspace(first, last, _LOOKED_FOR)))    # most of them near the lines
-    unexcited = np.array([2.0 * np.exp(-1j * np.multiply.outer(harmonics / period_s, angle)) @ rest / len(rest)
-                          for rest, angle in zip(rests, angles, strict=True)])
+    unexcited = np.array([turned @ rest / len(rest)
+                          for rest, turned in zip(rests, instants.at_harmonics(harmonics), strict=True)])
     again = np.abs(unexcited.mean(axis=0)) ** 2 - np.var(unexcited, axis=0, ddof=1) / len(unexcited)
     return min(max(float(np.mean(again)), 0.0), most)
 
@@ -190,10 +220,10 @@ def period_lines(stretch: Stretch, samples: Samples, quanta: tuple[float, float]
     drift = np.array([edge.drift(begin, segment.period_s) for begin in begins])
     speed = table[:, 0] - drift[:, None] * table[:, 2]
     times = tuple(period.time_s for period in stretch.periods)
+    instants = PeriodInstants(times, segment.period_s, segment.start_s, lines) if times else None
     rounding = [
-        repeating_rounding(
-            signals, times, segment.period_s, segment.start_s, lines, seen.mean(axis=0), _least(seen), quantum
-        ) if len(signals) > 1 else 0.0
+        0.0 if instants is None or len(signals) < 2
+        else repeating_rounding(signals, instants, seen.mean(axis=0), _least(seen), quantum)
         for signals, seen, quantum in (
             (tuple(period.speed_rad_s for period in stretch.periods), speed, quanta[0]),
             (tuple(period.torque_nm for period in stretch.periods), table[:, 1], quanta[1]),

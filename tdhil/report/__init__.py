@@ -9,7 +9,7 @@ if TYPE_CHECKING:
         card_html as card_html, card_text as card_text, inertia_text as inertia_text, minutes as minutes,
         print_card as print_card, rounded as rounded,
     )
-    from tdhil.report.console import PlainConsole as PlainConsole
+    from tdhil.report.console import PlainConsole as PlainConsole, stderr_console as stderr_console
     from tdhil.report.document import SIMULATED as SIMULATED, result_document as result_document
     from tdhil.report.evaluation import (
         evaluation_document as evaluation_document, evaluation_report as evaluation_report,
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         ShownPicture as ShownPicture, check_report_path as check_report_path, pictures_in as pictures_in,
         write_report as write_report,
     )
-    from tdhil.report.live import LiveDisplay as LiveDisplay, stderr_console as stderr_console
+    from tdhil.report.live import LiveDisplay as LiveDisplay
     from tdhil.report.page import (
         STYLE as STYLE, has_extra as has_extra, inline_svg as inline_svg,
         install_command as install_command,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from typing import TextIO
 
@@ -28,6 +29,11 @@ class PlainConsole(Console):
     def on_broken_pipe(self) -> None:
         """Leave a broken pipe to the caller: rich would end the process with 1, the code of an internal error."""
         raise  # noqa: PLE0704 (rich calls this where it has caught the BrokenPipeError)
+
+
+def stderr_console() -> Console:
+    """Return the console for progress and messages. stdout is for results."""
+    return PlainConsole(sys.stderr)
 
 
 def names_and_texts(rows: Iterable[tuple[str, RenderableType]], *, quiet: bool = False) -> Table:

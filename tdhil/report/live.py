@@ -20,7 +20,6 @@ from drivers import Command, Outcome, Preflight, Sample
 from profiles import visible
 from tdhil.recording import Stage
 from tdhil.report.card import minutes
-from tdhil.report.console import PlainConsole
 from tdhil.report.document import SIMULATED
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -349,8 +348,3 @@ def preflight_table(preflight: Preflight) -> Table:
             table.add_row("", "", "", Text(visible(check.next_step), "yellow"), "")
     table.add_row("", "if the host falls silent", "", preflight.safe_action.replace("_", " "), "")
     return table
-
-
-def stderr_console() -> Console:
-    """Progress and messages go here; stdout is for results."""
-    return PlainConsole(sys.stderr)

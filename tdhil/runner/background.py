@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from threading import Event, Lock, Thread
 from typing import IO, Any, Generic, TypeVar
 
-from tdhil.process_pool import ONE_CORE
+from tdhil.numerics import ONE_THREAD
 
 T = TypeVar("T")
 
@@ -58,7 +58,7 @@ class WorkerProcess:
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-c", program],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            env=os.environ | ONE_CORE, **_out_of_the_way(),      # the other cores are for the control loop
+            env=os.environ | ONE_THREAD, **_out_of_the_way(),      # the other cores are for the control loop
         )
         assert self._process.stdin is not None
         assert self._process.stdout is not None

@@ -11,12 +11,14 @@ from contextlib import suppress
 from queue import SimpleQueue
 from threading import Thread
 
+from tdhil.numerics import prepare
 from tdhil.runner.background import NICE, READY
 
 
 def serve() -> None:
     """Answer one request after the other until the pipe ends. `WorkerProcess` runs this function."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    prepare()
     _take_second_place()
     # Printed output must not come between the answers.
     answers = os.fdopen(os.dup(1), "wb")

@@ -84,6 +84,11 @@ def kept_within(setpoint: float, least: float, most: float) -> float:
     return max(min(setpoint, most), least)
 
 
+def _at(sample: Sample) -> str:
+    """Return the place of a limit that was exceeded, for the message."""
+    return f"guard at {sample.time_s:.3f} s"
+
+
 class Guard:
     """Holds the machine's limits over one run.
 
@@ -214,8 +219,7 @@ class Guard:
     def check_sample(self, command: Command, sample: Sample) -> None:
         """Check a sample. Raises CommunicationLost, DriveFault or LimitHit."""
         self.observer.see(command, sample)
-        where = f"guard at {sample.time_s:.3f} s"
-        self._check_age(sample, where)
+        self._check_age(sample)
         if self.expected is not None and sample.state is not self.expected:
             raise DriveFault(
                 f"the drive left the state '{self.expected.value}' and reports '{sample.state.value}'",
@@ -226,35 +230,35 @@ class Guard:
         if not (math.isfinite(sample.speed_rad_s) and math.isfinite(sample.torque_nm)):
             raise DriveFault(
                 f"the feedback is not finite (speed {sample.speed_rad_s}, torque {sample.torque_nm})",
-                where=where,
+                where=_at(sample),
                 next_step="Check word order and scaling in the profile",
                 entry=MessageCode.FEEDBACK_NOT_FINITE,
             )
-        self._check_speed(sample.speed_rad_s, where)
+        self._check_speed(sample)
         if abs(sample.torque_nm) > self._torque_seen_nm:
             raise LimitHit(
                 f"torque {sample.torque_nm:.1f} N·m is above the limit of {self._limits.torque_nm:g} N·m",
-                where=where,
+                where=_at(sample),
                 next_step="The shaft was stopped. Check that rig.yaml has the drive's rated torque",
                 entry=MessageCode.TORQUE_LIMIT,
             )
         if self.left_s(sample.time_s) < 0.0:
             raise LimitHit(
                 f"the run has taken longer than the limit of {self._limits.time_s:g} s",
-                where=where,
+                where=_at(sample),
                 next_step="The shaft was stopped. Raise limits.time_s in rig.yaml or request fewer periods",
                 entry=MessageCode.TIME_LIMIT,
             )
         self._check_mode(command, sample)
-        self._check_reports(where)
+        self._check_reports(sample)
         self._check_limited(command, sample)
         if self.torque_offset_nm > 0.0 and command.mode is Mode.SPEED:
             self._following.reset()
-            self._check_lower_end(sample.speed_rad_s, where)
+            self._check_lower_end(sample)
         else:
-            self._check_following(command, sample, where)
+            self._check_following(command, sample)
         if command.mode is Mode.TORQUE and self.model is not None:
-            self._check_window(self.model, command, sample.speed_rad_s, where)
+            self._check_window(self.model, command, sample)
 
     @property
     def least_torque_nm(self) -> float:
@@ -285,14 +289,14 @@ class Guard:
         left_s = self._horizon_s + speed_rad_s / rate
         return push_nm / inertia * left_s if push_nm * direction < 0.0 else 0.0
 
-    def _check_speed(self, speed_rad_s: float, where: str) -> None:
-        limits = self._limits
+    def _check_speed(self, sample: Sample) -> None:
+        limits, speed_rad_s = self._limits, sample.speed_rad_s
         if speed_rad_s > limits.speed_max_rad_s or (limits.allow_reverse and speed_rad_s < -limits.speed_max_rad_s):
             raise LimitHit(
                 self._besides(
                     f"speed {speed_rad_s:.3f} rad/s is above the limit of {limits.speed_max_rad_s:g} rad/s"
                 ),
-                where=where,
+                where=_at(sample),
                 next_step="The shaft was stopped. "
                 + self._helps("Check whether the load was lost, and limits.speed_max_rad_s in rig.yaml"),
                 entry=MessageCode.SPEED_LIMIT,
@@ -300,42 +304,45 @@ class Guard:
         if not limits.allow_reverse and speed_rad_s < -self._reverse_rad_s:
             raise LimitHit(
                 f"the shaft turns backwards ({speed_rad_s:.3f} rad/s) and allow_reverse is false",
-                where=where,
+                where=_at(sample),
                 next_step="The shaft was stopped. Reverse rotation unscrews tool joints",
                 entry=MessageCode.TURNED_BACKWARDS,
             )
 
-    def _check_window(self, model: RigGuess, command: Command, speed_rad_s: float, where: str) -> None:
-        limits = self._limits
+    def _check_window(self, model: RigGuess, command: Command, sample: Sample) -> None:
+        limits, speed_rad_s = self._limits, sample.speed_rad_s
         predicted = self.predicted_speed(model, command.torque_nm, speed_rad_s)
         lowest = -limits.speed_max_rad_s if limits.allow_reverse else -self._reverse_rad_s
-        leads = f"{speed_rad_s:.3f} rad/s reported and {command.torque_nm:.1f} N·m lead to {predicted:.3f} rad/s"
+
+        def leads() -> str:
+            return f"{speed_rad_s:.3f} rad/s reported and {command.torque_nm:.1f} N·m lead to {predicted:.3f} rad/s"
+
         if predicted > limits.speed_max_rad_s:
             raise LimitHit(
                 self._besides(
-                    f"the speed is about to leave its window: {leads}, above {limits.speed_max_rad_s:g} rad/s"
+                    f"the speed is about to leave its window: {leads()}, above {limits.speed_max_rad_s:g} rad/s"
                 ),
-                where=where,
+                where=_at(sample),
                 next_step=f"The shaft was stopped. {self._helps('Lower the amplitude or the offset')}",
                 entry=MessageCode.SPEED_LIMIT,
             )
         if predicted < lowest:
             raise LimitHit(
-                self._besides(f"the shaft is about to turn backwards: {leads}"),
-                where=where,
+                self._besides(f"the shaft is about to turn backwards: {leads()}"),
+                where=_at(sample),
                 next_step=f"The shaft was stopped. {self._helps('Lower the amplitude or raise the offset')}",
                 entry=MessageCode.TURNED_BACKWARDS,
             )
-        self._check_lower_end(speed_rad_s, where)
+        self._check_lower_end(sample)
 
-    def _check_lower_end(self, speed_rad_s: float, where: str) -> None:
-        limits = self._limits
+    def _check_lower_end(self, sample: Sample) -> None:
+        limits, speed_rad_s = self._limits, sample.speed_rad_s
         if speed_rad_s < limits.speed_min_rad_s - self._speed_noise_rad_s:
             raise LimitHit(
                 self._besides(
                     f"the speed has left its window: {speed_rad_s:.3f} rad/s is below {limits.speed_min_rad_s:g} rad/s"
                 ),
-                where=where,
+                where=_at(sample),
                 next_step="The shaft was stopped. "
                 + self._helps("Lower the amplitude or raise the offset. Check whether the load increased"),
                 entry=MessageCode.SPEED_LIMIT,
@@ -347,7 +354,7 @@ class Guard:
     def _helps(self, usual: str) -> str:
         return LIGHTEN if self.disturbed else usual
 
-    def _check_age(self, sample: Sample, where: str) -> None:
+    def _check_age(self, sample: Sample) -> None:
         if sample.fresh:
             self._stale = 0
             return
@@ -356,14 +363,14 @@ class Guard:
             late, missing = self.host_late(), f"no feedback for {self._stale} cycles"
             raise CommunicationLost(
                 f"{late}; {missing}" if late else missing,
-                where=f"host, and {where}" if late else where,
+                where=f"host, and {_at(sample)}" if late else _at(sample),
                 next_step=LOWER_THE_RATE
                 if late
                 else "The drive's own watchdog stops the shaft. Check the drive's supply and the bus",
                 entry=MessageCode.FEEDBACK_LOST,
             )
 
-    def _check_reports(self, where: str) -> None:
+    def _check_reports(self, sample: Sample) -> None:
         """Raise the contradiction that the observer found.
 
         CommunicationLost for feedback that repeats, LimitHit for a shaft that became lighter, else ReportsContradict.
@@ -372,10 +379,10 @@ class Guard:
         if doubt is None:
             return
         if Signal.ALL in doubt.signals:
-            raise CommunicationLost(doubt.what, where=where, next_step=doubt.helps)
+            raise CommunicationLost(doubt.what, where=_at(sample), next_step=doubt.helps)
         if doubt.lighter:
-            raise LimitHit(doubt.what, where=where, next_step=f"The shaft was stopped. {doubt.helps}")
-        raise ReportsContradict(doubt.what, where=where, next_step=f"The shaft was stopped. {doubt.helps}")
+            raise LimitHit(doubt.what, where=_at(sample), next_step=f"The shaft was stopped. {doubt.helps}")
+        raise ReportsContradict(doubt.what, where=_at(sample), next_step=f"The shaft was stopped. {doubt.helps}")
 
     def _check_mode(self, command: Command, sample: Sample) -> None:
         if self.expected is not PowerState.ENABLED:
@@ -409,7 +416,7 @@ class Guard:
             " speed limit or ramp, or uses another unit of speed than the profile. If not, its speed loop is too soft",
         )
 
-    def _check_following(self, command: Command, sample: Sample, where: str) -> None:
+    def _check_following(self, command: Command, sample: Sample) -> None:
         following = self._following
         if self.expected is not PowerState.ENABLED or command.mode is not Mode.SPEED:
             following.reset()
@@ -419,7 +426,7 @@ class Guard:
                 f"the speed does not follow: {command.speed_rad_s:.3f} rad/s commanded,"
                 f" {following.speed_rad_s:.3f} rad/s reported, deviating since {following.since_s:.1f} s and no nearer"
                 f" for {following.within_s:g} s; {torque}",
-                where=where,
+                where=_at(sample),
                 next_step=f"The shaft was stopped. {helps}",
                 entry=MessageCode.SETPOINT_NOT_FOLLOWED,
             )

@@ -28,7 +28,6 @@ from drivers.own_limits import SPEED, TORQUE, WIDER_FLAG
 from profiles import CodedText, MessageCode
 from tdhil.config import DEFAULT_EXCITATION, told_before_echo
 from tdhil.recording import LagPrior
-from tdhil.runner.excitation import ECHOES_S, excitation_kind, tells_before_echo
 from tdhil.runner.settings import ControlAssumptions, ExcitationRequest, MachineLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -237,6 +236,8 @@ def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, releases_a
 
     ``releases_after_stop``: the drive is disabled after a quick stop, according to its profile.
     """
+    from tdhil.runner.excitation import ECHOES_S, excitation_kind, tells_before_echo
+
     if told_before_echo(request.kind) and limits.wave_impedance_nm_s_rad <= 0.0:
         raise PreflightRefused(
             f"{request.kind} needs a drill string whose pipe is known, and rig.yaml describes no pipe",
@@ -326,6 +327,8 @@ def choose_mode(request: ExcitationRequest, limits: MachineLimits, preflight: Pr
 
     Raises PreflightRefused if the drive has no mode for the requested motion.
     """
+    from tdhil.runner.excitation import excitation_kind
+
     if request.impedance is not None:
         _refuse_impedance(request, limits, preflight)
         return Mode.SPEED

@@ -15,14 +15,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from drivers import Command, Mode, Positioned, PositionReading, PreflightRefused, Sample
 from profiles import CodedText, MessageCode
 from tdhil.config import SPEED_UNIT_TOLERANCE
-from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
 from tdhil.runner.task import ConfirmSpeed, Say, refuse_unconfirmed_speed
+
+if TYPE_CHECKING:
+    from tdhil.runner.control_loop import ControlLoop
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The drive's position compared with its reported speed. Pure.

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from tdhil.errors import MessageCode, UsageError
+from tdhil.numerics import prepare
 from tdhil.service.run_state import Conflict, NotThere, Told, now
 from tdhil.service.store import Store, read_json, write_json
 
@@ -324,4 +325,5 @@ def main(folder: Path) -> int:
 
 
 if __name__ == "__main__":
+    prepare()
     sys.exit(main(Path(sys.argv[1])))

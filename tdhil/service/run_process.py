@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from drivers import Preflight, PreflightRefused
 from profiles import MessageCode, visible
+from tdhil.numerics import prepare
 from tdhil.service.attendance import (
     EXPECTED_S,
     LEASE_S,
@@ -243,4 +244,5 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    prepare()
     sys.exit(main(sys.argv[1:]))

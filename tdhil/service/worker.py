@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from tdhil.errors import UsageError
+from tdhil.numerics import prepare
 from tdhil.service.run_state import Told
 
 NICE: Final = {"plan": 5, "trend": 5}      # a page waits for it
@@ -138,4 +139,5 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    prepare()
     sys.exit(main(sys.argv[1:]))

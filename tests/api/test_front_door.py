@@ -245,7 +245,7 @@ def real_preflight():
 
 @pytest.mark.parametrize("answer", [False, None, "yes", 1])
 def test_only_true_moves_a_real_shaft(real_preflight, answer):
-    from tdhil.report.live import stderr_console
+    from tdhil.report.console import stderr_console
 
     told = []
     operator_interface = CallbackOperator(stderr_console(), lambda text: told.append(text) or answer)
@@ -257,7 +257,7 @@ def test_only_true_moves_a_real_shaft(real_preflight, answer):
 def test_a_confirmation_that_fails_moves_nothing_and_feeds_the_watchdog(real_preflight):
     import time
 
-    from tdhil.report.live import stderr_console
+    from tdhil.report.console import stderr_console
 
     asked = Asked()
 
@@ -272,7 +272,7 @@ def test_a_confirmation_that_fails_moves_nothing_and_feeds_the_watchdog(real_pre
 
 
 def test_without_a_terminal_nobody_confirms(real_preflight, monkeypatch):
-    from tdhil.report.live import stderr_console
+    from tdhil.report.console import stderr_console
 
     monkeypatch.setattr("sys.stdin", None)
     with pytest.raises(PreflightRefused, match="no operator can confirm"):
@@ -280,7 +280,7 @@ def test_without_a_terminal_nobody_confirms(real_preflight, monkeypatch):
 
 
 def test_true_moves(real_preflight):
-    from tdhil.report.live import stderr_console
+    from tdhil.report.console import stderr_console
 
     ask(CallbackOperator(stderr_console(), lambda text: True), real_preflight, Asked())
 

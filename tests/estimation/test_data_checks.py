@@ -10,7 +10,7 @@ from tdhil.estimation.data_checks import flat_share
 from tdhil.estimation.excitation_checks import undeclared_warning, wrong_period
 from tdhil.estimation.friction_levels import warming_of
 from tdhil.estimation.samples import frozen, spikes, stretches, usable_samples
-from tdhil.estimation.spectrum import period_lines, repeating_rounding
+from tdhil.estimation.spectrum import PeriodInstants, period_lines, repeating_rounding
 from tdhil.estimation.time_domain.identify import cut_off
 from tests.estimation.analytic import closed_form
 
@@ -226,7 +226,7 @@ def test_what_rounding_leaves_in_the_mean_of_a_line(rate_hz, noise, shifted):
                  for each, one, before in zip(turned, periods, noisy, strict=True)]
         seen.append(np.abs(np.mean(error, axis=0)) ** 2)
         alone.append(np.abs(error) ** 2)
-        told.append(repeating_rounding(periods, times, 10.0, 0.0, lines_hz, wave, 0.0, 1.0))
+        told.append(repeating_rounding(periods, PeriodInstants(times, 10.0, 0.0, lines_hz), wave, 0.0, 1.0))
     once = np.mean(alone)
     again = (10.0 * np.mean(seen) - once) / 9.0
     assert again / 1.4 - 0.02 * once < np.mean(told) < 1.7 * again + 0.02 * once

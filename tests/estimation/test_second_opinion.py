@@ -87,24 +87,26 @@ def test_disagreement_by_chance_comes_once_in_a_hundred_runs(usual):
     assert np.sum(said_no > 0) <= binom.ppf(0.995, runs, 0.01)
 
 
-def test_without_knowing_the_lags_it_is_wider_and_still_covers():
-    recordings = usual_runs()[:60]
+@pytest.mark.parametrize("runs", [20, pytest.param(60, marks=pytest.mark.heavy)])
+def test_without_knowing_the_lags_it_is_wider_and_still_covers(runs):
+    recordings = usual_runs()[:runs]
     known = [opinions_of(r)[0].inertia_kg_m2 for r in recordings]
     unknown = [opinions_of(r, result(delay=None))[0].inertia_kg_m2 for r in recordings]
     assert all(u.high - u.low > k.high - k.low for u, k in zip(unknown, known, strict=True))
-    assert sum(e.low <= TRUE <= e.high for e in unknown) >= binom.ppf(0.005, 60, 0.95)
+    assert sum(e.low <= TRUE <= e.high for e in unknown) >= binom.ppf(0.005, runs, 0.95)
 
 
-def test_without_excited_segments_the_rows_tell_the_scatter():
+@pytest.mark.parametrize("runs", [20, pytest.param(60, marks=pytest.mark.heavy)])
+def test_without_excited_segments_the_rows_tell_the_scatter(runs):
     """As after a refusal, or in a foreign trace: no levels, nothing of the lags, no result."""
     nothing = replace(result(delay=None), inertia=None)
     covered = 0
-    for recording in usual_runs()[:60]:
+    for recording in usual_runs()[:runs]:
         first, *_ = opinions_of(replace(recording, excitation=None), nothing, levels=False)
         assert first.agrees is None
         covered += first.inertia_kg_m2.low <= TRUE <= first.inertia_kg_m2.high
         assert disagreements((first,), nothing) == ()
-    assert covered >= binom.ppf(0.005, 60, 0.95)
+    assert covered >= binom.ppf(0.005, runs, 0.95)
 
 
 def test_a_result_that_is_wrong_is_contradicted():

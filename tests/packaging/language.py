@@ -33,6 +33,7 @@ WORDS = {
     r"\b(is|are|be|was) (told|said|asked for|looked at|reckoned)\b": "active voice: who reports, states or requests",
 }
 """Words and phrases to avoid, each with what to write instead."""
+_ANY_WORD = re.compile("|".join(WORDS), re.IGNORECASE)
 
 EXCEPTIONS = {
     "tdhil/report/document.py": "second_opinions is a key of the JSON document",
@@ -84,9 +85,10 @@ def of_code(path: Path) -> Iterator[Finding]:
                 if of_a_definition and first and first[1] in OPENINGS:
                     yield Finding(name, one.lineno, "opening", one.value.value.strip().partition("\n")[0])
                 yield from _words(name, one.lineno, one.value.value)
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT:
-            yield from _words(name, token.start[0], token.string)
+    if any("#" in row and _ANY_WORD.search(row) for row in source.splitlines()):      # to tokenise takes long
+        for token in tokenize.generate_tokens(io.StringIO(source).readline):
+            if token.type == tokenize.COMMENT:
+                yield from _words(name, token.start[0], token.string)
     inner = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in ast.walk(node)
              if part is not node}
     for node in ast.walk(tree):

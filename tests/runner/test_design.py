@@ -165,6 +165,7 @@ def test_the_time_allowed_is_kept():
         choose(LIMITS, GUESS, PlanRequest(), KNOWN, 0.95, 40.0)
 
 
+@pytest.mark.heavy
 def test_with_a_tolerance_the_plan_that_meets_it_soonest_is_taken():
     asked, left_s = ExcitationRequest(tolerance=0.01), 900.0
     planned = plan_acquisition(asked, "torque", LIMITS, GUESS, KNOWN, left_s)

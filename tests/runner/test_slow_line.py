@@ -34,6 +34,7 @@ def test_a_slow_line_identifies(rate_hz, modes):
     assert found.inertia.low <= TRUE_KG_M2 <= found.inertia.high
 
 
+@pytest.mark.heavy
 def test_signals_read_one_after_the_other_are_told_apart_by_their_skew():
     run = run_line(LineDrive(Line(0.1, apart=True), seed=6))
     found = identified(run)
@@ -64,6 +65,7 @@ def test_the_rate_is_written_down_once_it_is_known():
     assert {"timing_half_width_s", "stepped_setpoint"} <= FACTS
 
 
+@pytest.mark.heavy
 def test_torque_read_in_step_with_a_stiff_drive_is_not_trusted():
     """Every 100 ms the drive answers a step of its setpoint within some 30 ms, unfiltered: most of it is never seen."""
     stiff = COARSE.drive.model_copy(update={

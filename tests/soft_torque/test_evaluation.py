@@ -189,6 +189,7 @@ def decaying(damping, noise, seed):
     return table
 
 
+@pytest.mark.heavy
 def test_the_damping_of_a_noisy_decay_lies_in_its_interval():
     """Of 30 decays in noise of several sizes 93 % cover the truth, and at most one is said to differ."""
     found = [evaluate(decaying(0.226, noise, seed), CASE, PROGRAM)

@@ -221,6 +221,7 @@ def test_steady_rotation_stays_steady():
     assert np.isinf(trace.first_stuck_s).all()
 
 
+@pytest.mark.heavy
 def test_dry_friction_along_the_string_against_the_chain():
     """A deviated well: 1,500 N·m of dry friction on the wall moves cure speeds as in the chain of masses, to 5 %."""
     from dataclasses import replace

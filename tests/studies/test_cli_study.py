@@ -305,10 +305,10 @@ def test_ctrl_c_ends_with_130(studies):
 def test_on_a_terminal_a_bar_moves_and_leaves_nothing_behind(studies, monkeypatch):
     from rich.console import Console
 
-    from tdhil.report import live
+    from tdhil.report import console
 
     shown = io.StringIO()
-    monkeypatch.setattr(live, "stderr_console", lambda: Console(file=shown, force_terminal=True, width=80))
+    monkeypatch.setattr(console, "stderr_console", lambda: Console(file=shown, force_terminal=True, width=80))
     code, out, _ = tdhil("table1", "figure2", "--json")
     assert code == 0
     assert len(json.loads(out)["studies"]) == 2
