@@ -1,4 +1,4 @@
-"""Settings of numpy and scipy for a process of tdhil's own, made before either is loaded (decision 0030).
+"""Settings of numpy and scipy for a process of tdhil's own, made before either is loaded (decision 0031).
 
 One thread for linear algebra: the matrices of an identification are small, so that a second thread only spins. And sums
 are added in the same order on any machine.
