@@ -305,15 +305,15 @@ class StopSequence:
         self._loop.guard.expected = None
         self._loop.guard.observer.begin_stop()
         if self._loop.guard.observer.backwards or self._never_moved:
-            at_rest_s = self._coast()
-            if at_rest_s is not None:
-                disabled = self._remove_torque(_NO_TORQUE_ASKED)
-                stays = disabled and self._stays_at_rest()
-                return StopReport(stays, at_rest_s, disabled, tuple(self._trouble))
+            coasted = self._coasted()
+            if coasted is not None:
+                return coasted
         elif self._string is not None and not self._speed_doubted and self._slow_down():
             self._release(self._string)
-        if self._string is not None and self._speed_doubted and self._run_out(self._string):
-            return StopReport(False, None, self._torque_removed, tuple(self._trouble), self._trapped_nm)
+        if self._string is not None and self._speed_doubted:
+            ran_out = self._run_out(self._string)
+            if ran_out is not None:
+                return ran_out
         at_rest_s = self._decelerate()
         disabled, stays = self._torque_removed, False
         if at_rest_s is not None and not self._wound_up():
@@ -382,16 +382,17 @@ class StopSequence:
                 f" after {going.travel_rad:.1f} rad"
             )
 
-    def _run_out(self, string: StringReleaseLimits) -> bool:
+    def _run_out(self, string: StringReleaseLimits) -> StopReport | None:
         """Bring the torque to zero in torque mode and wait until friction has stopped the shaft; then remove it.
 
         Speed control by a speed that is not believed would drive the shaft on, and so would the drive's watchdog, which
-        brakes by the same signal. False where the drive does not follow torque mode, or its speed is believed again:
-        then the quick stop has to do.
+        brakes by the same signal. A speed that is believed again has shown how fast the shaft is, and not with which
+        sign: the shaft stays without torque until it is at rest. None where the drive does not follow torque mode: then
+        the quick stop has to do.
         """
         last = self._loop.last
         if last is None or last.state is not PowerState.ENABLED:
-            return False
+            return None
         observer = self._loop.guard.observer
         torque_nm = kept_within(last.torque_nm - string.torque_offset_nm, -string.torque_nm, string.torque_nm)
         # What flows while the shaft turns accelerates it and holds nothing: it goes at once.
@@ -406,21 +407,23 @@ class StopSequence:
                 without_s += self._loop.period_s
             if sample is None:
                 if self._silent >= self._enough_silent:
-                    return False
+                    return None
                 continue
             other_mode = sample.mode is not Mode.TORQUE and waited_s > MODE_S
             if sample.state is not PowerState.ENABLED or other_mode:
-                return False
+                return None
             held_nm = abs(sample.torque_nm - string.torque_offset_nm)
-            if not self._speed_doubted or (without_s > TORQUE_GONE_S and held_nm > 2.0 * string.residual_nm):
-                return False
+            if not self._speed_doubted:
+                return self._coasted()
+            if without_s > TORQUE_GONE_S and held_nm > 2.0 * string.residual_nm:
+                return None
         why = f" ({observer.doubt.what})" if observer.doubt is not None else ""
         self._trouble.append(
             f"torque removed: the reported speed is not believed{why}. The drive gave no torque for {without_s:.0f} s,"
             " in which friction stops the shaft; standstill was not seen"
         )
         self._remove_torque(_NO_TORQUE_ASKED)
-        return True
+        return StopReport(False, None, self._torque_removed, tuple(self._trouble), self._trapped_nm)
 
     def _wound_up(self) -> bool:
         """Return whether the drive holds a torque that disabling would release at once."""
@@ -474,6 +477,15 @@ class StopSequence:
             if rest.see(sample, without_torque=True):
                 return sample.time_s
         return None
+
+    def _coasted(self) -> StopReport | None:
+        """Coast to rest, then disable; None where the drive does not coast."""
+        at_rest_s = self._coast()
+        if at_rest_s is None:
+            return None
+        disabled = self._remove_torque(_NO_TORQUE_ASKED)
+        stays = disabled and self._stays_at_rest()
+        return StopReport(stays, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm)
 
     def _take_torque_back(self) -> None:
         """Command zero torque in torque mode first.

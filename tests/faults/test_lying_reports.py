@@ -5,7 +5,7 @@ Many more: `python benchmarks/lying_reports.py --all`.
 
 import pytest
 
-from sim_bus.lying_runs import sample, unknowable
+from sim_bus.lying_runs import product, sample, unknowable
 from sim_bus.shaft_judge import JudgedMachine, judge, outcome_of, read_shaft
 from tdhil.errors import LogError
 from tdhil.recording.log_reader import read_run
@@ -20,8 +20,14 @@ def closed(log):
         return False
 
 
+ONCE_BELIEVED = (856, 4889, 5087)
+"""856: a sign that changes above a string; believed again while the shaft ran out, the speed control drove it to 42
+rad/s. 4889 and 5087: a torque constant that changes within stage 2 made J wrong by a factor of 2, and valid."""
+
+
 @pytest.mark.heavy
-@pytest.mark.parametrize("combination", sample(COUNT, SEED), ids=str)
+@pytest.mark.parametrize(
+    "combination", [*sample(COUNT, SEED), *(product()[number] for number in ONCE_BELIEVED)], ids=str)
 def test_no_lie_is_believed(combination, tmp_path):
     program, excuse = combination.program, unknowable(combination)
     for name, text in program.files.items():
