@@ -29,6 +29,8 @@ import pytest
 from _pytest.runner import runtestprotocol
 from hypothesis import settings
 
+from tdhil.numerics import prepare
+
 settings.register_profile("same", deadline=None, derandomize=True)
 settings.register_profile("fuzz", deadline=None, max_examples=1000)
 settings.load_profile("fuzz" if os.environ.get("TDHIL_FUZZ") else "same")
@@ -36,8 +38,7 @@ settings.load_profile("fuzz" if os.environ.get("TDHIL_FUZZ") else "same")
 if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-for library in ("OPENBLAS", "OMP", "MKL"):
-    os.environ.setdefault(f"{library}_NUM_THREADS", "1")        # numpy asks when it is imported, which nobody has yet
+prepare()           # before numpy is loaded
 
 gc.disable()        # until everything is collected
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -78,6 +79,14 @@ def pytest_xdist_make_scheduler(config, log):      # type: ignore[no-untyped-def
 
         def _split_scope(self, nodeid: str) -> str:
             return self.groups.get(nodeid, nodeid)
+
+        def mark_test_complete(self, node, item_index: int, duration: float = 0) -> None:  # type: ignore[no-untyped-def]
+            """Forget a group that is done: pytest-xdist counts all groups of a worker again after each test."""
+            super().mark_test_complete(node, item_index, duration)
+            groups = self.assigned_work[node]
+            done = self._split_scope(self.registered_collections[node][item_index])
+            if all(groups[done].values()):
+                del groups[done]
 
     return ByMarker(config, log) if config.getvalue("dist") == "load" else None
 

@@ -11,6 +11,11 @@ from tdhil.recording.recording import Recording, Stage
 from tests.estimation.shaft_bench import DT
 from tests.estimation.stages_bench import Stages, run_stages, turn
 
+
+def heavy(value):
+    return pytest.param(value, marks=pytest.mark.heavy)
+
+
 FINE_S = 0.002
 LAGS = {
     "none": (), "one pole": (0.5,), "two poles": (0.25, 0.15), "average": ("average", 0.4), "dead time": ("late", 0.3),
@@ -127,7 +132,7 @@ def test_a_sound_run_has_the_same_bits_with_its_setpoints_and_without(runs):
         assert with_them.inertia.low <= 104.0 <= with_them.inertia.high
 
 
-@pytest.mark.parametrize("scale", [0.5, 0.9, 1.1, 2.0])
+@pytest.mark.parametrize("scale", [heavy(0.5), 0.9, 1.1, heavy(2.0)])
 def test_a_reported_torque_beyond_its_scale_is_never_valid(runs, scale):
     found = identify(replace(runs[0], torque_nm=scale * runs[0].torque_nm), Options(tolerance=0.2))
     assert (found.verdict, found.inertia) == (Verdict.NOT_IDENTIFIABLE, None)
@@ -150,7 +155,7 @@ def test_a_larger_stated_uncertainty_of_the_scale_is_an_answer(runs):
     assert found.inertia.low_total <= 104.0 <= found.inertia.high_total
 
 
-@pytest.mark.parametrize("factor", [0.5, 0.85, 2.0])
+@pytest.mark.parametrize("factor", [heavy(0.5), 0.85, heavy(2.0)])
 def test_a_speed_whose_scale_changes_before_stage_5_is_never_valid(runs, factor):
     for one in runs:
         speed = np.where(one.time_s < 43.0, 1.0, factor) * one.speed_rad_s
@@ -207,7 +212,7 @@ def test_turns_that_are_lost_in_a_gap_of_the_angle_contradict_nothing(turned):
     assert identify(replace(broken, speed_rad_s=speed, stages=())).verdict is Verdict.MODEL_REJECTED
 
 
-@pytest.mark.parametrize("counts", [0.5, 2.0, 10.0])
+@pytest.mark.parametrize("counts", [heavy(0.5), 2.0, heavy(10.0)])
 def test_counts_that_the_operator_takes_as_wrong_contradict_nothing(turned, counts):
     """--accept-speed-unit: the unit of speed is right, that of the angle is not; a change of scale is still seen."""
     wrong = replace(turned, position_rad=counts * turned.position_rad)

@@ -235,7 +235,8 @@ def test_a_frozen_host_is_no_watchdog_either(tmp_path):
 
 
 @pytest.mark.parametrize("stage", [
-    pytest.param(stage, marks=pytest.mark.long if stage in ("torque", "hold") else ()) for stage in STAGES
+    pytest.param(stage, marks={"torque": pytest.mark.long, "hold": pytest.mark.long, "acquire": HEAVY}.get(stage, ()))
+    for stage in STAGES
 ])
 def test_an_exception_in_each_stage(tmp_path, monkeypatch, stage):
     def begin(self, name, expected_s, plain=LiveDisplay.stage_started):

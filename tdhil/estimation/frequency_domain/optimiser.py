@@ -125,10 +125,12 @@ def _within(
     while True in outside.tolist():
         there = np.minimum(np.maximum(there, least), most)
         free = ~held
-        if True not in free.tolist():
+        go, stay = np.flatnonzero(free), np.flatnonzero(held)
+        if not len(go):
             break
-        rest = right[free] - matrix[np.ix_(free, held)].dot((there[held] - here[held]) / scale[held])
-        there[free] = here[free] + _solved(matrix[np.ix_(free, free)], rest) * scale[free]
+        rows = go[:, None]
+        rest = right[go] - matrix[rows, stay].dot((there[stay] - here[stay]) / scale[stay])
+        there[go] = here[go] + _solved(matrix[rows, go], rest) * scale[go]
         outside = free & ((there < least) | (there > most))
         held = held | outside
     return there
