@@ -89,3 +89,8 @@ def test_friction_that_falls_while_a_gear_warms_up_is_no_contradiction(share):
 def test_a_torque_that_scatters_more_than_it_changed_is_no_contradiction():
     recording = turning_twice(0.5, sd_nm=1200.0)
     assert level_contradiction(recording, usable_samples(recording)) is None
+
+
+def test_the_torque_of_a_swinging_string_is_no_contradiction():
+    recording = replace(turning_twice(0.5), winds_up=True)
+    assert level_contradiction(recording, usable_samples(recording)) is None

@@ -37,7 +37,8 @@ _CLEAR_SDS = 5.0
 """Standard deviations of the torque's block means by which the torque must differ."""
 
 _BLOCK_S = 2.0            # of a level; a segment's blocks are its periods
-_REPEAT_BLOCK_S = 1.0     # of a calm stretch, which lasts 2 s or more
+_REPEAT_BLOCK_S, _REPEAT_BLOCKS = 1.0, 3
+"""Of a calm stretch, s, and how many it must have: fewer show neither its scatter nor a swing of the load."""
 _ADVICE = ("check that torque is reported with one scale in all stages and that the load stays the same; then run it"
            " again")
 _FEWEST = 20              # samples of a stretch
@@ -89,21 +90,27 @@ def level_contradiction(recording: Recording, samples: Samples) -> Refusal | Non
 
 
 def _repeat_contradiction(recording: Recording, samples: Samples) -> Refusal | None:
-    """Compare each calm stretch outside of the excitation with the later ones at its speed."""
-    blocks = block_means(samples)
+    """Compare each calm stretch outside of the excitation with the later ones at its speed.
+
+    Not above a drill string: its torque swings by more than friction while the speed is held.
+    """
+    blocks = None if recording.winds_up else block_means(samples)
     if blocks is None:
         return None
     steady = []
     for span in calm_spans(blocks, periodic_segments(recording)):
-        mean = _mean(samples.between(span.start_s, span.end_s), _REPEAT_BLOCK_S)
+        mean = _mean(samples.between(span.start_s, span.end_s), _REPEAT_BLOCK_S, _REPEAT_BLOCKS)
         if mean is not None:
             steady.append((0.5 * (span.start_s + span.end_s), *mean))
-    fastest = max((abs(speed) for _, speed, _, _ in steady), default=0.0)
+    if not steady:
+        return None
+    fastest = max(abs(speed) for _, speed, _, _ in steady)
+    usual_sd = float(np.median([sd for *_, sd in steady]))       # a few blocks may scatter little by chance
     for (time, speed, torque, sd), (later_time, later_speed, later, later_sd) in combinations(steady, 2):
-        apart = abs(later - torque)
+        clear_nm = _CLEAR_SDS * math.hypot(max(sd, usual_sd), max(later_sd, usual_sd))
         ratio = later / torque if torque != 0.0 else math.inf
         alike = abs(later_speed - speed) <= _SAME_SPEED * fastest
-        if not alike or LEAST <= ratio <= MOST or apart <= _CLEAR_SDS * math.hypot(sd, later_sd):
+        if not alike or LEAST <= ratio <= MOST or abs(later - torque) <= clear_nm:
             continue
         return Refusal(
             f"at {speed:.3g} rad/s the mean torque is {torque:.4g} N·m at {time:.0f} s and {later:.4g} N·m at"
@@ -141,13 +148,13 @@ def level_checked(finding: Finding, case: Case) -> Finding:
     )
 
 
-def _mean(samples: Samples, block_s: float) -> tuple[float, float, float] | None:
-    """Return mean speed, mean torque and the standard deviation of the latter; None for less than two blocks."""
+def _mean(samples: Samples, block_s: float, fewest: int = 2) -> tuple[float, float, float] | None:
+    """Return mean speed, mean torque and the standard deviation of the latter; None for less than ``fewest`` blocks."""
     if len(samples) < _FEWEST:
         return None
     blocks = np.floor((samples.time_s - samples.time_s[0]) / block_s + 1e-9)
     means = np.array([float(np.mean(samples.torque_nm[blocks == block])) for block in np.unique(blocks)])
-    if len(means) < 2:
+    if len(means) < fewest:
         return None
     sd = float(np.std(means, ddof=1)) / math.sqrt(len(means))
     return float(np.mean(samples.speed_rad_s)), float(np.mean(samples.torque_nm)), sd
