@@ -50,11 +50,7 @@ _GROUPS: Final = {
         "scan": "list the drives on the bus; nothing is written to them",
         "rig": "write a rig.yaml to fill in, without a drive",
         "profiles": "show known drives, their settings and what is verified",
-<<<<<<< HEAD
         "calibrate": "compute the scale of torque or speed from known quantities",
-=======
-        "calibrate": "compute the scale of torque (known body) or of speed (turns)",
->>>>>>> 9483b84 (docs: accuracy states only numbers that a command repeats; the rest is decision 0031)
     },
     "what J is for": {
         "tune": "compute a speed controller that damps the drill string",
