@@ -1,4 +1,4 @@
-"""Decides, records, concludes: the moment of inertia of an inverter-driven machine, with an interval that holds.
+"""Identification of the moment of inertia of an inverter-driven machine, with its 95 % coverage interval.
 
 The names below are the stable Python API; the command line goes the same ways. They are loaded when they are used, so
 that ``import tdhil`` costs nothing.

@@ -90,10 +90,11 @@ class Pool(Generic[Task, Result]):
     def run(
         self, tasks: Iterable[Task], stop: Callable[[], bool] | None = None
     ) -> Iterator[tuple[Task, Result | Loss]]:
-        """Every task with its result, or with what became of it instead, as they are done.
+        """Yield each task with its result or its loss, in the order of completion.
 
-        ``stop`` is asked several times a second: True ends it at once, without what is in hand. Raises TdhilError where
-        no process can be started, and what ``function`` raises. Whoever stops in the middle calls `close`.
+        ``stop`` is called several times a second: True ends the run at once, without the tasks in work.
+        Raises TdhilError if no process can be started, and each error of ``function``. A caller that stops
+        early must call `close`.
         """
         fresh = iter(tasks)
         again: deque[_Job[Task]] = deque()

@@ -140,7 +140,7 @@ class ModbusTarget:
         """Return remarks on the stop."""
         said = []
         if self._switching_since_s is not None:
-            said.append("a quick stop does not decelerate from torque mode: tdhil requested speed mode first")
+            said.append("a quick stop does not decelerate from torque mode: tdhil requested speed mode at zero first")
         if self._stayed_in_torque:
             said.append(
                 "the drive did not change to speed mode, and its quick stop may release the shaft in torque mode"

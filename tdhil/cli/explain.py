@@ -76,7 +76,8 @@ def text(entry: MessageCode) -> str:
     title, code, _ = GROUPS[entry.group]
     rows = [f"{entry.code}  {entry.title}", ""]
     for name, sentences in (("cause", entry.cause), ("cure", entry.cure), ("exit code", f"{code} ({title.lower()})")):
-        rows.append(textwrap.fill(sentences, 79, initial_indent=f"{name:<11}", subsequent_indent=" " * 11))
+        rows.append(textwrap.fill(sentences, 79, initial_indent=f"{name:<11}", subsequent_indent=" " * 11,
+                                  break_on_hyphens=False))      # an option stays whole
     return "\n".join(rows)
 
 

@@ -9,7 +9,7 @@ from tdhil.estimation.result import Identification, InertiaEstimate, Options, Ve
 from tdhil.recording import Stage
 
 _SHARPER = "identical filters on reported speed and torque, or known filters, would reduce the uncertainty further"
-_BY_SCALE = "a torque calibration (tdhil calibrate torque) would reduce the uncertainty most"
+_BY_SCALE = "a torque calibration (tdhil calibrate torque) reduces the uncertainty most"
 
 
 def conclude(case: Case, finding: Finding) -> Identification:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import threading
 import time
@@ -31,6 +32,7 @@ from tdhil.report.document import SIMULATED
 
 Job = Callable[[], None]
 
+_ERROR_CLASS = re.compile(r"^[A-Z][A-Za-z]+: ")
 MOST_LINES = 500
 """Longest queue of a terminal that accepts no lines; the oldest lines are dropped."""
 
@@ -251,7 +253,8 @@ class LiveDisplay:
     def stage_ended(self, stage: Stage) -> None:
         self._view = replace(self._view, ended={**self._view.ended, stage.name: stage})
         if not self._console.is_terminal:
-            detail = f": {stage.detail}" if stage.detail else ""
+            # An aborted stage begins its detail with the class of the error, which is for the log only.
+            detail = f": {re.sub(_ERROR_CLASS, '', stage.detail)}" if stage.detail else ""
             took = minutes(stage.end_s - stage.start_s)
             self._print(f"{self._prefix()}stage {stage.name} {stage.outcome}, {took}{detail}")
         else:

@@ -64,7 +64,7 @@ def test_foreign_words_are_named_with_ours_beside_them(words, name, other, ours,
     run = Run()
     run.foreign = words
     error = run.lost(1.0)
-    assert f"the {name} there is {other}, and this run wrote {ours}" in error.what
+    assert f"the {name} in the drive is {other}, and this run wrote {ours}" in error.what
     assert where in error.where and "other master" in error.next_step
     run.foreign = {}
     run.cycles(40)                                             # told once: the stop goes on
@@ -154,7 +154,7 @@ def test_the_stop_word_is_repeated_against_somebody_who_goes_on():
     run = Run(bank=Bank(takes_s=0.002))
     run.foreign = {CONTROL: 0x000F}
     run.drive.quick_stop()
-    with pytest.raises(CommunicationLost, match="somebody else"):
+    with pytest.raises(CommunicationLost, match="another master"):
         run.cycles(20)
     run.bank.requests.clear()
     run.cycle()

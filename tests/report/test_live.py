@@ -148,6 +148,15 @@ def test_lines_come_in_order_and_before_it_is_left():
     ]
 
 
+def test_an_aborted_stage_shows_its_message_without_the_class_of_the_error():
+    import io
+
+    shown = io.StringIO()
+    with LiveDisplay(Console(file=shown, width=100), show_preflight=False) as display:
+        display.stage_ended(Stage("setup", 0.0, 2.0, "aborted", "PreflightRefused: 1000h: no answer"))
+    assert shown.getvalue().strip() == "stage setup aborted, 2 s: 1000h: no answer"
+
+
 def test_its_thread_ends_with_it():
     import io
 
