@@ -220,7 +220,7 @@ def _refusal(runs: Sequence[CalibrationRun], identified: Sequence[Identification
             reason = f"the shaft is not rigid in it (model {found.model}): the body does not turn as one with the motor"
             advice = "bolt the body tight to the motor's shaft, and run it again"
         if reason:
-            return TorqueCalibration(verdict, f"{name} can't be used: {reason}", advice)
+            return TorqueCalibration(verdict, f"the log {name} can't be used: {reason}", advice)
     return None
 
 
