@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         calibrate_by_position as calibrate_by_position, calibrate_by_turns as calibrate_by_turns,
     )
     from tdhil.calibration.stored import (
-        CalibrationUnusable as CalibrationUnusable, StoredCalibration as StoredCalibration,
+        OWN_LOG as OWN_LOG, CalibrationUnusable as CalibrationUnusable, StoredCalibration as StoredCalibration,
     )
 else:
     __getattr__, __dir__ = lazy_face(__name__)

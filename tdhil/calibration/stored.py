@@ -10,6 +10,8 @@ from tdhil.estimation import normal_quantile
 from tdhil.recording import FloatArray, Recording
 
 KIND: Final = "torque_calibration"
+OWN_LOG: Final = "own_log"
+"""Key of a calibration that is applied to a log that it comes from."""
 _NUMBERS: Final = ("value", "low", "high", "confidence")
 _LEAST, _MOST = 0.1, 10.0
 """A factor beyond these is no calibration of a drive."""
@@ -24,7 +26,8 @@ class CalibrationUnusable(ValueError):
 class StoredCalibration:
     """``factor`` κ = true over reported torque, with its coverage interval. ``date`` in ISO 8601.
 
-    ``drive`` and ``settings``: identity of the drive, and what its unit of torque depends on.
+    ``drive`` and ``settings``: identity of the drive, and what its unit of torque depends on. ``own_rel_sd``: standard
+    uncertainty of J of the calibration, as a share, for a log that the calibration comes from; else 0.
     """
 
     factor: float
@@ -35,6 +38,7 @@ class StoredCalibration:
     drive: Mapping[str, Any]
     settings: Mapping[str, Any]
     simulated: bool
+    own_rel_sd: float = 0.0
 
     @classmethod
     def of(cls, document: Any) -> "StoredCalibration":
@@ -59,7 +63,7 @@ class StoredCalibration:
         if not isinstance(drive, Mapping) or not isinstance(settings, Mapping):
             raise CalibrationUnusable("names no drive")
         return cls(value, low, high, confidence, str(date), dict(drive), dict(settings),
-                   document.get("simulated") is True)
+                   document.get("simulated") is True, _own_rel_sd(document))
 
     @property
     def day(self) -> str:
@@ -68,8 +72,12 @@ class StoredCalibration:
 
     @property
     def rel_sd(self) -> float:
-        """Standard deviation of a normal scale that has this interval, as a share."""
-        return 0.5 * (self.high - self.low) / self.factor / normal_quantile(self.confidence)
+        """Standard deviation of a normal scale that has this interval, as a share.
+
+        The noise of a log that the calibration comes from is in the factor too, and adds up instead of its squares. J
+        is then no better known than the calibration knows it.
+        """
+        return max(self.own_rel_sd, 0.5 * (self.high - self.low) / self.factor / normal_quantile(self.confidence))
 
     def another_drive(self, drive: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
         """Return the difference to this drive or its settings, in words; '' if there is none."""
@@ -101,6 +109,19 @@ class StoredCalibration:
             torque_resolution_nm=factor * recording.torque_resolution_nm,
             torque_scale_rel_sd=self.rel_sd,
         )
+
+
+def _own_rel_sd(document: Mapping[str, Any]) -> float:
+    inertia = document.get("inertia_kg_m2")
+    if document.get(OWN_LOG) is not True or not isinstance(inertia, Mapping):
+        return 0.0
+    numbers = [inertia.get(name) for name in _NUMBERS]
+    if not all(isinstance(one, int | float) and math.isfinite(one) for one in numbers):
+        return 0.0
+    value, low, high, confidence = (float(one) for one in numbers if isinstance(one, int | float))
+    if not (0.0 < low <= value <= high and 0.5 <= confidence < 1.0):
+        return 0.0
+    return 0.5 * (high - low) / value / normal_quantile(confidence)
 
 
 def _scaled(signal: FloatArray | None, factor: float) -> FloatArray | None:

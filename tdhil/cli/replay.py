@@ -19,6 +19,7 @@ from tdhil.session import (
     load_calibration,
     read,
     require_file,
+    sha256_of_log,
     with_calibration,
 )
 
@@ -133,7 +134,8 @@ def _identify(namespace: argparse.Namespace, recorded: RunRecord) -> int:
 
     if namespace.torque_calibration is not None:
         path = namespace.torque_calibration
-        changed = with_calibration(recorded.configuration, recorded.recording, load_calibration(path), str(path))
+        changed = with_calibration(recorded.configuration, recorded.recording, load_calibration(path), str(path),
+                                   sha256_of_log(recorded))
         recorded = replace(recorded, configuration=changed)
     result = identify(recorded, **settings_in(namespace))
     console = stderr_console()

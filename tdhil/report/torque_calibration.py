@@ -91,7 +91,7 @@ def print_calibration(document: Part, console: PlainConsole) -> None:
     if inertia is not None:
         rows.add_row("J without the body", Words(_with_share(inertia, "kg·m²"), style="bold"))
     for run in document["runs"]:
-        text = f"{Path(run['log']).name}: {run['added_kg_m2']:.4g} kg·m² added"
+        text = f"{_name(run)}: {run['added_kg_m2']:.4g} kg·m² added"
         if "reported_kg_m2" in run:
             text += f", identified {plus_minus(run['reported_kg_m2'], 2.0 * run['standard_uncertainty_kg_m2'])}"
         rows.add_row("run", text)
@@ -107,6 +107,11 @@ def print_calibration(document: Part, console: PlainConsole) -> None:
     body += [Words(f"! {warning}", style="yellow") for warning in document["warnings"]]
     title = "torque calibration" + (f" · {SIMULATED}" if document["simulated"] else "")
     console.print(Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue"))
+
+
+def _name(run: Part) -> str:
+    """Return the short name of a run's log; a file of an earlier version has its path only."""
+    return str(run.get("name") or Path(run["log"]).name)
 
 
 def _with_share(part: Part, unit: str) -> str:
@@ -233,7 +238,7 @@ def _sections(document: Part) -> Iterator[ReportSection]:
         yield ReportSection("Uncertainty budget", (_factor_budget(document), Text(_BUDGET_NOTE)))
     if document["line"] is not None:
         yield ReportSection("Identified over known inertia", (_picture(document), _data(document)))
-    conditions = [(Path(run["log"]).name, f"{shown_date(run['date'])}, SHA-256 {run['sha256']}")
+    conditions = [(_name(run), f"{shown_date(run['date'])}, SHA-256 {run['sha256']}")
                   for run in document["runs"]]
     yield ReportSection("Recordings", (Pairs(tuple(conditions)),))
     yield ReportSection("Date and signature", (Pairs((
@@ -251,8 +256,9 @@ _METHOD = (
     " degrees of freedom after Welch and Satterthwaite."
 )
 _BUDGET_NOTE = (
-    "u(x): standard uncertainty of the input quantity, kg·m²; ν: degrees of freedom; c·u: contribution to the relative"
-    " standard uncertainty of κ and of J (sensitivity coefficient times standard uncertainty)."
+    "u: standard uncertainty of the input quantity; ν: its degrees of freedom; c: magnitude of the relative sensitivity"
+    " coefficient of κ and of J, % per kg·m²; c·u: contribution to the relative standard uncertainty, %. “Filters of"
+    " the reports” acts on all runs together: its c is effective."
 )
 
 
@@ -280,21 +286,22 @@ def _results(document: Part) -> Table:
 def _factor_budget(document: Part) -> Table:
     rows = []
     for line in document["budget"]:
-        dof = line["degrees_of_freedom"]
-        rows.append((line["source"], f"{line['standard_uncertainty_kg_m2']:.3g}", line["distribution"],
-                     "∞" if dof > 1e4 else f"{dof:.0f}", f"{100 * line['of_factor']:.3f} %",
-                     f"{100 * line['of_inertia']:.3f} %"))
-    total = ("combined", "", "", "", *(
-        f"{100 * document[key]['standard_uncertainty'] / document[key]['value']:.3f} %"
-        for key in ("calibration_factor", "inertia_kg_m2")))
-    columns = (Column("input quantity", 0.36), Column("u(x), kg·m²", 0.15, True), Column("distribution", 0.13),
-               Column("ν", 0.08, True), Column("c·u of κ", 0.14, True), Column("c·u of J", 0.14, True))
-    return Table(columns, (*rows, total))
+        dof, sd = line["degrees_of_freedom"], line["standard_uncertainty_kg_m2"]
+        shares = [cell for key in ("of_factor", "of_inertia") for cell in (
+            f"{100 * line[key] / sd:.3g}" if sd > 0.0 else "", f"{100 * line[key]:.3f}")]
+        rows.append((line["source"], f"{sd:.3g}", line["distribution"], "∞" if dof > 1e4 else f"{dof:.0f}", *shares))
+    total = ["combined", "", "", ""]
+    for key in ("calibration_factor", "inertia_kg_m2"):
+        total += ["", f"{100 * document[key]['standard_uncertainty'] / document[key]['value']:.3f}"]
+    columns = (Column("input quantity X", 0.26), Column("u, kg·m²", 0.12, True), Column("distribution", 0.14),
+               Column("ν", 0.08, True), Column("c of κ", 0.1, True), Column("c·u of κ, %", 0.1, True),
+               Column("c of J", 0.1, True), Column("c·u of J, %", 0.1, True))
+    return Table(columns, (*rows, tuple(total)))
 
 
 def _data(document: Part) -> Table:
-    rows = tuple((Path(run["log"]).name, f"{run['added_kg_m2']:.5g}", f"{run['reported_kg_m2']:.5g}",
-                  f"{run['standard_uncertainty_kg_m2']:.2g}", f"{_residual(run):+.2g}")
+    rows = tuple((_name(run), f"{run['added_kg_m2']:.5g}", f"{run['reported_kg_m2']:.5g}",
+                  f"{run['standard_uncertainty_kg_m2']:.2g}", f"{_residual(run):+.2g}" if _residual(run) else "0")
                  for run in document["runs"])
     return Table((Column("recording", 0.36), *(Column(name, 0.16, True) for name in
                                               ("b, kg·m²", "y, kg·m²", "u(y)", "residual"))), rows)

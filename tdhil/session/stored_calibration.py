@@ -94,9 +94,17 @@ def other_drive(document: Mapping[str, Any], drive: Mapping[str, Any], settings:
 
 
 def with_calibration(run: Mapping[str, Any], recording: Recording, document: Mapping[str, Any], where: str,
-                     ) -> dict[str, Any]:
-    """The configuration with another calibration, for a replay. Raises UsageError where it is of another drive."""
-    changed = {**run, KEPT: dict(document)}
+                     sha256: str = "") -> dict[str, Any]:
+    """The configuration with another calibration, for a replay. Raises UsageError where it is of another drive.
+
+    ``sha256``: of the log. The noise of a log that the calibration comes from is in the calibration factor too.
+    """
+    from tdhil.calibration import OWN_LOG
+
+    runs = document.get("runs")
+    own = bool(sha256) and isinstance(runs, list) and any(
+        isinstance(one, Mapping) and one.get("sha256") == sha256 for one in runs)
+    changed = {**run, KEPT: {**document, OWN_LOG: True} if own else dict(document)}
     found = stored_of(changed)
     if found is None:
         raise UsageError("is no calibration", where=where, next_step=_AGAIN)

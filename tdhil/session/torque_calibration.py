@@ -62,6 +62,13 @@ def sha256_of_log(record: RunRecord) -> str:
         raise UsageError(f"can't be read ({error.strerror or error})", where=record.log) from error
 
 
+def _names(runs: Sequence[CalibrationRun]) -> list[str]:
+    """Return a short name of each run's log: the file's, or with its folder where two are the same."""
+    paths = [Path(run.record.log) for run in runs]
+    names = [path.name for path in paths]
+    return names if len(set(names)) == len(names) else [f"{path.parent.name}/{path.name}" for path in paths]
+
+
 def find_calibration(runs: Sequence[CalibrationRun], at: str, confidence: float = 0.95) -> CalibrationFound:
     """Result of all runs together. ``at``: the shaft that the bodies' inertia is given at, motor or main.
 
@@ -88,8 +95,8 @@ def find_calibration(runs: Sequence[CalibrationRun], at: str, confidence: float 
                         " the intervals are wider than need be")
     noise = np.sqrt(np.maximum(np.diag(known), 0.0)) / values
     bodies = tuple(
-        BodyRun(Path(run.record.log).name, run.added_kg_m2 / square, _sd(run) / square, float(share))
-        for run, share in zip(runs, noise, strict=True)
+        BodyRun(name, run.added_kg_m2 / square, _sd(run) / square, float(share))
+        for name, run, share in zip(_names(runs), runs, noise, strict=True)
     )
     case = CalibrationCase(
         bodies, values, covariance, known, dof, sharing, _unlike(runs, identified),
@@ -104,9 +111,10 @@ def document_of_calibration(found: CalibrationFound) -> dict[str, Any]:
 
     first = found.runs[0].record
     runs = tuple(
-        {"log": run.record.log, "sha256": sha256_of_log(run.record), "date": run.record.configuration.get("started"),
-         "added_kg_m2": run.added_kg_m2, "added_sd_kg_m2": run.added_sd_kg_m2}
-        for run in found.runs
+        {"log": run.record.log, "name": name, "sha256": sha256_of_log(run.record),
+         "date": run.record.configuration.get("started"), "added_kg_m2": run.added_kg_m2,
+         "added_sd_kg_m2": run.added_sd_kg_m2}
+        for name, run in zip(_names(found.runs), found.runs, strict=True)
     )
     dates = [str(run["date"]) for run in runs if run["date"]]
     return calibration_document(
@@ -196,7 +204,7 @@ def _refusal(runs: Sequence[CalibrationRun], identified: Sequence[Identification
     from tdhil.estimation import Verdict
     from tdhil.recording import aborted_stage
 
-    for run, found in zip(runs, identified, strict=True):
+    for name, run, found in zip(_names(runs), runs, identified, strict=True):
         verdict, reason, advice = Verdict.NOT_IDENTIFIABLE, "", "run it again, and calibrate with the new log"
         stage = aborted_stage(run.record.recording)
         if stage is not None:
@@ -212,7 +220,7 @@ def _refusal(runs: Sequence[CalibrationRun], identified: Sequence[Identification
             reason = f"the shaft is not rigid in it (model {found.model}): the body does not turn as one with the motor"
             advice = "bolt the body tight to the motor's shaft, and run it again"
         if reason:
-            return TorqueCalibration(verdict, f"{Path(run.record.log).name} can't be used: {reason}", advice)
+            return TorqueCalibration(verdict, f"the log {name} can't be used: {reason}", advice)
     return None
 
 
@@ -246,7 +254,7 @@ def _unlike(runs: Sequence[CalibrationRun], identified: Sequence[Identification]
         low, high = (pick(known, key=lambda part: part.value) for pick in (min, max))
         width = 0.5 * math.hypot(high.high - high.low, low.high - low.low) or 1e-9
         found.append(((high.value - low.value) / width,
-                      f": the {text} is {known[0].value:.3f} s in {Path(runs[0].record.log).name} and"
+                      f": the {text} is {known[0].value:.3f} s in {_names(runs)[0]} and"
                       f" {max(known[1:], key=lambda one: abs(one.value - known[0].value)).value:.3f} s in another run"))
     return max(found)[1] if found else ""
 

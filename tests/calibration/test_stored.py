@@ -100,3 +100,14 @@ def test_a_log_that_was_calibrated_before_is_calibrated_from_the_drives_own_unit
                                                                    "torque_calibration": document}))
             for one in two(tmp_path)]
     assert find_calibration(runs, "motor").calibration.factor.value == document["calibration_factor"]["value"]
+
+
+def test_a_log_of_the_calibration_itself_is_no_better_known_than_the_calibration(document):
+    """Its noise is in the factor and in J, with the same sign: the squares alone would be too narrow."""
+    own = with_calibration(RUN, recording(0.0, 1), document, "calibration.json", document["runs"][0]["sha256"])
+    other = with_calibration(RUN, recording(0.0, 1), document, "calibration.json", "0" * 64)
+    assert other["torque_calibration"] == document
+    found, plain = (conclude(recording(0.0, 1), run, "run.mcap").identification.inertia for run in (own, other))
+    of_calibration = document["inertia_kg_m2"]
+    assert found.high_total - found.low_total >= of_calibration["high"] - of_calibration["low"]
+    assert found.high_total - found.low_total > plain.high_total - plain.low_total

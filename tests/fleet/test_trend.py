@@ -13,7 +13,7 @@ from tdhil.cli.main import main
 from tdhil.errors import UsageError
 from tdhil.fleet.rows import FleetRow
 from tdhil.fleet.table import write_table
-from tdhil.fleet.trend import trend_document
+from tdhil.fleet.trend import scale_of, trend_document
 
 
 def rows(kind, count=24, serial=7):
@@ -69,6 +69,27 @@ def test_what_was_left_out_and_assumed_is_said():
         trend_document([FleetRow("other.mcap", "valid")])
     with pytest.raises(UsageError, match="There are: R7"):
         trend_document(found, "R9")
+
+
+def test_runs_before_and_after_a_calibration_are_kept_apart():
+    """A calibration moves J by 5 %: the torque scale of each side is in the difference, and no shaft has changed."""
+    found, _ = rows("none")
+    half = len(found) // 2
+    day = "2026-01-12T10:00:00+00:00"
+    after = [replace(one, inertia_kg_m2=1.05 * one.inertia_kg_m2, inertia_low_kg_m2=1.05 * one.inertia_low_kg_m2,
+                     inertia_high_kg_m2=1.05 * one.inertia_high_kg_m2, torque_calibration=day,
+                     torque_scale_rel_sd=0.005) for one in found[half:]]
+    plain = [replace(one, torque_calibration=None, torque_scale_rel_sd=0.03) for one in after]
+
+    def inertia(mine):
+        document = trend_document(mine)
+        return next(one for one in document["quantities"] if one["name"] == "inertia"), " ".join(document["notes"])
+
+    apart, said = inertia(found[:half] + after)
+    assert apart["changes"] == [] and "different torque calibrations (none, 2026-01-12)" in said
+    together, said = inertia(found[:half] + plain)
+    assert len(together["changes"]) == 1 and "torque calibrations" not in said
+    assert scale_of(after[0]) != scale_of(found[0]) == scale_of(plain[0])
 
 
 def test_dates_of_a_trend_s_picture_can_be_read(tmp_path):

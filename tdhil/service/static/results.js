@@ -338,6 +338,8 @@
     });
   }
 
+  const sentence = (text) => `${text.charAt(0).toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
+
   function calibrated(found) {
     const factor = found.calibration_factor, J = found.inertia_kg_m2, share = (one) => percent(0.5 * (one.high - one.low) / one.value);
     const rows = [["verdict", found.verdict]];
@@ -345,8 +347,8 @@
     for (const one of found.runs) if (one.reported_kg_m2 !== undefined) rows.push([`${number(one.added_kg_m2)} kg·m² added`, `${number(one.reported_kg_m2)} kg·m² as reported`]);
     const parts = [el("div", { class: "card" }, el("p", { class: "figure" }, factor ? `κ = ${of(factor)}` : found.verdict),
       region("Numbers", el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => line(name, [text]))))),
-      el("p", {}, found.reason), found.advice ? el("p", {}, found.advice) : null)];
-    for (const one of found.warnings) parts.push(el("p", { class: "alarm" }, one));
+      el("p", {}, sentence(found.reason)), found.advice ? el("p", {}, sentence(found.advice)) : null)];
+    for (const one of found.warnings) parts.push(el("p", { class: "alarm" }, sentence(one)));
     if (!factor) return parts;
     parts.push(el("h3", {}, "Uncertainty budget"), region("Uncertainty budget", el("table", {},
       el("thead", {}, el("tr", {}, ...["", "± % of κ", "± % of J"].map((one) => el("th", { scope: "col" }, one)))),
