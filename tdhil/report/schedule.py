@@ -143,9 +143,7 @@ def schedule_section(document: Part) -> ReportSection:
                 "Gains and critical speed over depth. Crosses: interpolated gains, checked halfway between two rows."),
     ]
     if parameters:
-        titles = [one["title"] for one in _with_gains(document)[0]["drive_parameters"]]
-        blocks.append(Table((Column("depth, m", 0.2, number=True),
-                             *(Column(title, 0.8 / len(titles), number=True) for title in titles)), parameters))
+        blocks.append(Table((Column("depth, m", 0.15), Column("parameter", 0.55), Column("value", 0.3)), parameters))
     return ReportSection(f"Gains over depth ({document['kind']}, at the motor shaft)", tuple(blocks))
 
 
@@ -184,11 +182,9 @@ def _table(document: Part) -> Iterator[list[str]]:
 
 def _parameter_rows(document: Part) -> Iterator[tuple[str, ...]]:
     for one in _with_gains(document):
-        settings = one["drive_parameters"]
-        if settings:
-            yield (f"{one['depth_m']:.0f}", *(
-                setting["why"] if setting["value"] is None else f"{gain_words(setting['value'])} {setting['unit']}"
-                for setting in settings))
+        for setting in one["drive_parameters"]:
+            value = setting["why"] if setting["value"] is None else f"{gain_words(setting['value'])} {setting['unit']}"
+            yield f"{one['depth_m']:.0f}", setting["title"], value
 
 
 def draw_schedule(figure: FigureBase, document: Part) -> None:

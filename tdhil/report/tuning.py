@@ -452,7 +452,7 @@ class Showcase:
 
 
 def showcase_of(tuning: Tuning, seconds: float = 60.0) -> Showcase | None:
-    """At a set speed at which the stiff loop leaves the bit sticking and the best tuned one frees it; None: no such."""
+    """At a set speed at which the stiff loop leaves the bit sticking and the advised one frees it; None: no such."""
     import numpy as np
 
     found = {one.kind: one for one in tuning.tuned if one.controller is not None and one.quiet_cures}
@@ -461,7 +461,8 @@ def showcase_of(tuning: Tuning, seconds: float = 60.0) -> Showcase | None:
              if kind not in ("stiff", "present") and one.quiet_cure_rpm]
     if stiff is None or not tuned or tuning.searched is None:
         return None
-    best = min(tuned, key=lambda one: one.quiet_cure_rpm or math.inf)
+    advised = [one for one in tuned if one.kind == tuning.advice.kind]
+    best = min(advised or tuned, key=lambda one: one.quiet_cure_rpm or math.inf)
     assert best.quiet_cure_rpm is not None
     above = stiff.quiet_cure_rpm or tuning.searched.highest_rpm
     if above < 1.1 * best.quiet_cure_rpm:
