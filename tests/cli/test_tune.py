@@ -330,7 +330,7 @@ def test_depths_that_are_none_are_refused(tuned, text):
 
 def test_a_schedule_needs_the_string(tuned):
     code, document, _ = tuned("--depths", "500:1000:250", string=None)
-    assert code == ExitCode.USAGE and "--string" in document["error"]["next_step"]
+    assert code == ExitCode.USAGE and "--string string.yaml" in json.dumps(document)
 
 
 def test_the_picture_of_a_schedule_is_drawn(tmp_path):
