@@ -37,6 +37,8 @@ CONTROL_PERIOD_S, DEAD_TIME_PERIODS = 0.002, 10.0
 """Assumed control period of an inverter's speed loop, s; and the dead-time reserve in such periods."""
 STATED_LAG_TOLERANCE, ASSUMED_LAG_TOLERANCE = 0.1, 0.5
 """Relative uncertainty of each lag that was not measured."""
+MOST_DEPTHS = 60
+"""Depths of one schedule: each takes some seconds."""
 IDENTIFIED_DRAWS, IDENTIFIED_SEED = 20, 3
 MOST_IMPEDANCE_SPREAD = 0.15
 """Relative half-width of ζ up to which an identified pipe counts as known."""
@@ -75,6 +77,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="rated torque of the motor, for gains in %%")
     parser.add_argument("--rated-speed", type=amount(RPM), metavar="RPM",
                         help="rated speed of the motor, for gains in %%")
+    parser.add_argument("--depths", type=depths, metavar="FROM:TO:STEP",
+                        help="gains over the depth of the well, m: the topmost section of string.yaml gets longer, "
+                        "for example 500:6000:250")
     parser.add_argument("--no-simulation", action="store_true", help="omit the critical speeds")
     add_option(parser, OPTION["json"])
     parser.add_argument("--report", type=Path, metavar="FILE", help="write a report with pictures: tune.html, or "
@@ -110,6 +115,8 @@ def run(namespace: argparse.Namespace) -> int:
     tuning = tune(case, None if namespace.no_simulation else Search(), tell)
     tuned_for = _tuned_for(result, namespace, tuning, lags_from, profile)
     document = tuning_document(tuning, tuned_for)
+    if namespace.depths is not None:
+        document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, profile, tell)
     if namespace.json:
         print_json(document)
     else:
@@ -139,10 +146,54 @@ def _check(namespace: argparse.Namespace) -> None:
     if namespace.present is not None and namespace.impedance is not None:
         raise UsageError("--present and --impedance both state the present gains", where="--present",
                          next_step="Leave one of them out", entry=MessageCode.VALUE_NOT_ALLOWED)
+    if namespace.depths is not None and namespace.string is None:
+        raise UsageError("--depths needs the string: its topmost section gets longer", where="--depths",
+                         next_step="--string string.yaml", entry=MessageCode.STRING_MISSING)
     for lag in namespace.inner_lags or ():
         if not 0.0 <= lag <= 5.0:
             raise UsageError(f"{lag:g}: must be a time from 0 to 5 s", where="--inner-lags",
                              entry=MessageCode.VALUE_NOT_ALLOWED)
+
+
+def depths(text: str) -> tuple[float, ...]:
+    """Return the depths of FROM:TO:STEP in m, both ends included."""
+    try:
+        begin, end, step = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text[:40]}: is not FROM:TO:STEP, for example 500:6000:250") from None
+    if not (0.0 < begin < end <= 20_000.0 and 0.0 < step <= end - begin):
+        raise argparse.ArgumentTypeError(f"{text[:40]}: FROM must be below TO, both up to 20000 m, and STEP not larger "
+                                         "than their difference")
+    found = [begin]
+    while found[-1] + step < end - 1e-9:
+        found.append(found[-1] + step)
+    if len(found) + 1 > MOST_DEPTHS:
+        raise argparse.ArgumentTypeError(f"{text[:40]}: has {len(found) + 1} depths; at most {MOST_DEPTHS}")
+    return (*found, end)
+
+
+def _schedule(
+    case: TuneCase, namespace: argparse.Namespace, ratio: float, profile: Profile | None, tell: Callable[[str], None]
+) -> dict[str, Any]:
+    """Return gains over depth: soft ones, which any drive takes, or compensated ones if --compensate asks for them."""
+    from tdhil.report import schedule_document
+    from tdhil.soft_torque import at_depth, drive_settings, schedule
+
+    try:
+        at_depth(case.string, namespace.depths[0])
+    except ValueError as error:
+        raise UsageError(str(error), where="--depths", next_step="Begin deeper than that",
+                         entry=MessageCode.VALUE_NOT_ALLOWED) from None
+    found = schedule(case, namespace.depths, "compensated" if namespace.compensate else "soft",
+                     simulated=not namespace.no_simulation, told=tell)
+    parameters = profile.speed_controller if profile is not None and namespace.loop == "drive" else None
+
+    def settings(law: SpeedController) -> Sequence[DriveSetting]:
+        if parameters is None:
+            return ()
+        return drive_settings(parameters, law, namespace.rated_torque, namespace.rated_speed)
+
+    return schedule_document(found, ratio, settings)
 
 
 def read_result(path: Path) -> Mapping[str, Any]:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         draw_calibration as draw_calibration, pairs_document as pairs_document, print_calibration as print_calibration,
         print_pairs as print_pairs, write_calibration_report as write_calibration_report,
     )
+    from tdhil.report.schedule import schedule_document as schedule_document
     from tdhil.report.tuning import (
         TunedFor as TunedFor, print_tuning as print_tuning, showcase_of as showcase_of,
         tuning_document as tuning_document, write_tuning_report as write_tuning_report,

@@ -18,13 +18,14 @@ from tdhil.report.card import with_interval
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED
 from tdhil.report.html import write_blocks
+from tdhil.report.schedule import finite, gain_words, noisy_speed, print_schedule, schedule_section, spread_document
 from tdhil.soft_torque import (
     BAND_HZ,
     HIGHEST_NOISY_RPM,
     NOISY_RESOLUTION,
     RPM,
+    START_DRAWS,
     Begin,
-    CriticalSpeeds,
     DrawnValues,
     DriveSetting,
     Interval,
@@ -55,7 +56,6 @@ SIMULATION_ERROR_RPM, SIMULATION_ERROR_SHARE = 0.5, 0.015
 """Of a critical speed: half of the search's step, and what the tick and the length of the simulation move it by
 (the stiff loop of the reference case: 182 for 183; collars as sections: 1.5 %)."""
 _COLOURS = {"present": "0.25", "stiff": "#c2410c", "soft": "#1f5fa8", "compensated": "#1a7f37", "broadband": "#7c3aed"}
-_CRITICAL = ("cure", "start")
 _IN_BRACKETS = "95 % interval over J, string, lags and bit drawn together; ψ: over J alone, the string as stated"
 _MEANT = {
     "cure": "lowest set speed from which a stuck bit ends turning, the top at full speed",
@@ -64,7 +64,7 @@ _MEANT = {
 _EXPLAINED = {
     "P, I, J_c": "gains in N·m·s/rad, N·m/rad and kg·m², at the main shaft and at the motor shaft",
     "critical": "lowest set speed from which a stuck bit, under bit noise, ends turning",
-    "by ramp": "the same after a ramp of the set speed from rest",
+    "by ramp": f"the same after a ramp of the set speed from rest, on {START_DRAWS} of the draws",
     "linear": "mean speed below which steady rotation is unstable, without noise",
     "phase margin": "phase that the loop with the string on it may lose; this and the next two: the least of all "
                     "sampled machines and strings",
@@ -129,7 +129,7 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
             "modes_hz": list(tuning.string_modes_hz),
             "bottom_inertia_kg_m2": string.bottom_inertia_kg_m2,
             "bit": None if string.bit is None else {
-                **_finite(asdict(string.bit)), "viscous_nm_s_rad": string.bottom_viscous_nm_s_rad,
+                **finite(asdict(string.bit)), "viscous_nm_s_rad": string.bottom_viscous_nm_s_rad,
                 "words": f"{string.bit.describe()}, viscous {string.bottom_viscous_nm_s_rad:g} N·m·s/rad",
             },
         },
@@ -145,6 +145,7 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
             "start_ramp_rpm_s": search.start_ramp_rpm_s,
             "under_noise": {
                 "noise_nm": string.bit.noise_nm if string.bit else 0.0, "draws": len(tuning.truths),
+                "start_draws": min(START_DRAWS, len(tuning.truths)),
                 "resolution_share": NOISY_RESOLUTION, "highest_rpm": HIGHEST_NOISY_RPM,
             },
         },
@@ -185,7 +186,7 @@ def _controller(one: Tuned, ratio: float, settings: Sequence[DriveSetting]) -> d
         **head,
         "a": one.softness, "softest_a": _number(one.softest),
         "compensated_share": one.compensated_share, "largest_share": one.largest_share,
-        "at_main_shaft": _gains(law), "at_motor": _gains(law.at_shaft(ratio)),
+        "at_main_shaft": gains_document(law), "at_motor": gains_document(law.at_shaft(ratio)),
         "integral_nm_rad_by_inertia": None if one.integral_nm_rad is None else asdict(one.integral_nm_rad),
         "drive_parameters": [asdict(setting) for setting in settings],
         "reflection_at_lowest_mode": asdict(one.reflection),
@@ -198,38 +199,25 @@ def _controller(one: Tuned, ratio: float, settings: Sequence[DriveSetting]) -> d
         "dead_time_reserve_s": one.dead_time_reserve_s,
         "frequency_factor": one.frequency_factor,
         "margins": None if one.worst is None or one.with_string is None else {
-            "as_believed": _finite(asdict(one.with_string)), "worst": _finite(asdict(one.worst)),
+            "as_believed": finite(asdict(one.with_string)), "worst": finite(asdict(one.worst)),
             "failed": list(one.failed),
         },
         "critical_under_noise_rpm": None if one.cure is None or one.start is None else {
-            "cure": _spread(one.cure, NOISY_RESOLUTION), "start": _spread(one.start, NOISY_RESOLUTION),
+            "cure": spread_document(one.cure, NOISY_RESOLUTION), "start": spread_document(one.start, NOISY_RESOLUTION),
         },
-        "linear_limit_rpm": None if one.linear_limit is None else _spread(one.linear_limit, 0.0),
-        "critical_rpm": None if one.critical is None else {
-            name: _critical_part(one, name) for name in _CRITICAL
-        },
+        "linear_limit_rpm": None if one.linear_limit is None else spread_document(one.linear_limit, 0.0),
+        "critical_rpm": {"cure": _quiet_part(one)} if one.quiet_cures else None,
         "inertia_wrong_by": [asdict(wrong) for wrong in one.wrong],
     }
 
 
-def _spread(spread: DrawnValues, resolution_share: float) -> dict[str, float | None]:
-    """Median of the sampled truths and 95 % interval; None: above the highest that was tried."""
-    median = spread.median
-    low, high = spread.interval(resolution_share * (median or 0.0))
-    return {"value": median, "low": low, "high": high}
-
-
-def _critical_part(one: Tuned, name: str) -> dict[str, float | None]:
+def _quiet_part(one: Tuned) -> dict[str, float | None]:
     """Value, and ends over all that has an interval; None: not found below the highest speed tried.
 
     The ends include the search's resolution and the error of the simulation's grid.
     """
-    def of(speeds: CriticalSpeeds | None) -> float | None:
-        found: float | None = None if speeds is None else getattr(speeds, f"{name}_rpm")
-        return found
-
-    value, ends = of(one.critical), [of(one.critical), *(of(one) for one in one.critical_along)]
-    pairs = [[of(end) for end in pair] for pair in one.critical_moved]
+    value, ends = one.quiet_cure_rpm, one.quiet_cures
+    pairs = one.quiet_cures_moved
     known = [end for end in ends if end is not None]
     if value is None or len(known) < len(ends) or any(end is None for pair in pairs for end in pair):
         known += [end for pair in pairs for end in pair if end is not None]
@@ -289,7 +277,7 @@ def _degrees(value: float) -> str:
     return f"{value:.0f}°" if math.isfinite(value) else "none needed"
 
 
-def _gains(law: SpeedController) -> dict[str, float]:
+def gains_document(law: SpeedController) -> dict[str, float]:
     return {
         "gain_nm_s_rad": law.gain_nm_s_rad, "integral_nm_rad": law.integral_nm_rad,
         "compensated_kg_m2": law.compensated_kg_m2, "derivative_filter_s": law.derivative_filter_s,
@@ -298,11 +286,6 @@ def _gains(law: SpeedController) -> dict[str, float]:
 
 def _number(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
-
-
-def _finite(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value if not isinstance(value, float) or math.isfinite(value) else None
-            for name, value in values.items()}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -330,6 +313,8 @@ def print_tuning(document: Part, console: PlainConsole) -> None:
     for name, cells in _rows(document):
         grid.add_row(name, *(Words(cell[1:], style="bold red") if cell.startswith("!") else cell for cell in cells))
     console.print(grid)
+    if document.get("schedule"):
+        print_schedule(document["schedule"], console)
     console.print(names_and_texts(_legend(document), quiet=True))
     for one in document["controllers"]:
         if one["refused"]:
@@ -386,14 +371,14 @@ def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
     ratio = document["tuned_for"]["gear_ratio"]
     shafts = [("at_main_shaft", ", main"), ("at_motor", ", motor")] if ratio != 1.0 else [("at_motor", "")]
     for key, shaft in shafts:
-        yield f"P{shaft}", [_gain(one[key]["gain_nm_s_rad"]) for one in taken]
-        yield f"I{shaft}", [_gain(one[key]["integral_nm_rad"]) for one in taken]
+        yield f"P{shaft}", [gain_words(one[key]["gain_nm_s_rad"]) for one in taken]
+        yield f"I{shaft}", [gain_words(one[key]["integral_nm_rad"]) for one in taken]
         if any(one[key]["compensated_kg_m2"] for one in taken):
-            yield f"J_c{shaft}", [_gain(one[key]["compensated_kg_m2"]) for one in taken]
+            yield f"J_c{shaft}", [gain_words(one[key]["compensated_kg_m2"]) for one in taken]
     noise = document["critical_speeds"] is not None
     if noise:
-        yield "critical, rpm", [_noisy_speed(one["critical_under_noise_rpm"]["cure"]) for one in taken]
-        yield "  by ramp, rpm", [_noisy_speed(one["critical_under_noise_rpm"]["start"]) for one in taken]
+        yield "critical, rpm", [noisy_speed(one["critical_under_noise_rpm"]["cure"]) for one in taken]
+        yield "  by ramp, rpm", [noisy_speed(one["critical_under_noise_rpm"]["start"]) for one in taken]
         yield "  linear, rpm", [_interval(one["linear_limit_rpm"], 0) for one in taken]
     yield "phase margin", [_margin(one, "phase_deg", "{:.0f}°") for one in taken]
     yield "gain margin, dB", [_margin(one, "gain_db", "{:.1f}") for one in taken]
@@ -409,18 +394,6 @@ def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
     for k, error in enumerate(wrong["error"] for wrong in wrongs):
         yield (f"J {100 * error:+.3g} % wrong",
                [_wrong(one["inertia_wrong_by"][k]) if one["inertia_wrong_by"] else "–" for one in taken])
-
-
-def _gain(value: float) -> str:
-    """Four digits, and no power of ten."""
-    return f"{value:.0f}" if value >= 1e3 else f"{value:.4g}"
-
-
-def _noisy_speed(part: Part) -> str:
-    if part["value"] is None:
-        return f"> {HIGHEST_NOISY_RPM:.0f}"
-    high = f"> {HIGHEST_NOISY_RPM:.0f}" if part["high"] is None else f"{part['high']:.0f}"
-    return f"{part['value']:.0f} ({part['low']:.0f}–{high})"
 
 
 _LIMIT_OF = {"phase_deg": "phase margin", "gain_db": "gain margin", "dead_time_s": "dead-time reserve"}
@@ -460,7 +433,7 @@ def _setting_rows(document: Part) -> Iterator[tuple[str, str, str]]:
         own = [one["drive_parameters"][k] for one in taken]
         first = own[0]
         values = first["why"] if first["value"] is None else ", ".join(
-            f"{one['kind']} {_gain(setting['value'])}" for one, setting in zip(taken, own, strict=True)
+            f"{one['kind']} {gain_words(setting['value'])}" for one, setting in zip(taken, own, strict=True)
         ) + f" {first['unit']}"
         yield first["title"], values, first["confidence"]
 
@@ -479,21 +452,22 @@ class Showcase:
 
 
 def showcase_of(tuning: Tuning, seconds: float = 60.0) -> Showcase | None:
-    """At a set speed at which the stiff loop leaves the bit sticking and the best tuned one frees it; None: no such."""
+    """At a set speed at which the stiff loop leaves the bit sticking and the advised one frees it; None: no such."""
     import numpy as np
 
-    found = {one.kind: one for one in tuning.tuned if one.controller is not None and one.critical is not None}
+    found = {one.kind: one for one in tuning.tuned if one.controller is not None and one.quiet_cures}
     stiff = found.get("stiff")
     tuned = [one for kind, one in found.items()
-             if kind not in ("stiff", "present") and one.critical and one.critical.cure_rpm]
-    if stiff is None or stiff.critical is None or not tuned or tuning.searched is None:
+             if kind not in ("stiff", "present") and one.quiet_cure_rpm]
+    if stiff is None or not tuned or tuning.searched is None:
         return None
-    best = min(tuned, key=lambda one: one.critical.cure_rpm if one.critical and one.critical.cure_rpm else math.inf)
-    assert best.critical is not None and best.critical.cure_rpm is not None
-    above = stiff.critical.cure_rpm or tuning.searched.highest_rpm
-    if above < 1.1 * best.critical.cure_rpm:
+    advised = [one for one in tuned if one.kind == tuning.advice.kind]
+    best = min(advised or tuned, key=lambda one: one.quiet_cure_rpm or math.inf)
+    assert best.quiet_cure_rpm is not None
+    above = stiff.quiet_cure_rpm or tuning.searched.highest_rpm
+    if above < 1.1 * best.quiet_cure_rpm:
         return None
-    rpm = float(round(math.sqrt(above * best.critical.cure_rpm)))
+    rpm = float(round(math.sqrt(above * best.quiet_cure_rpm)))
     loops = [(tuning.case.drive, one.controller) for one in (stiff, best) if one.controller is not None]
     target = np.full((len(loops), 1), rpm * RPM)
     trace = simulate(tuning.case.string, loops, Begin("stuck", target), target, 1.0, seconds, 0.05)
@@ -541,6 +515,8 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
             Text("Nothing here was written into any drive. Change one thing at a time, at a low speed, with the "
                  "hard-wired stop in reach."),
         )))
+    if document.get("schedule"):
+        sections.append(schedule_section(document["schedule"]))
     rests: list[tuple[str, str]] = list(_rests_on(document))
     rests += [("from", document["tuned_for"]["source"]), ("profile", document["tuned_for"]["profile"] or "none")]
     rests += _legend(document)
@@ -569,7 +545,7 @@ def _answer(best: Part | None, document: Part) -> AnswerBox:
     if gains["compensated_kg_m2"]:
         told.append(f"inertia compensation J_c = {gains['compensated_kg_m2']:.4g} kg·m², its derivative filtered by "
                      f"{1e3 * gains['derivative_filter_s']:g} ms")
-    headline = f"P = {_gain(gains['gain_nm_s_rad'])} N·m·s/rad, I = {_gain(gains['integral_nm_rad'])} N·m/rad"
+    headline = f"P = {gain_words(gains['gain_nm_s_rad'])} N·m·s/rad, I = {gain_words(gains['integral_nm_rad'])} N·m/rad"
     required = document["required_margins"]
     verdict = (f"keeps {required['phase_deg']:.0f}°, {required['gain_db']:g} dB and "
                f"{1e3 * required['dead_time_s']:.0f} ms on every sampled machine and string")

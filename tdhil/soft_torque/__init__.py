@@ -53,7 +53,10 @@ if TYPE_CHECKING:
         BAND_HZ as BAND_HZ, figures_at as figures_at, in_squares as in_squares, least_damping as least_damping,
         lowest_modes_below_hz as lowest_modes_below_hz, recipe_with as recipe_with, string_modes_hz as string_modes_hz,
     )
-    from tdhil.soft_torque.tuning import tune as tune
+    from tdhil.soft_torque.tuning import START_DRAWS as START_DRAWS, tune as tune
+    from tdhil.soft_torque.depth_schedule import (
+        DepthRow as DepthRow, DepthSchedule as DepthSchedule, at_depth as at_depth, schedule as schedule,
+    )
     from tdhil.soft_torque.virtual_string import (
         COLUMNS as COLUMNS, ProgramCourse as ProgramCourse, HostController as HostController, HostLoop as HostLoop,
         RotorObserver as RotorObserver, Phase as Phase, SpeedProgram as SpeedProgram, IdentifiedRig as IdentifiedRig,

@@ -23,7 +23,7 @@ LOWEST_RATE_HZ = 20.0
 MOST_CROSSOVER = 0.35
 """P/J times a cycle: a controller as quick as that swings by the cycle alone."""
 MOST_LAG_S, MOST_LAG_ERROR_S = 0.5, 0.05
-"""Of the reported speed: beyond them nobody has shown that the loop is the string's and not the observer's."""
+"""Of the reported speed: beyond them it is not known whether the loop is the string's and not the observer's."""
 LEAST_DRAG_NM_S_RAD_M = 0.001
 """Of the virtual mud, per metre: what the loop's own errors put into the string has to go somewhere."""
 
@@ -288,7 +288,7 @@ def _verdict(
         return EvaluationOutcome.INVALID, f"the torque limit cut the virtual string's torque off in {clamped} cycles"
     if foreign > FOREIGN_SHARE:
         return EvaluationOutcome.INVALID, (
-            f"{unknown_nm:.0f} N·m rms of torque that nobody commanded, {100.0 * foreign:.0f} % of what moved the "
+            f"{unknown_nm:.0f} N·m rms of torque that was not commanded, {100.0 * foreign:.0f} % of what moved the "
             "shaft: " + ("the drive's gains are not these, or " if case.own_loop else "")
             + "inertia, friction or lags are not those of the result")
     if not did_stick:

@@ -85,7 +85,7 @@ def soft(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> list[T
 
 
 def compensated(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> list[Tuned]:
-    """As `soft`, with a share of J compensated."""
+    """Return what `soft` does, with a share of J compensated."""
     asked = case.compensated_share
     if case.string.supposed:
         if asked:
@@ -136,7 +136,7 @@ def _within_margins(case: TuneCase, grid: Sequence[Candidate], samples: TruthMar
 
 
 def _no_margin(case: TuneCase, samples: TruthMargins, law: SpeedController) -> str:
-    """What fails on the worst of the truths."""
+    """Name the margins that fail on the worst of the truths."""
     worst = samples.every(law)
     return ", ".join(case.required.failed(worst) or ("too soft for these lags",)) + (
         f" over J's interval, string, bit and {_lag_ms(case)} of lag{_no_drag(case)}")

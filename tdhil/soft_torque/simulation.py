@@ -31,9 +31,10 @@ No torque limit is simulated.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import ceil, e, pi, sqrt
+from functools import lru_cache
+from math import ceil, e, log, pi, sqrt
 from typing import Literal
 
 import numpy as np
@@ -390,15 +391,12 @@ class _Top:
     """Rotor, controller and lags; (loops, speeds, states)."""
 
     def __init__(self, loops: Sequence[Loop], grids: Sequence[Grid], speeds: int) -> None:
-        from scipy.linalg import expm
-
         self._lags = max(1, *(len(drive.inner_lags_s) for drive, _ in loops))
         self._size = size = 4 + self._lags
         ticks = np.array([grid.tick_s for grid in grids])
         self._impedance = np.array([grid.impedance_nm_s_rad[0] for grid in grids])[:, None]
-        matrices = np.array([self._matrix(*loop, grid) for loop, grid in zip(loops, grids, strict=True)])
         # right factors: (states + inputs) → states
-        step = np.swapaxes(expm(matrices * ticks[:, None, None])[:, :size], 1, 2)
+        step = np.array([_top_step(*loop, grid, self._lags)[:size].T for loop, grid in zip(loops, grids, strict=True)])
         step[:, :, 3] /= ticks[:, None]      # ∫ω dt over the tick becomes its mean
         step[:, 3] = 0.0                     # and begins anew with each
         self._step, self._of_inputs = np.ascontiguousarray(step[:, :size]), step[:, None, size:]
@@ -407,30 +405,6 @@ class _Top:
         self._own_dry = np.array([drive.coulomb_nm for drive, _ in loops])[:, None]
         self._viscous = np.array([drive.viscous_nm_s_rad for drive, _ in loops])[:, None]
         self._state = np.zeros((len(loops), speeds, size))
-
-    def _matrix(self, drive: TopDrive, controller: SpeedController, grid: Grid) -> Array:
-        """Of states ω, ∫e·I, filtered ω, ∫ω dt, lags; and the inputs wave, dry friction, set speed."""
-        size = self._size
-        law = np.zeros((size + 3, size + 3))
-        wave, dry, wanted = size, size + 1, size + 2
-        lags = [lag for lag in drive.inner_lags_s if lag > 0.0]
-        lags += [1e-4] * (self._lags - len(lags))
-        inertia = drive.inertia_kg_m2
-        felt = grid.impedance_nm_s_rad[0] + 0.5 * grid.drag_nm_s_rad[0]
-        law[0, 0] = -(drive.viscous_nm_s_rad + felt) / inertia
-        law[0, 3 + self._lags] = law[0, wave] = law[0, dry] = 1.0 / inertia
-        law[1, 0], law[1, wanted] = -controller.integral_nm_rad, controller.integral_nm_rad
-        filter_s = controller.derivative_filter_s
-        law[2, 0], law[2, 2] = 1.0 / filter_s, -1.0 / filter_s
-        law[3, 0] = 1.0
-        back = controller.compensated_kg_m2 / filter_s
-        law[4, 0], law[4, wanted] = back - controller.gain_nm_s_rad, controller.gain_nm_s_rad
-        law[4, 1], law[4, 2] = 1.0, -back
-        law[4] /= lags[0]
-        law[4, 4] -= 1.0 / lags[0]
-        for number, lag in enumerate(lags[1:], start=5):
-            law[number, number - 1], law[number, number] = 1.0 / lag, -1.0 / lag
-        return law
 
     @property
     def torque_nm(self) -> Array:
@@ -459,6 +433,35 @@ class _Top:
         self._state = after
         mean = after[:, :, 3]
         return (2.0 * self._impedance * mean - wave).ravel(), mean
+
+
+@lru_cache(maxsize=2048)
+def _top_step(drive: TopDrive, controller: SpeedController, grid: Grid, most_lags: int) -> Array:
+    """Return what a tick makes of ω, ∫e·I, filtered ω, ∫ω dt, lags; and of the inputs wave, dry friction, set speed."""
+    from scipy.linalg import expm
+
+    size = 4 + most_lags
+    law = np.zeros((size + 3, size + 3))
+    wave, dry, wanted = size, size + 1, size + 2
+    lags = [lag for lag in drive.inner_lags_s if lag > 0.0]
+    lags += [1e-4] * (most_lags - len(lags))
+    inertia = drive.inertia_kg_m2
+    felt = grid.impedance_nm_s_rad[0] + 0.5 * grid.drag_nm_s_rad[0]
+    law[0, 0] = -(drive.viscous_nm_s_rad + felt) / inertia
+    law[0, 3 + most_lags] = law[0, wave] = law[0, dry] = 1.0 / inertia
+    law[1, 0], law[1, wanted] = -controller.integral_nm_rad, controller.integral_nm_rad
+    filter_s = controller.derivative_filter_s
+    law[2, 0], law[2, 2] = 1.0 / filter_s, -1.0 / filter_s
+    law[3, 0] = 1.0
+    back = controller.compensated_kg_m2 / filter_s
+    law[4, 0], law[4, wanted] = back - controller.gain_nm_s_rad, controller.gain_nm_s_rad
+    law[4, 1], law[4, 2] = 1.0, -back
+    law[4] /= lags[0]
+    law[4, 4] -= 1.0 / lags[0]
+    for number, lag in enumerate(lags[1:], start=5):
+        law[number, number - 1], law[number, number] = 1.0 / lag, -1.0 / lag
+    found: Array = expm(law * grid.tick_s)
+    return found
 
 
 class _Bit:
@@ -551,8 +554,8 @@ class Search:
     """How critical speeds are looked for."""
 
     highest_rpm: float = 240.0
-    lowest_rpm: float = 8.0
-    coarse_rpm: float = 8.0
+    lowest_rpm: float = 0.0
+    coarse_rpm: float = 16.0
     resolution_rpm: float = 1.0
     duration_s: float = 100.0
     calm_s: float = 20.0
@@ -576,19 +579,38 @@ def lowest_turning(strings: Strings, loops: Sequence[Loop], how: Start, search: 
 
     First on a coarse grid, then between the last that sticks and the first above it.
     """
-    coarse = np.arange(search.lowest_rpm, search.highest_rpm + 1.0, search.coarse_rpm)
-    turns = _ends_turning(strings, loops, how, np.tile(coarse, (len(loops), 1)), search)
-    first = [_first_of_the_rest(row) for row in turns]
-    parts = max(1, round(search.coarse_rpm / search.resolution_rpm))
-    offsets = search.coarse_rpm * (np.arange(1, parts + 1) / parts - 1.0)
-    # above a loop for which nothing turned there is nothing to look for: it goes along, and is not looked at
-    top = np.array([coarse[min(at, coarse.size - 1)] for at in first])
-    fine = np.maximum(top[:, None] + offsets[None, :], 0.5 * search.resolution_rpm)
-    turns = _ends_turning(strings, loops, how, fine, search)
-    return [
-        None if at == coarse.size else float(fine[k, min(_first_of_the_rest(turns[k]), parts - 1)])
-        for k, at in enumerate(first)
-    ]
+    span = search.highest_rpm - search.lowest_rpm
+    coarse = np.linspace(search.lowest_rpm, search.highest_rpm, max(1, ceil(span / search.coarse_rpm - 1e-9)) + 1)
+
+    def turn(speeds_rpm: Array) -> NDArray[np.bool_]:
+        return _ends_turning(strings, loops, how, np.maximum(speeds_rpm, 0.5 * search.resolution_rpm), search)
+
+    found = _lowest(turn, np.tile(coarse, (len(loops), 1)), float(coarse[1] - coarse[0]) / search.resolution_rpm)
+    return [None if one == np.inf else float(max(one, 0.5 * search.resolution_rpm)) for one in found]
+
+
+FINER = 4
+"""Parts into which a bracket is cut, as often as the resolution asks for it."""
+
+
+def _lowest(turn: Callable[[Array], NDArray[np.bool_]], coarse: Array, parts: float) -> Array:
+    """Return for each row the lowest value from which on all turn, to a ``parts``-th of the step; infinite: none.
+
+    ``coarse``: evenly spaced; rows are loops. Above a row in which nothing turned there is nothing to look for: it goes
+    along, and its result is not used.
+    """
+    first = np.array([_first_of_the_rest(row) for row in turn(coarse)])
+    rows = np.arange(len(coarse))
+    top = coarse[rows, np.minimum(first, coarse.shape[1] - 1)]
+    step, left = float(coarse[0, 1] - coarse[0, 0]), ceil(parts - 1e-9)
+    while left > 1:
+        count = FINER if left > FINER + 1 else left
+        between = top[:, None] + step * (np.arange(1, count) / count - 1.0)
+        turns = np.column_stack([turn(between), np.ones(len(top), dtype=bool)])      # the top itself is known to turn
+        at = np.array([_first_of_the_rest(row) for row in turns])
+        top = np.column_stack([between, top])[rows, at]
+        step, left = step / count, -(-left // count)
+    return np.where(first < coarse.shape[1], top, np.inf)
 
 
 def _first_of_the_rest(turns: NDArray[np.bool_]) -> int:
@@ -614,16 +636,16 @@ def _ends_turning(
 # ---------------------------------------------------------------------------------------------------------------------
 # Under bit noise: many strings, each with its own noise, on a grid of speeds that rises by a factor.
 
-TICKS_PER_WAY, LONGEST_NOISY_TICK_S = 30.0, 0.02
+TICKS_PER_WAY, LONGEST_NOISY_TICK_S = 30.0, 0.03
 """Of a search over many strings: the tick is a thirtieth of the way down, at most. Cure speeds of the reference case
 are the same at 0.006 and at 0.03 s."""
-COARSE_SPEEDS, FINE_SPEEDS = 14, 8
-"""Speeds of the first and of the second grid."""
+COARSE_SPEEDS, FINE_PARTS = 7, 16
+"""Speeds of the first grid, and parts of one of its steps that are told apart."""
 PERIODS, CALM_PERIODS = 12.0, 3.0
 """Length of a simulation in periods of the string's lowest mode with the top held, and of its end in which the bit must
 not stand still."""
 LOWEST_NOISY_RPM, HIGHEST_NOISY_RPM = 10.0, 240.0
-NOISY_RESOLUTION = (HIGHEST_NOISY_RPM / LOWEST_NOISY_RPM) ** (1.0 / ((COARSE_SPEEDS - 1) * FINE_SPEEDS)) - 1.0
+NOISY_RESOLUTION = (HIGHEST_NOISY_RPM / LOWEST_NOISY_RPM) ** (1.0 / ((COARSE_SPEEDS - 1) * FINE_PARTS)) - 1.0
 """Relative, of a critical speed under noise: 3 %."""
 
 
@@ -642,13 +664,10 @@ def lowest_turning_with_noise(
     """
     search = Search(duration_s=PERIODS * period_s, calm_s=CALM_PERIODS * period_s,
                     longest_tick_s=coarse_tick_s(strings[0]))
-    coarse = np.geomspace(LOWEST_NOISY_RPM, HIGHEST_NOISY_RPM, COARSE_SPEEDS)
-    turns = _ends_turning(strings, loops, how, np.tile(coarse, (len(loops), 1)), search, seeds)
-    first = np.array([_first_of_the_rest(row) for row in turns])
-    ratio = float(coarse[1] / coarse[0])
-    top = coarse[np.minimum(first, COARSE_SPEEDS - 1)]
-    fine = top[:, None] * ratio ** (np.arange(1, FINE_SPEEDS + 1) / FINE_SPEEDS - 1.0)
-    turns = _ends_turning(strings, loops, how, fine, search, seeds)
-    turns[:, -1] = True
-    found = fine[np.arange(len(loops)), [_first_of_the_rest(row) for row in turns]]
-    return np.where(first < COARSE_SPEEDS, found, np.inf)
+    coarse = np.linspace(log(LOWEST_NOISY_RPM), log(HIGHEST_NOISY_RPM), COARSE_SPEEDS)
+
+    def turn(logs: Array) -> NDArray[np.bool_]:
+        return _ends_turning(strings, loops, how, np.exp(logs), search, seeds)
+
+    found: Array = np.exp(_lowest(turn, np.tile(coarse, (len(loops), 1)), FINE_PARTS))
+    return found

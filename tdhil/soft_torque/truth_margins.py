@@ -40,5 +40,5 @@ class TruthMargins:
                          for k, truth in enumerate(self.truths)])
 
     def keeps(self, law: SpeedController, required: RequiredMargins) -> bool:
-        """Whether no truth has a margin that is thinner."""
+        """Return whether no truth has a margin that is thinner."""
         return not any(required.failed(self.margins(k, law)) for k in range(len(self.truths)))

@@ -1,4 +1,4 @@
-"""What is tuned for what, and what comes out: data of `tune`."""
+"""Data of `tune`: the case, the rows, the advice."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from tdhil.soft_torque.controller import (
 )
 from tdhil.soft_torque.drill_string import DrillString
 from tdhil.soft_torque.simulation import (
-    CriticalSpeeds,
     Search,
 )
 from tdhil.soft_torque.stability import (
@@ -53,7 +52,7 @@ class Moved:
 
 @dataclass(frozen=True)
 class TuneCase:
-    """What is tuned for what, all at the main shaft."""
+    """String, drive, and all else that tuning needs, at the main shaft."""
 
     string: DrillString
     drive: TopDrive
@@ -95,7 +94,7 @@ class TuneCase:
         return tuple(self.drive.with_inertia(one) for one in self.inertias(STEPS))
 
     def inertias(self, steps: int) -> tuple[float, ...]:
-        """So many values of J (odd), from end to end of its interval, the believed one in the middle."""
+        """Return so many values of J (odd) from end to end of its interval, with the believed one in the middle."""
         low, value, high = self.inertia_kg_m2.low, self.inertia_kg_m2.value, self.inertia_kg_m2.high
         half = steps // 2
         below = [low + (value - low) * k / half for k in range(half)]
@@ -162,18 +161,22 @@ class Tuned:
     """The least of each margin over all sampled truths."""
     failed: tuple[str, ...] = ()
     """Margins that are thinner than required on a sampled truth, with their numbers."""
-    critical: CriticalSpeeds | None = None
-    """Without noise, the string as stated."""
-    critical_along: tuple[CriticalSpeeds, ...] = ()
-    """The same at values of J from end to end of its interval."""
-    critical_moved: tuple[tuple[CriticalSpeeds, CriticalSpeeds], ...] = ()
-    """At both ends of whatever else has an interval."""
+    quiet_cures: tuple[float | None, ...] = ()
+    """Cure speeds without bit noise, rpm, the string as stated, at values of J from end to end of its interval; None:
+    above the highest that was tried; (): not simulated."""
+    quiet_cures_moved: tuple[tuple[float | None, float | None], ...] = ()
+    """At both ends of each other interval."""
     cure: DrawnValues | None = None
     """Under bit noise, rpm, over the sampled truths; so are the next two."""
     start: DrawnValues | None = None
     linear_limit: DrawnValues | None = None
     """Mean speed below which steady rotation is unstable."""
     wrong: tuple[WrongInertia, ...] = ()
+
+    @property
+    def quiet_cure_rpm(self) -> float | None:
+        """Without bit noise, all as believed."""
+        return self.quiet_cures[len(self.quiet_cures) // 2] if self.quiet_cures else None
 
     @property
     def lag_reserve_s(self) -> float | None:
@@ -189,7 +192,7 @@ class Tuned:
 
 @dataclass(frozen=True)
 class Advice:
-    """What to do."""
+    """Row to type in, or none."""
 
     kind: str | None
     """The row whose gains to type in; None: keep what there is, or nothing can be recommended."""

@@ -1,4 +1,4 @@
-r"""What follows from the gains: reflection, damping, margins, each with its interval.
+r"""Figures of one controller: reflection, damping, margins, each with its interval.
 
 **How J's error comes in.** The gains are what they are; J is what moves. The figures of one string as it is stated are
 told over the 95 % interval of J alone, with the turning points between its ends. What else was measured (lags, present
@@ -71,7 +71,7 @@ def lowest_modes(
 
 
 def least_damping(case: TuneCase, drive: TopDrive, law: SpeedController, held_hz: Sequence[float]) -> float:
-    """Of `lowest_modes`; 1 where none swings."""
+    """Return the least damping of `lowest_modes`; 1 where none swings."""
     return min((mode.damping for mode in lowest_modes(case, drive, law, held_hz)), default=1.0)
 
 

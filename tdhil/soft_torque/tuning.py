@@ -1,4 +1,4 @@
-"""From J, with its interval, to gains that can be typed in: the lowest critical speed that the margins allow.
+"""Gains that can be typed in: the lowest critical speed that the margins allow.
 
 **Objective.** The lowest set speed without stick-slip, *cure under bit noise*, as the mean over truths that are drawn
 jointly (`uncertainty`): J, string, lags and bit at once. **Subject to** a phase margin, a gain margin and a dead-time
@@ -30,10 +30,8 @@ from tdhil.soft_torque.simulation import (
     LOWEST_NOISY_RPM,
     NOISY_RESOLUTION,
     RPM,
-    CriticalSpeeds,
     Search,
     coarse_tick_s,
-    critical_speeds,
     lowest_turning,
     lowest_turning_with_noise,
 )
@@ -54,6 +52,8 @@ from tdhil.soft_torque.tuned_figures import (
 )
 from tdhil.soft_torque.uncertainty import DrawnValues, Truth
 
+START_DRAWS = 6
+"""Truths on which the ramp from rest is simulated: it takes longer than the critical speed, and decides nothing."""
 CRITICAL_STEPS = 5
 """Values of J at which critical speeds of the stated string are simulated."""
 NOT_BETTER_SHARE = 2.0 * NOISY_RESOLUTION
@@ -80,7 +80,7 @@ def tune(
     pools = [soft(case, held, samples), compensated(case, held, samples)]
     if simulated:
         told("the best of them, simulated under bit noise")
-        pools = _chosen_by_simulation(pools, samples, held)
+        pools = best_by_simulation(pools, samples, held)
     found += [pool[0] for pool in pools]
     told("broadband: gains")
     found.append(broadband(case, held, samples))
@@ -91,11 +91,11 @@ def tune(
     if simulated and search is not None:
         found = _under_noise(found, samples, held, told)
         stated = replace(search, longest_tick_s=coarse_tick_s(case.string))
-        found = list(_with_critical_speeds(case, tuple(found), held, stated, told))
+        found = list(_without_noise(case, tuple(found), held, stated, told))
     return Tuning(case, held, tuple(found), search if simulated else None, _advice(case, found), samples.truths)
 
 
-def _chosen_by_simulation(
+def best_by_simulation(
     pools: list[list[Tuned]], samples: TruthMargins, held: Sequence[float]
 ) -> list[list[Tuned]]:
     """Each pool, the lowest cure speed under noise first, as the mean over the first truths."""
@@ -121,18 +121,26 @@ def _noisy(
     return found.reshape(len(laws), len(truths))
 
 
+def noisy_cures(
+    truths: Sequence[Truth], laws: Sequence[SpeedController | None], held: Sequence[float]
+) -> list[DrawnValues]:
+    """Return the critical speed under bit noise, rpm, of every law over the truths; None: each truth's present one."""
+    return [DrawnValues(tuple(map(float, row)), LOWEST_NOISY_RPM) for row in _noisy(truths, laws, held, "stuck")]
+
+
 def _under_noise(
     found: list[Tuned], samples: TruthMargins, held: Sequence[float], told: Callable[[str], None]
 ) -> list[Tuned]:
     told("critical speeds under bit noise, simulated on every truth")
     taken = [one for one in found if one.controller is not None]
     laws = [None if one.kind == "present" else one.controller for one in taken]
-    cures, starts = (_noisy(samples.truths, laws, held, how) for how in ("stuck", "rest"))
+    cures = noisy_cures(samples.truths, laws, held)
+    starts = _noisy(samples.truths[:START_DRAWS], laws, held, "rest")
     done = {}
     for one, law, cure, start in zip(taken, laws, cures, starts, strict=True):
         limits = [linear_limit(truth.string, truth.drive, law or truth.present or SpeedController(0.0, 0.0)) / RPM
                   for truth in samples.truths]
-        done[one.kind] = replace(one, cure=DrawnValues(tuple(map(float, cure)), LOWEST_NOISY_RPM),
+        done[one.kind] = replace(one, cure=cure,
                                  start=DrawnValues(tuple(map(float, start)), LOWEST_NOISY_RPM),
                                  linear_limit=DrawnValues(tuple(limits)))
     return [done.get(one.kind, one) for one in found]
@@ -173,50 +181,44 @@ def _advice(case: TuneCase, found: Sequence[Tuned]) -> Advice:
     return Advice(best.kind, base.kind, keep=False, better_share=share)
 
 
-def _with_critical_speeds(
+def _without_noise(
     case: TuneCase, every: tuple[Tuned, ...], held: Sequence[float], search: Search, told: Callable[[str], None]
 ) -> tuple[Tuned, ...]:
+    """Cure speeds of the string as stated: over J and each other interval, and for a wrong J."""
+    told("critical speeds without noise, and what a wrong J costs")
     inertia = case.inertia_kg_m2
-    taken = [one for one in every if one.controller is not None]
-    believed = [
-        (case.string, case.drive.with_inertia(true), one.controller)
-        for one in taken for true in case.inertias(CRITICAL_STEPS) if one.controller is not None
-    ]
-    ends = [
-        (end.string, end.drive, end.present or one.controller if one.kind == "present" else one.controller)
-        for one in taken for pair in case.moves(present=one.kind == "present") for end in pair
-        if one.controller is not None
-    ]
-    told("critical speeds without noise, the string as stated")
-    speeds = _critical_speeds([*believed, *ends], search)
-    found, moved = speeds[: len(believed)], iter(speeds[len(believed) :])
-    wrong = [(one.kind, part.error) for one in taken for part in one.wrong if part.stable]
-    by_kind = {one.kind: one for one in taken}
-    told("what a wrong J costs, simulated")
-    cures = lowest_turning(
-        case.string,
-        [(case.drive, recipe_with(case, by_kind[kind], (1.0 + error) * inertia.value, held)) for kind, error in wrong],
-        "stuck", search,
-    ) if wrong else []
-    cure = dict(zip(wrong, cures, strict=True))
-    done = {
-        one.kind: replace(
-            one, critical=found[CRITICAL_STEPS * k + CRITICAL_STEPS // 2],
-            critical_along=tuple(found[CRITICAL_STEPS * k : CRITICAL_STEPS * (k + 1)]),
-            critical_moved=tuple((next(moved), next(moved)) for _ in case.moves(present=one.kind == "present")),
-            wrong=tuple(replace(part, cure_rpm=cure.get((one.kind, part.error))) for part in one.wrong),
-        )
-        for k, one in enumerate(taken)
-    }
-    return tuple(done.get(one.kind, one) for one in every)
+    loops: list[tuple[DrillString, TopDrive, SpeedController]] = []
+    sizes = []
+    for one in every:
+        law = one.controller
+        own: list[tuple[DrillString, TopDrive, SpeedController]] = []
+        if law is not None:
+            own = [(case.string, case.drive.with_inertia(true), law) for true in case.inertias(CRITICAL_STEPS)]
+            own += [(end.string, end.drive, end.present or law if one.kind == "present" else law)
+                    for pair in case.moves(present=one.kind == "present") for end in pair]
+            own += [(case.string, case.drive, recipe_with(case, one, (1.0 + part.error) * inertia.value, held))
+                    for part in one.wrong if part.stable]
+        sizes.append(len(own))
+        loops += own
+    cures = iter(_quiet_cures(loops, search))
+    done = []
+    for one, size in zip(every, sizes, strict=True):
+        if not size:
+            done.append(one)
+            continue
+        along = tuple(next(cures) for _ in range(CRITICAL_STEPS))
+        moved = tuple((next(cures), next(cures)) for _ in case.moves(present=one.kind == "present"))
+        wrong = tuple(replace(part, cure_rpm=next(cures) if part.stable else None) for part in one.wrong)
+        done.append(replace(one, quiet_cures=along, quiet_cures_moved=moved, wrong=wrong))
+    return tuple(done)
 
 
-def _critical_speeds(
+def _quiet_cures(
     loops: Sequence[tuple[DrillString, TopDrive, SpeedController]], search: Search
-) -> list[CriticalSpeeds]:
-    """In the order of ``loops``: those on one string at once."""
-    found: dict[int, CriticalSpeeds] = {}
+) -> list[float | None]:
+    """Return them in the order of ``loops``; those on one string are simulated at once."""
+    found: dict[int, float | None] = {}
     for string in dict.fromkeys(string for string, _, _ in loops):
         at = [k for k, (one, _, _) in enumerate(loops) if one == string]
-        found |= zip(at, critical_speeds(string, [loops[k][1:] for k in at], search), strict=True)
+        found |= zip(at, lowest_turning(string, [loops[k][1:] for k in at], "stuck", search), strict=True)
     return [found[k] for k in range(len(loops))]

@@ -13,7 +13,7 @@ from tdhil.cli.main import main
 from tdhil.errors import ExitCode
 from tdhil.report import showcase_of, tuning_document, write_tuning_report
 from tdhil.report.tuning import TunedFor, tuning_report
-from tdhil.soft_torque import CriticalSpeeds, DrawnValues, Interval, Search, TuneCase, tune
+from tdhil.soft_torque import DrawnValues, Interval, Search, TuneCase, tune
 from tests.soft_torque.cases import DRIVE, STRING
 
 STRING_YAML = Path(__file__).parents[2] / "examples" / "string.yaml"
@@ -161,12 +161,12 @@ def test_the_page_has_the_pictures_and_the_speeds(tmp_path):
     """Stick-slip is shown at a set speed between the two cure speeds, here given and not searched for."""
     pytest.importorskip("matplotlib")
     tuning = tune(TuneCase(STRING, DRIVE, Interval(1500.0, 1440.0, 1560.0)), None)
-    speeds = {"stiff": CriticalSpeeds(None, 150.0), "soft": CriticalSpeeds(61.0, 62.0)}
+    cures = {"stiff": None, "soft": 61.0}
     noisy = {"stiff": DrawnValues((180.0, 170.0)), "soft": DrawnValues((60.0, 66.0))}
     tuning = replace(tuning, searched=Search(highest_rpm=160.0), tuned=tuple(
-        replace(one, critical=speeds[one.kind], critical_along=(speeds[one.kind],) * 5, cure=noisy[one.kind],
+        replace(one, quiet_cures=(cures[one.kind],) * 5, cure=noisy[one.kind],
                 start=noisy[one.kind], linear_limit=noisy[one.kind])
-        for one in tuning.tuned if one.kind in speeds))
+        for one in tuning.tuned if one.kind in cures))
     document = tuning_document(tuning, TunedFor("result.json", True, None, 1.0, "drive", "as stated"))
     json.dumps(document, allow_nan=False)
     stiff, soft = document["controllers"][:2]
@@ -260,6 +260,7 @@ def test_the_first_sentence_says_what_changes(tuned):
     sentence = document["advice"]["sentence"]
     assert sentence.startswith("Type in the soft gains. Compared with the present gains:")
     assert "phase margin" in sentence and "°" in sentence
+    assert "onset" not in json.dumps(document)
     _, text, _ = tuned("--present", "40", "30", as_json=False)
     assert " ".join(text.split()).startswith(sentence)
 
@@ -303,3 +304,48 @@ def test_an_identified_pipe_keeps_its_impedance(tuned):
     compensated = next(one for one in document["controllers"] if one["kind"] == "compensated")
     assert not compensated["refused"] or "margin" in compensated["refused"]
     assert any("the pipe is the one" in warning for warning in document["warnings"])
+
+
+def test_depths_give_a_schedule_with_the_drives_parameters(tuned):
+    """Each row has gains at both shafts and what to type; what lies between the rows is told in a sentence."""
+    code, document, _ = tuned("--depths", "1000:3000:1000", profile={"name": "siemens/s120-canopen"})
+    assert code == 0
+    schedule = document["schedule"]
+    assert [row["depth_m"] for row in schedule["rows"]] == [1000.0, 2000.0, 3000.0]
+    assert [row["depth_m"] for row in schedule["between"]] == [1500.0, 2500.0]
+    for row in schedule["rows"]:
+        assert row["at_main_shaft"]["gain_nm_s_rad"] == pytest.approx(100.0 * row["at_motor"]["gain_nm_s_rad"])
+        assert [one["title"] for one in row["drive_parameters"]]
+    assert schedule["sentence"].startswith("Interpolated halfway between rows: least phase margin")
+    _, text, _ = tuned("--depths", "1000:3000:1000", as_json=False)
+    words = " ".join(text.split())
+    assert "gains over depth, soft" in words and schedule["sentence"] in words
+
+
+@pytest.mark.parametrize("text", ["500", "500:400:10", "500:6000:9000", "1:6000:1", "a:b:c"])
+def test_depths_that_are_none_are_refused(tuned, text):
+    code, _, _err = tuned("--depths", text)
+    assert code == ExitCode.USAGE
+
+
+def test_a_schedule_needs_the_string(tuned):
+    code, document, _ = tuned("--depths", "500:1000:250", string=None)
+    assert code == ExitCode.USAGE and "--string string.yaml" in json.dumps(document)
+
+
+def test_the_picture_of_a_schedule_is_drawn(tmp_path):
+    """With and without critical speeds, and with a depth that is refused."""
+    figure = pytest.importorskip("matplotlib.figure")
+    from tdhil.report.schedule import draw_schedule
+
+    speeds = {"value": 50.0, "low": 40.0, "high": None}
+    row = {"depth_m": 1000.0, "refused": None, "at_motor": {"gain_nm_s_rad": 10.0, "integral_nm_rad": 5.0},
+           "critical_under_noise_rpm": speeds, "compared_critical_rpm": speeds}
+    for noisy in (speeds, None):
+        own = {**row, "critical_under_noise_rpm": noisy, "compared_critical_rpm": noisy}
+        document = {"kind": "soft", "compared_with": "stiff", "between": [{**own, "depth_m": 1500.0}],
+                    "rows": [own, {**own, "depth_m": 2000.0}, {"depth_m": 3000.0, "refused": "no"}]}
+        drawn = figure.Figure()
+        draw_schedule(drawn, document)
+        assert len(drawn.axes) == (2 if noisy else 1)
+        drawn.savefig(tmp_path / "schedule.svg")

@@ -157,7 +157,7 @@ def test_critical_speed_and_damping_are_read_off_the_rows():
     (rows(99.0, (60.0, 70.0)), EvaluationOutcome.NOT_FOUND, "ended at 70 rpm, before the bit had ended turning"),
     (rows(99.0, (60.0, 79.0)), EvaluationOutcome.NOT_FOUND, "never ended turning"),
     (rows(57.0, (57.5, 56.6), damping=0.22, clamped=1.0), EvaluationOutcome.INVALID, "torque limit"),
-    (rows(57.0, (57.5, 56.6), damping=0.22, unknown_nm=200.0), EvaluationOutcome.INVALID, "nobody commanded"),
+    (rows(57.0, (57.5, 56.6), damping=0.22, unknown_nm=200.0), EvaluationOutcome.INVALID, "was not commanded"),
 ], ids=["higher", "lower", "never stuck", "cut short", "never turned", "clamped", "another rig"])
 def test_the_verdict(log, outcome, said):
     found = evaluate(log, CASE, PROGRAM)

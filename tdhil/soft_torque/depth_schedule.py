@@ -1,0 +1,126 @@
+"""Gains over the depth of the well: tuned at each depth, and checked halfway between.
+
+As the well gets deeper the topmost section of the string gets longer. The drive, or its operator, interpolates P, I and
+J_c linearly between the rows. Halfway between two rows the interpolated gains are held against margins and simulated
+under bit noise, as the rows themselves are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
+
+from tdhil.soft_torque.controller import SpeedController
+from tdhil.soft_torque.drill_string import DrillString
+from tdhil.soft_torque.recipes import compensated, soft, stiff
+from tdhil.soft_torque.stability import LoopMargins
+from tdhil.soft_torque.truth_margins import TruthMargins
+from tdhil.soft_torque.tune_case import TuneCase
+from tdhil.soft_torque.tuned_figures import string_modes_hz
+from tdhil.soft_torque.tuning import best_by_simulation, noisy_cures
+from tdhil.soft_torque.uncertainty import DrawnValues
+
+ScheduledKind = Literal["soft", "compensated"]
+
+
+@dataclass(frozen=True)
+class DepthRow:
+    """Gains at one depth. Refused: ``controller`` is None and ``refusal`` says why."""
+
+    depth_m: float
+    """Length of the whole string."""
+    mode_hz: float
+    """Lowest, with the top held."""
+    controller: SpeedController | None
+    refusal: str = ""
+    softness: float | None = None
+    frequency_factor: float | None = None
+    """a and φ; None: the gains are interpolated."""
+    worst: LoopMargins | None = None
+    """The least of each margin over all sampled truths."""
+    failed: tuple[str, ...] = ()
+    """Margins that are thinner than required on a sampled truth, with their numbers."""
+    cure: DrawnValues | None = None
+    """Critical speed under bit noise, rpm."""
+    compared: DrawnValues | None = None
+    """The same with the present gains, or with the stiff loop."""
+
+
+@dataclass(frozen=True)
+class DepthSchedule:
+    """Rows from the shallowest to the deepest."""
+
+    kind: ScheduledKind
+    compared_with: str
+    """present, or stiff."""
+    rows: tuple[DepthRow, ...]
+    between: tuple[DepthRow, ...]
+    """Halfway between two rows that both have gains, with the interpolated ones."""
+
+
+def at_depth(string: DrillString, depth_m: float) -> DrillString:
+    """Return the string that reaches so deep: its topmost section gets longer or shorter.
+
+    Raises ValueError where what hangs below that section is longer.
+    """
+    first, *rest = string.lines
+    length_m = depth_m - sum(line.length_m for line in rest)
+    if length_m <= 0.0:
+        raise ValueError(f"what hangs below the topmost section is {depth_m - length_m:.4g} m long")
+    return replace(string, lines=(replace(first, length_m=length_m), *rest))
+
+
+def schedule(
+    case: TuneCase, depths_m: Sequence[float], kind: ScheduledKind, *, simulated: bool = True,
+    told: Callable[[str], None] = lambda text: None,
+) -> DepthSchedule:
+    """Tune at each depth, and check what interpolation makes of it. Raises as `at_depth` and `tune` do.
+
+    ``simulated`` False, or no bit: without critical speeds.
+    """
+    rows, between = [], []
+    for depth_m in depths_m:
+        told(f"gains at {depth_m:.0f} m")
+        rows.append(_row(replace(case, string=at_depth(case.string, depth_m)), depth_m, kind, simulated))
+    for above, below in pairwise(rows):
+        if above.controller is not None and below.controller is not None:
+            depth_m = 0.5 * (above.depth_m + below.depth_m)
+            told(f"interpolated gains at {depth_m:.0f} m")
+            own = replace(case, string=at_depth(case.string, depth_m))
+            halfway = _halfway(above.controller, below.controller)
+            between.append(_judged(own, DepthRow(depth_m, string_modes_hz(own.string)[0], halfway), simulated))
+    return DepthSchedule(kind, "present" if case.present is not None else "stiff", tuple(rows), tuple(between))
+
+
+def _row(case: TuneCase, depth_m: float, kind: ScheduledKind, simulated: bool) -> DepthRow:
+    held = string_modes_hz(case.string)
+    samples = TruthMargins(case)
+    pool = (soft if kind == "soft" else compensated)(case, held, samples)
+    if simulated and case.string.bit is not None:
+        pool = best_by_simulation([pool], samples, held)[0]
+    best = pool[0]
+    row = DepthRow(depth_m, held[0], best.controller, best.refusal, best.softness, best.frequency_factor)
+    return row if row.controller is None else _judged(case, row, simulated, samples)
+
+
+def _judged(case: TuneCase, row: DepthRow, simulated: bool, samples: TruthMargins | None = None) -> DepthRow:
+    """Return the row with its margins and critical speeds."""
+    assert row.controller is not None
+    samples = samples or TruthMargins(case)
+    worst = samples.every(row.controller)
+    row = replace(row, worst=worst, failed=case.required.failed(worst))
+    other = stiff(case).controller
+    if not simulated or case.string.bit is None or (case.present is None and other is None):
+        return row
+    laws = [row.controller, None if case.present is not None else other]
+    cure, compared = noisy_cures(samples.truths, laws, (row.mode_hz,))
+    return replace(row, cure=cure, compared=compared)
+
+
+def _halfway(one: SpeedController, other: SpeedController) -> SpeedController:
+    return replace(
+        one, gain_nm_s_rad=0.5 * (one.gain_nm_s_rad + other.gain_nm_s_rad),
+        integral_nm_rad=0.5 * (one.integral_nm_rad + other.integral_nm_rad),
+        compensated_kg_m2=0.5 * (one.compensated_kg_m2 + other.compensated_kg_m2))

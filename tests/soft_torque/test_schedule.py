@@ -1,0 +1,75 @@
+"""Gains over depth: each row is what tuning at that depth gives, and what lies between is checked, not supposed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from tdhil.soft_torque import (
+    Interval,
+    RequiredMargins,
+    SpeedController,
+    TuneCase,
+    at_depth,
+    draw_truths,
+    loop_margins,
+    schedule,
+    string_modes_hz,
+    tune,
+)
+from tests.soft_torque.cases import DRIVE, STRING
+
+J = Interval(1500.0, 1440.0, 1560.0)
+CASE = TuneCase(STRING, DRIVE, J, draws=8)
+DEPTHS_M = (1500.0, 2250.0, 3000.0)
+
+
+@pytest.fixture(scope="module")
+def scheduled():
+    return schedule(CASE, DEPTHS_M, "soft", simulated=False)
+
+
+def test_the_topmost_section_takes_the_depth():
+    assert at_depth(STRING, 1200.0).lines[0].length_m == 1200.0
+    collars = replace(STRING, lines=(STRING.lines[0], replace(STRING.lines[0], length_m=200.0)))
+    assert [line.length_m for line in at_depth(collars, 1000.0).lines] == [800.0, 200.0]
+    with pytest.raises(ValueError, match="200 m long"):
+        at_depth(collars, 150.0)
+
+
+def test_a_row_is_what_tuning_at_that_depth_gives(scheduled):
+    """At the length that the string is stated with, the row has the gains of `tune`; deeper is softer and slower."""
+    alone = tune(CASE, search=None).by_kind("soft").controller
+    assert scheduled.rows[-1].controller == alone
+    gains = [row.controller.integral_nm_rad for row in scheduled.rows]
+    assert gains == sorted(gains, reverse=True)
+    assert [row.mode_hz for row in scheduled.rows] == [string_modes_hz(at_depth(STRING, one))[0] for one in DEPTHS_M]
+
+
+def test_rows_keep_the_margins_and_what_lies_between_is_measured(scheduled):
+    """Interpolated gains are the mean of their neighbours'; their margins are those of `loop_margins` on each truth."""
+    assert not any(row.failed for row in scheduled.rows)
+    assert [row.depth_m for row in scheduled.between] == [1875.0, 2625.0]
+    for k, row in enumerate(scheduled.between):
+        neighbours = [one.controller.gain_nm_s_rad for one in scheduled.rows[k : k + 2]]
+        assert row.controller.gain_nm_s_rad == pytest.approx(sum(neighbours) / 2.0)
+        truths = draw_truths(at_depth(STRING, row.depth_m), DRIVE, J, count=8, lag_tolerance=CASE.lag_tolerance)
+        least = min(loop_margins(one.drive, row.controller, one.string).phase_deg for one in truths)
+        assert row.worst.phase_deg == pytest.approx(least, abs=0.5)
+        assert bool(row.failed) is bool(RequiredMargins().failed(row.worst))
+
+
+def test_critical_speeds_stand_beside_those_of_the_present_gains():
+    """Present gains of a rig that was tuned at 3,000 m, at 1,500 m: the row's critical speed is not above theirs."""
+    case = replace(CASE, present=SpeedController(4000.0, 3000.0), draws=6)
+    (row,) = schedule(case, (1500.0,), "soft").rows
+    assert row.cure.median < row.compared.median
+
+
+def test_a_depth_at_which_nothing_keeps_the_margins_says_so():
+    strict = replace(CASE, required=RequiredMargins(89.0, 30.0, 1.0))
+    found = schedule(strict, (1500.0, 3000.0), "soft", simulated=False)
+    assert [row.controller for row in found.rows] == [None, None]
+    assert "limit 89°" in found.rows[0].refusal
+    assert found.between == ()
