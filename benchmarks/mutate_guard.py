@@ -138,7 +138,7 @@ SUBJECTS = {
     "canopen/quick_stop": _driver(
         "canopen/quick_stop", "test_quick_stop.py",
         within="HALT BY_SDO_TRIES BY_RPDO_TRIES BURST BURST_PAUSE_S NEAR_ZERO_RAD_S NEAR_ZERO_LSB MODE_S MODE_PAUSE_S "
-        "_RPDOS _CONTROLWORD _COAST _BRAKE_AND_HOLD Cia402Target",
+        "_RPDOS _CONTROLWORD _COAST _BRAKE_AND_HOLD CanopenTarget",
     ),
     "modbus/state_machine": _driver(
         "modbus/state_machine", "test_modbus_state_machine.py", "test_no_valid_state.py", "test_modbus_drive.py"
