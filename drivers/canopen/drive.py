@@ -30,11 +30,11 @@ from drivers.cia402 import (
     DRIVE_SILENT_S,
     Cia402Bus,
     Cia402Drive,
+    CycleInputs,
+    CycleSetpoints,
     CyclicObjects,
     FeedbackSetting,
     Group,
-    Inputs,
-    Setpoints,
     Traffic,
     answer_time_s,
 )
@@ -236,14 +236,14 @@ class CanopenBus(Cia402Bus):
         self._life.feed_when_due(now_s)
         return now_s
 
-    def send(self, setpoints: Setpoints) -> None:
+    def send(self, setpoints: CycleSetpoints) -> None:
         """Send RPDO2 if it is needed, and RPDO1; they act at the next SYNC."""
         shape, (word, torque, speed, mode, offset, mode_changes) = self._shape, setpoints
         if (mode_changes and shape.mode) or shape.offset is not None:
             self._link.send(self._rpdo2_id, shape.slow_setpoints(mode, offset))
         self._link.send(self._rpdo1_id, shape.setpoints(word, torque, speed), self.ticks.check)
 
-    def receive(self, now_s: float, sync: bool) -> Inputs:
+    def receive(self, now_s: float, sync: bool) -> CycleInputs:
         """Send SYNC and read the feedback that belongs to it."""
         feedback = self._feedback
         feedback.begin(now_s, sync=sync)
@@ -257,9 +257,9 @@ class CanopenBus(Cia402Bus):
             self._contradictions += 1
             self._watch.on_contradiction()
         if not feedback.data or self._remapped:
-            return Inputs(age_s, False, doubted)
+            return CycleInputs(age_s, False, doubted)
         status, torque, speed = self._layout.unpack(feedback.data)
-        return Inputs(age_s, True, doubted, status, torque, speed, self._slow.counts if sync else None)
+        return CycleInputs(age_s, True, doubted, status, torque, speed, self._slow.counts if sync else None)
 
     def _await_feedback(self, sync_s: float) -> float:
         """Handle frames until TPDO1 has come. Return its age in seconds of control time."""

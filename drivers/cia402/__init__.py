@@ -6,8 +6,8 @@ from profiles import lazy_face
 
 if TYPE_CHECKING:
     from drivers.cia402.bus import (
-        Cia402Bus as Cia402Bus, FeedbackSetting as FeedbackSetting, Inputs as Inputs, Setpoints as Setpoints,
-        Traffic as Traffic,
+        Cia402Bus as Cia402Bus, CycleInputs as CycleInputs, CycleSetpoints as CycleSetpoints,
+        FeedbackSetting as FeedbackSetting, Traffic as Traffic,
     )
     from drivers.cia402.drive import Cia402Drive as Cia402Drive, DRIVE_SILENT_S as DRIVE_SILENT_S
     from drivers.cia402.limits import check_parameters as check_parameters

@@ -7,7 +7,7 @@ abstract methods of `Cia402Bus`; the other methods have a default for a bus on w
     take → map_cyclic → arm → start → (listen_until → begin → send → receive) … → release → close
 
 Setpoints and inputs are in counts of the objects. A bus scales nothing and knows no state of the drive. In the cyclic
-synchronous modes (CST, CSV) the setpoint of each `send` acts at once, so the host's ramp is what the drive follows; the
+synchronous modes (CST, CSV) the setpoint of each `send` acts at once, so the host's ramp is what the drive follows. The
 bus treats them like any other mode.
 """
 
@@ -28,7 +28,7 @@ from drivers.preflight import PreflightTable
 from profiles.cia402 import Position
 
 
-class Setpoints(NamedTuple):
+class CycleSetpoints(NamedTuple):
     """Setpoints of one cycle, in counts. ``mode_changes``: 6060h must be sent, even if it is not sent cyclically."""
 
     word: int                      # 6040h
@@ -39,7 +39,7 @@ class Setpoints(NamedTuple):
     mode_changes: bool
 
 
-class Inputs(NamedTuple):
+class CycleInputs(NamedTuple):
     """Feedback of one cycle, in counts. ``age_s``: delay after the instant that it belongs to, s.
 
     ``doubted``: more than one feedback frame came for this cycle. ``angle``: None if the cycle brought none.
@@ -153,11 +153,11 @@ class Cia402Bus(ABC):
         """
 
     @abstractmethod
-    def send(self, setpoints: Setpoints) -> None:
+    def send(self, setpoints: CycleSetpoints) -> None:
         """Send the setpoints; they act in this cycle."""
 
     @abstractmethod
-    def receive(self, now_s: float, sync: bool) -> Inputs:
+    def receive(self, now_s: float, sync: bool) -> CycleInputs:
         """Complete the cycle: ``sync`` starts the exchange of the frames. Return the feedback."""
 
     def check(self) -> None:

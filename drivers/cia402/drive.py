@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 
 from drivers.angle import Unwrapped
 from drivers.cia402 import preflight as checks
-from drivers.cia402.bus import Cia402Bus, FeedbackSetting, Inputs, Setpoints
+from drivers.cia402.bus import Cia402Bus, CycleInputs, CycleSetpoints, FeedbackSetting
 from drivers.cia402.limits import check_parameters, note_temperature, set_limits
 from drivers.cia402.polling import poll, push
 from drivers.cia402.position import AngleObject, find_angle
@@ -410,7 +410,7 @@ class Cia402Drive:
         back.sent(content.target_speed[0], speed_raw)
         back.sent(0x6071, torque_raw)
         back.sent(0x6060, code)
-        bus.send(Setpoints(word, torque_raw, speed_raw, code, offset_raw, changes))
+        bus.send(CycleSetpoints(word, torque_raw, speed_raw, code, offset_raw, changes))
         if changes:
             mode.code, mode.cycles, mode.overwritten = code, 0, False
         sample = self._judge(now_s, bus.receive(now_s, True))
@@ -443,7 +443,7 @@ class Cia402Drive:
         )
         self._bus.ticks.put_off()
 
-    def _judge(self, now_s: float, inputs: Inputs) -> Sample:
+    def _judge(self, now_s: float, inputs: CycleInputs) -> Sample:
         """Follow the drive's state by the feedback of this cycle, and raise its errors. Return the sample."""
         reported, bus, cycles = self._reported, self._bus, self._cycles
         fresh = inputs.fresh

@@ -8,7 +8,7 @@ import struct
 
 import numpy as np
 
-from drivers.cia402.bus import Cia402Bus, Inputs
+from drivers.cia402.bus import Cia402Bus, CycleInputs
 from drivers.cia402.drive import Cia402Drive
 from drivers.cia402.objects import Objects, name
 from drivers.cia402.supervision import DriveWatch, Group
@@ -167,7 +167,7 @@ class MemoryBus(Cia402Bus):
         self._tap(RawFrame(now_s, False, 0, data))
         status, torque, speed, demand, mode = FEEDBACK.unpack(data)
         self.reported.take_slow(now_s, mode, demand)
-        return Inputs(0.0, True, False, status, torque, speed)
+        return CycleInputs(0.0, True, False, status, torque, speed)
 
     def feed(self):
         self._drive.silent_s = self._drive.silent_s if not self._fed else 0.0
