@@ -1,8 +1,8 @@
 """Content of the cyclic frames of a drive, where it differs from the usual CiA 402 objects.
 
 - If 6060h can't be mapped and no torque offset is used, there is no RPDO2.
-- A 32-bit torque leaves no room for the statusword beside the
-  speed: then TPDO1 holds torque and speed, and TPDO2 brings the statusword with every SYNC.
+- A 32-bit torque leaves no room for the statusword beside the speed. TPDO1 then holds torque and speed, and TPDO2
+  brings the statusword with every SYNC.
 """
 
 from __future__ import annotations
