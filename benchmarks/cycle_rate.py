@@ -3,7 +3,7 @@
 Three loops take turns, A B C A B C …, in this one process on python-can's virtual bus:
 
 A  bare     RPDO1 and SYNC out, TPDO1 in, struct both ways; a thread with python-can alone answers each SYNC.
-B  drive    `Cia402Drive.exchange` against the embedded simulator: stepped, enabled, turning, with all its noise.
+B  drive    `CanopenDrive.exchange` against the embedded simulator: stepped, enabled, turning, with all its noise.
 C  run      the same under `ControlLoop.cycle`: guard, every frame, command and sample logged, the file closed.
 
 One more round of C is timed piece by piece, as CPU time of each thread. Absolute figures drift with the machine, so
@@ -27,7 +27,7 @@ from typing import Any
 import can
 from can.interfaces.virtual import VirtualBus
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, DriveLimits, FrameTap, Mode, PowerState, Preflight
 from profiles.library import load_canopen_profile
@@ -85,12 +85,12 @@ def bare(cycles: int) -> float:
 
 
 @contextmanager
-def turning_drive(tap: FrameTap | None = None) -> Iterator[tuple[EmbeddedSimulator, Cia402Drive, Preflight]]:
+def turning_drive(tap: FrameTap | None = None) -> Iterator[tuple[EmbeddedSimulator, CanopenDrive, Preflight]]:
     """The default simulated rig, enabled in speed mode."""
     with EmbeddedSimulator(RigParams(), seed=1) as simulator:
         bus = can.Bus(simulator.channel, interface="virtual")
         profile = load_canopen_profile("generic/cia402")
-        drive = Cia402Drive(bus, profile, SteppedClock(), node=1, rate_hz=RATE_HZ, tap=tap)
+        drive = CanopenDrive(bus, profile, SteppedClock(), node=1, rate_hz=RATE_HZ, tap=tap)
         try:
             drive.connect()
             preflight = drive.preflight(LIMITS)

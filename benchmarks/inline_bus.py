@@ -2,7 +2,7 @@
 
     python benchmarks/inline_bus.py [--cycles 5000] [--rounds 3] [--require 1.5]
 
-`Cia402Drive.exchange` against the same simulated drive, enabled and turning: over python-can's virtual bus, where host
+`CanopenDrive.exchange` against the same simulated drive, enabled and turning: over python-can's virtual bus, where host
 and simulator hand each frame over, and over `InlineSimulator`, where `send` has the answer. The two take turns in this
 process; the median of the rounds counts. `--require` makes the exit code say whether the CPU time is that many times
 smaller. The samples of both must be equal.
@@ -19,7 +19,7 @@ from contextlib import ExitStack
 
 import can
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, DriveLimits, Mode, Sample
 from profiles.library import load_canopen_profile
@@ -45,7 +45,7 @@ def inline(stack: ExitStack) -> can.BusABC:
 def run(open_bus: Open, cycles: int) -> tuple[float, float, list[Sample]]:
     """Wall and CPU time of a cycle, in µs, and what was seen."""
     with ExitStack() as stack:
-        drive = Cia402Drive(open_bus(stack), load_canopen_profile("generic/cia402"), SteppedClock(), node=1)
+        drive = CanopenDrive(open_bus(stack), load_canopen_profile("generic/cia402"), SteppedClock(), node=1)
         stack.callback(drive.close)
         drive.connect()
         drive.preflight(LIMITS)

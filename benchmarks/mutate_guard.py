@@ -103,12 +103,18 @@ SUBJECTS = {
         "test_feedback.py", "test_sdo_feedback.py", "test_other_master.py", "test_supervision.py", "test_position.py",
         "test_guarding.py", "test_no_watchdog.py", "test_profile_preflight.py", "test_drive_contract.py",
     ),
+    "cia402/drive": _driver(
+        "cia402/drive", "test_preflight.py", "test_trouble.py", "test_late_host.py", "test_drive_faults.py",
+        "test_feedback.py", "test_sdo_feedback.py", "test_other_master.py", "test_supervision.py", "test_position.py",
+        "test_guarding.py", "test_no_watchdog.py", "test_profile_preflight.py", "test_drive_contract.py",
+        "test_cia402_without_bus.py",
+    ),
     "clock": _driver(
         "clock", "test_late_host.py", "test_drive_faults.py",
         within="RECENT LATE_SHARE RATES_HZ STALL_S STALL_CYCLES how_late quantile Ticks",
     ),
-    "canopen/limits": _driver(
-        "canopen/limits", "test_preflight.py", "test_profile_preflight.py",
+    "cia402/limits": _driver(
+        "cia402/limits", "test_preflight.py", "test_profile_preflight.py",
         within="_LIMIT _TITLES set_limits note_temperature _set _count _rounded _limit _same",
     ),
     "canopen/supervision": _driver(
@@ -119,26 +125,31 @@ SUBJECTS = {
         "canopen/watchdog", "test_preflight.py", "test_no_watchdog.py", "test_guarding.py", "test_watchdog_feed.py",
         "test_angle_in_cycle.py", "test_changed_feedback.py", "test_other_master.py",
     ),
-    "canopen/state_machine": _driver(
-        "canopen/state_machine", "test_state_machine.py", "test_no_valid_state.py", "test_falling_out.py"
+    "cia402/state_machine": _driver(
+        "cia402/state_machine", "test_state_machine.py", "test_no_valid_state.py", "test_falling_out.py"
     ),
     "canopen/pdo_mapping": _driver("canopen/pdo_mapping", "test_pdo_mapping.py", "test_other_master.py"),
-    "canopen/position": _driver(
-        "canopen/position", "test_position.py", "test_angle_in_cycle.py", "test_profile_preflight.py"
+    "cia402/position": _driver(
+        "cia402/position", "test_position.py", "test_angle_in_cycle.py", "test_profile_preflight.py"
     ),
     "canopen/slow_feedback": _driver("canopen/slow_feedback", "test_angle_in_cycle.py", "test_drive_contract.py"),
-    "canopen/sdo_feedback": _driver("canopen/sdo_feedback", "test_sdo_feedback.py", "test_no_valid_state.py"),
+    "cia402/polling": _driver("cia402/polling", "test_sdo_feedback.py", "test_no_valid_state.py"),
     "canopen/other_master": _driver("canopen/other_master", "test_other_master.py", "test_falling_out.py"),
-    "canopen/read back": _driver(
-        "canopen/supervision", "test_other_master.py", "test_changed_feedback.py",
+    "cia402/read back": _driver(
+        "cia402/supervision", "test_other_master.py", "test_changed_feedback.py",
         within="Group ReadBack _WatchedObject _shown",
     ),
     "angle": _driver("angle", "test_angle_in_cycle.py"),
     "bare stop": _driver("quick_stop", "test_modbus_quick_stop.py", "test_no_valid_state.py"),
     "canopen/quick_stop": _driver(
         "canopen/quick_stop", "test_quick_stop.py",
-        within="HALT BY_SDO_TRIES BY_RPDO_TRIES BURST BURST_PAUSE_S NEAR_ZERO_RAD_S NEAR_ZERO_LSB MODE_S MODE_PAUSE_S "
-        "_RPDOS _CONTROLWORD _COAST _BRAKE_AND_HOLD Cia402Target",
+        within="BY_SDO_TRIES BY_RPDO_TRIES BURST BURST_PAUSE_S _RPDOS _CONTROLWORD CanopenTarget",
+    ),
+    "cia402/quick_stop": _driver(
+        "cia402/quick_stop", "test_quick_stop.py", "test_other_master.py", "test_cia402_without_bus.py",
+    ),
+    "cia402/watchdog": _driver(
+        "cia402/watchdog", "test_preflight.py", "test_no_watchdog.py", "test_guarding.py", "test_watchdog_feed.py",
     ),
     "modbus/state_machine": _driver(
         "modbus/state_machine", "test_modbus_state_machine.py", "test_no_valid_state.py", "test_modbus_drive.py"
@@ -191,13 +202,13 @@ SUBJECTS = {
     "stop_on_signals": Subject("tdhil/session/stop_signals.py", ("cli/test_identify_end.py",)),
 }
 NAMED: tuple[tuple[str, str, str], ...] = (
-    ("canopen/drive", "stall_share * self._watchdog_s", "10.0 * stall_share * self._watchdog_s"),
-    ("canopen/limits", 'limits.torque_nm, lsb, 16, "N·m", math.floor', 'limits.torque_nm, lsb, 16, "N·m", math.ceil'),
-    ("canopen/limits", "return _rounded(one, limits.torque_nm * nm, per_lsb, math.floor)",
+    ("cia402/drive", "stall_share * self._prepared.watchdog_s", "10.0 * stall_share * self._prepared.watchdog_s"),
+    ("cia402/limits", 'limits.torque_nm, lsb, 16, "N·m", math.floor', 'limits.torque_nm, lsb, 16, "N·m", math.ceil'),
+    ("cia402/limits", "return _rounded(one, limits.torque_nm * nm, per_lsb, math.floor)",
      "return _rounded(one, limits.torque_nm * nm, per_lsb, math.ceil)"),
     ("canopen/supervision", "self._every_s = min(HEARTBEAT_S, every_s)", "self._every_s = HEARTBEAT_S"),
     ("canopen/watchdog", "return time_ms / 5000.0", "return time_ms / 2500.0"),
-    ("canopen/state_machine", "return State.UNKNOWN if state is State.NOT_READY else state", "return state"),
+    ("cia402/state_machine", "return State.UNKNOWN if state is State.NOT_READY else state", "return state"),
     ("modbus/tcp", "self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)", "pass"),
     ("modbus/watchdog", "good = LEAST_CYCLES * period_s <= value <= ", "good = value <= "),
     ("modbus/preflight", "            access.write(register, 0)\n", "            pass\n"),

@@ -1,6 +1,6 @@
 """Cycles that begin late at 250 Hz beside busy loops, one a core, with `--real-time-priority` and without, by turns.
 
-The loop is the run's own (`Cia402Drive.exchange`, and the log's thread beside it) over the simulator's socketcand hub.
+The loop is the run's own (`CanopenDrive.exchange`, and the log's thread beside it) over the simulator's socketcand hub.
 The simulated drive is a process of its own that goes before everything, as far as that is allowed: a real one has a
 processor of its own. A cycle is missed where it began late by more than half a period, or its feedback wasn't there.
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 
 import can
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import MonotonicClock, quantile
 from drivers.drive import Command, DriveLimits, Mode
 from profiles.library import load_canopen_profile
@@ -51,7 +51,7 @@ def one_round(raised: bool, seconds: float) -> tuple[int, int, int, float, float
         log = RunLog(RunWriter(Path(folder) / "run.mcap", epoch_ns=0, block=False), {})
         stack.callback(log.close)
         bus = can.Bus(found[3], interface="socketcand", host=found[1], port=int(found[2]), tcp_tune=True)
-        drive = Cia402Drive(bus, load_canopen_profile("generic/cia402"), MonotonicClock(), node=1, rate_hz=RATE_HZ,
+        drive = CanopenDrive(bus, load_canopen_profile("generic/cia402"), MonotonicClock(), node=1, rate_hz=RATE_HZ,
                             tap=log.frame)
         stack.callback(drive.close)
         drive.connect()

@@ -8,7 +8,8 @@ Only this host may send these frames to this drive. If one is received, another 
     RPDOs            setpoints
         600h + node      SDO requests: a tool that reads does no harm; one that writes may
 
-A single frame is reported (`remarks`). The second frame of a kind, at any time in the run, ends the run (`NodeWatch`).
+A single frame is reported (`NodeWatch.tell`). The second frame of a kind, at any time in the run, ends the run
+(`NodeWatch`).
 A tool that writes driving objects (6040h, 6060h, 6071h, 60FFh) repeatedly is a second master too.
 """
 
@@ -19,8 +20,8 @@ from collections.abc import Callable
 from functools import partial
 
 from drivers.canopen.bus import CanLink, Handler
-from drivers.canopen.sdo import name
 from drivers.canopen.supervision import NodeWatch
+from drivers.cia402 import name
 from drivers.clock import Clock
 from drivers.errors import PreflightRefused
 from drivers.preflight import PreflightTable
@@ -32,7 +33,6 @@ HIGHEST_NODE = 127
 FOREIGN_WRITES = 3
 """This number of writes to driving objects in one run shows a second master."""
 DRIVING = frozenset({0x6040, 0x6042, 0x6060, 0x6071, 0x60FF})
-_MOST_REMARKS = 20
 _DOWNLOAD, _EXPEDITED, _SIZED = 1, 0x02, 0x01
 
 
@@ -48,8 +48,6 @@ class ForeignTraffic:
         self._beats: Counter[int] = Counter()
         self._writes: Counter[tuple[int, int]] = Counter()
         self._last: dict[tuple[int, int], int | None] = {}
-        self._told: list[str] = []
-        self._said: set[str] = set()
         self._armed = False
         self.number = number
         self.feeds_by_heartbeat = True             # the drive's watchdog consumes a heartbeat
@@ -122,10 +120,10 @@ class ForeignTraffic:
             if self.feeds_by_heartbeat:
                 self._foreign(kind, f"another node sends {kind}: it would feed the drive's watchdog if this host fails")
             else:
-                self.tell(f"another node sends {kind}")
+                self._watch.tell(f"another node sends {kind}")
 
     def _foreign(self, kind: str, why: str = "") -> None:
-        self.tell(f"{kind} came from another master")
+        self._watch.tell(f"{kind} came from another master")
         self._watch.on_foreign(kind, why)
 
     # -- a tool's SDO ------------------------------------------------------------------------------------------
@@ -142,7 +140,7 @@ class ForeignTraffic:
             size = 4 - (data[0] >> 2 & 3) if data[0] & _SIZED else 4
             value = int.from_bytes(data[4 : 4 + size], "little")
         self._last[key] = value
-        self.tell(f"another master wrote {_shown(index, sub, value)} by SDO")
+        self._watch.tell(f"another master wrote {_shown(index, sub, value)} by SDO")
         self.on_write(index, sub)
         driving = sum(count for (one, _), count in self._writes.items() if one in DRIVING)
         if index in DRIVING and driving >= FOREIGN_WRITES:
@@ -153,19 +151,6 @@ class ForeignTraffic:
             )
 
     # -- remarks ---------------------------------------------------------------------------------------------------
-
-    def tell(self, text: str) -> None:
-        """Add a remark; each text once."""
-        if text not in self._said and len(self._said) < _MOST_REMARKS:
-            self._said.add(text)
-            self._told.append(text)
-
-    def remarks(self) -> tuple[str, ...]:
-        """Return the remarks since the last call, one line each."""
-        if not self._told:
-            return ()
-        told, self._told = tuple(self._told), []
-        return told
 
     def summary(self) -> tuple[str, ...]:
         """Return what other masters sent during the run, with the count."""

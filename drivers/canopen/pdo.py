@@ -1,35 +1,30 @@
 """Content of the cyclic frames of a drive, where it differs from the usual CiA 402 objects.
 
-- A drive without torque mode receives only 6040h and 60FFh. If its 6060h can't be mapped, there is no RPDO2.
-- In velocity mode (vl, 2) the speed setpoint is 6042h and the reported speed 6044h, 16 bits each.
-- Torque may be reported in a manufacturer's object. A 32-bit torque leaves no room for the statusword beside the
-  speed: then TPDO1 holds torque and speed, and TPDO2 brings the statusword with every SYNC.
+- If 6060h can't be mapped and no torque offset is used, there is no RPDO2.
+- A 32-bit torque leaves no room for the statusword beside the speed. TPDO1 then holds torque and speed, and TPDO2
+  brings the statusword with every SYNC.
 """
 
 from __future__ import annotations
 
-import math
-import struct
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from struct import Struct, error
+from struct import Struct
 
-from drivers.canopen.state_machine import (
-    ENABLE_OPERATION,
-    INTERNAL_LIMIT,
-    SPEED_ZERO,
-    TARGET_REACHED,
-    State,
-    decode,
-    decode_after,
-    power_state,
+from drivers.cia402 import (
+    LAYOUTS,
+    MODE,
+    MODE_DISPLAY,
+    STATUSWORD,
+    TORQUE_DEMAND,
+    CyclicObjects,
+    bits_of,
+    cyclic_objects,
 )
-from drivers.drive import Mode, PowerState, Sample
-from drivers.errors import CommandRejected, ObjectRefused
 from profiles import CYCLES_END, LAST_CYCLE_OVER
-from profiles.canopen import CanopenProfile, ObjectType, Position
+from profiles.canopen import CanopenProfile, Position
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The CiA 402 objects that tdhil uses, and the pure codec between them and SI.
@@ -44,72 +39,12 @@ from profiles.canopen import CanopenProfile, ObjectType, Position
 # ‰ is of the rated torque (6076h); the velocity's LSB is the profile's. `FrameShape` holds the differences of a drive.
 
 
-RPDO1 = struct.Struct("<Hhi")
-TPDO1 = struct.Struct("<Hhi")
-RPDO2 = struct.Struct("<b")
-RPDO2_OFFSET = struct.Struct("<h")
-RPDO2_MODE_OFFSET = struct.Struct("<bh")
+RPDO1 = Struct("<Hhi")
+TPDO1 = Struct("<Hhi")
+RPDO2 = Struct("<b")
+RPDO2_OFFSET = Struct("<h")
+RPDO2_MODE_OFFSET = Struct("<bh")
 PDO_BYTES = 8
-
-RPM = 2.0 * math.pi / 60.0
-"""rad/s in one rev/min."""
-
-# (index, subindex, bits), as mapped into PDOs.
-CONTROLWORD = (0x6040, 0, 16)
-STATUSWORD = (0x6041, 0, 16)
-MODE = (0x6060, 0, 8)
-MODE_DISPLAY = (0x6061, 0, 8)
-VELOCITY_ACTUAL = (0x606C, 0, 32)
-TARGET_TORQUE = (0x6071, 0, 16)
-TORQUE_DEMAND = (0x6074, 0, 16)
-TORQUE_ACTUAL = (0x6077, 0, 16)
-TARGET_VELOCITY = (0x60FF, 0, 32)
-VL_TARGET, VL_ACTUAL = (0x6042, 0, 16), (0x6044, 0, 16)
-"""Velocity mode (vl): target velocity, and vl velocity actual value (or control effort) of CiA 402-2."""
-
-MODE_NAMES = {2: "velocity mode", 3: "profile velocity", 4: "profile torque", 9: "cyclic sync velocity",
-              10: "cyclic sync torque"}
-"""6060h codes that tdhil may use."""
-
-
-@dataclass(frozen=True)
-class Units:
-    """Value of one LSB on this drive: speed in both directions, reported torque, target torque 6071h, torque offset."""
-
-    speed_rad_s_per_lsb: float
-    torque_nm_per_lsb: float
-    target_nm_per_lsb: float | None = None      # None: as the reported torque
-    offset_nm_per_lsb: float = 0.0              # 0: no torque offset in use
-
-
-def encode_speed(speed_rad_s: float, units: Units, target: tuple[int, int, int] = TARGET_VELOCITY) -> int:
-    """Convert rad/s at the motor shaft to 60FFh or 6042h. Raises CommandRejected out of range or if not finite."""
-    index, _, bits = target
-    return _encode(speed_rad_s, units.speed_rad_s_per_lsb, bits - 1, f"target velocity {index:04X}h", "rad/s")
-
-
-def encode_torque(torque_nm: float, units: Units) -> int:
-    """Convert N·m at the motor shaft to 6071h. Raises CommandRejected outside i16 or if not finite."""
-    per_lsb = units.target_nm_per_lsb or units.torque_nm_per_lsb
-    return _encode(torque_nm, per_lsb, 15, "target torque 6071h", "N·m")
-
-
-def encode_torque_offset(torque_nm: float, units: Units) -> int:
-    """Convert N·m at the motor shaft to 60B2h. Raises CommandRejected outside i16, if not finite, or if not mapped."""
-    if not units.offset_nm_per_lsb:
-        if torque_nm != 0.0:
-            raise CommandRejected("a torque offset was commanded, but none is mapped", where="60B2h")
-        return 0
-    return _encode(torque_nm, units.offset_nm_per_lsb, 15, "torque offset 60B2h", "N·m")
-
-
-def _encode(value: float, per_lsb: float, bits: int, where: str, unit: str) -> int:
-    if not math.isfinite(value):
-        raise CommandRejected(f"setpoint {value} {unit} is not finite", where=where)
-    raw = round(value / per_lsb)
-    if not -(1 << bits) <= raw < 1 << bits:
-        raise CommandRejected(f"setpoint {value:g} {unit} is outside the range of the object", where=where)
-    return raw
 
 
 def mapping_entry(mapped: tuple[int, int, int]) -> int:
@@ -124,137 +59,22 @@ def consumer_heartbeat(node: int, time_ms: int) -> int:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Values that a drive reported last, in its own counts, and the Sample in SI at the motor shaft made from them.
-
-
-_PROFILE_VELOCITY = 3
-
-
-class Reported:
-    """Last reported values, from TPDOs or single answers; zero before the first."""
-
-    def __init__(self) -> None:
-        self.state = State.NOT_READY
-        self._started = False          # it has shown a state other than not ready since its start
-        self.shown_code = 0            # 6061h
-        self._status = 0
-        self._speed_raw = 0
-        self._torque_raw: float = 0
-        self._demand_raw: int | None = None
-
-    def take(self, status: int, speed_raw: int, torque_raw: float | None) -> None:
-        """Take 6041h, 606Ch and 6077h (or the manufacturer's object) of one instant; torque None keeps the last
-        value.
-        """
-        self._status, self._speed_raw = status, speed_raw
-        self._torque_raw = self._torque_raw if torque_raw is None else torque_raw
-        self.state = decode_after(status) if self._started else decode(status)
-        self._started = self._started or self.state not in (State.NOT_READY, State.UNKNOWN)
-
-    def restarted(self) -> None:
-        """Note that the drive has sent its boot-up message: it may be not ready to switch on."""
-        self._started = False
-
-    def take_slow(self, shown_code: int, demand_raw: int | None) -> None:
-        """Take 6061h, and 6074h if the drive has it."""
-        self.shown_code, self._demand_raw = shown_code, demand_raw
-
-    def sample(
-        self, time_s: float, age_s: float, fresh: bool, units: Units, modes: Mapping[int, Mode],
-        position_rad: float | None = None,
-    ) -> Sample:
-        """Return the sample; ``time_s`` and ``age_s`` in control time, ``modes`` by their codes of 6061h."""
-        status = self._status
-        power = power_state(self.state)
-        reached = bool(status & TARGET_REACHED) and power is PowerState.QUICK_STOP
-        zero = bool(status & SPEED_ZERO) and self.shown_code == _PROFILE_VELOCITY and power is PowerState.ENABLED
-        demand = self._demand_raw
-        return Sample(
-            time_s,
-            age_s,
-            0.0,
-            fresh,
-            self._speed_raw * units.speed_rad_s_per_lsb,
-            self._torque_raw * units.torque_nm_per_lsb,
-            None if demand is None else demand * units.torque_nm_per_lsb,
-            modes.get(self.shown_code),
-            power,
-            reached or zero,
-            bool(status & INTERNAL_LIMIT),
-            status,
-            position_rad,
-        )
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Pure codec between the bytes of an object and a number, for every type that a profile may name (CiA 301, 9.1).
-
-
-_LAYOUTS: dict[str, Struct] = {
-    "u8": Struct("<B"), "u16": Struct("<H"), "u32": Struct("<I"), "i8": Struct("<b"), "i16": Struct("<h"),
-    "i32": Struct("<i"), "f32": Struct("<f"),
-}
-
-
-def decode_value(kind: ObjectType, data: bytes, where: str) -> float:
-    """Return the number in the bytes. Raises ObjectRefused for too few bytes or a number that is not finite."""
-    layout = _LAYOUTS[kind]
-    if len(data) < layout.size:
-        raise ObjectRefused(f"{len(data)} bytes where {layout.size} were expected", where=where)
-    value = float(layout.unpack_from(data)[0])
-    if not math.isfinite(value):
-        raise ObjectRefused(f"{value} is not a finite number", where=where)
-    return value
-
-
-def bits_of(kind: ObjectType) -> int:
-    """Return the length of an object of this type, bits."""
-    return 8 * _LAYOUTS[kind].size
-
-
-def encode_value(kind: ObjectType, value: float, where: str) -> bytes:
-    """Return the bytes of a number, rounded for integer types. Raises ObjectRefused if it is out of range."""
-    try:
-        return _LAYOUTS[kind].pack(value if kind == "f32" else round(value))
-    except (error, OverflowError, ValueError) as trouble:
-        raise ObjectRefused(f"{value:g} is outside the range of the object ({kind})", where=where) from trouble
-
-
-# ---------------------------------------------------------------------------------------------------------------------
 
 RPDO1_SPEED = Struct("<Hi")
 """6040h controlword u16 | 60FFh target velocity i32."""
 
 RPDO1_VL = Struct("<Hh")
 """6040h controlword u16 | 6042h vl target velocity i16."""
-VL_RELEASED = 0x0070
-"""Bits 4 to 6 of the controlword: ramp enabled, not locked, reference used (CiA 402-2, velocity mode)."""
 
-_BITS = {"i16": 16, "i32": 32, "f32": 32}
 _FEEDBACK = {"i16": TPDO1, "i32": Struct("<Hii"), "f32": Struct("<Hfi")}
 _FEEDBACK_VL = {"i16": Struct("<Hhh"), "i32": Struct("<Hih"), "f32": Struct("<Hfh")}
 
 
 @dataclass(frozen=True)
-class FrameShape:
-    """Frames that a drive receives and sends."""
+class FrameShape(CyclicObjects):
+    """Frames that a drive receives and sends: its cyclic objects, and how they are packed."""
 
-    target_torque: bool = True                         # 6071h is in RPDO1
-    mode: bool = True                                  # there is an RPDO2 with 6060h
-    torque: tuple[int, int, int] = TORQUE_ACTUAL       # index, subindex, bits of the reported torque
-    vl: bool = False                                   # speed setpoint in 6042h, reported speed in 6044h
-    offset: tuple[int, int, int] | None = None         # index, subindex, bits of a torque offset that RPDO2 carries
     feedback: Struct = TPDO1                           # statusword, torque, speed; wide: both TPDOs combined
-
-    @property
-    def target_speed(self) -> tuple[int, int, int]:
-        """Index, subindex, bits of the speed's setpoint."""
-        return VL_TARGET if self.vl else TARGET_VELOCITY
-
-    @property
-    def actual_speed(self) -> tuple[int, int, int]:
-        """Index, subindex, bits of the reported speed."""
-        return VL_ACTUAL if self.vl else VELOCITY_ACTUAL
 
     @property
     def wide(self) -> bool:
@@ -262,11 +82,11 @@ class FrameShape:
         return self.torque[2] == 32
 
     def setpoints(self, word: int, torque_raw: int, speed_raw: int) -> bytes:
-        """Return RPDO1. In velocity mode an enabled drive follows its setpoint only if the word releases it."""
+        """Return RPDO1."""
         if self.target_torque:
             return RPDO1.pack(word, torque_raw, speed_raw)
         if self.vl:
-            return RPDO1_VL.pack(word | VL_RELEASED if word == ENABLE_OPERATION else word, speed_raw)
+            return RPDO1_VL.pack(word, speed_raw)
         return RPDO1_SPEED.pack(word, speed_raw)
 
     @property
@@ -283,7 +103,6 @@ class FrameShape:
     def data_size(self) -> int:
         """Return the bytes of TPDO1."""
         return self.feedback.size - 2 if self.wide else self.feedback.size
-
 
 
 @dataclass(frozen=True)
@@ -319,7 +138,7 @@ class Slow:
     @cached_property
     def layout(self) -> Struct:
         """Mode display, demand and angle, if present."""
-        angle = "" if self.position is None else _LAYOUTS[self.position.type].format.lstrip("<")
+        angle = "" if self.position is None else LAYOUTS[self.position.type].format.lstrip("<")
         return Struct("<b" + "h" * self.demand + angle)
 
     def unpack(self, data: bytes) -> tuple[int, int | None, float | None]:
@@ -335,12 +154,9 @@ STANDARD = FrameShape()
 
 def shape_of(profile: CanopenProfile) -> FrameShape:
     """Return the frame shape that the profile describes."""
-    torque, target, vl = profile.torque.actual, bool(profile.modes.torque), profile.speed.vl
-    feedback = _FEEDBACK_VL if vl else _FEEDBACK
-    if torque is None:
-        return FrameShape(target, profile.modes.mapped, vl=vl, feedback=feedback["i16"])
-    place = (torque.index, torque.sub, _BITS[torque.type])
-    return FrameShape(target, profile.modes.mapped, place, vl=vl, feedback=feedback[torque.type])
+    content, actual = cyclic_objects(profile), profile.torque.actual
+    feedback = (_FEEDBACK_VL if content.vl else _FEEDBACK)["i16" if actual is None else actual.type]
+    return FrameShape(content.target_torque, content.mode, content.torque, content.vl, feedback=feedback)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

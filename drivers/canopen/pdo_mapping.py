@@ -7,16 +7,8 @@ enable.
 
 from dataclasses import dataclass
 
-from drivers.canopen.pdo import (
-    CONTROLWORD,
-    STANDARD,
-    STATUSWORD,
-    TARGET_TORQUE,
-    FrameShape,
-    Slow,
-    mapping_entry,
-)
-from drivers.canopen.sdo import Objects, name
+from drivers.canopen.pdo import STANDARD, FrameShape, Slow, mapping_entry
+from drivers.cia402 import CONTROLWORD, STATUSWORD, TARGET_TORQUE, Objects, name
 from drivers.errors import PreflightRefused
 from profiles import MessageCode
 

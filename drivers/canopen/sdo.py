@@ -15,8 +15,8 @@ import canopen
 from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
 
 from drivers.canopen.bus import CanLink
+from drivers.cia402 import Objects, name
 from drivers.errors import CommunicationLost, ObjectRefused
-from drivers.undo_journal import UndoJournal
 from profiles import MessageCode
 
 
@@ -85,19 +85,16 @@ class _PumpingClient(SdoClient):  # type: ignore[misc]
         return super().read_response()
 
 
-class Objects:
-    """The drive's object dictionary, as integers and strings.
+class SdoObjects(Objects):
+    """The object dictionary of one node, by SDO.
 
     Raises ObjectRefused when the drive aborts a transfer and CommunicationLost when it doesn't answer.
     """
 
     def __init__(self, link: CanLink, node: int) -> None:
+        super().__init__()
         self._client = _PumpingClient(link, node)
         self._node = node
-        self._undo: list[Callable[[], None]] = []
-        self._changed: set[tuple[int, int]] = set()
-        self.journal: UndoJournal | None = None        # records each change before it is made
-        self.stands: dict[tuple[int, int], bytes] = {}     # last value read back, or found right
 
     def on_answer(self, take: Callable[[bytes], None]) -> None:
         """Have ``take`` see every SDO answer of the drive, including answers to other clients."""
@@ -127,19 +124,6 @@ class Objects:
         except SdoCommunicationError as error:
             raise self._silent(index, subindex) from error
 
-    def read(self, index: int, subindex: int = 0, *, signed: bool = False) -> int:
-        return int.from_bytes(self.read_bytes(index, subindex), "little", signed=signed)
-
-    def read_if_there(self, index: int, subindex: int = 0, *, signed: bool = False) -> int | None:
-        """Return the value, or None if the drive does not have the object."""
-        try:
-            return self.read(index, subindex, signed=signed)
-        except ObjectRefused:
-            return None
-
-    def write(self, index: int, subindex: int, value: int, bits: int) -> None:
-        self.write_bytes(index, subindex, _encoded(value, bits, name(index, subindex)), str(value))
-
     def write_bytes(self, index: int, subindex: int, data: bytes, shown: str = "") -> None:
         """Write raw bytes. ``shown`` is the value for messages."""
         try:
@@ -151,58 +135,6 @@ class Objects:
         except SdoCommunicationError as error:
             raise self._silent(index, subindex) from error
 
-    def change(self, index: int, subindex: int, value: int, bits: int) -> int:
-        """Write a value, remember the former one, and return the value read back."""
-        signed = value < 0
-        before = self.read_bytes(index, subindex)
-        if int.from_bytes(before, "little", signed=signed) != value:
-            after = _encoded(value, bits, name(index, subindex))
-            self._note_change(index, subindex, before, after)
-            self.write_bytes(index, subindex, after, str(value))
-        back = self.stands[index, subindex] = self.read_bytes(index, subindex)
-        return int.from_bytes(back, "little", signed=signed)
-
-    def change_bytes(self, index: int, subindex: int, data: bytes) -> bytes:
-        """Do the same as `change`, for an object of any type."""
-        before = self.read_bytes(index, subindex)
-        if before != data:
-            self._note_change(index, subindex, before, data)
-            self.write_bytes(index, subindex, data)
-        back = self.stands[index, subindex] = self.read_bytes(index, subindex)
-        return back
-
-    def _note_change(self, index: int, subindex: int, before: bytes, after: bytes) -> None:
-        """Register the restore, and record the former value in case this host dies."""
-        where = name(index, subindex)
-        if (index, subindex) not in self._changed:
-            self._changed.add((index, subindex))
-            self.on_restore(lambda: self._give_back(index, subindex, before))
-        if self.journal is not None:
-            self.journal.changing(where, before, after)
-
-    def _give_back(self, index: int, subindex: int, before: bytes) -> None:
-        self.write_bytes(index, subindex, before, str(int.from_bytes(before, "little")))
-        if self.journal is not None:
-            self.journal.given_back(name(index, subindex))
-
-    def on_restore(self, undo: Callable[[], None]) -> None:
-        """Have ``undo`` called by `restore`."""
-        self._undo.append(undo)
-
-    def restore(self) -> tuple[str, ...]:
-        """Undo every change, the last one first. Return the changes that could not be restored."""
-        failed = []
-        self._changed.clear()
-        while self._undo:
-            try:
-                self._undo.pop()()
-            except ObjectRefused as error:
-                failed.append(str(error))
-            except CommunicationLost as error:
-                failed.append(str(error))
-                self._undo.clear()
-        return tuple(failed)
-
     def _silent(self, index: int, subindex: int) -> CommunicationLost:
         return CommunicationLost(
             f"node {self._node} does not answer SDO requests",
@@ -210,21 +142,3 @@ class Objects:
             next_step="Check that the drive is powered, its node-ID and bit rate, the cable and its termination",
             entry=MessageCode.NODE_SILENT,
         )
-
-
-def _encoded(value: int, bits: int, where: str) -> bytes:
-    try:
-        return value.to_bytes(bits // 8, "little", signed=value < 0)
-    except OverflowError as error:
-        raise ObjectRefused(f"{value} is outside the range of {bits} bits", where=where) from error
-
-
-def place(where: str) -> tuple[int, int]:
-    """Return (index, subindex) of a name written by `name`. Raises ValueError."""
-    index, _, subindex = where.partition(":")
-    return int(index.removesuffix("h"), 16), int(subindex or 0)
-
-
-def name(index: int, subindex: int = 0) -> str:
-    """Return an object's name for messages: 6040h, 1016h:1."""
-    return f"{index:04X}h:{subindex}" if subindex else f"{index:04X}h"

@@ -1,20 +1,14 @@
-"""Supervision of the drive during a run: heartbeat, boot-up, emergency messages, and read-back of its settings.
-
-Each kind of error is kept until it was raised once, in the order of occurrence. So it does not disturb a stop sequence
-that continues to exchange.
-"""
+"""Supervision of a node during a run: heartbeat, boot-up, emergency messages, and the host's sign of life."""
 
 from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
-from enum import Enum
 
 from drivers.canopen.bus import CanLink
-from drivers.canopen.sdo import name
-from drivers.clock import LOWER_THE_RATE, Clock
-from drivers.errors import CommunicationLost, DriveFault, TdhilError
+from drivers.cia402 import HOST_SILENT, DriveWatch, emcy_text
+from drivers.clock import Clock
+from drivers.errors import CommunicationLost, DriveFault
 from profiles import MessageCode
 from profiles.canopen import CanopenProfile
 
@@ -38,75 +32,28 @@ START_GRACE_S = 0.5
 HOST_LOST = 0x8130
 """EMCY of a drive that lost its host: life guard error or heartbeat error (CiA 301)."""
 
-HOST_SILENT = "host silent"
-THIN = "thin feedback"
-OF_A_LATE_HOST = (HOST_SILENT, THIN)
-OF_A_SILENT_HOST = ("heartbeat", "nmt", *OF_A_LATE_HOST)
-"""Kinds of error that a delay of this host causes, or that it mistakes for errors of the drive."""
 
-# EMCY error code classes (CiA 301) and the CiA 402 codes a field engineer meets first.
-_EMCY_CLASSES = {
-    0x10: "generic error",
-    0x20: "current",
-    0x21: "current, input side",
-    0x22: "current inside the drive",
-    0x23: "current, output side (short circuit or overload)",
-    0x30: "voltage",
-    0x31: "mains voltage",
-    0x32: "DC link voltage",
-    0x33: "output voltage",
-    0x40: "temperature",
-    0x42: "drive temperature",
-    0x43: "motor temperature",
-    0x50: "drive hardware",
-    0x54: "power section (or STO)",
-    0x60: "drive software",
-    0x70: "additional modules",
-    0x73: "sensor",
-    0x75: "communication module",
-    0x80: "monitoring",
-    0x81: "communication (host heartbeat lost, CAN overrun or passive)",
-    0x82: "protocol error (PDO length)",
-    0x84: "speed controller (speed limit or following error)",
-    0x86: "positioning",
-    0x90: "external error",
-    0xF0: "additional functions",
-}
-
-
-def emcy_text(code: int) -> str:
-    """Return the meaning of an EMCY error code, by its class."""
-    meaning = _EMCY_CLASSES.get(code >> 8) or _EMCY_CLASSES.get(code >> 8 & 0xF0) or "manufacturer specific"
-    return f"EMCY {code:04X}h, {meaning}"
-
-
-class NodeWatch:
+class NodeWatch(DriveWatch):
     """Follows one node. ``allowed_silence_s`` is the longest time without a heartbeat (0 = not supervised).
 
     With node guarding, `Guarding` passes the answers on as if they were heartbeats.
     """
 
     def __init__(self, node: int, clock: Clock) -> None:
+        super().__init__(f"node {node}")
         self._node = node
         self._clock = clock
         self._heard_s: float | None = None
-        self._troubles: list[tuple[str, TdhilError]] = []
-        self._raised: set[str] = set()
         self._foreign_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
         self.foreign: Counter[str] = Counter()     # foreign frames since the start, by kind
         self._contradicted_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
         self._started_s = 0.0
         self._operational = False
         self.allowed_silence_s = 0.0
-        self.expect_operational = False
         self.emcy_code = 0
         self.nmt_state: int | None = None      # last reported by the drive; None before
         self.on_boot_up: Callable[[], None] = lambda: None
         self.sign_of_life: Callable[[], tuple[str, str]] = lambda: ("heartbeat has been missing", "1017h")
-        self.host_stood_still: Callable[[], str] = lambda: ""
-        """Returns the delay of this host, in words, to report before the error; empty if there was none."""
-        self.host_late: Callable[[], str] = lambda: ""
-        """The same for repeated short delays, on which a drive's watchdog acts."""
 
     def on_heartbeat(self, data: bytes) -> None:
         """Handle 700h + node: the NMT state, or 0 for boot-up."""
@@ -120,7 +67,7 @@ class NodeWatch:
         if not self.expect_operational:
             return
         if state == BOOT_UP:
-            self._keep(
+            self.keep(
                 "boot-up",
                 DriveFault(
                     "the drive restarted during the run (boot-up message)",
@@ -132,7 +79,7 @@ class NodeWatch:
         elif state == OPERATIONAL:
             self._operational = True
         elif self._operational or self._clock.now_s() - self._started_s > START_GRACE_S:
-            self._keep(
+            self.keep(
                 "nmt",
                 CommunicationLost(
                     f"another master put the drive into NMT state {_NMT_NAMES.get(state, state)}",
@@ -149,7 +96,7 @@ class NodeWatch:
         code = int.from_bytes(data[:2], "little")
         self.emcy_code = code
         if code == HOST_LOST and self.expect_operational:
-            self._keep(
+            self.keep(
                 HOST_SILENT,
                 CommunicationLost(
                     f"the drive's watchdog has tripped: {emcy_text(code)}",
@@ -160,7 +107,7 @@ class NodeWatch:
             )
         elif code and self.expect_operational:
             extra = data[3:].hex(" ")
-            self._keep(
+            self.keep(
                 "emcy",
                 DriveFault(
                     emcy_text(code) + (f" (manufacturer's bytes {extra})" if any(data[3:]) else ""),
@@ -187,26 +134,10 @@ class NodeWatch:
                 kind="master",
             )
 
-    def interference(self, what: str, where: str, next_step: str, *, kind: str) -> None:
-        """Record that another master changes or drives this drive; `check` raises it once for each ``kind``."""
-        self._keep(kind, CommunicationLost(what, where=where, next_step=next_step))
-
-    def thin_feedback(self, missed: int, cycles: int, period_s: float, where: str) -> None:
-        """Record that ``missed`` of the last cycles brought no feedback."""
-        self._keep(
-            THIN,
-            CommunicationLost(
-                f"{missed} of the last {cycles} cycles ({cycles * period_s:.2g} s) brought no feedback",
-                where=f"node {self._node}, {where}",
-                next_step="Check the TPDO's transmission type and mapping, the bus load and the cable",
-                entry=MessageCode.FEEDBACK_LOST,
-            ),
-        )
-
     def on_contradiction(self) -> None:
         """Handle a feedback frame that contradicts an earlier one for the same SYNC: one of them is foreign."""
         if self._no_accident(self._contradicted_s):
-            self._keep(
+            self.keep(
                 "feedback",
                 CommunicationLost(
                     "several different feedback frames come for one SYNC: another node sends them too",
@@ -220,7 +151,7 @@ class NodeWatch:
         """Raise the oldest error that was not raised yet."""
         if self.overdue and self._heard_s is not None:
             missing, where = self.sign_of_life()
-            self._keep(
+            self.keep(
                 "heartbeat",
                 CommunicationLost(
                     f"the drive's {missing} for {self._clock.now_s() - self._heard_s:.2f} s",
@@ -230,8 +161,7 @@ class NodeWatch:
                 ),
             )
         if self._troubles:
-            kind, trouble = self._troubles.pop(0)
-            raise self._of_host(kind, trouble) if kind in OF_A_SILENT_HOST else trouble
+            super().check()
 
     @property
     def overdue(self) -> bool:
@@ -239,29 +169,17 @@ class NodeWatch:
         silent_s = 0.0 if self._heard_s is None else self._clock.now_s() - self._heard_s
         return 0.0 < self.allowed_silence_s < silent_s
 
-    def _of_host(self, kind: str, trouble: TdhilError) -> TdhilError:
-        """Return the error with the delay of this host in front, if there was one: the delay may be its only cause.
-
-        The drive's watchdog also trips on many cycles that are each only a little late.
-        """
-        away = self.host_late() if kind in OF_A_LATE_HOST else self.host_stood_still()
-        if not away:
-            return trouble
-        where = trouble.where if kind == HOST_SILENT else f"host; {trouble.where}"
-        return CommunicationLost(f"{away}. After that: {trouble.what}", where=where, next_step=LOWER_THE_RATE,
-                                 entry=MessageCode.HOST_LATE)
-
     def start(self, allowed_silence_s: float) -> None:
         """Treat silence, boot-up, EMCY and foreign NMT commands as errors from now on."""
         self._heard_s = self._started_s = self._clock.now_s()
         self._operational = False
         self.foreign.clear()
         self.allowed_silence_s = allowed_silence_s
-        self.expect_operational = True
+        super().start(allowed_silence_s)
 
     def stop(self) -> None:
         """End the supervision."""
-        self.expect_operational = False
+        super().stop()
         self.allowed_silence_s = 0.0
 
     def _no_accident(self, seen_s: deque[float]) -> bool:
@@ -269,11 +187,6 @@ class NodeWatch:
         now_s = self._clock.now_s()
         seen_s.append(now_s)
         return len(seen_s) == FOREIGN_FRAMES and now_s - seen_s[0] <= FOREIGN_S
-
-    def _keep(self, kind: str, trouble: TdhilError) -> None:
-        if kind not in self._raised:
-            self._raised.add(kind)
-            self._troubles.append((kind, trouble))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -324,225 +237,6 @@ class Guarding:
         if self.repeated:
             return f"answers to node guarding have not toggled ({self.repeated} alike)", "100Ch"
         return "answers to node guarding have been missing", "100Ch"
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Read-back of the settings that preflight made: two objects a second, beside the cycle, during the whole run.
-#
-# A tool, the drive's panel or another fieldbus may change the watchdog, its reaction, the quick stop or a limit while
-# the shaft turns, without any frame on this bus. So a request is sent after a cycle's feedback; tdhil does not wait for
-# the answer and checks it when it comes (SDO upload, expedited, CiA 301). Watchdog and quick stop have every third
-# turn, limits and setpoints another, and the content of the feedback frames (mapping, transmission type, COB-ID of the
-# TPDOs) the third. So a change shows within 0.5 s times three times the number of objects in its group. An object that
-# a tool writes on this bus is checked in the next cycle.
-#
-# Setpoints and mode (6071h, 60FFh, 6060h) are read too: they must be the values that this host sent last. A drive
-# echoes them if it has returned a value of ours other than zero. Only then does another value come from another master.
-#
-# An answer that differs is requested again at once, and counts the second time (a setpoint the third time). The changed
-# value is written back once before the stop, because the stop may depend on it (605Ah). Some drives do not answer SDO
-# requests while running; tdhil reports this and continues. If a drive stops answering after it has answered before,
-# `LOST` missed replies count as a lost connection.
-
-
-READ_BACK_EVERY_S = 0.5
-READ_BACK_ANSWER_S = 0.5
-"""Control time for an answer, s."""
-GIVE_UP, LOST = 5, 10
-"""Unanswered requests in a row: limit for a drive that never answered, and for one that did."""
-TRIES = 2
-REMEMBERED = 8
-"""Number of cycles whose setpoints an answer may show."""
-_UPLOAD, _ABORT = 2, 4
-
-
-class Group(Enum):
-    """Objects that are read back in the same turn."""
-
-    SAFETY = "watchdog, its reaction, quick stop"
-    REST = "limits, setpoints, RPDOs"
-    FEEDBACK = "what the TPDOs carry, and when"
-
-
-@dataclass(eq=False)
-class _WatchedObject:
-    """``data``: required value; None: one of the setpoints sent last."""
-
-    index: int
-    sub: int
-    title: str
-    data: bytes | None
-    differs: int = 0
-    refused: int = 0
-    echoed: bool = False
-
-
-class ReadBack:
-    """``ask`` puts an upload request on the bus; `step` is called once a cycle, `take` for each SDO answer."""
-
-    def __init__(self, watch: NodeWatch, ask: Callable[[bytes], None], tell: Callable[[str], None], node: int) -> None:
-        self._watch = watch
-        self._ask = ask
-        self._tell = tell
-        self._node = node
-        self._groups: dict[Group, list[_WatchedObject]] = {group: [] for group in Group}
-        self.on_changed: Callable[[int, int], None] = lambda index, sub: None
-        """Called with index and sub-index of an object that another master changed, before the error is raised."""
-        self._next: deque[_WatchedObject] = deque()      # to read before their turn
-        self._turn = 0
-        self._asked: _WatchedObject | None = None
-        self._asked_s = 0.0
-        self._due_s: float | None = None
-        self._silent = 0
-        self._answered = False
-        self._over = False
-        self._sent: dict[int, deque[int]] = {}
-
-    def clear(self) -> None:
-        """Remove all objects."""
-        for group in self._groups.values():
-            group.clear()
-        self._sent.clear()
-        self._next.clear()
-
-    def watch(self, title: str, index: int, sub: int, data: bytes, group: Group) -> None:
-        """Add an object that must keep its value."""
-        self._groups[group].append(_WatchedObject(index, sub, title, data))
-
-    def stands(self, index: int, sub: int, data: bytes) -> None:
-        """Note that this host has written a watched object itself."""
-        for one in self._all():
-            if (one.index, one.sub) == (index, sub):
-                one.data = data
-
-    def watch_setpoint(self, title: str, index: int) -> None:
-        """Add an object that must show the setpoint sent (`sent`)."""
-        self._sent[index] = deque(maxlen=REMEMBERED)
-        self._groups[Group.REST].append(_WatchedObject(index, 0, title, None))
-
-    def sent(self, index: int, value: int) -> None:
-        """Record a setpoint that was sent in this cycle."""
-        if index in self._sent:
-            self._sent[index].append(value)
-
-    def soon(self, index: int, sub: int) -> None:
-        """Read this object before its turn, because another master wrote it."""
-        for one in self._all():
-            if (one.index, one.sub) == (index, sub) and one not in self._next:
-                self._next.append(one)
-
-    def put_back(self, index: int, sub: int) -> None:
-        """Write the required value into a supervised object, without waiting for an answer (SDO download,
-        expedited).
-        """
-        for one in self._all():
-            if (one.index, one.sub) == (index, sub) and one.data is not None:
-                command = 0x23 | (4 - len(one.data)) << 2
-                self._ask(bytes((command,)) + self._head(one) + one.data.ljust(4, b"\0"))
-
-    def step(self, now_s: float) -> None:
-        """Send the next request, after a cycle's feedback."""
-        if self._over or not any(self._groups.values()):
-            return
-        if self._asked is not None:
-            if now_s - self._asked_s < READ_BACK_ANSWER_S:
-                return
-            self._asked = None
-            self._unanswered()
-        if self._due_s is None:
-            self._due_s = now_s
-        if self._next or now_s >= self._due_s - 1e-9:
-            if not self._next:
-                self._due_s = now_s + READ_BACK_EVERY_S
-            self._asked, self._asked_s = self._choose(), now_s
-            self._ask(bytes((_UPLOAD << 5,)) + self._head(self._asked) + bytes(4))
-
-    def take(self, data: bytes) -> None:
-        """Handle an SDO answer of the drive, to this or another client."""
-        one = self._asked
-        if one is None or len(data) != 8 or data[1:4] != self._head(one):
-            return
-        command = data[0] >> 5
-        if command == _ABORT:
-            self._asked, self._silent = None, 0
-            one.refused += 1
-            if one.refused == GIVE_UP:
-                self._tell(f"the drive refuses to read {name(one.index, one.sub)} in motion; it is not supervised")
-                self._drop(one)
-        elif command == _UPLOAD and data[0] & 0x02:
-            self._asked, self._silent, self._answered = None, 0, True
-            self._compare(one, data[4 : 8 - (data[0] >> 2 & 3 if data[0] & 1 else 0)])
-
-    def _choose(self) -> _WatchedObject:
-        if self._next:
-            return self._next.popleft()
-        groups = [group for group in self._groups.values() if group]
-        turn, self._turn = self._turn, self._turn + 1
-        group = groups[turn % len(groups)]
-        return group[turn // len(groups) % len(group)]
-
-    def _all(self) -> list[_WatchedObject]:
-        return [one for group in self._groups.values() for one in group]
-
-    def _compare(self, one: _WatchedObject, found: bytes) -> None:
-        if one.data is not None:
-            good = found[: len(one.data)] == one.data
-        else:
-            value, sent = int.from_bytes(found, "little", signed=True), self._sent[one.index]
-            good = value in sent
-            one.echoed = one.echoed or (good and value != 0)
-            if not good and not one.echoed:
-                return
-        if good:
-            one.differs = 0
-            return
-        one.differs += 1
-        if one.differs < TRIES + (one.data is None):
-            self._next.appendleft(one)
-        elif one.data is not None:
-            self.put_back(one.index, one.sub)      # before the stop, which may depend on it
-            self.on_changed(one.index, one.sub)
-            self._watch.interference(
-                f"{one.title} was changed by another master during the run: {_shown(one.data)} was set,"
-                f" {_shown(found)} is there now",
-                f"node {self._node}, {name(one.index, one.sub)}",
-                "Find the tool, panel or master that writes to this drive, disconnect it, and start again",
-                kind=f"changed {one.index:04X}:{one.sub}",
-            )
-        else:
-            self._watch.interference(
-                f"{one.title} is not what this host sent: {_shown(found)} is there, {sent[-1]} was sent",
-                f"node {self._node}, {name(one.index, one.sub)}",
-                "A second master, a panel or another fieldbus may drive it. Disconnect it and start again",
-                kind="setpoint",
-            )
-
-    def _unanswered(self) -> None:
-        self._silent += 1
-        if not self._answered and self._silent >= GIVE_UP:
-            self._over = True
-            self._tell("the drive answers no SDO requests in motion: watchdog and limits were not read back")
-        elif self._answered and self._silent >= LOST:
-            self._over = True
-            self._watch.interference(
-                f"the drive did not answer {LOST} SDO requests in a row: watchdog and limits can't be read back",
-                f"node {self._node}, SDO",
-                "Check a gateway in between and the load of the drive; see the frames in the log", kind="read back",
-            )
-
-    def _drop(self, one: _WatchedObject) -> None:
-        for those in self._groups.values():
-            if one in those:
-                those.remove(one)
-
-    @staticmethod
-    def _head(one: _WatchedObject) -> bytes:
-        return one.index.to_bytes(2, "little") + bytes((one.sub,))
-
-
-def _shown(data: bytes) -> str:
-    number = int.from_bytes(data, "little")
-    return f"{number} ({number:X}h)" if number > 9 else str(number)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -7,28 +7,25 @@ from contextlib import suppress
 
 from drivers.canopen.pdo import FrameShape, Slow, consumer_heartbeat
 from drivers.canopen.pdo_mapping import layout, slow_syncs, switch_off_others, write_pdo, written
-from drivers.canopen.sdo import Objects, name
-from drivers.errors import ObjectRefused, PreflightRefused
-from drivers.preflight import DIES, PreflightTable, settle
+from drivers.cia402 import ANSWER_S, FeedbackSetting, Objects, arm, name
+from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
+from drivers.preflight import DIES, PreflightTable
 from profiles import MARKER_INDEX, MessageCode
 from profiles.canopen import CanopenProfile, Position, Watchdog
 
 GUARD_TIME, LIFE_TIME_FACTOR = 0x100C, 0x100D
-LEAST_CYCLES = 5
-"""The watchdog must not trip because of one or two lost frames."""
 
 
 def map_pdos(
-    table: PreflightTable, objects: Objects, node: int, profile: CanopenProfile, shape: FrameShape, period_s: float,
+    table: PreflightTable, objects: Objects, node: int, shape: FrameShape, period_s: float, demand: bool,
     position: Position | None,
 ) -> tuple[Slow, dict[int, int]]:
     """Map both pairs of PDOs, and switch off the drive's other RPDOs.
 
-    Return the content of the second TPDO: the torque demand 6074h and the angle ``position``, if the drive has them and
-    they can be mapped. Also return the COB-IDs that were switched off, by RPDO number.
+    Return the content of the second TPDO: the torque demand 6074h and the angle ``position``, if they can be mapped.
+    Also return the COB-IDs that were switched off, by RPDO number.
     """
-    with_demand = profile.torque.has_demand and objects.read_if_there(0x6074) is not None
-    carried = Slow.fitting(with_demand, position, shape)
+    carried = Slow.fitting(demand, position, shape)
     *pdos, slow = layout(carried, shape, slow_syncs(period_s))
     others: dict[int, int] = {}
     taken: list[Slow] = []             # accepted by the drive
@@ -41,7 +38,7 @@ def map_pdos(
         except PreflightRefused as error:
             if carried.position is None:
                 raise
-            less = Slow(with_demand, None, shape.wide)
+            less = Slow(demand, None, shape.wide)
             write_pdo(objects, node, layout(less, shape, slow_syncs(period_s))[-1])
             table.note("angle in the cycle", f"not mapped ({error.what}); it is read on request only", error.where)
             taken.append(less)
@@ -67,13 +64,13 @@ def set_period(objects: Objects, profile: CanopenProfile, period_s: float) -> in
     return objects.change(0x1006, 0, round(period_s * 1e6), 32)
 
 
-def feedback_frames(objects: Objects) -> list[tuple[str, int, int, bytes]]:
-    """Return title, index, sub-index and bytes of the objects that define content and timing of the two TPDOs.
+def feedback_frames(objects: Objects) -> list[FeedbackSetting]:
+    """Return the objects that define content and timing of the two TPDOs.
 
     These are COB-ID, transmission type, inhibit time and event timer (1800h:1, 2, 3, 5), if the drive has them; and the
     used part of the mapping (1A00h).
     """
-    found = []
+    found: list[FeedbackSetting] = []
     for number in (0, 1):
         mapping = 0x1A00 + number
         places = [(f"TPDO{number + 1}", 0x1800 + number, sub) for sub in (1, 2, 3, 5)]
@@ -127,6 +124,18 @@ def set_timing(
     return good and time_ms > 0
 
 
+def keep_stepping(objects: Objects, profile: CanopenProfile, period_s: float) -> None:
+    """Set the cycle of a simulated drive again (1006h, or the marker's): after a restart its time would not advance."""
+    index, sub = (0x1006, 0) if profile.cyclic.has_period else (MARKER_INDEX, 3)
+    wanted_us = round(period_s * 1e6)
+    with objects.answered_within(ANSWER_S):
+        try:
+            if objects.read(index, sub) != wanted_us:
+                objects.write(index, sub, wanted_us, 32)
+        except (CommunicationLost, ObjectRefused):
+            return
+
+
 def arm_watchdog(
     table: PreflightTable,
     objects: Objects,
@@ -139,38 +148,21 @@ def arm_watchdog(
     answered: Callable[[], bool],
     accept_none: bool,
 ) -> float:
-    """Write and read back the drive's watchdog and its reaction. Return the period at which the host must feed it, s.
+    """Arm the drive's watchdog (`drivers.cia402.arm`). Return the period at which the host must feed it, s; 0: none.
 
     Supervision begins with the first ``beat`` (heartbeat, or request of node guarding), so one is sent before the
-    read-back; ``answered`` waits for the drive's answer to a request. 0 if it is not armed: refused, unless
-    ``accept_none`` and it is known to be off.
+    read-back; ``answered`` waits for the drive's answer to a request.
     """
-    tried = PreflightTable()
-    if entry.kind == "none":
-        tried.row("watchdog", "armed", "this drive has none", False, "profile", DIES)
-        settle(table, tried, accept_none, lambda: True)
-        return 0.0
-    index, sub, wanted = entry.reaction_index, entry.reaction_sub, entry.reaction_value
-    if index is not None and wanted is not None:
 
-        def react() -> tuple[str, bool]:
-            found = objects.change(index, sub, wanted, 16)
-            return str(found), found == wanted
+    def armed(tried: PreflightTable, time_ms: int) -> float:
+        if entry.kind == "node_guarding":
+            return _arm_guarding(tried, objects, time_ms, entry.life_time_factor, beat, answered)
+        return _arm_heartbeat(tried, objects, entry, host_node, time_ms, beat)
 
-        tried.attempt("watchdog reaction", f"{wanted} ({entry.reaction})", name(index, sub), react)
-    time_ms = round(watchdog_s * 1000)
-    if not 1 <= time_ms <= 0xFFFF or watchdog_s < LEAST_CYCLES * period_s:
-        table.checks += tried.checks
-        table.row(
-            "watchdog time", f"{LEAST_CYCLES} cycles to 65 s", f"{time_ms} ms", False, "limits.watchdog_s",
-            f"Set it to at least {LEAST_CYCLES * period_s:g} s, or use a higher rate",
-        )
-        return 0.0
-    if entry.kind == "node_guarding":
-        feed_s = _arm_guarding(tried, objects, time_ms, entry.life_time_factor, beat, answered)
-    else:
-        feed_s = _arm_heartbeat(tried, objects, entry, host_node, time_ms, beat)
-    return feed_s if settle(table, tried, accept_none, lambda: _is_off(objects, entry)) else 0.0
+    return arm(
+        table, objects, entry, armed, lambda: _is_off(objects, entry),
+        watchdog_s=watchdog_s, period_s=period_s, accept_none=accept_none,
+    )
 
 
 def _arm_heartbeat(

@@ -70,12 +70,21 @@ def _abb():
     return AbbBench
 
 
-MAKERS = {"abb-fcan": _abb, "canopen": _canopen, "epos4": _epos4, "modbus": _modbus, "s120-canopen": _s120}
+def _memory():
+    from tests.drivers.memory_bench import MemoryBench
+
+    return MemoryBench
+
+
+MAKERS = {
+    "abb-fcan": _abb, "canopen": _canopen, "epos4": _epos4, "memory": _memory, "modbus": _modbus, "s120-canopen": _s120,
+}
 
 
 @pytest.fixture(params=[
     # One of each bus at once; the vendors' profiles, which CI tries as well, differ from them by what they declare.
-    pytest.param(name, marks=() if name in ("canopen", "modbus") else pytest.mark.heavy) for name in sorted(MAKERS)
+    pytest.param(name, marks=() if name in ("canopen", "memory", "modbus") else pytest.mark.heavy)
+    for name in sorted(MAKERS)
 ])
 def make_bench(request):
     """Makes benches of one kind of drive (see drive_benches); a further kind joins the contract by its line above."""

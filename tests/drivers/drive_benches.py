@@ -15,7 +15,7 @@ from collections import deque
 
 import can
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, DriveLimits, Mode, PowerState
 from profiles.library import load_canopen_profile
@@ -66,7 +66,7 @@ class TamperedBus:
 
 
 class CanopenBench:
-    """Cia402Drive on the embedded simulator, stepped, in this thread."""
+    """CanopenDrive on the embedded simulator, stepped, in this thread."""
 
     SETTINGS = ((0x1006, 0), (0x1016, 1), (0x1017, 0), (0x6007, 0), (0x605A, 0), (0x6072, 0), (0x6080, 0), (0x6085, 0))
     TARGETS = ((0x6060, 0), (0x6071, 0), (0x60FF, 0))
@@ -98,7 +98,7 @@ class CanopenBench:
         self._second = self.simulated.station()
         self.bus = TamperedBus(self.simulated.station())
         self.frames = []
-        self.drive = Cia402Drive(self.bus, profile, SteppedClock(), node=1, tap=self._tap, **options)
+        self.drive = CanopenDrive(self.bus, profile, SteppedClock(), node=1, tap=self._tap, **options)
 
     def _tap(self, frame):
         self.frames.append(frame)

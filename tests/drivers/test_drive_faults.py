@@ -6,7 +6,7 @@ import itertools
 import can
 import pytest
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, DriveLimits, Mode, PowerState
 from drivers.errors import CommunicationLost, DriveFault
@@ -138,7 +138,7 @@ def test_closing_on_a_dead_bus_does_not_raise(turning, bench):
 @pytest.fixture(params=["stepped", "real time"])
 def numbered(request, wire, peer, profile, fake_time):
     clock = SteppedClock() if request.param == "stepped" else MonotonicClock()
-    drive = Cia402Drive(wire, profile, clock, node=1)
+    drive = CanopenDrive(wire, profile, clock, node=1)
     drive.connect()
     assert drive.preflight(LIMITS).refused == ()
     drive.enable(Mode.SPEED)
@@ -147,7 +147,7 @@ def numbered(request, wire, peer, profile, fake_time):
 
 @pytest.fixture
 def stepped_drive(wire, peer, profile, fake_time):
-    drive = Cia402Drive(wire, profile, SteppedClock(), node=1)
+    drive = CanopenDrive(wire, profile, SteppedClock(), node=1)
     drive.connect()
     assert drive.preflight(LIMITS).refused == ()
     drive.enable(Mode.SPEED)
@@ -156,7 +156,7 @@ def stepped_drive(wire, peer, profile, fake_time):
 
 @pytest.fixture
 def in_real_time(wire, peer, profile, fake_time):
-    drive = Cia402Drive(wire, profile, MonotonicClock(), node=1)
+    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
     drive.connect()
     drive.preflight(LIMITS)
     drive.enable(Mode.SPEED)
@@ -239,7 +239,7 @@ def test_a_dead_peer_ends_a_wait_and_costs_little_from_then_on(stepped_drive, pe
 
 def test_questions_are_no_part_of_the_log(wire, peer, profile, fake_time):
     frames = []
-    drive = Cia402Drive(wire, profile, SteppedClock(), node=1, tap=frames.append)
+    drive = CanopenDrive(wire, profile, SteppedClock(), node=1, tap=frames.append)
     drive.connect()
     drive.preflight(LIMITS)
     wire.on_send = answered_questions(wire, wire.on_send, 0.01)
@@ -414,7 +414,7 @@ def test_speed_zero_counts_in_profile_velocity_only(wire, peer, profile):
     """Bit 12 means something else in the cyclic modes."""
     for supported, standstill in ((1 << 2, True), (1 << 8, False)):
         peer.objects[0x6502, 0] = supported.to_bytes(4, "little")
-        drive = Cia402Drive(wire, profile, SteppedClock(), node=1)
+        drive = CanopenDrive(wire, profile, SteppedClock(), node=1)
         drive.connect()
         drive.preflight(LIMITS)
         peer.answer_sync = lambda cycle: [(0.0002, bytes.fromhex("37120000") + bytes(4))]

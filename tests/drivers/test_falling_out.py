@@ -2,7 +2,7 @@
 
 import pytest
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, DriveLimits, Mode, PowerState
 from drivers.errors import CommunicationLost
@@ -22,7 +22,7 @@ def cycles(drive, wire, count=20):
 
 @pytest.fixture
 def drive(wire, peer, profile):
-    drive = Cia402Drive(wire, profile, SteppedClock(), node=1)
+    drive = CanopenDrive(wire, profile, SteppedClock(), node=1)
     drive.connect()
     drive.preflight(LIMITS)
     drive.enable(Mode.SPEED)
@@ -74,7 +74,7 @@ def test_a_drive_that_is_switched_to_another_control_place_ends_the_run(drive, w
 
 def test_a_drive_that_never_sets_that_bit_is_not_judged_by_it(wire, peer, profile):
     peer.tpdo = lambda cycle: TPDO1.pack(peer.machine.status | 0x1000, 0, 0)
-    drive = Cia402Drive(wire, profile, SteppedClock(), node=1)
+    drive = CanopenDrive(wire, profile, SteppedClock(), node=1)
     drive.connect()
     drive.preflight(LIMITS)
     drive.enable(Mode.SPEED)

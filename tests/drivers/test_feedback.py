@@ -206,7 +206,7 @@ def test_after_answers_that_were_lost_one_more_cycle_is_doubtful(lost):
 
 
 def test_a_drive_that_is_always_a_cycle_late_is_never_paired_with_the_wrong_sync():
-    """How soon it answers is known from the first SYNC, which is given its time (`Cia402Drive`)."""
+    """How soon it answers is known from the first SYNC, which is given its time (`CanopenDrive`)."""
     wire = Wire()
     wire.feedback.begin(0.0)
     wire.now_s = 1.2 * PERIOD_S

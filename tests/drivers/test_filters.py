@@ -6,8 +6,8 @@ import struct
 import pytest
 
 from drivers.canopen.bus import CanLink
-from drivers.canopen.preflight import lag_seconds, read_filters
-from drivers.canopen.sdo import Objects
+from drivers.canopen.sdo import SdoObjects
+from drivers.cia402.preflight import lag_seconds, read_filters
 from drivers.clock import SteppedClock
 from drivers.errors import ObjectRefused
 from profiles.canopen import ReportingFilter
@@ -45,7 +45,7 @@ def test_reading(wire, peer, profile):
     speed, torque = entry(), entry("torque", 0x2505)
     notes = []
     found = read_filters(
-        lambda *row: notes.append(row), Objects(CanLink(wire, SteppedClock()), 1),
+        lambda *row: notes.append(row), SdoObjects(CanLink(wire, SteppedClock()), 1),
         profile.model_copy(update={"filters": (speed, torque)}),
     )
     assert (found.speed_lag_s, found.torque_lag_s) == (pytest.approx(0.4), None)

@@ -13,7 +13,7 @@ from pathlib import Path
 import can
 import pytest
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, DriveLimits, Mode, PowerState
 from profiles.library import load_canopen_profile
@@ -43,7 +43,7 @@ def simulated(tmp_path):
 def test_a_host_that_is_gone_leaves_a_shaft_at_rest(simulated):
     port, trace, process = simulated
     bus = can.Bus(interface="socketcand", host="127.0.0.1", port=port, channel="can0", tcp_tune=True)
-    drive = Cia402Drive(bus, load_canopen_profile(NAME), SteppedClock(), node=1)
+    drive = CanopenDrive(bus, load_canopen_profile(NAME), SteppedClock(), node=1)
     drive.connect()
     found = drive.preflight(LIMITS)
     assert found.refused == ()

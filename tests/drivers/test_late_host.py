@@ -5,7 +5,7 @@ On a scripted drive in fake time; each TPDO1 bears the number of its SYNC.
 
 import pytest
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import LOWER_THE_RATE, MonotonicClock, SteppedClock, Ticks, how_late
 from drivers.drive import Command, DriveLimits, Mode
 from drivers.errors import CommunicationLost
@@ -17,7 +17,7 @@ PERIOD_S = 0.004
 
 @pytest.fixture
 def drive(wire, peer, profile, fake_time):
-    drive = Cia402Drive(wire, profile, MonotonicClock(), node=1)
+    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
     drive.connect()
     drive.preflight(LIMITS)
     drive.enable(Mode.SPEED)
@@ -226,7 +226,7 @@ def test_time_spent_well_is_not_overslept(fake_time):
 @pytest.fixture
 def prepared(wire, peer, profile, fake_time):
     peer.objects[0x1006, 0] = bytes(4)
-    drive = Cia402Drive(wire, profile, MonotonicClock(), node=1)
+    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
     drive.connect()
     assert drive.preflight(LIMITS).refused == ()
     return drive
@@ -264,15 +264,15 @@ def test_standing_still_is_no_error_while_a_rate_is_tried_and_one_afterwards(pre
 
 
 def test_a_short_watchdog_leaves_no_slow_rate(wire, peer, profile, fake_time):
-    drive = Cia402Drive(wire, profile, MonotonicClock(), node=1)
+    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
     drive.connect()
     drive.preflight(DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.06))
     assert drive.rates_hz == (250.0, 200.0, 125.0, 100.0)
 
 
 def test_a_named_rate_and_stepped_time_leave_no_choice(wire, peer, profile, fake_time):
-    assert Cia402Drive(wire, profile, MonotonicClock(), node=1, rate_hz=250.0).rates_hz == ()
-    assert Cia402Drive(wire, profile, SteppedClock(), node=1).rates_hz == ()
+    assert CanopenDrive(wire, profile, MonotonicClock(), node=1, rate_hz=250.0).rates_hz == ()
+    assert CanopenDrive(wire, profile, SteppedClock(), node=1).rates_hz == ()
 
 
 # -- a stall, and the bus off on waking --------------------------------------------------------------------------------

@@ -4,9 +4,9 @@ import struct
 
 import pytest
 
-from drivers.canopen.drive import Cia402Drive
-from drivers.canopen.quick_stop import Cia402Target
-from drivers.canopen.state_machine import State, decode, decode_after
+from drivers.canopen.drive import CanopenDrive
+from drivers.canopen.quick_stop import CanopenTarget
+from drivers.cia402.state_machine import State, decode, decode_after
 from drivers.clock import SteppedClock
 from drivers.drive import Command, DriveLimits, Mode, PowerState
 from drivers.errors import DriveFault
@@ -43,7 +43,7 @@ def cycles(drive, wire, count=20):
 
 @pytest.fixture
 def fresh(wire, peer, profile):
-    drive = Cia402Drive(wire, profile, SteppedClock(), node=1)
+    drive = CanopenDrive(wire, profile, SteppedClock(), node=1)
     drive.connect()
     drive.preflight(LIMITS)
     return drive
@@ -124,7 +124,7 @@ def test_a_look_by_sdo_repeats_the_quick_stop_of_one_that_shows_no_state():
 
 def test_one_that_shows_no_state_is_refused(wire, peer, profile):
     peer.machine.__class__ = type("Blank", (type(peer.machine),), {"status": property(lambda self: 0xFFFF)})
-    drive = Cia402Drive(wire, profile, SteppedClock(), node=1)
+    drive = CanopenDrive(wire, profile, SteppedClock(), node=1)
     drive.connect()
     found = drive.preflight(LIMITS)
     state = next(check for check in found.refused if check.name == "state")
@@ -240,7 +240,7 @@ def test_a_stop_from_outside_on_canopen_too():
     run.turning(2.0)
     store = bench.simulated.simulator.node.store
     store.live[0x6041 << 8] = store.live[0x606C << 8] = lambda: 0
-    target = Cia402Target(bench.simulated.station(), run.drive._profile, SteppedClock(), node=1)
+    target = CanopenTarget(bench.simulated.station(), run.drive._profile, SteppedClock(), node=1)
     report = bare_stop(target, SteppedClock())
     assert report.ended is Ended.TURNING
     assert any("0000h" in line for line in report.remarks)

@@ -10,7 +10,7 @@ from dataclasses import replace
 import can
 import pytest
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, DriveLimits, Mode, Outcome
 from drivers.errors import CommunicationLost
@@ -65,7 +65,7 @@ def test_a_drive_that_can_be_armed_is_armed_all_the_same(run):
 def canopen(wire, profile):
     def preflight(limits=LIMITS, **watchdog):
         changed = profile.model_copy(update={"watchdog": profile.watchdog.model_copy(update=watchdog)})
-        drive = Cia402Drive(wire, changed, SteppedClock(), node=1)
+        drive = CanopenDrive(wire, changed, SteppedClock(), node=1)
         drive.connect()
         return drive.preflight(limits)
 
@@ -77,7 +77,7 @@ def test_a_full_queue_keeps_no_stop_back_where_no_watchdog_acts(wire, peer, prof
     """With one armed nothing more is sent: it acts on the silence. Without one the quick stop is all that there is."""
     none = {"kind": "none", "reaction": "none", "reaction_index": None, "reaction_value": None}
     watchdog = profile.watchdog.model_copy(update=none if kind == "none" else {})
-    drive = Cia402Drive(wire, profile.model_copy(update={"watchdog": watchdog}), SteppedClock(), node=1)
+    drive = CanopenDrive(wire, profile.model_copy(update={"watchdog": watchdog}), SteppedClock(), node=1)
     drive.connect()
     assert drive.preflight(LIMITS).refused == ()
     drive.enable(Mode.SPEED)

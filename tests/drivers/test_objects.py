@@ -7,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.canopen import pdo as objects
-from drivers.canopen.pdo import Slow, Units, consumer_heartbeat, encode_speed, encode_torque, mapping_entry
+from drivers.canopen.pdo import Slow, consumer_heartbeat, mapping_entry
 from drivers.canopen.pdo_mapping import layout
+from drivers.cia402.process_data import Units, encode_speed, encode_torque
 from drivers.errors import CommandRejected
 from profiles.canopen import STANDARD_POSITION
 

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, DriveLimits, Mode
 from drivers.errors import CommunicationLost, PreflightRefused
@@ -16,7 +16,7 @@ LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, w
 @pytest.fixture
 def make(wire, peer, profile):
     def make(clock=None, **options):
-        return Cia402Drive(wire, profile, clock or SteppedClock(), node=1, **options)
+        return CanopenDrive(wire, profile, clock or SteppedClock(), node=1, **options)
 
     return make
 
@@ -304,7 +304,7 @@ def test_its_frames_are_known_by_their_own_identifier(make, wire, peer):
 
 @pytest.mark.parametrize("rate_hz", [4.0, 50.0, 250.0])
 def test_a_mode_that_was_lost_shows_within_a_tenth_of_a_second_or_a_cycle(wire, peer, profile, rate_hz):
-    drive = Cia402Drive(wire, profile, SteppedClock(), node=1, rate_hz=rate_hz)
+    drive = CanopenDrive(wire, profile, SteppedClock(), node=1, rate_hz=rate_hz)
     drive.connect()
     drive.preflight(DriveLimits(10.0, 300.0, 2.0, 3.0))
     syncs = peer.value(0x1801, 2)
@@ -325,7 +325,7 @@ def test_a_mode_that_is_not_displayed_any_more_is_not_known(running, wire, peer)
 
 @pytest.mark.parametrize("watchdog_s", [0.1, 0.2, 0.4, 2.0])
 def test_a_short_watchdog_is_fed_five_times_in_its_time(wire, peer, profile, fake_time, watchdog_s):
-    drive = Cia402Drive(wire, profile, MonotonicClock(), node=1)
+    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
     drive.connect()
     drive.preflight(DriveLimits(10.0, 300.0, 2.0, watchdog_s))
     sent, plain = [], wire.on_send

@@ -5,14 +5,14 @@ import pytest
 from drivers.canopen.bus import CanLink
 from drivers.canopen.pdo import Slow
 from drivers.canopen.pdo_mapping import layout, write_pdo
-from drivers.canopen.sdo import Objects
+from drivers.canopen.sdo import SdoObjects
 from drivers.clock import SteppedClock
 from drivers.errors import ObjectRefused, PreflightRefused
 
 
 @pytest.fixture
 def objects(wire, peer):
-    return Objects(CanLink(wire, SteppedClock()), 1)
+    return SdoObjects(CanLink(wire, SteppedClock()), 1)
 
 
 def written(peer):

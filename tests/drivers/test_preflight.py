@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, DriveLimits, Mode, Outcome
 from drivers.errors import CommunicationLost, PreflightRefused
@@ -22,7 +22,7 @@ ROWS = [
 @pytest.fixture
 def make(wire, profile):
     def make(clock=None, changed=profile, **options):
-        return Cia402Drive(wire, changed, clock or SteppedClock(), node=1, **options)
+        return CanopenDrive(wire, changed, clock or SteppedClock(), node=1, **options)
 
     return make
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.canopen.limits import fulfils, wanted_text
-from drivers.canopen.quick_stop import Cia402Target
+from drivers.canopen.quick_stop import CanopenTarget
+from drivers.cia402.limits import fulfils, wanted_text
 from drivers.drive import Mode, Outcome
 from profiles.canopen import CanopenProfile
 from profiles.entry import Require
@@ -168,7 +168,7 @@ def test_a_bare_stop_sees_the_speed_in_the_drives_own_scale(make, kind):
     """The S120 counts encoder increments, an ABB in vl shows its speed elsewhere."""
     bench = make(kind)
     Run(bench).turning(5.0)
-    target = Cia402Target(bench._second, load_canopen_profile(kind.PROFILE), bench.drive.clock, node=1)
+    target = CanopenTarget(bench._second, load_canopen_profile(kind.PROFILE), bench.drive.clock, node=1)
     seen = target.poll()
     assert seen.speed == pytest.approx(5.0, abs=0.2)
     assert not seen.near_zero

@@ -7,8 +7,8 @@ import pytest
 
 from drivers import quick_stop
 from drivers.canopen.bus import CanLink
-from drivers.canopen.quick_stop import BURST, BURST_PAUSE_S, BY_RPDO_TRIES, BY_SDO_TRIES, Cia402Target
-from drivers.canopen.sdo import Objects
+from drivers.canopen.quick_stop import BURST, BURST_PAUSE_S, BY_RPDO_TRIES, BY_SDO_TRIES, CanopenTarget
+from drivers.canopen.sdo import SdoObjects
 from drivers.clock import MonotonicClock
 from drivers.errors import DriveFault, ObjectRefused
 from drivers.quick_stop import Ended
@@ -31,7 +31,7 @@ def turning(epos4, tmp_path):
     params = RigParams(plant=Params(inertia_kg_m2=30.0), noise=QUIET, reporting=FAITHFUL)
     with EmbeddedSimulator(params, profile=epos4, stepped=False, trace=trace) as simulated:
         bus = can.Bus(interface="virtual", channel=simulated.channel)
-        objects = Objects(CanLink(bus, MonotonicClock()), 1)
+        objects = SdoObjects(CanLink(bus, MonotonicClock()), 1)
         objects.write(0x6060, 0, 10, 8)
         for word in (0x06, 0x07, 0x0F):
             objects.write(0x6040, 0, word, 16)
@@ -45,7 +45,7 @@ def turning(epos4, tmp_path):
 @pytest.mark.heavy
 def test_in_torque_mode_it_is_braked_and_never_let_go_while_it_turns(turning, epos4):
     simulator, bus, trace = turning
-    target = Cia402Target(bus, epos4, MonotonicClock(), node=1)
+    target = CanopenTarget(bus, epos4, MonotonicClock(), node=1)
     report = quick_stop.bare_stop(target, MonotonicClock())
     target.close()
     assert report.ended is Ended.AT_REST
@@ -69,13 +69,13 @@ def order(peer):
 
 
 def test_speed_mode_comes_before_the_quick_stop(wire, scripted, epos4):
-    Cia402Target(wire, epos4, MonotonicClock(), node=1).ask(1)
+    CanopenTarget(wire, epos4, MonotonicClock(), node=1).ask(1)
     assert order(scripted) == [(0x60FF, 0), (0x6060, 9), (0x6040, 0x02)]
 
 
 def test_a_drive_that_does_not_take_it_gets_the_quick_stop_all_the_same_and_that_is_said(wire, scripted, epos4):
     scripted.deaf_to.add((0x6061, 0))
-    target = Cia402Target(wire, epos4, MonotonicClock(), node=1)
+    target = CanopenTarget(wire, epos4, MonotonicClock(), node=1)
     target.ask(1)
     target.ask(2)
     assert order(scripted).count((0x6040, 0x02)) == 2
@@ -86,7 +86,7 @@ def test_a_drive_that_does_not_take_it_gets_the_quick_stop_all_the_same_and_that
 @pytest.mark.parametrize("refused", [(0x60FF, 0), (0x6060, 0), (0x6061, 0)])
 def test_whatever_the_drive_refuses_before_it_the_quick_stop_is_written(wire, scripted, epos4, refused):
     scripted.refuse_write[refused] = scripted.refuse_read[refused] = 0x08000022     # not in this state of the device
-    target = Cia402Target(wire, epos4, MonotonicClock(), node=1)
+    target = CanopenTarget(wire, epos4, MonotonicClock(), node=1)
     for attempt in range(1, BY_SDO_TRIES + 3):
         with suppress(ObjectRefused, DriveFault):
             target.ask(attempt)
@@ -98,12 +98,12 @@ def test_where_it_is_not_needed_nothing_is_written_but_the_quick_stop(wire, scri
     """In speed mode, or where a quick stop decelerates in torque mode too."""
     if name == "maxon/epos4":
         scripted.objects[0x6061, 0] = u(9, 1)
-    Cia402Target(wire, load_canopen_profile(name), MonotonicClock(), node=1).ask(1)
+    CanopenTarget(wire, load_canopen_profile(name), MonotonicClock(), node=1).ask(1)
     assert order(scripted) == [(0x6040, 0x02)]
 
 
 def target_of(wire, profile="generic/cia402"):
-    return Cia402Target(wire, load_canopen_profile(profile), MonotonicClock(), node=1)
+    return CanopenTarget(wire, load_canopen_profile(profile), MonotonicClock(), node=1)
 
 
 @pytest.mark.parametrize("refused", [False, True])

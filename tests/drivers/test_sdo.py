@@ -5,14 +5,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.canopen.bus import CanLink
-from drivers.canopen.sdo import Objects, is_answer, name
+from drivers.canopen.sdo import SdoObjects, is_answer
+from drivers.cia402.objects import name
 from drivers.clock import SteppedClock
 from drivers.errors import CommunicationLost, ObjectRefused
 
 
 @pytest.fixture
 def objects(wire, peer):
-    return Objects(CanLink(wire, SteppedClock()), 1)
+    return SdoObjects(CanLink(wire, SteppedClock()), 1)
 
 
 def test_bytes_on_the_wire(objects, wire, peer):

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.canopen.bus import JUMP_S, FrameStamps
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import MonotonicClock
 from drivers.drive import Command, DriveLimits, Mode
 
@@ -82,11 +82,11 @@ def turned(peer, wire, profile, wall_of):
         return message
 
     wire.recv = stamped
-    drive = Cia402Drive(wire, profile, MonotonicClock(), node=1)
+    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
     drive.connect()
     drive.preflight(DriveLimits(10.0, 400.0, 2.0, 0.5))
     # The scripted drive has no heartbeat of its own.
-    drive._watch.allowed_silence_s = 0.0
+    drive._bus.watch.allowed_silence_s = 0.0
     samples = [drive.exchange(Command(Mode.SPEED, 0.0, 0.0)) for _ in range(1000)]
     return samples, drive.counters
 

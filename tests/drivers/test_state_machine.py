@@ -2,7 +2,7 @@
 
 import pytest
 
-from drivers.canopen.state_machine import State, controlword_towards, decode, power_state
+from drivers.cia402.state_machine import State, controlword_towards, decode, power_state
 from drivers.drive import PowerRequest, PowerState
 from tests.drivers.power_machine import (
     ENABLED,

@@ -2,7 +2,8 @@
 
 import pytest
 
-from drivers.canopen.supervision import NodeWatch, emcy_text
+from drivers.canopen.supervision import NodeWatch
+from drivers.cia402.supervision import emcy_text
 from drivers.clock import SteppedClock
 from drivers.errors import CommunicationLost, DriveFault
 

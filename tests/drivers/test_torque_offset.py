@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.canopen.quick_stop import Cia402Target
+from drivers.canopen.quick_stop import CanopenTarget
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Mode, PowerState
 from drivers.errors import CommandRejected
@@ -92,7 +92,7 @@ def test_what_a_dead_host_left_is_gone_with_the_next_run_and_with_a_stop_from_ou
         assert bench.read(*OFFSET) == counts
 
     leave(70)
-    target = Cia402Target(
+    target = CanopenTarget(
         bench.simulated.station(), load_canopen_profile("generic/cia402"), SteppedClock(), node=1
     )
     target.ask(1)
@@ -107,7 +107,7 @@ def test_what_a_dead_host_left_is_gone_with_the_next_run_and_with_a_stop_from_ou
 def test_a_stop_by_sdo_takes_it_away_first(bench):
     run = turning(bench)
     push(run, 100.0, 50)
-    bench.drive._standing.take_over(0.0, lambda: None)
+    bench.drive._stand()
     bench.drive.quick_stop()
     bench.frames.clear()
     push(run, 100.0, 12)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.canopen.bus import CanLink, Condition, condition, queue_is_full
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.canopen.supervision import NodeWatch
 from drivers.clock import SteppedClock
 from drivers.drive import Command, DriveLimits, Mode
@@ -114,7 +114,7 @@ def test_a_second_master_is_told_with_its_second_frame_of_a_kind_however_late():
 
 @pytest.fixture
 def drive(wire, peer, profile):
-    return Cia402Drive(wire, profile, SteppedClock(), node=1)
+    return CanopenDrive(wire, profile, SteppedClock(), node=1)
 
 
 @pytest.mark.parametrize("identifier", [0x080, 0x201, 0x301, 0x401, 0x501])
@@ -159,7 +159,7 @@ def test_only_a_simulated_peer_is_told_of_stages(wire, peer, profile, marker):
         del peer.objects[0x5FFE, 1]
     from drivers.clock import MonotonicClock
 
-    drive = Cia402Drive(wire, profile, MonotonicClock(), node=1)
+    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
     drive.announce("setup")
     assert wire.sent == []                        # nobody knows yet who is there
     drive.connect()

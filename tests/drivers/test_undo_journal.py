@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import MonotonicClock
 from drivers.drive import Command, DriveLimits, Mode
 from drivers.errors import PreflightRefused
@@ -27,7 +27,7 @@ def real(wire):
 @pytest.fixture
 def make(wire, profile, tmp_path):
     def make():
-        return Cia402Drive(wire, profile, MonotonicClock(), node=1, journal=UndoJournal(tmp_path, "node1"))
+        return CanopenDrive(wire, profile, MonotonicClock(), node=1, journal=UndoJournal(tmp_path, "node1"))
 
     return make
 
@@ -111,7 +111,7 @@ def test_another_drive_is_not_given_it(make, real, wire, tmp_path):
 
 def test_of_a_simulated_drive_nothing_is_kept(wire, profile, tmp_path):
     ScriptedDrive(wire)
-    drive = Cia402Drive(wire, profile, MonotonicClock(), node=1, journal=UndoJournal(tmp_path, "node1"))
+    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1, journal=UndoJournal(tmp_path, "node1"))
     run(drive)
     assert files(tmp_path) == []
 
@@ -129,7 +129,7 @@ def test_a_file_that_is_none_refuses_the_run_and_is_named(make, real, tmp_path, 
 
 
 def test_a_folder_that_takes_no_file_refuses_before_anything_is_changed(wire, profile, real, tmp_path):
-    drive = Cia402Drive(wire, profile, MonotonicClock(), node=1, journal=UndoJournal(tmp_path / "gone", "node1"))
+    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1, journal=UndoJournal(tmp_path / "gone", "node1"))
     drive.connect()
     with pytest.raises(PreflightRefused, match="can't be written down"):
         drive.preflight(LIMITS)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, DriveLimits, Mode
 
@@ -12,7 +12,7 @@ WATCHED_S = 4.0
 @pytest.mark.parametrize(("watchdog_s", "every_s"), [(0.1, 0.02), (0.2, 0.04), (0.4, 0.08), (0.5, 0.1), (2.0, 0.1)])
 def test_a_heartbeat_goes_out_five_times_in_the_watchdogs_time(wire, peer, profile, watchdog_s, every_s):
     """And at least every 0.1 s, where that is long."""
-    drive = Cia402Drive(wire, profile, SteppedClock(), node=1)
+    drive = CanopenDrive(wire, profile, SteppedClock(), node=1)
     drive.connect()
     assert not drive.preflight(DriveLimits(10.0, 300.0, 2.0, watchdog_s)).refused
     wire.sent.clear()
@@ -26,7 +26,7 @@ def test_a_heartbeat_goes_out_five_times_in_the_watchdogs_time(wire, peer, profi
 def test_a_period_that_the_profile_does_not_have_is_not_written(wire, peer, profile):
     """Even where the drive has an object of that number: nobody has said what it does there."""
     without = profile.model_copy(update={"cyclic": profile.cyclic.model_copy(update={"has_period": False})})
-    drive = Cia402Drive(wire, without, MonotonicClock(), node=1)
+    drive = CanopenDrive(wire, without, MonotonicClock(), node=1)
     drive.connect()
     assert not drive.preflight(DriveLimits(10.0, 300.0, 2.0, 0.5)).refused
     assert not [index for index, _, _ in peer.writes if index == 0x1006]

@@ -11,7 +11,7 @@ from importlib.resources import files
 
 import pytest
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import SteppedClock
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus.drive import ModbusDrive
@@ -148,7 +148,7 @@ def canopen(tmp_path, factor, *changes, worn=False):
     of_drive = profile_of(tmp_path, "generic/cia402", load_canopen_profile, *changes) if worn else None
     simulated = InlineSimulator(RigParams(), seed=3, profile=of_drive).open()
     profile = profile_of(tmp_path, "generic/cia402", load_canopen_profile, *wrong, *changes)
-    drive = Cia402Drive(simulated.bus, profile, SteppedClock(), node=1, rate_hz=RATE_HZ)
+    drive = CanopenDrive(simulated.bus, profile, SteppedClock(), node=1, rate_hz=RATE_HZ)
     return Rig(drive, lambda: simulated.simulator.speed_rad_s, simulated.close, simulated.simulator.node)
 
 

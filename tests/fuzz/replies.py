@@ -95,7 +95,7 @@ def can_session(script: bytes) -> None:
         ScriptedDrive(bus)
         Script(script, bus)
         begun_s = now.now_s
-        drive = drivers.canopen.drive.Cia402Drive(bus, _profile, MonotonicClock(), node=1)
+        drive = drivers.canopen.drive.CanopenDrive(bus, _profile, MonotonicClock(), node=1)
         attempt(drive.connect)
         ready = first is None and attempt(drive.preflight, LIMITS)
         if ready:

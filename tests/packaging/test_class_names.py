@@ -22,11 +22,11 @@ SHARED = {
                "the script of one drive, on either bus"),
     "Misbehaviour": ({"sim_bus/canopen/faults.py", "sim_bus/modbus/faults.py"},
                      "what a fault of the bus in question overrides"),
-    "Parameter": ({"profiles/canopen.py", "profiles/modbus.py"}, "the same section of a profile, on either bus"),
-    "Position": ({"profiles/canopen.py", "profiles/modbus.py"}, "the same section of a profile, on either bus"),
-    "QuickStop": ({"profiles/canopen.py", "profiles/modbus.py"}, "the same section of a profile, on either bus"),
+    "Parameter": ({"profiles/cia402.py", "profiles/modbus.py"}, "the same section of a profile, on either bus"),
+    "Position": ({"profiles/cia402.py", "profiles/modbus.py"}, "the same section of a profile, on either bus"),
+    "QuickStop": ({"profiles/cia402.py", "profiles/modbus.py"}, "the same section of a profile, on either bus"),
     "Scene": ({"sim_bus/canopen/faults.py", "sim_bus/modbus/faults.py"}, "where a fault happens, on either bus"),
-    "State": ({"drivers/canopen/state_machine.py", "sim_bus/cia402.py", "tdhil/service/run_state.py"},
+    "State": ({"drivers/cia402/state_machine.py", "sim_bus/cia402.py", "tdhil/service/run_state.py"},
               "the states of CiA 402, which driver and simulator each take from the standard; and those of a run, as "
               "the service's document names them"),
 }

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from drivers import Command, Mode, PowerState, SteppedClock
-from drivers.canopen import Cia402Drive
+from drivers.canopen import CanopenDrive
 from drivers.drive import DriveLimits
 from profiles.library import load_canopen_profile
 from sim_bus.canopen.command import add_arguments
@@ -56,7 +56,7 @@ def turned(rig, set_rpm=SET_RPM, seconds=SECONDS, trace=None):
     """The set speed ramped up over the bus: times, true speed of the bit, reported speed of the top; rad/s."""
     simulated = InlineSimulator(rig, seed=5).open()
     profile = load_canopen_profile("generic/cia402")
-    drive = Cia402Drive(simulated.station(), profile, SteppedClock(), node=1, rate_hz=25.0)
+    drive = CanopenDrive(simulated.station(), profile, SteppedClock(), node=1, rate_hz=25.0)
     times, bit, top = [], [], []
     try:
         assert drive.connect().simulated

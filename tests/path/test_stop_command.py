@@ -25,14 +25,14 @@ class Master:
 
     def __init__(self, drive):
         from drivers.canopen.bus import CanLink
-        from drivers.canopen.sdo import Objects
+        from drivers.canopen.sdo import SdoObjects
         from drivers.clock import MonotonicClock
 
         options = dict(text.split("=") for text in drive.options if "=" in text)
         self.bus = can.Bus(interface="socketcand", channel=drive.options[3], host=options["host"],
                            port=int(options["port"]), tcp_tune=True)
         self.link = CanLink(self.bus, MonotonicClock())
-        self.objects = Objects(self.link, NODE)
+        self.objects = SdoObjects(self.link, NODE)
         self.patient = self.objects.answered_within(30.0)       # a drive on a busy computer answers when it can
 
     def __enter__(self):

@@ -12,7 +12,7 @@ import subprocess
 import can
 import pytest
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, DriveLimits, Mode, Outcome, PowerState
 from profiles.library import load_canopen_profile
@@ -106,7 +106,8 @@ def bus_options(hub):
 
 
 def driver(hub, clock, **options):
-    return Cia402Drive(can.Bus(**bus_options(hub)), load_canopen_profile("generic/cia402"), clock, node=NODE, **options)
+    bus = can.Bus(**bus_options(hub))
+    return CanopenDrive(bus, load_canopen_profile("generic/cia402"), clock, node=NODE, **options)
 
 
 def last_words(child):

@@ -9,7 +9,7 @@ import can
 import pytest
 import yaml
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, DriveLimits, Mode, PowerState
 from profiles.library import load_canopen_profile, profile_names, profile_path
@@ -56,7 +56,7 @@ class Bench:
         self.host = can.Bus(interface="virtual", channel=self.simulated.channel)
         self.bus = Swapped(can.Bus(interface="virtual", channel=self.simulated.channel))
         self.frames = []
-        self.drive = Cia402Drive(
+        self.drive = CanopenDrive(
             self.bus, profile, SteppedClock(), node=1, tap=self.frames.append,
             rated_torque_nm=golden.get("told_rated_torque_nm"),
         )

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import can
 
-from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.drive import CanopenDrive
 from drivers.clock import SteppedClock
 from profiles.library import load_canopen_profile
 from sim_bus.canopen.simulator import Simulator
@@ -43,7 +43,7 @@ class VcanBench(CanopenBench):
         self._thread.start()
         assert self._second.recv(10.0) is not None       # its boot-up, before the driver listens
         self.bus = TamperedBus(open_bus())
-        self.drive = Cia402Drive(
+        self.drive = CanopenDrive(
             self.bus, load_canopen_profile(self.PROFILE), SteppedClock(), node=1, tap=self._tap, rate_hz=rate_hz,
             **options,
         )

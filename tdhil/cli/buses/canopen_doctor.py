@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from drivers import NO_WATCHDOG_FLAG, CommunicationLost, MonotonicClock, ObjectRefused, PreflightTable
-from drivers.canopen import CanLink, Objects, State, check_parameters, decode, find_units, name
+from drivers.canopen import CanLink, SdoObjects
+from drivers.cia402 import State, check_parameters, decode, find_units, name
 from profiles import MARKER_INDEX, MARKER_TEXT
 from profiles.canopen import CanopenProfile
 from tdhil.cli.doctor_finding import DoctorFinding, Grade, bad, note, of_check, ok
@@ -60,7 +61,7 @@ def drive_findings(
 ) -> Iterator[DoctorFinding]:
     """Yield findings on the drive. Raises CommunicationLost if it does not answer; nothing is written."""
     link = CanLink(bus, MonotonicClock())
-    objects = Objects(link, node)
+    objects = SdoObjects(link, node)
     try:
         device = objects.read(0x1000)
     except CommunicationLost as error:
@@ -84,7 +85,7 @@ def drive_findings(
         yield note("error frames", f"{link.error_frames} received", "Check bit rate, termination and cable")
 
 
-def _identity(objects: Objects, profile: CanopenProfile) -> Iterator[DoctorFinding]:
+def _identity(objects: SdoObjects, profile: CanopenProfile) -> Iterator[DoctorFinding]:
     found = {part: objects.read_if_there(0x1018, sub) for sub, part in ((1, "vendor"), (2, "product"), (3, "revision"))}
     text = ", ".join(f"{part} {value:X}h" for part, value in found.items() if value is not None) or "not reported"
     wrong = [
@@ -101,7 +102,7 @@ def _identity(objects: Objects, profile: CanopenProfile) -> Iterator[DoctorFindi
     yield note("peer", "SIMULATED: it has the simulator's marker") if marked else ok("peer", "not a simulator")
 
 
-def _watchdog(objects: Objects, profile: CanopenProfile) -> Iterator[DoctorFinding]:
+def _watchdog(objects: SdoObjects, profile: CanopenProfile) -> Iterator[DoctorFinding]:
     dog = profile.watchdog
     if dog.kind == "none":
         yield bad("watchdog", f"profile {profile.name} names none",
@@ -120,7 +121,7 @@ def _watchdog(objects: Objects, profile: CanopenProfile) -> Iterator[DoctorFindi
             yield bad("watchdog", f"the drive has no {name(*at)}", step)
 
 
-def _modes(objects: Objects, profile: CanopenProfile) -> DoctorFinding:
+def _modes(objects: SdoObjects, profile: CanopenProfile) -> DoctorFinding:
     supported = objects.read_if_there(0x6502)
     if supported is None:
         return note("modes", "the drive does not report its modes (6502h)")
@@ -130,7 +131,7 @@ def _modes(objects: Objects, profile: CanopenProfile) -> DoctorFinding:
     return ok("modes", text) if speed else bad("modes", text, "None controls speed: check the profile")
 
 
-def _state(objects: Objects) -> DoctorFinding:
+def _state(objects: SdoObjects) -> DoctorFinding:
     state = decode(objects.read(0x6041))
     if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
         code = objects.read_if_there(0x603F)

@@ -13,7 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from drivers import CommunicationLost, MonotonicClock, ObjectRefused
-from drivers.canopen import CanLink, Objects
+from drivers.canopen import CanLink, SdoObjects
 from profiles import MARKER_INDEX, MARKER_TEXT, MessageCode, load_profile, profile_names, visible
 from profiles.canopen import CanopenProfile
 from tdhil.cli.scan_common import FoundDrive
@@ -79,7 +79,7 @@ def match(device_type: int, identity: tuple[int | None, int | None, int | None],
 
 
 def _identify(link: CanLink, node: int, heard: Heard, profiles: list[CanopenProfile]) -> FoundDrive:
-    objects = Objects(link, node)
+    objects = SdoObjects(link, node)
     values: list[int | None] = []
     title, simulated = "", False
     try:
@@ -96,7 +96,7 @@ def _identify(link: CanLink, node: int, heard: Heard, profiles: list[CanopenProf
                       heard.states.get(node, ""))
 
 
-def _text(objects: Objects, index: int, sub: int = 0) -> str:
+def _text(objects: SdoObjects, index: int, sub: int = 0) -> str:
     try:
         return visible(objects.read_bytes(index, sub).decode("ascii", "replace").rstrip("\0 "))
     except ObjectRefused:

@@ -78,12 +78,12 @@ class CanopenKind(BusKind):
     def open(self, plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData, clock: Clock,
              tap: FrameTap, trace: Path | None) -> Iterator[Drive]:
         """Open the bus and the drive on it. The bus is shut down afterwards."""
-        from drivers.canopen import Cia402Drive
+        from drivers.canopen import CanopenDrive
         from drivers.undo_journal import UndoJournal
 
         profile, node = profile_of(connection), node_of(options, connection)
         with open_can(plan, connection, node, trace) as channel:
-            yield Cia402Drive(
+            yield CanopenDrive(
                 channel,
                 profile,
                 clock,
@@ -97,10 +97,10 @@ class CanopenKind(BusKind):
     @contextmanager
     def open_target(self, options: RunOptions, connection: Connection, clock: Clock) -> Iterator[Target]:
         """Open the bus and the node alone."""
-        from drivers.canopen import Cia402Target
+        from drivers.canopen import CanopenTarget
 
         bus = can_bus.open_bus(config_of(connection))
-        target = Cia402Target(bus, profile_of(connection), clock, node=node_of(options, connection))
+        target = CanopenTarget(bus, profile_of(connection), clock, node=node_of(options, connection))
         try:
             yield target
         finally:

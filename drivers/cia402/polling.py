@@ -1,21 +1,19 @@
-"""Status, speed and torque by SDO (6041h, 606Ch, 6077h), for a drive without cyclic feedback.
+"""Status, speed and torque read as objects (6041h, 606Ch, 6077h), for a drive without cyclic feedback.
 
-A drive in pre-operational serves SDO too, after a restart or a foreign NMT command. In NMT state stopped it does not;
-such a node is put into pre-operational first, in which nothing is enabled (CiA 301, NMT state machine). The controlword
-(6040h) is sent by SDO too, and only towards standstill, because the drive may no longer accept an RPDO.
+The controlword (6040h) is written as an object too, and only towards standstill, because the drive may no longer accept
+a cyclic setpoint.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from drivers.canopen.pdo import VELOCITY_ACTUAL, VL_ACTUAL, decode_value
-from drivers.canopen.sdo import Objects, name
-from drivers.canopen.state_machine import State, controlword_towards
+from drivers.cia402.objects import Objects, name
+from drivers.cia402.process_data import VELOCITY_ACTUAL, VL_ACTUAL, decode_value
+from drivers.cia402.state_machine import State, controlword_towards
 from drivers.drive import PowerRequest
 from drivers.errors import CommunicationLost, ObjectRefused
-from profiles import MARKER_INDEX
-from profiles.canopen import CanopenProfile, ObjectType
+from profiles.cia402 import Cia402Profile, ObjectType
 
 ANSWER_S = 0.1
 """Wall time for one answer, s. Each request is sent once; the caller polls again."""
@@ -37,9 +35,14 @@ class Looked(NamedTuple):
     torque: float | None
 
 
-def poll(objects: Objects, profile: CanopenProfile, watchdog_s: float) -> Looked | None:
+def answer_time_s(watchdog_s: float) -> float:
+    """Return the wall time for one answer while a shaft may turn, s, for a watchdog of this time (0: none is armed)."""
+    return min(ANSWER_S, WATCHDOG_SHARE * watchdog_s) if watchdog_s else ANSWER_S
+
+
+def poll(objects: Objects, profile: Cia402Profile, watchdog_s: float) -> Looked | None:
     """Read the three objects in well under the watchdog's time; None without status or speed."""
-    with objects.answered_within(min(ANSWER_S, WATCHDOG_SHARE * watchdog_s) if watchdog_s else ANSWER_S):
+    with objects.answered_within(answer_time_s(watchdog_s)):
         try:
             status = objects.read(0x6041)
             speed = objects.read((VL_ACTUAL if profile.speed.vl else VELOCITY_ACTUAL)[0], 0, signed=True)
@@ -48,7 +51,7 @@ def poll(objects: Objects, profile: CanopenProfile, watchdog_s: float) -> Looked
         return Looked(status, speed, reported_torque(objects, profile))
 
 
-def reported_torque(objects: Objects, profile: CanopenProfile) -> float | None:
+def reported_torque(objects: Objects, profile: Cia402Profile) -> float | None:
     """Return the torque in counts; None if the drive does not report it."""
     actual = profile.torque.actual
     index, sub, kind = (0x6077, 0, _I16) if actual is None else (actual.index, actual.sub, actual.type)
@@ -58,28 +61,16 @@ def reported_torque(objects: Objects, profile: CanopenProfile) -> float | None:
         return None
 
 
-def keep_stepping(objects: Objects, profile: CanopenProfile, period_s: float) -> None:
-    """Set the cycle of a simulated drive again (1006h, or the marker's): after a restart its time would not advance."""
-    index, sub = (0x1006, 0) if profile.cyclic.has_period else (MARKER_INDEX, 3)
-    wanted_us = round(period_s * 1e6)
-    with objects.answered_within(ANSWER_S):
-        try:
-            if objects.read(index, sub) != wanted_us:
-                objects.write(index, sub, wanted_us, 32)
-        except (CommunicationLost, ObjectRefused):
-            return
-
-
 def push(
     objects: Objects, state: State, wish: PowerRequest, watchdog_s: float, offset: tuple[int, int, int] | None = None
 ) -> None:
-    """Send the controlword towards ``wish`` by SDO if the drive is not in that state; never one that enables.
+    """Write the controlword towards ``wish`` if the drive is not in that state; never one that enables.
 
     A torque ``offset`` in use is cleared first.
     """
     if wish is PowerRequest.ENABLED or state in _AT_REST[wish]:
         return
-    with objects.answered_within(min(ANSWER_S, WATCHDOG_SHARE * watchdog_s) if watchdog_s else ANSWER_S):
+    with objects.answered_within(answer_time_s(watchdog_s)):
         try:
             if offset is not None:
                 objects.write(offset[0], offset[1], 0, offset[2])

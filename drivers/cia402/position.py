@@ -10,20 +10,18 @@ import math
 from typing import NamedTuple
 
 from drivers.angle import Unwrapped
-from drivers.canopen.pdo import RPM, bits_of, decode_value
-from drivers.canopen.sdo import Objects, name
+from drivers.cia402.objects import Objects, name
+from drivers.cia402.polling import answer_time_s
+from drivers.cia402.process_data import RPM, bits_of, decode_value
 from drivers.clock import Clock
 from drivers.drive import PositionReading
 from drivers.errors import CommunicationLost, ObjectRefused
 from drivers.preflight import PreflightTable
-from profiles.canopen import CanopenProfile, Position
+from profiles.cia402 import Cia402Profile, Position
 
 TURN_RAD = 60.0 * RPM
 FEWEST_COUNTS = 16
 """Least counts of 608Fh for one turn. A lower value is not an encoder, but an object that was never set."""
-ANSWER_S = 0.1
-WATCHDOG_SHARE = 0.15
-"""Longest wait for an answer: `ANSWER_S`, or this share of the watchdog's time."""
 _ENCODER, _GEAR, _FEED, _UNIT = 0x608F, 0x6091, 0x6092, 0x60A8
 _INCREMENTS = (0x0000_0000, 0x00B5_0000)
 """60A8h where one count of 6064h is one increment (CiA 303-2: B5h)."""
@@ -53,7 +51,7 @@ class AngleObject(NamedTuple):
     def read(self, objects: Objects, clock: Clock, watchdog_s: float) -> PositionReading | None:
         """Read the angle once, within a part of the watchdog's time; None without a valid answer."""
         entry, begun_s = self.entry, clock.now_s()
-        with objects.answered_within(min(ANSWER_S, WATCHDOG_SHARE * watchdog_s) if watchdog_s else ANSWER_S):
+        with objects.answered_within(answer_time_s(watchdog_s)):
             try:
                 counts = decode_value(entry.type, objects.read_bytes(entry.index, entry.sub), self.where)
             except (CommunicationLost, ObjectRefused):
@@ -62,7 +60,7 @@ class AngleObject(NamedTuple):
         return PositionReading(begun_s + half_s, half_s, counts * self.rad_per_count, self.wraps_rad, self.where)
 
 
-def find_angle(table: PreflightTable, objects: Objects, profile: CanopenProfile) -> AngleObject | None:
+def find_angle(table: PreflightTable, objects: Objects, profile: Cia402Profile) -> AngleObject | None:
     """Return the profile's angle object, or the standard's if the counts of a turn are known; else add a note."""
     entry = profile.position
     if entry is None:

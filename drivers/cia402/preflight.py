@@ -10,8 +10,10 @@ import struct
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from drivers.canopen.limits import DriveSettings
-from drivers.canopen.pdo import (
+from drivers.cia402.limits import DriveSettings
+from drivers.cia402.objects import Objects, name, place
+from drivers.cia402.polling import reported_torque
+from drivers.cia402.process_data import (
     MODE_NAMES,
     RPM,
     TARGET_VELOCITY,
@@ -21,16 +23,14 @@ from drivers.canopen.pdo import (
     Units,
     decode_value,
 )
-from drivers.canopen.sdo import Objects, name, place
-from drivers.canopen.sdo_feedback import reported_torque
-from drivers.canopen.state_machine import State, decode
+from drivers.cia402.state_machine import State, decode
 from drivers.drive import DriveLimits, Identity, Mode, Preflight, ReportingFilters
 from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.own_limits import SPEED, TORQUE
 from drivers.preflight import PreflightTable, agreed_rated_torque, check_nothing_held
 from drivers.undo_journal import UndoJournal
 from profiles import MARKER_INDEX, MARKER_TEXT, MessageCode, visible
-from profiles.canopen import CanopenProfile, ReportingFilter
+from profiles.cia402 import Cia402Profile, ReportingFilter
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Filters on the reported signals of a drive, read from the objects that its profile names.
@@ -39,7 +39,7 @@ from profiles.canopen import CanopenProfile, ReportingFilter
 _FORMATS = {"u8": "<B", "u16": "<H", "u32": "<I", "i8": "<b", "i16": "<h", "i32": "<i", "f32": "<f"}
 
 
-def read_filters(note: Callable[[str, str, str], None], objects: Objects, profile: CanopenProfile) -> ReportingFilters:
+def read_filters(note: Callable[[str, str, str], None], objects: Objects, profile: Cia402Profile) -> ReportingFilters:
     """Return first-order lags in seconds, None if the drive does not report one; add each to the preflight table."""
     lags: dict[str, float] = {}
     sources = []
@@ -77,7 +77,7 @@ SI_UNIT_VELOCITY = 0x60A9
 
 
 def find_units(
-    table: PreflightTable, objects: Objects, profile: CanopenProfile, rated_torque_nm: float | None
+    table: PreflightTable, objects: Objects, profile: Cia402Profile, rated_torque_nm: float | None
 ) -> tuple[Units, float]:
     """Return the scaling of speed and torque, and the rated torque, N·m."""
     where = name(profile.torque.rated.index, profile.torque.rated.sub)
@@ -91,7 +91,7 @@ def find_units(
     return Units(speed, actual.per_lsb * (rated_nm if actual.unit == "rated" else 1.0), target), rated_nm
 
 
-def _told(objects: Objects, profile: CanopenProfile) -> float | None:
+def _told(objects: Objects, profile: Cia402Profile) -> float | None:
     """Return the rated torque that the drive reports, N·m; None if it reports none or 0."""
     place, per_lsb = profile.torque.rated, profile.torque.rated_torque_nm_per_lsb
     if per_lsb is None:
@@ -103,7 +103,7 @@ def _told(objects: Objects, profile: CanopenProfile) -> float | None:
     return raw * per_lsb if raw > 0.0 else None
 
 
-def speed_unit(table: PreflightTable, objects: Objects, profile: CanopenProfile) -> float:
+def speed_unit(table: PreflightTable, objects: Objects, profile: Cia402Profile) -> float:
     """Return rad/s for one count. If the unit can be set, it must read back as required."""
     speed = profile.speed
     if speed.si_unit is not None:
@@ -156,7 +156,7 @@ STILL_LSB, STILL_RAD_S = 5, 0.05
 """Noise of the velocity at standstill: counts, or rad/s if a count is smaller."""
 
 
-def check_identity(table: PreflightTable, identity: Identity, profile: CanopenProfile) -> None:
+def check_identity(table: PreflightTable, identity: Identity, profile: Cia402Profile) -> None:
     """Check vendor, product and revision (1018h) against the profile; None there means not checked."""
     wanted = profile.identity
     pairs = (
@@ -204,7 +204,7 @@ def restore_from(table: PreflightTable, objects: Objects, journal: UndoJournal, 
 
 
 def check_state(
-    table: PreflightTable, objects: Objects, units: Units, profile: CanopenProfile, limits: DriveLimits
+    table: PreflightTable, objects: Objects, units: Units, profile: Cia402Profile, limits: DriveLimits
 ) -> bool:
     """Refuse a drive in fault (it is never reset silently), and one that still brakes after an earlier stop.
 
@@ -246,7 +246,7 @@ def refuse_if_driven(objects: Objects) -> None:
 
 
 def choose_modes(
-    table: PreflightTable, objects: Objects, profile: CanopenProfile, with_offset: bool = False
+    table: PreflightTable, objects: Objects, profile: Cia402Profile, with_offset: bool = False
 ) -> dict[Mode, int]:
     """Choose the first of the profile's modes that the drive supports (6502h), for speed and for torque.
 
@@ -287,7 +287,7 @@ def check_mode_display(table: PreflightTable, objects: Objects, code: int, wait:
     )
 
 
-def clear_targets(table: PreflightTable, objects: Objects, profile: CanopenProfile) -> None:
+def clear_targets(table: PreflightTable, objects: Objects, profile: Cia402Profile) -> None:
     """Set the targets to zero: a setpoint of an earlier run must not act when the drive is enabled."""
     index, _, bits = VL_TARGET if profile.speed.vl else TARGET_VELOCITY
     targets = ((0x6071, 16), (index, bits)) if profile.modes.torque else ((index, bits),)
@@ -304,7 +304,7 @@ def clear_targets(table: PreflightTable, objects: Objects, profile: CanopenProfi
 
 
 def find_torque_offset(
-    table: PreflightTable, objects: Objects, profile: CanopenProfile, rated_nm: float
+    table: PreflightTable, objects: Objects, profile: Cia402Profile, rated_nm: float
 ) -> tuple[tuple[int, int, int], float] | None:
     """Return index, subindex and bits of the torque offset, and N·m per count; None if refused, with the reason."""
     entry = profile.torque_offset
@@ -325,7 +325,7 @@ def find_torque_offset(
     return (entry.index, entry.sub, 16), entry.rated_per_lsb * rated_nm
 
 
-def quick_stop_holds(objects: Objects, profile: CanopenProfile) -> bool | None:
+def quick_stop_holds(objects: Objects, profile: Cia402Profile) -> bool | None:
     """Return whether the drive holds the shaft after a quick stop, by the profile and 605Ah.
 
     CiA 402-2, 605Ah: with 5 to 8 it stays in quick stop active, with 0 to 4 it switches its torque off; negative codes
@@ -351,7 +351,7 @@ class AngleComing(NamedTuple):
 def report(
     table: PreflightTable,
     identity: Identity,
-    profile: CanopenProfile,
+    profile: Cia402Profile,
     objects: Objects,
     units: Units,
     rated_nm: float,
@@ -386,11 +386,7 @@ def report(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Identity of the node (CiA 301: 1000h, 1018h, 1008h), refused if it is ambiguous.
-
-
-DOUBLED_ANSWERS = 3
-"""This number of doubled answers shows two nodes with one node-ID; `Cia402Drive.connect` sends about ten requests."""
+# Identity of the drive (CiA 301: 1000h, 1018h, 1008h).
 
 
 def find_free_node(objects: Objects) -> None:
@@ -413,21 +409,14 @@ def read_identity(objects: Objects) -> Identity:
     return Identity(vendor, product, revision, serial, title, _is_simulated(objects))
 
 
-def refuse_in_doubt(objects: Objects, identity: Identity, node: int, stepped: bool) -> None:
-    """Refuse a real drive in stepped time, and two nodes with one node-ID. Raises PreflightRefused."""
-    if stepped and not identity.simulated:
+def refuse_stepped(identity: Identity) -> None:
+    """Refuse a real drive in stepped time. Raises PreflightRefused."""
+    if not identity.simulated:
         raise PreflightRefused(
             "stepped time was requested, but the peer does not have the simulator's marker",
             where=name(MARKER_INDEX, 1),
             next_step="Remove --stepped: a real shaft moves in real time",
             entry=MessageCode.NOT_THE_SIMULATOR,
-        )
-    if objects.doubled >= DOUBLED_ANSWERS:
-        raise PreflightRefused(
-            "requests are answered twice: two nodes have the same node-ID",
-            where=f"node {node}",
-            next_step="Disconnect one of them, or give each its own node-ID",
-            entry=MessageCode.NODE_ID_CONFLICT,
         )
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from drivers.canopen.pdo import RPM, decode_value, encode_value
-from drivers.canopen.sdo import Objects, name
+from drivers.cia402.objects import Objects, name
+from drivers.cia402.process_data import RPM, decode_value, encode_value
 from drivers.drive import Check, DriveLimits, Outcome
 from drivers.errors import ObjectRefused, PreflightRefused
 from drivers.own_limits import QUICK_STOP, SPEED, TORQUE, OwnLimits
 from drivers.preflight import PreflightTable
 from profiles import Require
-from profiles.canopen import CanopenProfile, Parameter
+from profiles.cia402 import Cia402Profile, Parameter
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Settings of the drive that the profile names: read, compared with the required values, and used as scales.
@@ -24,7 +24,7 @@ _UNITS = {"rpm": " rpm", "rpm_s": " rpm/s", "nm": " N·m", "rated": " x rated to
 class DriveSettings:
     """The drive's settings by name, in their units, read on request."""
 
-    def __init__(self, objects: Objects, profile: CanopenProfile) -> None:
+    def __init__(self, objects: Objects, profile: Cia402Profile) -> None:
         self._objects = objects
         self._profile = profile
 
@@ -48,7 +48,7 @@ class DriveSettings:
         return one.per_lsb * factor
 
 
-def check_parameters(table: PreflightTable, objects: Objects, profile: CanopenProfile) -> None:
+def check_parameters(table: PreflightTable, objects: Objects, profile: Cia402Profile) -> None:
     """Add one row for each setting that the operator must set; tdhil writes none of them."""
     settings = DriveSettings(objects, profile)
     for one in profile.parameters:
@@ -105,7 +105,7 @@ _TITLES = {
 
 
 def set_limits(
-    table: PreflightTable, objects: Objects, profile: CanopenProfile, limits: DriveLimits, rated_nm: float,
+    table: PreflightTable, objects: Objects, profile: Cia402Profile, limits: DriveLimits, rated_nm: float,
     own: OwnLimits
 ) -> None:
     """Write the drive's own torque limit, speed limit and quick stop and read them back, where ``own`` permits it."""

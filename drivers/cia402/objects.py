@@ -1,0 +1,122 @@
+"""Objects of a drive's object dictionary: read, written, changed with a way back. The transfer is the bus's.
+
+The names are those of CiA 301: index, sub-index, little-endian bytes. CANopen and EtherCAT (CoE) share them.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from drivers.errors import CommunicationLost, ObjectRefused
+from drivers.undo_journal import UndoJournal
+
+
+class Objects(ABC):
+    """The drive's object dictionary, as integers and bytes.
+
+    Raises ObjectRefused when the drive refuses a transfer and CommunicationLost when it doesn't answer.
+    """
+
+    def __init__(self) -> None:
+        self._undo: list[Callable[[], None]] = []
+        self._changed: set[tuple[int, int]] = set()
+        self.journal: UndoJournal | None = None        # records each change before it is made
+        self.stands: dict[tuple[int, int], bytes] = {}     # last value read back, or found right
+
+    @contextmanager
+    def answered_within(self, answer_s: float) -> Iterator[None]:
+        """Send each request once and wait at most ``answer_s`` of wall time: a shaft may be turning meanwhile."""
+        yield
+
+    @abstractmethod
+    def read_bytes(self, index: int, subindex: int = 0) -> bytes:
+        """Return the bytes of an object."""
+
+    @abstractmethod
+    def write_bytes(self, index: int, subindex: int, data: bytes, shown: str = "") -> None:
+        """Write raw bytes. ``shown`` is the value for messages."""
+
+    def read(self, index: int, subindex: int = 0, *, signed: bool = False) -> int:
+        return int.from_bytes(self.read_bytes(index, subindex), "little", signed=signed)
+
+    def read_if_there(self, index: int, subindex: int = 0, *, signed: bool = False) -> int | None:
+        """Return the value, or None if the drive does not have the object."""
+        try:
+            return self.read(index, subindex, signed=signed)
+        except ObjectRefused:
+            return None
+
+    def write(self, index: int, subindex: int, value: int, bits: int) -> None:
+        self.write_bytes(index, subindex, _encoded(value, bits, name(index, subindex)), str(value))
+
+    def change(self, index: int, subindex: int, value: int, bits: int) -> int:
+        """Write a value, remember the former one, and return the value read back."""
+        signed = value < 0
+        before = self.read_bytes(index, subindex)
+        if int.from_bytes(before, "little", signed=signed) != value:
+            after = _encoded(value, bits, name(index, subindex))
+            self._note_change(index, subindex, before, after)
+            self.write_bytes(index, subindex, after, str(value))
+        back = self.stands[index, subindex] = self.read_bytes(index, subindex)
+        return int.from_bytes(back, "little", signed=signed)
+
+    def change_bytes(self, index: int, subindex: int, data: bytes) -> bytes:
+        """Do the same as `change`, for an object of any type."""
+        before = self.read_bytes(index, subindex)
+        if before != data:
+            self._note_change(index, subindex, before, data)
+            self.write_bytes(index, subindex, data)
+        back = self.stands[index, subindex] = self.read_bytes(index, subindex)
+        return back
+
+    def _note_change(self, index: int, subindex: int, before: bytes, after: bytes) -> None:
+        """Register the restore, and record the former value in case this host dies."""
+        where = name(index, subindex)
+        if (index, subindex) not in self._changed:
+            self._changed.add((index, subindex))
+            self.on_restore(lambda: self._give_back(index, subindex, before))
+        if self.journal is not None:
+            self.journal.changing(where, before, after)
+
+    def _give_back(self, index: int, subindex: int, before: bytes) -> None:
+        self.write_bytes(index, subindex, before, str(int.from_bytes(before, "little")))
+        if self.journal is not None:
+            self.journal.given_back(name(index, subindex))
+
+    def on_restore(self, undo: Callable[[], None]) -> None:
+        """Have ``undo`` called by `restore`."""
+        self._undo.append(undo)
+
+    def restore(self) -> tuple[str, ...]:
+        """Undo every change, the last one first. Return the changes that could not be restored."""
+        failed = []
+        self._changed.clear()
+        while self._undo:
+            try:
+                self._undo.pop()()
+            except ObjectRefused as error:
+                failed.append(str(error))
+            except CommunicationLost as error:
+                failed.append(str(error))
+                self._undo.clear()
+        return tuple(failed)
+
+
+def _encoded(value: int, bits: int, where: str) -> bytes:
+    try:
+        return value.to_bytes(bits // 8, "little", signed=value < 0)
+    except OverflowError as error:
+        raise ObjectRefused(f"{value} is outside the range of {bits} bits", where=where) from error
+
+
+def place(where: str) -> tuple[int, int]:
+    """Return (index, subindex) of a name written by `name`. Raises ValueError."""
+    index, _, subindex = where.partition(":")
+    return int(index.removesuffix("h"), 16), int(subindex or 0)
+
+
+def name(index: int, subindex: int = 0) -> str:
+    """Return an object's name for messages: 6040h, 1016h:1."""
+    return f"{index:04X}h:{subindex}" if subindex else f"{index:04X}h"

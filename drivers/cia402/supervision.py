@@ -1,0 +1,351 @@
+"""Supervision of a drive during a run, on any bus: its errors, remarks, and the read-back of its settings.
+
+Each kind of error is kept until it was raised once, in the order of occurrence. So it does not disturb a stop sequence
+that continues to exchange.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+from drivers.cia402.objects import name
+from drivers.clock import LOWER_THE_RATE
+from drivers.errors import CommunicationLost, TdhilError
+from profiles import MessageCode
+
+HOST_SILENT = "host silent"
+THIN = "thin feedback"
+OF_A_LATE_HOST = (HOST_SILENT, THIN)
+OF_A_SILENT_HOST = ("heartbeat", "nmt", *OF_A_LATE_HOST)
+"""Kinds of error that a delay of this host causes, or that it mistakes for errors of the drive."""
+
+MOST_REMARKS = 20
+"""Number of different remarks in one run."""
+
+# EMCY error code classes (CiA 301) and the CiA 402 codes a field engineer meets first.
+_EMCY_CLASSES = {
+    0x10: "generic error",
+    0x20: "current",
+    0x21: "current, input side",
+    0x22: "current inside the drive",
+    0x23: "current, output side (short circuit or overload)",
+    0x30: "voltage",
+    0x31: "mains voltage",
+    0x32: "DC link voltage",
+    0x33: "output voltage",
+    0x40: "temperature",
+    0x42: "drive temperature",
+    0x43: "motor temperature",
+    0x50: "drive hardware",
+    0x54: "power section (or STO)",
+    0x60: "drive software",
+    0x70: "additional modules",
+    0x73: "sensor",
+    0x75: "communication module",
+    0x80: "monitoring",
+    0x81: "communication (host heartbeat lost, CAN overrun or passive)",
+    0x82: "protocol error (PDO length)",
+    0x84: "speed controller (speed limit or following error)",
+    0x86: "positioning",
+    0x90: "external error",
+    0xF0: "additional functions",
+}
+
+
+def emcy_text(code: int) -> str:
+    """Return the meaning of an EMCY error code, by its class."""
+    meaning = _EMCY_CLASSES.get(code >> 8) or _EMCY_CLASSES.get(code >> 8 & 0xF0) or "manufacturer specific"
+    return f"EMCY {code:04X}h, {meaning}"
+
+
+class DriveWatch:
+    """Errors of one drive during a run, and remarks. ``place``: name of the drive on its bus."""
+
+    def __init__(self, place: str) -> None:
+        self.place = place
+        self._troubles: list[tuple[str, TdhilError]] = []
+        self._raised: set[str] = set()
+        self._told: list[str] = []
+        self._said: set[str] = set()
+        self.expect_operational = False
+        self.host_stood_still: Callable[[], str] = lambda: ""
+        """Returns the delay of this host, in words, to report before the error; empty if there was none."""
+        self.host_late: Callable[[], str] = lambda: ""
+        """The same for repeated short delays, on which a drive's watchdog acts."""
+
+    def start(self, allowed_silence_s: float) -> None:
+        """Treat what happens to the drive as errors from now on. ``allowed_silence_s``: 0 = not supervised."""
+        self.expect_operational = True
+
+    def stop(self) -> None:
+        """End the supervision."""
+        self.expect_operational = False
+
+    def check(self) -> None:
+        """Raise the oldest error that was not raised yet."""
+        if self._troubles:
+            kind, trouble = self._troubles.pop(0)
+            raise self._of_host(kind, trouble) if kind in OF_A_SILENT_HOST else trouble
+
+    def interference(self, what: str, where: str, next_step: str, *, kind: str) -> None:
+        """Record that another master changes or drives this drive; `check` raises it once for each ``kind``."""
+        self.keep(kind, CommunicationLost(what, where=where, next_step=next_step))
+
+    def thin_feedback(self, missed: int, cycles: int, period_s: float, where: str) -> None:
+        """Record that ``missed`` of the last cycles brought no feedback."""
+        self.keep(
+            THIN,
+            CommunicationLost(
+                f"{missed} of the last {cycles} cycles ({cycles * period_s:.2g} s) brought no feedback",
+                where=f"{self.place}, {where}",
+                next_step="Check the TPDO's transmission type and mapping, the bus load and the cable",
+                entry=MessageCode.FEEDBACK_LOST,
+            ),
+        )
+
+    def tell(self, text: str) -> None:
+        """Add a remark; each text once."""
+        if text not in self._said and len(self._said) < MOST_REMARKS:
+            self._said.add(text)
+            self._told.append(text)
+
+    def remarks(self) -> tuple[str, ...]:
+        """Return the remarks since the last call, one line each."""
+        if not self._told:
+            return ()
+        told, self._told = tuple(self._told), []
+        return told
+
+    def keep(self, kind: str, trouble: TdhilError) -> None:
+        """Keep an error until `check` raises it; each kind once."""
+        if kind not in self._raised:
+            self._raised.add(kind)
+            self._troubles.append((kind, trouble))
+
+    def _of_host(self, kind: str, trouble: TdhilError) -> TdhilError:
+        """Return the error with the delay of this host in front, if there was one: the delay may be its only cause.
+
+        The drive's watchdog also trips on many cycles that are each only a little late.
+        """
+        away = self.host_late() if kind in OF_A_LATE_HOST else self.host_stood_still()
+        if not away:
+            return trouble
+        where = trouble.where if kind == HOST_SILENT else f"host; {trouble.where}"
+        return CommunicationLost(f"{away}. After that: {trouble.what}", where=where, next_step=LOWER_THE_RATE,
+                                 entry=MessageCode.HOST_LATE)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Read-back of the settings that preflight made: two objects a second, beside the cycle, during the whole run.
+#
+# A tool, the drive's panel or another fieldbus may change the watchdog, its reaction, the quick stop or a limit while
+# the shaft turns, without any frame on this bus. So a request is sent after a cycle's feedback; tdhil does not wait for
+# the answer and checks it when it comes. Watchdog and quick stop have every third
+# turn, limits and setpoints another, and the content of the feedback frames (mapping, transmission type, COB-ID of the
+# TPDOs) the third. So a change shows within 0.5 s times three times the number of objects in its group. An object that
+# a tool writes on this bus is checked in the next cycle.
+#
+# Setpoints and mode (6071h, 60FFh, 6060h) are read too: they must be the values that this host sent last. A drive
+# echoes them if it has returned a value of ours other than zero. Only then does another value come from another master.
+#
+# An answer that differs is requested again at once, and counts the second time (a setpoint the third time). The changed
+# value is written back once before the stop, because the stop may depend on it (605Ah). Some drives do not answer SDO
+# requests while running; tdhil reports this and continues. If a drive stops answering after it has answered before,
+# `LOST` missed replies count as a lost connection.
+
+
+READ_BACK_EVERY_S = 0.5
+READ_BACK_ANSWER_S = 0.5
+"""Control time for an answer, s."""
+GIVE_UP, LOST = 5, 10
+"""Unanswered requests in a row: limit for a drive that never answered, and for one that did."""
+TRIES = 2
+REMEMBERED = 8
+"""Number of cycles whose setpoints an answer may show."""
+
+
+class Group(Enum):
+    """Objects that are read back in the same turn."""
+
+    SAFETY = "watchdog, its reaction, quick stop"
+    REST = "limits, setpoints, RPDOs"
+    FEEDBACK = "what the TPDOs carry, and when"
+
+
+@dataclass(eq=False)
+class _WatchedObject:
+    """``data``: required value; None: one of the setpoints sent last."""
+
+    index: int
+    sub: int
+    title: str
+    data: bytes | None
+    differs: int = 0
+    refused: int = 0
+    echoed: bool = False
+
+
+class ReadBack:
+    """``ask`` sends a read request, ``put`` a write request; `step` is called once a cycle, `take` for each answer."""
+
+    def __init__(
+        self, watch: DriveWatch, ask: Callable[[int, int], None], put: Callable[[int, int, bytes], None], place: str
+    ) -> None:
+        self._watch = watch
+        self._ask = ask
+        self._put = put
+        self._place = place
+        self._groups: dict[Group, list[_WatchedObject]] = {group: [] for group in Group}
+        self.on_changed: Callable[[int, int], None] = lambda index, sub: None
+        """Called with index and sub-index of an object that another master changed, before the error is raised."""
+        self._next: deque[_WatchedObject] = deque()      # to read before their turn
+        self._turn = 0
+        self._asked: _WatchedObject | None = None
+        self._asked_s = 0.0
+        self._due_s: float | None = None
+        self._silent = 0
+        self._answered = False
+        self._over = False
+        self._sent: dict[int, deque[int]] = {}
+
+    def clear(self) -> None:
+        """Remove all objects."""
+        for group in self._groups.values():
+            group.clear()
+        self._sent.clear()
+        self._next.clear()
+
+    def watch(self, title: str, index: int, sub: int, data: bytes, group: Group) -> None:
+        """Add an object that must keep its value."""
+        self._groups[group].append(_WatchedObject(index, sub, title, data))
+
+    def stands(self, index: int, sub: int, data: bytes) -> None:
+        """Note that this host has written a watched object itself."""
+        for one in self._all():
+            if (one.index, one.sub) == (index, sub):
+                one.data = data
+
+    def watch_setpoint(self, title: str, index: int) -> None:
+        """Add an object that must show the setpoint sent (`sent`)."""
+        self._sent[index] = deque(maxlen=REMEMBERED)
+        self._groups[Group.REST].append(_WatchedObject(index, 0, title, None))
+
+    def sent(self, index: int, value: int) -> None:
+        """Record a setpoint that was sent in this cycle."""
+        if index in self._sent:
+            self._sent[index].append(value)
+
+    def soon(self, index: int, sub: int) -> None:
+        """Read this object before its turn, because another master wrote it."""
+        for one in self._all():
+            if (one.index, one.sub) == (index, sub) and one not in self._next:
+                self._next.append(one)
+
+    def put_back(self, index: int, sub: int) -> None:
+        """Write the required value into a supervised object, without waiting for an answer."""
+        for one in self._all():
+            if (one.index, one.sub) == (index, sub) and one.data is not None:
+                self._put(index, sub, one.data)
+
+    def step(self, now_s: float) -> None:
+        """Send the next request, after a cycle's feedback."""
+        if self._over or not any(self._groups.values()):
+            return
+        if self._asked is not None:
+            if now_s - self._asked_s < READ_BACK_ANSWER_S:
+                return
+            self._asked = None
+            self._unanswered()
+        if self._due_s is None:
+            self._due_s = now_s
+        if self._next or now_s >= self._due_s - 1e-9:
+            if not self._next:
+                self._due_s = now_s + READ_BACK_EVERY_S
+            one = self._asked = self._choose()
+            self._asked_s = now_s
+            self._ask(one.index, one.sub)
+
+    def take(self, index: int, sub: int, data: bytes | None) -> None:
+        """Handle an answer of the drive, to this or another client; None: the drive refused the request."""
+        one = self._asked
+        if one is None or (index, sub) != (one.index, one.sub):
+            return
+        self._asked, self._silent = None, 0
+        if data is None:
+            one.refused += 1
+            if one.refused == GIVE_UP:
+                self._watch.tell(f"the drive refuses to read {name(index, sub)} in motion; it is not supervised")
+                self._drop(one)
+        else:
+            self._answered = True
+            self._compare(one, data)
+
+    def _choose(self) -> _WatchedObject:
+        if self._next:
+            return self._next.popleft()
+        groups = [group for group in self._groups.values() if group]
+        turn, self._turn = self._turn, self._turn + 1
+        group = groups[turn % len(groups)]
+        return group[turn // len(groups) % len(group)]
+
+    def _all(self) -> list[_WatchedObject]:
+        return [one for group in self._groups.values() for one in group]
+
+    def _compare(self, one: _WatchedObject, found: bytes) -> None:
+        if one.data is not None:
+            good = found[: len(one.data)] == one.data
+        else:
+            value, sent = int.from_bytes(found, "little", signed=True), self._sent[one.index]
+            good = value in sent
+            one.echoed = one.echoed or (good and value != 0)
+            if not good and not one.echoed:
+                return
+        if good:
+            one.differs = 0
+            return
+        one.differs += 1
+        if one.differs < TRIES + (one.data is None):
+            self._next.appendleft(one)
+        elif one.data is not None:
+            self.put_back(one.index, one.sub)      # before the stop, which may depend on it
+            self.on_changed(one.index, one.sub)
+            self._watch.interference(
+                f"{one.title} was changed by another master during the run: {_shown(one.data)} was set,"
+                f" {_shown(found)} is there now",
+                f"{self._place}, {name(one.index, one.sub)}",
+                "Find the tool, panel or master that writes to this drive, disconnect it, and start again",
+                kind=f"changed {one.index:04X}:{one.sub}",
+            )
+        else:
+            self._watch.interference(
+                f"{one.title} is not what this host sent: {_shown(found)} is there, {sent[-1]} was sent",
+                f"{self._place}, {name(one.index, one.sub)}",
+                "A second master, a panel or another fieldbus may drive it. Disconnect it and start again",
+                kind="setpoint",
+            )
+
+    def _unanswered(self) -> None:
+        self._silent += 1
+        if not self._answered and self._silent >= GIVE_UP:
+            self._over = True
+            self._watch.tell("the drive answers no SDO requests in motion: watchdog and limits were not read back")
+        elif self._answered and self._silent >= LOST:
+            self._over = True
+            self._watch.interference(
+                f"the drive did not answer {LOST} SDO requests in a row: watchdog and limits can't be read back",
+                f"{self._place}, SDO",
+                "Check a gateway in between and the load of the drive; see the frames in the log", kind="read back",
+            )
+
+    def _drop(self, one: _WatchedObject) -> None:
+        for those in self._groups.values():
+            if one in those:
+                those.remove(one)
+
+
+def _shown(data: bytes) -> str:
+    number = int.from_bytes(data, "little")
+    return f"{number} ({number:X}h)" if number > 9 else str(number)
