@@ -300,7 +300,7 @@ def main(folder: Path) -> int:
     """Compute the request of this folder and write its outcome to stdout. Return 0."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with suppress(OSError, AttributeError):
-        os.nice(19)
+        os.setpriority(os.PRIO_PROCESS, 0, 19)
     teller = _Teller()
     try:
         from tdhil.fleet import FleetRequest, FleetSettings, run_fleet

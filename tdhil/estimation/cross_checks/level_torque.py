@@ -1,25 +1,22 @@
-"""The torque of steady turning, compared at equal speed: levels with one another, and stage 5 with the levels.
+"""The mean torque of stage 5 against the torque that the steady levels of stage 2 account for, at the same mean speed.
 
 The mean torque over whole periods is the load at the mean speed, free of every lag. Where the torque's scale changes
 between the stages, in every report alike, the mean torque changes by the same factor as J does. Above a drill string
 nothing else shows it: the ramps of stage 2 give J there to a factor of two at best.
 
-A run returns to a speed that it held before. Where the scale changes within stage 2, the torque of the two differs by
-the same factor, and every later report agrees with the wrong scale.
-
 A load may change by itself. Friction falls while oil and bearings warm up, so a smaller torque shows less than a larger
-one. The bounds are wide for that reason: they find a torque scale that halves or doubles, and no small change.
+one. The bounds are wide for that reason: they find a torque scale that halves or doubles, and no small change. Levels
+of one speed are not compared with each other: on sound rigs with a slowly changing load one had 2.4 times the torque
+of the other (three of 68 runs of `benchmarks/healthy_runs.py` above 1.7), and neither shows how well it is known.
 """
 
 import math
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
 from profiles import MessageCode
 from tdhil.estimation.case import Case, Finding
-from tdhil.estimation.cross_checks.momentum import block_means, calm_spans, periodic_segments
 from tdhil.estimation.result import Refusal
 from tdhil.estimation.samples import Samples, excited_window
 from tdhil.recording import Recording
@@ -30,17 +27,10 @@ LEAST, MOST = 0.55, 1.7
 _BEYOND = 0.25
 """How far the mean speed may lie beyond the levels, as a share of their distance: further out a line says little."""
 
-_SAME_SPEED = 0.03
-"""Share of the greatest speed: stretches closer than this have the same friction, within some percent."""
-
 _CLEAR_SDS = 5.0
 """Standard deviations of the torque's block means by which the torque must differ."""
 
 _BLOCK_S = 2.0            # of a level; a segment's blocks are its periods
-_REPEAT_BLOCK_S, _REPEAT_BLOCKS = 1.0, 3
-"""Of a calm stretch, s, and how many it must have: fewer show neither its scatter nor a swing of the load."""
-_ADVICE = ("check that torque is reported with one scale in all stages and that the load stays the same; then run it"
-           " again")
 _FEWEST = 20              # samples of a stretch
 
 
@@ -85,43 +75,7 @@ def level_torques(recording: Recording, samples: Samples) -> tuple[LevelTorque, 
 
 
 def level_contradiction(recording: Recording, samples: Samples) -> Refusal | None:
-    """Return the first contradiction between torques at equal speed; None if they agree."""
-    return _stage_5_contradiction(recording, samples) or _repeat_contradiction(recording, samples)
-
-
-def _repeat_contradiction(recording: Recording, samples: Samples) -> Refusal | None:
-    """Compare each calm stretch outside of the excitation with the later ones at its speed.
-
-    Not above a drill string: its torque swings by more than friction while the speed is held.
-    """
-    blocks = None if recording.winds_up else block_means(samples)
-    if blocks is None:
-        return None
-    steady = []
-    for span in calm_spans(blocks, periodic_segments(recording)):
-        mean = _mean(samples.between(span.start_s, span.end_s), _REPEAT_BLOCK_S, _REPEAT_BLOCKS)
-        if mean is not None:
-            steady.append((0.5 * (span.start_s + span.end_s), *mean))
-    if not steady:
-        return None
-    fastest = max(abs(speed) for _, speed, _, _ in steady)
-    usual_sd = float(np.median([sd for *_, sd in steady]))       # a few blocks may scatter little by chance
-    for (time, speed, torque, sd), (later_time, later_speed, later, later_sd) in combinations(steady, 2):
-        clear_nm = _CLEAR_SDS * math.hypot(max(sd, usual_sd), max(later_sd, usual_sd))
-        ratio = later / torque if torque != 0.0 else math.inf
-        alike = abs(later_speed - speed) <= _SAME_SPEED * fastest
-        if not alike or LEAST <= ratio <= MOST or abs(later - torque) <= clear_nm:
-            continue
-        return Refusal(
-            f"at {speed:.3g} rad/s the mean torque is {torque:.4g} N·m at {time:.0f} s and {later:.4g} N·m at"
-            f" {later_time:.0f} s ({ratio:.2f} times, limits {LEAST:g} to {MOST:g}): the scale of torque or the load"
-            " changed during the run",
-            _ADVICE, MessageCode.TORQUE_AT_SPEED_CHANGED,
-        )
-    return None
-
-
-def _stage_5_contradiction(recording: Recording, samples: Samples) -> Refusal | None:
+    """Return what is wrong where the mean torque is far from what the levels account for; else None."""
     for one in level_torques(recording, samples):
         apart = abs(one.torque_nm - one.by_levels_nm)
         if LEAST <= one.ratio <= MOST or apart <= _CLEAR_SDS * one.sd_nm:
@@ -130,7 +84,9 @@ def _stage_5_contradiction(recording: Recording, samples: Samples) -> Refusal | 
             f"the mean torque of stage 5 is {one.torque_nm:.4g} N·m at {one.speed_rad_s:.3g} rad/s, and the levels of"
             f" stage 2 account for {one.by_levels_nm:.4g} N·m there ({one.ratio:.2f} times, limits {LEAST:g} to"
             f" {MOST:g}): the scale of torque or the load changed during the run",
-            _ADVICE, MessageCode.TORQUE_AT_SPEED_CHANGED,
+            "check that torque is reported with one scale in all stages and that the load stays the same; then run it"
+            " again",
+            MessageCode.TORQUE_AT_SPEED_CHANGED,
         )
     return None
 
@@ -148,13 +104,13 @@ def level_checked(finding: Finding, case: Case) -> Finding:
     )
 
 
-def _mean(samples: Samples, block_s: float, fewest: int = 2) -> tuple[float, float, float] | None:
-    """Return mean speed, mean torque and the standard deviation of the latter; None for less than ``fewest`` blocks."""
+def _mean(samples: Samples, block_s: float) -> tuple[float, float, float] | None:
+    """Return mean speed, mean torque and the standard deviation of the latter; None for less than two blocks."""
     if len(samples) < _FEWEST:
         return None
     blocks = np.floor((samples.time_s - samples.time_s[0]) / block_s + 1e-9)
     means = np.array([float(np.mean(samples.torque_nm[blocks == block])) for block in np.unique(blocks)])
-    if len(means) < fewest:
+    if len(means) < 2:
         return None
     sd = float(np.std(means, ddof=1)) / math.sqrt(len(means))
     return float(np.mean(samples.speed_rad_s)), float(np.mean(samples.torque_nm)), sd
