@@ -56,7 +56,6 @@ OF_THEIR_DAY = {
     "cli/connection.py": "session/connection.py",
     "tdhil/protocol/beside.py": "tdhil/runner/background.py",
     "runner.py": "tdhil/runner/five_stages.py",
-    "worn_profile": "profile_emulation",
     "tdhil.drivers": "drivers",
 }
 KNOWN = set().union(*EXCEPTIONS.values())

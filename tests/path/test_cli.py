@@ -264,7 +264,7 @@ def test_one_tone_is_not_identifiable_and_the_paper_s_estimate_is_shown(tmp_path
     card = tdhil("replay", done.log)
     assert card.code == 9
     assert "not_identifiable" in card.out
-    assert "paper" in card.out
+    assert "regression (Xu 2026)" in card.out
 
 
 @pytest.mark.heavy

@@ -161,7 +161,7 @@ def test_a_stop_to_a_process_that_stands_still_kills_it_and_says_that_nothing_wa
     write_json(service.store.place(run) / CONNECTION_FILE,
                kept_connection(*service.supervisor.rigs.get("real").way()))
     pid = service.store.status(run).pid
-    os.kill(pid, signal.SIGSTOP)
+    suspend(pid)
     told = call("POST", f"/runs/{run}/stop", 504, json={})["error"]
     for words in ("does not react", "SIGSTOP", "watchdog (500 ms) stops the shaft", "sends tdhil stop"):
         assert words in told["what"]
@@ -178,10 +178,16 @@ def test_a_stop_to_a_process_that_stands_still_kills_it_and_says_that_nothing_wa
         {"process": "stood still", "killed": True}])
 
 
+def suspend(pid: int) -> None:
+    """A signal is on its way for a moment; a process that still runs would answer a Stop."""
+    os.kill(pid, signal.SIGSTOP)
+    wait_for("its standstill", lambda: stands_still(pid))
+
+
 def test_a_rig_whose_run_stands_still_answers_the_same(call, service):
     run = call.start("a", what="hold")["id"]
     service.wait(run, "moving")
-    os.kill(service.store.status(run).pid, signal.SIGSTOP)
+    suspend(service.store.status(run).pid)
     assert "does not react" in call("POST", "/rigs/a/stop", 504, json={})["error"]["what"]
     service.wait(run, "interrupted")
 
@@ -190,7 +196,7 @@ def test_a_process_that_stands_still_and_cannot_be_killed_is_told_as_such(call, 
     run = call.start("a", what="hold")["id"]
     service.wait(run, "moving")
     pid = service.store.status(run).pid
-    os.kill(pid, signal.SIGSTOP)
+    suspend(pid)
     with monkeypatch.context() as patched:
         patched.setattr("tdhil.service.supervisor.send_signal", lambda *arguments: False)
         told = call("POST", f"/runs/{run}/stop", 504, json={})["error"]
