@@ -81,7 +81,7 @@ _OF_SPEEDS = ("critical", "by ramp", "linear")
 
 @dataclass(frozen=True)
 class TunedFor:
-    """Where the numbers come from."""
+    """Source of the numbers."""
 
     source: str
     """The result or log."""
@@ -229,7 +229,7 @@ def _quiet_part(one: Tuned) -> dict[str, float | None]:
 
 
 def _advice(tuning: Tuning) -> dict[str, Any]:
-    """What to do, in one sentence and as data."""
+    """The advice, in one sentence and as data."""
     advice = tuning.advice
     base = tuning.by_kind(advice.compared_with)
     best = None if advice.kind is None else tuning.by_kind(advice.kind)
@@ -355,7 +355,7 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
 
 
 def _legend(document: Part) -> Iterator[tuple[str, str]]:
-    """What each line of the table is, in a few words."""
+    """Return a few words about each line of the table."""
     yield "in brackets", _IN_BRACKETS
     left_out = () if document["critical_speeds"] is not None else _OF_SPEEDS
     yield from ((name, words) for name, words in _EXPLAINED.items() if name not in left_out)
@@ -452,7 +452,7 @@ class Showcase:
 
 
 def showcase_of(tuning: Tuning, seconds: float = 60.0) -> Showcase | None:
-    """At a set speed at which the stiff loop leaves the bit sticking and the advised one frees it; None: no such."""
+    """Return the motion at a set speed at which only the stiff loop leaves the bit stuck; None without such a speed."""
     import numpy as np
 
     found = {one.kind: one for one in tuning.tuned if one.controller is not None and one.quiet_cures}

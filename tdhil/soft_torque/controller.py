@@ -163,7 +163,7 @@ class ClosedSystem:
         return tuple(sorted(swinging, key=lambda mode: mode.frequency_hz))
 
     def is_stable(self, up_to_rad_s: float | None = None) -> bool:
-        """Whether no pole lies right of the imaginary axis, up to ``up_to_rad_s`` (default `reach_rad_s`)."""
+        """Return whether no pole lies right of the imaginary axis, up to ``up_to_rad_s`` (default `reach_rad_s`)."""
         reach = self.reach_rad_s() if up_to_rad_s is None else up_to_rad_s
         return count_right_of(self.characteristic, reach, self._pace, most=200.0 / self.string.echo_s) == 0
 

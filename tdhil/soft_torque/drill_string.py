@@ -125,7 +125,7 @@ class PipeSection(DataModel):
 
 
 class BottomEnd(DataModel):
-    """What turns at the bottom: an inertia, or sections of a bottom-hole assembly, and the bit's friction.
+    """The bottom end: an inertia, or sections of a bottom-hole assembly, and the bit's friction.
 
     The words are plant.yaml's. Without ``coulomb_nm`` no bit is stated, and nothing is said of critical speeds.
     """
@@ -213,7 +213,7 @@ class WaveLine:
 
     @property
     def has_friction(self) -> bool:
-        """Whether anything along the line takes energy."""
+        """Return whether anything along the line takes energy."""
         return self.drag_nm_s_rad_m > 0.0 or self.coulomb_nm_m > 0.0
 
     @property
@@ -228,7 +228,7 @@ class WaveLine:
 
     @property
     def delay_s(self) -> float:
-        """From end to end."""
+        """Travel time of a wave from end to end."""
         return self.length_m / self.speed_m_s
 
 
@@ -295,12 +295,12 @@ class DrillString:
 
     @property
     def stiffness_nm_rad(self) -> float:
-        """Of the whole as a spring, k, bottom-hole assembly included."""
+        """Stiffness k of the whole as a spring, bottom-hole assembly included."""
         return 1.0 / sum(line.length_m * line.compliance_rad_nm_m for line in self.lines)
 
     @property
     def inertia_kg_m2(self) -> float:
-        """Of everything below the top drive, as if it were stiff."""
+        """Inertia of everything below the top drive, as if it were stiff."""
         return self.bottom_inertia_kg_m2 + sum(line.length_m * line.inertia_kg_m for line in self.lines)
 
     @property
@@ -371,7 +371,7 @@ def _per_metre(section: PipeSection, outer_m: float, inner_m: float) -> tuple[fl
 
 
 def string_of(file: StringFile) -> DrillString:
-    """What the file says, from the top down."""
+    """Return the string of the file, from the top down."""
     bottom = file.bottom
     bit = None
     if bottom.coulomb_nm is not None:
@@ -386,7 +386,7 @@ def string_of(file: StringFile) -> DrillString:
 
 
 def _tolerance_of(file: StringFile, sections: tuple[PipeSection, ...]) -> StringTolerance:
-    """As stated; G of the handbook may be anything that was ever fitted, a stated G is known better."""
+    """Return the tolerances of the file. Without a stated G, every value that was fitted in the field is possible."""
     stated = file.tolerance or ToleranceFile()
     shear = tuple(one / STEEL_SHEAR_MODULUS_PA for one in SHEAR_RANGE_PA)
     if stated.shear_modulus is not None:

@@ -53,7 +53,7 @@ class EvaluationRefused(TdhilError):
 
 @dataclass(frozen=True)
 class Prediction:
-    """By `tune`, at the main shaft."""
+    """Prediction by `tune`, at the main shaft."""
 
     kind: str
     cure_rpm: Interval
@@ -63,7 +63,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class RigWindow:
-    """What the rig may do, at the motor: speed, torque, and by how much its guard looks ahead."""
+    """Limits of the rig at the motor: speed, torque, and the time by which its guard looks ahead."""
 
     lowest_rad_s: float
     highest_rad_s: float
@@ -91,7 +91,7 @@ class EvaluationCase:
         return self.rig.inertia_kg_m2 * self.rig.gear_ratio / self.meant.inertia_kg_m2
 
     def plain(self) -> dict[str, Any]:
-        """As the run's configuration keeps it; infinite numbers as None."""
+        """Return the mapping for the run's configuration; infinite numbers are None."""
         found = asdict(self)
         bit = found["string"]["bit"]
         if bit is not None and bit["stribeck_speed_rad_s"] == inf:
@@ -170,7 +170,10 @@ def program_for(case: EvaluationCase, window: RigWindow) -> SpeedProgram:
 
 
 def _refuse_low(case: EvaluationCase, window: RigWindow, lowest_rad_s: float) -> NoReturn:
-    """At every set speed at which the bit shall stick the top swings too low, at the best to ``lowest_rad_s``."""
+    """Refuse a rig whose top swings too low at every set speed at which the bit shall stick.
+
+    ``lowest_rad_s``: the lowest speed at the best of them.
+    """
     if lowest_rad_s <= 0.0:
         raise EvaluationRefused(
             f"a top drive of {case.meant.inertia_kg_m2:.4g} kg·m² at the main shaft is so light beside this string and "
@@ -189,7 +192,7 @@ def _refuse_low(case: EvaluationCase, window: RigWindow, lowest_rad_s: float) ->
 
 
 class EvaluationOutcome(StrEnum):
-    """Of an evaluation."""
+    """Verdict of an evaluation."""
 
     AS_PREDICTED = "as_predicted"
     DIFFERS = "differs"
@@ -202,7 +205,7 @@ class EvaluationOutcome(StrEnum):
 
 @dataclass(frozen=True)
 class Trial:
-    """At one steady set speed, from the bit about to break away."""
+    """Result at one steady set speed, from the bit about to break away."""
 
     set_rpm: float
     turns: bool
@@ -240,7 +243,7 @@ FOREIGN_SHARE = 0.1
 
 
 def evaluate(rows: Array, case: EvaluationCase, program: SpeedProgram, contradiction: str = "") -> Evaluation:
-    """What the log of a run shows. ValueError where no row is there.
+    """Return the content of a run's log. Raises ValueError for a log without rows.
 
     ``contradiction``: how the drive's torque signals contradict each other, if they do; then nothing is as predicted.
     """
@@ -466,14 +469,14 @@ def _fitted(poles: NDArray[np.complex128], values: Array, every_s: float) -> NDA
 
 
 def _tolerance(plain: Mapping[str, Any] | None) -> StringTolerance:
-    """As a log has it; a log from before it was kept is of a string as usual."""
+    """Return the tolerances of a log. A log without them is of a string with the usual ones."""
     values: dict[str, Any] = {name: tuple(one) if isinstance(one, list) else one
                               for name, one in (plain or {}).items()}
     return StringTolerance(**values)
 
 
 def case_of(plain: Mapping[str, Any]) -> EvaluationCase:
-    """What `EvaluationCase.plain` made a mapping of, as a log's configuration gives it back. Raises as its types do."""
+    """Return the case from the mapping that `EvaluationCase.plain` made. Raises as its types do."""
     from tdhil.soft_torque.drill_string import BitFriction, WaveLine
 
     string, bit = plain["string"], plain["string"]["bit"]

@@ -32,7 +32,7 @@ def drive_settings(
     parameters: SpeedControllerParameters | None, at_motor: SpeedController,
     rated_torque_nm: float | None = None, rated_speed_rpm: float | None = None,
 ) -> tuple[DriveSetting, ...]:
-    """What to type for these gains of the motor shaft; () where the profile says nothing of its speed controller."""
+    """Return the values to type in for these motor-shaft gains; () if the profile has no speed controller."""
     if parameters is None:
         return ()
     gain, integral = parameters.gain, parameters.integral

@@ -120,7 +120,7 @@ def _newton(f: Function, low: complex, high: complex) -> complex | None:
 
 
 def _turn(f: Function, start: complex, end: complex, pace: float) -> float:
-    """By how much the argument of f turns on the straight way."""
+    """Return by how much the argument of f turns on the straight way."""
     at = np.linspace(0.0, 1.0, 9 + ceil(abs(end - start) / pace))
     values = f(start + (end - start) * at)
     for _ in range(40):

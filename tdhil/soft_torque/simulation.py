@@ -79,7 +79,7 @@ class Grid:
 
     @property
     def delay_s(self) -> float:
-        """From top to bottom."""
+        """Travel time of a wave from top to bottom."""
         return self.tick_s * sum(self.ticks)
 
 
@@ -142,7 +142,7 @@ def _cut(string: DrillString, tick_s: float, counts: tuple[int, ...], parts: tup
 
 @dataclass(frozen=True)
 class SimulationTrace:
-    """What was kept: first index time, second the loop, third the set speed."""
+    """Kept values: first index time, second the loop, third the set speed."""
 
     time_s: Array
     """Of the first loop; another string's time runs faster by the ratio of the travel times."""
@@ -317,12 +317,12 @@ class _Waves:
         return torque
 
     def at_top(self) -> Array:
-        """What comes out of the topmost segment now, at its upper end."""
+        """Return the wave that leaves the upper end of the topmost segment now."""
         arriving: Array = self._up[(self._now - self._ticks[0]) % self._size, 0]
         return arriving
 
     def arriving(self) -> tuple[Array, Array]:
-        """What comes out of every segment now, at its lower and at its upper end."""
+        """Return the waves that leave every segment now, at its lower and at its upper end."""
         slots = (self._now - self._ticks) % self._size
         return self._down[slots, self._rows], self._up[slots, self._rows]
 
@@ -354,7 +354,7 @@ class PipeSimulation:
 
     @property
     def breakaway_nm(self) -> Array:
-        """At which each bit begins to turn."""
+        """Return the torque at which each bit begins to turn."""
         return self._bit.static_nm
 
     def wind_up(self, torque_nm: Array) -> None:
@@ -465,7 +465,7 @@ def _top_step(drive: TopDrive, controller: SpeedController, grid: Grid, most_lag
 
 
 class _Bit:
-    """What turns at the bottom, one number a case."""
+    """The bottom end, one number a case."""
 
     def __init__(self, strings: Sequence[DrillString], grids: Sequence[Grid], repeats: int) -> None:
         def each(values: Sequence[float]) -> Array:
@@ -501,7 +501,7 @@ class _Bit:
         return self._coulomb - self._wall + self._bent(speed)
 
     def release(self) -> None:
-        """No dry friction of the bit any more."""
+        """Remove the dry friction of the bit."""
         self._coulomb, self._falls = self._wall.copy(), np.zeros_like(self._falls)
         self.static_nm, self._bends = self._wall.copy(), False
 
@@ -541,7 +541,7 @@ RPM = 2.0 * pi / 60.0
 
 @dataclass(frozen=True)
 class CriticalSpeeds:
-    """In rpm of the main shaft, without bit noise; None: none up to the highest that was tried."""
+    """Critical speeds in rpm of the main shaft, without bit noise; None: none up to the highest that was tried."""
 
     cure_rpm: float | None
     """The lowest set speed from which a stuck bit (at breakaway, the top at full set speed) ends turning."""
@@ -565,7 +565,7 @@ class Search:
 
 
 def critical_speeds(strings: Strings, loops: Sequence[Loop], search: Search = Search()) -> list[CriticalSpeeds]:
-    """Of every loop. Raises ValueError where no bit is stated."""
+    """Return the critical speeds of every loop. Raises ValueError if no bit is stated."""
     cures = lowest_turning(strings, loops, "stuck", search)
     starts = lowest_turning(strings, loops, "rest", search)
     return [CriticalSpeeds(*two) for two in zip(cures, starts, strict=True)]
@@ -614,7 +614,7 @@ def _lowest(turn: Callable[[Array], NDArray[np.bool_]], coarse: Array, parts: fl
 
 
 def _first_of_the_rest(turns: NDArray[np.bool_]) -> int:
-    """From which one on all are true; their number if the last is false."""
+    """Return the index from which on all are true; their number if the last is false."""
     sticking = np.flatnonzero(~turns)
     return int(sticking[-1]) + 1 if sticking.size else 0
 

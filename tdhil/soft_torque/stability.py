@@ -72,7 +72,7 @@ class LoopMargins:
 
 @dataclass(frozen=True)
 class RequiredMargins:
-    """What every sampled case has to keep."""
+    """Margins that every sampled case has to keep."""
 
     phase_deg: float = 30.0
     gain_db: float = 6.0
@@ -202,7 +202,7 @@ def _encircles_nothing(loop: Complex) -> bool:
 
 
 def is_stable(string: DrillString, drive: TopDrive, law: SpeedController) -> bool:
-    """Whether the closed system, the bit turning, has no pole right of the imaginary axis or on it."""
+    """Return whether the closed system, with a turning bit, has no pole right of the imaginary axis or on it."""
     return loop_margins(drive, law, string, stuck=False).stable
 
 

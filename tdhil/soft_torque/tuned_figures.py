@@ -58,7 +58,7 @@ def string_modes_hz(string: DrillString) -> tuple[float, ...]:
 
 
 def lowest_modes_below_hz(held_hz: Sequence[float]) -> float:
-    """What swings below is what the string's lowest mode has become; the next, which rotor and P hold, stays above."""
+    """Return the frequency below which a mode is the string's lowest one; that of rotor and P is above."""
     second = held_hz[1] if len(held_hz) > 1 else 4.0 * held_hz[0]
     return max(sqrt(held_hz[0] * second), NEXT_MODE_SHARE * second)
 
@@ -128,7 +128,7 @@ def with_figures(case: TuneCase, tuned: Tuned, held: Sequence[float], samples: T
 
 
 def _turning_points(along: NDArray[np.float64], case: TuneCase, value_at: Callable[[TopDrive], float]) -> Interval:
-    """What a figure spans over J, its turning points included, kinks too: where the least of two changes sides.
+    """Return the span of a figure over J with its turning points, also kinks where the least of two changes sides.
 
     Golden sections between the neighbours of the largest and of the smallest value.
     """
@@ -149,7 +149,7 @@ def _turning_points(along: NDArray[np.float64], case: TuneCase, value_at: Callab
 
 
 def _spanned(along: NDArray[np.float64]) -> Interval:
-    """What these values span, and the turning points between them: of the parabola through the nearest three."""
+    """Return the span of these values and the turning points between them, by a parabola through the nearest three."""
     low, high = float(along.min()), float(along.max())
     for k in range(1, len(along) - 1):
         before, here, after = (float(one) for one in along[k - 1 : k + 2])

@@ -1,4 +1,4 @@
-r"""What is not known exactly, drawn jointly: rotor, lags, present gains, string and bit.
+r"""Joint draws of all that is not known exactly: rotor, lags, present gains, string and bit.
 
 The true machine is one of many that the data allow. Each draw, a `Truth`, is one of them: J from its interval, every
 lag, every property of the string and of the bit within its tolerance, all at once. What a controller does is worked
@@ -58,7 +58,7 @@ class DrawnValues:
 
     @property
     def median(self) -> float | None:
-        """None: not found."""
+        """Median of the draws; None: not found."""
         middle = float(np.median(self.values))
         return middle if middle < inf else None
 

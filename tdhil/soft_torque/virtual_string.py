@@ -50,7 +50,7 @@ class VirtualString:
         self.arm()
 
     def arm(self) -> None:
-        """At rest, and wound up to where the bit is about to break away."""
+        """Put the string at rest, twisted to the point at which the bit is about to break away."""
         self._pipe = PipeSimulation((self._string,), (self._grid,))
         self._pipe.wind_up(np.array([self._static_nm]))
         self._into_tick_s = self._travel_rad = self._top_rad_s = 0.0
@@ -66,7 +66,7 @@ class VirtualString:
         return float(self._pipe.top_torque(np.array([self._top_rad_s]))[0])
 
     def begin(self, top_rad_s: float) -> None:
-        """From now on the top turns at that speed."""
+        """Turn the top at this speed from now on."""
         self._top_rad_s = top_rad_s
 
     def release(self) -> None:
@@ -119,7 +119,7 @@ class HostController:
             lag.before = lag.after = torque_nm
 
     def shift(self, torque_nm: float) -> None:
-        """So much more torque from now on."""
+        """Add this torque from now on."""
         self._integral_nm += torque_nm
         for lag in self._lags:
             lag.before += torque_nm
@@ -226,7 +226,7 @@ class RotorObserver:
             self._state = self._state + self._gain * self.innovation_rad_s
 
     def less_unknown(self, torque_nm: float) -> None:
-        """So much of it is known from now on."""
+        """Take this much of the unknown torque as known from now on."""
         self._state[2] -= torque_nm
 
     def ahead(self, torque_nm: float) -> float:
@@ -243,7 +243,7 @@ class RotorObserver:
 
 
 class Phase(IntEnum):
-    """Of the course."""
+    """Phase of the course."""
 
     MOVE = 0           # to a set speed, without string
     ARM = 1            # the wound-up string's torque is faded in
@@ -284,7 +284,7 @@ class SpeedProgram:
 
     @property
     def longest_s(self) -> float:
-        """Of all of it, if every trial takes its time."""
+        """Duration of the whole program, if every trial takes its full time, s."""
         span = self.highest_rad_s - self.start_rad_s
         around = 2.0 * self.fade_s + self.armed_s + self.settle_s
         once = self.hold_s + span / self.ramp_rad_s2 + self.steady_s + self.released_s + around
@@ -292,7 +292,7 @@ class SpeedProgram:
 
 
 class ProgramCourse:
-    """Where the program is; told in every cycle whether the bit stands still."""
+    """Position in the program. In every cycle it takes whether the bit stands still."""
 
     def __init__(self, program: SpeedProgram, period_s: float) -> None:
         self._program, self._period_s = program, period_s
@@ -449,7 +449,7 @@ class HostLoop:
 
     @property
     def phase(self) -> Phase:
-        """Where the program is."""
+        """Present phase of the program."""
         return self._course.phase
 
     @property
@@ -459,7 +459,7 @@ class HostLoop:
 
     @property
     def innovation_rad_s(self) -> float:
-        """What the last report was away from what was expected, at the main shaft."""
+        """Difference of the last report from the expected one, at the main shaft."""
         return self._observer.innovation_rad_s
 
     @property
@@ -469,7 +469,7 @@ class HostLoop:
 
     @property
     def put_in_j(self) -> float:
-        """By the loop's errors, into the meant shaft."""
+        """Energy that the loop's errors put into the intended shaft, J."""
         return self._put_in_j
 
     @property

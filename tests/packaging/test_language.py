@@ -20,10 +20,8 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 MOST_EXCEPTIONS = 5
 
 CEILINGS = {
-    ("tdhil/report", "opening"): 4,
     ("tdhil/soft_torque", "long"): 1,
-    ("tdhil/soft_torque", "opening"): 56,
-    ("tdhil/soft_torque", "word"): 26,
+    ("tdhil/soft_torque", "word"): 24,
 }
 """Findings left in each room, by kind. Each was counted before the room was reworded."""
 
