@@ -1,6 +1,7 @@
 """One setting for every property test: the same examples at every run. TDHIL_FUZZ=1 looks for new ones instead.
 
-The longest cases run with --long only, heavy ones in CI (--heavy: those alone), which the header of every run says.
+The README's command takes what is quick, so that it stays below four minutes. Heavy cases run in CI (--heavy: those
+alone), the longest with --long only, which the header of every run says.
 What the markers mean: pyproject.toml.
 
 A test in real time (`real_time`) that fails has shown nothing where this computer stood still meanwhile: a drive's
@@ -23,6 +24,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -91,13 +93,25 @@ def pytest_xdist_make_scheduler(config, log):      # type: ignore[no-untyped-def
     return ByMarker(config, log) if config.getvalue("dist") == "load" else None
 
 
+def heavy_ones(items: list[pytest.Item]) -> set[str]:
+    """Return the node-IDs of the heavy cases. ``heavy(but_first=n)``: all cases of the test but its first n."""
+    seen: Counter[str] = Counter()
+    heavy = set()
+    for item in items:
+        function = item.nodeid.partition("[")[0]
+        seen[function] += 1
+        if any(seen[function] > mark.kwargs.get("but_first", 0) for mark in item.iter_markers("heavy")):
+            heavy.add(item.nodeid)
+    return heavy
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if not config.getoption("--long"):
-        heavy, too = config.getoption("--heavy"), config.getoption("--all-but-long")
+        only, too = config.getoption("--heavy"), config.getoption("--all-but-long")
+        heavy = heavy_ones(items)
         chosen = [
             item for item in items
-            if item.get_closest_marker("long") is None
-            and (too or (item.get_closest_marker("heavy") is not None) is heavy)
+            if item.get_closest_marker("long") is None and (too or (item.nodeid in heavy) is only)
         ]
         if len(chosen) < len(items):
             kept = set(chosen)

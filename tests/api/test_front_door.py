@@ -51,6 +51,7 @@ def test_every_name_that_it_promises_is_there():
         _ = tdhil.nothing
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("first", ["tdhil", "tdhil.runner", "tdhil.runner.guard", "tdhil.api"])
 def test_run_is_called_whatever_was_loaded_before(first):
     code = f"import {first}, tdhil\ntry: tdhil.run(tdhil.simulate(seed=7).__enter__(), no_guard=True)\n"
@@ -59,6 +60,7 @@ def test_run_is_called_whatever_was_loaded_before(first):
     assert "unknown option: no_guard" in done.stdout
 
 
+@pytest.mark.heavy
 def test_a_run_is_read_back_as_it_was(record):
     again = tdhil.read(record.log)
     assert (again.recording.time_s == record.recording.time_s).all()
@@ -69,6 +71,7 @@ def test_a_run_is_read_back_as_it_was(record):
     assert tdhil.identify(again).to_dict() == tdhil.identify(record).to_dict()
 
 
+@pytest.mark.heavy
 def test_the_document_is_that_of_the_command_line(record, capsys):
     code = main(["replay", record.log, "--json", "--model", "rigid", "--confidence", "0.9"])
     result = tdhil.identify(tdhil.read(record.log), model="rigid", confidence=0.9)
@@ -103,6 +106,7 @@ def test_a_trace_in_csv_takes_the_options_of_replay(record, capsys, tmp_path):
         tdhil.read(record.log, gear_ratio=2.0)
 
 
+@pytest.mark.heavy
 def test_what_ends_a_run_is_raised_once_the_shaft_rests(tmp_path):
     with tdhil.simulate(seed=7, faults=["sto@speed+15s"]) as drive, pytest.raises(tdhil.TdhilError) as caught:
         tdhil.run(drive, SHORT, log="broken.mcap")
@@ -180,6 +184,7 @@ class AskedLater(tdhil.StopRequest):
         assert value is None
 
 
+@pytest.mark.heavy
 def test_a_run_in_a_thread_is_stopped_by_its_request_and_leaves_the_signals_alone(tmp_path):
     former = signal.getsignal(signal.SIGINT)
     handlers = set()
@@ -293,6 +298,7 @@ def test_frames_for_notebooks(record):
     assert frame.attrs["units"]["torque_nm"] == "N m"
 
 
+@pytest.mark.heavy
 def test_datasets_for_notebooks(record):
     pytest.importorskip("xarray")
     data = record.to_xarray()

@@ -52,6 +52,7 @@ def test_three_bodies_are_tested_for_a_straight_line(tmp_path):
     assert bent.verdict is Verdict.MODEL_REJECTED and "straight line" in bent.reason
 
 
+@pytest.mark.heavy
 def test_bodies_that_were_exchanged(tmp_path):
     without, loaded = two(tmp_path)
     exchanged = [replace(loaded, added_kg_m2=0.0), replace(without, added_kg_m2=55.0)]
@@ -99,6 +100,7 @@ def test_a_setting_that_changed_between_the_runs(tmp_path):
         find_calibration([first, run(tmp_path, "b.mcap", 55.0, loaded.record.recording, bench=bench)], "motor")
 
 
+@pytest.mark.heavy
 def test_friction_may_grow_with_the_body(tmp_path):
     grown = recording(55.0, 2, viscous=10.4, coulomb=78.0)
     found = find_calibration(two(tmp_path, with_body=grown), "motor").calibration
@@ -134,6 +136,7 @@ def test_a_body_that_slips_on_the_shaft(tmp_path, slip_nm_s_rad):
     assert found.verdict is not Verdict.VALID and found.factor is None
 
 
+@pytest.mark.heavy
 def test_a_body_that_is_too_small_is_told_the_least_that_would_do(tmp_path):
     small = two(tmp_path, 3.0, with_body=recording(3.0, 2, noise=20.0))
     small[0] = run(tmp_path, "noisy.mcap", 0.0, recording(0.0, 1, noise=20.0))
@@ -169,6 +172,7 @@ def test_the_plan_says_which_body_and_how_long(tmp_path):
     assert twice.minutes == pytest.approx(4.0 * (twice.half_width_share / 0.02) ** 2)
 
 
+@pytest.mark.heavy
 def test_intervals_cover_as_often_as_they_say():
     rng, covered, many = np.random.default_rng(4), np.zeros(2, dtype=int), 2000
     for _ in range(many):

@@ -37,6 +37,7 @@ def test_york_agrees_with_orthogonal_distance_regression(seed):
     assert chi2 == pytest.approx(fit.sum_square, rel=1e-6)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("hysteresis", [0.0, 4.0])
 def test_the_interval_covers_with_errors_in_both_and_hysteresis(hysteresis):
     rng, many = np.random.default_rng(11), 1000

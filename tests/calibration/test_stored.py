@@ -28,6 +28,7 @@ def document(tmp_path_factory):
 RUN = {"identity": IDENTITY, "started": "2026-12-01T10:00:00+00:00"}
 
 
+@pytest.mark.heavy
 def test_a_run_with_a_calibration_is_in_calibrated_torque(document):
     plain = conclude(recording(0.0, 7), RUN, "run.mcap").identification
     found = conclude(recording(0.0, 7), {**RUN, "torque_calibration": document}, "run.mcap")
@@ -70,6 +71,7 @@ def test_a_file_that_is_not_there(tmp_path: Path):
         load_calibration(tmp_path / "calibration.json")
 
 
+@pytest.mark.heavy
 def test_another_drive_is_refused_before_motion_and_never_calibrated(document):
     other = {**IDENTITY, "serial": 23}
     with pytest.raises(PreflightRefused, match="serial is 17, and 23"):
@@ -80,6 +82,7 @@ def test_another_drive_is_refused_before_motion_and_never_calibrated(document):
     assert any("not applied" in warning and "serial" in warning for warning in found.warnings)
 
 
+@pytest.mark.heavy
 def test_an_old_calibration_is_named(document):
     old = {**RUN, "started": "2028-01-01T00:00:00+00:00", "torque_calibration": {**document, "valid_days": 100.0}}
     warnings = conclude(recording(0.0, 7), old, "run.mcap").identification.warnings
@@ -95,6 +98,7 @@ def test_a_replay_takes_the_calibration_of_its_drive_only(document):
         with_calibration(RUN, replace(recording(0.0, 7), simulated=False), document, "calibration.json")
 
 
+@pytest.mark.heavy
 def test_a_log_that_was_calibrated_before_is_calibrated_from_the_drives_own_unit(document, tmp_path):
     runs = [replace(one, record=replace(one.record, configuration={**one.record.configuration,
                                                                    "torque_calibration": document}))
@@ -102,6 +106,7 @@ def test_a_log_that_was_calibrated_before_is_calibrated_from_the_drives_own_unit
     assert find_calibration(runs, "motor").calibration.factor.value == document["calibration_factor"]["value"]
 
 
+@pytest.mark.heavy
 def test_a_log_of_the_calibration_itself_is_no_better_known_than_the_calibration(document):
     """Its noise is in the factor and in J, with the same sign: the squares alone would be too narrow."""
     own = with_calibration(RUN, recording(0.0, 1), document, "calibration.json", document["runs"][0]["sha256"])

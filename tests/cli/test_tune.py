@@ -50,6 +50,7 @@ def tuned(tmp_path, capsys):
     return run
 
 
+@pytest.mark.heavy
 def test_gains_stand_at_main_shaft_and_motor_and_in_the_drives_parameters(tuned):
     code, document, _ = tuned(profile={"name": "siemens/s120-canopen"})
     assert code == 0
@@ -68,6 +69,7 @@ def test_gains_stand_at_main_shaft_and_motor_and_in_the_drives_parameters(tuned)
     assert any("compensated sends back" in warning for warning in document["warnings"])
 
 
+@pytest.mark.heavy
 def test_the_terminal_says_what_it_rests_on_and_what_to_type(tuned):
     code, text, _ = tuned("--inner-lags", "20ms", "10ms", "3ms", "--profile", "abb/acs880-enhanced", as_json=False)
     assert code == 0
@@ -100,6 +102,7 @@ def test_what_is_refused(tuned, words, said, code, message):
     assert "Traceback" not in err
 
 
+@pytest.mark.heavy
 def test_over_the_bus_the_reported_speeds_lag_is_in_the_loop(tuned):
     _, document, _ = tuned("--loop", "bus")
     assert document["main_shaft"]["inner_lags_s"] == pytest.approx([0.4, 0.03, 0.01, 0.003])
@@ -114,6 +117,7 @@ def compliant(**said):
             "damping_nm_s_rad": None, **said}
 
 
+@pytest.mark.heavy
 def test_without_a_string_k_and_j_l_are_as_the_result_has_them(tuned):
     code, document, _ = tuned(string=None, model="two-mass", compliant=compliant())
     assert code == 0
@@ -157,6 +161,7 @@ def test_files_that_are_none_are_named(tmp_path, capsys):
     assert "string.yaml:2" in capsys.readouterr().err
 
 
+@pytest.mark.heavy
 def test_the_page_has_the_pictures_and_the_speeds(tmp_path):
     """Stick-slip is shown at a set speed between the two cure speeds, here given and not searched for."""
     pytest.importorskip("matplotlib")
@@ -206,6 +211,7 @@ def measured(tmp_path):
     return write
 
 
+@pytest.mark.heavy
 def test_the_drives_present_gains_stand_beside_the_others_with_its_own_lags(tuned, measured):
     code, document, _ = tuned(*measured())
     assert code == 0
@@ -228,12 +234,14 @@ def test_the_drives_present_gains_stand_beside_the_others_with_its_own_lags(tune
     assert len(document["reflection"]["present"]) == len(document["reflection"]["hertz"])
 
 
+@pytest.mark.heavy
 def test_the_table_has_a_column_for_them(tuned, measured):
     code, text, _ = tuned(*measured(), as_json=False)
     assert code == 0
     assert "present" in text and "+12.6" in text
 
 
+@pytest.mark.heavy
 def test_stated_lags_go_before_measured_ones(tuned, measured):
     _, document, _ = tuned(*measured(), "--inner-lags", "20ms", "10ms")
     assert document["main_shaft"]["inner_lags_s"] == [0.02, 0.01]
@@ -251,6 +259,7 @@ def test_what_is_no_measured_impedance_of_this_shaft_is_refused(tuned, measured,
     assert words in err
 
 
+@pytest.mark.heavy
 def test_the_first_sentence_says_what_changes(tuned):
     """Typed gains are a row like the others, and the sentence compares with them."""
     code, document, _ = tuned("--present", "40", "30")
@@ -273,6 +282,7 @@ def test_a_very_soft_request_is_refused_with_its_margin(tuned):
     assert "(limit 30°)" in document["error"]["message"]
 
 
+@pytest.mark.heavy
 def test_thin_present_gains_are_told_in_words(tuned):
     """Gains that lose all phase somewhere in the sampled cases are named with the number and the limit."""
     code, text, _ = tuned("--present", "2.965", "9.993", as_json=False)
@@ -280,6 +290,7 @@ def test_thin_present_gains_are_told_in_words(tuned):
     assert "present: thin margins, phase margin" in " ".join(text.split())
 
 
+@pytest.mark.heavy
 def test_other_margins_can_be_asked_for(tuned):
     _, document, _ = tuned("--margins", "45", "9", "50ms")
     assert document["required_margins"] == {"phase_deg": 45.0, "gain_db": 9.0, "dead_time_s": 0.05}
@@ -290,6 +301,7 @@ def test_other_margins_can_be_asked_for(tuned):
     assert code == ExitCode.USAGE and "--margins 30 6 20ms" in document["error"]["message"]
 
 
+@pytest.mark.heavy
 def test_an_identified_pipe_keeps_its_impedance(tuned):
     """k, f and J_L known to 0.3 % leave one uniform pipe: ζ 296 of the reference case, and compensation is possible."""
     def near(value):
@@ -306,6 +318,7 @@ def test_an_identified_pipe_keeps_its_impedance(tuned):
     assert any("the pipe is the one" in warning for warning in document["warnings"])
 
 
+@pytest.mark.heavy
 def test_depths_give_a_schedule_with_the_drives_parameters(tuned):
     """Each row has gains at both shafts and what to type; what lies between the rows is told in a sentence."""
     code, document, _ = tuned("--depths", "1000:3000:1000", profile={"name": "siemens/s120-canopen"})

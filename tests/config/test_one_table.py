@@ -72,6 +72,7 @@ for wrong in ({"dwell_s": 61.0}, {"dwell": 1.0}):
 """
 
 
+@pytest.mark.heavy
 def test_an_option_is_added_in_one_line_and_is_there_in_all_six_places(tmp_path):
     pytest.importorskip("jinja2", reason="jinja2 is not installed (pip install '.[service]')")
     shutil.copytree(PACKAGE, tmp_path / "tdhil", ignore=shutil.ignore_patterns("__pycache__"))
@@ -255,6 +256,7 @@ FILES = sorted(path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*
                if path.suffix in (".py", ".js", ".html") and "uPlot" not in path.name)
 
 
+@pytest.mark.heavy(but_first=58)
 @pytest.mark.parametrize("file", FILES)
 def test_no_name_of_an_option_stands_in_a_second_file(file):
     if file in DECLARED:

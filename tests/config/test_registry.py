@@ -106,6 +106,7 @@ def test_a_toy_excitation_is_run_by_the_front_door_and_identified(tmp_path):
     assert inertia is not None and inertia.low < 104.0 < inertia.high
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.usefixtures("toys")
 @pytest.mark.parametrize(("kind", "motion"), [("two-tones", "segments"), ("stairs", "ways")])
 def test_a_toy_excitation_is_taken_by_the_command_line_and_rig_yaml(kind, motion, tmp_path, capsys):
@@ -154,6 +155,7 @@ class StiffJoint(TwoMassShaft):
 STIFF_JOINT = ShaftModel(StiffJoint, "a stiff joint")
 
 
+@pytest.mark.heavy
 def test_a_toy_shaft_is_fitted_by_name(monkeypatch):
     with pytest.raises(ValueError, match=r"model must be auto, rigid, two-mass, .* or [a-z-]+: 'stiff-joint'"):
         Options(model="stiff-joint")
@@ -405,6 +407,7 @@ def test_the_command_line_tells_a_toy_from_the_other_buses(toy_bus, capsys):
     assert "--drive toy\n\nbite: the toy bites" in capsys.readouterr().out
 
 
+@pytest.mark.heavy
 def test_nothing_is_compared_with_the_name_of_a_bus():
     found = []
     for path in sorted((*(ROOT / "tdhil").rglob("*.py"), *(ROOT / "profiles").rglob("*.py"))):
@@ -461,6 +464,7 @@ def test_a_wrong_name_on_the_way_in_lists_what_there_is(tmp_path, capsys):
     assert "invalid choice: 'noise'" in said and all(name in said.rpartition("choose from")[2] for name in EXCITATIONS)
 
 
+@pytest.mark.heavy
 def test_no_chain_of_excitations_or_models_is_left():
     chains = []
     for path in sorted((ROOT / "tdhil").rglob("*.py")):

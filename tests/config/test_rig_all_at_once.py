@@ -85,6 +85,7 @@ def test_a_key_that_is_missing_takes_no_check_of_others_along(tmp_path):
     assert any("probe_torque_nm: must not be above" in text for text in found)
 
 
+@pytest.mark.heavy
 @given(st.sets(st.sampled_from(["window", "probe", "reverse", "watchdog"])), st.booleans())
 def test_what_is_told_does_not_depend_on_another_mistake(tmp_path_factory, wrong, beside):
     limits = {

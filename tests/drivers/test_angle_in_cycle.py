@@ -56,6 +56,7 @@ def brought(pairs):
 # -- CANopen ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_it_is_of_the_same_sync_as_speed_and_torque(made):
     """To a count: one period later the shaft would be 15 counts further."""
     run = made(CanopenBench)
@@ -119,6 +120,7 @@ def test_an_angle_without_its_feedback_is_dropped(made):
     assert [sample.position_rad for sample in samples] == [None] * 20
 
 
+@pytest.mark.heavy
 def test_a_foreign_sync_shifts_it_and_it_is_found_again(made):
     run = made(CanopenBench)
     run.turning(5.0)
@@ -195,6 +197,7 @@ def narrow_profile(**position):
     return CanopenProfile.model_validate(data)
 
 
+@pytest.mark.heavy
 def test_a_counter_that_starts_over_goes_on_counting(made, monkeypatch):
     """16 bits, 4096 a turn: it starts over every 16 turns, 100 rad."""
     profile = narrow_profile(type="u16")
@@ -293,6 +296,7 @@ def test_it_rides_along_where_that_is_free_and_beside_the_speed():
         assert not plan.has_position
 
 
+@pytest.mark.heavy
 def test_on_modbus_it_comes_with_every_cycle(made, monkeypatch):
     monkeypatch.setattr(modbus_bench, "load_modbus_profile", lambda name: beside(21))
     run = made(ModbusBench)

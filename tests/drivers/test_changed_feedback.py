@@ -49,6 +49,7 @@ REMAPPED = ((0x1800, 1, DISABLED | 0x181), (0x1A00, 0, 0), (0x1A00, 2, 0x6074001
 """The demanded torque in place of the reported one: a frame of the same length."""
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("writes", "where", "words"), [
     (REMAPPED, "1A00h:2", ("TPDO1 mapping", "60770010h", "60740010h")),
     (((0x1800, 3, 1),), "1800h:3", ("TPDO1", "0 was set, 1 is there now")),
@@ -67,6 +68,7 @@ def test_what_the_panel_changes_is_found_within_a_round_and_named(run, writes, w
     assert took_s <= ROUND_S + 1.0
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("index", "sub", "value", "size"), [
     (0x1800, 2, 10, 1), (0x1801, 2, 100, 1), (0x1800, 5, 7, 2),
 ])
@@ -77,6 +79,7 @@ def test_what_a_tool_is_heard_to_write_is_found_at_once(run, index, sub, value, 
     assert took_s <= 0.1
 
 
+@pytest.mark.heavy
 def test_a_whole_remapping_on_the_bus_is_stopped_while_it_is_under_way(run):
     """Its first write switches the TPDO off: that is seen, and written back."""
     tool(run, 0x1800, 1, DISABLED | 0x181, 4)
@@ -87,6 +90,7 @@ def test_a_whole_remapping_on_the_bus_is_stopped_while_it_is_under_way(run):
     assert run.cycle().fresh
 
 
+@pytest.mark.heavy
 def test_frames_of_another_mapping_are_not_believed_any_more(run):
     panel(run, *REMAPPED)
     until_lost(run, ROUND_S + 3.0)
@@ -98,6 +102,7 @@ def test_frames_of_another_mapping_are_not_believed_any_more(run):
     assert found.speed_rad_s == pytest.approx(run.bench.true_speed_rad_s, abs=0.1)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("every", [3, 8, 100])
 def test_feedback_that_is_too_thin_ends_the_run_within_a_second(run, every):
     """The read-back may be far from its turn."""
@@ -109,6 +114,7 @@ def test_feedback_that_is_too_thin_ends_the_run_within_a_second(run, every):
     assert took_s <= 1.0 + every * run.drive.period_s
 
 
+@pytest.mark.heavy
 def test_rest_is_seen_by_sdo_while_feedback_is_thin(run):
     run.drive._read_back._over = True
     number = itertools.count(1)
@@ -129,6 +135,7 @@ def test_rest_is_seen_by_sdo_while_feedback_is_thin(run):
     assert run.drive.poll().state is PowerState.OFF
 
 
+@pytest.mark.heavy
 def test_the_transmission_type_is_put_back_for_the_stop(run):
     run.drive._read_back._over = True
     panel(run, (0x1800, 2, 8))
@@ -139,6 +146,7 @@ def test_the_transmission_type_is_put_back_for_the_stop(run):
     assert run.bench.read(0x1800, 2) == 1
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("lost", [0.01, 0.1])
 def test_a_bus_that_loses_frames_runs_on(run, lost):
     """Row 17: one to ten percent."""
@@ -149,6 +157,7 @@ def test_a_bus_that_loses_frames_runs_on(run, lost):
     assert run.drive.remarks() == ()
 
 
+@pytest.mark.heavy
 def test_a_gap_before_it_is_enabled_is_none_of_this(run):
     run.stop()
     run.drive.disable()

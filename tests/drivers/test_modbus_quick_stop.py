@@ -54,6 +54,7 @@ class Left:
             return [(float(row[0]), float(row[1]), row[3]) for row in list(csv.reader(file))[1:]]
 
 
+@pytest.mark.heavy(but_first=3)
 @pytest.mark.parametrize(("profile", "mode"), [
     (profile, mode) for profile in MODBUS for mode in Mode if mode is Mode.SPEED or profile.modes.torque
 ], ids=lambda one: one.name)

@@ -68,6 +68,7 @@ def mistaken(profile, setpoint, change):
     return profile.model_copy(update={"cycle": cycle})
 
 
+@pytest.mark.heavy(but_first=16)
 @pytest.mark.parametrize("factor", [0.1, 0.5, 2.0, 10.0])
 @pytest.mark.parametrize(("name", "setpoint"), SHOWN)
 def test_a_profile_that_mistakes_what_a_count_of_a_setpoint_is(name, setpoint, factor):

@@ -142,6 +142,7 @@ def test_of_every_family_ones_are_no_state_and_zeros_none_after_it_was_enabled(p
     assert power_state(decode_modbus_after(profile.control, 0x0000)) is PowerState.UNKNOWN
 
 
+@pytest.mark.heavy(but_first=3)
 @pytest.mark.parametrize("profile", MODBUS, ids=lambda one: one.name)
 def test_a_good_run_of_every_family_shows_a_valid_state_in_every_cycle(profile):
     """The simulated drive speaks as its family's manual has it, not as the profile does."""
@@ -234,6 +235,7 @@ def test_a_stop_from_outside_takes_no_speed_of_a_blank_status_for_rest(status):
     assert any("no valid state" in line or f"{status:04X}h" in line for line in report.remarks)
 
 
+@pytest.mark.heavy
 def test_a_stop_from_outside_on_canopen_too():
     bench = CanopenBench()
     run = Run(bench)

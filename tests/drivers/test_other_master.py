@@ -183,6 +183,7 @@ def test_one_that_has_answered_and_falls_silent_for_good_is_lost(running, wire, 
         go(running, wire, 30.0)
 
 
+@pytest.mark.heavy
 def test_one_that_refuses_an_object_in_motion_is_not_asked_for_it_any_more(running, wire, peer):
     peer.refuse_read[0x6080, 0] = 0x08000022
     peer.feedback = lambda cycle: (0, 0)
@@ -214,6 +215,7 @@ def test_a_speed_in_the_drive_that_is_not_ours_ends_the_run(running, wire, peer)
         go(running, wire, 20.0, speed=1.0)
 
 
+@pytest.mark.heavy
 def test_a_drive_that_does_not_show_its_setpoint_is_not_judged_by_it(running, wire, peer):
     peer.objects[0x60FF, 0] = u(77, 4)
     go(running, wire, 30.0, speed=1.0)

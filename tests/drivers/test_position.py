@@ -23,6 +23,7 @@ def true_angle(bench):
     return machine.inverter.state.angle_rad
 
 
+@pytest.mark.heavy(but_first=1)
 def test_it_follows_the_true_shaft(run):
     run.ready()
     run.enable(Mode.SPEED)

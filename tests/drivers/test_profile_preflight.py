@@ -163,6 +163,7 @@ def test_torque_of_32_bits(make, monkeypatch, kind):
     assert run.samples[-1].mode is Mode.SPEED
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("kind", [AbbBench, Epos4Bench, S120Bench])
 def test_a_bare_stop_sees_the_speed_in_the_drives_own_scale(make, kind):
     """The S120 counts encoder increments, an ABB in vl shows its speed elsewhere."""

@@ -63,6 +63,7 @@ def test_stamps_that_are_no_wall_clocks_are_left_alone(stamped):
     assert (stamps.offset_s, stamps.jumps) == (None, 0)
 
 
+@pytest.mark.heavy
 @settings(max_examples=50)
 @given(st.lists(st.floats(0.0, 0.9 * JUMP_S), min_size=100, max_size=300))
 def test_no_delay_below_the_bound_is_a_jump(late_s):

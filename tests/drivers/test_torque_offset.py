@@ -41,6 +41,7 @@ def push(run, offset_nm, cycles=1, speed=5.0):
     return sample
 
 
+@pytest.mark.heavy
 def test_it_acts_with_the_cycle_and_is_added_to_the_speed_loop(bench):
     run = turning(bench)
     before = push(run, 0.0)
@@ -51,6 +52,7 @@ def test_it_acts_with_the_cycle_and_is_added_to_the_speed_loop(bench):
     assert bench.read(*OFFSET) == 100
 
 
+@pytest.mark.heavy
 def test_it_is_zero_in_the_very_cycle_of_a_quick_stop_whatever_is_commanded(bench):
     run = turning(bench)
     push(run, 100.0, 50)
@@ -62,6 +64,7 @@ def test_it_is_zero_in_the_very_cycle_of_a_quick_stop_whatever_is_commanded(benc
     assert bench.true_speed_rad_s == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.heavy
 def test_it_is_zero_in_torque_mode(bench):
     run = turning(bench)
     push(run, 100.0, 5)
@@ -69,6 +72,7 @@ def test_it_is_zero_in_torque_mode(bench):
     assert offsets(bench)[-1] == 0
 
 
+@pytest.mark.heavy
 def test_it_is_refused_where_nobody_asked_for_it():
     bench = CanopenBench()
     run = turning(bench)

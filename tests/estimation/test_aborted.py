@@ -30,6 +30,7 @@ def aborted(recording, time_s, tail):
     )
 
 
+@pytest.mark.heavy
 def test_the_stop_is_not_taken_for_motion(one_recording):
     end_s = float(one_recording.time_s[-1])
     found = identify(aborted(one_recording, end_s - 13.0, 20.0))
@@ -51,6 +52,7 @@ def test_whatever_follows_the_abort_the_result_is_the_same(one_recording, before
     assert short.inertia == killed.inertia
 
 
+@pytest.mark.heavy
 def test_before_the_excitation_there_is_no_number_and_the_abort_is_the_reason(one_recording):
     begin_s = one_recording.excitation.segments[0].start_s
     found = identify(aborted(one_recording, begin_s + 3.0, 20.0))

@@ -63,6 +63,7 @@ def test_what_goes_down_comes_back_after_its_way():
     assert np.allclose(ways[0][11:back], ways[0][11] * decay, rtol=1e-9)
 
 
+@pytest.mark.heavy
 def test_the_inertia_is_covered(record):
     found = identify(record)
     assert found.verdict is not Verdict.MODEL_REJECTED and found.model == "string"
@@ -159,6 +160,7 @@ def test_an_answer_that_is_no_filter_of_two_poles_tells_nothing():
     assert answering(lambda torque: late(torque, 0.15), length=100) is None
 
 
+@pytest.mark.heavy
 def test_the_torques_answer_closes_what_its_filter_left_open(record):
     """With nothing known of the filters, long ones before a lighter motor look alike."""
     found, blind = identify(record).inertia, identify(replace(record, torque_answer=None)).inertia
@@ -170,6 +172,7 @@ def test_the_torques_answer_closes_what_its_filter_left_open(record):
     assert not any("follows its setpoint" in one for one in identify(stated).inertia.conditional_on)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("strongest_nm", (5.0, 4000.0), ids=("all", "all but one"))
 def test_lines_that_the_string_drowns_name_it(strongest_nm):
     """A multisine's few lines, above a bit that scatters by far more than they move the shaft."""
@@ -181,6 +184,7 @@ def test_lines_that_the_string_drowns_name_it(strongest_nm):
     assert "the string below by ±" in found.reason and "--excitation prbs" in found.advice
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("torque_nm", "verdict"), ((200.0, Verdict.NOT_IDENTIFIABLE), (300.0, Verdict.VALID_WIDE)))
 def test_where_the_string_drowns_some_lines_and_the_others_tell_little_it_says_what_would_tell_more(torque_nm, verdict):
     multiples = np.array([1, 2, 3, 4, 6, 8, 10, 13, 16, 20])

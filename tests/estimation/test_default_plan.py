@@ -54,6 +54,7 @@ MARKS = dict.fromkeys(
 ) | dict.fromkeys(("moving average alone", "the long lag on torque"), pytest.mark.heavy)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("name", [
     pytest.param(name, marks=MARKS.get(name, ())) for name in TRUTHS
 ])
@@ -65,6 +66,7 @@ def test_covers_other_reporting_filters(default_run, name):
     assert np.max(np.abs(value - 104.0)) < 2.1
 
 
+@pytest.mark.heavy
 def test_jitter_and_dropped_samples(default_run):
     rig, motion, _, shaft = default_run
     for recording in recordings(rig, motion, shaft, SEEDS[:2], rate_hz=100.0, jitter_s=0.004, drop=0.05):
@@ -79,6 +81,7 @@ def test_the_same_recording_gives_the_same_bits(one_recording):
     assert repr(identify(one_recording)) == repr(identify(one_recording))
 
 
+@pytest.mark.heavy
 def test_aborted_run_uses_the_whole_periods_that_there_are(one_recording):
     first, second = one_recording.excitation.segments
     cut = second.start_s + 5.5 * second.period_s
@@ -113,6 +116,7 @@ def test_papers_model_is_rejected_where_there_are_lags(one_recording):
     assert found.paper is not None
 
 
+@pytest.mark.heavy
 def test_tolerance_decides_between_valid_and_wide(one_recording):
     found = identify(one_recording, Options(tolerance=1e-3))
     assert found.verdict is Verdict.VALID_WIDE

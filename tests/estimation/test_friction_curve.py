@@ -50,6 +50,7 @@ def true_friction(plant, speed):
     return plant.coulomb_nm + plant.viscous_nm_s_rad * speed + (extra if plant.friction == "stribeck" else 0.0)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("plant", "bends"), [(Params(), False), (STRIBECK, True)])
 def test_points_cover_and_the_bend_is_told(plant, bends):
     covered = points = bent = 0
@@ -67,6 +68,7 @@ def test_points_cover_and_the_bend_is_told(plant, bends):
     assert bent >= 11 if bends else bent <= 1
 
 
+@pytest.mark.heavy
 def test_the_spread_of_the_slope_is_of_the_size_that_the_bend_makes():
     """Between 3 and 7 rad/s: chord against the two local slopes, from the formula of the plant."""
     step = 1e-4

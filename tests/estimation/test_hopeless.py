@@ -57,6 +57,7 @@ def left_out(one, number):
     return pytest.mark.long if str(number)[0] == "1" else pytest.mark.heavy if number > 3 else ()
 
 
+@pytest.mark.heavy(but_first=15)
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("one", "number"), [
     pytest.param(one, number, id=f"{one.name}-{number}", marks=left_out(one, number)) for one, number in CASES
@@ -74,6 +75,7 @@ def test_never_a_number_without_a_warning(records, one, number):
     assert not one.said or any(words in said for words in one.said), said
 
 
+@pytest.mark.heavy
 @pytest.mark.filterwarnings("error")
 def test_the_sound_record_has_a_number_and_no_warning():
     for record in simulate([Trouble()] * 4, 4):

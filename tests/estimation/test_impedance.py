@@ -31,6 +31,7 @@ def holds(part, truth, times=1.0):
     return abs(part.value - truth) <= times * 0.5 * (part.high - part.low)
 
 
+@pytest.mark.heavy(but_first=2)
 @NAMED
 @pytest.mark.parametrize("by", ["offset", "reference"])
 def test_gains_lags_and_reflection_are_found(name, by):
@@ -74,6 +75,7 @@ def test_a_loop_in_closed_form_is_sampled_as_the_simulated_drive_is():
     assert drive.inner_lag == pytest.approx(0.02905, abs=1e-5)
 
 
+@pytest.mark.heavy
 @NAMED
 def test_a_reference_filter_that_nobody_declared_is_refused(name):
     drive = machine(name, reference_filter=0.1)
@@ -84,6 +86,7 @@ def test_a_reference_filter_that_nobody_declared_is_refused(name):
     assert seen.gain_nm_s_rad is None and seen.points == ()
 
 
+@pytest.mark.heavy
 def test_one_that_is_declared_is_taken_off():
     drive = machine("the paper's", reference_filter=0.1)
     seen = found(record(drive, "reference", seed=3, declared=0.1))
@@ -92,6 +95,7 @@ def test_one_that_is_declared_is_taken_off():
     assert "a reference filter of 0.1 s" in seen.conditions
 
 
+@pytest.mark.heavy
 def test_one_that_is_declared_wrongly_is_named_as_a_whole():
     """Declared 0.2 s, true 0.3 s: the filter that is named is the true one, and it stands in place of the declared."""
     drive = machine("the paper's", reference_filter=0.3)
@@ -101,11 +105,13 @@ def test_one_that_is_declared_wrongly_is_named_as_a_whole():
     assert "the declared reference filter of 0.2 s" in seen.reason and "in place of it" in seen.reason
 
 
+@pytest.mark.heavy
 def test_the_torque_offset_does_not_care_for_the_references_filter():
     seen = found(record(machine("soft, a = 0.25", reference_filter=0.1), "offset", seed=3))
     assert seen.verdict is Verdict.VALID
 
 
+@pytest.mark.heavy
 def test_a_drive_that_does_not_take_the_offset_is_told_apart_from_one_that_does():
     recording = record(machine("the paper's"), "offset", seed=1, peak=0.6)
     refused = found(recording)
@@ -119,6 +125,7 @@ def test_too_few_periods_are_refused():
     assert "too few" in refused.reason
 
 
+@pytest.mark.heavy
 def test_a_report_that_is_no_first_order_lag_is_refused_and_not_fitted_away():
     recording = record(machine("the paper's"), seed=1)
     late = 60                      # samples, 0.24 s: of the speed alone
@@ -128,6 +135,7 @@ def test_a_report_that_is_no_first_order_lag_is_refused_and_not_fitted_away():
     assert seen.verdict is Verdict.MODEL_REJECTED
 
 
+@pytest.mark.heavy
 def test_the_torque_scale_counts_in_the_reflection_and_not_in_the_gains():
     drive = machine("soft, a = 0.25")
     exact, open_ = (found(record(drive, seed=2, scale_sd=sd)) for sd in (0.0, 0.02))
@@ -141,6 +149,7 @@ def test_the_torque_scale_counts_in_the_reflection_and_not_in_the_gains():
         assert 0.5 * (other.reflection_total.high - other.reflection_total.low) == pytest.approx(half, rel=0.05)
 
 
+@pytest.mark.heavy
 def test_without_a_string_there_is_no_reflection():
     recording = record(machine("the paper's"), seed=1)
     seen = found(replace(recording, impedance=replace(recording.impedance, string_nm_s_rad=0.0)))
@@ -149,6 +158,7 @@ def test_without_a_string_there_is_no_reflection():
     assert "--string-impedance" in seen.advice
 
 
+@pytest.mark.heavy
 def test_stated_lags_narrow_what_hangs_on_them():
     drive = machine("stiff")
     known = LagPrior(0.40, 0.002, 0.15, 0.002, "rig.yaml")
@@ -161,6 +171,7 @@ def width(part):
     return part.high - part.low
 
 
+@pytest.mark.heavy
 def test_the_whole_identification_has_it_beside_the_inertia_and_again_from_what_a_log_keeps():
     recording = record(machine("the paper's"), seed=6, scale_sd=0.02)
     whole = identify(recording)

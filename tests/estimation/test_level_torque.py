@@ -31,6 +31,7 @@ def test_the_levels_account_for_the_mean_torque_of_a_healthy_run(recorded):
         assert all(0.95 < one.ratio < 1.05 for one in seen)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_a_torque_scale_that_halves_or_doubles_is_found(recorded, factor):
     recording = scaled_in_stage_5(recorded[0], factor)
@@ -46,6 +47,7 @@ def test_a_load_that_changes_by_less_is_no_contradiction(recorded, factor):
     assert level_contradiction(recording, usable_samples(recording)) is None
 
 
+@pytest.mark.heavy
 def test_such_a_run_has_no_inertia(recorded):
     found = identify(scaled_in_stage_5(recorded[1], 0.5))
     assert found.inertia is None

@@ -166,6 +166,7 @@ def test_lags_that_all_but_cancel_are_taken_out_of_the_wave():
     assert start == pytest.approx([104.0, 8.0, 0.01, 0.0, 0.0, 0.0, 0.0, 0.01])
 
 
+@pytest.mark.heavy
 def test_straight_friction_is_not_bent():
     assert identify(closed_form()).model == "rigid+lags"
 

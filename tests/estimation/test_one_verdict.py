@@ -31,12 +31,14 @@ def trees():
     return [ast.parse(file.read_text(encoding="utf-8")) for file in Path(package.__file__).parent.rglob("*.py")]
 
 
+@pytest.mark.heavy
 def test_an_identification_is_made_in_one_place():
     made = [node for tree in trees() for node in ast.walk(tree)
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Identification"]
     assert len(made) == 1
 
 
+@pytest.mark.heavy
 def test_a_refusal_is_caught_in_one_place():
     caught = [node for tree in trees() for node in ast.walk(tree)
               if isinstance(node, ast.ExceptHandler) and isinstance(node.type, ast.Name) and node.type.id == "Refused"]

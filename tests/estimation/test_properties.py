@@ -21,6 +21,7 @@ def plain():
     return identify(closed_form())
 
 
+@pytest.mark.heavy
 @few
 @given(scale=st.floats(1e-3, 1e3))
 def test_torque_scale_scales_what_has_torque_in_it(plain, scale):
@@ -34,6 +35,7 @@ def test_torque_scale_scales_what_has_torque_in_it(plain, scale):
     assert found.paper.stepped.inertia_kg_m2 == pytest.approx(plain.paper.stepped.inertia_kg_m2 * scale, rel=1e-9)
 
 
+@pytest.mark.heavy
 @few
 @given(shift=st.floats(-1e5, 1e5))
 def test_the_clock_may_start_anywhere(plain, shift):
@@ -55,6 +57,7 @@ def test_of_a_string_that_ten_lines_do_not_show_a_rigid_shafts_inertia_is_said_t
     assert len(found.warnings) == len(plain.warnings) + 1
 
 
+@pytest.mark.heavy
 def test_behind_a_declared_string_too_few_lines_to_show_it_give_no_inertia(plain):
     """A rigid shaft explains these four lines; so would many strings, each with another inertia of the motor."""
     found = identify(replace(closed_form(), winds_up=True))
@@ -63,6 +66,7 @@ def test_behind_a_declared_string_too_few_lines_to_show_it_give_no_inertia(plain
     assert "string" in found.reason and "4 excited lines" in found.reason
 
 
+@pytest.mark.heavy
 def test_rotation_may_be_either_way(plain):
     recording = closed_form()
     found = identify(replace(recording, speed_rad_s=-recording.speed_rad_s, torque_nm=-recording.torque_nm))
@@ -100,6 +104,7 @@ def test_a_shaft_that_a_lag_can_impersonate_is_refused_or_wide():
     assert found.inertia is None
 
 
+@pytest.mark.heavy
 def test_torque_offset_is_taken_off():
     recording = closed_form()
     found = identify(replace(recording, torque_nm=recording.torque_nm + 25.0, torque_offset_nm=25.0))

@@ -136,6 +136,7 @@ def test_friction_that_is_no_straight_line_is_rejected():
     assert found.inertia is None
 
 
+@pytest.mark.heavy
 def test_a_few_bad_samples_do_no_harm():
     recording = closed_form()
     speed = recording.speed_rad_s.copy()

@@ -87,7 +87,8 @@ def test_disagreement_by_chance_comes_once_in_a_hundred_runs(usual):
     assert np.sum(said_no > 0) <= binom.ppf(0.995, runs, 0.01)
 
 
-@pytest.mark.parametrize("runs", [20, pytest.param(60, marks=pytest.mark.heavy)])
+@pytest.mark.heavy
+@pytest.mark.parametrize("runs", [20, pytest.param(60, marks=pytest.mark.long)])
 def test_without_knowing_the_lags_it_is_wider_and_still_covers(runs):
     recordings = usual_runs()[:runs]
     known = [opinions_of(r)[0].inertia_kg_m2 for r in recordings]
@@ -120,6 +121,7 @@ def test_a_result_that_is_wrong_is_contradicted():
     assert "119.6" in warnings[0]
 
 
+@pytest.mark.heavy
 def test_torque_that_nobody_reports_is_found_by_the_coast_down():
     """10 N·m brake while the drive says that it gives none."""
     hidden = run_stages(Stages(coast=True, coast_torque=-10.0), list(range(8)))
@@ -136,6 +138,7 @@ def test_a_compliant_shaft_is_compared_with_all_that_turns():
     assert {o.agrees for o in opinions_of(recording, replace(motor_only, compliant=whole))} == {True}
 
 
+@pytest.mark.heavy
 def test_plateaus_of_a_square_wave_are_torque_steps():
     motion, _ = planned(PlanRequest(kind="step", periods=3))
     found = []

@@ -54,6 +54,7 @@ def test_none_of_108_records_in_stick_slip_is_answered_wrong():
     assert check(shafts) >= 0.7 * len(shafts)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("machine", [FIELD, SERVO, HEAVY], ids=lambda machine: machine.name)
 def test_sound_records_are_never_called_stick_slip(machine):
     """Among them starts from standstill, coasting to standstill, and speeds that go through zero."""
@@ -86,6 +87,7 @@ def test_an_answer_whose_residual_test_fails_at_one_percent_is_none(p_value, sta
     assert (found.verdict is Verdict.MODEL_REJECTED) == (not stands)
 
 
+@pytest.mark.heavy
 def test_a_record_with_few_frequencies_in_a_row_is_tested_as_well():
     """A machine that stops often has short windows; the test's larger groups of frequencies do not fit into them."""
     (recording,) = simulate(FIELD, "speed steps", [1])

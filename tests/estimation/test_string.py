@@ -152,6 +152,7 @@ def test_a_string_has_a_double_that_the_lines_cannot_tell(wave, resistance, end,
     assert string_resonances(string_parameters(double))[0] <= np.pi * base
 
 
+@pytest.mark.heavy
 def test_the_double_of_a_string_does_not_stand_in_its_place():
     """Wherever the descents begin: also at the double, where scatter makes it the likelier by a hair."""
     lines, constraint = synthetic(TwoMass(), 0, 20.0)

@@ -81,6 +81,7 @@ def test_the_truth_solves_the_bins_of_short_stretches_at_low_rates_too(rate_hz, 
     assert np.max(error) < 2e-3 * np.max(np.abs(bins.torque[low, 0]))
 
 
+@pytest.mark.heavy
 def test_windage_follows_the_shaft_s_own_speed_not_the_reported_one():
     """Friction's slope at the mean speed is 17 N·m·s/rad, behind a lag of 0.4 s: J had been read 5 kg·m² too large."""
     windy = replace(quiet(FIELD), viscous=2.0, quadratic=1.8)
@@ -89,6 +90,7 @@ def test_windage_follows_the_shaft_s_own_speed_not_the_reported_one():
     assert said.inertia.low <= 104.0 <= said.inertia.high
 
 
+@pytest.mark.heavy
 def test_lags_that_nothing_speaks_of_do_not_widen_the_interval():
     """Reports of 6 and 5 ms: lags of a second and more on both had been held as likely as none, ±3.0 % instead of 1.2.
     """
@@ -119,6 +121,7 @@ def test_tapers_add_up_to_one():
 # -- the band ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_what_stands_clear_beyond_the_lags_counts():
     """Up to a radian of the longer lag stands half of what tells the lags: ±1.8 kg·m² had come of it."""
     inertia = found(simulate(FIELD, "torque pulses", [3])[0]).inertia
@@ -126,6 +129,7 @@ def test_what_stands_clear_beyond_the_lags_counts():
     assert inertia.high - inertia.low < 0.025 * 104.0
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("said", [0.5, 0.005, None])
 def test_the_wide_band_is_left_where_the_model_is_doubtful_in_it_or_untested(monkeypatch, said):
     recording = simulate(FIELD, "torque pulses", [3])[0]
@@ -143,7 +147,8 @@ def test_the_wide_band_is_left_where_the_model_is_doubtful_in_it_or_untested(mon
 
 
 @pytest.mark.parametrize(("gain", "followed"), [
-    (0.0, (0.0, 0.1)), pytest.param(5.0, (0.0, 0.2), marks=pytest.mark.heavy), (40.0, (0.95, 1.0)),
+    (0.0, (0.0, 0.1)), *(
+        pytest.param(*case, marks=pytest.mark.heavy) for case in ((5.0, (0.0, 0.2)), (40.0, (0.95, 1.0)))),
 ])
 def test_the_value_follows_a_structure_of_the_filters_as_far_as_it_weighs(monkeypatch, gain, followed):
     """Two shapes more that lower −2 ln L by 5 are nothing: the value had gone over to theirs from 4 on."""
@@ -156,6 +161,7 @@ def test_the_value_follows_a_structure_of_the_filters_as_far_as_it_weighs(monkey
     assert followed[0] <= (value / plain - 1.0) / 0.01 <= followed[1]
 
 
+@pytest.mark.heavy
 def test_where_the_wide_band_leaves_the_inertia_open_the_narrow_one_speaks(monkeypatch):
     """A load that is slow and strong: one start with coasting of seventy had been refused."""
     recording = simulate(FIELD, "torque pulses", [3])[0]
@@ -173,6 +179,7 @@ def test_where_the_wide_band_leaves_the_inertia_open_the_narrow_one_speaks(monke
     assert solved.inertia.bounded
 
 
+@pytest.mark.heavy
 def test_the_rounds_leave_a_place_without_lags(monkeypatch):
     """A skew takes a short lag's delay back, so that descents stand still there: reversing ramps had been refused."""
     recording = simulate(FIELD, "torque pulses", [3])[0]
@@ -194,6 +201,7 @@ def test_the_rounds_leave_a_place_without_lags(monkeypatch):
     assert settled.fit.theta[0] == pytest.approx(104.0, rel=0.02)
 
 
+@pytest.mark.heavy
 def test_a_slow_strong_load_is_no_scatter_over_time():
     """It is at the lowest frequencies, which count for little; cut by blocks of time it had passed for twice
     the noise's variance.
@@ -228,6 +236,7 @@ ROWS = [(FIELD, "foreign"), (SERVO, "up-down ramps"), (HEAVY, "ramp + coast"),
          "torque pulses")]
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("machine", "motion"), ROWS, ids=lambda value: getattr(value, "name", value))
 def test_the_interval_covers(machine, motion):
     assert motion in (*MOTIONS, "foreign")
@@ -240,6 +249,7 @@ def test_the_interval_covers(machine, motion):
         assert {line.source for line in said.budget} >= {"noise", "lags", "lag structure", "friction model"}
 
 
+@pytest.mark.heavy
 def test_known_lags_narrow_the_interval_and_the_torque_scale_widens_the_total_only():
     recording = simulate(FIELD, "torque pulses", [3])[0]
     alone = found(recording).inertia

@@ -59,6 +59,7 @@ def record(scale, seed, lag=(0.5,), rate_hz=100.0, offset=4.0, limit=None):
     )
 
 
+@pytest.mark.heavy(but_first=3)
 @pytest.mark.parametrize("rate_hz", [100.0, 12.5])
 @pytest.mark.parametrize("lag", list(LAGS.values()), ids=list(LAGS))
 def test_the_ratio_covers_whatever_lags_between(lag, rate_hz):
@@ -124,6 +125,7 @@ def runs():
     return found
 
 
+@pytest.mark.heavy
 def test_a_sound_run_has_the_same_bits_with_its_setpoints_and_without(runs):
     for one in runs:
         with_them, without = identify(one), identify(replace(one, commanded_torque_nm=None))
@@ -132,6 +134,7 @@ def test_a_sound_run_has_the_same_bits_with_its_setpoints_and_without(runs):
         assert with_them.inertia.low <= 104.0 <= with_them.inertia.high
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("scale", [heavy(0.5), 0.9, 1.1, heavy(2.0)])
 def test_a_reported_torque_beyond_its_scale_is_never_valid(runs, scale):
     found = identify(replace(runs[0], torque_nm=scale * runs[0].torque_nm), Options(tolerance=0.2))
@@ -140,6 +143,7 @@ def test_a_reported_torque_beyond_its_scale_is_never_valid(runs, scale):
     assert found.torque_ratios[0].ratio.value == pytest.approx(scale, rel=0.01)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("scale", [0.97, 1.035])
 def test_a_difference_that_the_scale_allows_widens_it_until_both_torques_fit(runs, scale):
     found = identify(replace(runs[0], torque_nm=scale * runs[0].torque_nm), Options(tolerance=0.2))
@@ -148,6 +152,7 @@ def test_a_difference_that_the_scale_allows_widens_it_until_both_torques_fit(run
     assert any("torque scale was widened from 2.00%" in warning for warning in found.warnings)
 
 
+@pytest.mark.heavy
 def test_a_larger_stated_uncertainty_of_the_scale_is_an_answer(runs):
     one = replace(runs[0], torque_nm=0.9 * runs[0].torque_nm, torque_scale_rel_sd=0.06)
     found = identify(one, Options(tolerance=0.3))
@@ -155,6 +160,7 @@ def test_a_larger_stated_uncertainty_of_the_scale_is_an_answer(runs):
     assert found.inertia.low_total <= 104.0 <= found.inertia.high_total
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("factor", [heavy(0.5), 0.85, heavy(2.0)])
 def test_a_speed_whose_scale_changes_before_stage_5_is_never_valid(runs, factor):
     for one in runs:
@@ -164,6 +170,7 @@ def test_a_speed_whose_scale_changes_before_stage_5_is_never_valid(runs, factor)
         assert "two routes through the same run contradict each other" in found.reason
 
 
+@pytest.mark.heavy
 def test_the_least_change_of_a_scale_that_shows_is_told(runs):
     for one in runs:
         opinion = identify(one).second_opinions[0]
@@ -185,10 +192,12 @@ def turned(runs):
     return replace(runs[0], position_rad=angle)
 
 
+@pytest.mark.heavy
 def test_an_angle_that_fits_changes_nothing(turned):
     assert identify(turned) == identify(replace(turned, position_rad=None))
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("factor", "said"), [
     (0.9, "contradicts the shaft's angle"), (1.15, "contradicts the shaft's angle"), (0.94, "changed its scale"),
 ])
@@ -199,6 +208,7 @@ def test_a_speed_that_the_angle_contradicts_is_never_valid(turned, factor, said)
     assert said in found.reason
 
 
+@pytest.mark.heavy
 def test_turns_that_are_lost_in_a_gap_of_the_angle_contradict_nothing(turned):
     """A counter that starts over with each turn: in a gap longer than its range allows, a turn is lost."""
     lost = turned.position_rad.copy()
@@ -212,6 +222,7 @@ def test_turns_that_are_lost_in_a_gap_of_the_angle_contradict_nothing(turned):
     assert identify(replace(broken, speed_rad_s=speed, stages=())).verdict is Verdict.MODEL_REJECTED
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("counts", [heavy(0.5), 2.0, heavy(10.0)])
 def test_counts_that_the_operator_takes_as_wrong_contradict_nothing(turned, counts):
     """--accept-speed-unit: the unit of speed is right, that of the angle is not; a change of scale is still seen."""

@@ -61,6 +61,7 @@ def off(lines, stiffness=SPRING):
     return np.array([abs(line.torque[0] / line.speed[0] / impedance(line.hertz, stiffness) - 1.0) for line in lines])
 
 
+@pytest.mark.heavy
 def test_the_lines_of_a_shaft_that_still_swings_are_those_of_the_shaft():
     fits, cut = fits_of(1)
     plain, settled = pooled_lines(fits, 0.0), settled_lines(fits, cut, 0.0)
@@ -71,6 +72,7 @@ def test_the_lines_of_a_shaft_that_still_swings_are_those_of_the_shaft():
     assert all(7.5 <= line.nu < 9.0 for line in settled)
 
 
+@pytest.mark.heavy
 def test_a_line_at_the_very_swing_is_told_by_all_the_others():
     settled = settled_lines(*fits_of(1, stiffness=AT_A_LINE), 0.0)
     others = [line for line in settled if line.hertz != 0.2]
@@ -79,6 +81,7 @@ def test_a_line_at_the_very_swing_is_told_by_all_the_others():
     assert all(line.periods[0] > 6.0 for line in others)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("seed", range(4))
 def test_their_scatter_says_how_far_off_they_are(seed):
     settled = settled_lines(*fits_of(seed), 0.0)

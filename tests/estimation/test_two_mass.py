@@ -169,6 +169,7 @@ def test_where_a_string_isn_t_excluded_and_widens_most_it_is_asked_what_swings()
     assert told.inertia.high - told.inertia.low < found.inertia.high - found.inertia.low
 
 
+@pytest.mark.heavy
 def test_a_model_that_is_asked_for_is_the_one_that_is_fitted(recording):
     two = identify(recording, Options(model="two-mass"))
     assert two.model == "two-mass"
@@ -178,6 +179,7 @@ def test_a_model_that_is_asked_for_is_the_one_that_is_fitted(recording):
     assert rigid.inertia is None
 
 
+@pytest.mark.heavy
 def test_the_same_recording_gives_the_same_bits(recording):
     asked = Options(model="two-mass")
     assert identify(recording, asked) == identify(recording, asked)
@@ -220,6 +222,7 @@ def test_a_line_that_stands_still_at_the_antiresonance_is_no_weak_line():
         assert identify(recording, Options(model="rigid")).residual.p_value < 0.01
 
 
+@pytest.mark.heavy
 def test_a_line_by_the_swing_that_the_mean_speeds_differ_at_counts_by_the_difference():
     """The load's dry friction changes sign there at the slower mean speed alone, and nowhere else."""
     plant = TwoMass()
@@ -240,6 +243,7 @@ def test_a_line_by_the_swing_that_the_mean_speeds_differ_at_counts_by_the_differ
     assert choose_unlike(elsewhere, "two-mass", unlike(swing + 1), constraint, (), {}) is elsewhere
 
 
+@pytest.mark.heavy
 def test_what_is_known_of_a_pipe_counts_as_equations():
     """Four lines and two mean speeds: nine, for the eleven unknowns of a string behind lags."""
     plant = PipeBench()
@@ -251,6 +255,7 @@ def test_what_is_known_of_a_pipe_counts_as_equations():
     assert found.fit.mechanical[0] == pytest.approx(plant.motor, rel=0.05)
 
 
+@pytest.mark.heavy
 def test_too_few_lines_are_counted_and_refused():
     lines, constraint = synthetic(TwoMass(), 0, 20.0, LINES[:3])
     found = choose("two-mass", lines, constraint, (), {})

@@ -96,6 +96,7 @@ in_motion = pytest.mark.parametrize("stage", STAGES[1:])
 in_torque = pytest.mark.parametrize("stage", ["torque", "hold", "acquire"])
 
 
+@pytest.mark.heavy(but_first=8)
 @each_stage
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 143)])
 @pytest.mark.parametrize("times", [1, 2])
@@ -290,6 +291,7 @@ def test_rows_20_to_23_what_the_driver_raises(stage, error, code):
     assert told
 
 
+@pytest.mark.heavy(but_first=8)
 @in_motion
 @pytest.mark.parametrize("state", [PowerState.OFF, PowerState.READY, PowerState.QUICK_STOP, PowerState.FAULT])
 def test_rows_31_33_a_drive_that_leaves_its_state(stage, state):
@@ -342,6 +344,7 @@ def test_row_34_the_load_is_lost(stage):
     assert max(ended.speeds) <= 10.0 + 2.0 * PERIOD_S * 400.0 / 5.0
 
 
+@pytest.mark.heavy(but_first=8)
 @in_motion
 @pytest.mark.parametrize(
     ("change", "what"),

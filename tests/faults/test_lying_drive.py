@@ -85,6 +85,7 @@ REPORTS = [
 ]
 
 
+@pytest.mark.heavy(but_first=4)
 @pytest.mark.parametrize(("name", "value", "signal", "seen"), REPORTS)
 def test_one_report_is_wrong_and_nothing_else(name, value, signal, seen):
     drive, twin = pair(name, value)
@@ -204,6 +205,7 @@ def test_a_quick_stop_accelerates_and_the_torque_is_reported_as_it_is(name, valu
     assert drive.inverter.torque_nm > 0.0
 
 
+@pytest.mark.heavy
 def test_a_lie_ends():
     for name in LIES:
         drive, twin = Drive(NoiseParams()), Drive(NoiseParams())

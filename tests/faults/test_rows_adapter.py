@@ -43,6 +43,7 @@ def assert_left_to_the_watchdog(run, acted, seen, row, *words):
     seen(row, run.message, standstill_s, run.assert_log_whole(), run.done.code)
 
 
+@pytest.mark.heavy
 def test_row_12_adapter_unplugged(rehearse, adapter, monkeypatch, seen):
     def act(sample):
         adapter().error = can.CanOperationError("adapter is gone")
@@ -51,6 +52,7 @@ def test_row_12_adapter_unplugged(rehearse, adapter, monkeypatch, seen):
     assert_left_to_the_watchdog(run, acted, seen, 12, "adapter is gone", "Check adapter and cable", "watchdog")
 
 
+@pytest.mark.heavy
 def test_row_13_bus_off(rehearse, adapter, monkeypatch, seen):
     """The adapter may come back by itself; nothing more is sent in this run all the same."""
     def act(sample):
@@ -77,6 +79,7 @@ def test_row_14_error_passive(rehearse, adapter, monkeypatch, seen):
          run.assert_log_whole(), run.done.code)
 
 
+@pytest.mark.heavy
 def test_row_15_transmit_queue_full(rehearse, adapter, monkeypatch, seen):
     def act(sample):
         bus = adapter()

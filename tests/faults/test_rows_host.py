@@ -33,6 +33,7 @@ def stopped_by_host(run, since_s, seen, row, code, *words):
     seen(row, run.message, standstill_s, run.assert_log_whole(), code)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 143),
                                               (signal.SIGQUIT, 143)])
 def test_rows_1_3_a_signal(number, code, rehearse, monkeypatch, seen):
@@ -57,6 +58,7 @@ def test_row_2_a_second_signal_during_the_stop(rehearse, monkeypatch, seen):
     stopped_by_host(run, acted[0], seen, 2, 130, "interrupted by Ctrl-C")
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("where", ["control loop", "planning thread"])
 def test_row_5_a_mistake_of_ours(where, rehearse, monkeypatch, seen):
     def mistake(*_arguments, **_options):
@@ -78,6 +80,7 @@ def test_row_5_a_mistake_of_ours(where, rehearse, monkeypatch, seen):
     seen(5, f"in the {where}: {run.message}; traceback kept in the log", standstill_s, run.assert_log_whole(), 1)
 
 
+@pytest.mark.heavy
 def test_row_6_a_stop_that_is_not_confirmed(rehearse, monkeypatch, seen):
     """The drive ignores the quick stop. Its setpoint of zero speed is followed, and its watchdog acts in the end."""
     acted = at(monkeypatch, "speed", 16.0, kill(signal.SIGINT))
@@ -91,6 +94,7 @@ def test_row_6_a_stop_that_is_not_confirmed(rehearse, monkeypatch, seen):
          " and it is not disabled", run.assert_stopped(acted[0], NOTICED_AT_ONCE_S), run.assert_log_whole(), 8)
 
 
+@pytest.mark.heavy
 def test_row_10_the_log_can_not_be_written(rehearse, monkeypatch, seen):
     plain, full = RunLog.cycle, []
 
@@ -126,6 +130,7 @@ def test_row_28_a_malformed_profile(name, text, no_bus_of_the_user, tmp_path, se
     seen(28, done.err.strip().splitlines()[0], None, "none begun", 2)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("which", ["time", "travel"])
 def test_row_35_time_and_travel(which, rehearse, tmp_path, seen):
     rig = tmp_path / "rig.yaml"
@@ -145,6 +150,7 @@ def test_row_35_time_and_travel(which, rehearse, tmp_path, seen):
 NONE = (float("nan"), float("inf"), 1e9)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("field", "value"), [*product(["torque_nm", "speed_rad_s"], NONE)])
 def test_row_37_a_setpoint_that_is_none(field, value, rehearse, monkeypatch, seen):
     due, plain = [], ControlLoop.cycle
@@ -161,6 +167,7 @@ def test_row_37_a_setpoint_that_is_none(field, value, rehearse, monkeypatch, see
     seen(37, run.message, standstill_s, run.assert_log_whole(), 1)
 
 
+@pytest.mark.heavy
 def test_row_49_an_aborted_run_begins_anew(rehearse, seen):
     """Resuming is not offered: the next run starts with a new preflight, from standstill."""
     rehearse("--fault", "emcy@speed+3s").assert_ended(6)

@@ -52,6 +52,7 @@ def test_no_other_switch_takes_it(unarmed, bus, seen):
         seen(50, f"the same on Modbus: {run.message}", None, log, run.done.code)
 
 
+@pytest.mark.heavy
 def test_taken_by_name_the_host_still_stops_the_shaft(unarmed, bus, seen):
     cause, code = ("emcy@speed+15s", 6) if bus == "canopen" else ("torque-scale@speed+15s=5", 7)
     run = unarmed(BY_NAME, "--fault", cause)
@@ -64,6 +65,7 @@ def test_taken_by_name_the_host_still_stops_the_shaft(unarmed, bus, seen):
          run.assert_log_whole(), run.done.code)
 
 
+@pytest.mark.heavy(but_first=1)
 def test_taken_by_name_and_the_line_is_gone(unarmed, bus, seen):
     """What was accepted: nothing stops the shaft. Then the message must not say so, and the hard-wired stop is left."""
     cause = "bus-dead@speed+15s" if bus == "canopen" else "no-reply@speed+15s"
@@ -94,6 +96,7 @@ def test_never_with_a_string(unarmed, tmp_path):
     run.assert_log_whole()
 
 
+@pytest.mark.heavy
 def test_the_result_says_so_live_and_replayed(rehearse):
     """On one bus, by the shortest way: the rest of it is the same."""
     run = rehearse(*NOT_ARMED, BY_NAME, "--periods", 2, "--mode", "speed")

@@ -71,6 +71,7 @@ def test_row_4_killed(turning, seen):
          f"salvaged up to {missing_s:.2f} s before the end", -9)
 
 
+@pytest.mark.heavy
 def test_row_7_frozen(turning, seen):
     drive, running = turning
     running.signal(signal.SIGSTOP)
@@ -112,6 +113,7 @@ def test_a_host_that_dies_with_a_torque_offset_at_work(no_bus_of_the_user, tmp_p
         stopped_by_its_watchdog(drive)
 
 
+@pytest.mark.heavy
 def test_a_rehearsal_over_a_wire(no_bus_of_the_user, tmp_path):
     """`tdhil simulate canopen --fault …` in a process of its own: it learns of the stages from the host."""
     with peer(tmp_path, "--stepped", "--seed", 1, "--fault", "emcy@speed+15s=4310h") as drive, host(

@@ -91,17 +91,18 @@ CASES = (
 )
 
 
-AT_ONCE = ("bus-dead@acquire+5s", "load-lost@acquire+2s")
-"""Late faults that the README's command tries. The others of stages 3 to 5 are CI's; `test_lying_drive` has their
-contradictions, without a bus."""
+AT_ONCE = ("bus-dead@acquire+5s", "load-lost@acquire+2s", "sto" + IN_MOTION, "speed-lost" + IN_MOTION,
+           "feedback-zero" + IN_MOTION, "position-frozen" + IN_MOTION, "encoder-inverted")
+"""Faults in motion that the README's command tries; the others are CI's. `test_lying_drive` has their contradictions,
+without a bus."""
 
 
-def late(case):
-    return any(stage in case.fault for stage in ("@torque+", "@acquire+")) and case.fault not in AT_ONCE
+def at_once(case):
+    return case.ends == "refused" or case.fault in AT_ONCE
 
 
 @pytest.mark.parametrize("case", [
-    pytest.param(case, id=case.id, marks=pytest.mark.heavy if late(case) else ()) for case in CASES
+    pytest.param(case, id=case.id, marks=() if at_once(case) else pytest.mark.heavy) for case in CASES
 ])
 def test_row(case, rehearse, seen):
     run = rehearse("--fault", case.fault, *case.more)

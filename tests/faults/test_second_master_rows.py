@@ -23,6 +23,7 @@ STOPPED = (
 )
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize(("row", "fault", "notice_s", "words"), STOPPED, ids=[row[1] for row in STOPPED])
 def test_noticed_and_stopped(row, fault, notice_s, words, rehearse, seen):
     run = rehearse("--fault", fault)
@@ -61,6 +62,7 @@ def test_stray_writes_that_the_cycle_undoes_are_told(rehearse, seen):
     seen(61, f"told at the end: {warnings}", None, run.assert_log_whole(), run.done.code)
 
 
+@pytest.mark.heavy
 def test_a_quick_stop_that_is_undone_again_and_again_is_left_to_the_watchdog(rehearse, seen):
     """The host's sign of life ends while it still looks on, and the drive's own reaction brakes the shaft."""
     run = rehearse("--fault", f"foreign-setpoints{IN_MOTION}=again")

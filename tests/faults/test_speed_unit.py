@@ -212,6 +212,7 @@ def assert_stopped_in_time(rig):
     assert rig.last_rad_s < 0.05
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("bus", "factor"), [
     (canopen, 10.0), (canopen, 2.0 * math.pi), (canopen, 3.0), (canopen, 2.0), (modbus, 10.0), (modbus, 2.0),
 ])
@@ -227,6 +228,7 @@ def test_the_angle_shows_a_unit_that_is_too_small(made, seen, bus, factor):
         seen(74, f"{cause.what}; the true shaft reached {rig.highest_rad_s:.1f} rad/s of 10", code=4)
 
 
+@pytest.mark.heavy
 @both
 def test_a_unit_that_is_too_large(made, bus):
     """Ten times too slow is no danger, but a wrong inertia; the shaft is let turn at the slow speed only."""
@@ -237,6 +239,7 @@ def test_a_unit_that_is_too_large(made, bus):
     assert_stopped_in_time(rig)
 
 
+@pytest.mark.heavy
 @both
 def test_without_an_angle_the_operator_says_no(made, seen, bus):
     rig = made(bus, 10.0, NO_ANGLE[bus])
@@ -250,6 +253,7 @@ def test_without_an_angle_the_operator_says_no(made, seen, bus):
     seen(75, f"{cause.what}; the true shaft reached {rig.highest_rad_s:.1f} rad/s of 10", code=4)
 
 
+@pytest.mark.heavy
 @both
 def test_without_an_angle_and_with_nobody_there(made, seen, bus):
     rig = made(bus, 10.0, NO_ANGLE[bus])
@@ -260,6 +264,7 @@ def test_without_an_angle_and_with_nobody_there(made, seen, bus):
     seen(76, f"{cause.what}; the true shaft reached {rig.highest_rad_s:.1f} rad/s of 10", code=4)
 
 
+@pytest.mark.heavy
 @both
 def test_the_operator_says_yes_to_a_right_unit(made, bus):
     rig = made(bus, 1.0, NO_ANGLE[bus])
@@ -269,6 +274,7 @@ def test_the_operator_says_yes_to_a_right_unit(made, bus):
     assert rig.log.run["speed_unit"]["seen_by"] == "operator"
 
 
+@pytest.mark.heavy
 @both
 def test_taken_by_name_nobody_is_asked(made, bus):
     rig = made(bus, 1.0, NO_ANGLE[bus])
@@ -279,6 +285,7 @@ def test_taken_by_name_nobody_is_asked(made, bus):
     assert "--accept-speed-unit" in warning
 
 
+@pytest.mark.heavy(but_first=1)
 @both
 def test_a_name_does_not_take_a_shaft_that_would_be_too_fast(made, bus):
     rig = made(bus, 10.0)
@@ -305,6 +312,7 @@ def test_a_name_takes_counts_that_are_wrong_where_no_harm_follows(made, bus):
     assert isinstance(again.run(simulated=False, limits=replace(LIMITS, accept_speed_unit=True)).cause, Enough)
 
 
+@pytest.mark.heavy
 @both
 def test_a_simulated_drive_without_an_angle_goes_on_with_a_note(made, bus):
     rig = made(bus, 1.0, NO_ANGLE[bus])
@@ -313,6 +321,7 @@ def test_a_simulated_drive_without_an_angle_goes_on_with_a_note(made, bus):
     assert any("not checked" in text for _, text in rig.log.events)
 
 
+@pytest.mark.heavy(but_first=1)
 @both
 def test_a_right_unit_is_seen_to_be_right_without_a_pause(made, bus):
     rig, plain = made(bus, 1.0), made(bus, 1.0, NO_ANGLE[bus])
@@ -354,6 +363,7 @@ def spoiled(rig, read):
     live[0x6064 << 8] = lambda: read(true())
 
 
+@pytest.mark.heavy
 def test_an_angle_that_counts_backwards(made, seen):
     rig = made(canopen, 1.0)
     spoiled(rig, lambda counts: -counts)
@@ -365,6 +375,7 @@ def test_an_angle_that_counts_backwards(made, seen):
     seen(77, cause.what, code=4)
 
 
+@pytest.mark.heavy
 def test_an_angle_that_stands_still_is_put_to_the_operator(made, seen):
     rig = made(canopen, 10.0)
     spoiled(rig, lambda counts: 1234)
@@ -376,6 +387,7 @@ def test_an_angle_that_stands_still_is_put_to_the_operator(made, seen):
     seen(78, f"{why}; {cause.what}", code=4)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("bus", "reading"), [(canopen, 3), (canopen, 40), (modbus, 12)])
 def test_an_angle_read_on_waking_up_is_no_wrong_unit(made, bus, reading):
     """What stopped the drive is told."""
@@ -386,6 +398,7 @@ def test_an_angle_read_on_waking_up_is_no_wrong_unit(made, bus, reading):
     assert "watchdog" in cause.what
 
 
+@pytest.mark.heavy
 def test_an_angle_that_stands_still_in_a_simulated_drive(made):
     rig = made(canopen, 1.0)
     spoiled(rig, lambda counts: 0)
@@ -394,6 +407,7 @@ def test_an_angle_that_stands_still_in_a_simulated_drive(made):
     assert "does not move" in cause.what
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("increments", "turns"), [(1, 1), (8192, 0), (0, 1)])
 def test_no_increments_for_a_turn_are_none(made, increments, turns):
     rig = made(canopen, 1.0)

@@ -57,6 +57,7 @@ def test_a_mode_that_is_lost_in_motion(drive, when, rehearse, seen):
     seen(82, f"in {when}: {run.message}", standstill_s, run.assert_log_whole(), run.done.code)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("drive", ["canopen", "modbus"])
 def test_a_shaft_that_does_not_follow_in_speed_mode(drive, rehearse, seen):
     """Torque enough for a tenth of the limit, and friction takes more."""
@@ -74,6 +75,7 @@ def _thread_dies(path):
     Pump._drain = dead
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("how", "said"), [
     (Path.unlink, "removed while it was being written"), (lambda path: os.truncate(path, 100), "was cut to 100 of"),
     (_thread_dies, "killed"),

@@ -80,6 +80,7 @@ def test_one_log_is_what_replay_gives(few):
     assert row.speed_lag_low_s < 0.4 < row.speed_lag_high_s
 
 
+@pytest.mark.heavy
 def test_what_comes_from_a_part_of_a_run_is_said_to(few, tmp_path, capsys):
     """By the row, the summary, trend, compare and watch; a whole run's row says nothing of the kind."""
     import tdhil
@@ -263,6 +264,7 @@ def test_interrupted_and_started_again_only_the_rest_is_done(tmp_path, calls):
     assert run_fleet(replace(request, again=True), function=poison.quick).done_before == 0
 
 
+@pytest.mark.heavy
 def test_told_to_stop_it_leaves_what_is_in_hand(tmp_path, calls):
     """Also one that hangs; and the same again does the rest."""
     request = FleetRequest(many(tmp_path / "logs", 30, (poison.HANGS,)), tmp_path / "fleet.csv", jobs=2)
@@ -282,6 +284,7 @@ def test_told_to_stop_it_leaves_what_is_in_hand(tmp_path, calls):
     assert (second.interrupted, second.done_before, second.left) == (False, len(first.rows), 0)
 
 
+@pytest.mark.heavy
 def test_ctrl_c_in_a_terminal_and_the_same_command_again(tmp_path, calls):
     """The whole foreground group gets the signal, as from a keyboard: the processes at work are in none of it."""
     pytest.importorskip("pty")
@@ -339,6 +342,7 @@ def bucket(few):
     memory.rm("/logs", recursive=True)
 
 
+@pytest.mark.heavy
 def test_logs_behind_an_address(few, bucket, monkeypatch):
     assert find_logs((bucket,)).logs == ("memory:///logs/R1-000.mcap", "memory:///logs/below/empty.mcap")
     assert find_logs((f"{bucket}/R1-000.mcap",)).logs == ("memory:///logs/R1-000.mcap",)
@@ -369,6 +373,7 @@ def test_an_address_that_can_t_be_reached_is_no_mistake_of_ours(bucket, monkeypa
         find_logs((bucket,))
 
 
+@pytest.mark.heavy
 def test_what_was_done_behind_an_address_is_not_fetched_again(tmp_path, calls):
     """By file://, which the pool's processes reach, too."""
     pytest.importorskip("fsspec")
@@ -409,6 +414,7 @@ def their_versions(asked=[]):  # noqa: B006  (who asks first is the host: both a
 OURS = cluster_module.versions()
 
 
+@pytest.mark.heavy
 def test_the_command(few, tmp_path, capsys, monkeypatch):
     out = tmp_path / "fleet.csv"
     arguments = ["fleet", str(few), "--out", str(out), "--jobs", "1"]
@@ -435,6 +441,7 @@ def test_the_command(few, tmp_path, capsys, monkeypatch):
     assert len(capsys.readouterr().out.splitlines()) == 7
 
 
+@pytest.mark.heavy
 def test_watch_takes_what_rests_and_leaves_what_grows(tmp_path):
     from tdhil.cli.fleet import FolderWatch
 

@@ -41,6 +41,7 @@ def test_the_corpus(name, path, tmp_path):
 CALM = {"valid_nothing", "valid_late", "valid_segment", "valid_abort", "valid_short"}
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("name", PARSERS)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_a_fresh_round(name, tmp_path):
@@ -114,6 +115,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 """
 
 
+@pytest.mark.heavy
 def test_text_that_grows_or_nests_takes_little_memory(tmp_path):
     """Aliases that double at each level, brackets without end, files that are merely large. All YAML is read alike."""
     done = subprocess.run([sys.executable, "-c", GROWING, tmp_path / "rig.yaml"], capture_output=True, text=True,
@@ -148,6 +150,7 @@ def test_the_same_seed_makes_the_same_inputs():
     assert len(set(made[0])) > 15
 
 
+@pytest.mark.heavy
 def test_the_named_command(tmp_path):
     done = subprocess.run(
         [sys.executable, ROOT / "benchmarks" / "fuzz.py", "--parser", "csv", "--inputs", "30", "--findings",

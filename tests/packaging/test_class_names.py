@@ -9,6 +9,8 @@ import ast
 from collections import defaultdict
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 ROOMS = ("tdhil", "drivers", "sim_bus", "profiles")
 
@@ -32,6 +34,7 @@ SHARED = {
 }
 
 
+@pytest.mark.heavy
 def test_no_two_classes_have_one_name():
     found = defaultdict(list)
     for room in ROOMS:

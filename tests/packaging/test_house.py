@@ -21,6 +21,7 @@ def run(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, timeout=600)
 
 
+@pytest.mark.heavy
 @pytest.mark.skipif(importlib.util.find_spec("importlinter") is None,
                     reason="import-linter is not installed (pip install '.[lint]'); .ci/run checks the contracts too")
 def test_import_contracts_hold():
@@ -50,6 +51,7 @@ def test_help_imports_nothing_heavy():
     assert done.stdout.splitlines()[-1].split() == ["loaded:"]
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("command", ["identify", "replay", "profiles", "scan", "doctor", "simulate"])
 def test_help_of_a_command_comes_quickly(command):
     done = run("-X", "importtime", "-m", "tdhil", command, "--help")

@@ -70,6 +70,7 @@ def _raised():
                         yield f"{path.relative_to(ROOT)}:{call.lineno}", ast.unparse(call.func), entry
 
 
+@pytest.mark.heavy
 def test_the_code_of_an_error_belongs_to_its_exit_code():
     for path in sorted((ROOT / "tdhil").rglob("*.py")):
         if "TdhilError)" in path.read_text(encoding="utf-8"):

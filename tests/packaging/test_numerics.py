@@ -5,6 +5,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from tdhil.numerics import LOADED_WHEN_USED, ONE_THREAD
 
 PROGRAM = """
@@ -30,6 +32,7 @@ def prepared(**variables: str) -> dict:
     return json.loads(done.stdout)
 
 
+@pytest.mark.heavy
 def test_what_is_not_used_is_loaded_at_its_first_use_and_works_then():
     found = prepared()
     assert found["heavy"] == []
@@ -38,6 +41,7 @@ def test_what_is_not_used_is_loaded_at_its_first_use_and_works_then():
     assert found["threads"] == ONE_THREAD
 
 
+@pytest.mark.heavy
 def test_the_threads_that_the_operator_set_stay():
     assert prepared(OMP_NUM_THREADS="3")["threads"] == ONE_THREAD | {"OMP_NUM_THREADS": "3"}
 

@@ -50,6 +50,7 @@ print(len(first))
 """
 
 
+@pytest.mark.heavy
 def test_everything_is_imported_without_what_only_posix_has():
     done = subprocess.run([sys.executable, "-c", _SCRIPT], capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr

@@ -244,6 +244,7 @@ def test_every_reference_of_the_pages_leads_somewhere(house):
     assert found == []
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("gone", ["let_go", "verdict.conclude", "tdhil.runner.let_go", "Guard.looks_away",
                                   "gone_file.py", "tdhil/runner/gone.py", "control_loop.gone()"])
 def test_a_name_that_is_gone_is_found(house, gone):

@@ -31,6 +31,7 @@ def test_one(number):
 """
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("what", "still_s", "calls", "passes"), [
     ("number > 1 or stand_still(); assert number > 1", 0.5, 2, True),
     ("stand_still(); assert False", 0.5, 4, False),

@@ -39,6 +39,7 @@ def names(wheel) -> set[str]:
     return set(wheel.namelist())
 
 
+@pytest.mark.heavy
 def test_pure_python_for_every_machine(wheel):
     assert wheel.filename is not None
     assert wheel.filename.endswith("-py3-none-any.whl")
@@ -83,6 +84,7 @@ def test_entry_point(wheel, names):
     assert dict(parser["console_scripts"]) == {"tdhil": "tdhil.__main__:console"}
 
 
+@pytest.mark.heavy
 def test_it_runs_from_the_wheel_alone(wheel, tmp_path):
     wheel.extractall(tmp_path)
     code = (

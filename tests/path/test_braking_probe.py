@@ -74,6 +74,7 @@ def test_over_modbus(name, regulates_torque, monkeypatch, tmp_path):
     assert_found(done, shaft, f"register {register.address}")
 
 
+@pytest.mark.heavy
 def test_over_canopen(regulates_torque, monkeypatch, tmp_path):
     plain = ApplicationObjects._set_target_torque
 

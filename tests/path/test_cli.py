@@ -47,6 +47,7 @@ def test_stdout_is_one_json_document_with_the_promised_keys(tmp_path):
     assert "rig.yaml:4" in done.err                               # which value came from where
 
 
+@pytest.mark.heavy
 def test_a_seed_repeats_result_and_samples(short_run, tmp_path):
     runs = [short_run, identify(tmp_path, *SHORT)]
     same = {"log": "", "date": ""}
@@ -55,6 +56,7 @@ def test_a_seed_repeats_result_and_samples(short_run, tmp_path):
     assert runs[0].log.read_bytes() != b""
 
 
+@pytest.mark.heavy
 def test_without_a_seed_one_is_drawn_and_named(tmp_path):
     runs = [identify(tmp_path, *QUICK, *TOO_MUCH, log=name) for name in ("a.mcap", "b.mcap")]
     seeds = [read_run(done.log).configuration["seed"] for done in runs]
@@ -66,6 +68,7 @@ def test_without_a_seed_one_is_drawn_and_named(tmp_path):
     assert list(read_samples(again.log)) == list(read_samples(runs[0].log))
 
 
+@pytest.mark.heavy
 def test_an_older_log_is_kept(tmp_path):
     (tmp_path / "run.mcap").write_bytes(b"an older run")
     done = identify(tmp_path, "--simulate", *QUICK, *TOO_MUCH)
@@ -175,6 +178,7 @@ def test_no_server_to_talk_to(tmp_path):
 # -- buses, from wherever they are named ---------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_the_environment_names_the_bus(tmp_path, monkeypatch):
     with EmbeddedSimulator(RigParams(), seed=1, stepped=True) as simulated:
         monkeypatch.setenv("CAN_INTERFACE", "virtual")
@@ -198,6 +202,7 @@ def test_a_bus_without_a_drive_is_refused_with_the_likely_causes(tmp_path, monke
     assert "nothing has moved" in done.err
 
 
+@pytest.mark.heavy
 def test_simulate_goes_before_a_configured_bus(tmp_path, monkeypatch):
     monkeypatch.setenv("CAN_INTERFACE", "virtual")
     done = identify(tmp_path, "--simulate", *QUICK, *TOO_MUCH)
@@ -220,6 +225,7 @@ def test_the_node_is_the_one_asked_for(tmp_path, node, code, said):
 # -- runs that end otherwise ---------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_a_plan_that_does_not_fit_ends_with_the_shaft_at_rest(tmp_path):
     trace = tmp_path / "shaft.csv"
     done = identify(tmp_path, "--simulate", "--seed", 1, "--trace", trace, *QUICK, *TOO_MUCH)
@@ -232,6 +238,7 @@ def test_a_plan_that_does_not_fit_ends_with_the_shaft_at_rest(tmp_path):
     shaft.assert_stopped_within_settings()
 
 
+@pytest.mark.heavy
 def test_a_drive_in_fault_is_reset_on_the_operator_s_word_only(tmp_path):
     trace = tmp_path / "shaft.csv"
     with EmbeddedSimulator(RigParams(), seed=1, trace=trace, stepped=True) as simulated:
@@ -252,6 +259,7 @@ def test_a_drive_in_fault_is_reset_on_the_operator_s_word_only(tmp_path):
     assert reset_s <= enabled_s
 
 
+@pytest.mark.heavy
 def test_one_tone_is_not_identifiable_and_the_paper_s_estimate_is_shown(tmp_path):
     done = identify(tmp_path, "--simulate", "--seed", 1, *QUICK, "--excitation", "sine", "--frequency", 0.5,
                     "--periods", 20)

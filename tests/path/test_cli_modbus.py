@@ -49,6 +49,7 @@ def test_the_inertia_of_the_simulated_rig(run):
     assert "SIMULATED: embedded Modbus drive and rig (as requested), stepped time, seed 1" in run.err
 
 
+@pytest.mark.heavy
 def test_its_replay_is_identical(run):
     again = tdhil("replay", "--json", run.log)
     assert again.code == 0, again.err
@@ -78,6 +79,7 @@ def test_a_seed_repeats_it(tmp_path):
     assert list(read_frames(runs[0].log)) == list(read_frames(runs[1].log))
 
 
+@pytest.mark.heavy
 def test_the_unit_is_the_one_asked_for(tmp_path):
     done = identify(tmp_path, "--drive", "modbus", "--simulate", "--unit", 17, *QUICK, *TOO_MUCH)
     assert done.code == 7
@@ -96,6 +98,7 @@ def test_a_dry_run_knows_the_drive(tmp_path):
     assert "--mode speed" in refused.err
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("name", "bus"), [("maxon/epos4", "canopen"), ("siemens/g130-s120", "modbus")])
 def test_the_simulator_wears_the_profile(tmp_path, name, bus):
     profile = load_profile(name)
@@ -149,6 +152,7 @@ def test_a_serial_device_that_refuses_its_settings(monkeypatch, command):
     assert "Traceback" not in done.err
 
 
+@pytest.mark.heavy
 def test_a_drive_in_another_process_over_tcp():
     with process(sys.executable, "-m", "sim_bus", "modbus", "--tcp", "127.0.0.1:0", "--unit", 3,
                  stdout=subprocess.PIPE) as drive:

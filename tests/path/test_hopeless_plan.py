@@ -10,6 +10,7 @@ from tests.path.path_runs import tdhil
 QUICK = ("--seed", 1)
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize(("arguments", "option"), [
     (("--max-time", 60), "--max-time 1"),
     (("--max-time", "1min", "--tolerance", "1%"), "--max-time 1"),

@@ -26,6 +26,7 @@ def test_the_table_has_every_profile_that_ships():
     assert generic["entries"] == {"verified": 2, "likely": 6, "unverified": 0}
 
 
+@pytest.mark.heavy(but_first=5)
 @pytest.mark.parametrize("name", profile_names())
 def test_a_page_leaves_nothing_out(name, monkeypatch):
     monkeypatch.setenv("COLUMNS", "300")

@@ -69,6 +69,7 @@ def at_rest_after(drive):
     return shaft
 
 
+@pytest.mark.heavy
 def test_without_a_rig_it_is_refused(tmp_path, drive):
     for yes in ((), ("--yes",)):
         done = identify(tmp_path, *drive.options, *yes)
@@ -81,6 +82,7 @@ def test_without_a_rig_it_is_refused(tmp_path, drive):
     assert_untouched(drive)
 
 
+@pytest.mark.heavy
 def test_a_rig_without_limits_is_refused(tmp_path, drive):
     rig = tmp_path / "rig.yaml"
     rig.write_text("node: 1\n")
@@ -90,6 +92,7 @@ def test_a_rig_without_limits_is_refused(tmp_path, drive):
     assert_untouched(drive)
 
 
+@pytest.mark.heavy
 def test_what_nobody_verified_is_refused_with_its_sources(tmp_path, drive, rig):
     rig.write_text(RIG.replace(ACCEPTED, ""))
     done = identify(tmp_path, *drive.options, "--rig", rig, "--yes")
@@ -107,6 +110,7 @@ def test_what_nobody_verified_is_refused_with_its_sources(tmp_path, drive, rig):
     assert not shaft.events("heartbeat supervision began")
 
 
+@pytest.mark.heavy
 def test_without_a_terminal_and_without_yes_it_is_refused(tmp_path, drive, rig):
     with host(tmp_path, *drive.options, "--rig", rig) as running:
         done = running.finish()
@@ -121,6 +125,7 @@ def test_without_a_terminal_and_without_yes_it_is_refused(tmp_path, drive, rig):
     assert_untouched(drive)
 
 
+@pytest.mark.heavy
 def test_stepped_time_is_refused(tmp_path, drive, rig):
     done = identify(tmp_path, *drive.options, "--rig", rig, "--yes", "--stepped")
     assert done.code == 4

@@ -89,6 +89,7 @@ def trace(run, tmp_path):
     return path
 
 
+@pytest.mark.heavy
 def test_without_an_excitation_it_is_identified_from_the_motion_itself(run, trace):
     document, *_ = run
     done = tdhil("replay", trace, "--json")
@@ -101,6 +102,7 @@ def test_without_an_excitation_it_is_identified_from_the_motion_itself(run, trac
     assert found["paper"]["inertia_kg_m2"] > 0
 
 
+@pytest.mark.heavy
 def test_a_trace_that_can_t_tell_says_which_motion_to_add(tmp_path):
     path = tmp_path / "trace.csv"
     rng = np.random.default_rng(1)
@@ -114,6 +116,7 @@ def test_a_trace_that_can_t_tell_says_which_motion_to_add(tmp_path):
     assert "several speeds" in done.document["advice"]
 
 
+@pytest.mark.heavy
 def test_what_is_known_of_the_bench_is_used(run, trace):
     _, _, excitation, _ = run
     arguments = ("replay", "--json", trace, "--excitation", excitation)
@@ -134,6 +137,7 @@ def test_what_is_known_of_the_bench_is_used(run, trace):
     assert "limit of 50 N·m" in clipped.document["reason"]
 
 
+@pytest.mark.heavy
 def test_a_log_is_known_by_its_content(run, tmp_path):
     document, _, excitation, log = run
     renamed = tmp_path / "trace.csv"
@@ -168,6 +172,7 @@ def test_a_wrong_option_ends_with_2_and_names_what_is_wrong(trace, arguments, sa
     assert done.out == ""
 
 
+@pytest.mark.heavy
 def test_the_file_may_stand_behind_the_columns(trace):
     done = tdhil("replay", "--json", "--columns", "time=TIME_S", "speed=speed_rad_s", trace)
     assert done.code == 0

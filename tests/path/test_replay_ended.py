@@ -17,6 +17,7 @@ def sto(tmp_path_factory):
     return identify(tmp_path_factory.mktemp("sto"), *CANOPEN, "--periods", 5, "--fault", "sto@acquire+97s")
 
 
+@pytest.mark.heavy
 def test_an_aborted_run_is_a_partial_result(sto):
     assert sto.code == 6
     again = tdhil("replay", "--json", sto.log)
@@ -28,6 +29,7 @@ def test_an_aborted_run_is_a_partial_result(sto):
     assert again.document["ended"]["kind"] == "DriveFault"
 
 
+@pytest.mark.heavy
 def test_so_is_its_recovered_copy(sto, tmp_path):
     cut, whole = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
     shutil.copy(sto.log, cut)

@@ -31,6 +31,7 @@ def test_a_run_has_a_second_opinion_and_a_friction_curve(run):
     assert len(run.document["friction_curve"]) >= 3
 
 
+@pytest.mark.heavy
 def test_the_replay_gives_the_same_page_and_the_same_numbers_to_the_last_bit(run):
     page = run.log.parent / "replay.html"
     again = tdhil("replay", "--json", run.log, "--report", page)
@@ -45,6 +46,7 @@ def test_the_replay_gives_the_same_page_and_the_same_numbers_to_the_last_bit(run
     assert "speed change" in text
 
 
+@pytest.mark.heavy
 def test_json_says_when_on_what_and_by_whom(run):
     found = run.document
     assert datetime.fromisoformat(found["date"]).utcoffset() is not None

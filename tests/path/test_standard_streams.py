@@ -62,6 +62,7 @@ def run(monkeypatch, stdout, *arguments, stderr=None):
     return code, "" if stderr is not None else err.getvalue()
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "koi8-r"])
 @pytest.mark.parametrize("arguments", [(), ("--json",)])
 def test_an_encoding_that_lacks_our_signs(log, monkeypatch, encoding, arguments):
@@ -77,6 +78,7 @@ def test_an_encoding_that_lacks_our_signs(log, monkeypatch, encoding, arguments)
         assert {len(line) for line in text.splitlines()} == {80}      # the frame's right edge stays a line
 
 
+@pytest.mark.heavy
 def test_a_full_device(log, monkeypatch):
     with open(FULL, "w", encoding="utf-8") as stdout:  # noqa: PTH123
         code, err = run(monkeypatch, stdout, "replay", log)
@@ -106,12 +108,14 @@ def test_any_command_into_a_full_device(monkeypatch):
     assert "Traceback" not in err
 
 
+@pytest.mark.heavy
 def test_no_stdout_at_all(log, monkeypatch):
     code, err = run(monkeypatch, None, "replay", log)
     assert code == 0
     assert "kg·m²" in err
 
 
+@pytest.mark.heavy
 def test_neither_stdout_nor_stderr(log, monkeypatch):
     monkeypatch.setattr(sys, "stdout", None)
     monkeypatch.setattr(sys, "stderr", None)
@@ -124,6 +128,7 @@ def test_a_dead_stderr_takes_no_cause_with_it(monkeypatch, tmp_path, buffering):
         assert run(monkeypatch, io.StringIO(), "replay", tmp_path / "none.mcap", stderr=stderr)[0] == 2
 
 
+@pytest.mark.heavy
 def test_closed_descriptors_are_given_to_no_file():
     script = "import os, sys; os.close(1); os.close(0)\n" \
              "from tdhil.cli.main import main; main(['profiles', 'show', 'nothing'])\n" \
@@ -157,7 +162,8 @@ def test_an_unknown_model_in_a_log():
         conclude(None, {"identify": {"model": "magic"}}, "run.mcap")      # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("fault", [(), pytest.param(("--fault", "sto@hold+1s"), marks=pytest.mark.heavy)])
+@pytest.mark.heavy
+@pytest.mark.parametrize("fault", [(), ("--fault", "sto@hold+1s")])
 def test_nothing_is_loaded_once_the_shaft_may_move(tmp_path, fault):
     """Later there may be no descriptor left to load it with, or no disk."""
     script = f"""

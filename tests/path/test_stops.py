@@ -62,6 +62,7 @@ SELDOM = {
 """What a signal and a stage are marked with; those that aren't here are long."""
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("how", "stage"), [
         *(pytest.param(how, stage, marks=SELDOM.get((how, stage), pytest.mark.long))
@@ -289,6 +290,7 @@ def test_a_log_that_can_not_grow_stops_the_shaft(tmp_path):
     assert tdhil("replay", done.log).code in (3, 9)
 
 
+@pytest.mark.heavy
 def test_what_follows_the_shaft_is_in_order(tmp_path):
     """Of one interrupted run: enabled, quick stop, disabled, and only then let go of the bus."""
     trace = tmp_path / "shaft.csv"

@@ -45,6 +45,7 @@ def test_an_answer_that_comes_with_the_first_word_is_not_waited_for():
     worker.kill()
 
 
+@pytest.mark.heavy
 def test_what_ends_its_process_or_hangs_is_set_aside_and_the_rest_goes_on(monkeypatch):
     """The time of the limit goes on only while nothing but what hangs is left: no slow computer loses the others."""
     bad = [poison.KILLS, poison.HANGS, poison.OUTSIDE]
@@ -78,6 +79,7 @@ def test_without_limits():
         assert sorted(task for task, _ in pool.run(range(7))) == list(range(7))
 
 
+@pytest.mark.heavy
 def test_processes_killed_at_random():
     """Twelve kills over sixty tasks, some while idle: nothing is lost, nothing comes twice."""
     rng = random.Random(3)

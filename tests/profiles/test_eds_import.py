@@ -324,6 +324,7 @@ NASTY = st.text(
 )
 
 
+@pytest.mark.heavy
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(vendor=NASTY, product=NASTY, thing=NASTY)
 def test_no_name_breaks_out_of_the_profile(begin, vendor, product, thing):
@@ -339,6 +340,7 @@ def test_no_name_breaks_out_of_the_profile(begin, vendor, product, thing):
     assert "Zqx" not in begun.text                              # no text of the maker's but the two names
 
 
+@pytest.mark.heavy
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_mutilated_file_is_refused_in_lines_or_gives_a_profile_that_loads(begin, tmp_path, data):

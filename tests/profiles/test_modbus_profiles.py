@@ -135,6 +135,7 @@ def test_the_file_begins_with_what_is_special(name: str) -> None:
         assert all(f"# {word}" in head for word in ("Special:", "To set:", "Unsure:"))
 
 
+@pytest.mark.heavy(but_first=4)
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

@@ -75,6 +75,7 @@ def test_what_is_read(text: str, key: str, value: object) -> None:
     assert type(found) is type(value)
 
 
+@pytest.mark.heavy(but_first=14)
 @pytest.mark.parametrize(
     ("text", "line", "words"),
     [
@@ -199,6 +200,7 @@ PIECES = st.sampled_from(
 )
 
 
+@pytest.mark.heavy
 @settings(max_examples=300, deadline=None)
 @given(st.one_of(st.text(max_size=80), st.lists(PIECES, max_size=30).map("".join)))
 def test_any_text_gives_a_model_or_a_data_file_error(text: str) -> None:

@@ -149,6 +149,7 @@ def both(path, data, batch=log_reader.BATCH):
     return told[0]
 
 
+@pytest.mark.heavy
 @FEW
 @given(raw=st.lists(CHUNKS, max_size=20), plain=st.integers(0, 30), packing=st.sampled_from(("zstd", "lz4", "")),
        damaged=st.sets(st.integers(0, 40), max_size=2), end=st.booleans(), batch=st.sampled_from((1, 3000, 2**21)))

@@ -183,6 +183,7 @@ def excitation(tmp_path_factory):
     return path
 
 
+@pytest.mark.heavy
 def test_the_sound_trace_is_identified(tmp_path, excitation):
     path = tmp_path / "trace.csv"
     path.write_text(table(*sound(1)))
@@ -225,6 +226,7 @@ CELLS = st.one_of(
 NAMES = st.sampled_from(["time_s", "speed_rad_s", "torque_nm", "time", "Speed [rpm]", "torque_pct", "n", ""])
 
 
+@pytest.mark.heavy
 @settings(max_examples=150)
 @given(
     names=st.lists(NAMES, min_size=2, max_size=5), rows=st.lists(st.lists(CELLS, max_size=5), max_size=12),

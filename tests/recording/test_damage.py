@@ -54,6 +54,7 @@ def is_part(part, everything):
     return all(any(one == other for other in rest) for one in part)
 
 
+@pytest.mark.heavy
 @QUIET
 @given(share=st.floats(0, 1))
 def test_cut_anywhere(good, tmp_path, share):
@@ -73,6 +74,7 @@ def test_cut_anywhere(good, tmp_path, share):
     assert len(run.recording.time_s) == len(some)
 
 
+@pytest.mark.heavy
 def test_every_byte_that_is_cut_costs_at_most_a_chunk(good, tmp_path):
     data, _, samples, _ = good
     lengths = []
@@ -105,6 +107,7 @@ def test_flipped_bits(good, tmp_path, seed, flips):
     assert not run.complete or len(some) == len(samples)
 
 
+@pytest.mark.heavy
 def test_every_flip_in_the_heads_of_records(good, tmp_path):
     """The lengths and kinds that hold the file together, bit by bit, around the third chunk and its indexes."""
     data, _, samples, _ = good
@@ -186,6 +189,7 @@ def bomb(compression, size, declared, chunks=1):
     return MAGIC + builder.end() + MAGIC
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 @pytest.mark.parametrize("declared", [500_000_000, 1000, 2**63])
 def test_a_bomb_is_refused_in_little_memory(tmp_path, compression, declared):
@@ -197,6 +201,7 @@ def test_a_bomb_is_refused_in_little_memory(tmp_path, compression, declared):
     assert int(lines[-1]) < 100_000             # KiB above what the imports took
 
 
+@pytest.mark.heavy
 def test_many_small_bombs_are_bounded_too(tmp_path):
     """Chunks within the limit, full of what looks like empty samples: the sum is capped."""
     record = b"\x05" + (22).to_bytes(8, "little") + b"\x01\0" + bytes(20)

@@ -23,6 +23,7 @@ def identify(log, room):
     return subprocess.run(command, cwd=ROOT, preexec_fn=cap, capture_output=True, text=True, timeout=600)
 
 
+@pytest.mark.heavy
 def test_a_log_that_fails_in_mid_run_stops_the_shaft(tmp_path):
     done = identify(tmp_path / "run.mcap", 100_000)
     said = json.loads(done.stdout)

@@ -65,6 +65,7 @@ def test_a_killed_run_is_replayed_up_to_its_last_half_second(tmp_path):
         assert "not closed" in run.problems[-1]
 
 
+@pytest.mark.heavy
 def test_in_stepped_time_the_queue_bounds_what_a_kill_costs(tmp_path):
     """Four records a cycle: 0.26 s of control time in the queue, 0.4 s in the open chunk, whatever the wall says."""
     last_s = run_and_kill(tmp_path / "run.mcap", 20.0, STEPPED)
@@ -73,6 +74,7 @@ def test_in_stepped_time_the_queue_bounds_what_a_kill_costs(tmp_path):
     np.testing.assert_array_equal(time_s, np.arange(len(time_s)) * 0.004)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("cycle_s", [0.001, 0.004, 0.1])
 def test_in_stepped_time_the_default_queue_keeps_to_half_a_second_too(tmp_path, cycle_s):
     """Whatever the rate: at 10 Hz the queue alone could hold minutes. One cycle may be printed and not yet taken."""

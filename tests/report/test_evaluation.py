@@ -17,6 +17,7 @@ def document(log, **changes):
     return evaluation_document(evaluate(log, CASE, PROGRAM), CASE, recording(**changes), RUN, "run.mcap")
 
 
+@pytest.mark.heavy
 def test_the_page_has_both_columns_and_the_pictures(tmp_path):
     log = rows(57.0, (60.0, 56.3, 57.2), damping=0.22)
     page = evaluation_report(document(log), log)

@@ -52,6 +52,7 @@ def page(found, **changes):
     return report_page(report_of(result_document(found, own, RUN, "run.mcap"), own))
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("make", [full, bare, open_sided])
 @pytest.mark.parametrize("changes", [{}, {"samples": 1}, {"samples": 0, "stages": (), "excitation": None}])
 def test_the_page_is_well_formed_and_loads_nothing(make, changes):
@@ -91,11 +92,13 @@ def test_a_refusal_has_no_number_and_no_banner_on_a_real_drive():
     assert text.count("<svg") == 1
 
 
+@pytest.mark.heavy
 def test_open_sides_are_open():
     assert page(open_sided()).count('<td class="number">open</td>') == 3
     assert "J_r + J_L left open by the data" in page(open_sided())
 
 
+@pytest.mark.heavy
 def test_the_same_result_is_the_same_file(tmp_path):
     own = recording()
     document = result_document(full(), own, {}, "run.mcap")
@@ -104,6 +107,7 @@ def test_the_same_result_is_the_same_file(tmp_path):
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
 
 
+@pytest.mark.heavy
 def test_no_file_is_ever_written_over(tmp_path):
     own, old = recording(), tmp_path / "report.html"
     old.write_text("somebody's own")
@@ -113,6 +117,7 @@ def test_no_file_is_ever_written_over(tmp_path):
     assert old.read_text() == "somebody's own"
 
 
+@pytest.mark.heavy
 def test_it_names_the_log_by_its_hash(tmp_path):
     log = tmp_path / "run.mcap"
     log.write_bytes(b"abc")
@@ -159,6 +164,7 @@ def test_the_envelope_loses_no_peak():
     assert np.all(low <= high)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("name", ["r.html", "r.pdf"])
 def test_no_descriptor_left_for_the_report_is_said_plainly(tmp_path, name):
     """Fonts and modules that are read late fail as the file does: not a mistake of ours."""
@@ -186,6 +192,7 @@ except UsageError as error:
     assert not (tmp_path / name).exists()
 
 
+@pytest.mark.heavy
 def test_its_pictures_can_be_taken_out_of_it_each_whole_by_itself():
     own = recording()
     report = report_of(result_document(full(), own, RUN, "run.mcap"), own)

@@ -69,6 +69,7 @@ def test_everything_lies_within_the_margins_and_nothing_on_another(make):
             assert 72.0 * box.y0 >= 30.0
 
 
+@pytest.mark.heavy
 def test_a_long_table_is_split_with_its_head_and_a_short_one_never():
     sheets = [[text for text, *_ in texts_of(figure)] for figure in sheets_of(report(wordy()))]
     heads = [k for k, texts in enumerate(sheets) if "frequency, Hz" in texts]

@@ -54,6 +54,7 @@ def acquire(world, stub):
     return here, told, run
 
 
+@pytest.mark.heavy
 def test_the_last_mean_speed_goes_on_and_the_others_are_gone_back_to(world):
     stub = Stub(4, 2, 0)
     _, _, run = acquire(world, stub)
@@ -69,6 +70,7 @@ def test_the_last_mean_speed_goes_on_and_the_others_are_gone_back_to(world):
     assert stub.asked_s[1] - stub.asked_s[0] == pytest.approx(PLAN.extension_s(4), abs=3.0)
 
 
+@pytest.mark.heavy
 def test_what_is_little_is_run_where_the_shaft_is(world):
     stub = Stub(4, 0)
     stub.at_last = True
@@ -183,6 +185,7 @@ def test_what_the_scatter_says_is_missing_is_run_where_the_shaft_is(monkeypatch)
     assert "4 more periods here" in found.why
 
 
+@pytest.mark.heavy
 def test_all_looks_together_miss_no_more_than_asked():
     """Signed roots of data that grow as fast as they may behind a look: an interval whose root is too large misses."""
     rng = np.random.default_rng(3)

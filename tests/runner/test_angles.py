@@ -35,6 +35,7 @@ def watched(factor, counts_per_turn, wraps_rad, seconds=6.0, speed_rad_s=1.0, sw
     return angles
 
 
+@pytest.mark.heavy
 @given(st.floats(0.05, 11.0), st.booleans(), st.sampled_from([512, 4096, 1 << 20]), st.sampled_from(WIDTHS),
        st.floats(0.0, 0.4), st.sampled_from([0.0, 0.1]))
 def test_the_factor_is_found(factor, backwards, counts, wraps_rad, swing, lost):
@@ -44,6 +45,7 @@ def test_the_factor_is_found(factor, backwards, counts, wraps_rad, swing, lost):
     assert ratio.value == pytest.approx(factor, rel=0.035)
 
 
+@pytest.mark.heavy
 @given(st.floats(0.2, 10.0))
 def test_a_counter_of_turns_takes_turns_and_is_then_right(factor):
     seconds = 3.2 * 2.0 * math.pi / factor
@@ -68,6 +70,7 @@ def test_one_that_starts_over_too_often_tells_nothing():
     assert angles.speed_rad_s() is None
 
 
+@pytest.mark.heavy
 @given(st.floats(0.5, 10.0))
 def test_the_speed_of_the_angle_is_between_its_bounds(factor):
     low, high = watched(factor, 4096, None, swing=0.0).speed_rad_s()

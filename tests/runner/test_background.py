@@ -85,6 +85,7 @@ def live(world, worker_process):
     return here
 
 
+@pytest.mark.heavy
 def test_it_gives_what_the_function_gives_and_raises_what_it_raises(live):
     compute = functools.partial(live.bench.compute, command=REST)
     assert compute(functools.partial(math.hypot, 3.0, 4.0)) == 5.0
@@ -130,6 +131,7 @@ def test_its_linear_algebra_keeps_to_one_core_so_that_the_control_loop_has_the_o
     assert worker_process.ask(functools.partial(os.getenv, "OPENBLAS_NUM_THREADS")) == "1"
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
 def test_where_it_dies_in_the_midst_of_work_a_thread_does_it_and_the_log_says_so(live, tmp_path, end):
     begun = tmp_path / "begun"
@@ -149,6 +151,7 @@ while os.getpid() != {os.getpid()}:
     assert live.bench.compute(functools.partial(max, 1, 2), REST) == 2        # it stays dead, and that stops nothing
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(
     ("work", "kind"), [(lambda: 3, "int"), (functools.partial(compile, "3", "", "eval"), "code")]
 )
@@ -182,6 +185,7 @@ def test_ctrl_c_at_the_terminal_does_not_reach_it(worker_process):
     assert worker_process.ask(functools.partial(max, 1, 2)) == 2
 
 
+@pytest.mark.heavy
 def test_it_is_nicer_than_the_loop_and_inherits_nothing_but_its_pipes(worker_process, tmp_path):
     assert worker_process.ask(functools.partial(os.nice, 0)) >= os.nice(0) + background.NICE
     assert worker_process.ask(functools.partial(os.sched_getscheduler, 0)) == os.SCHED_OTHER

@@ -60,6 +60,7 @@ def test_a_drive_that_reads_no_sign_is_found_at_low_speed(world, how):
     assert here.drive.state is PowerState.OFF
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("how", "rate_hz", "seed"), [
     ("unsigned", 10, 1), ("unsigned", 50, 2), ("magnitude", 10, 3), ("magnitude", 50, 4),
 ])
@@ -72,6 +73,7 @@ def test_through_lags_and_noise(how, rate_hz, seed):
     assert all(abs(speed) < 0.05 for speed in run.drive.disabled_at)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("friction", [(60.0, 8.0), (0.0, 4.0), (0.0, 0.0)])
 def test_nothing_below_zero_is_sent_before_the_probe(world, friction):
     here = world(FakeDrive(coulomb=friction[0], viscous=friction[1]))
@@ -96,6 +98,7 @@ def test_a_shaft_too_light_to_try_is_never_braked_by_torque(world):
     assert torque_below_zero(here.drive) == []
 
 
+@pytest.mark.heavy
 def test_where_the_plan_needs_what_could_not_be_tried(world):
     here = world(FakeDrive(inertia=5.0, coulomb=3.0, viscous=0.5))
     cause = here.runner(ExcitationRequest(periods=2)).run().cause
@@ -109,6 +112,7 @@ def test_where_the_plan_needs_what_could_not_be_tried(world):
     assert here.runner(ExcitationRequest(periods=2)).run().cause is None
 
 
+@pytest.mark.heavy
 def test_in_speed_mode_there_is_nothing_to_try(world):
     here = world()
     assert here.runner(ExcitationRequest(mode="speed", periods=2)).run().cause is None

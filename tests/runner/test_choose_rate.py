@@ -79,6 +79,7 @@ def test_a_line_that_does_not_answer_in_time_is_too_fast_as_well():
     assert all(one.cycles < 10 for one in choice.tried[:3])      # given up as soon as it is clear
 
 
+@pytest.mark.heavy
 def test_the_runner_tries_before_motion_and_goes_on_at_that_rate(world):
     drive = PacedDrive(lambda rate, cycle: 0.015 * (rate > 25 and cycle % 50 == 49), rates=(50.0, 25.0))
     drive.period_s = 0.02
@@ -111,6 +112,7 @@ def test_whoever_named_a_rate_has_it(world):
     assert "set_rate" not in drive.calls
 
 
+@pytest.mark.heavy
 def test_ctrl_c_ends_the_trying(world):
     drive = PacedDrive()
     here = world(drive)

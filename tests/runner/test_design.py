@@ -79,6 +79,7 @@ def steady_stretch(seed, speed, load_sd, seconds=6.0, step_s=0.004):
     return Samples(*np.array(rows[-round(seconds / step_s) :]).T)
 
 
+@pytest.mark.heavy
 def test_the_noise_is_measured_at_steady_speed():
     fallback = assumed_noise(400.0, 10.0)
     theta = assumed_theta(104.0, 8.0, LagPrior(0.0, 0.0, 0.0, 0.0))
@@ -147,6 +148,7 @@ def test_what_the_user_fixes_rules(wish):
     assert choose(LIMITS, GUESS, wish, KNOWN, 0.95).plan == make_plan(LIMITS, GUESS, wish)
 
 
+@pytest.mark.heavy
 def test_amplitude_and_offset_are_kept_while_the_lines_are_chosen():
     wish = PlanRequest(amplitude_rad_s=0.8, offsets_rad_s=(3.0, 6.5))
     plan = choose(LIMITS, GUESS, wish, KNOWN, 0.95).plan
@@ -156,6 +158,7 @@ def test_amplitude_and_offset_are_kept_while_the_lines_are_chosen():
         assert np.abs(np.array(speeds) - segment.reference.offset_rad_s).max() == pytest.approx(0.8, rel=2e-3)
 
 
+@pytest.mark.heavy
 def test_the_time_allowed_is_kept():
     for time_s in (120.0,):
         plan = choose(LIMITS, GUESS, PlanRequest(), KNOWN, 0.95, time_s).plan
@@ -232,6 +235,7 @@ def motor_sd(plan):
     return float(np.sqrt(np.linalg.inv(whole * np.outer(scale, scale))[0, 0]) * scale[0])
 
 
+@pytest.mark.heavy
 def test_with_a_string_a_fixed_wish_rules_and_too_little_time_leaves_the_usual_choice():
     known, wish = hung(frequency_hz=0.2)
     assert choose(STRING_LIMITS, STRING_GUESS, wish, known, 0.95).plan == make_plan(STRING_LIMITS, STRING_GUESS, wish)
@@ -258,6 +262,7 @@ def test_where_braking_can_t_be_had_the_motion_asks_for_none():
     assert held.torque_min_nm == pytest.approx(1000.0)
 
 
+@pytest.mark.heavy
 def test_longer_at_the_last_mean_speed_alone():
     plan = make_plan(LIMITS, GUESS)
     evidence = predicted(plan, KNOWN.theta(GUESS), KNOWN.noise, KNOWN.prior)

@@ -3,6 +3,7 @@
 import math
 from itertools import pairwise
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -31,6 +32,7 @@ def test_no_period_of_the_excitation_meets_it_at_the_same_place():
     assert min(b - a for a, b in pairwise(starts)) > 0.02
 
 
+@pytest.mark.heavy
 @given(
     inertia=st.floats(1.0, 1000.0), coulomb=st.floats(0.0, 80.0), viscous=st.floats(0.0, 5.0),
     period_s=st.sampled_from([0.004, 1.0 / 15.0, 0.1]),

@@ -13,6 +13,7 @@ from tests.runner.fake_drive import LIMITS, FakeDrive
 from tests.runner.run_outcomes import assert_at_rest, outcomes, up_to
 
 
+@pytest.mark.heavy
 def test_a_run_goes_through_its_five_stages_and_stops(world):
     here = world()
     result = here.runner().run()
@@ -31,6 +32,7 @@ def test_a_run_goes_through_its_five_stages_and_stops(world):
     assert all(abs(command.torque_nm) <= 400.0 for command in here.drive.commands)
 
 
+@pytest.mark.heavy
 def test_the_drive_is_disabled_once_and_after_the_quick_stop(world):
     here = world()
     here.runner().run()
@@ -52,6 +54,7 @@ def test_a_segment_is_announced_with_its_end_before_it_is_run(world):
     assert segment.end_s - segment.start_s == pytest.approx(2 * segment.period_s)
 
 
+@pytest.mark.heavy
 def test_in_speed_mode_two_stages_are_skipped(world):
     here = world()
     result = here.runner(ExcitationRequest(mode="speed", periods=2)).run()
@@ -143,6 +146,7 @@ def test_a_load_that_lets_go_in_torque_mode_is_caught_inside_the_window(world):
     assert "began to turn" in result.stop.trouble[-1]
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("inertia", [2.0, 100.0, 3000.0])
 def test_light_and_heavy_shafts_go_through_alike(world, inertia):
     here = world(FakeDrive(inertia=inertia))

@@ -216,6 +216,7 @@ class Rig:
         return max(0.0, self.reported)
 
 
+@pytest.mark.heavy
 @settings(max_examples=8, deadline=None)
 @given(
     inertia=st.floats(20.0, 4000.0), torque_nm=st.floats(300.0, 400.0), lag_s=st.sampled_from([0.0, 0.15, 0.5]),
@@ -232,6 +233,7 @@ def test_no_rig_that_does_what_it_can_trips(inertia, torque_nm, lag_s, ramp_rad_
     assert followed(reference, rig, 240.0, period_s=period_s, torque=lambda t: 90.0) is None
 
 
+@pytest.mark.heavy
 @settings(max_examples=6, deadline=None)
 @given(
     hertz=st.sampled_from([0.02, 0.1, 0.5, 2.0]), amplitude=st.floats(0.3, 3.0), lag_s=st.sampled_from([0.0, 0.5]),
@@ -247,6 +249,7 @@ def test_no_excitation_that_a_rig_follows_as_well_as_it_can_trips(hertz, amplitu
     assert followed(reference, rig, 120.0, period_s=period_s) is None
 
 
+@pytest.mark.heavy
 @given(period_s=st.floats(3.0, 12.0), depth=st.floats(0.3, 1.0))
 @settings(max_examples=8, deadline=None)
 def test_a_string_that_sticks_and_slips_does_not(period_s, depth):

@@ -89,6 +89,7 @@ def frozen(drive, sample):
     return sample._replace(speed_rad_s=drive.held.speed_rad_s, torque_nm=drive.held.torque_nm)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("act", "cause"), [(lost_torque, LimitHit), (frozen, CommunicationLost)])
 def test_whatever_ends_it_the_offset_goes_with_the_first_cycle_of_the_stop(act, cause):
     one = Ending(Line(0.02, share=0.2, jitter=0.0), params=RIG, modes=frozenset({Mode.SPEED}))
@@ -109,6 +110,7 @@ def test_whatever_ends_it_the_offset_goes_with_the_first_cycle_of_the_stop(act, 
         assert ended.outcome.stop.confirmed
 
 
+@pytest.mark.heavy
 def test_an_interrupt_takes_it_away_as_well():
     one = Ending(Line(0.02, share=0.2, jitter=0.0), params=RIG, modes=frozenset({Mode.SPEED}))
 
@@ -149,6 +151,7 @@ def test_a_reference_that_comes_in_slow_steps_is_refused():
         refuse_slow_reference(slow, 0.05)
 
 
+@pytest.mark.heavy
 def test_too_little_time_is_refused_before_the_offset_grows():
     short = run_line(drive(), OFFSET, replace(RIG_LIMITS, time_s=220.0))
     assert isinstance(short.outcome.cause, LimitHit)

@@ -15,6 +15,7 @@ from tests.runner.fake_drive import World
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("stage", STAGES)
 def test_after_an_abort_in_any_stage_a_run_begins_anew(world, stage):
     here = world()
@@ -48,6 +49,7 @@ def test_no_option_of_a_run_takes_up_an_older_one():
     assert not [flag for flag in options for word in ("resume", "continue", "stage", "from") if word in flag]
 
 
+@pytest.mark.heavy
 def test_what_reads_a_log_of_an_aborted_run_has_no_drive_at_hand(tmp_path):
     script = (
         "import sys\n"

@@ -107,6 +107,7 @@ def healthy(rig, wrong, rel_error, frequency_hz, seed):
     assert bench.observer.moved and bench.observer.unseen_s == 0.0
 
 
+@pytest.mark.heavy(but_first=3)
 @pytest.mark.parametrize("speed_lag_s", [0.1, 0.3, 0.45, 0.5])
 @pytest.mark.parametrize("coulomb", [100.0, 371.0, 500.0])
 @pytest.mark.parametrize("quick_stop_rad_s2", [1.0, 1.8, 2.2, 3.0])
@@ -136,6 +137,7 @@ JUMPS = {
 }
 
 
+@pytest.mark.heavy(but_first=6)
 @pytest.mark.parametrize("lag_s", LAGS)
 @pytest.mark.parametrize("name", JUMPS)
 @pytest.mark.parametrize("mode", ["speed", "torque"])
@@ -182,6 +184,7 @@ def test_a_speed_that_freezes_is_found_once_the_shaft_turns_otherwise(lag_s, how
 TORQUES = {"sign": (-1.0, 2.5), "lost": (0.0, 6.0), "tenth": (0.1, 6.0), "twice": (2.0, 6.0)}
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("lag_s", LAGS)
 @pytest.mark.parametrize("name", TORQUES)
 def test_a_torque_that_lies_is_found_in_torque_mode(name, lag_s):

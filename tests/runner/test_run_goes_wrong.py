@@ -12,6 +12,7 @@ from tests.runner.fake_drive import FakeDrive, lost
 from tests.runner.run_outcomes import EACH_STAGE, after, assert_at_rest, outcomes, up_to
 
 
+@pytest.mark.heavy(but_first=3)
 @EACH_STAGE
 @pytest.mark.parametrize(
     "error",
@@ -90,6 +91,7 @@ def test_a_log_that_is_broken_for_good(world, stage):
     assert_at_rest(here, result)
 
 
+@pytest.mark.heavy(but_first=3)
 @EACH_STAGE
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
 def test_a_stop_request_in_each_stage(world, stage, signum):
@@ -181,6 +183,7 @@ def test_a_lost_bus_in_each_stage(world, stage):
     assert here.drive.disabled_at == []
 
 
+@pytest.mark.heavy
 def test_what_fails_while_closing_is_the_cause_only_where_there_is_no_other(world):
     for first in (None, RuntimeError("first")):
         here = world()
@@ -201,6 +204,7 @@ def test_what_fails_while_closing_is_the_cause_only_where_there_is_no_other(worl
             assert result.cause is first
 
 
+@pytest.mark.heavy
 def test_a_stop_that_is_not_confirmed_after_a_good_run_shows(world):
     here = world(FakeDrive(brakes=False))
     here.drive.coulomb = here.drive.viscous = 0.0

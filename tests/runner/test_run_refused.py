@@ -74,6 +74,7 @@ def test_a_shaft_that_already_turns_is_left_alone(world):
     assert not [call for call in here.drive.calls if call.startswith("enable")]
 
 
+@pytest.mark.heavy
 def test_a_fault_is_reset_on_the_operator_s_word_only(world):
     for word in (False, True):
         here = world(FakeDrive(state=PowerState.FAULT, wish=PowerState.FAULT))

@@ -45,6 +45,7 @@ def test_signals_read_one_after_the_other_are_told_apart_by_their_skew():
     assert run.recording.lag_prior.skew_sd_s == pytest.approx((0.01**2 + half_s**2) ** 0.5)
 
 
+@pytest.mark.heavy
 def test_without_torque_mode_two_stages_say_what_they_could_not_do():
     run = run_line(LineDrive(Line(0.05), modes=SPEED_ONLY), ExcitationRequest(periods=2))
     assert run.outcome.cause is None
@@ -56,6 +57,7 @@ def test_without_torque_mode_two_stages_say_what_they_could_not_do():
     assert run.recording.stages[2:4] == (torque, hold)
 
 
+@pytest.mark.heavy
 def test_the_rate_is_written_down_once_it_is_known():
     """`LineDrive.period_s` fails if anybody asks before preflight."""
     run = run_line(LineDrive(Line(0.1), modes=SPEED_ONLY), ExcitationRequest(periods=2))
@@ -84,6 +86,7 @@ def test_torque_read_in_step_with_a_stiff_drive_is_not_trusted():
         assert "stepped setpoint" in {line.source for line in found.budget}
 
 
+@pytest.mark.heavy
 def test_a_ramp_in_the_drive_is_seen_and_stayed_below():
     run = run_line(LineDrive(Line(0.05), modes=SPEED_ONLY, ramp_rad_s2=0.8, seed=3))
     found = identified(run)

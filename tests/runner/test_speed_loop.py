@@ -44,6 +44,7 @@ def test_its_filters_are_scipys():
         assert _response(wanted, zero, first, second, lag) == pytest.approx(late, rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.heavy
 @settings(max_examples=6, deadline=None)
 @given(gain=st.floats(1.5, 8.0), damping=st.floats(0.7, 1.3), period_s=st.sampled_from([0.02, 0.05, 0.1]))
 def test_the_loop_is_read_off_a_ramp(gain, damping, period_s):

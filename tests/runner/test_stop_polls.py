@@ -264,6 +264,7 @@ def test_a_shaft_that_brakes_as_well_as_it_can_is_fed_to_the_end(world, inertia)
     assert report.confirmed and "stop_feeding" not in here.drive.calls
 
 
+@pytest.mark.heavy
 def test_a_swinging_string_or_a_long_ramp_is_no_shaft_that_goes_on_turning(world):
     for limits in (replace(LIMITS, load="string", torque_ramp_nm_s=20.0), replace(LIMITS, quick_stop_rad_s2=0.1)):
         here = world(Starved(driven=None), limits)

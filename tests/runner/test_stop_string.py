@@ -56,6 +56,7 @@ def test_trapped_torque_comes_down_on_the_ramp_before_anything_is_disabled(twist
     assert here.drive.work_j <= 1e-9   # the motor gave nothing to the string
 
 
+@pytest.mark.heavy
 def test_reverse_rotation_is_no_more_than_the_twist_asks_for():
     here = StringWorld(twist_nm=300.0)
     assert not STRING.allow_reverse
@@ -75,6 +76,7 @@ def test_from_a_turning_shaft_in_either_mode(mode):
     assert "quick_stop" in here.drive.calls
 
 
+@pytest.mark.heavy
 def test_a_string_that_swings_is_waited_for():
     here = StringWorld(swing_nm=200.0)
     report = here.stop_sequence().run()
@@ -89,12 +91,14 @@ def test_an_untwisted_string_takes_the_wait_for_half_a_swing_only():
     assert here.bench.now_s == pytest.approx(QUIET_S + 2 * 1.5, abs=0.5)
 
 
+@pytest.mark.heavy
 def test_the_torque_s_offset_is_nothing_trapped():
     here = StringWorld()
     here.drive.misbehave = lambda drive, sample: sample._replace(torque_nm=sample.torque_nm + 30.0)
     assert here.stop_sequence(torque_offset_nm=30.0).run().confirmed
 
 
+@pytest.mark.heavy
 def test_a_drive_that_leaves_speed_mode_gets_the_quick_stop_and_is_left_holding():
     here = StringWorld(twist_nm=300.0)
     here.drive.misbehave = lambda drive, sample: sample._replace(mode=None)
@@ -107,6 +111,7 @@ def test_a_drive_that_leaves_speed_mode_gets_the_quick_stop_and_is_left_holding(
     assert here.drive.disabled_at == []
 
 
+@pytest.mark.heavy
 def test_a_drive_that_falls_out_while_it_lets_go():
     here = StringWorld(twist_nm=300.0)
 
@@ -140,6 +145,7 @@ def test_torque_that_is_still_reported_by_a_drive_without_any_is_not_held():
     assert report.confirmed, report.trouble
 
 
+@pytest.mark.heavy
 def test_torque_that_does_not_come_down_is_given_up_and_held():
     here = StringWorld(twist_nm=300.0)
     here.drive.misbehave = lambda drive, sample: sample._replace(torque_nm=300.0)
@@ -170,6 +176,7 @@ def test_a_drive_that_falls_silent_is_left_to_its_watchdog(begin, dead):
     assert here.drive.cycles < begin + 150
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("begin", [2, 60])
 def test_single_lost_frames_are_survived(begin):
     here = StringWorld(twist_nm=60.0, speed=1.0, stiffness=50.0)
@@ -217,6 +224,7 @@ def test_one_wrong_report_is_not_followed(told):
     assert max(abs(command.speed_rad_s) for command in here.drive.commands) <= 4.0
 
 
+@pytest.mark.heavy
 def test_a_speed_beyond_the_limit_is_braked_from_the_limit():
     here = StringWorld(speed=1e12, stiffness=0.1)
     here.stop_sequence().run()

@@ -40,6 +40,7 @@ def test_the_working_confidence_makes_up_for_looking(threshold, looks):
     assert mended >= 0.95 - chance
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("confidence", [0.8, 0.95, 0.99])
 def test_the_correction_is_small_and_vanishes_with_a_long_pilot(confidence):
     working = [working_confidence(confidence, dof) for dof in (10.0, 20.0, 80.0, 2000.0)]

@@ -120,6 +120,7 @@ def test_a_top_that_yields_damps_what_a_stiff_one_holds_on_to():
     assert max(abs(speed - 3.0) for speed in calmed.setpoints_rad_s) <= 1.0 + 1e-9
 
 
+@pytest.mark.heavy
 def test_a_sound_drive_over_a_ringing_string_is_not_called_wrong_signed():
     here = World(RingingDrive(), LIMITS)
     run = here.runner(ExcitationRequest(periods=2)).run()
@@ -129,6 +130,7 @@ def test_a_sound_drive_over_a_ringing_string_is_not_called_wrong_signed():
     assert "torque_answer" not in here.log.facts
 
 
+@pytest.mark.heavy
 def test_a_wrong_sign_over_a_ringing_string_is_still_refused():
     here = World(RingingDrive(unsigned=True), LIMITS)
     run = here.runner(ExcitationRequest(periods=2)).run()
@@ -233,6 +235,7 @@ def test_a_window_that_a_restless_string_fills_leaves_no_room_to_plan_in():
     assert "speed loop" not in str(hit.value)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("bit_nm", [0.0, 400.0])
 def test_a_string_that_was_calm_before_is_seen_to_swing_where_the_probe_is_tried(bit_nm):
     limits = replace(LIMITS, wave_impedance_nm_s_rad=1000.0)
@@ -302,6 +305,7 @@ class KeepingLog(FakeLog):
         return self.builder.recording(complete=complete)
 
 
+@pytest.mark.heavy
 def test_a_run_that_is_told_before_an_echo_learns_how_its_torque_answered():
     here = World(RingingDrive(), replace(LIMITS, wave_impedance_nm_s_rad=486.0, echo_s=2.0))
     here.log = KeepingLog()

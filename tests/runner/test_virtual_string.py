@@ -77,6 +77,7 @@ def stopped(here, result):
     assert all(one.torque_nm == 0.0 and one.mode is Mode.SPEED for one in here.drive.commands[cycles:])
 
 
+@pytest.mark.heavy
 def test_ctrl_c_while_the_bit_sticks_takes_the_string_away_first(world, course):
     here = world(FakeDrive(), ROOM)
     speeds = []
@@ -106,6 +107,7 @@ def frozen(first):
     return misbehave
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("name", "cause", "said"), [
     ("powerless", ReportsContradict, "does not do what the torque accounts for|contradict each other"),
     ("frozen", (ReportsContradict, CommunicationLost), "frozen|does not do"),
@@ -145,6 +147,7 @@ def test_what_befalls_the_drive_ends_the_stage_and_the_shaft_comes_to_rest(world
     assert outcomes(result) == up_to("acquire")
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("figure", "said"), [
     ("put_in_j", "the loop's errors have put 1000000 J"), ("net_nm", "the loop oscillates with"),
 ])
@@ -179,6 +182,7 @@ def test_a_result_of_another_rig_is_refused(world, course):
     assert_at_rest(here, result)
 
 
+@pytest.mark.heavy
 def test_a_torque_limit_that_acts_fades_the_string_out_and_leaves_no_result(world, course):
     tight = replace(ROOM, torque_nm=350.0)
     here = world(FakeDrive(), tight)

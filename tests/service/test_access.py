@@ -393,6 +393,7 @@ def test_a_login_on_a_full_disk_holds_as_long_as_the_process(guarded, monkeypatc
 # -- two of them
 
 
+@pytest.mark.heavy
 def test_two_who_ask_at_once_are_one_run(guarded):
     answers: list[Any] = []
     asking = [threading.Thread(target=lambda who=who: answers.append(guarded(
@@ -545,6 +546,7 @@ def test_at_this_computer_everybody_may_until_there_are_users(service):
         assert "start tdhil serve again" in refused.json()["error"]["next_step"]
 
 
+@pytest.mark.heavy
 def test_a_watched_rig_moves_for_who_is_known_alone(guarded):
     """Without a login it is refused: tests/service/test_api.py."""
     for headers in (guarded.of_token("operator"), guarded.sessions["operator"]):
@@ -626,6 +628,7 @@ def test_what_is_kept_tells_nothing(tmp_path):
     assert accounts.known.of_token("") is None
 
 
+@pytest.mark.heavy
 def test_a_password_costs_what_it_should(monkeypatch):
     """32 MB and three passes, whatever the tests take here; as RFC 7914 has it for a salt and a cost of its own."""
     monkeypatch.undo()
@@ -712,6 +715,7 @@ def test_users_and_tokens_on_the_terminal(tmp_path, capsys, monkeypatch):
 # -- a drive without a run, what is public, and how many runs may show a code
 
 
+@pytest.mark.heavy
 def test_everybody_stops_a_run_and_a_drive_that_tdhil_moves_and_an_operator_any_drive(guarded, monkeypatch):
     """Decision 0022: a stop of a drive that no tdhil moves opens its bus."""
     stopped: list[str] = []
@@ -783,6 +787,7 @@ def test_an_address_has_a_limit_of_its_own_and_what_was_refused_does_not_count()
         pace.begin("user-99", "192.0.2.2", "r")
 
 
+@pytest.mark.heavy
 def test_runs_that_show_a_code_are_limited_and_simulated_ones_are_not(guarded, monkeypatch):
     monkeypatch.setattr(RequestPace, "LIMITS", ((600.0, 2, 9), (86_400.0, 40, 120)))
     for _ in range(2):

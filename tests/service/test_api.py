@@ -25,6 +25,7 @@ from tests.service.conftest import HANGS_S, URL, Service, wait_for
 # -- what there is
 
 
+@pytest.mark.heavy
 def test_the_document_is_one(call):
     jsonschema.Draft202012Validator.check_schema({"$defs": call.document["components"]["schemas"]})
     assert call.document == document()
@@ -42,6 +43,7 @@ THERE = (
 )
 
 
+@pytest.mark.heavy(but_first=4)
 @pytest.mark.parametrize("route", THERE)
 def test_what_others_build_on_is_there_and_described(call, client, route):
     method, _, path = route.partition(" ")
@@ -212,6 +214,7 @@ def test_a_replay_that_cannot_be_says_why_and_one_of_a_live_run_waits_for_its_en
     assert failed["error"]["what"] == "no such model"
 
 
+@pytest.mark.heavy
 def test_a_rig_s_results_over_time_and_runs_side_by_side(call, service, monkeypatch):
     assert call("GET", "/rigs/a/trend", 200)["trend"]["results"] == 0
     call("GET", "/rigs/nobody/trend", 404)
@@ -396,6 +399,7 @@ def test_a_rig_that_may_not_move_from_here(call):
     assert "never.yaml" in refused["where"]
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize(("options", "status", "words"), [
     ({"accept_no_watchdog": True}, 403, "never accepted over HTTP"),
     ({"accept-no-watchdog": True}, 403, "never accepted over HTTP"),
@@ -508,6 +512,7 @@ def test_every_answer_says_what_a_page_may_do(client):
 # -- what dies
 
 
+@pytest.mark.heavy
 def test_a_run_whose_process_is_killed_is_told_of_and_its_drive_stopped(call, service):
     run = call.start(what="die")["id"]
     service.wait(run, "interrupted")
@@ -517,6 +522,7 @@ def test_a_run_whose_process_is_killed_is_told_of_and_its_drive_stopped(call, se
     assert call("GET", "/rigs/a", 200)["state"] == "free"
 
 
+@pytest.mark.heavy
 def test_so_it_is_on_a_full_disk_once_there_is_room(call, service, monkeypatch):
     save, room = service.store.save, threading.Event()
 
@@ -536,6 +542,7 @@ def test_so_it_is_on_a_full_disk_once_there_is_room(call, service, monkeypatch):
     wait_for("its end", lambda: not service.supervisor.live())
 
 
+@pytest.mark.heavy
 def test_a_real_drive_that_no_stop_reaches_blocks_its_rig_until_somebody_signs(call, service):
     run = call.start("real", what="ask")["id"]
     service.wait(run, "awaiting_confirmation")
@@ -589,6 +596,7 @@ def test_a_stop_of_a_run_that_has_ended_leaves_it_as_it_is(call, service):
     assert sorted(one.name for one in service.store.place(run).iterdir()) == before
 
 
+@pytest.mark.heavy
 def test_nothing_moves_by_a_restart(call, service, tmp_path, rigs):
     run = call.start("real", what="ask")["id"]
     service.wait(run, "awaiting_confirmation")

@@ -158,6 +158,7 @@ def test_systemd_takes_the_unit(tmp_path):
     assert done.returncode == 0, done.stdout[-300:] + done.stderr
 
 
+@pytest.mark.heavy
 @pytest.mark.skipif(sys.platform != "linux", reason="oom_score_adj is Linux's")
 def test_arithmetic_goes_first_where_memory_runs_out():
     code = ("import pathlib, sys; from tdhil.service import worker; worker.main(['plan']);"

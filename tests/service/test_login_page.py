@@ -57,6 +57,7 @@ def fits(page: Any) -> None:
                 if one["impact"] in ("serious", "critical")] == []
 
 
+@pytest.mark.heavy
 def test_from_the_login_to_a_run_and_out_again(page, served):
     page.goto("/start/a")
     page.wait_for_url("**/login?next=%2Fstart%2Fa")
@@ -100,6 +101,7 @@ def test_a_page_whose_login_has_ended_says_so_and_still_stops(page, served):
     page.wait_for_url("**/login?next=**")
 
 
+@pytest.mark.heavy
 def test_a_page_from_before_a_new_login_still_stops(page, served):
     run = served.service.supervisor.start_run("a", {"note": "hold"}, "operator").request.id
     served.service.wait(run, "moving")
@@ -155,6 +157,7 @@ def test_an_admin_s_accounts(page, served):
     assert page.evaluate("window.pwned === undefined")
 
 
+@pytest.mark.heavy
 def test_an_engineer_edits_limits(page, served, rigs):
     page.goto("/")
     log_in(page, "engineer")

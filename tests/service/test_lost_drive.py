@@ -65,6 +65,7 @@ def other_port(path: Path) -> None:
     path.write_text(path.read_text().replace("host: 127.0.0.1", "host: 127.0.0.2"))
 
 
+@pytest.mark.heavy
 def test_the_stop_after_a_lost_run_goes_where_the_run_went(service, stops):
     run = lost_run(service)
     assert stops.commands == [["tdhil.service.drive_stop", str(service.store.place(run) / CONNECTION_FILE)]]
@@ -74,6 +75,7 @@ def test_the_stop_after_a_lost_run_goes_where_the_run_went(service, stops):
     assert service.supervisor.blocked("real") is None
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("change", [other_port, lambda path: path.write_text(path.read_text() + "# a word\n"),
                                     lambda path: path.unlink()])
 def test_a_rig_s_file_that_was_changed_meanwhile_leaves_the_stop_unconfirmed(service, stops, change):
@@ -96,6 +98,7 @@ def test_a_rig_s_file_that_was_changed_meanwhile_leaves_the_stop_unconfirmed(ser
     assert service.supervisor.blocked("real") is None
 
 
+@pytest.mark.heavy
 def test_without_a_kept_connection_the_rig_s_file_counts_as_long_as_it_is_the_same(service, stops):
     path = service.supervisor.rigs.get("real").path
     run = lost_run(service, kept=False)
@@ -103,6 +106,7 @@ def test_without_a_kept_connection_the_rig_s_file_counts_as_long_as_it_is_the_sa
     assert service.store.status(run).state is State.INTERRUPTED
 
 
+@pytest.mark.heavy
 def test_without_a_kept_connection_and_with_another_file_no_drive_is_stopped(service, stops):
     run = lost_run(service, kept=False, change=other_port)
     assert stops.commands == []
@@ -111,6 +115,7 @@ def test_without_a_kept_connection_and_with_another_file_no_drive_is_stopped(ser
     assert "no stop was sent" in status.error.what
 
 
+@pytest.mark.heavy
 def test_a_drive_that_was_not_seen_at_rest_blocks_its_rig_and_stop_goes_to_it(service, stops):
     """Its rig's Stop goes to the run's own drive, whatever the file says by then."""
     stops.code, stops.said = 8, "is not JSON"
@@ -138,6 +143,7 @@ def test_a_drive_that_was_not_seen_at_rest_blocks_its_rig_and_stop_goes_to_it(se
         (one.who, one.what, one.run, one.rig) for one in service.audit.entries()})
 
 
+@pytest.mark.heavy
 def test_another_drive_at_the_run_s_address_is_not_the_run_s(service, stops, monkeypatch):
     stops.code, stops.said = 8, json.dumps({"at_rest": True, "same_drive": False, "identity": "1, 2, 3, 99"})
     status = service.store.status
@@ -155,6 +161,7 @@ def test_another_drive_at_the_run_s_address_is_not_the_run_s(service, stops, mon
 # -- a process that stands still
 
 
+@pytest.mark.heavy
 def test_a_stop_to_a_process_that_stands_still_kills_it_and_says_that_nothing_was_seen(call, service, stops):
     run = call.start("real", what="ask")["id"]
     service.wait(run, "awaiting_confirmation")
@@ -184,6 +191,7 @@ def suspend(pid: int) -> None:
     wait_for("its standstill", lambda: stands_still(pid))
 
 
+@pytest.mark.heavy
 def test_a_rig_whose_run_stands_still_answers_the_same(call, service):
     run = call.start("a", what="hold")["id"]
     service.wait(run, "moving")

@@ -103,6 +103,7 @@ def publishing(port: int, look: Any, said: list[str], **more: Any) -> Iterator[P
         publisher.close()
 
 
+@pytest.mark.heavy
 def test_states_and_results_are_told_as_they_change(service):
     heard, said = Heard(), []
     with publishing(heard.port, service.web.told, said):
@@ -250,6 +251,7 @@ def test_addresses_and_what_stands_beside_them():
         Publisher(Broker.of("mqtts://host", {"TDHIL_MQTT_CA_FILE": "/no/such/file"}), dict)
 
 
+@pytest.mark.heavy
 @pytest.mark.skipif(shutil.which("mosquitto") is None, reason="mosquitto is not installed (apt-get install mosquitto)")
 def test_a_real_broker_keeps_it_for_who_comes_later(service, tmp_path):
     """mosquitto: who subscribes afterwards gets the latest, and after a kill the last will."""

@@ -175,6 +175,7 @@ def second(served: Served, run: str) -> str:
     return str(other.request.id)
 
 
+@pytest.mark.heavy
 def test_from_the_rigs_to_a_result_by_keyboard_alone(page, served, monkeypatch):
     monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": PLAN})
     page.goto("/")
@@ -321,6 +322,7 @@ HIDE = """hidden => {
 }"""
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("way", "how"), [("hidden", "hidden"), ("closed", "closed"), ("offline", "silent")])
 def test_a_watched_run_brakes_once_its_page_is_gone(page, served, way, how):
     run = watched_run(page, served)
@@ -339,6 +341,7 @@ def test_a_watched_run_brakes_once_its_page_is_gone(page, served, way, how):
     assert lost(served, run) == how
 
 
+@pytest.mark.heavy
 def test_a_watched_run_goes_on_when_its_page_is_loaded_anew_or_hidden_for_a_moment(page, served):
     run = watched_run(page, served)
     page.reload()
@@ -360,6 +363,7 @@ def test_a_watched_run_goes_on_when_its_page_is_loaded_anew_or_hidden_for_a_mome
     assert lost(served, run) == "closed"
 
 
+@pytest.mark.heavy
 def test_a_run_that_hears_no_stop_is_not_called_stopped(page, served):
     """Its process is frozen: SIGTERM reaches it, and does nothing."""
     run = begin(served, "frozen")
@@ -425,6 +429,7 @@ def test_the_steps_of_a_torque_calibration(page, served, monkeypatch):
     assert page.evaluate("window.pwned") is None
 
 
+@pytest.mark.heavy
 def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypatch):
     run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
     served.service.wait(run, "done")
@@ -504,6 +509,7 @@ def test_a_newcomer_clicks_twice_and_has_a_result(browser, tmp_path):
               f" load {os.getloadavg()[0]:.1f}")
 
 
+@pytest.mark.heavy
 def test_a_page_says_when_nobody_answers_any_more(page, served, monkeypatch):
     run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
     served.service.wait(run, "done")
@@ -518,6 +524,7 @@ def test_a_page_says_when_nobody_answers_any_more(page, served, monkeypatch):
         page.locator("body:not(.stale)").wait_for()
 
 
+@pytest.mark.heavy
 def test_what_comes_from_rigs_drives_and_logs_is_text_on_every_page(page, served, monkeypatch):
     run = served.service.supervisor.start_run("hostile", {"note": "done", "operator": HOSTILE}, "local").request.id
     served.service.wait(run, "done")
@@ -533,6 +540,7 @@ def test_what_comes_from_rigs_drives_and_logs_is_text_on_every_page(page, served
         page.get_by_text(HOSTILE).first.wait_for()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_every_page_fits_a_phone_and_can_be_read(browser, served, monkeypatch, scheme):
     """No page is wider than 390 px; axe-core, where TDHIL_AXE names its file, finds no serious fault."""

@@ -82,6 +82,7 @@ def test_a_rig_s_file_that_was_changed_before_the_process_began_ends_it(tmp_path
     assert not list(asked.folder.glob("*.mcap"))
 
 
+@pytest.mark.heavy
 def test_where_its_drive_is_is_kept_before_the_bus_is_opened(tmp_path, nobody_s_port):
     """Nobody answers there, so that the run fails at its first word to the drive."""
     asked = Asked(tmp_path, f"modbus: {{host: 127.0.0.1, port: {nobody_s_port}}}\n{LIMITS}", simulated=False)
@@ -95,6 +96,7 @@ def test_where_its_drive_is_is_kept_before_the_bus_is_opened(tmp_path, nobody_s_
     assert plain["profile_text"].startswith("#") or "bus: modbus" in plain["profile_text"]
 
 
+@pytest.mark.heavy
 def test_a_run_that_cannot_keep_where_its_drive_is_opens_no_bus(tmp_path, nobody_s_port, monkeypatch):
     def full(path: Path, plain: object) -> None:
         if path.name == CONNECTION_FILE:
@@ -125,6 +127,7 @@ def test_what_comes_over_its_socket_has_an_answer_each(tmp_path):
     process.board.close()
 
 
+@pytest.mark.heavy
 def test_a_simulated_run_from_its_request_to_its_result(tmp_path, nicer):
     asked = Asked(tmp_path, SIMULATED, seed=7, rate_hz=50.0)
     process = RunProcess(asked.folder)

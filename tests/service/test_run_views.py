@@ -21,6 +21,7 @@ from tests.service.conftest import wait_for
 HOSTILE = "<script>alert(1)</script>"
 
 
+@pytest.mark.heavy
 def test_a_run_has_the_pictures_of_its_report(call, service):
     run = call.start()["id"]
     service.wait(run, "done")
@@ -37,6 +38,7 @@ def test_a_run_has_the_pictures_of_its_report(call, service):
         call("GET", f"/runs/{run}/pictures/{number}", 404)
 
 
+@pytest.mark.heavy
 def test_samples_are_a_table(call, service, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "run.mcap")
@@ -98,6 +100,7 @@ def hurry(fleets: Fleets) -> None:
         os.setpriority(os.PRIO_PROCESS, process.pid, 0)
 
 
+@pytest.mark.heavy
 def test_many_logs_are_identified_again_and_wait_while_a_shaft_turns(call, service, logs):
     turns = [True]
     service.web.fleets = fleets = Fleets(service.store, {"logs": logs}, lambda: turns[0])
@@ -128,6 +131,7 @@ def test_many_logs_are_identified_again_and_wait_while_a_shaft_turns(call, servi
     assert [one["what"] for one in call("GET", "/audit", 200)["entries"]].count("fleet asked") == 3
 
 
+@pytest.mark.heavy
 def test_a_fleet_that_is_ended_or_whose_web_dies_keeps_what_is_done(call, service, logs):
     turns = [True]
     service.web.fleets = fleets = Fleets(service.store, {"logs": logs}, lambda: turns[0])
@@ -168,6 +172,7 @@ def two_ended(call, service):
     return runs
 
 
+@pytest.mark.heavy
 def test_two_runs_of_a_rig_give_its_torque_calibration(call, service, monkeypatch):
     without, loaded = two_ended(call, service)
     asked = []
@@ -189,6 +194,7 @@ def test_two_runs_of_a_rig_give_its_torque_calibration(call, service, monkeypatc
     assert len(asked) == 1
 
 
+@pytest.mark.heavy
 def test_the_worker_calibrates_as_the_command_does(tmp_path, monkeypatch):
     from tests.calibration import bodies
 

@@ -123,6 +123,7 @@ def test_a_run_outlives_its_web_and_is_one_result(tmp_path):
     assert one == found["result"]
 
 
+@pytest.mark.heavy
 def test_half_requests_that_are_cut_off_leave_no_traceback(tmp_path):
     """Each took two of them, 5 KB of log and the time of a stop that came after it."""
     with served(tmp_path / "data") as server:
@@ -140,6 +141,7 @@ def test_half_requests_that_are_cut_off_leave_no_traceback(tmp_path):
         assert "ERROR" not in server.said()
 
 
+@pytest.mark.heavy
 @pytest.mark.real_time
 def test_its_end_brakes_what_moves(tmp_path):
     """SIGTERM, as of `systemctl stop`: the shaft is at rest before the service ends. A stop of a page comes to the
@@ -242,6 +244,7 @@ def test_a_certificate_that_does_not_serve_is_refused_in_words(tls, tmp_path, ca
     assert main(["serve", "--allowed-host", "rig:80", "--tls-cert", str(cert), "--tls-key", str(key)]) == ExitCode.USAGE
 
 
+@pytest.mark.heavy
 def test_with_users_it_is_reached_over_tls_with_a_token_alone(tls, tmp_path):
     """As a process: a token over TLS may; none, another, an open line and a name that isn't ours may not."""
     data = tmp_path / "data"

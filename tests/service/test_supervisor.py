@@ -97,6 +97,7 @@ def test_a_service_that_brakes_begins_nothing_more(service):
     assert service.supervisor.not_at_rest == [loose]
 
 
+@pytest.mark.heavy
 def test_a_service_that_waited_long_enough_says_what_still_lives(service):
     service.supervisor.start()
     run = begun(service, "frozen")
@@ -258,6 +259,7 @@ def test_an_edit_waits_for_nobody_who_has_the_rig(service, monkeypatch, rigs):
     wait_for("the audit", lambda: ("anna", "rig file edited", None, "real") in lines(service))
 
 
+@pytest.mark.heavy
 def test_a_process_that_is_lost_is_looked_after_once_and_the_others_all_the_same(service, monkeypatch):
     service.supervisor.start()
     run, other = begun(service), begun(service, "hold", "b")
@@ -318,6 +320,7 @@ def test_what_is_left_of_a_lost_run_is_its_result(service, monkeypatch):
     wait_for("the index", lambda: [one.verdict for one in service.index.find()] == ["valid"])
 
 
+@pytest.mark.heavy
 def test_arithmetic_that_fails_says_why(service, monkeypatch):
     with pytest.raises(RunRefused, match="nosuch") as refused:
         service.supervisor.work("plan", None, {"rig_file": "/nosuch/rig.yaml", "options": {}})

@@ -71,6 +71,7 @@ def test_what_can_be_neither_found_nor_saved_is_an_error(opened, monkeypatch):
     assert caught.value.exit_code == 3
 
 
+@pytest.mark.heavy
 def test_a_run_says_where_its_log_is(tmp_path, monkeypatch, capsys):
     """By the command line, with the folder renamed while the shaft turns."""
     from tdhil.cli.main import main

@@ -57,6 +57,7 @@ def swinging(rows: int, columns: int) -> np.ndarray:
     return 150.0 * np.sin(2.0 * np.pi * time / 900.0 + np.arange(columns)) + 20.0
 
 
+@pytest.mark.heavy
 def test_agrees_with_the_scalar_plant_through_starts_reversals_and_sticks():
     torques = swinging(4000, len(RIGS))
     torques[1500:2200] = 5.0      # sticks

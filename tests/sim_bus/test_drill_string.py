@@ -44,6 +44,7 @@ def moved(string: DrillString, torques: list[float], dt_s: float = DT) -> tuple[
     return states, np.diff([0.0] + [state.angle_rad for state in states]) / dt_s
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("end", ENDS)
 @pytest.mark.parametrize("hz", [0.05, 0.2, 0.45, 0.7, 1.1, 2.0, 5.0])
 def test_a_sine_meets_the_analytic_impedance(end: str, hz: float) -> None:
@@ -58,6 +59,7 @@ def test_a_sine_meets_the_analytic_impedance(end: str, hz: float) -> None:
     assert abs(found / impedance(params, hz) - 1.0) < 1e-3
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("end", ENDS)
 def test_the_response_to_an_impulse_meets_it_too(end: str) -> None:
     """One step of torque, every frequency at once: the transform of what follows is 1/impedance."""
@@ -107,6 +109,7 @@ def energy(string: DrillString, state: StringState) -> float:
             + 0.5 * bottom * state.bottom_speed_rad_s**2 + waves)
 
 
+@pytest.mark.heavy
 @settings(max_examples=25, deadline=None)
 @given(end=st.sampled_from(ENDS), friction=st.sampled_from(["coulomb", "stribeck"]), drag=st.sampled_from([0.0, 0.02]),
        torque=st.floats(-3000, 3000), viscous=st.floats(0, 50))
@@ -140,6 +143,7 @@ def test_without_friction_none_is_lost() -> None:
     assert energy(string, state) == pytest.approx(begin, rel=1e-5)
 
 
+@pytest.mark.heavy
 def test_a_clamped_string_holds_the_torque_by_its_twist() -> None:
     params = StringParams(bottom_end="clamped", coulomb_nm=0.0, viscous_nm_s_rad=400.0)
     string = DrillString(params)

@@ -81,6 +81,7 @@ def test_profile_torque_ramps_by_its_slope(bench: Open) -> None:
     assert host.read(0x6074, signed=True) == 100
 
 
+@pytest.mark.heavy
 def test_limits_show_in_bit_11(bench: Open) -> None:
     simulated, host = bench()
     host.set_up(mode=10)
@@ -97,6 +98,7 @@ def test_limits_show_in_bit_11(bench: Open) -> None:
     assert host.cycle(torque=140, times=30)[1] == 20
 
 
+@pytest.mark.heavy(but_first=5)
 @pytest.mark.parametrize("mode", [9, 10])
 @pytest.mark.parametrize(("option", "end"), [(0, "off"), (1, "off"), (2, "off"), (3, "off"), (5, "quick stop"),
                                              (6, "quick stop"), (7, "quick stop")])
@@ -161,6 +163,7 @@ def watched(host: Any, option: int, behaviour: int = 1) -> None:
     assert host.emcy() == []
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("option", "first", "last"), [
     (0, "enabled", "enabled"), (1, "reaction", "fault"), (2, "off", "off"), (3, "quick stop", "off"),
 ])
@@ -204,6 +207,7 @@ def test_error_behaviour(bench: Open, behaviour: int, nmt: int) -> None:
     assert simulated.simulator.node.nmt.state == (127 if nmt == 4 else nmt)
 
 
+@pytest.mark.heavy
 def test_reset_needs_an_edge(bench: Open) -> None:
     _, host = bench()
     watched(host, 1)

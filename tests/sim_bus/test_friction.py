@@ -109,6 +109,7 @@ CASES = {
 }
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("dt_s", [0.002, 0.0005])
 @pytest.mark.parametrize("name", CASES)
 def test_start_reversal_and_stick_as_integrated_between_events(name: str, dt_s: float) -> None:
@@ -120,6 +121,7 @@ def test_start_reversal_and_stick_as_integrated_between_events(name: str, dt_s: 
 SHORT = ((0.0, 0.02, 100.0), (0.02, 0.04, -90.0), (0.04, 0.08, 40.0))
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("words", "bound"), [
     ({"friction": "coulomb"}, 1e-9),
     ({"friction": "stribeck"}, 1e-5),
@@ -133,6 +135,7 @@ def test_a_shaft_ten_thousand_times_lighter_is_still_followed(words: dict[str, o
     assert deviation(Params(inertia_kg_m2=0.01, **words), 0.002, SHORT) < bound  # type: ignore[arg-type]
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("inertia", [0.01, 1.0, 104.0])
 @pytest.mark.parametrize("words", [
     {"friction": "lugre", "lugre_stiffness_nm_rad": stiffness, "lugre_damping_nm_s_rad": damping}

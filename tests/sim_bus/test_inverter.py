@@ -146,6 +146,7 @@ def test_quanta() -> None:
     assert drive.reporting.torque_nm == pytest.approx(round(drive.reporting.torque_nm), abs=1e-9)
 
 
+@pytest.mark.heavy
 def test_noise_has_the_size_it_says_and_repeats_with_its_seed() -> None:
     def load(seed: int) -> list[float]:
         params = RigParams(plant=Params(coulomb_nm=1e6), noise=NoiseParams(speed_sensor_rad_s=0.0, torque_nm=0.0))

@@ -124,6 +124,7 @@ def test_reactions(reaction: str, state: int, braking: bool, at_rest: bool) -> N
     assert (abs(simulated.speed_rad_s) < 0.01) is at_rest
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("fed_by", "reads", "parameters", "commands"), [
     ("any_request", True, True, True), ("writes", False, True, True), ("control_word", False, False, True),
 ])
@@ -145,6 +146,7 @@ def test_what_feeds_the_watchdog(fed_by: str, reads: bool, parameters: bool, com
 WORDS = st.sampled_from([0x00, 0x02, 0x06, 0x07, 0x0F, 0x0F, 0x0F, 0x80, 0x10F])
 
 
+@pytest.mark.heavy
 @settings(max_examples=12, deadline=None)
 @given(st.lists(st.tuples(WORDS, st.integers(-60, 60), st.integers(-300, 300), st.integers(0, 1)), max_size=25))
 def test_whatever_was_said_silence_brings_the_shaft_to_rest(said: list[tuple[int, int, int, int]]) -> None:
@@ -194,6 +196,7 @@ def modbus_profiles() -> list[str]:
     return [name for name in profile_names() if isinstance(load_profile(name), ModbusProfile)]
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("name", modbus_profiles())
 def test_every_profile_is_worn_turns_and_stops(name: str) -> None:
     """By the profile's own words: its states lead to enabled, the shaft follows, its quick stop brings it to rest."""

@@ -213,6 +213,7 @@ def test_less_torque_stays_less_whatever_is_written() -> None:
     assert one.drive.machine.inverter.control.limits.torque_forward_nm == pytest.approx(most)
 
 
+@pytest.mark.heavy
 def test_what_is_reported() -> None:
     right, inverted, scaled = host(), host("encoder-inverted"), host("torque-scale=2")
     for one in (right, inverted, scaled):

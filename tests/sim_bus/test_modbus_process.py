@@ -34,6 +34,7 @@ def ready(process: subprocess.Popen[str]) -> list[str]:
     return line.split()
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_over_tcp(tmp_path: Path, number: signal.Signals) -> None:
     trace = tmp_path / "shaft.csv"
@@ -68,6 +69,7 @@ def test_over_tcp(tmp_path: Path, number: signal.Signals) -> None:
     assert all(float(a[0]) <= float(b[0]) for a, b in pairwise(rows))
 
 
+@pytest.mark.heavy
 def test_over_a_pseudo_terminal() -> None:
     process = start("--rtu", "--profile", "schneider/atv320")
     try:
@@ -158,6 +160,7 @@ PDUS = st.one_of(
 )
 
 
+@pytest.mark.heavy
 @given(st.lists(st.tuples(st.integers(0, 255), PDUS), max_size=4), st.data())
 def test_frames_survive_any_split(requests: list[tuple[int, bytes]], data: st.DataObject) -> None:
     rtu = b"".join(framed(bytes([unit]) + pdu) for unit, pdu in requests)

@@ -113,6 +113,7 @@ def test_every_plant_keeps_the_one_protocol(params: Any) -> None:
     assert plant.step(free, 0.0, 0.002, 0.0).angle_rad == plant.step(free, 0.0, 0.002, 0.0).angle_rad > 0.0
 
 
+@pytest.mark.heavy
 def test_two_masses_turn_behind_the_canopen_face(bench: Callable[..., Any], tmp_path: Path) -> None:
     """Speed mode; the trace shows the motor's shaft, not the bottom's."""
     drive = DriveParams(rated_torque_nm=10_000.0, torque_limit_nm=8000.0, speed_gain_nm_s_rad=3000.0,

@@ -125,6 +125,7 @@ def start(*arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=HOME)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_process_over_its_hub(tmp_path: Path, number: signal.Signals) -> None:
     trace = tmp_path / "shaft.csv"
@@ -154,6 +155,7 @@ def refused(*arguments: str) -> str:
     return errors
 
 
+@pytest.mark.heavy
 def test_bad_plant_file_and_used_port(tmp_path: Path) -> None:
     plant = tmp_path / "plant.yaml"
     plant.write_text("plant:\n  inertia_kg_m2: 50.0\n  inertja: 1\n")
@@ -171,6 +173,7 @@ def test_bad_options() -> None:
         assert ended.value.code == 2
 
 
+@pytest.mark.heavy
 def test_plant_and_inverter_need_no_bus() -> None:
     heavy = "sys.exit(bool({'can', 'canopen', 'scipy'} & set(sys.modules)))"
     code = f"import sys, sim_bus.plant.rigid, sim_bus.inverter; {heavy}"

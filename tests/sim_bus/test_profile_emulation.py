@@ -140,6 +140,7 @@ def test_a_silent_host_stops_the_shaft(bench: Open, tmp_path: Path, reaction: in
     assert all(sooner <= later for sooner, later in pairwise(times))
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("guard_ms", "factor"), [(0, 4), (50, 0), (0, 0)])
 def test_guarding_that_is_not_set_watches_nobody(bench: Open, guard_ms: int, factor: int) -> None:
     simulated, host = bench(profile=load_canopen_profile(S120))
@@ -215,6 +216,7 @@ def test_an_encoder_that_the_profile_does_not_know(bench: Open) -> None:
     assert store.live[0x606400]() == 2.5 * 4096             # and the angle counts in it
 
 
+@pytest.mark.heavy
 def test_velocity_mode_follows_its_setpoint_only_where_it_is_released(bench: Open) -> None:
     """CiA 402-2, vl: bits 4 (ramp enabled), 5 (not locked) and 6 (reference used) of the controlword, by raw frames."""
     simulated, host = bench(profile=load_canopen_profile("abb/acs880-fcan"))

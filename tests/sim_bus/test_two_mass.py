@@ -43,12 +43,14 @@ def measured(params: TwoMassParams, hz: float, settle_s: float = 150.0) -> tuple
     return hz, complex(np.dot(torques, turn) / np.dot(speeds, turn))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("hz", [0.02, 0.1, 0.179, 0.2, 0.5, 1.0, 3.0])
 def test_impedance(hz: float) -> None:
     hz, found = measured(SMOOTH, hz)
     assert found == pytest.approx(impedance(hz), rel=3e-4)
 
 
+@pytest.mark.heavy
 def test_resonance_and_antiresonance_are_those_of_the_closed_form() -> None:
     """Free swing: √(k(1/J_r + 1/J_L)); bottom swinging on a held motor: √(k/J_L)."""
     free = SMOOTH.model_copy(update={
@@ -72,12 +74,14 @@ def test_resonance_and_antiresonance_are_those_of_the_closed_form() -> None:
         (math.sqrt(K * (1 / JR + 1 / JL)), math.sqrt(K / JL)), rel=1e-3)
 
 
+@pytest.mark.heavy
 def test_at_low_frequency_it_is_the_sum_of_both() -> None:
     no_drag = SMOOTH.model_copy(update={"bottom": SMOOTH.bottom.model_copy(update={"viscous_nm_s_rad": 0.0})})
     hz, found = measured(no_drag, 0.01, settle_s=700.0)
     assert found.imag / (2.0 * math.pi * hz) == pytest.approx(JR + JL, rel=2e-3)
 
 
+@pytest.mark.heavy
 def test_a_stuck_bottom_sticks_exactly_and_the_spring_holds_the_torque() -> None:
     params = SMOOTH.model_copy(update={"bottom": Bottom(friction="stribeck", coulomb_nm=500.0, static_nm=800.0)})
     state = TwoMassState()
@@ -151,6 +155,7 @@ STIFF_DRIVE = DriveParams(rated_torque_nm=20_000.0, torque_limit_nm=30_000.0, sp
 BIT = Bottom(friction="stribeck", coulomb_nm=2500.0, static_nm=5000.0, stribeck_speed_rad_s=2.5, viscous_nm_s_rad=20.0)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("speed", "sticks"), [(4.0, True), (16.0, False)])
 def test_the_bit_sticks_and_slips_at_low_speed_only(speed: float, sticks: bool) -> None:
     rig = RigParams(plant=TwoMassParams(bottom=BIT), drive=STIFF_DRIVE, noise=QUIET, reporting=FAITHFUL)

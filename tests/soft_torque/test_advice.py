@@ -33,6 +33,7 @@ def beside_good_gains():
     return tune(TuneCase(STRING, DRIVE, J, present=SOFT_035, draws=6))
 
 
+@pytest.mark.heavy
 def test_nothing_worse_than_the_present_gains_is_recommended(beside_good_gains):
     """Under noise the row that is recommended, if any, is below the present one, on nearly every truth."""
     advice = beside_good_gains.advice
@@ -64,6 +65,7 @@ def test_margins_hold_on_truths_that_were_not_drawn(beside_good_gains):
     assert np.mean(kept) >= 0.95
 
 
+@pytest.mark.heavy
 def test_gains_with_thin_margins_are_not_green():
     """a = 1 matches ζ and has 14° of phase margin: the row fails, and asking for it is refused."""
     tuning = tune(TuneCase(STRING, DRIVE, J, present=SOFT_1), search=None)
@@ -73,6 +75,7 @@ def test_gains_with_thin_margins_are_not_green():
         tune(TuneCase(STRING, DRIVE, J, softness=1.6), search=None)
 
 
+@pytest.mark.heavy
 def test_a_string_without_drag_is_refused_for_its_drag():
     """Not for the lags: with the mud's drag the same request is taken."""
     bare = string_with(drag=0.0)
@@ -81,6 +84,7 @@ def test_a_string_without_drag_is_refused_for_its_drag():
     tune(TuneCase(STRING, DRIVE, J, compensated_share=0.1), search=None)
 
 
+@pytest.mark.heavy
 def test_a_shear_modulus_of_the_field_lies_in_the_interval():
     """G of 61 GPa raises the cure speed of fixed gains; draws with and without the string's tolerance show how much."""
     law = tuned_controller(STRING, 1500.0, 0.19, 0.12995)
@@ -94,6 +98,7 @@ def test_a_shear_modulus_of_the_field_lies_in_the_interval():
     assert np.ptp(np.log(wide)) > 2.0 * np.ptp(np.log(exact))
 
 
+@pytest.mark.heavy
 def test_the_turning_point_of_a_kink_is_found():
     """The least of two dampings has its largest value where they cross, between the values of J that are tried."""
     light = TopDrive(104.126, 8.1, 60.0, DRIVE.inner_lags_s)

@@ -53,6 +53,7 @@ def test_what_can_be_true_is_not(law, period_s):
     refuse_untrue(replace(CASE, law=law), period_s)
 
 
+@pytest.mark.heavy
 def test_the_course_is_laid_where_the_shaft_can_bear_it():
     program = program_for(CASE, WINDOW)
     assert program.start_rad_s == pytest.approx(44.0 * RPM)
@@ -119,6 +120,7 @@ def rows(turns_from_rpm, trials, *, damping=0.2, hertz=0.13, **more):
     return table
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("seed", range(8))
 def test_two_modes_that_are_alike_are_told_apart_in_noise(seed):
     # As a = 0.25 of the reference case has them, with what the loop's own disturbances leave of the speed.

@@ -38,6 +38,7 @@ def test_the_topmost_section_takes_the_depth():
         at_depth(collars, 150.0)
 
 
+@pytest.mark.heavy
 def test_a_row_is_what_tuning_at_that_depth_gives(scheduled):
     """At the length that the string is stated with, the row has the gains of `tune`; deeper is softer and slower."""
     alone = tune(CASE, search=None).by_kind("soft").controller
@@ -47,6 +48,7 @@ def test_a_row_is_what_tuning_at_that_depth_gives(scheduled):
     assert [row.mode_hz for row in scheduled.rows] == [string_modes_hz(at_depth(STRING, one))[0] for one in DEPTHS_M]
 
 
+@pytest.mark.heavy
 def test_rows_keep_the_margins_and_what_lies_between_is_measured(scheduled):
     """Interpolated gains are the mean of their neighbours'; their margins are those of `loop_margins` on each truth."""
     assert not any(row.failed for row in scheduled.rows)
@@ -60,6 +62,7 @@ def test_rows_keep_the_margins_and_what_lies_between_is_measured(scheduled):
         assert bool(row.failed) is bool(RequiredMargins().failed(row.worst))
 
 
+@pytest.mark.heavy
 def test_critical_speeds_stand_beside_those_of_the_present_gains():
     """Present gains of a rig that was tuned at 3,000 m, at 1,500 m: the row's critical speed is not above theirs."""
     case = replace(CASE, present=SpeedController(4000.0, 3000.0), draws=6)
@@ -67,6 +70,7 @@ def test_critical_speeds_stand_beside_those_of_the_present_gains():
     assert row.cure.median < row.compared.median
 
 
+@pytest.mark.heavy
 def test_a_depth_at_which_nothing_keeps_the_margins_says_so():
     strict = replace(CASE, required=RequiredMargins(89.0, 30.0, 1.0))
     found = schedule(strict, (1500.0, 3000.0), "soft", simulated=False)

@@ -64,6 +64,7 @@ def test_echoes_come_back_after_twice_the_way():
         assert trace.time_s[1:][near][np.argmax(jump[near])] == pytest.approx(echo * string.echo_s, abs=0.005)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("hertz", [0.1299, 0.567])
 def test_what_the_top_sends_back_is_what_theory_says(hertz):
     """A wave sent up to it, of one tone: the amplitude that comes down again, to 0.005."""
@@ -140,6 +141,7 @@ def test_sections_in_time_against_the_chain(law):
     assert np.max(np.abs(seen - expected)) < 0.02
 
 
+@pytest.mark.heavy
 def test_a_bit_sticks_and_breaks_away_as_an_integration_from_event_to_event_says():
     """One inertia on a short, stiff stretch under a ramp: breakaway at F_s, then the solution of the equation."""
     from scipy.integrate import solve_ivp
@@ -169,6 +171,7 @@ def test_a_bit_sticks_and_breaks_away_as_an_integration_from_event_to_event_says
     assert trace.bit_rad_s[trace.time_s < solution.t[swing][-1] + 0.1, 0, 0].max() == pytest.approx(highest, rel=0.03)
 
 
+@pytest.mark.heavy
 def test_a_bit_below_collars_sticks_and_slips_alike_in_finer_steps():
     """Collars as lines leave the bit next to no inertia of its own: half a tick of them; half as much does the same."""
     from tdhil.soft_torque import BottomEnd, PipeSection, StringFile, string_of
@@ -185,6 +188,7 @@ def test_a_bit_below_collars_sticks_and_slips_alike_in_finer_steps():
     assert np.max(np.abs(seen - slow[1])) < 0.08 * slow[1].max()
 
 
+@pytest.mark.heavy
 def test_cure_speeds_of_the_reference_case():
     """Four controllers of the notes: 3 rpm below the bit sticks in the end, 2 rpm above it turns."""
     cures = np.array([[183.0], [72.0], [57.0], [40.0]])
@@ -194,6 +198,7 @@ def test_cure_speeds_of_the_reference_case():
     assert (trace.last_stuck_s > 60.0).tolist() == [[True, False]] * 4
 
 
+@pytest.mark.heavy
 def test_a_critical_speed_is_found_to_its_resolution():
     """Coarse, then fine, over a window of few speeds, for one controller."""
     search = Search(lowest_rpm=48.0, highest_rpm=64.0, coarse_rpm=8.0, resolution_rpm=2.0, duration_s=50.0, calm_s=15.0)
@@ -206,6 +211,7 @@ def test_without_a_bit_there_are_no_critical_speeds():
         critical_speeds(DrillString(STRING.lines, 374.0), [(DRIVE, SOFT_1)])
 
 
+@pytest.mark.heavy
 def test_a_stuck_bit_that_is_not_freed_stays_stuck():
     """Below breakaway nothing turns; above every one that is tried, the answer is None."""
     string = string_with(static_nm=1e6, coulomb_nm=1e6)

@@ -68,6 +68,7 @@ def check_reserve(cases, points):
         assert unstable_with(string, drive, law, reserve + 0.001), (law, reserve)
 
 
+@pytest.mark.heavy
 def test_the_dead_time_reserve_is_the_smallest_that_destabilises():
     """Every dead time of a scan up to 1 ms below is stable, 1 ms above is not: random strings, drives and gains."""
     check_reserve(random_cases(50, 1), 3)

@@ -42,6 +42,7 @@ def tuned():
     return {one.kind: one for one in tune(case(), search=None).tuned}
 
 
+@pytest.mark.heavy
 def test_what_is_chosen_ranks_best_of_all_that_keep_the_margins(tuned):
     """No gains of a finer grid that keep every margin on every truth have an estimated critical speed 5 % lower."""
     own = case()
@@ -82,6 +83,7 @@ def test_the_compensated_one_is_stable_over_the_whole_interval_and_keeps_a_reser
         assert ClosedSystem(STRING, DRIVE.with_inertia(float(inertia)), one.controller).is_stable()
 
 
+@pytest.mark.heavy
 def test_the_reserve_is_kept_at_the_softness_that_is_chosen():
     """On a light rotor the softest is the best damped, and bears least."""
     light = TuneCase(STRING, TopDrive(104.126, 8.1, 60.0, DRIVE.inner_lags_s), Interval(104.126, 99.857, 108.242))
@@ -98,6 +100,7 @@ def test_a_wider_interval_leaves_less_to_compensate():
     assert shares[0] > shares[1] > shares[2]
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("kind", ["stiff", "soft", "compensated"])
 def test_intervals_are_what_two_hundred_draws_of_j_give(tuned, kind):
     """95 % of the draws lie between the ends, which are no further out than what was drawn."""
@@ -183,6 +186,7 @@ def test_softer_than_the_lags_allow_is_refused_with_its_numbers():
     assert caught.value.exit_code == 11
 
 
+@pytest.mark.heavy
 def test_more_compensation_than_the_interval_allows_is_refused_with_its_numbers():
     wide = Interval(1500.0, 850.0, 2640.0)
     with pytest.raises(TuningRefused, match=r"50 % of J compensated swings by itself if J is 850.*33 ms of lag"):
@@ -202,6 +206,7 @@ def test_broadband_is_refused_behind_these_lags(tuned):
     assert "matching needs nearly all of J" in tuned["broadband"].refusal
 
 
+@pytest.mark.heavy
 def test_a_wrong_j_costs_what_the_notes_say(tuned):
     """12.6 %: little; 76 %: half of J compensated is not stable."""
     small, large = tuned["soft"].wrong

@@ -32,6 +32,7 @@ def phasor(time_s, values, hertz):
     return 2.0 * np.mean(values * np.exp(-2j * pi * hertz * time_s))
 
 
+@pytest.mark.heavy
 def test_a_top_that_swings_feels_the_impedance_of_the_lines():
     hertz, dt_s = 0.5, 0.02
     string = string_with(**SMOOTH, length_m=1000.0, drag=0.1)
@@ -197,6 +198,7 @@ def on_ideal_rotor(loop, program, rig, period_s, seconds, unknown_nm=0.0):
     return np.array(rows), np.array(speeds)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("rig", [
     IdentifiedRig(1500.0, 8.0, 60.0, 0.4),
     IdentifiedRig(104.0, 8.0, 60.0, 0.4),                                # a bench of a fifteenth of the inertia
@@ -229,6 +231,7 @@ def test_a_torque_limit_that_acts_shows_in_the_row():
     assert rows[rows[:, 1] <= Phase.ARM, 11].sum() == 0     # fading in takes no torque of the shaft
 
 
+@pytest.mark.heavy
 def test_fading_in_and_out_leaves_the_shaft_alone():
     """What comes in of the string's torque is met by as much of the drive's."""
     rig = IdentifiedRig(1500.0, 8.0, 60.0, 0.4)

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 
 def run(*words):
     return subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=600)
@@ -22,6 +24,7 @@ def test_help_of_study_imports_nothing_heavy():
     assert "--set" in done.stdout
 
 
+@pytest.mark.heavy
 def test_a_list_needs_neither_bus_nor_pictures():
     done = run("-X", "importtime", "-m", "tdhil", "study", "list")
     assert done.returncode == 0

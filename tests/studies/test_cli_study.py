@@ -213,6 +213,7 @@ def test_a_written_study_file_can_be_changed_and_run(studies, tmp_path):
     assert json.loads(tdhil("table1", "--study", mine, "--json")[1]) == json.loads(out)
 
 
+@pytest.mark.heavy
 def test_the_seed(studies):
     assert json.loads(tdhil("table1", "--seed", 7, "--json")[1])["seed"] == 7
     code, out, _ = tdhil("table1", "figure2", "--seed", 7, "--json")
@@ -302,6 +303,7 @@ def test_ctrl_c_ends_with_130(studies):
     assert "interrupted" in err
 
 
+@pytest.mark.heavy
 def test_on_a_terminal_a_bar_moves_and_leaves_nothing_behind(studies, monkeypatch):
     from rich.console import Console
 

@@ -71,6 +71,7 @@ def test_what_cannot_be_told_apart_has_no_bound() -> None:
     assert bound_of(np.array([[1.0, 1.0], [1.0, 1.0]])) is None
 
 
+@pytest.mark.heavy
 def test_the_notes_design_has_about_the_notes_bound() -> None:
     """Half a percent at the notes' 240 s and lines; the default plan of 200 s is somewhat tighter."""
     bound = cramer_rao(PLANT["field"], 10)
@@ -148,6 +149,7 @@ def test_a_small_version_holds_and_does_not_depend_on_the_processes(seeds: int, 
     assert alone.tables[0].rows[0] == table.rows[0]
 
 
+@pytest.mark.heavy
 def test_the_picture_is_drawn() -> None:
     figure_module = pytest.importorskip("matplotlib.figure")
     outcome = COVERAGE.run(CoverageSettings(seeds=1, plants=["coarse"], periods=4, processes=1), lambda s, t: None)

@@ -29,6 +29,7 @@ def some_runs(wanted, processes):
     raise KeyboardInterrupt
 
 
+@pytest.mark.heavy
 def test_what_is_done_is_kept(monkeypatch):
     monkeypatch.setattr(study, "run_all", some_runs)
     heard = []
@@ -51,6 +52,7 @@ def test_before_the_first_runs_there_is_nothing_to_keep(monkeypatch):
         COVERAGE.run(CoverageSettings(seeds=1, plants=["field"]), lambda *told: None)
 
 
+@pytest.mark.heavy
 def test_a_whole_benchmark_says_nothing_of_it(monkeypatch):
     monkeypatch.setattr(study, "run_all", _all)
     outcome = COVERAGE.run(CoverageSettings(seeds=2, plants=["field"]), lambda *told: None)
@@ -138,6 +140,7 @@ def dies(task):
     os.abort()
 
 
+@pytest.mark.heavy
 def test_a_process_that_dies_ends_the_benchmark(monkeypatch):
     monkeypatch.setattr(simulate, "run_task", dies)
     with pytest.raises(TdhilError, match=r"process .* died.*SIGABRT.*fewer of them"):

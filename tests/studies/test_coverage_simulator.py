@@ -60,6 +60,7 @@ def test_a_report_stands_still_at_the_start_if_its_signal_does(name: str) -> Non
     assert np.allclose(seen, 7.0, rtol=1e-12)
 
 
+@pytest.mark.heavy
 def test_the_shaft_obeys_newton_at_every_line() -> None:
     plant = PLANT["field"]
     asked, shaft = quiet_shaft(plant, np.array([-1.0, 1.0]), 4)
@@ -110,6 +111,7 @@ def test_the_load_is_coloured_as_stated() -> None:
     assert np.mean(found[later:] * found[:-later]) == pytest.approx(np.exp(-1.0), abs=0.06)
 
 
+@pytest.mark.heavy
 def test_a_run_does_not_depend_on_its_company() -> None:
     plant = PLANT["coarse"]
     alone = simulate(plant, [(1, 2, 3)], 4)[0]
@@ -118,6 +120,7 @@ def test_a_run_does_not_depend_on_its_company() -> None:
         assert np.array_equal(getattr(alone, name), getattr(among, name)), name
 
 
+@pytest.mark.heavy
 def test_rounding_drops_and_rate_are_as_stated() -> None:
     plant = PLANT["coarse"]
     record = simulate(plant, [(1, 2, 3)], 4)[0]
@@ -128,6 +131,7 @@ def test_rounding_drops_and_rate_are_as_stated() -> None:
     assert np.all(np.diff(record.time_s) > 0.0)
 
 
+@pytest.mark.heavy
 def test_a_plant_whose_speed_reaches_zero_is_refused() -> None:
     wild = replace(PLANT["field"], noise=PlantNoise(load_nm=400.0, load_time_s=5.0), reading=HostSampling())
     with pytest.raises(ValueError, match="reaches zero"):

@@ -23,6 +23,7 @@ def run(**changes):
     return SimulatedFieldBench().run(wish(**changes), lambda share: None)
 
 
+@pytest.mark.heavy
 def test_the_five_stages_ran_and_a_seed_repeats_them():
     first, again, other = run(), run(), run(seed=2)
     assert [stage.name for stage in first.stages] == ["setup", "speed", "torque", "hold", "acquire"]
@@ -36,6 +37,7 @@ def test_the_five_stages_ran_and_a_seed_repeats_them():
     assert segment.amplitudes_rad_s == (0.2,)
 
 
+@pytest.mark.heavy
 def test_progress_rises_to_one():
     shares = []
     SimulatedFieldBench().run(wish(), shares.append)
@@ -45,11 +47,13 @@ def test_progress_rises_to_one():
     assert len(shares) > 20
 
 
+@pytest.mark.heavy
 def test_what_does_not_fit_is_refused_with_the_limit():
     with pytest.raises(LimitHit, match="torque limit"):
         run(amplitude_rad_s=1.5)
 
 
+@pytest.mark.heavy
 def test_ctrl_c_ends_it_as_an_interruption():
     def press(share):
         if share > 0.5 and not pressed:

@@ -62,6 +62,7 @@ def test_the_expected_slope_is_that_of_the_formula():
     assert found == pytest.approx(formula, rel=1e-12)
 
 
+@pytest.mark.heavy
 def test_one_record_alone_is_not_identifiable_and_all_together_are(records):
     for alone in records:
         assert identify(alone).verdict is Verdict.NOT_IDENTIFIABLE

@@ -52,6 +52,7 @@ def test_figure9_attenuation_and_lag_grow_with_inertia(outcomes):
     assert list(said(found).values()) == [True, True, None, None]
 
 
+@pytest.mark.heavy
 def test_figure10_is_low_pass_but_for_a_rise_the_paper_does_not_mention(outcomes):
     found = outcomes["figure10"]
     assert np.allclose(column(found, "gain")[:3], 1.0, atol=0.03)
@@ -61,6 +62,7 @@ def test_figure10_is_low_pass_but_for_a_rise_the_paper_does_not_mention(outcomes
     assert found.simulated_s == pytest.approx(10.0 * (1 / 0.1 + 1 / 0.2 + 1 / 0.5 + 1 + 1 / 2))      # ten periods each
 
 
+@pytest.mark.heavy
 def test_figure10_falls_throughout_where_the_loop_allows_it():
     """2KiJ < 2KpB + B²: no gain above 1 anywhere, and the statement holds outright."""
     found = run("figure10", ki_nm_rad=100.0, viscous_nm_s_rad=200.0, values=(0.2, 0.5, 1.0, 2.0))
@@ -93,6 +95,7 @@ def test_figure13_amplitude_comes_nearer_and_lag_grows_with_i(outcomes):
     assert list(said(found).values()) == [True, True, None]
 
 
+@pytest.mark.heavy
 def test_a_trend_that_fails_is_said_to_fail():
     """The same words on other settings: far below resonance more I means more amplitude than was asked."""
     found = run("figure13", frequency_hz=0.2, duration_s=50.0, sample_period_s=0.002)
@@ -105,6 +108,7 @@ SMALL = {
 }
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["figure14", "figure15"])
 def test_scatter_of_a_small_design(name):
     found = run(name, **SMALL)
@@ -134,6 +138,7 @@ def test_every_figure_can_be_drawn(name, outcomes):
     assert any("rad/s" in label or "kg·m²" in label or "N·m" in label for label in labels)
 
 
+@pytest.mark.heavy
 def test_matplotlib_is_not_needed_to_run():
     program = "import sys\nfrom tdhil.studies.registry import simulated_studies\nsimulated_studies()\n"
     program += "assert 'matplotlib' not in sys.modules, 'matplotlib'"

@@ -19,6 +19,7 @@ from tdhil.studies.paper.processing import torque_line
 QUIET = LoopSettings(noise_power_nm2_s=0.0, coulomb_nm=0.0, duration_s=4.0)
 
 
+@pytest.mark.heavy
 def test_without_dry_friction_it_is_a_linear_system():
     record = simulate([QUIET])
     _, asked, speed, torque = record.of(0)
@@ -103,6 +104,7 @@ def test_references():
     assert set(np.flatnonzero(lines > 1e-6 * lines.max())) == {1, 2, 3, 4}
 
 
+@pytest.mark.heavy
 def test_each_signal_by_name():
     kinds = {name: reference_of(changed(QUIET, signal=name)) for name in ("sine", "step", "chirp", "multisine")}
     assert [type(kind).__name__.lower() for kind in kinds.values()] == [f"{name}reference" for name in kinds]

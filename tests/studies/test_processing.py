@@ -54,6 +54,7 @@ def test_gain_is_output_over_input_not_what_equation_12_prints():
     assert gain(0.5 * np.sin(TIME), np.sin(TIME)) == pytest.approx(0.5)
 
 
+@pytest.mark.heavy
 @given(
     lag=st.floats(-3.0, 3.0), size=st.floats(0.01, 10.0), offset=st.floats(-10.0, 10.0),
     frequency=st.sampled_from([0.5, 1.0, 2.0]),

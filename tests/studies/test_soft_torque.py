@@ -43,6 +43,7 @@ def test_a_figure_that_is_off_is_told_with_its_reason():
     assert [one.holds for one in error_statements(errors)].count(False) == 1
 
 
+@pytest.mark.heavy
 def test_it_runs_and_draws(monkeypatch):
     """The searches are stubbed: each has its own tests."""
     pytest.importorskip("matplotlib")
