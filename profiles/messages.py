@@ -735,6 +735,10 @@ class MessageCode(Enum):
         917, "The string's impedance is not that of the declared pipe",
         "The waves travel as in the pipe, but torque over speed differs by a constant factor.",
         "Check the pipe's diameters in rig.yaml, the rated torque and the speed unit.")
+    SPEED_JUMPED = (
+        918, "The reported speed jumped during the run",
+        "Within a tenth of a second it changed by more than torque and string can do to this shaft.",
+        "Check the encoder, its cable and its scale. Repeat the run.")
 
     # --- 10xx: nothing readable in a file ----------------------------------------------------------------------------
     NOTHING_RECOVERABLE = (

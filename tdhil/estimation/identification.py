@@ -9,7 +9,14 @@ from dataclasses import replace
 
 from tdhil.estimation.case import Case, Finding, PeriodicCase
 from tdhil.estimation.conclude import conclude
-from tdhil.estimation.cross_checks import angle_checked, cross_checked, level_checked, torques_compared, torques_judged
+from tdhil.estimation.cross_checks import (
+    angle_checked,
+    cross_checked,
+    jump_checked,
+    level_checked,
+    torques_compared,
+    torques_judged,
+)
 from tdhil.estimation.data_checks import check_samples
 from tdhil.estimation.impedance import measure_impedance, refusal
 from tdhil.estimation.paper_method import paper_estimate
@@ -40,7 +47,7 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
         finding = Finding(refusal=refused.refusal)
     if case.sound:
         finding = cross_checked(finding, case)
-    finding = level_checked(angle_checked(finding, case), case)
+    finding = jump_checked(level_checked(angle_checked(finding, case), case), case)
     found = conclude(case, stretched(finding, case.recording))
     asked = case.recording.impedance
     if asked is None:

@@ -1,0 +1,136 @@
+"""A reported speed that changes faster than the identified inertia allows, above a drill string.
+
+A reported speed is an average of true speeds with weights that are not negative, so no lag makes its slope steeper
+than the greatest acceleration of the shaft:
+
+    |dz/dt| ≤ (T_max − T_load,min)/J_low
+
+`tdhil.runner.observer` tests this in every cycle. Above a string it knows J to a factor of two at best by then, and a
+sensor whose scale changes passes. Here J is the result's own, so a jump shows that the result does not stand: where the
+scale changed during the run, J is wrong by as much.
+
+The torques are those of torque mode, commanded and reported, within the longest time that a report remembers. The load
+of a string is T − Jα over the time before; it stays within its own range beyond either end.
+"""
+
+import math
+
+import numpy as np
+
+from profiles import MessageCode
+from tdhil.estimation.case import Case, Finding
+from tdhil.estimation.result import Refusal
+from tdhil.recording import FloatArray, Recording
+
+POINT_S = 0.04
+"""Samples are averaged over so long, s; a slow line has one sample for each point."""
+
+SLOPE_S = 0.12
+"""Time over which a slope of the reported speed is taken, s."""
+
+MEMORY_S = 3.0
+"""A reported slope remembers the torque of so long, s: six of the longest plausible lags (0.5 s)."""
+
+LOAD_BEFORE_S, LOAD_RANGE = 10.0, 1.0
+"""The torque of a string stays within this multiple of its range, about the middle, over so long before, s."""
+
+NOISE_SDS = 6.0
+"""Standard deviations that count as the noise of a point's speed."""
+
+NORMAL_MEDIAN = 1.4826
+"""Standard deviation of normal noise as a multiple of its median magnitude."""
+
+MOST = 0.9
+"""Slope as a share of the bound: 0.69 at most in healthy runs above a string (`benchmarks/healthy_runs.py`); 1.01 where
+a sensor doubled in stage 5, 1.4 where it lost a tenth in stage 4 (`benchmarks/lying_reports.py`)."""
+
+_IN_A_ROW = 2             # points beyond the bound: a single false report is no change of scale
+
+
+def jump_checked(finding: Finding, case: Case) -> Finding:
+    """Return the finding, taken back where the speed jumps. Never raises."""
+    inertia = finding.inertia
+    if inertia is None or not case.sound or not case.recording.winds_up or not inertia.low > 0.0:
+        return finding
+    contradiction = jump_contradiction(case.recording, inertia.low, inertia.value)
+    if contradiction is None:
+        return finding
+    return Finding(
+        finding.model, finding.words, finding.residual, lines=finding.lines, samples_used=finding.samples_used,
+        warnings=finding.warnings, contradiction=contradiction,
+    )
+
+
+def jump_contradiction(recording: Recording, inertia_low_kg_m2: float, inertia_kg_m2: float) -> Refusal | None:
+    """Return what is wrong where the speed jumps in torque mode; else None."""
+    if recording.commanded_torque_nm is None or len(recording.time_s) < 2:
+        return None
+    period_s = float(np.median(np.diff(recording.time_s)))
+    per_point = max(1, round(POINT_S / period_s))
+    point_s = per_point * period_s
+    count = len(recording.time_s) // per_point
+    time_s, speed, torque, commanded = (
+        array[: count * per_point].reshape(count, per_point)
+        for array in (recording.time_s, recording.speed_rad_s, recording.torque_nm, recording.commanded_torque_nm)
+    )
+    speed = np.mean(speed, axis=1)
+    highest = _past(np.maximum(torque, commanded).max(axis=1), MEMORY_S / point_s)
+    lowest = -_past(-np.minimum(torque, commanded).min(axis=1), MEMORY_S / point_s)
+    back = max(1, round(SLOPE_S / point_s))
+    slope = np.full(count, np.nan)
+    took_s = time_s[back:, 0] - time_s[:-back, 0]
+    whole = took_s < 1.5 * back * point_s                    # not across a gap
+    slope[back:] = np.where(whole, (speed[back:] - speed[:-back]) / took_s, np.nan)
+    load = np.mean(torque, axis=1) - inertia_kg_m2 * slope
+    # Not the jump's own: the load of the time before it.
+    before = _delayed(load, math.ceil((SLOPE_S + 0.25) / point_s))
+    load_high = _past(before, LOAD_BEFORE_S / point_s)
+    load_low = -_past(-before, LOAD_BEFORE_S / point_s)
+    middle, half = 0.5 * (load_high + load_low), LOAD_RANGE * (load_high - load_low)
+    noise = NOISE_SDS * _noise_rad_s(speed) + _count_rad_s(recording)
+    blur = 2.0 * noise / (back * point_s)
+    faster = np.maximum(0.0, highest - (middle - half)) / inertia_low_kg_m2 + blur
+    slower = np.maximum(0.0, (middle + half) - lowest) / inertia_low_kg_m2 + blur
+    bound = np.where(slope > 0.0, faster, slower)
+    beyond = np.abs(slope) > MOST * bound                    # never where one of them is not known
+    for shift in range(1, _IN_A_ROW):
+        beyond[shift:] &= beyond[:-shift]
+    if not np.any(beyond):
+        return None
+    at = int(np.argmax(beyond))
+    return Refusal(
+        f"at {time_s[at, 0]:.1f} s the reported speed went from {speed[at - back]:.2f} to {speed[at]:.2f} rad/s within"
+        f" {back * point_s:.2g} s, {abs(slope[at]):.2g} rad/s²: torque and string accelerate this shaft by"
+        f" {bound[at]:.2g} rad/s² at most, so a scale of the speed changed during the run",
+        "check the encoder, its cable and its scale; then run it again", MessageCode.SPEED_JUMPED,
+    )
+
+
+def _past(values: FloatArray, points: float) -> FloatArray:
+    """Return the greatest of this point and those before it, over so many points; NaN where one of them is NaN."""
+    width = min(len(values), 1 + math.ceil(points))
+    padded = np.concatenate([np.full(width - 1, np.nan), values])
+    greatest: FloatArray = np.max(np.lib.stride_tricks.sliding_window_view(padded, width), axis=1)
+    return greatest
+
+
+def _delayed(values: FloatArray, points: int) -> FloatArray:
+    """Return the values of so many points before; NaN where there are none."""
+    late = np.full(len(values), np.nan)
+    late[points:] = values[: len(values) - points]
+    return late
+
+
+def _noise_rad_s(speed: FloatArray) -> float:
+    """Return the standard deviation of a point's noise, by the median of its third differences: 20 times its variance.
+
+    The motion itself hardly shows in them, even at 10 Hz.
+    """
+    rough = np.abs(np.diff(speed, 3))
+    rough = rough[np.isfinite(rough)]
+    return NORMAL_MEDIAN * float(np.median(rough)) / math.sqrt(20.0) if len(rough) else math.inf
+
+
+def _count_rad_s(recording: Recording) -> float:
+    count = recording.speed_resolution_rad_s
+    return count if math.isfinite(count) else 0.0
