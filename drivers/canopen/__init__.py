@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from drivers.canopen.bus import CanLink as CanLink
     from drivers.canopen.drive import CanopenDrive as CanopenDrive
     from drivers.canopen.quick_stop import CanopenTarget as CanopenTarget
+    from drivers.canopen.scan import Heard as Heard, ask_all as ask_all
     from drivers.canopen.sdo import SdoObjects as SdoObjects
 else:
     __getattr__, __dir__ = lazy_face(__name__)

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     )
     from drivers.modbus.quick_stop import ModbusTarget as ModbusTarget
     from drivers.modbus.rtu import RtuLink as RtuLink
+    from drivers.modbus.scan import (
+        ANSWER_S as ANSWER_S, device_identification as device_identification, probe as probe,
+    )
     from drivers.modbus.state_machine import decode as decode, power_state as power_state, seen as seen
     from drivers.modbus.tcp import TcpLink as TcpLink
 else:

@@ -10,7 +10,8 @@ if TYPE_CHECKING:
     )
     from tdhil.recording.log_format import (
         CAN as CAN, CHANNELS as CHANNELS, CLASSES as CLASSES, COMMAND as COMMAND, EXCITATION as EXCITATION,
-        MODBUS as MODBUS, SAMPLE as SAMPLE, VIRTUAL_COLUMNS as VIRTUAL_COLUMNS, VIRTUAL_STRING as VIRTUAL_STRING,
+        FRAME_CHANNELS as FRAME_CHANNELS, RAW_FRAMES as RAW_FRAMES, SAMPLE as SAMPLE,
+        VIRTUAL_COLUMNS as VIRTUAL_COLUMNS, VIRTUAL_STRING as VIRTUAL_STRING,
         schema_name as schema_name,
     )
     from tdhil.recording.log_reader import read_cycles as read_cycles, read_frames as read_frames, read_run as read_run

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
         CallbackOperator as CallbackOperator, TerminalOperator as TerminalOperator, motion_summary as motion_summary,
     )
     from tdhil.session.connection import (
-        Connection as Connection, PeerPlan as PeerPlan, bus_kind as bus_kind, bus_kinds as bus_kinds,
         connection_of as connection_of, simulated_connection as simulated_connection,
     )
     from tdhil.session.drive_lock import (

@@ -17,8 +17,8 @@ from profiles import lazy_face
 from profiles.face import names_by_type_checking
 
 ROOT = Path(__file__).parents[2]
-# The stable API at the front door, and both halves of each bus, in folders of their rooms.
-WITHOUT = {"tdhil", "tdhil.cli.buses", "tdhil.session.buses"}
+# The stable API at the front door.
+WITHOUT = {"tdhil"}
 PACKAGES = {
     ".".join(path.parent.relative_to(ROOT).parts): path
     for root in ("tdhil", "drivers", "sim_bus", "profiles")
