@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from profiles import lazy_face
+from profiles import lazy_names
 
 if TYPE_CHECKING:
     from tdhil.config.keywords import (
@@ -28,4 +28,12 @@ if TYPE_CHECKING:
         require_limits as require_limits, rig_model as rig_model, simulated_default_rig as simulated_default_rig,
     )
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "keywords": "OF_THE_RESULT OF_THE_RUN OF_THE_SIMULATOR values_of with_keywords",
+        "options": "ASKED_AGAIN OPTION OPTIONS Topic Option Origin Overrides RunDetails RunOptions Setting "
+                   "form_options",
+        "registry": "BUSES DEFAULT_BUS DEFAULT_EXCITATION EXCITATIONS MODELS SPEED_UNIT_TOLERANCE has_plateaus "
+                    "imported load told_before_echo",
+        "resolution": "check_values resolve",
+        "rig": "DriveData Limits Registered Rig load_rig parse_rig require_limits rig_model simulated_default_rig",
+    })
