@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from profiles import lazy_face
+from profiles import lazy_names
 
 if TYPE_CHECKING:
     from drivers.angle import Unwrapped as Unwrapped
@@ -33,4 +33,14 @@ if TYPE_CHECKING:
         BareStopReport as BareStopReport, Ended as Ended, Target as Target, bare_stop as bare_stop,
     )
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "angle": "Unwrapped",
+        "clock": "Clock LOWER_THE_RATE MonotonicClock SteppedClock quantile",
+        "drive": "Check Command Counters Drive DriveLimits FrameTap Identity KeptAlive Mode Outcome Paced Polled "
+                 "PositionReading Positioned PowerState Preflight RawFrame Rehearsed RemovesTorque ReportingFilters "
+                 "Sample StopsFeeding Telling Timed",
+        "errors": "CommandRejected CommunicationLost DataFileError DriveFault LimitHit ModeNotConfirmed ObjectRefused "
+                  "PreflightRefused Problem ReportsContradict StopNotConfirmed TdhilError",
+        "preflight": "ACCEPTED_BY ANY_CLIENT NOTHING_STOPS_IT NO_WATCHDOG_FLAG SHARED_FLAG PreflightTable",
+        "quick_stop": "BareStopReport Ended Target bare_stop",
+    })

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from profiles.face import lazy_face as lazy_face
+from profiles.lazy import lazy_names as lazy_names
 
 if TYPE_CHECKING:
     from profiles.eds_import import begin_profile as begin_profile
@@ -12,7 +12,6 @@ if TYPE_CHECKING:
         SpeedControllerParameters as SpeedControllerParameters,
     )
     from profiles.errors import DataFileError as DataFileError, Problem as Problem, TdhilError as TdhilError
-    from profiles.face import lazy_face as lazy_face
     from profiles.library import (
         Profile as Profile, eds_path as eds_path, load_canopen_profile as load_canopen_profile,
         load_modbus_profile as load_modbus_profile, load_profile as load_profile, matching_names as matching_names,
@@ -39,4 +38,19 @@ if TYPE_CHECKING:
     )
     from profiles.yaml_tree import read_tree as read_tree
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "eds_import": "begin_profile",
+        "eds_reader": "read_eds",
+        "entry": "Confidence DriveProfile ProfileEntry Require SpeedControllerParameters",
+        "errors": "DataFileError Problem TdhilError",
+        "library": "Profile eds_path load_canopen_profile load_modbus_profile load_profile matching_names "
+                   "parse_profile profile_names profile_text",
+        "messages": "CodedText MessageCode entry_of message_of with_code",
+        "model": "DataModel Finding NonNegative Positive Validated one_of refuse_if",
+        "simulator_marker": "CYCLES_END CYCLE_ANSWER CYCLE_ASKED CYCLE_ID CYCLE_OVER LAST_CYCLE_OVER MARKER_INDEX "
+                            "MARKER_REGISTER MARKER_REGISTERS MARKER_STAGE MARKER_STAGE_REGISTER MARKER_TEXT "
+                            "STAGE_NUMBERS",
+        "visible_text": "visible",
+        "yaml_loader": "Conversion Loaded load_model load_with_lines messages_of parse_model parse_with_lines",
+        "yaml_tree": "read_tree",
+    })

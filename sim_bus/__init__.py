@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from profiles import lazy_face
+from profiles import lazy_names
 
 if TYPE_CHECKING:
     from sim_bus.command import add_kinds as add_kinds
@@ -10,4 +10,9 @@ if TYPE_CHECKING:
     from sim_bus.params import RigParams as RigParams
     from sim_bus.trace import check_trace_path as check_trace_path
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "command": "add_kinds",
+        "fault_script": "KnownFault",
+        "params": "RigParams",
+        "trace": "check_trace_path",
+    })

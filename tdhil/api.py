@@ -35,10 +35,11 @@ from tdhil.runner import StopRequest
 from tdhil.session import ByKeyword, RunRecord, read
 
 if TYPE_CHECKING:
+    from tdhil.buses import Connection, PeerPlan
     from tdhil.config import Rig, RunOptions
     from tdhil.errors import ExitCode
     from tdhil.estimation import Identification, InertiaEstimate, Verdict
-    from tdhil.session import Connection, OperatorInterface, PeerPlan, RunRequest
+    from tdhil.session import OperatorInterface, RunRequest
 
 __all__ = [
     "CoastDown", "DriveHandle", "Motion", "Multisine", "Pulses", "Result", "RunRecord", "Sine", "Step", "StopRequest",

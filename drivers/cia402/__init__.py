@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from profiles import lazy_face
+from profiles import lazy_names
 
 if TYPE_CHECKING:
     from drivers.cia402.bus import (
@@ -26,4 +26,17 @@ if TYPE_CHECKING:
     )
     from drivers.cia402.watchdog import arm as arm
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "bus": "Cia402Bus CycleInputs CycleSetpoints FeedbackSetting Traffic",
+        "drive": "Cia402Drive DRIVE_SILENT_S",
+        "limits": "check_parameters",
+        "objects": "Objects name",
+        "polling": "ANSWER_S answer_time_s",
+        "preflight": "find_units",
+        "process_data": "CONTROLWORD CyclicObjects LAYOUTS MODE MODE_DISPLAY STATUSWORD TARGET_TORQUE TORQUE_DEMAND "
+                        "bits_of cyclic_objects",
+        "quick_stop": "Cia402Target",
+        "state_machine": "State decode",
+        "supervision": "DriveWatch Group HOST_SILENT emcy_text",
+        "watchdog": "arm",
+    })

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from profiles import lazy_face
+from profiles import lazy_names
 
 if TYPE_CHECKING:
     from drivers.modbus.access import RegisterAccess as RegisterAccess
@@ -20,7 +20,23 @@ if TYPE_CHECKING:
     )
     from drivers.modbus.quick_stop import ModbusTarget as ModbusTarget
     from drivers.modbus.rtu import RtuLink as RtuLink
+    from drivers.modbus.scan import (
+        ANSWER_S as ANSWER_S, device_identification as device_identification, probe as probe,
+    )
     from drivers.modbus.state_machine import decode as decode, power_state as power_state, seen as seen
     from drivers.modbus.tcp import TcpLink as TcpLink
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "access": "RegisterAccess",
+        "codec": "from_words settle",
+        "drive": "ModbusDrive",
+        "identity": "read_marker",
+        "link": "EmbeddedLink Link",
+        "parameters": "Parameters check_name_plate check_required find_filters find_rated_torque read_parameters",
+        "pdu": "BadReply NoReply READ_HOLDING READ_INPUT read",
+        "quick_stop": "ModbusTarget",
+        "rtu": "RtuLink",
+        "scan": "ANSWER_S device_identification probe",
+        "state_machine": "decode power_state seen",
+        "tcp": "TcpLink",
+    })

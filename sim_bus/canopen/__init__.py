@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from profiles import lazy_face
+from profiles import lazy_names
 
 if TYPE_CHECKING:
     from sim_bus.canopen.command import add_arguments as add_arguments, run as run
@@ -10,4 +10,9 @@ if TYPE_CHECKING:
     from sim_bus.canopen.inline import InlineSimulator as InlineSimulator
     from sim_bus.canopen.simulator import EmbeddedSimulator as EmbeddedSimulator, Simulator as Simulator
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "command": "add_arguments run",
+        "faults": "listed listing parse_all",
+        "inline": "InlineSimulator",
+        "simulator": "EmbeddedSimulator Simulator",
+    })

@@ -1,17 +1,10 @@
 """The shaft that the simulated drive turns: rigid, of two masses, or with a drill string; with its dry friction."""
 
-from typing import TYPE_CHECKING
-
-from profiles import lazy_face
-
-if TYPE_CHECKING:
-    from sim_bus.plant.batch import (
-        FixedStep as FixedStep, LARGEST_BRISTLE_STEP as LARGEST_BRISTLE_STEP, SPEED as SPEED, Shafts as Shafts,
-        white_torque as white_torque,
-    )
-    from sim_bus.plant.kinds import (
-        AnyPlantParams as AnyPlantParams, MotorState as MotorState, PLANTS as PLANTS, build as build,
-    )
-    from sim_bus.plant.rigid import Params as Params, ShaftState as ShaftState
-else:
-    __getattr__, __dir__ = lazy_face(__name__)
+from sim_bus.plant.batch import (
+    FixedStep as FixedStep, LARGEST_BRISTLE_STEP as LARGEST_BRISTLE_STEP, SPEED as SPEED, Shafts as Shafts,
+    white_torque as white_torque,
+)
+from sim_bus.plant.kinds import (
+    AnyPlantParams as AnyPlantParams, MotorState as MotorState, PLANTS as PLANTS, build as build,
+)
+from sim_bus.plant.rigid import Params as Params, ShaftState as ShaftState

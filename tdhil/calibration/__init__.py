@@ -1,25 +1,18 @@
 """The scales of a drive's torque and speed: from known bodies, from a reference, from turns; and their file. Pure."""
 
-from typing import TYPE_CHECKING
-
-from profiles import lazy_face
-
-if TYPE_CHECKING:
-    from tdhil.calibration.added_body import (
-        BodyRun as BodyRun, CalibrationCase as CalibrationCase, CalibrationLine as CalibrationLine,
-        MeasuredValue as MeasuredValue, RunPlan as RunPlan, TorqueCalibration as TorqueCalibration,
-        calibrate_torque as calibrate_torque, plan_bodies as plan_bodies,
-    )
-    from tdhil.calibration.pairs import (
-        PairsFit as PairsFit, TorquePairs as TorquePairs, calibrate_pairs as calibrate_pairs,
-        line_with_errors_in_both as line_with_errors_in_both,
-    )
-    from tdhil.calibration.speed import (
-        CountedTurns as CountedTurns, SpeedBudgetLine as SpeedBudgetLine, SpeedCalibration as SpeedCalibration,
-        calibrate_by_position as calibrate_by_position, calibrate_by_turns as calibrate_by_turns,
-    )
-    from tdhil.calibration.stored import (
-        OWN_LOG as OWN_LOG, CalibrationUnusable as CalibrationUnusable, StoredCalibration as StoredCalibration,
-    )
-else:
-    __getattr__, __dir__ = lazy_face(__name__)
+from tdhil.calibration.added_body import (
+    BodyRun as BodyRun, CalibrationCase as CalibrationCase, CalibrationLine as CalibrationLine,
+    MeasuredValue as MeasuredValue, RunPlan as RunPlan, TorqueCalibration as TorqueCalibration,
+    calibrate_torque as calibrate_torque, plan_bodies as plan_bodies,
+)
+from tdhil.calibration.pairs import (
+    PairsFit as PairsFit, TorquePairs as TorquePairs, calibrate_pairs as calibrate_pairs,
+    line_with_errors_in_both as line_with_errors_in_both,
+)
+from tdhil.calibration.speed import (
+    CountedTurns as CountedTurns, SpeedBudgetLine as SpeedBudgetLine, SpeedCalibration as SpeedCalibration,
+    calibrate_by_position as calibrate_by_position, calibrate_by_turns as calibrate_by_turns,
+)
+from tdhil.calibration.stored import (
+    OWN_LOG as OWN_LOG, CalibrationUnusable as CalibrationUnusable, StoredCalibration as StoredCalibration,
+)

@@ -14,7 +14,7 @@ from weakref import WeakSet
 
 from profiles import quantities
 from profiles.quantities import SHARE, Unit
-from tdhil.config import ASKED_AGAIN, COMMON_LINE_FLAGS, OPTIONS, Option, Topic
+from tdhil.config import ASKED_AGAIN, OPTIONS, Option, Topic
 from tdhil.errors import MessageCode, UsageError
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -112,10 +112,12 @@ def add_drive_arguments(parser: argparse.ArgumentParser) -> argparse._ArgumentGr
 
 def add_line_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the address on any bus. python-can's own options are the most, and come last."""
-    from tdhil.session import bus_kinds
+    from tdhil.buses import all_buses
 
     before = set(parser._actions)
-    for kind in reversed(bus_kinds()):
-        kind.add_arguments(parser)
+    buses = all_buses()
+    for bus in reversed(buses):
+        bus.add_arguments(parser)
+    common = frozenset[str]().union(*(bus.common_flags for bus in buses))
     _RARE.update(action for action in parser._actions
-                 if action not in before and COMMON_LINE_FLAGS.isdisjoint(action.option_strings))
+                 if action not in before and common.isdisjoint(action.option_strings))

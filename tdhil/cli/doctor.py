@@ -18,23 +18,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivers import DataFileError, TdhilError
-from tdhil.cli.doctor_finding import DoctorFinding, bad, note, of_error, ok
+from tdhil.buses import DoctorFinding, all_buses, bad, examples, note, of_error, ok, sure_text
 from tdhil.cli.results import print_json
-from tdhil.cli.scan_common import bus_commands
 from tdhil.session.real_time import HOW, allowed
 
 if TYPE_CHECKING:
-    from tdhil.cli.scan_common import ValueSeen
+    from tdhil.buses import Connection, ValueSeen
     from tdhil.config import Rig, RunOptions
-    from tdhil.session import Connection
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The computer: versions, timer, scheduling, disk. Reads, and sleeps a tenth of a second.
 
-
-LIBRARIES = {"python-can": (4, 6), "canopen": (2, 4), "pymodbus": (3, 16)}
-"""Name on the package index → oldest supported version."""
 
 WANTED_FREE_BYTES = 200_000_000
 """Free disk space that the log requires, bytes (tdhil.recording.log_writer)."""
@@ -57,7 +52,7 @@ def host_findings(log: Path) -> Iterator[DoctorFinding]:
 def library_findings(version_of: Callable[[str], str | None]) -> Iterator[DoctorFinding]:
     """Yield whether each library is installed, and new enough."""
     pip = f"{shlex.quote(sys.executable or 'python')} -m pip"      # of this environment, whichever is active
-    for name, least in LIBRARIES.items():
+    for name, least in (one for bus in all_buses() for one in bus.libraries.items()):
         version = version_of(name)
         wanted = ".".join(map(str, least))
         if version is None:
@@ -193,10 +188,10 @@ def findings(
     yield from _profile(options, connection)
     yield from _limits(rig)
     if not (options.simulate or connection.configured):
-        yield note("drive", f"{connection.nothing_there}: no drive was checked",
-                   "Name it, such as -i socketcan -c can0, --host 192.0.2.10 or --serial /dev/ttyUSB0")
+        yield note("drive", f"{connection.bus.nothing_there}: no drive was checked",
+                   f"Name it, such as {examples()}")
     else:
-        yield from bus_commands(connection.drive).findings(
+        yield from connection.bus.findings(
             plan_peer(options, connection), connection, options, rig, registers
         )
 
@@ -217,7 +212,6 @@ def _left(folder: Path) -> Iterator[DoctorFinding]:
 
 
 def _profile(options: RunOptions, connection: Connection) -> Iterator[DoctorFinding]:
-    from tdhil.cli.profile_text import sure_text
     from tdhil.session import doubtful, is_accepted
 
     profile = connection.profile

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from tdhil.buses import Connection
     from tdhil.runner import MachineLimits, Planned
-    from tdhil.session import Connection
     from tdhil.soft_torque import EvaluationCase
 
 

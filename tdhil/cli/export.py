@@ -98,12 +98,12 @@ def _write_frames(to: str, path: Path, target: Path, epoch_ns: int) -> int:
 
 def _can_frames(path: Path) -> Iterator[RawFrame]:
     """Yield CAN frames; none for another bus: older logs have Modbus bytes on the topic of CAN frames."""
+    from tdhil.buses import bus_named
     from tdhil.config import BUSES
-    from tdhil.recording import CAN, read_frames, read_run
-    from tdhil.session import bus_kind
+    from tdhil.recording import CAN, CHANNELS, read_frames, read_run
 
     bus = read_run(path).configuration.get("drive")
-    return read_frames(path) if bus not in BUSES or bus_kind(bus).frame_channel == CAN else iter(())
+    return read_frames(path) if bus not in BUSES or bus_named(bus).frame_topic == CHANNELS[CAN][0] else iter(())
 
 
 def _rows(path: Path, simulated: int) -> Iterator[tuple[Any, ...]]:

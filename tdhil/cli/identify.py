@@ -12,22 +12,23 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from profiles import with_code
+from tdhil.buses import PeerPlan, all_buses
 from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, add_options
 from tdhil.cli.calibrate_run import add_calibrate_arguments, check_calibrate, run_calibration
 from tdhil.config import OPTION, Overrides, RunDetails, Topic, load_rig, resolve
 from tdhil.errors import ExitCode, LogError, TdhilError, code_of, error_document, exit_code
-from tdhil.session import PeerPlan, bus_kinds
 
 if TYPE_CHECKING:
+    from tdhil.buses import Connection
     from tdhil.config import Rig, RunOptions
     from tdhil.runner import RunOutcome
-    from tdhil.session import Connection, Ending, RunRequest, RunSession
+    from tdhil.session import Ending, RunRequest, RunSession
     from tdhil.soft_torque import EvaluationCase
 
 
 def list_faults() -> int:
     """Print the known faults. Return the exit code."""
-    print("\n\n".join(f"--drive {kind.name}\n\n{kind.fault_listing()}" for kind in bus_kinds()))  # noqa: T201
+    print("\n\n".join(f"--drive {bus.name}\n\n{bus.fault_listing()}" for bus in all_buses()))  # noqa: T201
     return 0
 
 
@@ -36,15 +37,15 @@ def show_settings(
 ) -> None:
     """Print the source of every value that is not a default, and conversions of values with a unit."""
     if peer.embedded:
-        why = "as requested" if options.simulate else connection.nothing_there
+        why = "as requested" if options.simulate else connection.bus.nothing_there
         clock = "stepped time" if peer.stepped else "real time"
-        what = connection.line.simulated_text
+        what = connection.bus.simulated_text
         console.print(f"SIMULATED: embedded {what} ({why}), {clock}, seed {peer.seed}", style="magenta")
         for fault in peer.faults:
             console.print(f"SIMULATED: scripted fault {fault.text}", style="magenta", markup=False)
     else:
-        for name, value, source in connection.rows():
-            console.print(f"{connection.line.row_name} {name:<10} {value}  ({source})", style="dim", markup=False)
+        for name, value, source in connection.line.rows():
+            console.print(f"{connection.bus.row_name} {name:<10} {value}  ({source})", style="dim", markup=False)
     for name, value, source in options.rows():
         if options.given(name):
             console.print(f"{name:<14} {value}  ({source})", style="dim", markup=False)

@@ -18,6 +18,7 @@ from typing import Final, NoReturn
 from profiles import with_code
 from tdhil.cli.parser import CommandParser, FrontParser
 from tdhil.cli.standard_streams import sheltered
+from tdhil.config import BUSES
 from tdhil.errors import (
     ExitCode,
     MessageCode,
@@ -100,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _main(arguments: list[str], namespace: argparse.Namespace) -> int:
     # Libraries log what we report ourselves, with where and what next.
-    for library in ("can", "canopen"):
+    for library in (name for bus in BUSES.values() for name in bus.loggers):
         logging.getLogger(library).addHandler(logging.NullHandler())
         logging.getLogger(library).propagate = False
     chosen = _chosen(arguments)

@@ -8,21 +8,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles import DataFileError, Profile, ProfileEntry, eds_path, load_profile, matching_names, profile_names
-from profiles.canopen import CanopenProfile, Parameter
-from profiles.modbus import ModbusProfile
-from profiles.modbus import Parameter as ModbusParameter
-from tdhil.cli.arguments import add_option
-from tdhil.cli.profile_text import (
+from tdhil.buses import (
+    MARKS,
+    bus_named,
     counts,
     facts_of,
     modes_text,
-    register_uses,
     required_text,
     row,
     sure_text,
     unit_text,
     watchdog_text,
 )
+from tdhil.cli.arguments import add_option
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.errors import ExitCode
@@ -39,20 +37,23 @@ if TYPE_CHECKING:
 
 _NARROW = 72          # columns; a table of five would lose whole columns below
 _SHOW = "tdhil profiles show NAME shows what to set at the drive and what to look up in its manual."
-_MARKS = {"verified": "", "likely": "likely", "unverified": "UNVERIFIED"}
 
 
 def show(profile: Profile, console: Console) -> None:
     """Print the page. Unverified entries come last, where they are visible."""
     _head(profile, console)
     _by_hand(profile, console)
-    if isinstance(profile, ModbusProfile):
-        _registers(profile, console)
-        _filters(profile, console)
-        sections: tuple[str, ...] = ("line", "control", "modes", "quick_stop", "watchdog", "name_plate")
-    else:
-        if isinstance(profile, CanopenProfile):
-            _objects(profile, console)
+    bus = bus_named(profile.bus)
+    for one in bus.profile_tables(profile):
+        if one.headings:
+            table = _table(one.title, *one.headings)
+            for cells in one.rows:
+                table.add_row(*cells)
+            console.print(table)
+        for remark in one.remarks:
+            console.print(remark, markup=False)
+    sections = bus.profile_sections
+    if sections is None:
         sections = tuple(name for name, _ in profile.entries() if not name.startswith("parameters."))
     for name, entry in profile.entries():
         if name in sections:
@@ -63,12 +64,7 @@ def show(profile: Profile, console: Console) -> None:
 def _head(profile: Profile, console: Console) -> None:
     console.print(f"{profile.name}: {profile.title}", style="bold", markup=False)
     rows = [("bus", profile.bus), ("modes", modes_text(profile)), ("watchdog", watchdog_text(profile))]
-    if isinstance(profile, ModbusProfile):
-        line = profile.line
-        ways = {"tcp": f"TCP port {line.port}", "rtu": f"RTU {line.baud} baud 8{line.parity}{line.stop_bits}"}
-        rows.append(("line", f"{' or '.join(ways[way] for way in line.transports)}; unit {line.unit}; 32 bit "
-                             f"{line.word_order.replace('_', ' ')}"))
-        rows.append(("cycle", f"{profile.cycle.rate_hz:g} Hz unless another rate is given, if the line allows it"))
+    rows += bus_named(profile.bus).profile_facts(profile)
     if profile.experimental:
         rows.append(("EXPERIMENTAL", "from secondary sources, or never tried on this bus"))
     rows.append(("confidence", sure_text(profile)))
@@ -85,7 +81,8 @@ def _by_hand(profile: Profile, console: Console) -> None:
         table = _table("set by hand at the drive; a run is refused until they are read", "parameter", "must be", "do")
         for one in required:
             assert one.require is not None
-            table.add_row(one.title, required_text(one.require, unit_text(one.unit)), _advice(one))
+            needed = required_text(one.require, unit_text(one.unit))
+            table.add_row(one.title, needed, _advice(one, one in profile.untold))
         console.print(table)
     told = [(f"parameters: {{{one.name}: …}}", one.title, unit_text(one.unit)) for one in profile.untold]
     if profile.rated_torque_by_hand:
@@ -103,46 +100,10 @@ def _by_hand(profile: Profile, console: Console) -> None:
         console.print(table)
 
 
-def _advice(one: Parameter | ModbusParameter) -> str:
-    stated = ""
-    if isinstance(one, ModbusParameter) and one.register_ is None:
-        stated = f"and state it in rig.yaml: drive_data.parameters.{one.name}"
+def _advice(one: Any, untold: bool) -> str:
+    """Return what to do for a parameter. ``untold``: it can't be read over the bus."""
+    stated = f"and state it in rig.yaml: drive_data.parameters.{one.name}" if untold else ""
     return "; ".join(part for part in (one.advice or "", stated) if part)
-
-
-def _objects(profile: CanopenProfile, console: Console) -> None:
-    """Print the objects beyond those of CiA 402."""
-    if profile.parameters:
-        table = _table("the drive's own objects", "object", "type", "meaning", "one count", "confidence")
-        for one in profile.parameters:
-            scale = f"{one.per_lsb:g}{f' × {one.times}' if one.times else ''} {unit_text(one.unit)}".strip()
-            scale = "2^count" if one.scale == "power_of_two" else scale
-            at = f"{one.index:04X}h:{one.sub}" if one.sub else f"{one.index:04X}h"
-            table.add_row(at, one.type, one.title, scale, _MARKS[one.confidence])
-        console.print(table)
-
-
-def _registers(profile: ModbusProfile, console: Console) -> None:
-    table = _table("registers, as on the wire, counted from 0", "address", "type", "meaning", "one count", "confidence")
-    for use in register_uses(profile):
-        table.add_row(use.address, use.register.type, use.meaning, use.scale, _MARKS[use.entry.confidence])
-    console.print(table)
-
-
-def _filters(profile: ModbusProfile, console: Console) -> None:
-    if not profile.filters:
-        console.print("This profile names no filter on the reported signals.")
-        return
-    table = _table("filters on the reported signals", "signal", "time constant", "to change for a better result")
-    for one in profile.filters:
-        where = f"{one.documented_s:g} s, as documented" if one.parameter is None else (
-            f"read from {profile.parameter(one.parameter).title}"
-        )
-        table.add_row(one.signal, where, one.advice or "")
-    console.print(table)
-    for name in ("speed", "torque"):
-        if note := getattr(profile.cycle, name).note:
-            console.print(f"  {name}: {note}", markup=False)
 
 
 def _section(name: str, entry: ProfileEntry, console: Console) -> None:
@@ -162,7 +123,7 @@ def _not_verified(profile: Profile, console: Console) -> None:
     table = _table("not verified: look these up in the drive's manual", "entry", "confidence", "claim", "source")
     for name, entry in found:
         claims = "; ".join(f"{key} {value}" for key, value, _ in facts_of(entry))
-        table.add_row(name, _MARKS[entry.confidence], claims, entry.source)
+        table.add_row(name, MARKS[entry.confidence], claims, entry.source)
     console.print(table)
     console.print(
         f"A real drive is refused until you set 'confidence: verified' in a copy of the profile, or accept them as "
@@ -309,7 +270,8 @@ def _import(file: str, output: str | None, as_json: bool) -> int:
     if as_json:
         print_json({"file": str(target), "profile": row(begun.profile), "unverified": open_entries})
         return 0
-    print(f"{target}: {begun.profile.name} on canopen, created from {source.name}: {sure_text(begun.profile)}")  # noqa: T201
+    named = f"{begun.profile.name} on {begun.profile.bus}"
+    print(f"{target}: {named}, created from {source.name}: {sure_text(begun.profile)}")  # noqa: T201
     print(f"Look up in the drive's manual: {', '.join(open_entries)}. The file states what to look for.")  # noqa: T201
     print(f"Then: tdhil profiles check {target}, and tdhil identify --simulate --profile {_as_path(target)}")  # noqa: T201
     return 0

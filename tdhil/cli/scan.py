@@ -15,16 +15,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles import Profile, load_profile, visible
-from tdhil.cli.profile_text import required_text
+from tdhil.buses import FoundDrive, all_buses, bus_named, examples, required_text
 from tdhil.cli.results import print_json
-from tdhil.cli.scan_common import FoundDrive, bus_commands
-from tdhil.config import BUSES, Limits, Rig, load_rig, resolve
+from tdhil.config import Limits, Rig, load_rig, resolve
 from tdhil.errors import MessageCode, UsageError
-from tdhil.session import bus_kind, doubtful
+from tdhil.session import doubtful
 
 if TYPE_CHECKING:
+    from tdhil.buses import Connection
     from tdhil.config import RunOptions
-    from tdhil.session import Connection
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -46,7 +45,7 @@ def starter(found: FoundDrive, line: Mapping[str, Any], profile: Profile | None)
     ]
     if line:
         parts.append(_section(found.bus, line))
-    parts += [f"{key}: {_value(value)}" for key, value in bus_commands(found.bus).keys(found).items()]
+    parts += [f"{key}: {_value(value)}" for key, value in bus_named(found.bus).rig_keys(found).items()]
     if found.profile is not None:
         parts.append(f"profile: {scalar(found.profile)}    # {_comment(found.why)}")
     else:
@@ -73,7 +72,7 @@ def blank_rig(profile: Profile, named: str, load: str) -> str:
         f"drive: {profile.bus}",
         f"profile: {scalar(named)}    # {_comment(profile.title)}",
         "# The drive's address. Without it the embedded simulator runs.",
-        *bus_commands(profile.bus).blank(profile),
+        *bus_named(profile.bus).rig_blank(profile),
     ]
     parts += _doubts(profile)
     parts += ["", "# A real drive does not move without these. Remove the '#' and give every value of your machine, in",
@@ -92,7 +91,7 @@ def blank_rig(profile: Profile, named: str, load: str) -> str:
 
 def to_fill_in(profile: Profile, load: str) -> list[str]:
     """Return what a run on a real drive needs besides."""
-    found = [f"limits: {', '.join(_LIMITS)}", f"the drive's address: {bus_commands(profile.bus).to_fill_in}"]
+    found = [f"limits: {', '.join(_LIMITS)}", f"the drive's address: {bus_named(profile.bus).to_fill_in}"]
     if load == "string":
         found.append(f"{', '.join(_STRING)}: without them the file is refused")
     if doubtful(profile):
@@ -120,7 +119,7 @@ def _blank(name: str) -> str:
 
 
 def _section(bus: str, line: Mapping[str, Any]) -> str:
-    return f"{bus_kind(bus).section}: {{{', '.join(f'{key}: {_value(value)}' for key, value in line.items())}}}"
+    return f"{bus_named(bus).section}: {{{', '.join(f'{key}: {_value(value)}' for key, value in line.items())}}}"
 
 
 def _value(value: Any) -> str:
@@ -183,8 +182,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     drive = add_drive_arguments(parser)
     add_option(drive, OPTION["simulate"], help="scan the embedded simulator")
     scan = parser.add_argument_group("scan")
-    for name in BUSES:
-        bus_commands(name).add_scan_arguments(scan)
+    for bus in all_buses():
+        bus.add_scan_arguments(scan)
     scan.add_argument("--write", type=Path, metavar="rig.yaml", help="write a rig.yaml to start from; no file is "
                                                                      "overwritten")
     add_option(scan, OPTION["json"])
@@ -202,12 +201,11 @@ def run(namespace: argparse.Namespace) -> int:
     options, connection = connection_of(vars(namespace), rig, resolve(vars(namespace), rig))
     if not (options.simulate or connection.configured):
         raise UsageError(
-            f"{connection.nothing_there}", where="scan",
-            next_step="Name a bus or line, such as -i socketcan -c can0, --host 192.0.2.10 or --serial /dev/ttyUSB0",
+            f"{connection.bus.nothing_there}", where="scan",
+            next_step=f"Name a bus or line, such as {examples()}",
             entry=MessageCode.BUS_NOT_CONFIGURED,
         )
-    commands = bus_commands(connection.drive)
-    found, remarks = commands.scan(plan_peer(options, connection), connection, options, namespace)
+    found, remarks = connection.bus.scan(plan_peer(options, connection), connection, options, namespace)
     _print(found, remarks, namespace.json is True)
     if namespace.write is not None:
         _write(namespace.write, found, connection, options)
@@ -256,13 +254,12 @@ def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, op
     if options.given("profile"):
         one = replace(one, profile=options.profile, why=f"as given: {options.source('profile')}")
     profile = load_profile(one.profile) if one.profile is not None else None
-    write_new(path, starter(one, bus_commands(one.bus).section(one, connection), profile))
+    write_new(path, starter(one, connection.bus.rig_section(one, connection), profile))
     print(f"{path}: written. Fill in its limits: until then a real drive does not move", file=sys.stderr)  # noqa: T201
 
 
 def _chosen(found: tuple[FoundDrive, ...], connection: Connection, options: RunOptions) -> FoundDrive:
-    commands = bus_commands(connection.drive)
-    named = commands.wanted(connection, options)
+    named = connection.bus.wanted(connection, options)
     drives = [one for one in found if named in (None, one.address)]
     if named is None and len(drives) > 1:
         drives = [one for one in drives if one.profile is not None] or drives
@@ -270,4 +267,4 @@ def _chosen(found: tuple[FoundDrive, ...], connection: Connection, options: RunO
         return drives[0]
     what = f"{len(drives)} drives were found" if drives else f"number {named} did not answer"
     raise UsageError(f"{what}, but a rig.yaml is for one drive", where="--write",
-                     next_step=f"Select it with {commands.address_flag}")
+                     next_step=f"Select it with {connection.bus.address_flag}")

@@ -38,6 +38,7 @@ def run(namespace: argparse.Namespace) -> int:
     Ctrl-C ends only the observation. The stop request stays in force.
     """
     from drivers import MonotonicClock, bare_stop
+    from tdhil.buses import examples
     from tdhil.config import load_rig, resolve
     from tdhil.session import connection_of
 
@@ -45,15 +46,15 @@ def run(namespace: argparse.Namespace) -> int:
     options, connection = connection_of(vars(namespace), rig, resolve(vars(namespace), rig))
     if not connection.configured:
         raise UsageError(
-            connection.nothing_there,
+            connection.bus.nothing_there,
             where="stop",
-            next_step="Give the drive's address, such as -i socketcan -c can0 --node 1, or --host 192.0.2.10",
+            next_step=f"Give the drive's address, such as {examples()}",
             entry=MessageCode.BUS_NOT_CONFIGURED,
         )
     print(NO_EMERGENCY_STOP, file=sys.stderr)  # noqa: T201
     clock = MonotonicClock()
     try:
-        with connection.kind.open_target(options, connection, clock) as target:
+        with connection.bus.open_target(options, connection, clock) as target:
             report = bare_stop(target, clock)
     except Exception as error:         # no connection, or a lost one; an adapter's driver may raise anything
         if exit_code(error) is ExitCode.USAGE:

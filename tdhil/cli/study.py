@@ -42,10 +42,11 @@ class SimulatedFieldBench:
 
     def run(self, wish: FieldRun, progress: RunProgress) -> Recording:
         """Return the Recording. Raises the error that ended the run early."""
+        from tdhil.buses import PeerPlan
         from tdhil.config import resolve
         from tdhil.recording import RunLog, RunWriter
         from tdhil.runner import Runner
-        from tdhil.session import PeerPlan, opened_drive, simulated_connection, stop_on_signals
+        from tdhil.session import opened_drive, simulated_connection, stop_on_signals
 
         rig = bench_rig(wish)
         options = resolve(_asked(wish), rig)
@@ -67,10 +68,10 @@ class SimulatedFieldBench:
 
 def bench_rig(wish: FieldRun) -> Rig:
     """Return the limits of the bench: those of the simulated rig, with the study's torque limit."""
-    from tdhil.config import Rig, simulated_default_rig
+    from tdhil.config import rig_model, simulated_default_rig
 
     usual = simulated_default_rig().model_dump(by_alias=True)
-    return Rig.model_validate({**usual, "limits": {**usual["limits"], "torque_nm": wish.torque_limit_nm}})
+    return rig_model().model_validate({**usual, "limits": {**usual["limits"], "torque_nm": wish.torque_limit_nm}})
 
 
 def plant_of(wish: FieldRun) -> RigParams:

@@ -18,18 +18,19 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from tdhil.buses import all_buses
 from tdhil.errors import ExitCode, LogError, MessageCode, UsageError
 from tdhil.version import __version__
 
 LIBRARIES = (
-    "numpy", "scipy", "python-can", "canopen", "pymodbus", "pyserial", "mcap", "protobuf", "pydantic", "rich", "PyYAML",
-    "matplotlib", "jinja2",
+    "numpy", "scipy", "pyserial", "mcap", "protobuf", "pydantic", "rich", "PyYAML", "matplotlib", "jinja2",
 )
+"""Libraries whose version is included, beside those of the buses."""
 VARIABLES = (
-    "LANG", "LC_ALL", "LC_CTYPE", "TERM", "PYTHONIOENCODING", "PYTHONUTF8", "CAN_INTERFACE", "CAN_CHANNEL",
-    "CAN_BITRATE", "OPENBLAS_CORETYPE", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS",
+    "LANG", "LC_ALL", "LC_CTYPE", "TERM", "PYTHONIOENCODING", "PYTHONUTF8", "OPENBLAS_CORETYPE",
+    "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS",
 )
-"""The only environment variables that are included: others are private."""
+"""The only environment variables that are included, beside those of the buses: others are private."""
 
 _SECRET = re.compile(r"pass(word|wd|phrase)?|secret|token|api_?key|credential|authori[sz]ation|private", re.IGNORECASE)
 _PERSON = frozenset({"operator"})
@@ -92,7 +93,9 @@ def about(log: Path) -> Iterable[tuple[str, str]]:
 def versions() -> dict[str, Any]:
     """Return the versions, and the few environment variables that change tdhil's behaviour."""
     found: dict[str, str | None] = {}
-    for name in LIBRARIES:
+    buses = all_buses()
+    variables = (*VARIABLES, *(name for bus in buses for name in bus.variables))
+    for name in (*LIBRARIES, *(name for bus in buses for name in bus.libraries)):
         with suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
     return {
@@ -104,7 +107,7 @@ def versions() -> dict[str, Any]:
         "machine": platform.machine(),
         "processors": os.cpu_count(),
         "libraries": found,
-        "environment": {name: os.environ[name] for name in VARIABLES if name in os.environ},
+        "environment": {name: os.environ[name] for name in variables if name in os.environ},
     }
 
 
@@ -178,9 +181,9 @@ class Scrub:
         """Scrub the texts of a log's message; its numbers stay."""
         from google.protobuf.descriptor import FieldDescriptor
 
-        from tdhil.recording import CAN, CHANNELS, CLASSES, COMMAND, EXCITATION, MODBUS, SAMPLE, VIRTUAL_STRING
+        from tdhil.recording import CHANNELS, CLASSES, COMMAND, EXCITATION, RAW_FRAMES, SAMPLE, VIRTUAL_STRING
 
-        if channel in (SAMPLE, COMMAND, CAN, MODBUS, EXCITATION, VIRTUAL_STRING):
+        if channel in RAW_FRAMES | {SAMPLE, COMMAND, EXCITATION, VIRTUAL_STRING}:
             return payload
         message = CLASSES[CHANNELS[channel][1]].FromString(payload)
         for field in message.DESCRIPTOR.fields:

@@ -211,8 +211,8 @@ class RunOptions:
     drive: str = option(
         "--drive", "drive", DEFAULT_BUS, group=Topic.DRIVE, common=True, choices=BUSES,
         help="bus of the drive (default: the profile's bus, else {default})",
-        more="bus of the drive. If it is missing, it follows from `profile`, or from the section (`bus` or `modbus`) "
-             "that gives the drive's address",
+        more="bus of the drive. If it is missing, it follows from `profile`, or from the section that gives the "
+             "drive's address",
     )
     node: int | None = option(
         "--node", "node", group=Topic.DRIVE, common=True, metavar="N", ge=1, le=127, unset="the profile's",
@@ -223,8 +223,8 @@ class RunOptions:
         is_file=True,
         min_length=1,
         help="vendor/model, or a .yaml file (default: the generic profile of the bus, {default} on CANopen)",
-        more="a profile that tdhil contains (`tdhil profiles`), or your own `.yaml` file; on Modbus the default is "
-             "`generic/modbus`",
+        more="a profile that tdhil contains (`tdhil profiles`), or your own `.yaml` file; the default is the "
+             "generic profile of the bus",
     )
     accept_unverified: tuple[str, ...] = option(
         "--accept-unverified", "accept_unverified", (), group=Topic.OVERRIDES, metavar="NAME", api=True,
@@ -479,9 +479,6 @@ OPTION: Final = MappingProxyType({one.name: one for one in OPTIONS})
 ASKED_AGAIN: Final = tuple(sorted((one for one in OPTIONS if one.asked_again), key=lambda one: one.name))
 """Options that a replay, a comparison or a fleet may set differently from the run."""
 
-
-COMMON_LINE_FLAGS: Final = frozenset({"--channel", "--interface", "--bitrate", "--host", "--serial"})
-"""Options that say where the drive is, and that ``--help`` shows. The buses declare them (`tdhil.session.buses`)."""
 
 CLOCKS: Final = ("real_time", "stepped")
 """The two clocks of a simulated rig. They exclude each other."""

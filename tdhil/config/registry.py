@@ -31,13 +31,12 @@ class RegistryEntry:
 
 @dataclass(frozen=True)
 class BusEntry(RegistryEntry):
-    """``at``: the bus as a run uses it, a `tdhil.session.connection.BusKind`: its options, how a drive is opened.
+    """``at``: a `tdhil.buses.Bus`. Its module imports no library of the bus: ``--help`` shows the options of every bus.
 
-    ``commands``: scan, doctor and rig new on this bus, a `tdhil.cli.scan_common.BusCommands`. The modules of both load
-    no library of the bus at import: ``--help`` shows the options of every bus.
+    ``loggers``: loggers of these libraries. tdhil reports their errors itself.
     """
 
-    commands: str = ""
+    loggers: tuple[str, ...] = ()
 
 
 EXCITATIONS: dict[str, RegistryEntry] = {
@@ -67,16 +66,10 @@ MODELS: dict[str, RegistryEntry] = {
 """Models of the shaft."""
 
 BUSES: dict[str, BusEntry] = {
-    "canopen": BusEntry("tdhil.session.buses.canopen:CANOPEN", "CANopen, CiA 402",
-                        commands="tdhil.cli.buses.canopen:CANOPEN"),
-    "modbus": BusEntry("tdhil.session.buses.modbus:MODBUS", "Modbus TCP or RTU",
-                       commands="tdhil.cli.buses.modbus:MODBUS"),
+    "canopen": BusEntry("tdhil.buses.canopen:CANOPEN", "CANopen, CiA 402", loggers=("can", "canopen")),
+    "modbus": BusEntry("tdhil.buses.modbus:MODBUS", "Modbus TCP or RTU"),
 }
-"""Buses of a drive.
-
-Two parts of a bus are elsewhere: the schema of its profiles, in the list of `profiles.library`; its section of
-rig.yaml, a field of `tdhil.config.rig.Rig`.
-"""
+"""Buses of a drive. The schema of the profiles of a bus is in the list of `profiles.library`, below all our lists."""
 
 DEFAULT_BUS = "canopen"
 

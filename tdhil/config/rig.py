@@ -11,9 +11,9 @@ shaft. It is frozen, and holds the file and line of each key::
       …
 """
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -42,7 +42,7 @@ from profiles import (
     parse_with_lines,
 )
 from tdhil.config.options import CLOCKS, OPTIONS, Option, Topic
-from tdhil.config.registry import RegistryEntry, names
+from tdhil.config.registry import BUSES, RegistryEntry, imported, names
 
 
 def _within(low: float, high: float, *, zero: bool = False) -> Any:
@@ -79,62 +79,6 @@ Speed = Annotated[float, Field(ge=-1e5, le=1e5)]
 Time = Annotated[float, _within(1e-6, 1e7)]
 Inertia = Annotated[float, _within(1e-9, 1e9)]
 Ratio = Annotated[float, _within(1e-6, 1e6)]
-
-CAN_BIT_RATES = (
-    5_000, 10_000, 20_000, 33_000, 33_333, 47_000, 47_619, 50_000, 62_000, 62_500, 83_000, 83_300, 83_333, 95_000,
-    95_238, 100_000, 125_000, 200_000, 250_000, 400_000, 500_000, 750_000, 800_000, 1_000_000,
-)
-"""Bit rates of CiA 301, and others that adapters offer, bit/s."""
-
-
-def bit_rate_problem(bit_s: int) -> str:
-    """Return the error of a CAN bit rate; '' if it is valid."""
-    if bit_s in CAN_BIT_RATES:
-        return ""
-    if bit_s * 1000 in CAN_BIT_RATES:
-        return f"{bit_s} bit/s is not a CAN bit rate; {bit_s}k is one: {bit_s * 1000}"
-    nearest = min(CAN_BIT_RATES, key=lambda one: abs(math.log(one / max(bit_s, 1))))
-    return f"{bit_s} bit/s is not a CAN bit rate; the nearest is {nearest}"
-
-
-class Bus(DataModel):
-    """python-can's own options. Missing ones come from its environment variables and files."""
-
-    interface: str | None = Field(default=None, min_length=1, description="as for -i: socketcan, pcan, slcan …")
-    channel: str | int | None = Field(default=None, description="as for -c: can0, PCAN_USBBUS1 …")
-    bitrate: int | None = Field(default=None, gt=0, description="bit/s; for socketcan the bit rate of the link")
-    options: dict[str, str | int | float | bool] = Field(default={}, description="further options of the interface")
-
-    @classmethod
-    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """Return an invalid CAN bit rate."""
-        bitrate = values.get("bitrate")
-        wrong = "" if bitrate is None else bit_rate_problem(bitrate)
-        return [("bitrate", wrong)] if wrong else []
-
-
-class Modbus(DataModel):
-    """The address of a Modbus drive. Missing values come from the profile's ``line``."""
-
-    host: str | None = Field(default=None, min_length=1, description="Modbus TCP: name or address of the drive")
-    port: int | None = Field(default=None, ge=1, le=65535, description="TCP port")
-    serial: str | None = Field(default=None, min_length=1, description="Modbus RTU: device, such as /dev/ttyUSB0")
-    baud: int | None = Field(default=None, ge=1200, le=1_000_000, description="bit/s on the serial line")
-    parity: Literal["N", "E", "O"] | None = Field(default=None, description="of the serial line: N, E or O")
-    stop_bits: Literal[1, 2] | None = Field(default=None, description="of the serial line")
-    unit: int | None = Field(default=None, ge=0, le=255, description="unit (slave) number of the drive")
-
-    @classmethod
-    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """Return two lines at once, or a unit out of range."""
-        findings = []
-        host, serial, unit = (values.get(name) for name in ("host", "serial", "unit"))
-        if host is not None and serial is not None:
-            findings.append(("serial", "and host exclude each other; keep one"))
-        if serial is not None and unit is not None and not 1 <= unit <= 247:
-            findings.append(("unit", f"must be 1 to 247 on a serial line, not {unit}"))
-        return findings
-
 
 LONGEST_BRAKING_S = 90.0
 """Longest braking from the highest speed, s. A stop is awaited for three times its ramp, at most five minutes."""
@@ -330,13 +274,11 @@ class Service(DataModel):
 
 
 class Rig(_Options):
-    """The whole bench. Each key is optional until it is needed."""
+    """The whole bench, without the sections of the buses (`rig_model`). Each key is optional until it is needed."""
 
     never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
     name: str | None = Field(default=None, min_length=1, max_length=200, description="name of the rig, in reports")
-    bus: Bus = Bus()
-    modbus: Modbus = Modbus()
     limits: Limits | None = Field(default=None, description="required unless the drive is simulated")
     gear: Gear = Gear()
     load: Annotated[Load, BeforeValidator(_load_of)] = Load()
@@ -407,14 +349,29 @@ class Rig(_Options):
         return Path(self._file).parent
 
 
+def rig_model() -> type[Rig]:
+    """Return `Rig` with the section of each bus in the table `BUSES`."""
+    return _with_sections(tuple(BUSES.items()))
+
+
+@lru_cache(maxsize=4)
+def _with_sections(buses: tuple[tuple[str, RegistryEntry], ...]) -> type[Rig]:
+    found: dict[str, Any] = {}
+    for bus in (imported(entry.at) for _, entry in buses):
+        if bus.section_model is not None:
+            found[bus.section] = (bus.section_model, bus.section_model())
+    model: type[Rig] = create_model("Rig", __base__=Rig, __module__=__name__, __doc__=Rig.__doc__, **found)
+    return model
+
+
 def load_rig(path: Path) -> Rig:
     """Return the bench of a rig.yaml, in SI. Raises DataFileError with every problem and its line."""
-    return _rig_of(load_with_lines(path, Rig, convert=True))
+    return _rig_of(load_with_lines(path, rig_model(), convert=True))
 
 
 def parse_rig(text: str, name: str) -> Rig:
     """Return the bench of a text that is not in a file yet; ``name`` stands in the problems."""
-    return _rig_of(parse_with_lines(text, name, Rig, convert=True))
+    return _rig_of(parse_with_lines(text, name, rig_model(), convert=True))
 
 
 def _rig_of(loaded: Loaded[Rig]) -> Rig:
@@ -450,18 +407,18 @@ _SIMULATED_TORQUE_SCALE_SD = 0.02
 
 def simulated_default_rig(rig: Rig | None = None) -> Rig:
     """Return the bench of the simulated rig; ``rig`` overrides it. Raises DataFileError if they contradict."""
-    rig = rig or Rig()
+    rig = rig or rig_model()()
     data = rig.model_dump(by_alias=True)
     data["limits"] = data["limits"] or _SIMULATED_LIMITS.model_dump()
     if data["drive_data"]["torque_scale_rel_sd"] is None:
         data["drive_data"]["torque_scale_rel_sd"] = _SIMULATED_TORQUE_SCALE_SD
     try:
-        filled = Rig.model_validate(data)
+        filled = rig_model().model_validate(data)
     except ValidationError as error:
         file = rig._file or "rig"
         found = [
             Problem(file, rig.line(".".join(map(str, path))), f"{'.'.join(map(str, path))}: {message} (simulated rig)")
-            for path, message in messages_of(error, data, Rig)
+            for path, message in messages_of(error, data, rig_model())
         ]
         raise DataFileError(tuple(found)) from None
     filled._file, filled._lines, filled._conversions = rig._file, rig._lines, rig._conversions

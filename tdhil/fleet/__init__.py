@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from profiles import lazy_face
+from profiles import lazy_names
 
 if TYPE_CHECKING:
     from tdhil.fleet.change_detection import (
@@ -23,4 +23,11 @@ if TYPE_CHECKING:
         trend_document as trend_document,
     )
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "change_detection": "Difference History Measured difference history",
+        "fleet": "FleetRequest FleetSummary Progress find_logs run_fleet",
+        "rows": "FleetRow FleetSettings counted row_of",
+        "table": "load_duckdb read_table",
+        "task": "Done LogTask identify_log",
+        "trend": "Compared compare_document identified trend_document",
+    })

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from profiles import lazy_face
+from profiles import lazy_names
 
 if TYPE_CHECKING:
     from tdhil.recording.csv import (
@@ -10,7 +10,8 @@ if TYPE_CHECKING:
     )
     from tdhil.recording.log_format import (
         CAN as CAN, CHANNELS as CHANNELS, CLASSES as CLASSES, COMMAND as COMMAND, EXCITATION as EXCITATION,
-        MODBUS as MODBUS, SAMPLE as SAMPLE, VIRTUAL_COLUMNS as VIRTUAL_COLUMNS, VIRTUAL_STRING as VIRTUAL_STRING,
+        FRAME_CHANNELS as FRAME_CHANNELS, RAW_FRAMES as RAW_FRAMES, SAMPLE as SAMPLE,
+        VIRTUAL_COLUMNS as VIRTUAL_COLUMNS, VIRTUAL_STRING as VIRTUAL_STRING,
         schema_name as schema_name,
     )
     from tdhil.recording.log_reader import read_cycles as read_cycles, read_frames as read_frames, read_run as read_run
@@ -31,4 +32,17 @@ if TYPE_CHECKING:
     from tdhil.recording.run_log import RunEnd as RunEnd, RunLog as RunLog, find_ended as find_ended
     from tdhil.recording.salvage import Salvage as Salvage, examine as examine, write_copy as write_copy
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "csv": "Bench USUAL parse_columns read_recording",
+        "log_format": "CAN CHANNELS CLASSES COMMAND EXCITATION FRAME_CHANNELS RAW_FRAMES SAMPLE VIRTUAL_COLUMNS "
+                      "VIRTUAL_STRING schema_name",
+        "log_reader": "read_cycles read_frames read_run",
+        "log_tail": "LogChunks LoggedMessage LogNews LogTail messages_in",
+        "log_writer": "RunWriter",
+        "mcap_container": "MAGIC schema_of",
+        "npz_cache": "pack_recording unpack_recording",
+        "recording": "BoolArray Excitation FloatArray ImpedanceInput LagPrior Level Pipe Ramp Recording Segment Stage "
+                     "SteppedSetpoint TorqueAnswer ABORTED aborted_stage before_abort",
+        "run_log": "RunEnd RunLog find_ended",
+        "salvage": "Salvage examine write_copy",
+    })

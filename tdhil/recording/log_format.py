@@ -14,6 +14,7 @@
    9  /log             foxglove.Log   the same events again, for viewers; never read back
   10  /modbus          Frames         requests and replies (PDU), in place of /can; older logs have them there
   11  /virtual_string  VirtualString  every cycle of a virtual string, at its main shaft
+  12  /frames          Frames         the frames of any other bus, in place of /can
 ====  ===============  =============  =====================================================================
 
 A message's log time is the epoch handed in at the start plus its control time, in nanoseconds.
@@ -188,6 +189,7 @@ RESULT: Final = 8
 LOG: Final = 9
 MODBUS: Final = 10
 VIRTUAL_STRING: Final = 11
+OTHER_FRAMES: Final = 12
 
 VIRTUAL_COLUMNS: Final = (
     "time_s", "phase", "set_rad_s", "top_rad_s", "innovation_rad_s", "string_nm", "drive_nm", "share", "bit_rad_s",
@@ -207,7 +209,11 @@ CHANNELS: Final = {
     LOG: ("/log", "Log"),
     MODBUS: ("/modbus", "Frames"),
     VIRTUAL_STRING: ("/virtual_string", "VirtualString"),
+    OTHER_FRAMES: ("/frames", "Frames"),
 }
+FRAME_CHANNELS: Final = {topic: number for number, (topic, message) in CHANNELS.items() if message == "Frames"}
+"""The channels of raw frames by topic. A log has messages on one of them."""
+RAW_FRAMES: Final = frozenset(FRAME_CHANNELS.values())
 
 MODES: Final = {None: 0, Mode.SPEED: 1, Mode.TORQUE: 2}
 MODE_OF: Final = {number: mode for mode, number in MODES.items()}

@@ -223,7 +223,7 @@ _CENTURY_NS: Final = 946_684_800 * 10**9       # 2000-01-01
 RARE: Final = 20_000                   # stages, events, problems
 RARE_BYTES: Final = 64 * 2**20         # of everything but samples, commands and frames
 BATCH: Final = 2 * 2**20               # bytes of chunks that are read at once; a longer one is read message by message
-_UNREAD: Final = frozenset({log_format.CAN, log_format.LOG, log_format.MODBUS})
+_UNREAD: Final = frozenset({log_format.LOG}) | log_format.RAW_FRAMES
 _EVERY_CYCLE: Final = frozenset({log_format.SAMPLE, log_format.COMMAND})
 
 
@@ -267,7 +267,7 @@ def read_frames(path: Path) -> Iterator[RawFrame]:
 
     Of a Modbus line they are requests and replies, the unit for an identifier.
     """
-    for _, message in _messages(path, log_format.CAN, log_format.MODBUS):
+    for _, message in _messages(path, *log_format.RAW_FRAMES):
         for frame in message.frames:
             yield RawFrame(frame.time_s, frame.outgoing, frame.identifier, frame.data)
 

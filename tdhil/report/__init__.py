@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from profiles import lazy_face
+from profiles import lazy_names
 
 if TYPE_CHECKING:
     from tdhil.report.card import (
@@ -40,4 +40,18 @@ if TYPE_CHECKING:
         tuning_document as tuning_document, write_tuning_report as write_tuning_report,
     )
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "card": "card_html card_text inertia_text minutes print_card rounded",
+        "console": "PlainConsole stderr_console",
+        "document": "SIMULATED result_document",
+        "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",
+        "html": "ShownPicture check_report_path pictures_in write_report",
+        "live": "LiveDisplay",
+        "page": "STYLE has_extra inline_svg install_command repeatable_figures require_extra",
+        "plots": "draw_run",
+        "speed_calibration": "print_speed_calibration speed_document",
+        "torque_calibration": "calibration_document calibration_report draw_calibration pairs_document "
+                              "print_calibration print_pairs write_calibration_report",
+        "schedule": "schedule_document",
+        "tuning": "TunedFor print_tuning showcase_of tuning_document write_tuning_report",
+    })

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from profiles import lazy_face
+from profiles import lazy_names
 
 if TYPE_CHECKING:
     from tdhil.runner.design import (
@@ -29,4 +29,16 @@ if TYPE_CHECKING:
         Display as Display, Idle as Idle, RunOutcome as RunOutcome, STAGES as STAGES, Task as Task,
     )
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "design": "DesignKnowledge assumed_noise interval_confidence",
+        "five_stages": "Runner",
+        "guard": "Guard",
+        "planning": "NOTHING_TO_EXPECT NOT_PREDICTED Planned plan_acquisition refuse_hopeless",
+        "preconditions": "precondition_warnings refuse_by_plan",
+        "settings": "ControlAssumptions ExcitationRequest MachineLimits StopRequest",
+        "speed_check": "speed_warnings",
+        "stage_log": "stage_warnings",
+        "stages": "course_of",
+        "stop": "not_confirmed",
+        "task": "Display Idle RunOutcome STAGES Task",
+    })

@@ -6,7 +6,7 @@ line. It writes run.mcap, and the web reads this file as it grows.
 
 from typing import TYPE_CHECKING
 
-from profiles import lazy_face
+from profiles import lazy_names
 
 if TYPE_CHECKING:
     from tdhil.service.accounts import ROLES as ROLES, AccountsFile as AccountsFile
@@ -19,4 +19,11 @@ if TYPE_CHECKING:
         serve as serve,
     )
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "accounts": "ROLES AccountsFile",
+        "audit": "Audit ChainHead",
+        "client": "Client ServiceError",
+        "console": "attend",
+        "run_state": "Conflict NotAllowed NotThere",
+        "server": "HOST PORT Tls check_idle require_folder serve",
+    })

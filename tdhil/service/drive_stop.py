@@ -27,7 +27,7 @@ def stop(path: Path, identity: tuple[int, ...]) -> dict[str, Any]:
     same = True
     try:
         options, connection = connection_of_kept(read_json(path) or {})
-        with connection.kind.open_target(options, connection, clock) as target:
+        with connection.bus.open_target(options, connection, clock) as target:
             report = bare_stop(target, clock)
             if any(identity) and (read := getattr(target, "identity", None)) is not None:
                 now = read()

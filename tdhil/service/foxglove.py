@@ -20,10 +20,9 @@ from typing import Any, Final
 import anyio
 
 from tdhil.recording import (
-    CAN,
     CHANNELS,
     COMMAND,
-    MODBUS,
+    RAW_FRAMES,
     SAMPLE,
     VIRTUAL_STRING,
     LogChunks,
@@ -41,7 +40,7 @@ LOOK_S: Final = 1.0
 LATE_S: Final = 10.0
 FIRST_S: Final = 60.0
 """Time allowed for the part of the log from before the subscription, s."""
-_EACH_CYCLE: Final = frozenset({SAMPLE, COMMAND, CAN, MODBUS, VIRTUAL_STRING})
+_EACH_CYCLE: Final = frozenset({SAMPLE, COMMAND, VIRTUAL_STRING}) | RAW_FRAMES
 _DATA: Final = Struct("<BIQ")              # opcode 1, subscription, log time in ns; then the message
 _INFO, _WARNING, _ERROR = 0, 1, 2
 _WAITS: Final = "run"

@@ -65,14 +65,14 @@ async def _samples(site: Site, request: Request, body: None) -> Response:
 
 
 async def _faults(site: Site, request: Request, body: None) -> list[FaultView]:
-    from tdhil.session import bus_kind
+    from tdhil.buses import bus_named
 
     rig = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
     if not rig.simulated:
         raise NotAllowed("faults can be rehearsed only on a simulated rig", where=f"rig {rig.id}",
                          next_step="Use a rig whose file contains run: {simulate: true}")
-    kind = bus_kind(rig.way()[1].drive)
-    return [FaultView(one.name, one.summary, one.row, one.value, one.takes, one.from_start) for one in kind.faults()]
+    bus = bus_named(rig.way()[1].drive)
+    return [FaultView(one.name, one.summary, one.row, one.value, one.takes, one.from_start) for one in bus.faults()]
 
 
 _LARGEST: Final = 1e9

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from drivers import DataFileError, PreflightRefused
 from profiles.quantities import read
+from tdhil.buses import Connection
 from tdhil.config import (
     OPTION,
     OPTIONS,
@@ -32,7 +33,7 @@ from tdhil.config import (
 )
 from tdhil.errors import MessageCode, UsageError
 from tdhil.service.run_state import NotAllowed, NotThere
-from tdhil.session import Connection, address_of, connection_of
+from tdhil.session import address_of, connection_of
 
 if TYPE_CHECKING:
     from tdhil.session import RunRequest
@@ -291,7 +292,7 @@ def binding_of(request: RunRequest, rig_sha256: str, preflight: Any, plan: Mappi
         "rig": rig_sha256,
         "profile": request.connection.profile.model_dump(mode="json", by_alias=True),
         "options": [list(row) for row in request.options.rows()],
-        "way": [list(row) for row in request.connection.rows()],
+        "way": [list(row) for row in request.connection.line.rows()],
         "preflight": preflight,
         "plan": plan,
     }

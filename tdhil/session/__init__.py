@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from profiles import lazy_face
+from profiles import lazy_names
 
 if TYPE_CHECKING:
     from tdhil.session.conclusion import conclude as conclude
@@ -11,7 +11,6 @@ if TYPE_CHECKING:
         CallbackOperator as CallbackOperator, TerminalOperator as TerminalOperator, motion_summary as motion_summary,
     )
     from tdhil.session.connection import (
-        Connection as Connection, PeerPlan as PeerPlan, bus_kind as bus_kind, bus_kinds as bus_kinds,
         connection_of as connection_of, simulated_connection as simulated_connection,
     )
     from tdhil.session.drive_lock import (
@@ -67,4 +66,24 @@ if TYPE_CHECKING:
         sha256_of_log as sha256_of_log,
     )
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "conclusion": "conclude",
+        "confirm": "confirm_mounted require_terminal CallbackOperator TerminalOperator motion_summary",
+        "connection": "connection_of simulated_connection",
+        "drive_lock": "DriveHeld Holder address_of hold holder_of holders",
+        "dry_run": "BEFORE_ACQUIRE_S Figure plan_course plan_document plan_dry",
+        "evaluation": "conclude_evaluation evaluation_case is_evaluation load_tuning",
+        "kept": "connection_of_kept kept_connection",
+        "log_files": "check_different_files check_log_path is_live make_room",
+        "open_drive": "opened_drive plan_peer with_faults",
+        "overrides": "UNVERIFIED_FLAG check_unverified doubtful is_accepted",
+        "run_record": "RunRecord ByKeyword is_log read require_file",
+        "run_session": "OperatorInterface RunRequest RunSession",
+        "speed_calibration": "SECONDS_SD SPEED_REL_SD TURNS_SD TurnsCount add_speed_calibration check_speed_place "
+                             "speed_by_position speed_by_turns",
+        "stored_calibration": "drive_identity drive_settings load_calibration save_calibration with_calibration",
+        "stop_signals": "Ending stop_on_signals",
+        "task": "bench_of excitation_request facts machine_limits stated_lags suited",
+        "torque_calibration": "ASSUMED_BODY_REL_SD CalibrationFound CalibrationRun document_of_calibration "
+                              "find_calibration find_plan read_pairs sha256_of_log",
+    })

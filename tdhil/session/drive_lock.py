@@ -28,8 +28,8 @@ from drivers import PreflightRefused
 from profiles import MessageCode
 
 if TYPE_CHECKING:
+    from tdhil.buses import Connection
     from tdhil.config import RunOptions
-    from tdhil.session.connection import Connection
 
 FOLDERS = ("/run/lock", "/dev/shm", "/tmp")
 """Candidates. The first one in which every user may create files is used."""
@@ -73,7 +73,7 @@ def address_of(connection: Connection, options: RunOptions) -> str | None:
     """
     if options.simulate or not connection.configured:
         return None
-    return connection.kind.address(options, connection)
+    return connection.bus.address(options, connection)
 
 
 @contextmanager

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from profiles import parse_profile, profile_text
+from tdhil.buses import Connection, bus_named
 from tdhil.config import Origin, RunOptions, Setting, resolve
-from tdhil.session.connection import Connection, bus_kind
 
 _SOURCE: Final = "the run's own connection"
 _PLAIN: Final = (str, int, float, bool, type(None), list, dict)
@@ -22,14 +22,14 @@ def kept_connection(options: RunOptions, connection: Connection) -> dict[str, An
     line = {name: one.value for name, one in connection.line.settings.items() if isinstance(one.value, _PLAIN)}
     return {
         "drive": connection.drive, "line": line, "node": options.node, "profile": connection.profile.name,
-        "profile_text": profile_text(options.profile), "address": connection.kind.address(options, connection),
+        "profile_text": profile_text(options.profile), "address": connection.bus.address(options, connection),
     }
 
 
 def connection_of_kept(plain: Mapping[str, Any]) -> tuple[RunOptions, Connection]:
     """Return options and connection as the run had them. Raises DataFileError, KeyError, TypeError or ValueError."""
-    kind = bus_kind(str(plain["drive"]))
+    bus = bus_named(str(plain["drive"]))
     profile = parse_profile(str(plain["profile_text"]), str(plain["profile"]))
     settings = {name: Setting(value, _SOURCE, Origin.RIG_FILE) for name, value in dict(plain["line"]).items()}
-    options = resolve({"drive": kind.name, "node": plain["node"]}, None)
-    return options, Connection(kind, profile, type(kind.nowhere)(settings))
+    options = resolve({"drive": bus.name, "node": plain["node"]}, None)
+    return options, Connection(bus, profile, bus.line_type(settings))

@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from drivers import Clock, Drive, FrameTap, MonotonicClock, SteppedClock
+from tdhil.buses import Connection, Opening, PeerPlan, bus_named
 from tdhil.config import OPTION, DriveData, RunOptions
 from tdhil.errors import MessageCode, UsageError
-from tdhil.session.connection import Connection, PeerPlan, bus_kind
 from tdhil.session.drive_lock import address_of, hold
 
 
@@ -18,9 +18,9 @@ def plan_peer(options: RunOptions, connection: Connection) -> PeerPlan:
     """Return the peer; embedded with --simulate or without an address. Raises UsageError for stepped Modbus."""
     embedded = options.simulate or not connection.configured
     if not embedded:
-        if options.stepped and not connection.kind.steps_over_a_wire:
+        if options.stepped and not connection.bus.steps_over_a_wire:
             raise UsageError(
-                f"a {connection.kind.title} line has no SYNC, so it can't be stepped over a wire",
+                f"a {connection.bus.title} line has no SYNC, so it can't be stepped over a wire",
                 where=options.source("stepped"),
                 next_step="Remove --stepped, or use --simulate, which is stepped",
                 entry=MessageCode.STEPPED_NEEDS_SYNC,
@@ -55,7 +55,8 @@ def opened_drive(
     clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
     data = data or DriveData()
     address = None if plan.embedded else address_of(connection, options)
-    with hold(address), connection.kind.open(plan, options, connection, data, clock, tap, trace) as drive:
+    opening = Opening(plan, options, connection, data, clock, tap, trace)
+    with hold(address), connection.bus.open(opening) as drive:
         yield drive
 
 
@@ -69,4 +70,4 @@ def with_faults(plan: PeerPlan, texts: Sequence[str] | None, drive: str) -> Peer
             next_step="Add --simulate, or give --fault to tdhil simulate",
             entry=MessageCode.FAULTS_NEED_SIMULATOR,
         )
-    return replace(plan, faults=bus_kind(drive).parse_faults(texts))
+    return replace(plan, faults=bus_named(drive).parse_faults(texts))

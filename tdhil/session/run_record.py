@@ -129,10 +129,10 @@ class ByKeyword(ContextDecorator):
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         if isinstance(error, TdhilError):
+            from tdhil.buses import all_buses
             from tdhil.config import OPTIONS
-            from tdhil.session.connection import bus_kinds
 
-            of_buses = {flag: name for kind in bus_kinds() for name, flag in kind.flags.items()}
+            of_buses = {flag: name for bus in all_buses() for name, flag in bus.flags.items()}
             error.spelling = {**of_buses, **{option.flag: option.keyword for option in OPTIONS}, **_KEYWORDS}
 
 

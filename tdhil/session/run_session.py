@@ -13,11 +13,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from tdhil.buses import Connection, PeerPlan
 from tdhil.config import Overrides, Rig, RunOptions
 from tdhil.errors import LogError, TdhilError
-from tdhil.recording import RunLog, RunWriter
+from tdhil.recording import FRAME_CHANNELS, RunLog, RunWriter
 from tdhil.runner import Display, ExcitationRequest, Idle, Runner, RunOutcome, StopRequest, Task
-from tdhil.session.connection import Connection, PeerPlan
 from tdhil.session.dry_run import refuse_hopeless
 from tdhil.session.log_files import LogPlace
 from tdhil.session.open_drive import opened_drive
@@ -97,7 +97,7 @@ class RunSession:
         self._request, self._operator_interface = request, operator_interface
         self._place = place = LogPlace(Path(options.log))
         writer = RunWriter(place.wanted, epoch_ns=peer.epoch_ns, block=peer.stepped, opener=place.open,
-                           frames=request.connection.kind.frame_channel)
+                           frames=FRAME_CHANNELS[request.connection.bus.frame_topic])
         writer.path = place.path
         if place.live:
             operator_interface.warn(f"another run writes {place.wanted}: the log of this run is {place.path}")
@@ -248,7 +248,7 @@ def configuration(request: RunRequest) -> dict[str, Any]:
         "rig_file": None if rig is None or not rig.file else rig.file,
         "options": {name: {"value": value, "source": source} for name, value, source in options.rows()},
         "drive": connection.drive,
-        "bus": {name: {"value": value, "source": source} for name, value, source in connection.rows()},
+        "bus": {name: {"value": value, "source": source} for name, value, source in connection.line.rows()},
         "profile": connection.profile.model_dump(mode="json", by_alias=True),
         "embedded_simulator": peer.embedded,
         "stepped": peer.stepped,

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from typing import Any
 
 from drivers import Identity
-from tdhil.config import Rig, RunOptions, require_limits, simulated_default_rig
+from tdhil.config import Rig, RunOptions, require_limits, rig_model, simulated_default_rig
 from tdhil.recording import LagPrior, Pipe
 from tdhil.runner import ExcitationRequest, MachineLimits
 
@@ -47,7 +47,7 @@ def suited(rig: Rig | None, plant: Any) -> Rig | None:
         "make_up_torque_nm": most_nm,
         "torque_ramp_nm_s": TORQUE_SHARE * most_nm / RAMP_S,
     }
-    bench = Rig.model_validate(data)
+    bench = rig_model().model_validate(data)
     if rig is not None:
         bench._file, bench._lines = rig._file, rig._lines
     return bench

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from profiles import lazy_face
+from profiles import lazy_names
 
 if TYPE_CHECKING:
     from tdhil.soft_torque.drill_string import (
@@ -63,4 +63,26 @@ if TYPE_CHECKING:
         VirtualString as VirtualString,
     )
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "drill_string": "BitFriction EXACT_STRING BottomEnd DrillString WaveLine PipeSection StringFile "
+                        "identified_string StringTolerance load_string spring_and_mass string_of",
+        "controller": "ClosedSystem DERIVATIVE_FILTER_S Margins NaturalMode SpeedController TopDrive control_law "
+                      "impedance inner_lags margins reflection reflection_at softest_allowed stiff_controller "
+                      "tuned_controller",
+        "evaluation": "Evaluation EvaluationCase EvaluationRefused EvaluationOutcome Prediction Trial RigWindow "
+                      "case_of evaluate program_for refuse_untrue",
+        "own_units": "DriveSetting drive_settings",
+        "roots": "RootsLost count_in roots_in",
+        "stability": "LoopMargins NO_MARGINS RequiredMargins is_stable linear_limit loop_margins",
+        "uncertainty": "Interval DrawnValues Truth draw_truths",
+        "simulation": "Begin CriticalSpeeds Grid RPM Search SimulationTrace critical_speeds grid_of lowest_turning "
+                      "HIGHEST_NOISY_RPM NOISY_RESOLUTION lowest_turning_with_noise simulate",
+        "recipes": "largest_stable_share",
+        "tune_case": "Advice Moved TUNING_REFUSED TuneCase Tuned Tuning TuningRefused WrongInertia",
+        "tuned_figures": "BAND_HZ figures_at in_squares least_damping lowest_modes_below_hz recipe_with "
+                         "string_modes_hz",
+        "tuning": "START_DRAWS tune",
+        "depth_schedule": "DepthRow DepthSchedule at_depth schedule",
+        "virtual_string": "COLUMNS ProgramCourse HostController HostLoop RotorObserver Phase SpeedProgram "
+                          "IdentifiedRig VirtualString",
+    })

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from profiles import lazy_face
+from profiles import lazy_names
 
 if TYPE_CHECKING:
     from tdhil.studies.coverage import COVERAGE as COVERAGE
@@ -17,4 +17,12 @@ if TYPE_CHECKING:
     from tdhil.studies.settings_files import load_study_file as load_study_file, with_assignments as with_assignments
     from tdhil.studies.study import Study as Study, StudyOutcome as StudyOutcome
 else:
-    __getattr__, __dir__ = lazy_face(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "coverage": "COVERAGE",
+        "field": "FieldRun RunProgress field_studies",
+        "output": "Chapter INSTALL StudyBar document print_list print_outcome tally write_report write_study",
+        "registry": "simulated_studies",
+        "soft_torque": "SOFT_TORQUE",
+        "settings_files": "load_study_file with_assignments",
+        "study": "Study StudyOutcome",
+    })

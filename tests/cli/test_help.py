@@ -6,8 +6,9 @@ import sys
 
 import pytest
 
+from tdhil.buses import all_buses
 from tdhil.cli.main import _COMMANDS, _GROUPS, build_parser, main
-from tdhil.config import COMMON_LINE_FLAGS, OPTIONS
+from tdhil.config import OPTIONS
 
 COMMON = 20
 """Options that `identify --help` shows."""
@@ -36,7 +37,8 @@ def test_identify_shows_the_options_that_most_runs_need(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     short, full = _help(capsys, "identify", "--help"), _help(capsys, "identify", "--help-all")
     shown = _flags(short) - {"--help", "--help-all"}
-    common = {one.flag for one in OPTIONS if one.common} | COMMON_LINE_FLAGS | {"--rig", "--dry-run", "--report"}
+    of_buses = {flag for bus in all_buses() for flag in bus.common_flags}
+    common = {one.flag for one in OPTIONS if one.common} | of_buses | {"--rig", "--dry-run", "--report"}
     assert shown == common and len(shown) == COMMON
     assert {one.flag for one in OPTIONS} | shown <= _flags(full)
     assert all(len(line) <= 80 for line in short.splitlines())

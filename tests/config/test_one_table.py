@@ -200,8 +200,7 @@ pages and scripts alone. Buses: `tests/config/test_registry.py` sees to it that 
 
 EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
     "api.py": ("classes of the motions that ship, for their users", {"coast-down", "pulses", "multisine", "sine"}),
-    "cli/buses/canopen.py": ("where a scan found the drive, as a flag to type", {"--node"}),
-    "session/buses/canopen.py": ("the flags that mean this bus", {"--node"}),
+    "buses/canopen.py": ("the flag that means this bus, and to type where a scan found several drives", {"--node"}),
     "cli/main.py": ("arguments that could not be parsed; it loads no table", {"--json"}),
     "cli/profiles.py": ("said before or after its own sub-commands", {"--json"}),
     "cli/replay.py": ("a file with the excitation of a trace", {"--excitation"}),

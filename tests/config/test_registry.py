@@ -5,15 +5,11 @@ Everything that a toy needs stands in this file, and one line puts it in; nothin
 
 from __future__ import annotations
 
-import argparse
 import ast
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
-from types import MappingProxyType, SimpleNamespace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -21,27 +17,19 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 import tdhil
-from drivers.drive import RawFrame
-from drivers.errors import CommunicationLost, DataFileError
-from profiles.entry import DriveProfile, ProfileEntry
-from profiles.library import SCHEMAS
+from drivers.errors import DataFileError
 from profiles.model import Positive
 from profiles.yaml_loader import parse_model
 from sim_bus.params import RigParams
 from sim_bus.plant import kinds as plants
 from sim_bus.plant.friction.shaft import ShaftParams
-from tdhil.cli.doctor_finding import DoctorFinding, ok
 from tdhil.cli.main import build_parser, main
-from tdhil.cli.scan_common import BusCommands, FoundDrive
-from tdhil.config.options import Setting
-from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, BusEntry, RegistryEntry, load, names, told_before_echo
+from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, RegistryEntry, load, names, told_before_echo
 from tdhil.config.rig import Registered, Rig, load_rig
 from tdhil.errors import UsageError
 from tdhil.estimation import Options, identify
 from tdhil.estimation.frequency_domain.shafts import ShaftModel, TwoMassShaft
 from tdhil.recording.csv.excitation import ExcitationFile
-from tdhil.recording.log_format import MODBUS
-from tdhil.recording.log_reader import read_frames, read_run
 from tdhil.runner.excitation import (
     ExcitationKind,
     MotionLimits,
@@ -56,11 +44,9 @@ from tdhil.runner.excitation.signals import unit_peak
 from tdhil.runner.planning import adaptive, plan_acquisition, refuse_hopeless
 from tdhil.runner.preconditions import refuse_by_plan
 from tdhil.runner.settings import ExcitationRequest, MachineLimits
-from tdhil.session.connection import BusKind, LineConfig, PeerPlan
 from tests.estimation.compliant_bench import TwoMass, run
 from tests.estimation.test_two_mass import KNOWN as KNOWN_LAGS
 from tests.estimation.test_two_mass import MILD
-from tests.runner.line_drive import Line, LineDrive
 from tests.runner.test_design import KNOWN
 
 ROOT = Path(__file__).parents[2]
@@ -204,218 +190,6 @@ def test_a_toy_plant_is_read_and_turned(monkeypatch):
         parse_model("plant: {kind: fly}\n", "plant.yaml", RigParams)
     with pytest.raises(DataFileError, match="wheel_kg_m2: must be greater than 0, not -1"):
         parse_model("plant: {kind: flywheel, wheel_kg_m2: -1.0}\n", "plant.yaml", RigParams)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# A bus: its options, how a drive is opened, scan and doctor, the schema of its profiles; and one line in two lists
-
-
-class Stated(ProfileEntry):
-    """A section of a toy's profile."""
-
-    ends: Literal["off", "held"] = "held"
-    kind: str = "lease"
-    reaction: str = "quick_stop"
-
-
-class ToyProfile(DriveProfile):
-    """What is known of a drive on the toy bus."""
-
-    bus: Literal["toy"]
-    quick_stop: Stated
-    watchdog: Stated
-    parameters: tuple[Any, ...] = ()
-
-    def entries(self) -> tuple[tuple[str, ProfileEntry], ...]:
-        return (("quick_stop", self.quick_stop), ("watchdog", self.watchdog))
-
-    @property
-    def can_torque(self) -> bool:
-        return True
-
-    @property
-    def rated_torque_by_hand(self) -> bool:
-        return False
-
-
-@dataclass(frozen=True)
-class ToyLine(LineConfig):
-    nothing_there = "no peg is named"
-    simulated_text = "toy on a string"
-
-    @property
-    def configured(self) -> bool:
-        return self.value("peg") is not None
-
-
-class ToyKind(BusKind):
-    """Its drive is the one of `tests.runner.line_drive`, which no bus of ours knows."""
-
-    name, title, named_by = "toy", "Toy", "--peg"
-    flags = MappingProxyType({"peg": "--peg"})
-    default_profile = "toy.yaml"
-
-    def __init__(self) -> None:
-        self.drives: list[LineDrive] = []
-        self.closed = 0
-
-    @property
-    def frame_channel(self) -> int:
-        return MODBUS
-
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--peg", type=int)
-
-    def line(self, cli: Mapping[str, Any], rig: Rig | None, profile: Any) -> ToyLine:
-        return ToyLine({"peg": Setting.by_flag(cli["peg"], "--peg")} if cli.get("peg") is not None else {})
-
-    @property
-    def nowhere(self) -> ToyLine:
-        return ToyLine()
-
-    @contextmanager
-    def open(self, plan: PeerPlan, options: Any, connection: Any, data: Any, clock: Any, tap: Any,
-             trace: Any) -> Iterator[LineDrive]:
-        drive = LineDrive(Line(0.1), seed=plan.seed or 0, clock=clock)
-        self.drives.append(drive)
-        tap(RawFrame(0.0, True, 3, b"hello"))
-        yield drive
-        self.closed += 1
-
-    @contextmanager
-    def open_target(self, options: Any, connection: Any, clock: Any) -> Iterator[Any]:
-        raise CommunicationLost("nobody there", where=f"peg {connection.line.value('peg')}")
-        yield
-
-    def parse_faults(self, texts: Sequence[str]) -> tuple[Any, ...]:
-        return tuple(SimpleNamespace(text=text) for text in texts)
-
-    def faults(self) -> tuple[Any, ...]:
-        return ()
-
-    def fault_listing(self) -> str:
-        return "bite: the toy bites"
-
-
-@dataclass(frozen=True)
-class Peg:
-    """A value of the toy's."""
-
-    number: int
-
-    def cells(self) -> tuple[str, str, str, str]:
-        return f"peg {self.number}", "1", "1 toy", "what it is"
-
-    def plain(self) -> dict[str, Any]:
-        return {"peg": self.number}
-
-
-class ToyCommands(BusCommands):
-    address, address_flag, to_fill_in = "peg", "--peg", "a peg"
-
-    def blank(self, profile: Any) -> tuple[str, ...]:
-        return ("#peg:",)
-
-    def scan(self, plan: Any, connection: Any, options: Any, asked: Any) -> tuple[tuple[FoundDrive, ...], list[str]]:
-        return (FoundDrive("toy", connection.line.value("peg"), "a toy", "wood", plan.embedded),), ["it is asleep"]
-
-    def findings(self, plan: Any, connection: Any, options: Any, rig: Any, seen: list[Any]) -> Iterator[DoctorFinding]:
-        yield ok("toy", f"peg {connection.line.value('peg')} answers")
-        seen.append(Peg(7))
-
-    def wanted(self, connection: Any, options: Any) -> int | None:
-        return None
-
-    def section(self, found: FoundDrive, connection: Any) -> Mapping[str, Any]:
-        return {}
-
-    def keys(self, found: FoundDrive) -> Mapping[str, Any]:
-        return {"rate_hz": 20.0}
-
-
-TOY_BUS, TOY_COMMANDS = ToyKind(), ToyCommands()
-
-
-@pytest.fixture
-def toy_bus(monkeypatch, tmp_path) -> ToyKind:
-    """The bus in both lists, and a folder with a profile of it."""
-    monkeypatch.setitem(SCHEMAS, "toy", ToyProfile)
-    monkeypatch.setitem(BUSES, "toy", BusEntry(f"{__name__}:TOY_BUS", "a toy", commands=f"{__name__}:TOY_COMMANDS"))
-    monkeypatch.chdir(tmp_path)
-    sure = "{source: carved by hand, confidence: verified}"
-    (tmp_path / "toy.yaml").write_text(
-        f"name: wood/toy\ntitle: A toy of wood\nbus: toy\nquick_stop: {sure}\nwatchdog: {sure}\n"
-    )
-    TOY_BUS.drives.clear()
-    TOY_BUS.closed = 0
-    return TOY_BUS
-
-
-@pytest.mark.heavy
-def test_a_run_on_a_toy_bus_goes_all_the_way(toy_bus, capsys):
-    code = main(["identify", "--drive", "toy", "--simulate", "--seed", "3", "--json", "--model", "rigid",
-                 "--excitation", "multisine", "--periods", "3"])
-    out, err = capsys.readouterr()
-    document = json.loads(out)
-    assert (code, document["verdict"]) == (0, "valid"), err
-    estimate = document["inertia_kg_m2"]
-    assert estimate["low_total"] < 104.0 < estimate["high_total"]
-    assert "embedded toy on a string" in err
-    (drive,) = toy_bus.drives
-    assert drive.cycles > 500 and toy_bus.closed == 1
-    logged = read_run(Path("run.mcap")).configuration
-    assert (logged["drive"], logged["profile"]["name"]) == ("toy", "wood/toy")
-    assert [frame.data for frame in read_frames(Path("run.mcap"))] == [b"hello"]
-    assert main(["export", "run.mcap", "--to", "candump"]) == 2           # the toy's frames are no CAN frames
-    assert "contains no CAN frames" in capsys.readouterr().err
-
-
-def test_scan_and_doctor_ask_the_toy_bus(toy_bus, capsys):
-    assert main(["scan", "--peg", "7", "--write", "rig.yaml"]) == 0
-    assert "peg 7: a toy" in capsys.readouterr().out
-    rig = load_rig(Path("rig.yaml"))
-    assert (rig.drive, rig.rate_hz) == ("toy", 20.0)
-    main(["doctor", "--peg", "7", "--profile", "toy.yaml", "--json"])
-    document = json.loads(capsys.readouterr().out)
-    assert {"grade": "ok", "name": "toy", "said": "peg 7 answers", "do": ""} in document["checks"]
-    assert document["registers"] == [{"peg": 7}]
-    main(["doctor", "--peg", "7"])
-    assert "peg 7" in capsys.readouterr().out
-    assert main(["profiles", "show", "toy.yaml"]) == 0
-    assert "A toy of wood" in capsys.readouterr().out
-    assert main(["rig", "new", "new.yaml", "--profile", "toy.yaml", "--load", "none"]) == 0
-    assert "the drive's address: a peg" in capsys.readouterr().err
-    assert "#peg:" in Path("new.yaml").read_text()
-
-
-def test_the_command_line_tells_a_toy_from_the_other_buses(toy_bus, capsys):
-    assert build_parser("identify").parse_args(["identify", "--drive", "toy"]).drive == "toy"
-    assert main(["stop", "--peg", "7"]) == 8
-    assert "peg 7: nobody there" in capsys.readouterr().err
-    for arguments, said in (
-        (["--drive", "toy", "--host", "a"], "belongs to Modbus, but the drive is on Toy. Name a Toy drive with --peg"),
-        (["--drive", "modbus", "--peg", "7"], "--peg: belongs to Toy, but"),
-        (["--drive", "toy", "--profile", "generic/modbus"], "is a profile for modbus, and --drive says toy"),
-        (["--peg", "7", "--stepped"], "a Toy line has no SYNC, so it can't be stepped"),
-    ):
-        assert main(["identify", *arguments]) == 2
-        assert said in " ".join(capsys.readouterr().err.split())
-    Path("wired.yaml").write_text("drive: toy\nbus: {interface: socketcan, channel: can0}\n")
-    assert main(["identify", "--rig", "wired.yaml"]) == 2
-    assert "wired.yaml:2: bus: gives a drive's address, but the drive is on toy" in capsys.readouterr().err
-    assert main(["identify", "--fault", "list"]) == 0
-    assert "--drive toy\n\nbite: the toy bites" in capsys.readouterr().out
-
-
-@pytest.mark.heavy
-def test_nothing_is_compared_with_the_name_of_a_bus():
-    found = []
-    for path in sorted((*(ROOT / "tdhil").rglob("*.py"), *(ROOT / "profiles").rglob("*.py"))):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Compare | ast.MatchValue | ast.MatchOr):
-                told = {one.value for one in ast.walk(node) if isinstance(one, ast.Constant)} & set(BUSES)
-                found += [f"{path.relative_to(ROOT)}:{node.lineno}: {name}" for name in told]
-    assert found == []
 
 
 # ---------------------------------------------------------------------------------------------------------------------

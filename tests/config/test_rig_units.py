@@ -9,8 +9,9 @@ import pytest
 
 from drivers.errors import DataFileError
 from profiles.yaml_loader import load_model
+from tdhil.buses.canopen import CAN_BIT_RATES, bit_rate_problem
 from tdhil.cli.main import main
-from tdhil.config.rig import CAN_BIT_RATES, Rig, bit_rate_problem, load_rig
+from tdhil.config.rig import Rig, load_rig
 from tdhil.errors import UsageError
 
 LIMITS = {
@@ -116,14 +117,14 @@ def test_bit_rates_that_can_does_not_have(bit_s):
 
 
 def test_the_command_line_and_the_environment_know_the_same_rates(monkeypatch, tmp_path, capsys):
-    from tdhil.session.buses.can_bus import bus_config
+    from tdhil.buses.canopen import can_line
 
     monkeypatch.setenv("HOME", str(tmp_path))
     with pytest.raises(UsageError, match="500 bit/s is not a CAN bit rate"):
-        bus_config({"interface": "socketcan", "bitrate": 500})
+        can_line({"interface": "socketcan", "bitrate": 500})
     monkeypatch.setenv("CAN_BITRATE", "500")
     with pytest.raises(UsageError, match=r"CAN_BITRATE: bitrate 500 bit/s"):
-        bus_config({"interface": "socketcan"})
+        can_line({"interface": "socketcan"})
 
 
 def test_options_take_units(capsys):

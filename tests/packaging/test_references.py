@@ -57,6 +57,13 @@ OF_THEIR_DAY = {
     "tdhil/protocol/beside.py": "tdhil/runner/background.py",
     "runner.py": "tdhil/runner/five_stages.py",
     "tdhil.drivers": "drivers",
+    "tdhil.session.buses": "tdhil.buses",
+    "tdhil.cli.buses": "tdhil.buses",
+    "tdhil/cli/scan_common.py": "tdhil/buses/bus.py",
+    "profiles/face.py": "profiles/lazy.py",
+    "BusKind": "tdhil.buses.Bus",
+    "BusCommands": "tdhil.buses.Bus",
+    "LineConfig": "tdhil.buses.Line",
 }
 KNOWN = set().union(*EXCEPTIONS.values())
 

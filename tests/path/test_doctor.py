@@ -10,9 +10,9 @@ from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.modbus import embedded
 from sim_bus.modbus.wrong_maps import Wrong
 from sim_bus.params import RigParams
-from tdhil.cli.buses.canopen_doctor import link_findings
+from tdhil.buses import canopen
+from tdhil.buses.canopen import link_findings
 from tdhil.cli.doctor import disk_finding, jitter_finding, library_findings, naps, timer_finding
-from tdhil.session.buses import can_bus
 from tests.path.path_runs import tdhil
 from tests.path.watched_bus import WatchedBus
 
@@ -126,7 +126,7 @@ def test_disk(tmp_path, monkeypatch):
 def test_a_drive_on_the_bus_is_read_and_never_written_to(monkeypatch):
     with EmbeddedSimulator(RigParams(), node_id=3, stepped=True) as simulated:
         bus = WatchedBus(simulated.channel)
-        monkeypatch.setattr(can_bus, "open_bus", lambda config: bus)
+        monkeypatch.setattr(canopen, "open_bus", lambda config: bus)
         done = tdhil("doctor", "-i", "virtual", "-c", simulated.channel, "--node", 3)
     assert done.code == 0, done.out
     assert bus.identifiers == {0x603}

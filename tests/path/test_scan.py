@@ -8,16 +8,16 @@ import can
 import pytest
 
 from drivers.errors import PreflightRefused
+from drivers.modbus.scan import parse_identification
 from profiles.canopen import CanopenProfile
 from profiles.library import load_canopen_profile, load_profile, profile_names
 from sim_bus.canopen.simulator import EmbeddedSimulator, Simulator
 from sim_bus.params import RigParams
-from tdhil.cli.buses.canopen_scan import match
-from tdhil.cli.buses.modbus_scan import parse_identification, parse_units
+from tdhil.buses import FoundDrive, canopen, modbus
+from tdhil.buses.canopen import match
+from tdhil.buses.modbus import parse_units
 from tdhil.cli.scan import starter
-from tdhil.cli.scan_common import FoundDrive
 from tdhil.config.rig import load_rig, require_limits
-from tdhil.session.buses import can_bus, modbus
 from tests.path.path_runs import tdhil
 from tests.path.scan_lines_scripted import Answering, Garbled, Silent
 from tests.path.watched_bus import WatchedBus
@@ -59,7 +59,7 @@ def test_a_node_says_who_it_is(tmp_path):
 def test_scanning_writes_nothing_to_a_drive(monkeypatch):
     with EmbeddedSimulator(RigParams(), node_id=3, stepped=True) as simulated:
         bus = WatchedBus(simulated.channel)
-        monkeypatch.setattr(can_bus, "open_bus", lambda config: bus)
+        monkeypatch.setattr(canopen, "open_bus", lambda config: bus)
         done = tdhil("scan", "-i", "virtual", "-c", simulated.channel, *QUICK)
     assert done.code == 0, done.err
     assert bus.identifiers == {0x600 + node for node in range(1, 128)}
@@ -160,7 +160,7 @@ class Full(ErrorFrames):
 @pytest.mark.parametrize("command", ["scan", "doctor", "identify"])
 @pytest.mark.parametrize("bus", [ErrorFrames, Full])
 def test_a_wrong_bit_rate(monkeypatch, command, bus):
-    monkeypatch.setattr(can_bus, "open_bus", lambda config: bus())
+    monkeypatch.setattr(canopen, "open_bus", lambda config: bus())
     more = QUICK if command == "scan" else ()
     done = tdhil(command, "-i", "virtual", "-c", "x", *more)
     said = done.err + done.out

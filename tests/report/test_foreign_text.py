@@ -116,6 +116,6 @@ def test_the_head_of_a_column(tmp_path, capsys):
 
 @pytest.mark.parametrize("grade", ["ok", "bad"])
 def test_a_line_of_the_doctor_s(grade):
-    from tdhil.cli.doctor_finding import DoctorFinding
+    from tdhil.buses import DoctorFinding
 
     assert harmless(DoctorFinding(grade, "drive", EVIL, EVIL).text)

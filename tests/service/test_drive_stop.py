@@ -5,15 +5,18 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from drivers import BareStopReport, Ended, Identity
+from tdhil.buses import Connection
+from tdhil.buses.modbus import MODBUS
 from tdhil.service import drive_stop
 from tdhil.service.store import write_json
-from tdhil.session import Connection, kept_connection
+from tdhil.session import kept_connection
 from tests.service.conftest import Service
 
 
@@ -24,11 +27,11 @@ class OneDrive:
         self.asked: list[str] = []
 
         @contextlib.contextmanager
-        def opened(kind: object, options: object, connection: Connection, clock: object) -> Iterator[object]:
-            self.asked.append(connection.kind.address(options, connection) or "")
+        def opened(options: object, connection: Connection, clock: object) -> Iterator[object]:
+            self.asked.append(connection.bus.address(options, connection) or "")
             yield SimpleNamespace() if identity is None else SimpleNamespace(identity=lambda: identity)
 
-        monkeypatch.setattr("tdhil.session.buses.modbus.ModbusKind.open_target", opened)
+        monkeypatch.setattr("tdhil.buses.modbus.MODBUS", replace(MODBUS, open_target=opened))
         monkeypatch.setattr(drive_stop, "bare_stop",
                             lambda target, clock: BareStopReport(ended, None, None, 1.0, 1, ()))
 

@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 
 from profiles import STAGE_NUMBERS
+from tdhil.buses import all_buses
 from tdhil.service import worker
 from tdhil.service.fleets import Fleets
 from tdhil.service.run_state import Conflict
 from tdhil.service.start_request import Rigs
-from tdhil.session import bus_kinds, hold
+from tdhil.session import hold
 from tests.recording.test_log_tail import write
 from tests.service.conftest import wait_for
 
@@ -56,14 +57,14 @@ def test_samples_are_a_table(call, service, tmp_path, monkeypatch):
 
 
 def test_what_can_be_rehearsed_is_taken_at_every_stage(call):
-    for kind in bus_kinds():
-        faults = kind.faults()
+    for bus in all_buses():
+        faults = bus.faults()
         assert len({one.name for one in faults}) == len(faults) > 20
         for one in faults:
             for stage in STAGE_NUMBERS:
                 value = f"={one.value}" if one.takes and one.value else ""
                 text = f"{one.name}{value}" if one.from_start else f"{one.name}@{stage}+2s{value}/5s"
-                assert len(kind.parse_faults([text])) == 1, text
+                assert len(bus.parse_faults([text])) == 1, text
     found = {one["name"]: one for one in call("GET", "/rigs/a/faults", 200)}
     assert found["sto"]["row"] == 33
     assert found["frame-loss"]["value"] == "5%"

@@ -13,10 +13,10 @@ import can.util
 import pytest
 
 from drivers.errors import CommunicationLost, DataFileError, PreflightRefused
+from tdhil.buses import canopen
+from tdhil.buses.canopen import CanLine, can_line, check_link, open_bus, parse_link
 from tdhil.config.rig import Rig, load_rig
 from tdhil.errors import UsageError
-from tdhil.session.buses import can_bus
-from tdhil.session.buses.can_bus import BusConfig, bus_config, check_link, open_bus, parse_link
 
 
 @pytest.fixture(autouse=True)
@@ -41,12 +41,12 @@ def rig(tmp_path: Path, text: str) -> Rig:
     return load_rig(path)
 
 
-def test_no_bus_configured(files: tuple[Path, Path]) -> None:
-    assert not bus_config(cli()).configured
+def test_no_can_lineured(files: tuple[Path, Path]) -> None:
+    assert can_line(cli()).interface is None
     files[0].write_text("[default]\nbitrate = 250000\n")
-    assert not bus_config(cli("-c", "can0")).configured
+    assert can_line(cli("-c", "can0")).interface is None
     with pytest.raises(UsageError, match="--simulate"):
-        open_bus(bus_config({}))
+        open_bus(can_line({}))
 
 
 def test_each_value_comes_from_the_first_place_that_names_it(
@@ -54,19 +54,19 @@ def test_each_value_comes_from_the_first_place_that_names_it(
 ) -> None:
     files[0].write_text("[default]\ninterface = pcan\nchannel = PCAN_USBBUS1\nbitrate = 125000\nfd = False\n")
     files[1].write_text("[default]\nbitrate = 250000\nstate = ACTIVE\n")
-    found = bus_config({})
+    found = can_line({})
     assert found.kwargs() == can.util.load_config() | {"state": "ACTIVE"}
     assert (found.bitrate, found.source("bitrate")) == (250000, str(files[1]))
 
     monkeypatch.setenv("CAN_CONFIG", '{"channel": "vcan1", "receive_own_messages": "true", "bitrate": "1"}')
     monkeypatch.setenv("CAN_BITRATE", "500000")
-    found = bus_config({})
+    found = can_line({})
     assert (found.channel, found.source("channel")) == ("vcan1", "CAN_CONFIG")
     assert (found.bitrate, found.source("bitrate")) == (500000, "CAN_BITRATE")
     assert found.kwargs() == can.util.load_config() | {"state": "ACTIVE"}
 
     bench = rig(tmp_path, "bus:\n  channel: can7\n  options: {tcp_tune: true}\n")
-    found = bus_config(cli("-i", "socketcan", "--bus-kwargs", "a=1"), bench)
+    found = can_line(cli("-i", "socketcan", "--bus-kwargs", "a=1"), bench)
     assert list(found.rows())[:3] == [
         ("interface", "socketcan", "--interface"),
         ("channel", "can7", "rig.yaml:2"),
@@ -78,7 +78,7 @@ def test_each_value_comes_from_the_first_place_that_names_it(
 
 def test_bustype_is_an_interface(files: tuple[Path, Path]) -> None:
     files[0].write_text("[default]\nbustype = virtual\n")
-    assert bus_config({}).interface == "virtual"
+    assert can_line({}).interface == "virtual"
 
 
 @pytest.mark.parametrize(
@@ -93,14 +93,14 @@ def test_bustype_is_an_interface(files: tuple[Path, Path]) -> None:
 def test_wrong_variables(monkeypatch: pytest.MonkeyPatch, variable: str, value: str, words: str) -> None:
     monkeypatch.setenv(variable, value)
     with pytest.raises(UsageError, match=words.replace("[", r"\[")):
-        bus_config({})
+        can_line({})
 
 
 @pytest.mark.parametrize("text", ["interface = x\n", "[default]\nno equals\n", "[default]\na = %(b)s\n", "[default\n"])
 def test_wrong_files(files: tuple[Path, Path], text: str) -> None:
     files[0].write_text(text)
     with pytest.raises(DataFileError) as caught:
-        bus_config({})
+        can_line({})
     assert str(files[0]) in str(caught.value)
 
 
@@ -123,30 +123,30 @@ def test_what_ip_should_not_say(text: str) -> None:
 
 
 def test_a_link_with_another_bit_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(can_bus, "_read_link", lambda channel: link(name=channel))
-    check_link(bus_config(cli("-i", "socketcan", "-c", "can0")))
-    check_link(bus_config(cli("-i", "socketcan", "-c", "can0", "-b", "250000")))
+    monkeypatch.setattr(canopen, "read_link", lambda channel: link(name=channel))
+    check_link(can_line(cli("-i", "socketcan", "-c", "can0")))
+    check_link(can_line(cli("-i", "socketcan", "-c", "can0", "-b", "250000")))
     with pytest.raises(PreflightRefused) as caught:
-        check_link(bus_config(cli("-i", "socketcan", "-c", "can0", "-b", "500000")))
+        check_link(can_line(cli("-i", "socketcan", "-c", "can0", "-b", "500000")))
     assert "the CAN link runs at 250000 bit/s, but --bitrate requests 500000 bit/s" in str(caught.value)
     assert "sudo ip link set can0 down && sudo ip link set can0 up type can bitrate 500000" in str(caught.value)
 
 
 def test_a_link_that_is_down(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(can_bus, "_read_link", lambda channel: link(name=channel, up=False))
+    monkeypatch.setattr(canopen, "read_link", lambda channel: link(name=channel, up=False))
     with pytest.raises(PreflightRefused, match="sudo ip link set can0 up type can bitrate 250000"):
-        check_link(bus_config(cli("-i", "socketcan", "-c", "can0")))
-    monkeypatch.setattr(can_bus, "_read_link", lambda channel: link(name=channel, up=False, bitrate=None))
+        check_link(can_line(cli("-i", "socketcan", "-c", "can0")))
+    monkeypatch.setattr(canopen, "read_link", lambda channel: link(name=channel, up=False, bitrate=None))
     with pytest.raises(PreflightRefused, match=r"sudo ip link set vcan9 up$"):
-        check_link(bus_config(cli("-i", "socketcan", "-c", "vcan9")))
+        check_link(can_line(cli("-i", "socketcan", "-c", "vcan9")))
 
 
 def test_no_such_device() -> None:
     with pytest.raises((PreflightRefused, UsageError)) as caught:
-        open_bus(bus_config(cli("-i", "socketcan", "-c", "nocan77")))
+        open_bus(can_line(cli("-i", "socketcan", "-c", "nocan77")))
     assert caught.value.next_step
     with pytest.raises(UsageError, match="needs a channel"):
-        open_bus(bus_config(cli("-i", "socketcan")))
+        open_bus(can_line(cli("-i", "socketcan")))
 
 
 @pytest.mark.parametrize(
@@ -168,18 +168,18 @@ def test_causes_are_named(
         raise error
 
     monkeypatch.setattr(can, "Bus", fail)
-    monkeypatch.setattr(can_bus, "_read_link", lambda channel: None)
+    monkeypatch.setattr(canopen, "read_link", lambda channel: None)
     with pytest.raises(kind, match=words):
-        open_bus(bus_config(cli("-i", "socketcan", "-c", "can0")))
+        open_bus(can_line(cli("-i", "socketcan", "-c", "can0")))
 
 
 def test_the_virtual_bus_opens() -> None:
-    with open_bus(bus_config(cli("-i", "virtual", "-c", "bus options"))) as bus:
+    with open_bus(can_line(cli("-i", "virtual", "-c", "bus options"))) as bus:
         assert isinstance(bus, can.BusABC)
 
 
-def daemon(port: int, *more: str) -> BusConfig:
-    return bus_config(cli("-i", "socketcand", "-c", "can0", "--bus-kwargs", "host=127.0.0.1", f"port={port}", *more))
+def daemon(port: int, *more: str) -> CanLine:
+    return can_line(cli("-i", "socketcand", "-c", "can0", "--bus-kwargs", "host=127.0.0.1", f"port={port}", *more))
 
 
 def test_no_socketcand_server_is_found_out_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,7 +191,7 @@ def test_no_socketcand_server_is_found_out_at_once(monkeypatch: pytest.MonkeyPat
         with pytest.raises(CommunicationLost, match=f"127.0.0.1:{port}: no socketcand server answers"):
             open_bus(daemon(port))
     with pytest.raises(UsageError, match="needs 'host'"):
-        open_bus(bus_config(cli("-i", "socketcand", "-c", "can0")))
+        open_bus(can_line(cli("-i", "socketcand", "-c", "can0")))
 
 
 def serve(server: socket.socket, answers: tuple[bytes, ...]) -> None:
@@ -217,6 +217,6 @@ def test_socketcand_opens_tuned(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_another_server_on_that_port(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(can_bus, "PROBE_S", 0.2)
+    monkeypatch.setattr(canopen, "PROBE_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as silent, pytest.raises(CommunicationLost, match="not a socketcand"):
         open_bus(daemon(silent.getsockname()[1]))

@@ -39,8 +39,8 @@ def test_the_way_to_a_drive_comes_back_without_its_files(tmp_path, monkeypatch, 
     again, back = connection_of_kept(plain)
     assert {name: one.value for name, one in back.line.settings.items()} == {
         name: one.value for name, one in connection.line.settings.items()}
-    assert (back.kind, back.profile, again.node) == (connection.kind, connection.profile, options.node)
-    assert back.kind.address(again, back) == connection.kind.address(options, connection) == plain["address"]
+    assert (back.bus, back.profile, again.node) == (connection.bus, connection.profile, options.node)
+    assert back.bus.address(again, back) == connection.bus.address(options, connection) == plain["address"]
 
 
 @pytest.mark.parametrize("name", profile_names())

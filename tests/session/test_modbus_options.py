@@ -9,10 +9,10 @@ import pytest
 
 from drivers.errors import DataFileError
 from profiles.library import load_modbus_profile
+from tdhil.buses.modbus import modbus_line
 from tdhil.config.resolution import resolve
 from tdhil.config.rig import Rig, load_rig
 from tdhil.errors import UsageError
-from tdhil.session.buses.modbus_line import modbus_config
 from tdhil.session.connection import connection_of
 
 PROFILE = load_modbus_profile("generic/modbus")
@@ -41,15 +41,15 @@ def chosen(cli: dict[str, Any], rig: Rig | None = None) -> tuple[str, str, str, 
 
 
 def test_nobody_says_where() -> None:
-    found = modbus_config({}, None, PROFILE)
-    assert not found.configured
+    found = modbus_line({}, None, PROFILE)
+    assert found.host is None and found.serial is None
     assert list(found.rows()) == [("unit", "1", "profile generic/modbus")]
     assert found.unit == 1
 
 
 def test_each_value_comes_from_the_first_place_that_names_it(tmp_path: Path) -> None:
     rig = rig_of(tmp_path, "modbus:\n  host: 192.0.2.10\n  port: 5020\n  unit: 7\n")
-    found = modbus_config({"unit": 9}, rig, PROFILE)
+    found = modbus_line({"unit": 9}, rig, PROFILE)
     assert list(found.rows()) == [
         ("host", "192.0.2.10", "rig.yaml:2"), ("port", "5020", "rig.yaml:3"), ("unit", "9", "--unit"),
     ]
@@ -58,7 +58,7 @@ def test_each_value_comes_from_the_first_place_that_names_it(tmp_path: Path) -> 
 
 def test_the_command_line_s_serial_device_undoes_the_rig_s_host(tmp_path: Path) -> None:
     rig = rig_of(tmp_path, "modbus: {host: 192.0.2.10, port: 5020}\n")
-    found = modbus_config({"serial": "/dev/ttyUSB0", "baud": 9600}, rig, PROFILE)
+    found = modbus_line({"serial": "/dev/ttyUSB0", "baud": 9600}, rig, PROFILE)
     assert list(found.rows()) == [
         ("serial", "/dev/ttyUSB0", "--serial"), ("baud", "9600", "--baud"),
         ("parity", "E", "profile generic/modbus"), ("stop_bits", "1", "profile generic/modbus"),
@@ -81,7 +81,7 @@ def test_the_command_line_s_serial_device_undoes_the_rig_s_host(tmp_path: Path) 
 )
 def test_what_is_refused(cli: dict[str, Any], said: str) -> None:
     with pytest.raises(UsageError) as caught:
-        modbus_config(cli, None, PROFILE)
+        modbus_line(cli, None, PROFILE)
     assert said in str(caught.value)
 
 

@@ -1,4 +1,4 @@
-"""The nodes of a CAN bus: all receive a request for the device type (1000h) at once, those that answer one for 1018h.
+"""The nodes of a CAN bus: all receive a request for the device type (1000h) at once.
 
 Reads only. The 127 requests take 0.2 s. Everything received meanwhile (heartbeats, boot-ups, error frames) counts.
 """
@@ -12,11 +12,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
-from drivers import CommunicationLost, MonotonicClock, ObjectRefused
-from drivers.canopen import CanLink, SdoObjects
-from profiles import MARKER_INDEX, MARKER_TEXT, MessageCode, load_profile, profile_names, visible
-from profiles.canopen import CanopenProfile
-from tdhil.cli.scan_common import FoundDrive
+from drivers.canopen.bus import CanLink
+from drivers.clock import MonotonicClock
+from drivers.errors import CommunicationLost
+from profiles import MessageCode
 
 if TYPE_CHECKING:
     import can
@@ -28,9 +27,6 @@ PACE_S = 0.0015
 FULL_TRIES, FULL_PAUSE_S = 20, 0.01
 """Time for a full transmit queue to empty, s, if another node acknowledges the frames."""
 _STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
-_CIA402 = 402
-
-
 @dataclass
 class Heard:
     """Everything received during the scan."""
@@ -54,53 +50,6 @@ def ask_all(bus: can.BusABC, nodes: Iterable[int], wait_s: float) -> tuple[CanLi
     _listen(link, wait_s, heard)
     heard.error_frames = link.error_frames
     return link, heard
-
-
-def identify_all(link: CanLink, heard: Heard) -> tuple[FoundDrive, ...]:
-    """Return name and profile of every node that answered."""
-    profiles = [profile for name in profile_names() if isinstance(profile := load_profile(name), CanopenProfile)]
-    return tuple(_identify(link, node, heard, profiles) for node in sorted(heard.device_types))
-
-
-def match(device_type: int, identity: tuple[int | None, int | None, int | None],
-          profiles: Iterable[CanopenProfile]) -> tuple[str | None, str]:
-    """Return (profile, reason): the one whose identity (vendor, product, revision of 1018h) fits best."""
-    best, most = None, 0
-    for profile in profiles:
-        wanted = (profile.identity.vendor, profile.identity.product, profile.identity.revision)
-        asked = [(want, have) for want, have in zip(wanted, identity, strict=True) if want is not None]
-        if len(asked) > most and all(want == have for want, have in asked):
-            best, most = profile.name, len(asked)
-    if best is not None:
-        return best, ("vendor", "vendor and product", "vendor, product and revision")[most - 1]
-    if device_type & 0xFFFF == _CIA402:
-        return "generic/cia402", "a CiA 402 drive without a profile of its own: check every unit"
-    return None, f"not a CiA 402 drive (device type {device_type:08X}h)"
-
-
-def _identify(link: CanLink, node: int, heard: Heard, profiles: list[CanopenProfile]) -> FoundDrive:
-    objects = SdoObjects(link, node)
-    values: list[int | None] = []
-    title, simulated = "", False
-    try:
-        values += [objects.read_if_there(0x1018, sub) for sub in (1, 2, 3, 4)]
-        title = _text(objects, 0x1008)
-        simulated = _text(objects, MARKER_INDEX, 1) == MARKER_TEXT
-    except CommunicationLost:
-        values += [None] * (4 - len(values))           # it answered once and then no more: show what is known
-    vendor, product, revision, serial = values
-    profile, why = match(heard.device_types[node], (vendor, product, revision), profiles)
-    parts = (("vendor", vendor), ("product", product), ("revision", revision), ("serial", serial))
-    identity = ", ".join(f"{part} {value:X}h" for part, value in parts if value is not None)
-    return FoundDrive("canopen", node, title, identity or "not reported (1018h)", simulated, profile, why,
-                      heard.states.get(node, ""))
-
-
-def _text(objects: SdoObjects, index: int, sub: int = 0) -> str:
-    try:
-        return visible(objects.read_bytes(index, sub).decode("ascii", "replace").rstrip("\0 "))
-    except ObjectRefused:
-        return ""
 
 
 def _send(link: CanLink, identifier: int, heard: Heard) -> None:

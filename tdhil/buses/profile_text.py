@@ -2,88 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from pydantic import BaseModel
 
 from profiles import Confidence, Profile, ProfileEntry, Require
-from profiles.modbus import ModbusProfile, Register
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Every register that a Modbus profile names, with its meaning: for `profiles show` and for `doctor`. Pure.
-
+from profiles.cia402 import Parameter
+from tdhil.buses.bus import ProfileTable
 
 _UNITS = {"rpm_s": "rpm/s", "nm": "N·m", "rated": "of rated torque", "hz": "Hz", "kw": "kW", "none": ""}
-_SIGNALS = {
-    "control": "control word",
-    "status": "status word",
-    "speed_setpoint": "speed setpoint",
-    "torque_setpoint": "torque setpoint",
-    "speed": "reported speed",
-    "torque": "reported torque",
-    "torque_demand": "torque demand",
-}
-
-
-@dataclass(frozen=True)
-class RegisterUse:
-    """The use of one register. ``per_lsb``: units for one count, None for words of bits; ``times``: parameter that
-    multiplies.
-    """
-
-    name: str                   # as in `ModbusProfile.entries`
-    meaning: str
-    register: Register
-    per_lsb: float | None
-    unit: str                   # as it is written in texts
-    times: str | None
-    entry: ProfileEntry
-
-    @property
-    def address(self) -> str:
-        """Return the address as on the wire and as in the manual."""
-        at = self.register
-        table = "" if at.table == "holding" else " input"
-        return f"{at.address} ({at.address:04X}h){table}" + (f" = {at.reference}" if at.reference else "")
-
-    @property
-    def scale(self) -> str:
-        """Return the value of one count."""
-        if self.per_lsb is None:
-            return "bits"
-        times = f" × {self.times}" if self.times else ""
-        return f"{self.per_lsb:g}{times} {self.unit}".strip()
-
-
-def register_uses(profile: ModbusProfile) -> tuple[RegisterUse, ...]:
-    """Return all uses in the profile's order: cycle, mode, parameters, echoes. Two uses may share a register."""
-    found = [
-        RegisterUse(
-            f"cycle.{name}", meaning, part.register_, getattr(part, "per_lsb", None),
-            _UNITS.get(getattr(part, "unit", "none"), getattr(part, "unit", "")), getattr(part, "times", None), part,
-        )
-        for name, meaning in _SIGNALS.items()
-        if (part := getattr(profile.cycle, name)) is not None
-    ]
-    modes = profile.modes
-    if modes.register_ is not None:
-        found.append(RegisterUse("modes", "speed or torque", modes.register_, None, "", None, modes))
-    if modes.display is not None:
-        found.append(RegisterUse("modes", "speed or torque, as shown", modes.display.register_, None, "", None, modes))
-    found += [
-        RegisterUse(f"parameters.{one.name}", one.title, one.register_, one.per_lsb, unit_text(one.unit),
-                    one.factor, one)
-        for one in profile.parameters
-        if one.register_ is not None
-    ]
-    found += [
-        RegisterUse(f"echoes.{one.setpoint}", f"{one.setpoint} setpoint, as received", one.register_, one.per_lsb,
-                    unit_text(one.unit), one.times, one)
-        for one in profile.echoes
-    ]
-    return tuple(found)
+MARKS = {"verified": "", "likely": "likely", "unverified": "UNVERIFIED"}
+"""Mark of an entry's confidence in a table."""
 
 
 def unit_text(unit: str) -> str:
@@ -91,7 +21,17 @@ def unit_text(unit: str) -> str:
     return _UNITS.get(unit, unit)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+def object_table(parameters: Sequence[Parameter]) -> ProfileTable:
+    """Return a drive's own objects of CiA 402, on any bus that carries them."""
+    rows = []
+    for one in parameters:
+        scale = f"{one.per_lsb:g}{f' × {one.times}' if one.times else ''} {unit_text(one.unit)}".strip()
+        scale = "2^count" if one.scale == "power_of_two" else scale
+        at = f"{one.index:04X}h:{one.sub}" if one.sub else f"{one.index:04X}h"
+        rows.append((at, one.type, one.title, scale, MARKS[one.confidence]))
+    return ProfileTable("the drive's own objects", ("object", "type", "meaning", "one count", "confidence"),
+                        tuple(rows))
+
 
 LEVELS: tuple[Confidence, ...] = ("verified", "likely", "unverified")
 
