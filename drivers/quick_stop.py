@@ -105,7 +105,7 @@ class BareStopReport:
 
 
 class StopAction(Enum):
-    """What the next round does."""
+    """Action of the next round."""
 
     REQUEST = "send the quick stop, then read"
     WATCH = "read only"
