@@ -155,14 +155,14 @@ async def stop_rig(site: Site, request: Request, body: Any) -> StoppedView:
 
 async def faults(site: Site, request: Request, body: None) -> list[FaultView]:
     """Return the faults that can be rehearsed. Raises NotAllowed for a real rig."""
-    from tdhil.session import bus_kind
+    from tdhil.buses import bus_named
 
     which = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
     if not which.simulated:
         raise NotAllowed("faults can be rehearsed only on a simulated rig", where=f"rig {which.id}",
                          next_step="Use a rig whose file contains run: {simulate: true}")
-    kind = bus_kind(which.way()[1].drive)
-    return [FaultView(one.name, one.summary, one.row, one.value, one.takes, one.from_start) for one in kind.faults()]
+    bus = bus_named(which.way()[1].drive)
+    return [FaultView(one.name, one.summary, one.row, one.value, one.takes, one.from_start) for one in bus.faults()]
 
 
 async def calibration(site: Site, request: Request, body: CalibrationBody) -> CalibrationView:
