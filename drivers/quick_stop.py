@@ -1,15 +1,34 @@
 """A quick stop outside of any run: best effort, on a drive that was not prepared. It is no emergency stop.
 
-It first sends the request and then reads the state, repeatedly while the drive still follows another master's
-setpoints, until standstill, or no answer comes, or the shaft gets no slower. It never disables the drive: a turning
-shaft would coast, and a shaft at standstill may hold a load.
+Each round sends the request if the state asks for it, then reads the drive. The reading alone decides the next state:
+
+```text
+   reading                             state     action in the next round     end
+   ---------------------------------   -------   --------------------------   -----------------------------
+                            begin ---> ASKING    REQUEST, then read
+   follows setpoints, or blank ------> ASKING    REQUEST, then read           no slower for 10 s: TURNING
+   turns, follows no setpoint -------> BRAKING   WATCH: read only             no slower for 10 s: TURNING
+   speed near zero ------------------> QUIET     WATCH: read only             after 3 s: AT_REST
+   ... and the drive reports it too -> STILL     WATCH: read only             after 1.5 s: AT_REST
+   error, or no reply ---------------> SILENT    REQUEST, then read           no reply for 3 s: NO_ANSWER
+
+   usual way:       ASKING ---> BRAKING ---> QUIET, STILL ---> AT_REST
+   another master:  ASKING <---> BRAKING                       (its setpoints act again: the request is repeated)
+   a gap:           any state <---> SILENT                     (the time at standstill begins again)
+   any state, after 120 s: TURNING, or NO_ANSWER if the drive never replied
+```
+
+No action disables the drive: a turning shaft would coast, and a shaft at standstill may hold a load.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import operator
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from enum import Enum
+from types import MappingProxyType
 from typing import Protocol
 
 from drivers.clock import Clock
@@ -19,9 +38,15 @@ from drivers.errors import CommunicationLost, TdhilError
 QUIET_S, QUIET_UNSAID_S = 1.5, 3.0
 """Least duration of standstill, s: if the drive reports it too, and if it does not."""
 PAUSE_S = 0.02
+"""Time between two rounds, s."""
 SILENT_S = 3.0
+"""Longest time without any reply, s."""
 NO_SLOWER_S, SLOWER = 10.0, 0.99
+"""Longest time, s, in which the speed does not fall below this share of its least value."""
 LONGEST_S = 120.0
+"""Longest time of the whole stop, s."""
+MOST_TROUBLES = 20
+"""Number of errors that the report repeats."""
 _NO_TORQUE = (PowerState.OFF, PowerState.READY, PowerState.NOT_READY, PowerState.FAULT)
 
 
@@ -75,68 +100,160 @@ class BareStopReport:
     remarks: tuple[str, ...]
 
 
+# ---------------------------------------------------------------------------------------------------------------------
+# The table. Pure.
+
+
+class StopAction(Enum):
+    """Action of the next round."""
+
+    REQUEST = "send the quick stop, then read"
+    WATCH = "read only"
+    END = "end"
+
+
+class StopState(Enum):
+    """State of the stop, from the latest reading."""
+
+    ASKING = "asking"
+    BRAKING = "braking"
+    QUIET = "quiet"
+    STILL = "still"
+    SILENT = "silent"
+
+
+@dataclass(frozen=True)
+class StopRound:
+    """One round. ``seen``: None after an error. ``heard``: the drive replied, if only with an error."""
+
+    time_s: float
+    seen: Seen | None
+    heard: bool = True
+
+
+@dataclass(frozen=True)
+class StopCourse:
+    """State and its times. ``least_speed``: least magnitude so far of a speed that is not near zero."""
+
+    state: StopState
+    begun_s: float
+    heard_s: float                     # latest reply
+    gained_s: float                    # latest time at which the shaft became slower
+    near_zero_s: float                 # begin of the present standstill; inf: there is none
+    least_speed: float
+    longest_s: float
+    answered: bool = False             # there was a reading
+    ended: Ended | None = None
+
+    @classmethod
+    def begin(cls, now_s: float, longest_s: float = LONGEST_S) -> StopCourse:
+        """Return the state before the first request."""
+        return cls(StopState.ASKING, now_s, now_s, now_s, math.inf, math.inf, longest_s)
+
+
+@dataclass(frozen=True)
+class StopRule:
+    """``action`` in a state, and its end: ``limit_s`` after ``since_s``."""
+
+    action: StopAction
+    since_s: Callable[[StopCourse], float]
+    reached: Callable[[float, float], bool]
+    limit_s: float
+    ended: Ended
+
+
+_heard_s = operator.attrgetter("heard_s")
+_gained_s = operator.attrgetter("gained_s")
+_near_zero_s = operator.attrgetter("near_zero_s")
+
+TABLE: Mapping[StopState, StopRule] = MappingProxyType({
+    StopState.ASKING: StopRule(StopAction.REQUEST, _gained_s, operator.gt, NO_SLOWER_S, Ended.TURNING),
+    StopState.BRAKING: StopRule(StopAction.WATCH, _gained_s, operator.gt, NO_SLOWER_S, Ended.TURNING),
+    StopState.QUIET: StopRule(StopAction.WATCH, _near_zero_s, operator.ge, QUIET_UNSAID_S, Ended.AT_REST),
+    StopState.STILL: StopRule(StopAction.WATCH, _near_zero_s, operator.ge, QUIET_S, Ended.AT_REST),
+    StopState.SILENT: StopRule(StopAction.REQUEST, _heard_s, operator.gt, SILENT_S, Ended.NO_ANSWER),
+})
+
+
+def state_of(seen: Seen | None) -> StopState:
+    """Return the state that a reading means. A status word that a gateway made up (``blank``) shows nothing."""
+    if seen is None:
+        return StopState.SILENT
+    if seen.follows or seen.blank:
+        return StopState.ASKING
+    if not seen.near_zero:
+        return StopState.BRAKING
+    return StopState.STILL if seen.standstill or seen.state in _NO_TORQUE else StopState.QUIET
+
+
+def step(before: StopCourse, now: StopRound) -> tuple[StopCourse, StopAction]:
+    """Return the next state and action. Pure."""
+    seen, time_s, state = now.seen, now.time_s, state_of(now.seen)
+    standing = state in (StopState.QUIET, StopState.STILL)
+    slower = seen is not None and not seen.near_zero and abs(seen.speed) < SLOWER * before.least_speed
+    after = replace(
+        before,
+        state=state,
+        heard_s=time_s if now.heard else before.heard_s,
+        gained_s=time_s if slower else before.gained_s,
+        near_zero_s=min(before.near_zero_s, time_s) if standing else math.inf,
+        least_speed=abs(seen.speed) if seen is not None and slower else before.least_speed,
+        answered=before.answered or seen is not None,
+    )
+    row = TABLE[state]
+    if row.reached(time_s - row.since_s(after), row.limit_s):
+        return replace(after, ended=row.ended), StopAction.END
+    if time_s - after.begun_s > after.longest_s:
+        return replace(after, ended=Ended.TURNING if after.answered else Ended.NO_ANSWER), StopAction.END
+    return after, row.action
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
 def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_S) -> BareStopReport:
     """Stop the shaft. Never raises: errors are among the remarks."""
-    begun_s = heard_s = gained_s = clock.now_s()
-    first: Seen | None = None
-    last: Seen | None = None
-    quiet_since_s: float | None = None
-    best, asked, follows = math.inf, 0, True
+    stopping, action = StopCourse.begin(clock.now_s(), longest_s), StopAction.REQUEST
+    readings: list[Seen] = []
     troubles: list[str] = []
-    coasted: Seen | None = None
-    shown = ""                         # what was shown in place of a state
-    ended: Ended | None = None
-    while ended is None:
-        try:
-            if follows:
-                asked += 1
+    asked = 0
+    while action is not StopAction.END:
+        if action is StopAction.REQUEST:
+            asked += 1
+            try:
                 target.ask(asked)
-        except TdhilError as error:    # the poll shows whether it helped anyway
-            _note(troubles, error)
-        now_s = clock.now_s()
+            except TdhilError as error:    # the reading shows whether it helped anyway
+                troubles.append(str(error))
         try:
-            last = target.poll()
+            readings.append(target.poll())
+            now = StopRound(clock.now_s(), readings[-1])
         except TdhilError as error:
-            _note(troubles, error)
-            now_s = clock.now_s()
-            quiet_since_s, follows = None, True
-            if not isinstance(error, CommunicationLost):
-                heard_s = now_s
-            if now_s - heard_s > SILENT_S:
-                ended = Ended.NO_ANSWER
-        else:
-            now_s = heard_s = clock.now_s()
-            first, follows = first or last, last.follows or last.blank
-            if coasted is None and last.state is PowerState.OFF and not last.near_zero:
-                coasted = last
-            shown = last.text if last.blank else shown
-            if not last.near_zero or follows:
-                quiet_since_s = None
-            elif quiet_since_s is None:
-                quiet_since_s = now_s
-            said = last.standstill or last.state in _NO_TORQUE
-            if quiet_since_s is not None and now_s - quiet_since_s >= (QUIET_S if said else QUIET_UNSAID_S):
-                ended = Ended.AT_REST
-            if not last.near_zero and abs(last.speed) < SLOWER * best:
-                best, gained_s = abs(last.speed), now_s
-            stuck = quiet_since_s is None and now_s - gained_s > NO_SLOWER_S
-            if ended is None and stuck:
-                ended = Ended.TURNING
-        if ended is None and now_s - begun_s > longest_s:
-            ended = Ended.TURNING if last is not None else Ended.NO_ANSWER
+            troubles.append(str(error))
+            now = StopRound(clock.now_s(), None, heard=not isinstance(error, CommunicationLost))
+        stopping, action = step(stopping, now)
         clock.wait_until(clock.now_s() + PAUSE_S)
-    ran_out = () if coasted is None else (
-        f"the torque was off while the shaft still turned at {coasted.speed:.3g} {coasted.unit}: the shaft ran out",
-    )
-    no_state = () if not shown else (
-        f"the drive showed {shown}: tdhil ignored the speed beside it, and requested the quick stop again",
-    )
+    assert stopping.ended is not None
     return BareStopReport(
-        ended, first, last, clock.now_s() - begun_s, asked,
-        (*target.remarks(), *ran_out, *no_state, *dict.fromkeys(troubles)),
+        stopping.ended,
+        readings[0] if readings else None,
+        readings[-1] if readings else None,
+        clock.now_s() - stopping.begun_s,
+        asked,
+        (*target.remarks(), *_remarks(readings), *dict.fromkeys(troubles[:MOST_TROUBLES])),
     )
 
 
-def _note(troubles: list[str], error: TdhilError) -> None:
-    if len(troubles) < 20:
-        troubles.append(str(error))
+def _remarks(readings: list[Seen]) -> list[str]:
+    """Return what the readings showed beside the end: a shaft that ran out, a state that is none."""
+    said = []
+    coasted = next((one for one in readings if one.state is PowerState.OFF and not one.near_zero), None)
+    if coasted is not None:
+        said.append(
+            f"the torque was off while the shaft still turned at {coasted.speed:.3g} {coasted.unit}: the shaft ran out"
+        )
+    shown = next((one.text for one in reversed(readings) if one.blank), "")
+    if shown:
+        said.append(
+            f"the drive showed {shown}: tdhil ignored the speed beside it, and requested the quick stop again"
+        )
+    return said

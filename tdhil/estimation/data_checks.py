@@ -189,9 +189,9 @@ def _check_rate(segment: Segment, part: Samples) -> None:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_LEAST_SAMPLES = 64
-_STALE_SHARE = 0.5
-_LONGEST_S = 7.0 * 86400.0
+_LEAST_SAMPLES = 64       # fewer samples are no record
+_STALE_SHARE = 0.5        # of the samples that must bring something new
+_LONGEST_S = 7.0 * 86400.0   # s; a week, the limit of a record
 _HUGE = 1e15            # rad/s or N·m: no machine; squares of it, and of its ratios, are still numbers
 _MOTIONLESS = 2.0       # steps of a signal within which it hasn't changed
 _TINY = 1e-12           # of a signal's size, or of its unit: below it is the arithmetic's own

@@ -78,7 +78,7 @@ def _copied(lines: tuple[SpectralLine, ...]) -> bool:
 
 
 _NEAR_ZERO = 0.01       # of the speed's largest value counts as rest; at least so many of the signal's steps:
-_STEPS = 2.0
+_STEPS = 2.0              # quanta of the signal that count as near
 _LEAST_SHARE = 0.02     # of the samples
 
 
@@ -125,9 +125,9 @@ def check_standstill(parts: list[tuple[Segment, Samples]], quantum: float) -> No
 
 _CLEAR_TIMEBASE = 40.0           # of Λ
 _HARMLESS = 5e-4        # of the period: it makes J wrong by as much
-_WIDEST = 0.05
-_MOST_STEPS = 4001
-_STEPS_A_TURN = 32.0
+_WIDEST = 0.05            # largest ε that is searched
+_MOST_STEPS = 4001        # steps of this search, at most
+_STEPS_A_TURN = 32.0      # steps of ε for a turn of the fastest line over the segment
 _MOST_PERIODS = 64      # most periods used of a segment: enough to see a turning that matters
 _EQUAL = 1e-6           # of Λ: less is rounding
 _FLOOR = 1e-12          # relative: scatter that is the arithmetic's
@@ -205,8 +205,8 @@ def _gain(turning: list[tuple[FloatArray, FloatArray, ComplexArray]], trial: Flo
 # neighbourhood: forty times the median of the neighbours, at one in 10¹² bins.
 
 
-_BINS_A_CYCLE = 20.0
-_MOST_BINS = 400_000
+_BINS_A_CYCLE = 20.0      # bins of a cycle of the fastest line
+_MOST_BINS = 400_000      # bins in all, at most
 _NEIGHBOURS = 15          # to either side
 _FEWEST = 4               # of a side that count
 _CLEAR_UNDECLARED = 40.0             # times the neighbours' median

@@ -57,11 +57,11 @@ _LEAST_PERIODS = 5             # in a row: the lines beside an excited one are t
 _BESIDE = 5                    # of them on either side
 _BLOCK = 8192                  # samples worked on at once
 _FLOOR = 1e-14                 # relative variance below which noise is rounding of the arithmetic
-_LEAST_LINES = 4
+_LEAST_LINES = 4          # lines that the fit needs
 _CLEAR = 9.0                   # |mean|² over its variance, of a line that answers
-_STARTS_S = ((0.40, 0.15), (0.05, 0.02), (0.1, 0.4))
+_STARTS_S = ((0.40, 0.15), (0.05, 0.02), (0.1, 0.4))   # s; start values of the lags of speed and torque
 _OPEN = 0.5                    # relative half-width of P beyond which no value is given
-_AT_BOUND = 1e-6
+_AT_BOUND = 1e-6          # of a parameter's scale: nearer to its bound counts as on it
 _REFERENCE_GAIN = 10.83        # −2 ln L that a reference filter must be worth: one time in a thousand by chance
 _POINTS = 49                   # of the curve
 

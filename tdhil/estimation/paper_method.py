@@ -18,9 +18,9 @@ from tdhil.estimation.result import LineFit, PaperEstimate
 from tdhil.estimation.samples import Samples
 from tdhil.recording import FloatArray
 
-STEP_S = 0.1
+STEP_S = 0.1              # s; interval of the acceleration (Xu 2026)
 _SHORTEST = 0.7     # of a step: a gap before the last sample may cut it
-_LONGEST = 1.5
+_LONGEST = 1.5            # of this interval: a longer one has a gap
 _BLOCK = 65536      # samples worked on at once
 
 Pairs = tuple[FloatArray, FloatArray]

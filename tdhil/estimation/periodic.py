@@ -38,7 +38,7 @@ from tdhil.estimation.samples import Stretch, log_warnings, stretches
 from tdhil.estimation.spectrum import PeriodLines, SpectralLine, period_lines, pooled_lines
 from tdhil.recording import Excitation
 
-_ROUGH_REL_SD = 0.1
+_ROUGH_REL_SD = 0.1       # relative standard uncertainty of the rough inertia as a prior
 _LEAST_NU = 2.0     # complex degrees of freedom of the weights; fewer and the interval means nothing
 _BEFORE_ECHO_HELPS = (
     "use --excitation prbs, which asks only for the time before an echo; or lift the bit off bottom, take weight off"

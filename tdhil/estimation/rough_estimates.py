@@ -19,7 +19,7 @@ import numpy as np
 from tdhil.recording import FloatArray, Level
 
 _LEAST_REL = 0.05       # unknown lags, friction that isn't a straight line
-_MOST_REL = 0.9
+_MOST_REL = 0.9           # largest relative uncertainty: the inertia stays positive
 _BLOCK_S = 1.0          # means over a block are taken as independent
 
 

@@ -311,7 +311,7 @@ STICK_SLIP_SHARE = 0.6
 """A bit that sticks and slips swings by the mean speed and more, and so the torque above it by ζ times that. This share
 of it tells stick-slip from a swing that noise keeps going."""
 
-SHORTEST_SWING_S = 1.5
+SHORTEST_SWING_S = 1.5    # s; shortest period of a string's oscillation
 
 
 def repeats(signal: FloatArray, step_s: float) -> tuple[float, float]:

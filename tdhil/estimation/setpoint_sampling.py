@@ -33,7 +33,7 @@ from tdhil.recording import FloatArray, Recording, SteppedSetpoint
 
 NEGLIGIBLE = 1e-3         # of J
 _FINE = 32                # steps of a cycle
-_LONGEST_S = 40.0
+_LONGEST_S = 40.0         # s; duration of the simulated response
 _MOST = 0.5               # of J: beyond it there is no number
 
 
@@ -152,7 +152,7 @@ _CROSSOVER_RAD_S = 5.0
 answers a step more sharply. Simulated drives of all profiles stay below half of what follows from it."""
 
 
-_SHARES_OF_CROSSOVER = (0.2, 0.4, 0.6, 0.8, 1.0)
+_SHARES_OF_CROSSOVER = (0.2, 0.4, 0.6, 0.8, 1.0)   # crossovers of the usual loops, from slow to quick
 
 
 def usual_loops(period_s: float) -> tuple[SteppedSetpoint, ...]:

@@ -33,7 +33,7 @@ from tdhil.recording import FloatArray
 
 
 _EDGE_S = 0.1             # either side of a period's end, averaged to read the speed there
-_EDGE_SAMPLES = 4
+_EDGE_SAMPLES = 4         # samples at one instant, at least
 
 
 class Edge:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Final
 
 from tdhil.recording import ABORTED
@@ -32,6 +32,13 @@ class FleetSettings:
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
+def _at(*places: str) -> Any:
+    """Declare a column by its place in the result document, such as ``inertia_kg_m2.low``: the first that says
+    something.
+    """
+    return field(default=None, metadata={"places": places})
+
+
 @dataclass(frozen=True)
 class FleetRow:
     """Result of one log. SI at the motor shaft; ``low`` to ``high`` is the interval at ``confidence``.
@@ -46,72 +53,72 @@ class FleetRow:
 
     log: str
     verdict: str
-    reason: str | None = None
+    reason: str | None = _at("reason")
     error_kind: str | None = None
     error_text: str | None = None
-    rig: str | None = None
-    date: str | None = None
-    inertia_kg_m2: float | None = None
-    inertia_low_kg_m2: float | None = None
-    inertia_high_kg_m2: float | None = None
-    inertia_low_total_kg_m2: float | None = None
-    inertia_high_total_kg_m2: float | None = None
-    confidence: float | None = None
+    rig: str | None = _at("rig.name", "rig.file")
+    date: str | None = _at("date")
+    inertia_kg_m2: float | None = _at("inertia_kg_m2.value")
+    inertia_low_kg_m2: float | None = _at("inertia_kg_m2.low")
+    inertia_high_kg_m2: float | None = _at("inertia_kg_m2.high")
+    inertia_low_total_kg_m2: float | None = _at("inertia_kg_m2.low_total")
+    inertia_high_total_kg_m2: float | None = _at("inertia_kg_m2.high_total")
+    confidence: float | None = _at("inertia_kg_m2.confidence")
     torque_scale_rel_sd: float | None = None
     torque_calibration: str | None = None
-    gear_ratio: float | None = None
-    viscous_nm_s_rad: float | None = None
-    viscous_low_nm_s_rad: float | None = None
-    viscous_high_nm_s_rad: float | None = None
-    coulomb_nm: float | None = None
-    coulomb_low_nm: float | None = None
-    coulomb_high_nm: float | None = None
-    speed_lag_s: float | None = None
-    speed_lag_low_s: float | None = None
-    speed_lag_high_s: float | None = None
-    torque_lag_s: float | None = None
-    torque_lag_low_s: float | None = None
-    torque_lag_high_s: float | None = None
-    skew_s: float | None = None
-    skew_low_s: float | None = None
-    skew_high_s: float | None = None
-    load_inertia_kg_m2: float | None = None
-    load_inertia_low_kg_m2: float | None = None
-    load_inertia_high_kg_m2: float | None = None
-    stiffness_nm_rad: float | None = None
-    stiffness_low_nm_rad: float | None = None
-    stiffness_high_nm_rad: float | None = None
-    resonance_hz: float | None = None
-    resonance_low_hz: float | None = None
-    resonance_high_hz: float | None = None
-    paper_inertia_kg_m2: float | None = None
-    second_opinion_kg_m2: float | None = None
-    second_opinion_agrees: bool | None = None
-    residual_p_value: float | None = None
-    model: str | None = None
+    gear_ratio: float | None = _at("gear_ratio")
+    viscous_nm_s_rad: float | None = _at("viscous_nm_s_rad.value")
+    viscous_low_nm_s_rad: float | None = _at("viscous_nm_s_rad.low")
+    viscous_high_nm_s_rad: float | None = _at("viscous_nm_s_rad.high")
+    coulomb_nm: float | None = _at("coulomb_nm.value")
+    coulomb_low_nm: float | None = _at("coulomb_nm.low")
+    coulomb_high_nm: float | None = _at("coulomb_nm.high")
+    speed_lag_s: float | None = _at("speed_lag_s.value")
+    speed_lag_low_s: float | None = _at("speed_lag_s.low")
+    speed_lag_high_s: float | None = _at("speed_lag_s.high")
+    torque_lag_s: float | None = _at("torque_lag_s.value")
+    torque_lag_low_s: float | None = _at("torque_lag_s.low")
+    torque_lag_high_s: float | None = _at("torque_lag_s.high")
+    skew_s: float | None = _at("skew_s.value")
+    skew_low_s: float | None = _at("skew_s.low")
+    skew_high_s: float | None = _at("skew_s.high")
+    load_inertia_kg_m2: float | None = _at("compliant.load_inertia_kg_m2.value")
+    load_inertia_low_kg_m2: float | None = _at("compliant.load_inertia_kg_m2.low")
+    load_inertia_high_kg_m2: float | None = _at("compliant.load_inertia_kg_m2.high")
+    stiffness_nm_rad: float | None = _at("compliant.stiffness_nm_rad.value")
+    stiffness_low_nm_rad: float | None = _at("compliant.stiffness_nm_rad.low")
+    stiffness_high_nm_rad: float | None = _at("compliant.stiffness_nm_rad.high")
+    resonance_hz: float | None = _at("compliant.resonance_hz.value")
+    resonance_low_hz: float | None = _at("compliant.resonance_hz.low")
+    resonance_high_hz: float | None = _at("compliant.resonance_hz.high")
+    paper_inertia_kg_m2: float | None = _at("paper.inertia_kg_m2")
+    second_opinion_kg_m2: float | None = _at("second_opinions.0.inertia_kg_m2.value")
+    second_opinion_agrees: bool | None = _at("second_opinions.0.agrees")
+    residual_p_value: float | None = _at("residual.p_value")
+    model: str | None = _at("model")
     warnings: str | None = None
     excitation: str | None = None
     mode: str | None = None
     duration_s: float | None = None
     samples: int | None = None
-    periods_used: int | None = None
-    complete: bool | None = None
+    periods_used: int | None = _at("periods_used")
+    complete: bool | None = _at("complete")
     aborted_stage: str | None = None
-    aborted_by: str | None = None
-    simulated: bool | None = None
-    drive_name: str | None = None
-    drive_vendor: int | None = None
-    drive_product: int | None = None
-    drive_revision: int | None = None
-    drive_serial: int | None = None
-    profile: str | None = None
-    connection: str | None = None
-    operator: str | None = None
-    note: str | None = None
+    aborted_by: str | None = _at("ended.kind")
+    simulated: bool | None = _at("simulated")
+    drive_name: str | None = _at("drive.name")
+    drive_vendor: int | None = _at("drive.vendor")
+    drive_product: int | None = _at("drive.product")
+    drive_revision: int | None = _at("drive.revision")
+    drive_serial: int | None = _at("drive.serial")
+    profile: str | None = _at("profile.name")
+    connection: str | None = _at("connection")
+    operator: str | None = _at("operator")
+    note: str | None = _at("note")
     stored_verdict: str | None = None
     stored_inertia_kg_m2: float | None = None
     changed: bool | None = None
-    recorded_by: str | None = None
+    recorded_by: str | None = _at("recorded_by")
     tdhil: str = __version__
     settings: str = "{}"
     sha256: str | None = None
@@ -136,6 +143,12 @@ COLUMNS: Final[Mapping[str, type]] = {
     for one in fields(FleetRow)
 }
 """Each column's type; all but the log, the verdict and the settings may be empty."""
+
+
+PLACES: Final[Mapping[str, tuple[str, ...]]] = {
+    one.name: one.metadata["places"] for one in fields(FleetRow) if "places" in one.metadata
+}
+"""Places in the result document of the columns that are taken from it as they are."""
 
 
 def counted(count: int, noun: str) -> str:
@@ -176,47 +189,15 @@ def row_of(
 
     ``facts``: other fields by name, such as ``sha256`` and ``torque_scale_rel_sd``.
     """
-    inertia = document.get("inertia_kg_m2") or {}
-    compliant = document.get("compliant") or {}
-    rig, drive = document.get("rig") or {}, document.get("drive") or {}
-    opinion = (document.get("second_opinions") or [{}])[0]
-    found: dict[str, Any] = {
-        "reason": document["reason"],
-        "rig": rig.get("name") or rig.get("file"),
-        "date": document.get("date"),
-        "inertia_kg_m2": inertia.get("value"),
-        **{f"inertia_{end}_kg_m2": inertia.get(end) for end in ("low", "high", "low_total", "high_total")},
-        "confidence": inertia.get("confidence"),
-        "gear_ratio": document.get("gear_ratio"),
-        "paper_inertia_kg_m2": (document.get("paper") or {}).get("inertia_kg_m2"),
-        "second_opinion_kg_m2": (opinion.get("inertia_kg_m2") or {}).get("value"),
-        "second_opinion_agrees": opinion.get("agrees"),
-        "residual_p_value": (document.get("residual") or {}).get("p_value"),
-        "model": document.get("model"),
+    found: dict[str, Any] = {name: _find(document, places) for name, places in PLACES.items()} | {
         "warnings": "\n".join(document.get("warnings") or ()) or None,
-        "periods_used": document.get("periods_used"),
-        "complete": document.get("complete"),
         "aborted_stage": next((one["name"] for one in document.get("stages") or () if one["outcome"] == ABORTED), None),
-        "aborted_by": (document.get("ended") or {}).get("kind"),
-        "simulated": document.get("simulated"),
-        "drive_name": drive.get("name"),
-        **{f"drive_{name}": drive.get(name) for name in ("vendor", "product", "revision", "serial")},
-        "profile": (document.get("profile") or {}).get("name"),
-        **{name: document.get(name) for name in ("connection", "operator", "note", "recorded_by")},
     }
-    for name, unit, source in (
-        ("viscous", "nm_s_rad", document), ("coulomb", "nm", document), ("speed_lag", "s", document),
-        ("torque_lag", "s", document), ("skew", "s", document), ("load_inertia", "kg_m2", compliant),
-        ("stiffness", "nm_rad", compliant), ("resonance", "hz", compliant),
-    ):
-        estimate = source.get(f"{name}_{unit}") or {}
-        found[f"{name}_{unit}"] = estimate.get("value")
-        found |= {f"{name}_{end}_{unit}": estimate.get(end) for end in ("low", "high")}
     calibration = document.get("torque_calibration")
     if isinstance(calibration, Mapping):
         facts |= {"torque_calibration": calibration.get("date"), "torque_scale_rel_sd": calibration.get("rel_sd")}
     was = _stored(stored)
-    now = (document["verdict"], inertia.get("value"))
+    now = (document["verdict"], found["inertia_kg_m2"])
     known: dict[str, Any] = found | facts | {
         "stored_verdict": was[0] if was else None,
         "stored_inertia_kg_m2": was[1] if was else None,
@@ -225,6 +206,23 @@ def row_of(
     return row_from_json(
         {"log": log, "verdict": document["verdict"], "settings": json.dumps(settings.asked(), sort_keys=True)} | known
     )
+
+
+def _find(document: Mapping[str, Any], places: tuple[str, ...]) -> Any:
+    """Return the first value that says something, else the last one; None where a place does not exist."""
+    value: Any = None
+    for place in places:
+        value = document
+        for name in place.split("."):
+            if isinstance(value, Mapping):
+                value = value.get(name)
+            elif isinstance(value, list):
+                value = value[int(name)] if name.isdecimal() and int(name) < len(value) else None
+            else:
+                value = None
+        if value:
+            break
+    return value
 
 
 def failure_row(log: str, kind: str, text: str, settings: FleetSettings, **facts: Any) -> FleetRow:

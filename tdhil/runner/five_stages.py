@@ -1,4 +1,4 @@
-"""Runs the five stages in order, and after every end the one stop sequence.
+"""Runs one program of stages (`programs`) on one drive, and after every end the one stop sequence.
 
 The first cause is kept. Errors during the stop are reported beside it, never instead of it.
 """
@@ -7,59 +7,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
-from functools import partial
 
 from drivers import Command, Drive, DriveLimits, Mode, Outcome, Paced, Preflight, PreflightRefused, Sample, Timed
 from profiles import MessageCode
 from tdhil.config import told_before_echo
 from tdhil.estimation import torque_answer
-from tdhil.recording import Excitation, ImpedanceInput, LagPrior, Ramp, RunLog
+from tdhil.recording import ImpedanceInput, LagPrior, RunLog
 from tdhil.runner import preconditions, stage_log
 from tdhil.runner.background import WorkerProcess, begin
 from tdhil.runner.control_loop import ControlLoop
-from tdhil.runner.excitation import RigGuess
 from tdhil.runner.guard import Guard
-from tdhil.runner.planning import request_of
 from tdhil.runner.preconditions import (
     choose_mode,
     choose_rate,
     keep_within,
-    no_torque,
     quieten,
     refuse_slow_reference,
     refuse_with_string,
     with_known_lag,
     with_read_filters,
-    with_timing,
 )
+from tdhil.runner.programs import Run, program_of
 from tdhil.runner.settings import StopRequest
-from tdhil.runner.speed_check import SpeedWitness
 from tdhil.runner.stage_log import StageBook
-from tdhil.runner.stage_planner import StagePlanner
-from tdhil.runner.stages import (
-    NOT_YET,
-    MeanSpeedControl,
-    SpeedResult,
-    TorqueResult,
-    course_of,
-    go_to,
-    measure_offsets,
-    probe_sign,
-    refuse_other_rig,
-    run_hold,
-    run_offset,
-    run_pilot,
-    run_plan,
-    run_speed,
-    run_torque,
-    run_virtual_string,
-    slow_down,
-)
+from tdhil.runner.stages import NOT_YET, measure_offsets
 from tdhil.runner.stop import StopReport, StopSequence
 from tdhil.runner.task import Confirm, ConfirmSpeed, Display, MakeTask, RunOutcome, Say, Task, refuse_unconfirmed_speed
-from tdhil.soft_torque import EvaluationCase, SpeedProgram
 
 
 def _nothing(text: str) -> None:
@@ -93,7 +68,6 @@ class Runner:
         self._confirm_speed = confirm_speed
         self._book = StageBook(drive, log, display, say)
         self._stop: StopSequence | None = None
-        self._prior = LagPrior()
         self._before_echo = False
         self._worker_process: WorkerProcess | None = None
 
@@ -140,156 +114,46 @@ class Runner:
     # -- the stages ------------------------------------------------------------------------------------------
 
     def _run_stages(self) -> None:
-        with self._book.stage("setup", 10.0):
-            task, loop, preflight = self._prepare()
-            limits, assumptions = task.limits, task.assumptions
-            mode = choose_mode(task.request, limits, preflight)
-            self._before_echo = told_before_echo(task.request.kind)
-            _, torque_offset = measure_offsets(loop, limits)
-            loop.guard.observer.torque_offset_nm = torque_offset
-            program = None if task.evaluation is None else self._program(task, task.evaluation, loop, preflight)
-            self._log.learn(torque_offset_nm=torque_offset)
-            self._confirm(task, preflight, lambda: self._idle(loop))
-            self._stop = StopSequence(
-                loop,
-                limits,
-                preflight.speed_resolution_rad_s,
-                preflight.quick_stop_in_torque_mode,
-                assumptions,
-                torque_resolution_nm=preflight.torque_resolution_nm,
-                torque_offset_nm=torque_offset,
-                watched=preflight.watched,
-            )
-            loop.guard.start_clock(loop.now_s)
-            breakaway = probe_sign(loop, limits, mode, preflight.speed_resolution_rad_s)
-            if breakaway is not None:
-                self._log.event(loop.now_s, "probe", f"the shaft moved forward at {breakaway:.1f} N·m")
-        with self._book.stage("speed", 50.0):
-            witness = SpeedWitness(
-                self._confirm_speed, preflight.identity.simulated, limits.accept_speed_unit, self._say
-            )
-            speed = run_speed(
-                loop, limits, assumptions, preflight.speed_resolution_rad_s, torque_offset, witness
-            )
-            self._log.motion(None, speed.levels, (speed.ramp,))
-            self._note_rough(loop, speed)
-            self._note_timing(loop, speed)
-            resolution = preflight.speed_resolution_rad_s
-            slow: tuple[Sample, ...] = ()
-            if mode is Mode.TORQUE:
-                slow, speed = slow_down(loop, limits, speed, assumptions, resolution)
-        ramps: tuple[Ramp, ...] = (speed.ramp,)
-        drifted: TorqueResult | None = None
-        if mode is Mode.TORQUE:
-            with self._book.stage("torque", 15.0):
-                drifted = run_torque(
-                    loop, limits, assumptions, speed, slow, torque_offset, resolution, preflight.torque_setpoint
-                )
-                ramps = (speed.ramp, drifted.ramp)
-                self._log.motion(None, speed.levels, ramps)
-        else:
-            why = no_torque(task.request.mode, preflight)
-            self._book.skip("torque", f"{why}: no switch, and no second estimate of the inertia from a drift")
-        model = self._model(loop, speed, drifted)
-        if task.evaluation is not None and program is not None:
-            self._run_virtual_string(task, task.evaluation, program, loop, speed, drifted, resolution)
-            return
-        if task.request.impedance == "offset":
-            self._run_offset(task, loop, speed, ramps, resolution)
-            return
-        planner = StagePlanner(loop, self._log, self._display, self._say)
-        planned = planner.plan(task, speed, mode, self._prior)
-        plan = planned.plan
-        control: MeanSpeedControl | None = None
-        if drifted is not None:
-            with self._book.stage("hold", 15.0):
-                control = MeanSpeedControl(model, 0.25 * limits.torque_nm, assumptions)
-                run_hold(
-                    loop, limits, model, control, plan.start_rad_s, drifted.speed_rad_s,
-                    preflight.speed_resolution_rad_s, speed.wander_rad_s,
-                )
-        else:
-            self._book.skip("hold", f"{why}: the drive's own speed control holds the mean speed")
-        with self._book.stage("acquire", planned.duration_s + 10.0):
-            announced = self._announcer(speed, ramps)
-            run_plan(
-                loop, limits, plan, control, assumptions, announced, planner.enough(planned),
-                preflight.speed_resolution_rad_s,
-            )
+        """Connect and check in stage 1; the program that the task requests ends it and runs the others."""
+        with ExitStack() as setup:
+            setup.enter_context(self._book.stage("setup", 10.0))
+            run = self._prepare(setup.close)
+            program_of(run.task)(run)
 
-    def _program(self, task: Task, case: EvaluationCase, loop: ControlLoop, preflight: Preflight) -> SpeedProgram:
-        """Return the virtual string's speed program, before motion. Raises an error if it is refused."""
-        if case.own_loop and preflight.torque_offset_resolution_nm <= 0.0:
-            raise PreflightRefused(
-                "the profile names no torque offset of the drive, which --own-loop needs to apply the string's torque",
-                where="--own-loop", next_step="Remove --own-loop: the host's controller in torque mode needs none",
-                entry=MessageCode.VIRTUAL_STRING_REFUSED,
-            )
-        course = partial(course_of, case, task.limits, loop.period_s, Guard.foresight_s(task.assumptions))
-        program = loop.compute(course, Command(Mode.SPEED, 0.0, 0.0))
-        self._log.configure(evaluation={"case": case.plain(), "program": asdict(program)})
-        return program
+    def _armed(self, stop: StopSequence) -> None:
+        self._stop = stop
 
-    def _run_virtual_string(
-        self, task: Task, case: EvaluationCase, program: SpeedProgram, loop: ControlLoop, speed: SpeedResult,
-        drifted: TorqueResult | None, resolution_rad_s: float,
-    ) -> None:
-        """Run stages 4 and 5 with a virtual string."""
-        limits, assumptions = task.limits, task.assumptions
-        refuse_other_rig(case, speed.model)
-        if drifted is not None and loop.guard.no_braking:
-            raise PreflightRefused(
-                f"a virtual string needs braking torque: {loop.guard.no_braking}", where="braking probe",
-                next_step=loop.guard.to_brake,
-                entry=MessageCode.BRAKING_UNCLEAR,
-            )
-        start = program.start_rad_s * case.rig.gear_ratio
-        with self._book.stage("hold", 15.0):
-            if drifted is None:
-                go_to(loop, limits, speed.model, start, resolution_rad_s)
-            else:
-                control = MeanSpeedControl(speed.model, 0.25 * limits.torque_nm, assumptions)
-                run_hold(loop, limits, speed.model, control, start, drifted.speed_rad_s, resolution_rad_s)
-        with self._book.stage("acquire", program.longest_s):
-            run_virtual_string(
-                loop, limits, case, program, self._log.virtual, self._say, resolution_rad_s, speed.high.speed_sd_rad_s
-            )
-
-    def _run_offset(
-        self, task: Task, loop: ControlLoop, speed: SpeedResult, ramps: tuple[Ramp, ...], resolution_rad_s: float
-    ) -> None:
-        """Run stages 4 and 5 of a measurement of the drive's own impedance with its torque offset."""
-        limits, assumptions = task.limits, task.assumptions
-        room = Guard.room(limits, assumptions)
-        with self._book.stage("hold", 60.0):
-            found = run_pilot(
-                loop, limits, room, speed.model, assumptions, request_of(task.request, Mode.SPEED.value),
-                string_at_motor(task), resolution_rad_s,
-            )
-            plan = found.plan
-            self._display.planned(plan)
-            text = (
-                f"torque offset of up to {found.peak_nm:.0f} N·m, {plan.duration_s:.0f} s, speed"
-                f" {plan.speed_min_rad_s:.2f} to {plan.speed_max_rad_s:.2f} rad/s"
-            )
-            self._log.event(loop.now_s, "plan", text)
-            self._say(text)
-            self._log.configure(plan=plan.plain() | {"torque_amplitudes_nm": list(found.torque_amplitudes_nm)})
-        with self._book.stage("acquire", plan.duration_s + 10.0):
-            run_offset(loop, found, self._announcer(speed, ramps), resolution_rad_s)
-
-    def _prepare(self) -> tuple[Task, ControlLoop, Preflight]:
+    def _prepare(self, end_setup: Callable[[], None]) -> Run:
+        """Connect, check and set the drive, and measure its offsets at standstill. Nothing moves."""
         identity = self._drive.connect()
         self._log.learn(simulated=identity.simulated)
         task = self._make_task(identity)
-        limits = task.limits
         self._log.learn(**task.facts)
         if self._reset_fault:
             self._log.event(self._drive.clock.now_s(), "reset", "fault reset, requested by the operator")
             self._drive.reset_fault()
-        no_worker_process = ""
-        if not self._drive.clock.stepped:
-            no_worker_process = self._make_ready()
+        no_worker_process = "" if self._drive.clock.stepped else self._make_ready()
+        preflight = self._check_drive(task)
+        refuse_with_string(task.limits, task.request, preflight)
+        task = replace(task, limits=keep_within(task.limits, task.request, preflight))
+        self._tell_watchdog(preflight)
+        task = self._set_rate(task)
+        prior = with_read_filters(task.facts.get("lag_prior", LagPrior()), preflight.filters)
+        task = replace(task, assumptions=with_known_lag(task.assumptions, prior))
+        self._learn_inputs(task, preflight, prior)
+        loop = self._make_loop(task, preflight, no_worker_process)
+        mode = choose_mode(task.request, task.limits, preflight)
+        self._before_echo = told_before_echo(task.request.kind)
+        _, torque_offset_nm = measure_offsets(loop, task.limits)
+        loop.guard.observer.torque_offset_nm = torque_offset_nm
+        return Run(
+            task, mode, loop, preflight, torque_offset_nm, prior, self._book, self._log, self._display, self._say,
+            self._confirm, self._confirm_speed, self._armed, end_setup,
+        )
+
+    def _check_drive(self, task: Task) -> Preflight:
+        """Run the drive's preflight with the limits of the task. Raises PreflightRefused with its first refusal."""
+        limits = task.limits
         preflight = self._book.preflight = self._drive.preflight(
             DriveLimits(
                 limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s,
@@ -307,41 +171,49 @@ class Runner:
             self._log.event(self._drive.clock.now_s(), "preflight", text)
         if preflight.refused:
             raise _refusal(preflight)
-        refuse_with_string(limits, task.request, preflight)
-        limits = keep_within(limits, task.request, preflight)
-        task = replace(task, limits=limits)
+        return preflight
+
+    def _tell_watchdog(self, preflight: Preflight) -> None:
+        """Tell the operator of a drive that has no watchdog, or a real one whose watchdog any client feeds."""
         if not preflight.watched:
-            self._log.configure(**preconditions.configuration(preflight))
-            self._log.event(self._drive.clock.now_s(), "watchdog", preconditions.SAID)
-            self._say(preconditions.SAID)
-        elif preflight.fed_by_any_client and not identity.simulated:
-            self._log.configure(**preconditions.configuration(preflight))
-            self._log.event(self._drive.clock.now_s(), "watchdog", preconditions.SAID_SHARED)
-            self._say(preconditions.SAID_SHARED)
+            said = preconditions.SAID
+        elif preflight.fed_by_any_client and not preflight.identity.simulated:
+            said = preconditions.SAID_SHARED
+        else:
+            return
+        self._log.configure(**preconditions.configuration(preflight))
+        self._log.event(self._drive.clock.now_s(), "watchdog", said)
+        self._say(said)
+
+    def _set_rate(self, task: Task) -> Task:
+        """Choose the cycle rate. Return the task with what the host assumes at this rate."""
         self._choose_rate()
         # The rate of the line is known only now: the driver may have measured it in preflight.
         period_s = self._drive.period_s
-        task = replace(task, assumptions=task.assumptions.at_period(period_s))
         self._log.configure(cycle={"period_s": period_s, "rate_hz": 1.0 / period_s})
         self._log.event(self._drive.clock.now_s(), "rate", f"{1.0 / period_s:.4g} cycles per second")
         refuse_slow_reference(task.request, period_s)
+        return replace(task, assumptions=task.assumptions.at_period(period_s))
+
+    def _learn_inputs(self, task: Task, preflight: Preflight, prior: LagPrior) -> None:
+        """Write to the log what identification must know of the drive and of the request."""
         if (by := task.request.impedance) is not None:
             count = preflight.torque_offset_resolution_nm if by == "offset" else preflight.speed_resolution_rad_s
             self._log.learn(
-                impedance=ImpedanceInput(by, count, task.request.reference_filter_s, string_at_motor(task))
+                impedance=ImpedanceInput(by, count, task.request.reference_filter_s, task.string_at_motor_nm_s_rad)
             )
-        self._prior = with_read_filters(task.facts.get("lag_prior", LagPrior()), preflight.filters)
-        task = replace(task, assumptions=with_known_lag(task.assumptions, self._prior))
         self._log.learn(
             speed_resolution_rad_s=preflight.speed_resolution_rad_s,
             torque_resolution_nm=preflight.torque_resolution_nm,
-            torque_limit_nm=limits.torque_nm,
-            lag_prior=self._prior,
+            torque_limit_nm=task.limits.torque_nm,
+            lag_prior=prior,
             position_gap_s=preflight.position_gap_s if math.isfinite(preflight.position_gap_s) else None,
         )
+
+    def _make_loop(self, task: Task, preflight: Preflight, no_worker_process: str) -> ControlLoop:
         guard = Guard(
-            limits,
-            period_s,
+            task.limits,
+            self._drive.period_s,
             preflight.speed_resolution_rad_s,
             preflight.torque_resolution_nm,
             task.assumptions,
@@ -354,7 +226,7 @@ class Runner:
         loop.worker_process = self._worker_process
         if no_worker_process:
             loop.no_worker_process(no_worker_process)
-        return task, loop, preflight
+        return loop
 
     def _make_ready(self) -> str:
         """Load and start what would delay the loop later. Return why there is no worker process; empty if there is
@@ -380,27 +252,6 @@ class Runner:
         self._log.configure(rate_tried=choice.plain())
         self._say(choice.text)
 
-    def _model(self, loop: ControlLoop, speed: SpeedResult, drifted: TorqueResult | None) -> RigGuess:
-        """Return the rough model of stage 2, and log its ratio to the drift of stage 3."""
-        model = speed.model
-        if drifted is not None and drifted.rough is not None:
-            ratio = drifted.rough.inertia_kg_m2 / model.inertia_kg_m2
-            text = f"rough inertia {model.inertia_kg_m2:.4g} kg·m² from the ramp, {ratio:.2f} times that from the drift"
-            self._log.event(loop.now_s, "plan", text)
-        return model
-
-    def _announcer(self, speed: SpeedResult, ramps: tuple[Ramp, ...]) -> Callable[[Excitation], None]:
-        return lambda motion: self._log.motion(motion, speed.levels, ramps)
-
-    def _note_timing(self, loop: ControlLoop, speed: SpeedResult) -> None:
-        """Note the uncertainty of the sample times. Torque and speed may be offset in time by as much."""
-        half_s = sum(sample.half_width_s for sample in speed.last) / max(1, len(speed.last))
-        if half_s > 0.0:
-            self._prior = with_timing(self._prior, half_s)
-            self._log.learn(timing_half_width_s=half_s, lag_prior=self._prior)
-            text = f"sample times are known to ±{1e3 * half_s:.3g} ms, half the duration of a transaction"
-            self._log.event(loop.now_s, "rate", text)
-
     def _learn_torque_answer(self) -> None:
         """Record how the reported torque follows the commanded one: the estimate before the echo needs it."""
         if self._before_echo:
@@ -408,31 +259,11 @@ class Runner:
             if answer is not None:
                 self._log.learn(torque_answer=answer)
 
-    def _note_rough(self, loop: ControlLoop, speed: SpeedResult) -> None:
-        model = speed.model
-        self._log.event(
-            loop.now_s,
-            "plan",
-            f"rough model: J {model.inertia_kg_m2:.4g} kg·m² ± {100 * speed.rough.rel_error:.0f} %, "
-            f"B {model.viscous_nm_s_rad:.3g} N·m·s/rad, T_c {model.coulomb_nm:.3g} N·m",
-        )
-
-    def _idle(self, loop: ControlLoop) -> None:
-        loop.cycle(Command(Mode.SPEED, 0.0, 0.0))
-
     def _log_failure(self, error: BaseException) -> None:
         try:
             self._log.failure(self._drive.clock.now_s(), error)
         except Exception as also:
             error.add_note(f"and this error could not be logged: {also}")
-
-
-def string_at_motor(task: Task) -> float:
-    """Return the impedance ζ for the reported |r|, at the motor: requested, or of rig.yaml's pipe; 0: unknown."""
-    asked, pipe = task.request.string_nm_s_rad, task.facts.get("pipe")
-    if asked is not None:
-        return asked / float(task.facts.get("gear_ratio", 1.0)) ** 2
-    return 0.0 if pipe is None else float(pipe.impedance_nm_s_rad)
 
 
 def _refusal(preflight: Preflight) -> PreflightRefused:

@@ -136,7 +136,7 @@ def _try(drive: Paced, rate_hz: float, cycle: Callable[[], Sample]) -> Tried:
 # Prior knowledge of the reporting lags: from rig.yaml, the drive's own filters, and timing. Pure.
 
 
-READ_FILTER_SD_SHARE = 0.1
+READ_FILTER_SD_SHARE = 0.1   # of the filter time
 READ_FILTER_SD_S = 0.001
 """Standard uncertainty of the lag that follows from a filter setting read from the drive (share, and s)."""
 

@@ -178,7 +178,7 @@ TOO_FAST = 2.0
 """Factor over the setpoint above which the ramp waits until position and speed are compared."""
 FASTEST_SHARE = 0.7
 """Share of the highest speed, by the position. Above it the run is refused without a comparison."""
-HARMLESS_SHARE = 0.1
+HARMLESS_SHARE = 0.1      # of the highest speed: a speed below it is never too fast
 EVERY_S, EVERY_CYCLES, SELDOM_S = 0.05, 3, 0.25
 """Reading interval of the position, s; on a slower line each third cycle, at most the last value, s."""
 LEVEL_EVERY_S = 0.25
@@ -191,7 +191,7 @@ SEEN_S = 3.0
 """Averaging time of the speed that the operator confirms, s."""
 TURNS_WAITED = 3.2
 """Turns to wait for at the slow speed, for a counter of whole turns."""
-LONGEST_WAIT_S = 60.0
+LONGEST_WAIT_S = 60.0     # s; longest wait for these turns
 BY_POSITION, BY_OPERATOR, BY_NAME, UNSEEN = "position", "operator", "--accept-speed-unit", "nobody"
 _WHERE = "unit of speed"
 _CHECK = "Check the speed scaling in the profile (unit of the speed's setpoint and of the reported speed)"

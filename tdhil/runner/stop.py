@@ -138,10 +138,10 @@ class Slowing:
 # blocks.
 
 
-BLOCK_S = 5.0
-BLOCKS = 2.0
-SLOWER_SHARE = 0.99
-LONGEST_S = 300.0
+BLOCK_S = 5.0             # s; block whose highest speed is compared
+BLOCKS = 2.0              # blocks without a lower speed that end the wait
+SLOWER_SHARE = 0.99       # of the least peak so far: a block below it is slower
+LONGEST_S = 300.0         # s; longest wait
 
 
 class StopTimeout:

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 SPEED_SHARE = 0.1
 """Yielding is never faster than this share of the speed limit."""
 
-IMPEDANCE_SPEED_SHARE = 0.5
+IMPEDANCE_SPEED_SHARE = 0.5   # of the speed limit, at which the impedance takes the torque limit
 RESIDUAL_SHARE, RESIDUAL_QUANTA = 0.02, 5.0
 """Torque counts as zero when its mean is below this share of the torque limit, or this many quanta of its report."""
 
@@ -32,8 +32,8 @@ MEAN_S = 0.5
 QUIET_S = 6.0
 """Time for which torque and speed must be quiet, s: half a period of a string with a period of 12 s."""
 
-FASTEST_SWING_S = 2.0
-STIFFEST = 64.0
+FASTEST_SWING_S = 2.0     # s; a shorter half period is not the string's, but the loop's own
+STIFFEST = 64.0           # largest multiple of the impedance at the beginning
 TRAVEL_RAD = 250.0
 """About 40 turns: no string holds more twist below its make-up torque."""
 

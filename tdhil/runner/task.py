@@ -61,6 +61,14 @@ class Task:
     assumptions: ControlAssumptions = field(default_factory=ControlAssumptions)
     evaluation: EvaluationCase | None = None       # a virtual string in stage 5, in place of an excitation
 
+    @property
+    def string_at_motor_nm_s_rad(self) -> float:
+        """Return the impedance ζ for the reported |r|, at the motor: requested, or of rig.yaml's pipe; 0: unknown."""
+        asked, pipe = self.request.string_nm_s_rad, self.facts.get("pipe")
+        if asked is not None:
+            return asked / float(self.facts.get("gear_ratio", 1.0)) ** 2
+        return 0.0 if pipe is None else float(pipe.impedance_nm_s_rad)
+
 
 MakeTask = Callable[[Identity], Task]
 """Returns the task for the identified peer; raises PreflightRefused if there is none for it."""

@@ -1,13 +1,10 @@
-"""The routes for logins, users and machines. Passwords are checked one at a time.
-
-Each of `ANSWERS` is called with the site, the request and its body, like the web's own routes.
-"""
+"""The routes for logins, users and machines. Passwords are checked one at a time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
 from starlette.responses import JSONResponse, Response
@@ -15,14 +12,34 @@ from starlette.responses import JSONResponse, Response
 from tdhil.errors import MessageCode, UsageError
 from tdhil.service.access import Principal, address_of, principal, set_cookies
 from tdhil.service.accounts import ROLES, Token, User
-from tdhil.service.middleware import Answer, Site, off
+from tdhil.service.middleware import off
+from tdhil.service.routing import api
 from tdhil.service.run_state import NotLoggedIn, TooManyTries, iso
 from tdhil.service.schemas import AccountsView, AccountView, MeView, TokenView, plain
 
 if TYPE_CHECKING:
     from starlette.requests import Request
+    from starlette.routing import Route
+
+    from tdhil.service.site import Site
 
 T = TypeVar("T")
+
+
+def routes(site: Site) -> list[Route]:
+    """Return the routes."""
+    return [
+        api(site, "me", me),
+        api(site, "login", login),
+        api(site, "logout", logout),
+        api(site, "password", password),
+        api(site, "accounts", accounts),
+        api(site, "add_user", add_user),
+        api(site, "set_password", set_password),
+        api(site, "remove_user", remove_user),
+        api(site, "add_token", add_token),
+        api(site, "remove_token", remove_token),
+    ]
 
 
 def _me_view(site: Site, who: Principal) -> MeView:
@@ -31,11 +48,13 @@ def _me_view(site: Site, who: Principal) -> MeView:
                   None if ends_s is None else iso(ends_s))
 
 
-async def _me(site: Site, request: Request, body: Any) -> MeView:
+async def me(site: Site, request: Request, body: Any) -> MeView:
+    """Return the client as the service identifies it."""
     return _me_view(site, principal(request))
 
 
-async def _login(site: Site, request: Request, body: Any) -> Response:
+async def login(site: Site, request: Request, body: Any) -> Response:
+    """Start a session. Raises NotLoggedIn and TooManyTries."""
     if not site.access.login:
         raise UsageError("this service has no accounts", where="login",
                          next_step="Add a user on the terminal: tdhil serve users add", entry=MessageCode.ACCOUNT_WRONG)
@@ -60,7 +79,8 @@ async def _slowly(site: Site, request: Request, name: str, password: str) -> tup
         raise
 
 
-async def _logout(site: Site, request: Request, body: Any) -> Response:
+async def logout(site: Site, request: Request, body: Any) -> Response:
+    """End the session."""
     who = principal(request)
     if who.session:
         await off(lambda: site.access.log_out(request))
@@ -70,7 +90,8 @@ async def _logout(site: Site, request: Request, body: Any) -> Response:
     return response
 
 
-async def _password(site: Site, request: Request, body: Any) -> MeView:
+async def password(site: Site, request: Request, body: Any) -> MeView:
+    """Change the user's own password."""
     who = principal(request)
     if not who.session:
         raise UsageError("only a logged-in user has a password", where="password", entry=MessageCode.ACCOUNT_WRONG)
@@ -94,7 +115,8 @@ async def _account(site: Site, request: Request, change: Callable[[], T], what: 
     return found
 
 
-async def _accounts(site: Site, request: Request, body: Any) -> AccountsView:
+async def accounts(site: Site, request: Request, body: Any) -> AccountsView:
+    """Return users and machines."""
     return _accounts_view(site)
 
 
@@ -104,31 +126,36 @@ def _accounts_view(site: Site) -> AccountsView:
                         [_account_view(one) for one in known.tokens.values()])
 
 
-async def _add_user(site: Site, request: Request, body: Any) -> AccountView:
+async def add_user(site: Site, request: Request, body: Any) -> AccountView:
+    """Add a user."""
     accounts = site.access.accounts
     return _account_view(await _account(
         site, request, lambda: accounts.add_user(body.name, body.role, body.password), "user added", body.name))
 
 
-async def _set_password(site: Site, request: Request, body: Any) -> AccountView:
+async def set_password(site: Site, request: Request, body: Any) -> AccountView:
+    """Set the password of a user."""
     accounts, name = site.access.accounts, request.path_params["user"]
     return _account_view(await _account(
         site, request, lambda: accounts.set_password(name, body.password), "password set", name))
 
 
-async def _remove_user(site: Site, request: Request, body: Any) -> AccountsView:
+async def remove_user(site: Site, request: Request, body: Any) -> AccountsView:
+    """Remove a user, but not the last admin."""
     accounts, name = site.access.accounts, request.path_params["user"]
     await _account(site, request, lambda: accounts.remove_user(name, keep_admin=True), "user removed", name)
     return _accounts_view(site)
 
 
-async def _add_token(site: Site, request: Request, body: Any) -> TokenView:
+async def add_token(site: Site, request: Request, body: Any) -> TokenView:
+    """Add a token of a machine."""
     token = await _account(
         site, request, lambda: site.access.accounts.add_token(body.name, body.role), "token added", body.name)
     return TokenView(body.name, body.role, token)
 
 
-async def _remove_token(site: Site, request: Request, body: Any) -> AccountsView:
+async def remove_token(site: Site, request: Request, body: Any) -> AccountsView:
+    """Remove a token."""
     accounts, name = site.access.accounts, request.path_params["token"]
     await _account(site, request, lambda: accounts.remove_token(name), "token removed", name)
     return _accounts_view(site)
@@ -136,11 +163,3 @@ async def _remove_token(site: Site, request: Request, body: Any) -> AccountsView
 
 def _account_view(one: User | Token) -> AccountView:
     return AccountView(one.name, one.role, one.since)
-
-
-ANSWERS: Final[Mapping[str, Answer]] = {
-    one.__name__.removeprefix("_"): one for one in (
-        _me, _login, _logout, _password, _accounts, _add_user, _set_password, _remove_user, _add_token, _remove_token,
-    )
-}
-"""Answers by route name."""

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import fields
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
+from typing import Any, Final, TypeVar
 from urllib.parse import urlsplit
 
 import anyio
@@ -20,7 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from drivers import CommunicationLost, DataFileError, PreflightRefused
 from tdhil.errors import ExitCode, LogError, MessageCode, TdhilError, UsageError
-from tdhil.service.access import Access, token_in
+from tdhil.service.access import token_in
 from tdhil.service.run_channel import RunRefused
 from tdhil.service.run_state import (
     Conflict,
@@ -34,11 +34,6 @@ from tdhil.service.run_state import (
 )
 from tdhil.service.schemas import OPTIONS, ErrorView, Route, adapter, plain
 
-if TYPE_CHECKING:
-    from tdhil.service.fleets import Fleets
-    from tdhil.service.store import Store
-    from tdhil.service.supervisor import Supervisor
-
 T = TypeVar("T")
 BODY_LIMIT: Final = 64 * 1024
 POLICY: Final = (
@@ -48,25 +43,6 @@ POLICY: Final = (
 """Content security policy of every page: nothing from elsewhere, no script or style in the page itself."""
 _NONE: Final[Mapping[str, str]] = MappingProxyType({})
 _BROKEN_HINT: Final = "See the terminal of tdhil serve"
-
-
-class Site(Protocol):
-    """The interface of an answer: the service behind the web, and helpers of the web."""
-
-    store: Store
-    supervisor: Supervisor
-    access: Access
-    fleets: Fleets
-    logins: anyio.CapacityLimiter
-
-    async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """Compute one task, one at a time. Return its document. Raises Refused."""
-
-    async def file(self, request: Request, name: str, media: str) -> Response:
-        """Return a file of the run as a download. Raises NotThere."""
-
-
-Answer = Callable[[Site, Request, Any], Awaitable[Any]]
 
 
 class RequestGuard:

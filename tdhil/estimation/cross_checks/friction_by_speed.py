@@ -123,9 +123,9 @@ def merged(points: list[FrictionStretch]) -> list[FrictionStretch]:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_BENT_P = 0.01
-_LEAST_SPEEDS = 3
-_LEAST_DOF = 4.0
+_BENT_P = 0.01            # p-value of a straight line over speed, below which friction counts as nonlinear
+_LEAST_SPEEDS = 3         # two speeds fit any straight line
+_LEAST_DOF = 4.0          # degrees of freedom of a scatter that counts
 
 
 @dataclass(frozen=True)

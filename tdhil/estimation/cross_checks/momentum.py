@@ -18,14 +18,14 @@ from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 # (`balance`). Coasting is motion without torque: there the torque's lag has nothing to act on.
 
 
-BLOCK_S = 0.5
-_MOST_BLOCKS = 1_000_000
+BLOCK_S = 0.5             # s; length of a block
+_MOST_BLOCKS = 1_000_000   # blocks of a record, at most
 _CALM_PER_S = 0.02        # of the range of speed per second: costs a lag of 0.5 s some 1 % of a full change of speed
 _DRIFT_PER_S = 0.05       # slow enough to take J times the acceleration off and keep the friction
 _POINT_WIDTH = 0.15       # of the fastest: how far the speed may go within one point of a friction curve
 _TURNING = 0.05           # of the greatest speed: slower is standstill or creep
 _LEAST_CALM = 5           # blocks, the first of which is left to the lags
-_LEAST_COAST = 4
+_LEAST_COAST = 4          # blocks in a row that make a coasting
 _COAST_TORQUE = 0.03      # of the torque that steady turning takes
 
 
@@ -160,7 +160,7 @@ def _runs(chosen: BoolArray, time_s: FloatArray, least: int) -> tuple[Span, ...]
 # knot of length a covary by D a/6, since ∫ u (1 − u) du = 1/6.
 
 
-_LONGEST_GAP_S = 0.3
+_LONGEST_GAP_S = 0.3      # s; longest time without a sample
 _CHUNK = 65_536           # samples worked on at once: a long row never stands in memory as a whole
 
 
@@ -278,8 +278,8 @@ def through(samples: Samples, start_s: float, end_s: float, knot_s: float, *,
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-KNOT_S = 1.0
-_COAST_KNOT_S = 0.5
+KNOT_S = 1.0              # s; length of a knot
+_COAST_KNOT_S = 0.5       # s; length of a knot at either end of a coasting
 _SETTLED = ("speed", "hold")      # stages that end at a speed
 _SETTLING_PER_S = 0.05    # of the range of speed per second: a delay that is known to 0.02 s costs 0.1 % of the range
 _APART_S = 5.0            # at least, between knots of one calm stretch

@@ -18,8 +18,8 @@ from tdhil.estimation.frequency_domain import fisher_tail, student_quantile
 from tdhil.estimation.setpoint_sampling import EXACT_READING, ReadingShare
 from tdhil.recording import FloatArray
 
-_ROWS_DIFFER_P = 0.01
-_LEAST_DOF = 3.0
+_ROWS_DIFFER_P = 0.01     # p-value below which the rows scatter more than the operating points
+_LEAST_DOF = 3.0          # degrees of freedom of a scatter that counts
 _BEND_SHOWS = 6.6         # of the density: what a bend must explain to be seen, χ² of one degree at 1 %
 _UNSEEN_BEND = 0.03       # of J: friction that bends unseen moves a balance by so much, one standard deviation
 _LEAST_CHANGE = 0.1       # of the greatest speed: rows that change it by less say nothing of J worth a number

@@ -35,7 +35,7 @@ from tdhil.estimation.samples import Samples, usual_interval
 from tdhil.estimation.setpoint_sampling import ReadingShare, ReadMoment, reading_share, usual_loops
 from tdhil.recording import FloatArray, Recording, SteppedSetpoint
 
-_LEAST_DOF = 3.0
+_LEAST_DOF = 3.0          # degrees of freedom of a scatter that counts
 _OPEN = 0.5               # a half-width beyond this share of J is no opinion
 _FALSE_ALARM = 0.01       # of the runs; a warning that comes in every twentieth sound one is soon read past
 _WORTH_A_FIT = 0.005

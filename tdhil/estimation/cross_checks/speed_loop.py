@@ -19,7 +19,7 @@ import numpy as np
 from tdhil.estimation.samples import Samples, usual_interval
 from tdhil.recording import FloatArray, Level, Recording
 
-_SAME_TIME_S = 1e-6
+_SAME_TIME_S = 1e-6       # s; times closer than this are one: they are rounded in the log
 _FEWEST = 20              # samples of either level, and of the way between
 _LAW_HOLDS = 2.0          # times the levels' own scatter, of the residual: beyond it is no PI loop
 _VALLEY_S = 0.05          # a ramp that is longer or shorter by 0.07 s leaves ten times the scatter

@@ -44,15 +44,15 @@ from tdhil.recording import BoolArray, FloatArray, Recording
 _RATE_HZ = 50.0           # of the averages that are compared: both signals pass the same average, so it cancels
 _GAP_STEPS, _GAP_S = 4.5, 0.05     # a longer hole begins a new stretch
 _LEAST_S = 4.0            # of a stretch; a shorter one says nothing at the frequencies below the lags
-_LEAST_BINS = 8
-_ROUNDS = 4
+_LEAST_BINS = 8           # frequencies that a fit needs
+_ROUNDS = 4               # of weighting again
 _CLEAR = 20.0             # power of what the reference explains over the residual's
 _NARROW = 0.05            # of the frequency: over so much the explained power is averaged
 _PHASE_RAD = 0.9          # of the lags, up to which a cubic stands for their inverse
 _LEAST_LAG_S = 0.02       # a lag is taken as no shorter than this where its square and cube are bounded
 _SQUARE, _SQUARE_SD = 0.25, 0.2        # a₂/a₁²: one pole 0, two poles up to 1/4, moving average 1/3, dead time 1/2
 _CUBE, _CUBE_SD = 0.05, 0.06           # a₃/a₁³: one and two poles 0, dead time 1/6
-_LEAST_DOF = 3.0
+_LEAST_DOF = 3.0          # degrees of freedom, at least, for the quantile
 _RATIO, _OFFSET, _FIRST, _SECOND, _THIRD = range(5)
 
 

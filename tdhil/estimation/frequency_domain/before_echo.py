@@ -53,8 +53,8 @@ _FASTER = 0.97              # of 2L/v: waves may be a little faster than in a sm
 _FINER, _LATE_FINER = 4.0, 1.4     # instants of r per half a cycle of the fastest line; from _LATE_S on
 _FULL = 1.0                 # of r over half a cycle, about a full reflection at first
 _DIES_S = 5.0               # to 1/e
-_LATE_S = 3.0
-_LASTS_S = 16.0
+_LATE_S = 3.0             # s after the echo; from then on the instants are farther apart
+_LASTS_S = 16.0           # s after the echo, for which its response is followed
 _UNEVEN = 0.01              # of r before the echo
 _TOP_SHARE = 0.05           # of ζ: the top's own friction
 _MOST = 5.0
@@ -133,7 +133,7 @@ class EchoShaft:
 # times as large. Variances of neighbours are averaged: noise changes slowly with frequency, and each has few periods.
 
 
-_NEIGHBOURS = 2
+_NEIGHBOURS = 2           # lines on either side over which a scatter is smoothed
 _SURER = 3.0        # times the degrees of freedom of one line's scatter, so averaged
 
 
@@ -353,8 +353,8 @@ def residual_of(fitted: FittedModel) -> ResidualTest | None:
     return ResidualTest(statistic, left, float(chdtrc(left, statistic))) if left >= 1.0 else None
 
 
-_GRID_S = 0.25
-_LOOKED_AT_S = 300.0
+_GRID_S = 0.25            # s; step of the search for a period in the rest
+_LOOKED_AT_S = 300.0      # s; longest part of a segment in this search
 
 
 def refuse_stick_slip(case: PeriodicCase) -> None:

@@ -92,7 +92,7 @@ def residual_test(problem: Likelihood, theta: FloatArray, fitted: int) -> Residu
 
 # Tails and quantiles are scipy.special's: scipy.stats gives the same bits, and takes a second to load.
 
-_TRIES = 14
+_TRIES = 14               # trial values of one bound of the interval
 _CLOSE = 5e-3     # of t: how well the edge is found
 
 

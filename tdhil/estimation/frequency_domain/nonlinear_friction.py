@@ -42,7 +42,7 @@ from tdhil.recording import FloatArray, Segment
 # them could hardly be kept apart.
 
 
-_WIDTHS = 9
+_WIDTHS = 9               # widths of the bend that are tried
 _NARROWEST, _WIDEST = 0.35, 1.0     # of the slowest and of the fastest speed: outside, a bell is not to be seen
 
 
@@ -71,7 +71,7 @@ def bends(slowest_rad_s: float, fastest_rad_s: float) -> tuple[Bend, ...]:
 # A rigid shaft whose friction has a third parameter, c, of a shape that is given.
 
 
-BEND = 2
+BEND = 2                  # place of the bend among the parameters
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def wave_of(fit: PeriodLines, segment: Segment) -> SegmentWave:
 # lies.
 
 
-_ROUNDS = 3
+_ROUNDS = 3               # of weighting again
 _RIGID = len(RigidShaft.names)
 _HOPELESS = 40.0    # of −2 ln L behind the best with first-order lags: looked at no further
 _FINE = 0.0005       # of a bell's width

@@ -23,8 +23,8 @@ from tdhil.recording import BoolArray, FloatArray
 At = Callable[[FloatArray], tuple[FloatArray, Callable[[], FloatArray]]]
 """A function from parameters to residuals r, and to a function that gives their slopes A."""
 
-_MOST_STEPS = 200
-_MOST_TRIES = 12
+_MOST_STEPS = 200         # steps of a fit, at most
+_MOST_TRIES = 12          # damping values of a step, at most
 _SMALL_GAIN = 1e-6        # of −2 ln L, absolute: an interval's edge is where it has risen by about 4
 _SMALL_STEP = 1e-9        # of the natural scale
 _CREEPING, _LOOKED_BACK = 0.01, 20         # of −2 ln L, gained in so many steps: along the floor of a flat valley
@@ -148,9 +148,9 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 # τ_w, τ_T, d to start from besides what linear least squares proposes: the field rig's, and its mirror image
-_STARTS = ((0.40, 0.15, 0.0), (0.15, 0.40, 0.0))
-_SKEWS = (-0.2, -0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1, 0.2)
-_PROPOSALS = 3
+_STARTS = ((0.40, 0.15, 0.0), (0.15, 0.40, 0.0))   # s; lags of speed and torque, and time offset
+_SKEWS = (-0.2, -0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1, 0.2)   # s; start values of the time offset
+_PROPOSALS = 3            # best start values of the search that are fitted
 _NO_LAG, _SOME_LAG = 0.1, 0.6      # radians at the fastest line
 _EQUAL_POLES, _NEAR_EQUAL = 0.25, 0.1      # of ρ
 _FOR_ONE_POLE = 4.0 ** (1.0 / 3.0)         # of its delay, that of two equal poles in its place

@@ -45,7 +45,7 @@ from tdhil.recording import LagPrior
 # The parameters are those of the rigid model.
 
 
-UNKNOWNS = 5
+UNKNOWNS = 5              # J, B, two lags and the time offset
 _AT = Model().at
 _LEAST_SD_S = 1e-4     # a lag "known exactly" is known to a tenth of a millisecond at best
 

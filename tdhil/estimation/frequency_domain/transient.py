@@ -27,15 +27,15 @@ from tdhil.estimation.samples import Stretch
 from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine, pooled_lines, torque_lines
 from tdhil.recording import FloatArray
 
-MOST_MODES = 3
-_LEAST_PERIODS = 5
+MOST_MODES = 3            # decaying modes, at most
+_LEAST_PERIODS = 5        # periods that a transient needs
 _OF_A_MODE = 4               # real numbers in a segment: the a of speed and that of torque
-_PER_OCTAVE = 12
+_PER_OCTAVE = 12          # frequencies tried per octave
 _BEYOND = (0.3, 1.3)         # where modes are looked for, of the lowest and the highest line
-_DECAYS = (0.05, 0.15, 0.4, 1.0, 2.0)
+_DECAYS = (0.05, 0.15, 0.4, 1.0, 2.0)   # decays tried, per period
 _LEAST_DECAY = 0.02          # of ln x over a period: what dies away slower is drift, which ends of periods correct for
 _STEPS = (0.2, 0.03)         # of the logarithm of a decay, of a frequency over the lowest line's: a descent's first
-_ROUNDING = 1e-12
+_ROUNDING = 1e-12         # least relative variance: below it is rounding
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from tdhil.estimation.time_domain.windows import Bins
 from tdhil.recording import FloatArray
 
 INERTIA, VISCOUS, SPEED_LAG, TORQUE_LAG, SKEW, SPEED_SHAPE, TORQUE_SHAPE, FORWARD, BACK, BEND = range(10)
-PARAMETERS = 10
+PARAMETERS = 10           # of the equation
 MOST_SHAPE = 0.5
 
 

@@ -101,8 +101,8 @@ def guessed(bins: Bins, inertia: float) -> BinNoise:
 # must still be covered.
 
 
-_TOLERANCE = 1e-9
-_PLAUSIBLE_S = 1.0
+_TOLERANCE = 1e-9         # of objective, parameters and gradient, relative
+_PLAUSIBLE_S = 1.0        # s; standard deviation of a lag that nothing is known of
 _SHARED = 0.5         # of the residual
 
 
@@ -229,14 +229,14 @@ def covariance(problem: FitProblem, theta: FloatArray, free: tuple[int, ...]) ->
 
 
 _STARTS = ((0.0, 0.0, 0.0), (0.40, 0.15, 0.0), (0.15, 0.40, 0.0), (0.1, 0.1, 0.0))
-_ROUNDS = 5
+_ROUNDS = 5               # of weighting again
 _NO_LAG = 0.1            # rad at the highest frequency
 _CLEAR = 20.0            # power of what is explained over the residual's
 _NARROW = 0.05           # of the frequency: where excitation is lines, what stands beside one need not stand clear
 _PHASE, _WIDE_PHASE = 1.2, 3.0     # rad
-_LEAST_BINS = 8
+_LEAST_BINS = 8           # frequencies above the noise that the fit needs
 _ENOUGH_BINS = 40        # that the phase rule leaves in any case, if they are clear
-_LEAST_LAG_S = 1e-3
+_LEAST_LAG_S = 1e-3       # s; a lag counts as no shorter
 _ABOUT_AS_WELL = 9.0     # of −2 ln L
 _UNSEEN = 0.1            # standard deviations that friction as large as the whole torque would show: it is not seen
 

@@ -37,14 +37,14 @@ from tdhil.recording import BoolArray, FloatArray, Recording
 IntArray = NDArray[np.intp]
 _STEADY_SHARE = 0.05       # of the speed: less excursion than this is a constant speed
 _IDLE_SHARE = 0.02         # of the torque's span: torque this small is none
-_LIMIT_SHARE = 0.005
-_AT_LIMIT = 0.98
-_FLAT_SHARE = 0.01
+_LIMIT_SHARE = 0.005      # of the samples that may be at a limit
+_AT_LIMIT = 0.98          # of the torque limit: a torque above it is at the limit
+_FLAT_SHARE = 0.01        # of the samples that may lie on a plateau
 _LIVELY = 1.5             # median step between neighbours from noise alone, in quanta: it is seen
 _BESIDE = 20              # samples on either side of a plateau
 _ALIKE = 8                # samples in a row that noise would not leave alike
 _TURNS = 2                 # changes of acceleration that one ramp has
-_BLOCKS = 60
+_BLOCKS = 60              # blocks over which a signal is averaged
 
 ADVICE = (
     "change the speed quickly and often, up and down, with the torque recorded all the while: steps or ramps of "
@@ -152,7 +152,7 @@ def _lively_beside(signal: FloatArray, at: BoolArray, plateaus: IntArray, quantu
 
 MODEL = "rigid+lags (time domain)"
 _HIDDEN_S = 2.5        # before a stop, the reported speed may outlive the motion by so long
-_LEAST_SKEW_SD_S = 1e-4
+_LEAST_SKEW_SD_S = 1e-4   # s; least standard uncertainty of a stated time offset
 _WIDE = {
     "noise": "change the speed more often or by more, or record for longer",
     "friction model": "run at more speeds, which determine the friction",

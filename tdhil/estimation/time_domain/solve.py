@@ -99,9 +99,9 @@ def _local_test(problem: FitProblem, theta: FloatArray, factor: float, group: in
 # large.
 
 
-_BLOCK_S = 4.0
-_BLOCKS = 40
-_LEAST_BLOCKS = 10
+_BLOCK_S = 4.0            # s; least length of a block, unless that makes too few
+_BLOCKS = 40              # blocks, at most
+_LEAST_BLOCKS = 10        # blocks, at least
 
 
 @dataclass(frozen=True)
@@ -156,8 +156,8 @@ def sandwich(scores: FloatArray, direction: FloatArray) -> BlockVariance:
 # time than the noise model says (`sandwich`).
 
 
-_LEAST_DOF = 3.0
-_SHAPE_STARTS = ((0.02, 0.02), (0.3, 0.1), (0.1, 0.3))
+_LEAST_DOF = 3.0          # degrees of freedom, at least, for the quantile
+_SHAPE_STARTS = ((0.02, 0.02), (0.3, 0.1), (0.1, 0.3))   # start values of the shapes of both filters
 _EQUAL_POLES, _NEAR_EQUAL = 0.25, 0.1      # of κ
 
 

@@ -23,7 +23,7 @@ _SETTLED = 0.2            # of a standstill: at its begin the reports still show
 _STEADY = 0.9             # correlation of torque and time: a torque that rises late and at once has less
 _LEAST_RISE = 0.1         # of the torque's span: less is drift
 _MOST_JUMPS_APART = 0.5   # of all standstills between motions, that are stick-slip
-_LEAST_JUMPS = 3
+_LEAST_JUMPS = 3          # jumps that make stick-slip
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ def _smoothstep(x: FloatArray, length: float) -> FloatArray:
 # ---------------------------------------------------------------------------------------------------------------------
 
 ComplexArray = NDArray[np.complex128]
-ORDERS = 4
+ORDERS = 4                # of the series
 
 
 def polynomial(s: ComplexArray, *coefficients: float) -> ComplexArray:

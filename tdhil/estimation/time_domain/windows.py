@@ -32,13 +32,13 @@ from tdhil.recording import BoolArray, FloatArray
 # the rate.
 
 
-_MOST_SAMPLES = 200_000
-_LEAST_RATE_HZ = 50.0
+_MOST_SAMPLES = 200_000   # samples of a record that are used: more are averaged in groups
+_LEAST_RATE_HZ = 50.0     # Hz; least rate after this averaging
 _STILL_SHARE = 0.04       # of the highest speed: below it the shaft may stand
-_STILL_QUANTA = 3.0
+_STILL_QUANTA = 3.0       # quanta of the speed below which the shaft stands still
 _GAP_STEPS = 4.5          # missing samples in a row that a straight line bridges
-_GAP_S = 0.05
-_LEAST_SAMPLES_OF_STRETCH = 32
+_GAP_S = 0.05             # s; a shorter interval is no gap
+_LEAST_SAMPLES_OF_STRETCH = 32   # fewer samples make no stretch
 
 
 @dataclass(frozen=True)
@@ -104,15 +104,15 @@ def _before_stops(time: FloatArray, moving: BoolArray, hidden_s: float) -> BoolA
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_LONGEST_S = 60.0
-_TAPER_S = 6.0
-_TAPER_SHARE = 0.25
+_LONGEST_S = 60.0         # s; longest window
+_TAPER_S = 6.0            # s; longest taper of a window
+_TAPER_SHARE = 0.25       # of the stretch: longest taper
 _MOST_BINS = 400          # a window
 _RATE_SHARE = 0.2         # of the sampling rate: the highest frequency used
 _OF_TAPER = 100           # samples: of fewer the sums of a window's third derivative are no integrals
 _COINCIDENT = 0.3         # of the usual interval: of samples closer than that a spline would make a swing
-_CHUNK = 64
-_LEAST_SAMPLES = 32
+_CHUNK = 64               # frequencies at once: it bounds the memory
+_LEAST_SAMPLES = 32       # samples that a window needs
 
 
 @dataclass(frozen=True)

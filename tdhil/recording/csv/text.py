@@ -1,7 +1,7 @@
 """A text file in blocks of whole lines, whatever its encoding, in bounded memory.
 
-UTF-8, UTF-16 and UTF-32 are known by their byte order mark; without one it is UTF-8 if the beginning decodes as that,
-else Windows-1252, which holds Latin-1's letters. Line ends may be LF, CR LF or CR.
+UTF-8 and UTF-16 are known by their byte order mark; without one it is UTF-8 if the beginning decodes as that, else
+Windows-1252, which holds Latin-1's letters. Line ends may be LF, CR LF or CR.
 
 Our own around `csv`, which splits the odd line: readers of tables (numpy's, pandas') stop at the first bad row, or pass
 over it unseen. Here each is counted by its cause, with its line.
@@ -22,8 +22,9 @@ from tdhil.errors import CsvUnusable
 # Times of day and time stamps, as seconds from the first one's day.
 #
 # Read are ``12:00:00.123`` (decimal comma too), ``00:12.3`` (minutes), with or without AM or PM, before it a date
-# (``2024-05-01T``, ``2024/05/01``, ``01.05.2024``, ``5/1/2024``), behind it a zone (``Z``, ``+02:00``). Without a
-# date, a clock that goes from the last hour of a day to the first one has passed midnight.
+# (``2024-05-01T``, ``2024/05/01``, ``01.05.2024``), behind it a zone (``Z``, ``+02:00``). Without a date, a clock that
+# goes from the last hour of a day to the first one has passed midnight. ``5/1/2024`` is no date here: its
+# day and month are ambiguous.
 
 
 _DAY_S = 86400.0
@@ -87,13 +88,12 @@ class ClockReader:
                 return None
             if self._first is None:
                 self._first = ordinal
-            # Day and month of 5/1/2024 are ambiguous; another date is the next day.
-            self._days[text] = len(self._days) if ordinal == 0 else ordinal - self._first
+            self._days[text] = ordinal - self._first
         return self._days[text]
 
 
 def _ordinal(text: str) -> int | None:
-    """Return the day's number; 0 for a date with ambiguous day and month."""
+    """Return the day's number; None for a date that is none, or that has an ambiguous day and month."""
     try:
         if found := _YEAR_FIRST.fullmatch(text):
             return date(int(found[1]), int(found[2]), int(found[3])).toordinal()
@@ -101,7 +101,7 @@ def _ordinal(text: str) -> int | None:
             return date(int(found[3]), int(found[2]), int(found[1])).toordinal()
     except ValueError:
         return None
-    return 0 if re.fullmatch(r"\d{1,2}[/-]\d{1,2}[/-]\d{2,4}", text, re.ASCII) else None
+    return None
 
 
 def _zone_s(zone: str | None) -> float:
@@ -200,8 +200,6 @@ _BLOCK = 1 << 20          # characters
 _HEAD = 64 * 1024
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
-    (codecs.BOM_UTF32_LE, "utf-32"),      # before UTF-16, whose mark it begins with
-    (codecs.BOM_UTF32_BE, "utf-32"),
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )

@@ -60,9 +60,10 @@ from tdhil.runner.excitation import (
 # says of J it first has to say of the structure.
 
 
-_SKEW_SD_S = 0.3
+_SKEW_SD_S = 0.3          # s; standard uncertainty of the time offset between speed and torque in this bound
 _AVERAGE_SHARE = 4.0       # u of an average that delays as long as the longest lag τ: (2 τ)²
 _CERTAIN = 1e-4
+"""Least standard uncertainty of a known lag, s, and of its shape: a bound of zero has no inverse."""
 
 
 def relative_sd(plan: Plan, theta: FloatArray, noise: NoiseDensity, prior: LagPrior) -> float:
@@ -124,10 +125,11 @@ LINES_LIMIT_HZ = (0.1, 2.0)
 
 SLOPES = (1.0, 1.5, 2.0)                               # amplitude ~ harmonic^−slope
 _HARMONICS = ((1, 2, 3, 4), (1, 2, 3, 5), (1, 2, 3, 4, 5), (1, 2, 3, 4, 6), (1, 2, 3, 4, 5, 6), (1, 3, 5, 7, 9))
+"""Sets of excited lines that are tried, multiples of the lowest one."""
 _REACHES = (0.8, 1.0)                                  # of the highest line that is allowed
-_GRID = 128
+_GRID = 128               # points of a period on which the peaks of a candidate are searched
 _TURN = 2.0 * np.pi * np.arange(_GRID) / _GRID
-_POPULATION, _KEPT, _ROUNDS, _STEP_RAD = 96, 6, 5, 0.8
+_POPULATION, _KEPT, _ROUNDS, _STEP_RAD = 96, 6, 5, 0.8   # search for phases: candidates, survivors, rounds, step in rad
 
 
 @dataclass(frozen=True)
@@ -208,7 +210,7 @@ class _AmplitudeRoom:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-OFFSET_SHARES = (0.2, 0.4)
+OFFSET_SHARES = (0.2, 0.4)   # candidates for the distance of the mean speeds from the ends, shares of the window
 BETTER = 0.95         # of the usual multisine's interval: what a candidate must come down to
 _SLACK = 1.02         # of the usual plan's time: a transition may take a second longer
 
@@ -340,7 +342,7 @@ SOON_COUNTED = (5, 6)     # periods at each mean speed at first, where time is w
                           # need more then, and some 14 minutes, as each look in vain asks for a higher confidence
 SETTLE_SOON_S = 8.0       # settling, where time is what counts: leaves 0.03 % of J at most, with reports' lags of 1 s
 _WIDTHS_OF_SD = 2.3       # half-width over the bound's standard deviation, as plans have it
-_OF_A_SLOPE, _FINALISTS = 4, 8
+_OF_A_SLOPE, _FINALISTS = 4, 8   # candidates kept of each slope, and of all slopes for the exact prediction
 _LEAST_MORE = 0.2         # of the periods at first: two of ten are the least that an extension has
 _SPREAD = 0.2             # of the logarithm of a half-width about the one that was predicted: 1 sd
 _QUANTILES = np.array([-1.5, -0.9, -0.5, -0.2, 0.2, 0.5, 0.9, 1.5])     # of a normal distribution, equally likely

@@ -45,11 +45,11 @@ RIGID = Model()
 """The model that plans are made with; theta (8,) = (J, B) and the six parameters of the reports."""
 
 LOAD_SHARE = 0.0075        # of the torque limit: sd of the load if it is not measured
-LOAD_TIME_S = 0.5
+LOAD_TIME_S = 0.5         # s; correlation time of the load if it is not measured
 SENSOR_SHARE = 0.002       # of the highest speed: sd of the speed sensor in 2 ms
-_SENSOR_STEP_S = 0.002
+_SENSOR_STEP_S = 0.002    # s; the step of `SENSOR_SHARE`
 SPEED_LAG_S = 0.40         # assumed lag of the reported speed, and of the torque, if none is stated
-TORQUE_LAG_S = 0.15
+TORQUE_LAG_S = 0.15       # s; assumed lag of the reported torque, if none is stated
 _LOW_LINES = 3             # of a stretch: its lowest lines tell the load
 _HIGH_LINES = 9            # … those behind them, up to this one, what grows with frequency
 _LEAST_SHARE = 1e-3        # of the assumed density: less than that, and something else will set the interval
@@ -144,7 +144,7 @@ def _readings(samples: Samples, theta: FloatArray) -> tuple[FloatArray, FloatArr
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_NINE_IN_TEN = 1.28
+_NINE_IN_TEN = 1.28       # standard deviations: one-sided 90 % quantile of the normal distribution
 LEAST_NU = 2.0      # complex degrees of freedom of a line's weight, below which identification leaves it out
 
 

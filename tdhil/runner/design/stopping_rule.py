@@ -67,9 +67,9 @@ MOST_BEHIND = 3.0         # of all before, that an extension behind an interval 
 AIM = 0.7                 # probability with which one extension is enough; the way back for another costs little
 MARGIN = 1.05             # an interval comes out 4 % (1 sd) wider or narrower than its scatter says, as residuals fall
 _WORTH_SHARE = 0.1        # of the interval at the end of the time: what is nearer than this needs no more time
-_THRESHOLDS = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0)
-_MARGINS = (1.0, 1.3)
-_PILOTS, _EXTENSIONS = 128, 32
+_THRESHOLDS = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0)   # r: candidates
+_MARGINS = (1.0, 1.3)     # a: candidates
+_PILOTS, _EXTENSIONS = 128, 32   # equally likely scatters of a pilot and of an extension over which a rule is rated
 
 
 @dataclass(frozen=True)

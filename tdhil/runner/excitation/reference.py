@@ -200,7 +200,7 @@ class PeriodicReference:
 # A transition between two speeds without a step of acceleration, with its feed-forward torque.
 
 
-_SHORTEST_S = 2.0
+_SHORTEST_S = 2.0         # s; shortest transition
 _TORQUE_SHARE = 0.5   # of the torque above friction: a transition is slow
 
 

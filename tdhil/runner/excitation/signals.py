@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tdhil.runner.excitation.reference import ExcitationKind
 from tdhil.runner.excitation.speed_loop import SpeedFollowing
 
-_GRID = 1024
+_GRID = 1024              # points of a period on which a peak is searched
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ SINE = PeriodicKind(shape=sine_shape, frequency_hz=SINE_FREQUENCY_HZ, at_one_spe
 
 
 STEP_FREQUENCY_HZ = 0.05   # of the square wave: each level lasts 10 s
-_HARMONICS = (1, 3, 5, 7, 9)
+_HARMONICS = (1, 3, 5, 7, 9)   # of the square wave: it has odd ones only
 
 
 def step_shape() -> Shape:
@@ -204,12 +204,12 @@ STEP = PeriodicKind(shape=step_shape, frequency_hz=STEP_FREQUENCY_HZ)
 # Held for a time h, an element has the spectrum sin(x)/x, x = π f h, and J s turns torque into speed.
 
 
-PRBS_FREQUENCY_HZ = 0.05
+PRBS_FREQUENCY_HZ = 0.05   # Hz; a period of 20 s
 ECHOES_S = (0.7, 3.8)
 """Range of usable echo times, s. An earlier echo leaves the fastest line no cycle; a later one outlasts a period."""
 
-_ORDER, _TAPS = 6, (6, 5)
-_PRBS_LINES = 30
+_ORDER, _TAPS = 6, (6, 5)   # of the shift register, x⁶ + x⁵ + 1
+_PRBS_LINES = 30          # lines of the sequence in use: up to 1.5 Hz
 
 
 def tells_before_echo(echo_s: float) -> bool:

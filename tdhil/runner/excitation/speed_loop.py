@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from tdhil.recording import FloatArray
 
-_GRID_S = 0.02
+_GRID_S = 0.02            # s; step of the simulated loop
 _STARTS = ((1.0, 1.0, 0.3), (0.2, 0.6, 0.1), (0.1, 0.15, 0.01))    # b, a1, a2
-_LEAST_S, _MOST_S = 1e-3, 5.0
+_LEAST_S, _MOST_S = 1e-3, 5.0   # s; bounds of the loop's time constants in the fit
 _GOOD = 0.05              # of the change: a fit that leaves more of it says nothing
 _HELD_BACK = 1.12         # times the commanded time from a fifth to four fifths of the way: the drive has its own ramp
 

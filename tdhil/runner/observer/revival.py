@@ -13,7 +13,7 @@ stop by no more than this multiple of its rate; the last factor is that of a ram
 ALIVE_S = 1.0
 """After a contradiction a speed is followed anew once the longest lag has passed so many times, …"""
 
-ALIVE_LAGS = 3.0
+ALIVE_LAGS = 3.0          # multiple of the longest lag, for `ALIVE_S`
 
 ALIVE_SHARE = 0.25
 """… if it has kept this share of itself by then, and comes down no faster than this share of the quick stop's time. A

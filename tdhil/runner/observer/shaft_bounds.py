@@ -19,7 +19,7 @@ SLOW_FRICTION = 2.0
 BREAKAWAY = 1.3
 """… but no larger than this multiple of the torque under which the shaft first moved."""
 
-SLOW_SHARE = 0.15
+SLOW_SHARE = 0.15         # of the speed limit, for `SLOW_FRICTION`
 
 LEARN_SHARE, LEARN_S = 0.03, 0.5
 """Before stage 2 ends, the inertia has an upper bound once the speed changed by this share of its limit in so long."""

@@ -4,7 +4,7 @@ from tdhil.runner.stages.acquire import run_plan as run_plan
 from tdhil.runner.stages.braking_probe import NOT_YET as NOT_YET, slow_down as slow_down
 from tdhil.runner.stages.hold import MeanSpeedControl as MeanSpeedControl, run_hold as run_hold
 from tdhil.runner.stages.impedance import (
-    reference_plan as reference_plan, run_offset as run_offset, run_pilot as run_pilot,
+    OffsetPlan as OffsetPlan, reference_plan as reference_plan, run_offset as run_offset, run_pilot as run_pilot,
 )
 from tdhil.runner.stages.setup import measure_offsets as measure_offsets, probe_sign as probe_sign
 from tdhil.runner.stages.speed import RampCourse as RampCourse, SpeedResult as SpeedResult, run_speed as run_speed

@@ -60,7 +60,7 @@ from tdhil.runner.stages.steady import CALM_S, WINDOW_S, calm_string, swing_of, 
 # whole pulse, counts as noise of the speed. If that hides the response, there is no pulse.
 
 
-UP_SHARE, DOWN_SHARE = 0.8, 0.6
+UP_SHARE, DOWN_SHARE = 0.8, 0.6   # shares of the room above and below the speed, in the bounds (up) and (down)
 SEEN_SHARE = 0.06
 """Intended change of speed, as a share of the speed limit, unless noise requires more."""
 
@@ -73,8 +73,8 @@ LEAST_FLOWING_SHARE = 0.5
 HELD_SHARE = 0.9
 """Share of the friction that holds the shaft at standstill."""
 
-LONGEST_S = 1.0
-STRING_EDGE_S = 0.5
+LONGEST_S = 1.0           # s; longest pulse
+STRING_EDGE_S = 0.5       # s; longest ramp of the pulse with a string
 CLEAR, WANTED_CLEAR = 2.0, 6.0
 """Required and preferred ratio of the change to the noise."""
 
@@ -294,8 +294,8 @@ class BrakingListener:
 NOT_YET = "no braking torque has been tried yet"
 """Reason of the guard until the probe."""
 
-TRIES = 2
-STEADY_S = 1.0
+TRIES = 2                 # pulses, if the first one shows nothing clear
+STEADY_S = 1.0            # s; steady rotation before the pulse that counts
 RAMP_S = 5.0
 """Time to slow down over the whole window, s; longer for a heavy shaft."""
 

@@ -48,9 +48,9 @@ class MeanSpeedControl:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-WINDOW_SHARE = 0.02
-SETTLED_S = 3.0
-MEAN_S = 1.0
+WINDOW_SHARE = 0.02       # of the target speed: the window of the mean speed
+SETTLED_S = 3.0           # s; time in the window that counts as settled
+MEAN_S = 1.0              # s; averaging time of the reported speed
 TIMEOUT_S = 90.0
 """Longest settling after the ramp, s."""
 

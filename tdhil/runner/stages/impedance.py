@@ -36,7 +36,7 @@ from tdhil.runner.excitation import (
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
 from tdhil.runner.stages.steady import trace, wait_until_steady
 
-HARMONICS = (1, 2, 3, 5, 7, 10, 14, 20, 30)
+HARMONICS = (1, 2, 3, 5, 7, 10, 14, 20, 30)   # excited lines, multiples of 1/PERIOD_S
 PHASES_RAD = (0.4081, 5.3094, 1.6031, 0.07, 3.2103, 0.7969, 5.0826, 4.208, 5.651)
 """Equal lines with them have a crest of 1.75: found by a search with growing p-norms."""
 PERIOD_S = 20.0            # lines of 0.05 to 1.5 Hz: from string modes to the bandwidth of speed loops
@@ -45,10 +45,10 @@ DRAWS, SHARPNESS = 400, 1.0   # random sets of phases, the best is used; weight 
 
 LARGEST_SHARE = 0.4
 """Largest offset as a share of the torque limit; the rest is for the speed loop."""
-PILOT_SHARE, PILOT_PERIODS = 0.05, 2
+PILOT_SHARE, PILOT_PERIODS = 0.05, 2   # offset of the pilot as a share of the torque limit; its periods
 ROOM_SHARE = 0.9           # share of the room in speed and torque that a plan uses
 FADE_S = 2.0               # at the end
-LEAST_COUNTED = 6
+LEAST_COUNTED = 6         # periods that must follow the settling ones
 RESERVE_S = 10.0           # s; reserved of the time limit, beside stage 5
 DITHER_COUNTS, DITHER_TURNS = 3.0, 6.0 * 1.0103
 """A small sine on the reference: amplitude in counts of the reported speed, and cycles per period (no whole number, far

@@ -15,7 +15,7 @@ from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.settings import MachineLimits
 from tdhil.runner.stages.steady import trace
 
-STANDSTILL_S = 1.0
+STANDSTILL_S = 1.0        # s; averaging time of the offsets at standstill
 RAMP_S = 5.0
 """Time to reach the probe torque, if nothing moves before, s."""
 TORQUE_SEEN_S = 0.5

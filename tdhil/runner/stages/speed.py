@@ -38,7 +38,7 @@ from tdhil.runner.stages.steady import (
 )
 from tdhil.runner.string_release import SwingDamper
 
-LEVEL_S = 6.0
+LEVEL_S = 6.0             # s; duration of an operating point
 RESTLESS_LEVEL_S = 24.0
 """Duration of an operating point with a string that keeps oscillating, s: some periods, to average them out."""
 
@@ -66,7 +66,7 @@ WANDER = 1.25
 oscillating
 string."""
 
-TRIES = 4
+TRIES = 4                 # ramps between the two speeds, until the rough inertia is good enough
 NOBODY = SpeedWitness()
 
 _WRONG_TORQUE = "Check sign and scale of the torque. A wider speed window gives a better ramp"

@@ -56,8 +56,8 @@ def steady_level(samples: Sequence[Sample]) -> SteadyLevel:
     )
 
 
-BLOCK_S = 0.5
-BLOCKS = 4
+BLOCK_S = 0.5             # s; a block whose mean speed is compared with the target
+BLOCKS = 4                # blocks in a row that must be at the target
 
 
 def wait_until_steady(
@@ -100,14 +100,14 @@ CALM_SHARE = 0.02
 CALM_S = 6.0
 """Time for which it must be calm, s: half a period of a string with a period of 12 s."""
 
-WINDOW_S = 12.0
+WINDOW_S = 12.0           # s; the oscillation of one such window is compared with that of the window before
 NO_CALMER = 0.75
 """Ratio to the oscillation of the time before; above it the oscillation counts as not decaying."""
 
 STICK_SLIP_TORQUE_SHARE = 0.5
 """Share of the mean torque that stick-slip reaches. With a known ζ `STICK_SLIP_SHARE` is used instead."""
 
-MOST_CALMING_S = 120.0
+MOST_CALMING_S = 120.0    # s; longest wait for a string to become calm
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ from tdhil.runner.stages.braking_probe import probe_braking, slow_speed
 from tdhil.runner.stages.speed import SpeedResult
 from tdhil.runner.stages.steady import trace
 
-DRIFT_S = 8.0
-END_S = 0.5
+DRIFT_S = 8.0             # s; time at the target torque
+END_S = 0.5               # s; end of this time, over which the last speed is averaged
 SLOPE_SHARE_PER_S = 0.1
 """Steepest torque ramp, share of the limit per second."""
 

@@ -35,7 +35,7 @@ STRANGE_SHARE, STRANGE_COUNTS, STRANGE_SDS = 0.015, 8.0, 6.0
 """Share of the speed limit, counts of the reported speed, and standard deviations of its noise: the largest of these is
 the permitted deviation of the report from the observer's expectation. An error of a tenth in a lag or inertia causes a
 fifth of the first. A lost load or torque is detected within a tenth of a second."""
-RMS_S = 5.0
+RMS_S = 5.0               # s; window of the rms torque that shows an oscillating loop
 ENERGY_SHARE = 0.05
 """Share of the string's energy at breakaway of the bit that loop errors may put in."""
 SAME_RIG = 0.5
@@ -43,7 +43,7 @@ SAME_RIG = 0.5
 TORQUE_SHARE, RAMP_S = 0.25, 5.0
 """Share of the torque limit with which the first set speed is approached in the drive's own loop; or time for the whole
 window, s."""
-RESERVE_S = 20.0
+RESERVE_S = 20.0          # s; reserved of the time limit
 BEFORE_S = 150.0
 """Approximate duration of stages 1 to 4, s; the rest of the time limit is checked before motion."""
 

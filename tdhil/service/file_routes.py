@@ -1,0 +1,130 @@
+"""The routes of a run's files: log, report, result, samples, pictures. A download stands in the audit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from starlette.responses import FileResponse, Response, StreamingResponse
+
+from tdhil.errors import MessageCode, UsageError
+from tdhil.service.access import principal
+from tdhil.service.middleware import off
+from tdhil.service.routing import api
+from tdhil.service.run_state import NotThere
+from tdhil.service.schemas import PictureView
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+    from starlette.routing import Route
+
+    from tdhil.report import ShownPicture
+    from tdhil.service.site import Site
+
+REPORT_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox allow-downloads"
+PICTURE_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; sandbox"
+"""Content security policies: a report and a picture carry their own style, and run no script."""
+
+
+def routes(site: Site) -> list[Route]:
+    """Return the routes."""
+    return [
+        api(site, "log", log),
+        api(site, "report", report),
+        api(site, "report_pdf", report_pdf),
+        api(site, "result", result),
+        api(site, "samples", samples),
+        api(site, "pictures", pictures),
+        api(site, "picture", picture),
+    ]
+
+
+async def log(site: Site, request: Request, body: None) -> Response:
+    """Return the log, also while it grows."""
+    return await _file(site, request, "run.mcap", "application/octet-stream")
+
+
+async def report(site: Site, request: Request, body: None) -> Response:
+    """Return the report, to be shown."""
+    response = await _file(site, request, "report.html", "text/html", shown=True)
+    response.headers["content-security-policy"] = REPORT_POLICY
+    return response
+
+
+async def report_pdf(site: Site, request: Request, body: None) -> Response:
+    """Return the report on A4, made at the first request."""
+    run = request.path_params["run"]
+    folder = await off(lambda: site.store.place(run))
+    if not (folder / "report.pdf").exists() and (folder / "result.json").exists():
+        await site.work("report", run, {"name": "report.pdf"})
+    return await _file(site, request, "report.pdf", "application/pdf")
+
+
+async def result(site: Site, request: Request, body: None) -> Response:
+    """Return the result."""
+    return await _file(site, request, "result.json", "application/json")
+
+
+async def samples(site: Site, request: Request, body: None) -> Response:
+    """Return the samples as CSV, made at the first request."""
+    run = request.path_params["run"]
+    folder = await off(lambda: site.store.place(run))
+    if not (folder / "samples.csv").exists() and (folder / "run.mcap").exists():
+        if not site.store.status(run).ended:
+            raise UsageError("the run has no finished log", where=f"run {run}", next_step="Wait until it has ended",
+                             entry=MessageCode.NOT_READY)
+        await site.work("samples", run, {})
+    return await _file(site, request, "samples.csv", "text/csv")
+
+
+async def pictures(site: Site, request: Request, body: None) -> list[PictureView]:
+    """Return the headings of the report's pictures."""
+    found = await _shown(site, request.path_params["run"])
+    return [PictureView(number, one.heading, one.caption) for number, one in enumerate(found)]
+
+
+async def picture(site: Site, request: Request, body: None) -> Response:
+    """Return one picture of the report. Raises NotThere."""
+    number = request.path_params["number"]
+    found = await _shown(site, request.path_params["run"])
+    if not number.isdecimal() or int(number) >= len(found):
+        raise NotThere("this picture does not exist", where=f"run {request.path_params['run']}")
+    said = {"content-security-policy": PICTURE_POLICY}
+    return Response(found[int(number)].svg, media_type="image/svg+xml", headers=said)
+
+
+async def _shown(site: Site, run: str) -> tuple[ShownPicture, ...]:
+    from tdhil.report import pictures_in
+
+    def look() -> tuple[ShownPicture, ...]:
+        found = site.store.place(run) / "report.html"
+        return pictures_in(found.read_text("utf-8")) if found.is_file() else ()
+
+    return await off(look)
+
+
+async def _file(site: Site, request: Request, name: str, media: str, *, shown: bool = False) -> Response:
+    """Return a file of the run, as a download (or ``shown``). Raises NotThere."""
+    run, who = request.path_params["run"], principal(request).name
+    path = (await off(lambda: site.store.place(run))) / name
+    if not path.is_file():
+        raise NotThere(f"this run has no {name}", where=f"run {run}", next_step="Wait until the run has ended")
+    rig = (await off(lambda: site.store.request(run))).rig
+    if request.method == "GET":
+        site.supervisor.note(who, f"downloaded {name}", run, rig)
+    called = f"{rig}-{run}-{name}"
+    grows = name == "run.mcap" and not (await off(lambda: site.store.status(run))).ended
+    if grows and ("range" not in request.headers or "if-range" in request.headers):
+        said = {"content-disposition": f'attachment; filename="{called}"'}
+        return StreamingResponse(_as_it_is(path), media_type=media, headers=said)
+    return FileResponse(path, media_type=media, filename=None if shown else called)
+
+
+def _as_it_is(path: Path) -> Iterator[bytes]:
+    """Yield a growing file up to its present end."""
+    left = path.stat().st_size
+    with path.open("rb") as file:
+        while left > 0 and (piece := file.read(min(left, 2**16))):
+            left -= len(piece)
+            yield piece

@@ -1,0 +1,93 @@
+"""The pages: templates with the views of the API, and the page for the login."""
+
+from __future__ import annotations
+
+import re
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from starlette.responses import HTMLResponse, RedirectResponse, Response
+from starlette.routing import BaseRoute, Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from tdhil.config import form_options
+from tdhil.service.access import principal, require
+from tdhil.service.accounts import Role
+from tdhil.service.middleware import off
+from tdhil.version import __version__
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+
+    from tdhil.service.site import Site
+
+HERE: Final = Path(str(files("tdhil.service")))
+_OF_HERE: Final = re.compile(r"/(?![/\\])[\x21-\x5b\x5d-\x7e]*")
+"""Addresses to which a login may redirect."""
+
+
+class Pages:
+    """The templates of the pages."""
+
+    def __init__(self, site: Site) -> None:
+        self._site = site
+        self._templates = Environment(
+            loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        self._templates.globals["version"] = __version__
+        self._templates.globals["form_options"] = form_options
+
+    def render(self, request: Request, template: str, here: str, status: int = 200, **known: Any) -> Response:
+        """Return a page. ``here``: the entry of the menu that it belongs to."""
+        text = self._templates.get_template(template).render(
+            here=here, who=principal(request), login=self._site.access.login, **known)
+        return HTMLResponse(text, status)
+
+    def routes(self) -> list[BaseRoute]:
+        """Return the routes: every page with its template, its entry in the menu and its least role."""
+        return [
+            self._page("/", "rigs.html", "rigs"),
+            self._page("/rigs/{rig}", "history.html", "rigs"),
+            self._page("/rigs/{rig}/file", "rig_file.html", "rigs"),
+            self._page("/start/{rig}", "start.html", "rigs"),
+            self._page("/runs", "runs.html", "runs"),
+            self._page("/runs/{run}", "run.html", "runs"),
+            self._page("/runs/{run}/live", "live.html", "runs"),
+            self._page("/calibrate/{rig}", "calibrate.html", "rigs"),
+            self._page("/rehearse/{rig}", "rehearse.html", "rigs"),
+            self._page("/compare", "compare.html", "runs"),
+            self._page("/fleets", "fleets.html", "fleets"),
+            self._page("/fleets/{fleet}", "fleet.html", "fleets"),
+            self._page("/audit", "audit.html", "audit", "admin"),
+            self._page("/accounts", "accounts.html", "accounts"),
+            Route("/login", self._login),
+            Route("/favicon.ico", lambda request: RedirectResponse("/static/icon.svg")),
+            Mount("/static", StaticFiles(directory=HERE / "static")),
+        ]
+
+    def _page(self, path: str, template: str, here: str, role: Role = "viewer") -> Route:
+        site = self._site
+
+        async def serve(request: Request) -> Response:
+            require(principal(request), role, route=request.url.path, open_here=not site.access.login)
+            known: dict[str, Any] = {}
+            if "rig" in request.path_params:
+                known["rig"] = await off(
+                    lambda: site.rig_view(site.supervisor.rigs.get(request.path_params["rig"])))
+            if "run" in request.path_params:
+                known["run"] = await off(lambda: site.run_view(request.path_params["run"]))
+            if "fleet" in request.path_params:
+                known["fleet"] = await off(lambda: site.fleets.get(request.path_params["fleet"]))
+            return self.render(request, template, here, **known)
+
+        return Route(path, serve)
+
+    async def _login(self, request: Request) -> Response:
+        there = request.query_params.get("next", "/")
+        there = there if _OF_HERE.fullmatch(there) else "/"
+        if principal(request).roles or not self._site.access.login:
+            return RedirectResponse(there, 303)
+        return self.render(request, "login.html", "login", next=there)

@@ -1,0 +1,192 @@
+"""The routes of a rig: its state and file, plan, start and stop of a run, trend, torque calibration, faults."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import TYPE_CHECKING, Any, Final
+
+from tdhil.errors import MessageCode, UsageError
+from tdhil.service.access import address_of, principal, require_options
+from tdhil.service.middleware import off
+from tdhil.service.routing import api
+from tdhil.service.run_state import NotAllowed
+from tdhil.service.schemas import (
+    CalibrationBody,
+    CalibrationView,
+    FaultView,
+    PlanView,
+    RigFileBody,
+    RigFileView,
+    RigView,
+    RunView,
+    StoppedView,
+    TrendView,
+)
+from tdhil.service.start_request import EDITABLE, RigFile, options_of, require_motion, require_unwatched
+from tdhil.service.store import read_json
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+    from starlette.routing import Route
+
+    from tdhil.service.site import Site
+
+LARGEST_KG_M2: Final = 1e9
+"""Largest added moment of inertia that a calibration accepts, kg·m²; no body has more."""
+TREND_RUNS: Final = 1000
+"""Number of runs that a trend goes back."""
+
+
+def routes(site: Site) -> list[Route]:
+    """Return the routes."""
+    return [
+        api(site, "rigs", rigs),
+        api(site, "rig", rig),
+        api(site, "rig_file", rig_file),
+        api(site, "edit_rig", edit_rig),
+        api(site, "trend", trend),
+        api(site, "calibration", calibration),
+        api(site, "plan", plan),
+        api(site, "start", start),
+        api(site, "stop_rig", stop_rig),
+        api(site, "faults", faults),
+    ]
+
+
+async def rigs(site: Site, request: Request, body: None) -> list[RigView]:
+    """Return every rig."""
+    return await off(lambda: [site.rig_view(one) for one in site.supervisor.rigs.all()])
+
+
+async def rig(site: Site, request: Request, body: None) -> RigView:
+    """Return one rig."""
+    return await off(lambda: site.rig_view(site.supervisor.rigs.get(request.path_params["rig"])))
+
+
+async def rig_file(site: Site, request: Request, body: None) -> RigFileView:
+    """Return a rig's file."""
+    return await off(lambda: _file_view(site.supervisor.rigs.get(request.path_params["rig"])))
+
+
+async def edit_rig(site: Site, request: Request, body: RigFileBody) -> RigFileView:
+    """Write a rig's file. Raises NotAllowed without a login."""
+    which, who = request.path_params["rig"], principal(request)
+    if not who.known:
+        raise NotAllowed("only a logged-in user may edit a rig's file", where=f"rig {which}",
+                         next_step="Edit the file on the service's computer, or add users")
+    return await off(lambda: _file_view(site.supervisor.edit_rig(which, body.text, body.sha256, who.name)))
+
+
+def _file_view(found: RigFile) -> RigFileView:
+    """Return the view of a rig's file. Raises UsageError."""
+    try:
+        data = found.path.read_bytes()
+        return RigFileView(found.id, data.decode(), hashlib.sha256(data).hexdigest(), sorted(EDITABLE))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"can't be read as text ({error})", where=found.path.name) from error
+
+
+async def plan(site: Site, request: Request, body: dict[str, Any]) -> PlanView:
+    """Plan a run. Nothing is connected."""
+    found = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
+    options = options_of(body)
+    await off(lambda: found.way(options))
+    asked = {"rig_file": str(found.path.resolve()), "options": options}
+    return PlanView(found.id, found.sha256, await site.work("plan", None, asked))
+
+
+async def trend(site: Site, request: Request, body: None) -> TrendView:
+    """Return how the results of a rig changed over time."""
+    which = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
+
+    def rows() -> list[dict[str, Any]]:
+        runs = site.list_runs(which.id, "done", TREND_RUNS)
+        return [row for one in runs if (row := read_json(site.store.place(one.id) / "row.json")) is not None]
+
+    found = await off(rows)
+    if not found:
+        nothing = {"rig": which.id, "logs": 0, "results": 0, "notes": ["no run has a result yet"], "quantities": []}
+        return TrendView(which.id, nothing)
+    asked = {"rows": found, "rig": which.id}
+    return TrendView(which.id, await site.work("trend", None, asked))
+
+
+async def start(site: Site, request: Request, body: dict[str, Any]) -> tuple[int, RunView]:
+    """Request a run. The same key returns the same run."""
+    key = request.headers.get("idempotency-key")
+    if key is not None and not 1 <= len(key) <= 200:
+        raise UsageError("must have 1 to 200 characters", where="Idempotency-Key", entry=MessageCode.REQUEST_WRONG)
+    which, who = request.path_params["rig"], principal(request)
+
+    def check() -> None:
+        found = site.supervisor.rigs.get(which)
+        require_motion(found)
+        if not who.known:
+            require_unwatched(found)
+        require_options(who, options_of(body))
+
+    await off(check)
+    asked = await off(lambda: site.supervisor.start_run(which, body, who.name, key, address_of(request)))
+    if asked.new:
+        site.metrics.runs_asked.inc()
+    return 201 if asked.new else 200, await off(lambda: site.run_view(asked.request.id))
+
+
+async def stop_rig(site: Site, request: Request, body: Any) -> StoppedView:
+    """Stop the rig's run, or its drive if there is no run."""
+    which, asking = request.path_params["rig"], principal(request)
+    who = asking.name
+    site.metrics.stops_asked.inc()
+
+    def stop() -> StoppedView:
+        found = site.supervisor.rigs.get(which)
+        if (run := site.supervisor.run_of(which)) is not None:
+            site.supervisor.stop(run, who)
+            return StoppedView(which, [run])
+        if "operator" not in asking.roles and site.supervisor.certainly_idle(found):
+            raise NotAllowed("no tdhil moves this rig: a stop would open its bus and act on a drive that another"
+                             " program may control", where=f"rig {which}",
+                             next_step="Ask an operator. If the shaft turns, use the hard-wired stop")
+        code, said = site.supervisor.stop_drive(found, who)
+        return StoppedView(which, [], code, said)
+
+    return await site.at_once(stop)
+
+
+async def faults(site: Site, request: Request, body: None) -> list[FaultView]:
+    """Return the faults that can be rehearsed. Raises NotAllowed for a real rig."""
+    from tdhil.buses import bus_named
+
+    which = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
+    if not which.simulated:
+        raise NotAllowed("faults can be rehearsed only on a simulated rig", where=f"rig {which.id}",
+                         next_step="Use a rig whose file contains run: {simulate: true}")
+    bus = bus_named(which.way()[1].drive)
+    return [FaultView(one.name, one.summary, one.row, one.value, one.takes, one.from_start) for one in bus.faults()]
+
+
+async def calibration(site: Site, request: Request, body: CalibrationBody) -> CalibrationView:
+    """Return the torque calibration from two ended runs of the rig."""
+    which = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
+    sd = body.added_sd_kg_m2
+    if not 0.0 < body.added_kg_m2 <= LARGEST_KG_M2:
+        raise UsageError(f"{body.added_kg_m2:g}: must be a positive number of kg·m²", where="added_kg_m2",
+                         entry=MessageCode.REQUEST_WRONG)
+    if sd is not None and not 0.0 <= sd <= LARGEST_KG_M2:
+        raise UsageError(f"{sd:g}: must be a number of kg·m², not negative", where="added_sd_kg_m2",
+                         entry=MessageCode.REQUEST_WRONG)
+
+    def check() -> None:
+        for run in (body.without, body.with_body):
+            if site.store.request(run).rig != which.id:
+                raise UsageError(f"is not a run of rig {which.id}", where=f"run {run}",
+                                 next_step="Calibrate each drive by its own two runs", entry=MessageCode.REQUEST_WRONG)
+            if not site.store.status(run).ended or not (site.store.place(run) / "run.mcap").is_file():
+                raise UsageError("the run has no finished log", where=f"run {run}",
+                                 next_step="Wait until it has ended", entry=MessageCode.NOT_READY)
+
+    await off(check)
+    asked = {"without": body.without, "with_body": body.with_body, "added_kg_m2": body.added_kg_m2,
+             "added_sd_kg_m2": sd, "at": body.at}
+    site.supervisor.note(principal(request).name, "torque calibration asked", body.with_body, which.id, **asked)
+    return CalibrationView(await site.work("calibrate", None, {**asked, "runs_folder": str(site.store.runs)}))

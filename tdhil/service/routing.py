@@ -1,0 +1,46 @@
+"""Starlette's route for a declared route of the API (`schemas.ROUTES`) and its handler.
+
+The declaration states method, path, role, body and answers. A handler is a function of the site, the request and its
+checked body. It returns a view, a status with a view, or a whole reply.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import Any, Final
+
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from tdhil.errors import TdhilError
+from tdhil.service import schemas
+from tdhil.service.access import principal, require
+from tdhil.service.middleware import body_of, error_response
+from tdhil.service.schemas import API, CSRF_HEADER, plain
+from tdhil.service.site import Site
+
+Handler = Callable[[Site, Request, Any], Awaitable[Any]]
+DECLARED: Final = {one.name: one for one in schemas.ROUTES}
+
+
+def api(site: Site, name: str, handler: Handler, *, base: str = API) -> Route:
+    """Return the route that is declared with this name. It checks role and body, then calls ``handler``."""
+    declared = DECLARED[name]
+    first = next(iter(declared.answers))
+
+    async def serve(request: Request) -> Response:
+        try:
+            sent = None if declared.method == "GET" else request.headers.get(CSRF_HEADER, "")
+            require(principal(request), declared.role, route=name, open_here=not site.access.login, csrf=sent)
+            found = await handler(site, request, await body_of(request, declared))
+        except TdhilError as error:
+            return error_response(error)
+        except ClientDisconnect:               # during the request: no reply can reach the client
+            return Response(status_code=400)
+        if isinstance(found, Response):
+            return found
+        code, value = found if isinstance(found, tuple) else (first, found)
+        return JSONResponse(plain(value, declared.answers[code]), code)
+
+    return Route(f"{base}{declared.path}", serve, methods=[declared.method], name=name)

@@ -1,0 +1,192 @@
+"""The routes of a run: lists and comparison, confirmation, lease, stop, sign-off, replays."""
+
+from __future__ import annotations
+
+import asyncio
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import anyio
+
+from tdhil.config import ASKED_AGAIN, resolve
+from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
+from tdhil.service.access import principal
+from tdhil.service.attendance import LEASE_S
+from tdhil.service.middleware import off, told_of
+from tdhil.service.routing import api
+from tdhil.service.run_state import NotThere, State, now
+from tdhil.service.schemas import (
+    CompareView,
+    ConfirmBody,
+    FleetBody,
+    LeaseBody,
+    LeaseView,
+    ReplayBody,
+    ReplayView,
+    RunView,
+    SignOffBody,
+    plain,
+)
+from tdhil.service.start_request import options_of
+from tdhil.service.store import write_json
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+    from starlette.routing import Route
+
+    from tdhil.service.site import Site
+    from tdhil.service.store import Summary
+
+
+def routes(site: Site) -> list[Route]:
+    """Return the routes. ``compare`` comes before ``run``, whose path it matches too."""
+    return [
+        api(site, "runs", runs),
+        api(site, "compare", compare),
+        api(site, "run", run),
+        api(site, "confirm", confirm),
+        api(site, "renew", renew),
+        api(site, "stop", stop),
+        api(site, "sign_off", sign_off),
+        api(site, "ask_replay", ask_replay),
+        api(site, "replay", replay),
+    ]
+
+
+async def runs(site: Site, request: Request, body: None) -> list[Summary]:
+    """Return the runs, the newest first."""
+    query = request.query_params
+    limit = query.get("limit", "100")
+    if not limit.isdecimal() or not 1 <= int(limit) <= 1000:
+        raise UsageError("must be 1 to 1000", where="limit", entry=MessageCode.REQUEST_WRONG)
+    if (state := query.get("state")) is not None and state not in set(State):
+        raise UsageError(f"{state[:40]!r} is not a state", where="state",
+                         next_step=f"States: {', '.join(State)}", entry=MessageCode.REQUEST_WRONG)
+    return await off(lambda: site.list_runs(query.get("rig"), state, int(limit)))
+
+
+async def compare(site: Site, request: Request, body: None) -> CompareView:
+    """Compare two to eight runs."""
+    which = [one for one in request.query_params.get("runs", "").split(",") if one]
+    if not 2 <= len(set(which)) == len(which) <= 8:
+        raise UsageError("name two to eight different runs", where="runs", next_step="?runs=ID,ID",
+                         entry=MessageCode.REQUEST_WRONG)
+    for one in which:
+        if not (await off(partial(site.store.place, one)) / "run.mcap").is_file():
+            raise NotThere("this run has no log", where=f"run {one}")
+    asked = {"runs": which, "runs_folder": str(site.store.runs)}
+    return CompareView(which, await site.work("compare", None, asked))
+
+
+async def run(site: Site, request: Request, body: None) -> RunView:
+    """Return one run."""
+    return await off(lambda: site.run_view(request.path_params["run"]))
+
+
+async def confirm(site: Site, request: Request, body: ConfirmBody) -> RunView:
+    """Confirm motion with the code that the rig's terminal shows."""
+    which, who = request.path_params["run"], principal(request).name
+    code = body.code.replace(" ", "")
+    _require_key(body.lease, "lease")
+    await off(lambda: site.supervisor.confirm(which, code, body.binding, who, body.lease))
+    return await off(lambda: site.run_view(which))
+
+
+async def renew(site: Site, request: Request, body: LeaseBody) -> LeaseView:
+    """Renew the lease of a watched run."""
+    which, who = request.path_params["run"], principal(request).name
+    _require_key(body.key, "key")
+    _require_key(body.new_key, "new_key")
+    renewed = partial(site.supervisor.renew, which, body.key, who, new_key=body.new_key, gone=body.gone)
+    return LeaseView(which, await anyio.to_thread.run_sync(renewed, limiter=site.leases), LEASE_S)
+
+
+def _require_key(key: str | None, where: str) -> None:
+    if key is not None and not 16 <= len(key) <= 200:
+        raise UsageError("must have 16 to 200 characters", where=where, next_step="Use a random key",
+                         entry=MessageCode.REQUEST_WRONG)
+
+
+async def stop(site: Site, request: Request, body: Any) -> RunView:
+    """Stop the run."""
+    which, who = request.path_params["run"], principal(request).name
+    site.metrics.stops_asked.inc()
+    return await site.at_once(lambda: site.run_view(which, site.supervisor.stop(which, who)))
+
+
+async def sign_off(site: Site, request: Request, body: SignOffBody) -> RunView:
+    """Sign off a stop that was not confirmed."""
+    which, who = request.path_params["run"], principal(request).name
+    if not body.note.strip() or len(body.note) > 500:
+        raise UsageError("must be 1 to 500 characters: state what you saw", where="note",
+                         entry=MessageCode.REQUEST_WRONG)
+    await off(lambda: site.supervisor.sign_off(which, who, body.note))
+    return await off(lambda: site.run_view(which))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Replays: the run identified again.
+
+
+def settings_of(body: ReplayBody | FleetBody) -> dict[str, Any]:
+    """Return the settings of an identification. Raises UsageError for values that no run would accept."""
+    given = {one.name: getattr(body, one.name) for one in ASKED_AGAIN}
+    found = options_of(given)
+    resolve(found, None)
+    return found
+
+
+async def ask_replay(site: Site, request: Request, body: ReplayBody) -> tuple[int, ReplayView]:
+    """Identify the run again, in the background. Its first result is kept."""
+    which, who = request.path_params["run"], principal(request).name
+    asked = settings_of(body)
+    view = await off(lambda: _new_replay(site, which, asked, who))
+    rig = (await off(lambda: site.store.request(which))).rig
+    site.supervisor.note(who, f"replay {view.name} asked", which, rig, options=asked)
+    task = asyncio.get_running_loop().create_task(_replay_later(site, which, view))
+    site.tasks.add(task)
+    task.add_done_callback(site.tasks.discard)
+    return 202, view
+
+
+def _new_replay(site: Site, which: str, asked: dict[str, Any], who: str) -> ReplayView:
+    folder = site.store.place(which)
+    if not site.store.status(which).ended or not (folder / "run.mcap").is_file():
+        raise UsageError("the run has no finished log", where=f"run {which}", next_step="Wait until it has ended",
+                         entry=MessageCode.NOT_READY)
+    with site.replay_names:
+        (folder / "replays").mkdir(exist_ok=True)
+        taken = [int(name) for name, _ in site.store.replays(which)] + [
+            int(name) for at, name in site.waiting_replays if at == which]
+        view = ReplayView(f"{max(taken, default=0) + 1:03d}", asked, now(), who, "waiting")
+        site.waiting_replays[which, view.name] = view
+    return view
+
+
+async def _replay_later(site: Site, which: str, view: ReplayView) -> None:
+    """Run a replay once no shaft of this service may turn."""
+    while await off(site.supervisor.turning):
+        await anyio.sleep(0.5)
+    try:
+        found = await site.work("replay", which, view.asked)
+        done = ReplayView(view.name, view.asked, view.at, view.by, "done", found)
+    except TdhilError as error:
+        done = ReplayView(view.name, view.asked, view.at, view.by, "failed", error=told_of(error).error)
+    path = site.store.place(which) / "replays" / f"{view.name}.json"
+    try:
+        await off(lambda: write_json(path, plain(done, ReplayView)))
+    except OSError as error:
+        lost = told_of(LogError(f"the replay can't be written ({error.strerror or error})", where=path.name)).error
+        site.waiting_replays[which, view.name] = ReplayView(
+            view.name, view.asked, view.at, view.by, "failed", error=lost)
+    else:
+        site.waiting_replays.pop((which, view.name), None)
+
+
+async def replay(site: Site, request: Request, body: None) -> ReplayView:
+    """Return one replay. Raises NotThere."""
+    which, name = request.path_params["run"], request.path_params["replay"]
+    found = next((one for one in await off(lambda: site.replays(which)) if one.name == name), None)
+    if found is None:
+        raise NotThere("this replay does not exist", where=f"run {which[:40]}")
+    return found

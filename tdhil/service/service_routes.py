@@ -1,0 +1,82 @@
+"""The routes of the service itself: audit, health, metrics, OpenAPI document."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from typing import TYPE_CHECKING
+
+from prometheus_client import generate_latest
+from starlette.responses import Response
+
+from tdhil.errors import MessageCode, UsageError
+from tdhil.service.access import principal
+from tdhil.service.audit import ChainHead
+from tdhil.service.middleware import off
+from tdhil.service.routing import api
+from tdhil.service.schemas import AuditView, HealthView, document
+from tdhil.version import __version__
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+    from starlette.routing import Route
+
+    from tdhil.service.site import Site
+
+
+def routes(site: Site) -> list[Route]:
+    """Return the routes. Health and metrics are also at the root, where monitoring expects them."""
+    return [
+        api(site, "audit", audit),
+        api(site, "health", health),
+        api(site, "health", health, base=""),
+        api(site, "metrics", metrics),
+        api(site, "metrics", metrics, base=""),
+        api(site, "openapi", openapi),
+    ]
+
+
+async def audit(site: Site, request: Request, body: None) -> AuditView:
+    """Return the newest lines of the audit, and whether its chain is whole."""
+    limit = request.query_params.get("limit", "200")
+    if not limit.isdecimal() or not 1 <= int(limit) <= 5000:
+        raise UsageError("must be 1 to 5000", where="limit", entry=MessageCode.REQUEST_WRONG)
+
+    given = request.query_params.get("head")
+    kept = None if given is None else ChainHead.of(given)
+
+    def look() -> AuditView:
+        book = site.supervisor.audit
+        entries, broken, head = list(book.entries()), book.verify(kept), book.head()
+        return AuditView(entries[-int(limit):][::-1], broken, None if head is None else str(head), book.made())
+
+    return await off(look)
+
+
+async def health(site: Site, request: Request, body: None) -> HealthView:
+    """Return the health. Only a known client sees the live runs."""
+    rigs = await off(site.supervisor.rigs.all)
+    live = site.supervisor.live() if principal(request).roles else []
+    return HealthView("ok", __version__, live, len(rigs))
+
+
+async def metrics(site: Site, request: Request, body: None) -> Response:
+    """Return the metrics in the text format of Prometheus."""
+    found = site.metrics
+    found.live.set(len(site.supervisor.live()))
+    found.viewers.set(site.feeds.viewers)
+    found.relayed.set(site.relays)
+    views = await off(lambda: [site.rig_view(rig) for rig in site.supervisor.rigs.all()])
+    found.unsigned.set(sum(one.state == "blocked" for one in views))
+    return Response(generate_latest(found.registry), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+async def openapi(site: Site, request: Request, body: None) -> Response:
+    """Return the OpenAPI document."""
+    return Response(openapi_text(), media_type="application/json")
+
+
+@cache
+def openapi_text() -> bytes:
+    """Return the OpenAPI document as JSON. The first call takes 0.4 s."""
+    return json.dumps(document(), ensure_ascii=False).encode()

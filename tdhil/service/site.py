@@ -1,0 +1,180 @@
+"""The service behind the web: what every route is given. It answers in plain views, and knows no HTTP."""
+
+from __future__ import annotations
+
+import asyncio
+import sqlite3
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final, Literal, TypeVar
+from urllib.parse import quote
+
+import anyio
+from prometheus_client import CollectorRegistry, Counter, Gauge
+
+from tdhil.errors import TdhilError
+from tdhil.service.access import Access
+from tdhil.service.fleets import Fleets
+from tdhil.service.live_feed import Feeds
+from tdhil.service.run_channel import lives
+from tdhil.service.run_state import NotThere, Status
+from tdhil.service.schemas import ReplayView, RigView, RunView, adapter
+from tdhil.service.start_request import RigFile
+from tdhil.service.store import Summary, read_json
+from tdhil.service.supervisor import Supervisor
+
+T = TypeVar("T")
+STOPS: Final = 16
+"""Number of simultaneous stops, each in its own thread, which is started in advance."""
+LEASES: Final = 8
+"""Number of threads for leases of watched runs, beside the web's other threads."""
+
+
+class Metrics:
+    """Metrics for Prometheus."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        self.runs_asked = Counter("tdhil_runs_asked", "Runs that were requested", registry=self.registry)
+        self.stops_asked = Counter("tdhil_stops_asked", "Stops that were requested", registry=self.registry)
+        self.live = Gauge("tdhil_runs_live", "Runs that have not ended", registry=self.registry)
+        self.viewers = Gauge("tdhil_live_viewers", "Pages that watch a run", registry=self.registry)
+        self.relayed = Gauge("tdhil_foxglove_viewers", "Viewers that are sent a log as it grows",
+                             registry=self.registry)
+        self.unsigned = Gauge("tdhil_rigs_blocked", "Rigs whose last stop is not signed off", registry=self.registry)
+
+
+class Site:
+    """The parts of one service around its supervisor. ``access``: roles and logins.
+
+    ``logs``: folders, by name, whose logs may be identified again.
+    """
+
+    def __init__(
+        self, supervisor: Supervisor, *, access: Access | None = None,
+        logs: Mapping[str, Path] = MappingProxyType({}),
+    ) -> None:
+        self.supervisor, self.store = supervisor, supervisor.store
+        self.access = access or Access(self.store.folder)
+        self.access.changed = lambda what, name: supervisor.note("terminal", what, None, None, name=name)
+        self.fleets = Fleets(self.store, logs, supervisor.turning)
+        self.feeds = Feeds()
+        self.metrics = Metrics()
+        self.relays = 0
+        self.leases = anyio.CapacityLimiter(LEASES)
+        self.logins = anyio.CapacityLimiter(1)         # passwords too: each takes 32 MB
+        self.waiting_replays: dict[tuple[str, str], ReplayView] = {}
+        self.replay_names = threading.Lock()
+        self.tasks: set[asyncio.Task[None]] = set()
+        self._stops = ThreadPoolExecutor(STOPS, "stop")
+        self._works = anyio.CapacityLimiter(1)         # computations that a page waits for, one at a time
+        self._replays = anyio.CapacityLimiter(1)       # slow ones, so that no plan waits behind them
+
+    def begin_stops(self) -> None:
+        """Start the threads for stops: on a busy computer, a thread may take 200 ms to start."""
+        there = threading.Barrier(STOPS + 1)
+        for _ in range(STOPS):
+            self._stops.submit(there.wait)
+        there.wait()
+
+    async def at_once(self, stop: Callable[[], T]) -> T:
+        """Run a stop in a thread of its own: it never waits for a computation, a download or the index."""
+        return await asyncio.get_running_loop().run_in_executor(self._stops, stop)
+
+    async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """Compute a task, one at a time. Return its document. Raises Refused."""
+        work, limiter = partial(self.supervisor.work, what, run, asked), self._works
+        if what in ("replay", "calibrate"):
+            limiter = self._replays
+        found: dict[str, Any] = (await anyio.to_thread.run_sync(work, limiter=limiter))["document"]
+        return found
+
+    def rig_view(self, rig: RigFile) -> RigView:
+        """Return a rig, with its present user and its last run."""
+        if rig.rig is None:
+            return RigView(rig.id, rig.id, "unusable", False, "never", rig.problem)
+        try:
+            options, connection = rig.way()
+            simulated = options.simulate or not connection.configured
+            drive, profile, problem = connection.drive, connection.profile.name, ""
+        except TdhilError as error:
+            return RigView(rig.id, rig.name, "unusable", False, rig.rig.service.motion, str(error))
+        run = self.supervisor.run_of(rig.id)
+        holder = self.supervisor.holder(rig)
+        blocked = self.supervisor.blocked(rig.id)
+        state: Literal["free", "busy", "held", "blocked"]
+        state = "busy" if run else "held" if holder else "blocked" if blocked else "free"
+        last = self.list_runs(rig.id, None, 10)
+        from tdhil.config import simulated_default_rig
+
+        bench = simulated_default_rig(rig.rig) if simulated else rig.rig
+        limits = None if bench.limits is None else bench.limits.model_dump()
+        return RigView(
+            rig.id, rig.name, state, simulated, rig.motion, problem, None if holder is None else str(holder), run,
+            blocked, drive, profile, limits, next((one for one in last if one.inertia_kg_m2 is not None), None),
+        )
+
+    def list_runs(self, rig: str | None, state: str | None, limit: int) -> list[Summary]:
+        """Return runs from the index; from the files if it is not available or out of date, as for a live run."""
+        live = self.supervisor.ahead_of_the_index()
+        now_live = []
+        for run in live:
+            with suppress(NotThere):
+                now_live.append(self.store.summary(run))
+        try:
+            ended = [one for one in self.supervisor.index.find(rig=rig, state=state, limit=limit + len(live))
+                     if one.id not in live]
+        except (sqlite3.Error, OSError):
+            ended = [one for one in self.store.summaries() if one.id not in live]
+        found = [one for one in (*now_live, *ended) if rig in (None, one.rig) and state in (None, one.state)]
+        return sorted(found, key=lambda one: one.id, reverse=True)[:limit]
+
+    def replays(self, run: str) -> list[ReplayView]:
+        """Return the finished replays and the waiting ones."""
+        made = {name: adapter(ReplayView).validate_python(one) for name, one in self.store.replays(run)}
+        waiting = {name: one for (at, name), one in tuple(self.waiting_replays.items())
+                   if at == run and name not in made}
+        return [one for _, one in sorted((made | waiting).items())]
+
+    def run_view(self, run: str, status: Status | None = None) -> RunView:
+        """Return a run without its samples. ``status``: if the run itself has just reported it. Raises NotThere."""
+        request, folder = self.store.request(run), self.store.place(run)
+        status = status or self.store.status(run)
+        rig_name = request.rig
+        with suppress(TdhilError):
+            rig_name = self.supervisor.rigs.get(request.rig).name
+        found = [name for name in ("run.mcap", "recovered.mcap", "report.html", "result.json", "report.pdf")
+                 if (folder / name).is_file()]
+        return RunView(
+            request.id, request.rig, rig_name, status.state, status.stage, status.at,
+            request.asked, request.asked_by, request.simulated if status.simulated is None else status.simulated,
+            dict(request.options), list(status.history), dict(status.expected_s), list(status.preflight),
+            status.identity, status.safe_action, status.confirmation, request.motion, status.watch, status.stop,
+            status.error, status.exit_code, status.verdict,
+            self.store.result(run), found, self.replays(run), read_json(folder / "signed_off.json"),
+            lives(folder),
+        )
+
+    def told(self) -> dict[str, Any]:
+        """Return the messages for a broker, by topic: each rig's state and latest result."""
+        found: dict[str, Any] = {}
+        for rig in self.supervisor.rigs.all():
+            view, run = self.rig_view(rig), None
+            if view.run is not None:
+                with suppress(NotThere):
+                    status = self.store.status(view.run)
+                    run = {"id": view.run, "state": status.state.value, "stage": status.stage, "since": status.at}
+            here = f"rigs/{quote(rig.id, safe='')}"
+            found[f"{here}/state"] = {
+                "rig": rig.id, "name": view.name, "state": view.state, "simulated": view.simulated,
+                "holder": view.holder, "blocked_by": view.blocked_by, "run": run,
+            }
+            if view.last is not None:
+                found[f"{here}/result"] = asdict(view.last)
+        return found

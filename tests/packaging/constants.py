@@ -1,0 +1,65 @@
+"""Module-level numeric constants that state neither their meaning nor their source.
+
+``python -m tests.packaging.constants FOLDER`` lists them. A constant states it by a docstring below, or by a comment on
+its line. Several names in one statement share both.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+@dataclass(frozen=True)
+class Bare:
+    """A statement that binds numbers without a word."""
+
+    path: Path
+    line: int
+    names: str
+
+    def __str__(self) -> str:
+        return f"{self.path.relative_to(ROOT).as_posix()}:{self.line}: {self.names}"
+
+
+def numeric(node: ast.expr | None) -> bool:
+    """Return whether an expression holds numbers only: literals, signs, sums, and tuples, lists or sets of them."""
+    if isinstance(node, ast.Constant):
+        return isinstance(node.value, int | float) and not isinstance(node.value, bool)
+    if isinstance(node, ast.UnaryOp):
+        return numeric(node.operand)
+    if isinstance(node, ast.BinOp):
+        return numeric(node.left) and numeric(node.right)
+    if isinstance(node, ast.Tuple | ast.List | ast.Set):
+        return bool(node.elts) and all(numeric(one) for one in node.elts)
+    return False
+
+
+def bare_constants(path: Path) -> Iterator[Bare]:
+    """Yield the constants of a module that state nothing."""
+    source = path.read_text(encoding="utf-8")
+    lines, body = source.split("\n"), ast.parse(source).body
+    for at, node in enumerate(body):
+        if not isinstance(node, ast.Assign | ast.AnnAssign) or not numeric(node.value):
+            continue
+        after = body[at + 1] if at + 1 < len(body) else None
+        stated = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) and isinstance(
+            after.value.value, str)
+        if not stated and "#" not in lines[(node.end_lineno or node.lineno) - 1]:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            yield Bare(path, node.lineno, ", ".join(ast.unparse(one).strip("()") for one in targets))
+
+
+def in_folder(folder: Path) -> list[Bare]:
+    """Return those of every module below a folder."""
+    return [one for path in sorted(folder.rglob("*.py")) for one in bare_constants(path)]
+
+
+if __name__ == "__main__":
+    for found in in_folder(ROOT / sys.argv[1]):
+        print(found)
