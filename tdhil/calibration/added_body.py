@@ -25,7 +25,7 @@ from tdhil.estimation.frequency_domain import student_quantile
 from tdhil.recording import FloatArray
 
 CERTAIN = 1e6
-"""Degrees of freedom of what is taken for known as well as it is stated."""
+"""Degrees of freedom that stand for infinitely many: of what is taken for known as well as it is stated."""
 CONTRADICTED_P = 0.001
 """Below, a test contradicts that filters are shared, or that the line is straight."""
 LARGEST_ERROR, LARGEST_IN_SD = 0.15, 5.0
@@ -264,9 +264,19 @@ def _propagated(
     for value, row in ((factor, both[0]), (inertia, both[1])):
         runs, bodies = float(row @ case.covariance @ row), float(np.sum((row * body) ** 2))
         variance = runs + bodies
-        dof = variance**2 / (runs**2 / case.degrees_of_freedom + bodies**2 / CERTAIN)
+        dof = effective_degrees_of_freedom(((math.sqrt(runs), case.degrees_of_freedom), (math.sqrt(bodies), CERTAIN)))
         found.append(measured_value(float(value), math.sqrt(variance) * abs(float(value)), dof, case.confidence))
     return found[0], found[1], tuple(lines)
+
+
+def effective_degrees_of_freedom(parts: Sequence[tuple[float, float]]) -> float:
+    """Welch and Satterthwaite (GUM G.2b) of (standard uncertainty, its degrees of freedom); at most `CERTAIN`.
+
+    A part with `CERTAIN` has infinitely many and drops out of the sum.
+    """
+    variance = sum(sd**2 for sd, _ in parts)
+    uncertain = sum(sd**4 / dof for sd, dof in parts if dof < CERTAIN)
+    return min(variance**2 / uncertain, CERTAIN) if uncertain > variance**2 / CERTAIN else CERTAIN
 
 
 def measured_value(value: float, standard_uncertainty: float, dof: float, confidence: float) -> MeasuredValue:

@@ -25,7 +25,7 @@ def test_gtc_gives_the_same_values_uncertainties_and_degrees_of_freedom():
     for ours, theirs in ((found.factor, factor), (found.inertia_kg_m2, inertia)):
         assert ours.value == pytest.approx(GTC.value(theirs), rel=1e-6)
         assert ours.standard_uncertainty == pytest.approx(GTC.uncertainty(theirs), rel=1e-6)
-        assert ours.degrees_of_freedom == pytest.approx(GTC.dof(theirs), rel=1e-3)
+        assert ours.degrees_of_freedom == pytest.approx(GTC.dof(theirs), rel=1e-6)
         k = GTC.reporting.k_factor(ours.degrees_of_freedom, 95)
         assert ours.coverage_factor == pytest.approx(k, rel=1e-6)
     of_body = next(line for line in found.budget if line.source == "body of with")
