@@ -1,11 +1,16 @@
 """Random simulated drives through the whole path of a torque calibration: two runs each, then `tdhil calibrate torque`.
 
-    python benchmarks/torque_calibration.py [--runs 200] [--first 1] [--logs FOLDER] [--only-logs]
+    python benchmarks/torque_calibration.py [--runs 200] [--first 1] [--logs FOLDER] [--only-logs] [--out rows.jsonl]
+                                            [--jobs 1]
 
 Every drive has a torque scale that is wrong by up to ±8 % (uniform), a body of 5 to 100 % of its inertia, and random
-lags and friction; the friction of the run with the body is its own. Logs are kept in ``--logs`` and used again. Prints
-a line for each drive and, at the end, how often the intervals of the calibration factor and of J cover the truth, how
-wide they are, and what was refused. The exit code is 1 where a figure misses what is asked of it.
+lags and friction; the friction of the run with the body is its own. Logs are kept in ``--logs`` and used again. Rows
+are kept in ``--out``, so that a study can be stopped, continued and added to. A case takes some 25 s of processor time:
+two runs of the whole path, and the joint fit. ``--jobs`` cases run beside each other.
+
+Prints a line for each drive and, at the end, over all rows of ``--out``, how often the intervals of the calibration
+factor and of J cover the truth, how wide they are, which line of the budget is the largest, and what was refused. The
+exit code is 1 where a figure misses what is asked of it.
 """
 
 from __future__ import annotations
@@ -14,7 +19,9 @@ import argparse
 import json
 import subprocess
 import sys
-from dataclasses import dataclass
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -102,28 +109,51 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=1)
     parser.add_argument("--logs", type=Path, default=Path("torque-calibration-logs"))
     parser.add_argument("--only-logs", action="store_true", help="record, and calibrate nothing yet")
+    parser.add_argument("--out", type=Path, help="JSON lines: rows of earlier parts are read, new ones appended")
+    parser.add_argument("--jobs", type=int, default=1, help="cases beside each other")
     asked = parser.parse_args()
     asked.logs.mkdir(parents=True, exist_ok=True)
-    rows = []
-    for seed in range(asked.first, asked.first + asked.runs):
+    rows = kept_rows(asked.out)
+    known = {row.seed for row in rows}
+
+    def one(seed: int) -> CalibrationRow | None:
         drive = random_drive(seed)
         paths = recorded(drive, asked.logs.resolve())
         if asked.only_logs:
             print(f"{seed}: recorded", flush=True)
-            continue
-        rows.append(judged(drive, calibrated(drive, paths)))
+            return None
+        return judged(drive, calibrated(drive, paths))
+
+    wanted = [seed for seed in range(asked.first, asked.first + asked.runs) if seed not in known]
+    with ThreadPoolExecutor(asked.jobs) as pool:
+        for row in pool.map(one, wanted):
+            if row is None:
+                continue
+            rows.append(row)
+            if asked.out is not None:
+                with asked.out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(asdict(row)) + "\n")
     return 0 if asked.only_logs else summary(rows)
+
+
+def kept_rows(path: Path | None) -> list[CalibrationRow]:
+    """Rows of earlier parts of the study."""
+    if path is None or not path.exists():
+        return []
+    return [CalibrationRow(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 @dataclass(frozen=True)
 class CalibrationRow:
-    """Result for one drive. Half-widths are shares of the value; None: refused."""
+    """Result for one drive. Half-widths are shares of the value; None: refused. ``largest``: line of J's budget."""
 
+    seed: int
     share: float
     verdict: str
     covers_scale: bool | None
     covers_inertia: bool | None
     half_width: float | None
+    largest: str = ""
 
 
 def judged(drive: RandomDrive, document: dict[str, Any]) -> CalibrationRow:
@@ -132,12 +162,14 @@ def judged(drive: RandomDrive, document: dict[str, Any]) -> CalibrationRow:
     verdict = str(document.get("verdict", document.get("error", "no document")))
     scale, inertia = document.get("calibration_factor"), document.get("inertia_kg_m2")
     if not scale or not inertia:
-        row = CalibrationRow(share, verdict, None, None, None)
+        row = CalibrationRow(drive.seed, share, verdict, None, None, None)
     else:
         half = 0.5 * (inertia["high"] - inertia["low"]) / inertia["value"]
+        largest = max(document["budget"], key=lambda line: float(line["of_inertia"]))["source"]
         row = CalibrationRow(
-            share, verdict, scale["low"] <= 1.0 / drive.scale <= scale["high"],
+            drive.seed, share, verdict, scale["low"] <= 1.0 / drive.scale <= scale["high"],
             inertia["low"] <= drive.inertia_kg_m2 <= inertia["high"], half,
+            str(largest).replace(f"{drive.seed}-", ""),
         )
         errors = scale["value"] * drive.scale - 1.0, inertia["value"] / drive.inertia_kg_m2 - 1.0
         print(f"{drive.seed:4d} J_a/J {share:4.2f} κ {errors[0]:+.2%} J {errors[1]:+.2%} ± {half:.2%} "
@@ -161,6 +193,8 @@ def summary(rows: list[CalibrationRow]) -> int:
         if widths:
             print(f"J_a ≥ {least:g} J: median half-width {median(widths):.2%} of {len(widths)} (at most {widest:.1%})")
             wrong |= median(widths) > widest
+    for source, count in Counter(row.largest for row in told if row.share >= 0.5).most_common():
+        print(f"J_a ≥ 0.5 J: largest line of the budget of J: {source} ({count})")
     refused = [row for row in rows if row.half_width is None]
     wide = [row for row in told if (row.half_width or 0.0) > ASSUMED_HALF_WIDTH]
     print(f"{len(refused)} refused; {len(wide)} told though wider than ±{ASSUMED_HALF_WIDTH:.1%}")

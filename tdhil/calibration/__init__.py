@@ -2,12 +2,20 @@
 
 from tdhil.calibration.added_body import (
     BodyRun as BodyRun, CalibrationCase as CalibrationCase, CalibrationLine as CalibrationLine,
-    MeasuredValue as MeasuredValue, RunPlan as RunPlan, TorqueCalibration as TorqueCalibration,
-    calibrate_torque as calibrate_torque, plan_bodies as plan_bodies,
+    FactorLine as FactorLine, MeasuredValue as MeasuredValue, RunPlan as RunPlan,
+    TorqueCalibration as TorqueCalibration, calibrate_torque as calibrate_torque, plan_bodies as plan_bodies,
+)
+from tdhil.calibration.known_pipe import (
+    KnownPipe as KnownPipe, KnownPipeFit as KnownPipeFit, PipeInput as PipeInput,
+    calibrate_known_pipe as calibrate_known_pipe,
 )
 from tdhil.calibration.pairs import (
     PairsFit as PairsFit, TorquePairs as TorquePairs, calibrate_pairs as calibrate_pairs,
     line_with_errors_in_both as line_with_errors_in_both,
+)
+from tdhil.calibration.reference import (
+    ASSUMED_REFERENCE_REL_SD as ASSUMED_REFERENCE_REL_SD, ReferenceFit as ReferenceFit,
+    TorqueRecord as TorqueRecord, calibrate_reference as calibrate_reference,
 )
 from tdhil.calibration.speed import (
     CountedTurns as CountedTurns, SpeedBudgetLine as SpeedBudgetLine, SpeedCalibration as SpeedCalibration,

@@ -95,6 +95,16 @@ class CalibrationLine:
 
 
 @dataclass(frozen=True)
+class FactorLine:
+    """One input quantity of the budget of κ (1 sd): what it adds to κ, as a share of it."""
+
+    source: str
+    distribution: str
+    degrees_of_freedom: float
+    of_factor: float
+
+
+@dataclass(frozen=True)
 class FittedPoint:
     """One run on the line. ``residual_kg_m2`` in the drive's unit, with the standard uncertainty of the point."""
 

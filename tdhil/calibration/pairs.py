@@ -19,7 +19,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.calibration.added_body import CERTAIN, CONTRADICTED_P, LARGEST_ERROR, MeasuredValue, measured_value
+from tdhil.calibration.added_body import (
+    CERTAIN,
+    CONTRADICTED_P,
+    LARGEST_ERROR,
+    FactorLine,
+    MeasuredValue,
+    effective_degrees_of_freedom,
+    measured_value,
+)
 from tdhil.estimation import ResidualTest
 from tdhil.recording import FloatArray
 
@@ -55,6 +63,7 @@ class PairsFit:
     spread: float
     hysteresis_nm: float | None
     refusal: str = ""
+    budget: tuple[FactorLine, ...] = ()
 
 
 def line_with_errors_in_both(
@@ -101,7 +110,12 @@ def calibrate_pairs(pairs: TorquePairs, confidence: float = 0.95) -> PairsFit:
     of_hysteresis = abs(hysteresis or 0.0) / 2.0 / math.sqrt(3.0) / size
     factor_sd = math.hypot(math.sqrt(covariance[0, 0]), of_hysteresis)
     statistic = ResidualTest(chi2, float(more), float(chdtrc(more, chi2)))
-    factor = measured_value(slope, factor_sd, dof, confidence)
+    budget = [FactorLine("scatter of the pairs" if spread > 1.0 else "stated uncertainty of the pairs",
+                         "Student" if spread > 1.0 else "normal", dof, math.sqrt(covariance[0, 0]) / abs(slope))]
+    if hysteresis is not None:
+        budget.append(FactorLine("hysteresis", "rectangular", CERTAIN, of_hysteresis / abs(slope)))
+    effective = effective_degrees_of_freedom([(line.of_factor, line.degrees_of_freedom) for line in budget])
+    factor = measured_value(slope, factor_sd, effective, confidence)
     refusal = ""
     if not abs(slope - 1.0) <= LARGEST_ERROR + 2.0 * factor_sd:
         refusal = (f"the calibration factor would be {slope:.3g}: more than {LARGEST_ERROR:.0%} from 1 is no error of a"
@@ -109,7 +123,7 @@ def calibrate_pairs(pairs: TorquePairs, confidence: float = 0.95) -> PairsFit:
     elif statistic.p_value < CONTRADICTED_P and abs(hysteresis or 0.0) < float(np.std(left)) and _bent(pairs, left):
         refusal = "the reference torque is no straight line over the reported one: its residuals are curved"
     return PairsFit(factor, measured_value(intercept, math.sqrt(covariance[1, 1]), dof, confidence), covariance, left,
-                    statistic, spread, hysteresis, refusal)
+                    statistic, spread, hysteresis, refusal, tuple(budget))
 
 
 def _bent(pairs: TorquePairs, left: FloatArray) -> bool:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from profiles.quantities import INERTIA
 from tdhil.cli.arguments import add_option, amount, share
+from tdhil.cli.calibrate_reference import WITHOUT_BODY, require_new, run_without_body
 from tdhil.cli.calibrate_speed import add_speed_arguments
 from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
 from tdhil.cli.results import print_json
@@ -51,8 +52,18 @@ def _add_torque(parser: argparse.ArgumentParser) -> None:
                         help="torque of a reference sensor beside reported torque, in N·m, with the columns"
                         " reported_nm, reported_sd_nm, reference_nm, reference_sd_nm and direction (up or down); a log"
                         " beside it names the drive")
+    parser.add_argument("--reference", type=Path, metavar="trace.csv",
+                        help="record of a torque sensor during the run of one log; the time offset is found")
+    parser.add_argument("--column", nargs="+", metavar="QUANTITY=NAME:UNIT",
+                        help="its columns, such as time=t_s torque=m:Nm; default: time_s torque_nm")
+    parser.add_argument("--reference-sd", type=share, metavar="SHARE",
+                        help="standard uncertainty of the sensor's scale (default 0.3 %%: accuracy class 0.5)")
+    parser.add_argument("--known-pipe", type=Path, metavar="string.yaml",
+                        help="sizes and tolerances of the pipe below the drive, in the run of one log: its resistance"
+                        " to waves is known from them")
     parser.add_argument("--at", choices=("motor", "main"), default="motor",
-                        help="shaft that the inertia is given at; main: behind the gear (default motor)")
+                        help="shaft that the inertia, or the torque of --reference, is given at; main: behind the gear"
+                        " (default motor)")
     add_option(parser, OPTION["confidence"])
     parser.add_argument("--plan", action="store_true",
                         help="from one log: which body, and how long a run, reach --want")
@@ -68,8 +79,9 @@ def _add_torque(parser: argparse.ArgumentParser) -> None:
 
 def run_torque(namespace: argparse.Namespace) -> int:
     """Read, fit together, print; or plan."""
-    if namespace.columns and "=" not in namespace.columns[-1]:
-        raise UsageError("takes every word behind it", where="--columns", next_step="Name the logs before --columns")
+    for flag, names in (("--columns", namespace.columns), ("--column", namespace.column)):
+        if names and "=" not in names[-1]:
+            raise UsageError("takes every word behind it", where=flag, next_step=f"Name the logs before {flag}")
     check_trace(namespace)
     asked = OPTION["confidence"]
     confidence = asked.default if namespace.confidence is None else namespace.confidence
@@ -77,10 +89,13 @@ def run_torque(namespace: argparse.Namespace) -> int:
         raise UsageError(f"{confidence:g}: must be {wrong}", where=asked.flag)
     if namespace.plan:
         return _plan(namespace)
-    if namespace.pairs is not None:
-        return _pairs(namespace, confidence)
+    if any(getattr(namespace, name) is not None for name in WITHOUT_BODY):
+        return run_without_body(namespace, confidence)
+    for name in ("column", "reference_sd"):
+        if getattr(namespace, name) is not None:
+            raise UsageError("needs --reference, the record of a sensor", where=f"--{name.replace('_', '-')}")
     wanted = _wanted(namespace)
-    _require_new(namespace.save)
+    require_new(namespace.save)
     if namespace.report is not None:
         from tdhil.report import check_report_path
 
@@ -116,18 +131,6 @@ def calibrate_two(without: Path, with_body: Path, added: float, added_sd: float 
     more = [] if added_sd is None else ["--added-sd", repr(added_sd)]
     return run_torque(parser.parse_args(
         [str(without), str(with_body), "--added", repr(added), *more, "--save", str(save)]))
-
-
-def _require_new(path: Path | None) -> None:
-    if path is not None and path.exists():
-        raise UsageError("is there already, and is left as it is", where=f"--save {path}",
-                         next_step="Name another file, or move that one away")
-
-
-def _now() -> str:
-    from datetime import datetime
-
-    return datetime.now().astimezone().isoformat(timespec="seconds")
 
 
 Wanted = list[tuple[Path, float, float | None]]
@@ -176,43 +179,6 @@ def _read(namespace: argparse.Namespace, wanted: Wanted) -> list[CalibrationRun]
     for path, _, _ in wanted:
         require_file(path)
     return [CalibrationRun(read_recorded(namespace, path), added, sd) for path, added, sd in wanted]
-
-
-def _pairs(namespace: argparse.Namespace, confidence: float) -> int:
-    """Read the pairs, fit, print."""
-    from tdhil.calibration import calibrate_pairs
-    from tdhil.report import PlainConsole, pairs_document, print_pairs, stderr_console
-    from tdhil.session import drive_identity, drive_settings, read_pairs, require_file, save_calibration
-
-    for name in ("body", "added", "added_sd", "report"):
-        if getattr(namespace, name):
-            raise UsageError("does not go with --pairs", where=f"--{name.replace('_', '-')}",
-                             next_step="Such as: tdhil calibrate torque --pairs pairs.csv")
-    if len(namespace.logs) > 1 or (namespace.save is not None and not namespace.logs):
-        raise UsageError("takes one log, which names the drive", where="--save" if namespace.save else "--pairs",
-                         next_step="Such as: tdhil calibrate torque run.mcap --pairs pairs.csv --save calibration.json")
-    _require_new(namespace.save)
-    pairs = read_pairs(namespace.pairs)
-    record = None
-    for path in namespace.logs:
-        require_file(path)
-        record = read_recorded(namespace, path)
-    try:
-        found = calibrate_pairs(pairs, confidence)
-    except ValueError as error:
-        raise UsageError(str(error), where=str(namespace.pairs)) from None
-    drive = {} if record is None else drive_identity(record.configuration)
-    settings = {} if record is None else drive_settings(record.configuration, record.recording)
-    document = pairs_document(found, pairs, str(namespace.pairs), drive, settings, date=_now(), confidence=confidence,
-                              simulated=record is not None and record.recording.simulated)
-    if namespace.json:
-        print_json(document)
-    else:
-        print_pairs(document, PlainConsole())
-    if namespace.save is not None and not found.refusal:
-        save_calibration(document, namespace.save)
-        stderr_console().print(f"calibration: {namespace.save}", markup=False, soft_wrap=True)
-    return int(ExitCode.NOT_IDENTIFIABLE if found.refusal else ExitCode.OK)
 
 
 def _plan(namespace: argparse.Namespace) -> int:

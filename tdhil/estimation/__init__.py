@@ -29,3 +29,6 @@ from tdhil.estimation.shared_filters import FittedTogether as FittedTogether, id
 from tdhil.estimation.spectrum import (
     SpectralLine as SpectralLine, period_lines as period_lines, pooled_lines as pooled_lines,
 )
+from tdhil.estimation.string_impedance import (
+    MeasuredString as MeasuredString, measure_lines as measure_lines, measure_string as measure_string,
+)

@@ -113,7 +113,7 @@ def identify_lines(case: PeriodicCase) -> Finding:
     asked = shaft_model(case.options.model)
     rigid = None
     if asked.compliant is not None:
-        finding = identify_compliant(_settled(case))
+        finding = identify_compliant(settled(case))
     else:
         rigid = _rigid(case, case.lines)
         weak = tuple(line for line in case.usable if all(line is not one for one in case.lines))
@@ -123,7 +123,7 @@ def identify_lines(case: PeriodicCase) -> Finding:
             doubted = asked.widened and (case.recording.winds_up or (rigid is not None and may_swing(rigid)))
         finding = rigid_finding(rigid, case)
         if doubted:
-            finding = identify_compliant(_settled(case), finding, rigid is not None and rigid.first_order)
+            finding = identify_compliant(settled(case), finding, rigid is not None and rigid.first_order)
     if isinstance(finding, Refusal):
         raise Refused(finding.reason, _BEFORE_ECHO_HELPS if _drowned(case) else finding.advice,
                       finding.entry)
@@ -161,7 +161,7 @@ def _drowned(case: PeriodicCase) -> bool:
     return case.recording.pipe is not None and any(not line.excited for line in case.every)
 
 
-def _settled(case: PeriodicCase) -> PeriodicCase:
+def settled(case: PeriodicCase) -> PeriodicCase:
     """The case without what a shaft that swings still does of its own (`transient`)."""
     slope = case.constraint.slope if case.constraint is not None else 0.0
     every = settled_lines(case.fits, case.stretches, slope, case.levels.warming.own)

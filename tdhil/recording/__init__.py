@@ -6,7 +6,9 @@ from profiles import lazy_names
 
 if TYPE_CHECKING:
     from tdhil.recording.csv import (
-        Bench as Bench, USUAL as USUAL, parse_columns as parse_columns, read_recording as read_recording,
+        Bench as Bench, REFERENCE_FLAG as REFERENCE_FLAG, ReferenceTrace as ReferenceTrace,
+        TIME_AND_TORQUE as TIME_AND_TORQUE, USUAL as USUAL, parse_columns as parse_columns,
+        read_recording as read_recording, read_reference as read_reference,
     )
     from tdhil.recording.log_format import (
         CAN as CAN, CHANNELS as CHANNELS, CLASSES as CLASSES, COMMAND as COMMAND, EXCITATION as EXCITATION,

@@ -26,13 +26,17 @@ if TYPE_CHECKING:
         repeatable_figures as repeatable_figures, require_extra as require_extra,
     )
     from tdhil.report.plots import draw_run as draw_run
+    from tdhil.report.factor_calibration import (
+        known_pipe_document as known_pipe_document, pairs_document as pairs_document, print_factor as print_factor,
+        reference_document as reference_document, write_factor_report as write_factor_report,
+    )
     from tdhil.report.speed_calibration import (
         print_speed_calibration as print_speed_calibration, speed_document as speed_document,
     )
     from tdhil.report.torque_calibration import (
         calibration_document as calibration_document, calibration_report as calibration_report,
-        draw_calibration as draw_calibration, pairs_document as pairs_document, print_calibration as print_calibration,
-        print_pairs as print_pairs, write_calibration_report as write_calibration_report,
+        draw_calibration as draw_calibration, print_calibration as print_calibration,
+        write_calibration_report as write_calibration_report,
     )
     from tdhil.report.schedule import schedule_document as schedule_document
     from tdhil.report.tuning import (

@@ -15,8 +15,20 @@ from rich.panel import Panel
 from rich.table import Table as Grid
 from rich.text import Text as Words
 
-from tdhil.report.blocks import AnswerBox, Block, Column, Pairs, Picture, Report, ReportSection, Table, Text, shown_date
-from tdhil.report.card import plus_minus, sentence, with_interval
+from tdhil.report.blocks import AnswerBox, Block, Column, Picture, Report, ReportSection, Table, Text, shown_date
+from tdhil.report.calibration_page import (
+    VERDICT_COLOUR,
+    VERDICT_STYLE,
+    calibrated_item,
+    date_and_signature,
+    quantity,
+    recordings,
+    result_rows,
+    run_name,
+    scale_error,
+    with_share,
+)
+from tdhil.report.card import plus_minus, sentence
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED
 from tdhil.report.html import write_blocks
@@ -26,12 +38,9 @@ from tdhil.version import __version__
 if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
 
-    from tdhil.calibration import MeasuredValue, PairsFit, TorqueCalibration, TorquePairs
+    from tdhil.calibration import TorqueCalibration
 
 Part = Mapping[str, Any]
-
-_STYLE = {"valid": "bold green", "not_identifiable": "bold red", "model_rejected": "bold red"}
-_COLOUR = {"valid": "green", "not_identifiable": "red", "model_rejected": "red"}
 
 
 def calibration_document(
@@ -50,8 +59,8 @@ def calibration_document(
         "verdict": found.verdict.value,
         "reason": found.reason,
         "advice": found.advice,
-        "calibration_factor": _quantity(found.factor, confidence),
-        "inertia_kg_m2": _quantity(found.inertia_kg_m2, confidence),
+        "calibration_factor": quantity(found.factor, confidence),
+        "inertia_kg_m2": quantity(found.inertia_kg_m2, confidence),
         "budget": [asdict(line) for line in found.budget],
         "runs": told,
         "line": None if not math.isfinite(found.slope) else {
@@ -71,10 +80,6 @@ def calibration_document(
     }
 
 
-def _quantity(one: MeasuredValue | None, confidence: float) -> dict[str, Any] | None:
-    return None if one is None else {**asdict(one), "confidence": confidence}
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # The card
 
@@ -83,15 +88,15 @@ def print_calibration(document: Part, console: PlainConsole) -> None:
     """The card of a torque calibration, on a console."""
     rows = names_and_texts(())
     verdict = document["verdict"]
-    rows.add_row("verdict", Words(verdict, style=_STYLE.get(verdict, "bold")))
+    rows.add_row("verdict", Words(verdict, style=VERDICT_STYLE.get(verdict, "bold")))
     factor, inertia = document["calibration_factor"], document["inertia_kg_m2"]
     if factor is not None:
-        rows.add_row("calibration factor", Words(_with_share(factor, ""), style="bold"))
-        rows.add_row("", f"true torque = κ · reported torque: the drive reports {_error(factor)}")
+        rows.add_row("calibration factor", Words(with_share(factor, ""), style="bold"))
+        rows.add_row("", f"true torque = κ · reported torque: the drive reports {scale_error(factor)}")
     if inertia is not None:
-        rows.add_row("J without the body", Words(_with_share(inertia, "kg·m²"), style="bold"))
+        rows.add_row("J without the body", Words(with_share(inertia, "kg·m²"), style="bold"))
     for run in document["runs"]:
-        text = f"{_name(run)}: {run['added_kg_m2']:.4g} kg·m² added"
+        text = f"{run_name(run)}: {run['added_kg_m2']:.4g} kg·m² added"
         if "reported_kg_m2" in run:
             text += f", identified {plus_minus(run['reported_kg_m2'], 2.0 * run['standard_uncertainty_kg_m2'])}"
         rows.add_row("run", text)
@@ -107,22 +112,6 @@ def print_calibration(document: Part, console: PlainConsole) -> None:
     body += [Words(f"! {warning}", style="yellow") for warning in document["warnings"]]
     title = "torque calibration" + (f" · {SIMULATED}" if document["simulated"] else "")
     console.print(Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue"))
-
-
-def _name(run: Part) -> str:
-    """Return the short name of a run's log; a file of an earlier version has its path only."""
-    return str(run.get("name") or Path(run["log"]).name)
-
-
-def _with_share(part: Part, unit: str) -> str:
-    share = 50.0 * (part["high"] - part["low"]) / part["value"]
-    return f"{with_interval(part['value'], part['low'], part['high'], unit).rstrip()}  ±{share:#.2g} %"
-
-
-def _error(factor: Part) -> str:
-    """Return the error of the drive's own torque: ``4.8 % too much torque``."""
-    error = 100.0 * (1.0 / factor["value"] - 1.0)
-    return f"{abs(error):.2g} % too {'much' if error > 0.0 else 'little'} torque"
 
 
 def _budget(document: Part) -> Grid:
@@ -141,62 +130,6 @@ def _budget(document: Part) -> Grid:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Pairs of a reference sensor
-
-
-def pairs_document(
-    found: PairsFit, pairs: TorquePairs, source: str, drive: Part, settings: Part, *, date: str, confidence: float,
-    simulated: bool,
-) -> dict[str, Any]:
-    """Plain data for `json.dumps`; ``source``: the file of the pairs, ``drive``: as a log names it."""
-    return {
-        "kind": "torque_calibration",
-        "method": "pairs",
-        "verdict": "model_rejected" if found.refusal else "valid",
-        "reason": found.refusal or f"{len(pairs.direction)} pairs give κ to ±{found.factor.half_width_share:.2%}",
-        "calibration_factor": None if found.refusal else _quantity(found.factor, confidence),
-        "offset_nm": _quantity(found.offset_nm, confidence),
-        "scatter": asdict(found.scatter),
-        "spread": found.spread,
-        "hysteresis_nm": found.hysteresis_nm,
-        "pairs": [
-            {"reported_nm": float(x), "reference_nm": float(y), "residual_nm": float(left), "direction": direction}
-            for x, y, left, direction in zip(pairs.reported_nm, pairs.reference_nm, found.residuals_nm,
-                                             pairs.direction, strict=True)
-        ],
-        "source": source,
-        "drive": dict(drive) or None,
-        "settings": dict(settings),
-        "date": date,
-        "simulated": simulated,
-        "tdhil": __version__,
-    }
-
-
-def print_pairs(document: Part, console: PlainConsole) -> None:
-    """The card of a calibration against a reference sensor."""
-    rows = names_and_texts(())
-    verdict, factor, offset = (document[name] for name in ("verdict", "calibration_factor", "offset_nm"))
-    rows.add_row("verdict", Words(verdict, style=_STYLE.get(verdict, "bold")))
-    if factor is not None:
-        rows.add_row("calibration factor", Words(_with_share(factor, ""), style="bold"))
-        rows.add_row("", f"true torque = κ · reported torque: the drive reports {_error(factor)}")
-    rows.add_row("offset", with_interval(offset["value"], offset["low"], offset["high"], "N·m"))
-    scatter = document["scatter"]
-    rows.add_row("scatter", f"p = {scatter['p_value']:.2g}" + (
-        f"; {document['spread']:.2g} times as much as stated, and counted so" if document["spread"] > 1.0 else ""))
-    if document["hysteresis_nm"] is not None:
-        rows.add_row("hysteresis", f"{document['hysteresis_nm']:+.2g} N·m, rising over falling torque")
-    else:
-        rows.add_row("hysteresis", "not known: all pairs are of one direction")
-    for pair in document["pairs"]:
-        rows.add_row("pair", f"{pair['reported_nm']:9.2f} N·m reported, {pair['reference_nm']:9.2f} N·m true,"
-                             f" {pair['residual_nm']:+.2g}, {pair['direction']}")
-    console.print(Panel(Group(rows, Words(sentence(document["reason"]))), title="torque calibration by pairs",
-                        border_style="blue"))
-
-
-# ---------------------------------------------------------------------------------------------------------------------
 # The page
 
 
@@ -210,14 +143,14 @@ def calibration_report(document: Part) -> Report:
     factor, inertia = document["calibration_factor"], document["inertia_kg_m2"]
     lines = []
     if factor is not None and inertia is not None:
-        lines = [f"J without the body {_with_share(inertia, 'kg·m²')}", f"The drive reports {_error(factor)}"]
+        lines = [f"J without the body {with_share(inertia, 'kg·m²')}", f"The drive reports {scale_error(factor)}"]
     return Report(
         title="Calibration of a drive's torque",
         subtitle=shown_date(document["date"]),
         simulated=f"{SIMULATED}: drive and rig are simulated, nothing real turned" if document["simulated"] else "",
         answer=AnswerBox(
-            _COLOUR.get(document["verdict"], "yellow"),
-            "No number" if factor is None else f"κ = {_with_share(factor, '')}", tuple(lines), document["verdict"],
+            VERDICT_COLOUR.get(document["verdict"], "yellow"),
+            "No number" if factor is None else f"κ = {with_share(factor, '')}", tuple(lines), document["verdict"],
             sentence(document["reason"]), sentence(document["advice"])),
         warnings=tuple(document["warnings"]),
         sections=tuple(one for one in _sections(document) if one.blocks),
@@ -226,28 +159,17 @@ def calibration_report(document: Part) -> Report:
 
 
 def _sections(document: Part) -> Iterator[ReportSection]:
-    drive = document["drive"] or {}
-    identity = [(name, str(drive[name])) for name in ("name", "vendor", "product", "revision", "serial")
-                if name in drive]
-    settings = [(_SETTINGS.get(name, name), str(value)) for name, value in document["settings"].items()
-                if value is not None]
-    yield ReportSection("Calibrated item", (Pairs((*identity, *settings)),) if identity or settings else ())
+    yield calibrated_item(document)
     yield ReportSection("Method", (Text(_METHOD),))
     if document["calibration_factor"] is not None:
         yield ReportSection("Result", (_results(document), Text(_result_note(document))))
         yield ReportSection("Uncertainty budget", (_factor_budget(document), Text(_BUDGET_NOTE)))
     if document["line"] is not None:
         yield ReportSection("Identified over known inertia", (_picture(document), _data(document)))
-    conditions = [(_name(run), f"{shown_date(run['date'])}, SHA-256 {run['sha256']}")
-                  for run in document["runs"]]
-    yield ReportSection("Recordings", (Pairs(tuple(conditions)),))
-    yield ReportSection("Date and signature", (Pairs((
-        ("date of calibration", shown_date(document["date"])), ("conditions", "temperature, warm-up: ____________"),
-        ("signature", "______________________"))),))
+    yield recordings(document)
+    yield date_and_signature(document)
 
 
-_SETTINGS = {"rated_torque_nm": "rated torque, N·m", "torque_count_nm": "one count of torque, N·m",
-             "gear_ratio": "gear ratio"}
 _METHOD = (
     "The moment of inertia y was identified from the drive's reported torque and speed, without and with bodies of"
     " known inertia b on the shaft. With the calibration factor κ, true torque T = κ T_rep, the measurement equation is"
@@ -270,17 +192,8 @@ def _result_note(document: Part) -> str:
 
 
 def _results(document: Part) -> Table:
-    rows = []
-    for name, key, unit in (("calibration factor κ", "calibration_factor", "1"),
-                            ("moment of inertia J", "inertia_kg_m2", "kg·m²")):
-        part = document[key]
-        dof = part["degrees_of_freedom"]
-        rows.append((name, unit, f"{part['value']:.5g}", f"{part['standard_uncertainty']:.3g}",
-                     "∞" if dof > 1e4 else f"{dof:.0f}", f"{part['coverage_factor']:.2f}",
-                     f"{0.5 * (part['high'] - part['low']):.3g}"))
-    columns = (Column("quantity", 0.26), Column("unit", 0.1), *(Column(name, 0.128, True)
-                                                               for name in ("value", "u", "ν_eff", "k", "U")))
-    return Table(columns, tuple(rows))
+    return result_rows((("calibration factor κ", document["calibration_factor"], "1"),
+                        ("moment of inertia J", document["inertia_kg_m2"], "kg·m²")))
 
 
 def _factor_budget(document: Part) -> Table:
@@ -300,7 +213,7 @@ def _factor_budget(document: Part) -> Table:
 
 
 def _data(document: Part) -> Table:
-    rows = tuple((_name(run), f"{run['added_kg_m2']:.5g}", f"{run['reported_kg_m2']:.5g}",
+    rows = tuple((run_name(run), f"{run['added_kg_m2']:.5g}", f"{run['reported_kg_m2']:.5g}",
                   f"{run['standard_uncertainty_kg_m2']:.2g}", f"{_residual(run):+.2g}" if _residual(run) else "0")
                  for run in document["runs"])
     return Table((Column("recording", 0.36), *(Column(name, 0.16, True) for name in

@@ -37,6 +37,10 @@ if TYPE_CHECKING:
         UNVERIFIED_FLAG as UNVERIFIED_FLAG, check_unverified as check_unverified, doubtful as doubtful,
         is_accepted as is_accepted,
     )
+    from tdhil.session.reference_calibration import (
+        find_by_known_pipe as find_by_known_pipe, find_by_reference as find_by_reference,
+        known_pipe_of as known_pipe_of, log_of_calibration as log_of_calibration,
+    )
     from tdhil.session.run_record import (
         RunRecord as RunRecord, ByKeyword as ByKeyword, is_log as is_log, read as read,
         require_file as require_file,

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
         BottomEnd as BottomEnd, DrillString as DrillString, WaveLine as WaveLine,
         PipeSection as PipeSection,
         StringFile as StringFile, identified_string as identified_string, StringTolerance as StringTolerance,
-        load_string as load_string, spring_and_mass as spring_and_mass,
-        string_of as string_of,
+        ToleranceFile as ToleranceFile, line_of as line_of, load_string as load_string,
+        spring_and_mass as spring_and_mass, string_of as string_of,
     )
     from tdhil.soft_torque.controller import (
         ClosedSystem as ClosedSystem, DERIVATIVE_FILTER_S as DERIVATIVE_FILTER_S, Margins as Margins,

@@ -170,6 +170,10 @@ class ToleranceFile(DataModel):
     shear_modulus: _Share | None = Field(
         default=None, description="of shear_modulus_pa; default 61 to 80 GPa, or 5 % of a value that is stated")
     wear: _Share = Field(default=1.0 - WORN_POLAR_SHARE, description="loss of polar moment of area, at most")
+    outer_diameter: _Share | None = Field(default=None, description="of the pipe, for calibrate torque --known-pipe")
+    inner_diameter: _Share | None = Field(default=None, description="of the pipe, for calibrate torque --known-pipe")
+    density: _Share | None = Field(
+        default=None, description="of density_kg_m3, for calibrate torque --known-pipe; default 0.5 %")
     drag: Annotated[float, Field(ge=0.0, le=9.0)] = Field(
         default=DRAG_FACTOR - 1.0, description="1.5 is a factor of 2.5, up or down")
     bottom_inertia: _Share = BOTTOM_TOLERANCE

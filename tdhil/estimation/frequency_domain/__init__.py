@@ -7,11 +7,15 @@ from tdhil.estimation.frequency_domain.before_echo import (
 from tdhil.estimation.frequency_domain.compliant import (
     identify_compliant as identify_compliant, may_swing as may_swing, usable_lines as usable_lines,
 )
+from tdhil.estimation.frequency_domain.compliant import plausible as plausible
+from tdhil.estimation.frequency_domain.compliant_fit import (
+    fit_compliant as fit_compliant, string_view as string_view, viewed as viewed,
+)
 from tdhil.estimation.frequency_domain.filter_order import (
     FittedModel as FittedModel, simple_weight as simple_weight,
 )
 from tdhil.estimation.frequency_domain.inference import (
-    contradicted as contradicted, fisher_tail as fisher_tail, profile_edge as profile_edge,
+    contradicted as contradicted, estimate as estimate, fisher_tail as fisher_tail, profile_edge as profile_edge,
     student_quantile as student_quantile, torque_scale_line as torque_scale_line,
     widened_most_by_scale as widened_most_by_scale, with_total as with_total,
 )
@@ -23,7 +27,10 @@ from tdhil.estimation.frequency_domain.rigid import (
     lag_priors as lag_priors, refuse_count as refuse_count, rigid_finding as rigid_finding,
     simultaneous as simultaneous, unfiltered as unfiltered,
 )
-from tdhil.estimation.frequency_domain.shafts import VISCOUS as VISCOUS, shaft_model as shaft_model
+from tdhil.estimation.frequency_domain.shafts import (
+    DELAY_SURER as DELAY_SURER, KnownStringShaft as KnownStringShaft, LOAD as LOAD, TwoMassShaft as TwoMassShaft,
+    VISCOUS as VISCOUS, shaft_model as shaft_model,
+)
 from tdhil.estimation.frequency_domain.signal_filters import (
     AVERAGE as AVERAGE, LAG_BOUND_S as LAG_BOUND_S, SHAPE_BOUND as SHAPE_BOUND, SKEW as SKEW,
     SKEW_BOUND_S as SKEW_BOUND_S, SPEED_LAG as SPEED_LAG, SPEED_SHAPE as SPEED_SHAPE, TORQUE_LAG as TORQUE_LAG,

@@ -202,6 +202,30 @@ def _resonance_back(m: FloatArray) -> tuple[float, FloatArray]:
     return swing, slope
 
 
+def string_view(exponent: float) -> ParameterView:
+    """View of a string's z = ζ T^(−exponent), with ζ = √(J_s k) and the travel time T = √(J_s/k), in place of J_L.
+
+    −1 is J_s, 0 is ζ, 1 is k. With J_s = η J_L and k = ω_a² J_L (1 − 2η/3), z is J_L times a factor of ω_a and η.
+    """
+
+    def factor(m: FloatArray) -> tuple[float, float, float]:
+        """(z/J_L, ∂ln/∂ω_a, ∂ln/∂η)."""
+        share, swing, light = max(float(m[STRING_SHARE]), _LIGHTEST), float(m[SWING]), _light(m)
+        value = swing ** (1.0 + exponent) * math.sqrt(share * light) * (share / light) ** (-0.5 * exponent)
+        of_light = -2.0 / 3.0 / light
+        by_share = 0.5 * (1.0 / share + of_light) - 0.5 * exponent * (1.0 / share - of_light)
+        return value, (1.0 + exponent) / swing, by_share
+
+    def back(m: FloatArray) -> tuple[float, FloatArray]:
+        value, by_swing, by_share = factor(m)
+        load, slope = float(m[LOAD]) / value, np.zeros(len(m))
+        slope[LOAD], slope[SWING], slope[STRING_SHARE] = 1.0 / value, -load * by_swing, -load * by_share
+        return load, slope
+
+    return ParameterView(LOAD, lambda m: float(m[LOAD]) * factor(m)[0], back)
+
+
+_LIGHTEST = 1e-6     # η of a string that weighs nothing
 TOTAL = ParameterView(INERTIA, lambda m: float(m[INERTIA] + m[LOAD]), _total_back)
 STIFFNESS = ParameterView(SWING, lambda m: float(m[SWING] ** 2 * m[LOAD] * _light(m)), _stiffness_back)
 RESONANCE = ParameterView(SWING, lambda m: float(m[SWING] * math.sqrt(1.0 + m[LOAD] / m[INERTIA])), _resonance_back)

@@ -1,4 +1,10 @@
 """A trace that a drive's own tool exported as CSV: its layout found, read with line numbers, made a Recording."""
 
-from tdhil.recording.csv.layout import USUAL as USUAL, parse_columns as parse_columns
-from tdhil.recording.csv.reader import Bench as Bench, read_recording as read_recording
+from tdhil.recording.csv.layout import (
+    REFERENCE_FLAG as REFERENCE_FLAG, TIME_AND_TORQUE as TIME_AND_TORQUE, USUAL as USUAL,
+    parse_columns as parse_columns,
+)
+from tdhil.recording.csv.reader import (
+    Bench as Bench, ReferenceTrace as ReferenceTrace, read_recording as read_recording,
+    read_reference as read_reference,
+)

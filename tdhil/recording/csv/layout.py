@@ -97,7 +97,7 @@ def known_units(quantity: str) -> tuple[str, ...]:
 
 
 _WHERE = "--columns"
-_NEXT = "Such as: --columns time=t_s speed=n_rpm:rpm torque=m:Nm"
+REFERENCE_FLAG = "--column"
 
 
 @dataclass(frozen=True)
@@ -109,36 +109,45 @@ class ColumnChoice:
     unit: ColumnUnit | None = None
 
 
-Choices = tuple[ColumnChoice, ColumnChoice, ColumnChoice]
+Choices = tuple[ColumnChoice, ...]
 USUAL: Choices = (ColumnChoice("time"), ColumnChoice("speed"), ColumnChoice("torque"))
+TIME_AND_TORQUE = ("time", "torque")
 
 
-def parse_columns(items: Iterable[str]) -> Choices:
-    """Time, speed and torque, in this order; one that isn't named keeps its usual name. UsageError."""
+def parse_columns(items: Iterable[str], quantities: Sequence[str] = QUANTITIES, flag: str = _WHERE) -> Choices:
+    """The columns of ``quantities``, in this order; one that isn't named keeps its usual name. UsageError.
+
+    ``flag``: the option that named them.
+    """
     found: dict[str, ColumnChoice] = {}
+    such_as = _such_as(quantities, flag)
     for item in items:
         quantity, equals, name = item.partition("=")
         quantity = quantity.strip().casefold()
         if not equals or not name.strip():
-            raise UsageError(f"{shown(item)!r} is not quantity=column", where=_WHERE, next_step=_NEXT,
+            raise UsageError(f"{shown(item)!r} is not quantity=column", where=flag, next_step=such_as,
                              entry=MessageCode.CSV_COLUMNS_UNCLEAR)
-        if quantity not in QUANTITIES:
-            meant = difflib.get_close_matches(quantity, QUANTITIES, 1)
-            hint = f"; did you mean {meant[0]!r}?" if meant else f"; there are {', '.join(QUANTITIES)}"
-            raise UsageError(f"there is no quantity {shown(quantity)!r}{hint}", where=_WHERE, next_step=_NEXT,
+        if quantity not in quantities:
+            meant = difflib.get_close_matches(quantity, quantities, 1)
+            hint = f"; did you mean {meant[0]!r}?" if meant else f"; there are {', '.join(quantities)}"
+            raise UsageError(f"there is no quantity {shown(quantity)!r}{hint}", where=flag, next_step=such_as,
                              entry=MessageCode.CSV_COLUMNS_UNCLEAR)
         if quantity in found:
-            raise UsageError(f"{quantity} is named twice", where=_WHERE, entry=MessageCode.CSV_COLUMNS_UNCLEAR)
-        found[quantity] = _choice(quantity, name.strip())
+            raise UsageError(f"{quantity} is named twice", where=flag, entry=MessageCode.CSV_COLUMNS_UNCLEAR)
+        found[quantity] = _choice(quantity, name.strip(), flag)
     names = [choice.name.casefold() for choice in found.values()]
     if len(set(names)) < len(names):
-        raise UsageError("one column can't hold two quantities", where=_WHERE, next_step=_NEXT,
+        raise UsageError("one column can't hold two quantities", where=flag, next_step=such_as,
                          entry=MessageCode.CSV_COLUMNS_UNCLEAR)
-    time, speed, torque = (found.get(quantity, ColumnChoice(quantity)) for quantity in QUANTITIES)
-    return time, speed, torque
+    return tuple(found.get(quantity, ColumnChoice(quantity)) for quantity in quantities)
 
 
-def _choice(quantity: str, text: str) -> ColumnChoice:
+def _such_as(quantities: Sequence[str], flag: str) -> str:
+    example = {"time": "time=t_s", "speed": "speed=n_rpm:rpm", "torque": "torque=m:Nm"}
+    return f"Such as: {flag} {' '.join(example[quantity] for quantity in quantities)}"
+
+
+def _choice(quantity: str, text: str, flag: str) -> ColumnChoice:
     name, colon, spelt = text.rpartition(":")
     if not colon or spelt.startswith(" "):       # "Axis 1: speed" is a name
         return ColumnChoice(quantity, text)
@@ -146,7 +155,7 @@ def _choice(quantity: str, text: str) -> ColumnChoice:
     if unit is None or not name:
         raise UsageError(
             f"{shown(spelt)!r} is no unit of {quantity}; there are {', '.join(known_units(quantity))}",
-            where=_WHERE, next_step="If the colon belongs to the column's name, write the unit behind another colon",
+            where=flag, next_step="If the colon belongs to the column's name, write the unit behind another colon",
             entry=MessageCode.CSV_COLUMNS_UNCLEAR,
         )
     return ColumnChoice(quantity, name.strip(), unit)
@@ -160,23 +169,25 @@ def _choice(quantity: str, text: str) -> ColumnChoice:
 
 
 HEADER_LINES = 50
+_STANDARD = {"time": "time_s", "speed": "speed_rad_s", "torque": "torque_nm"}
 MOST_COLUMNS = 512
 _DELIMITERS = ("\t", ";", ",")
 
 
 @dataclass(frozen=True)
 class Header:
-    """``line`` counts from 1; ``columns`` are the positions of time, speed, torque in ``names``."""
+    """``line`` counts from 1; ``columns`` are the positions of the choices in ``names``, the time first."""
 
     line: int
     delimiter: str
     names: tuple[str, ...]
-    columns: tuple[int, int, int]
+    columns: tuple[int, ...]
 
 
 def find_header(lines: Sequence[str], choices: Choices, file: str) -> Header:
     """The header in the file's first lines. CsvMisnamed if a column isn't there, CsvUnusable if there is no table."""
     best: tuple[tuple[int, int, int], int, list[str]] | None = None
+    usual = ",".join(_STANDARD[choice.quantity] for choice in choices)
     for number, line in enumerate(lines[:HEADER_LINES], 1):
         for delimiter in _DELIMITERS:
             if delimiter not in line:
@@ -200,10 +211,10 @@ def find_header(lines: Sequence[str], choices: Choices, file: str) -> Header:
     if words < 2:
         raise CsvMisnamed(
             f"no header in the first {HEADER_LINES} lines", where=file,
-            next_step="Put a line with the columns' names above them, such as time_s,speed_rad_s,torque_nm",
+            next_step=f"Put a line with the columns' names above them, such as {usual}",
         )
     missing = next(choice for choice in choices if not _positions(names, choice))
-    raise _no_column(missing, names, f"{file}:{number}")
+    raise _no_column(missing, names, f"{file}:{number}", choices)
 
 
 def _positions(names: Sequence[str], choice: ColumnChoice) -> list[int]:
@@ -215,8 +226,7 @@ def _positions(names: Sequence[str], choice: ColumnChoice) -> list[int]:
         exact = [at for at, name in enumerate(full) if name == wanted]
         return exact or [at for at, name in enumerate(bare) if name == wanted]
     quantity = choice.quantity
-    standard = {"time": "time_s", "speed": "speed_rad_s", "torque": "torque_nm"}[quantity]
-    exact = [at for at, name in enumerate(full) if name == standard]
+    exact = [at for at, name in enumerate(full) if name == _STANDARD[quantity]]
     return exact or [
         at for at, name in enumerate(bare)
         if name == quantity or (name.startswith(f"{quantity}_") and unit_in_name(quantity, names[at]) is not None)
@@ -229,21 +239,27 @@ def _folded(name: str) -> str:
 
 def _one_each(
     found: Sequence[Sequence[int]], names: Sequence[str], choices: Choices, where: str
-) -> tuple[int, int, int]:
+) -> tuple[int, ...]:
     for choice, positions in zip(choices, found, strict=True):
         if len(positions) > 1:
             several = ", ".join(repr(shown(names[at])) for at in positions[:4])
             raise CsvMisnamed(
                 f"{len(positions)} columns could be {choice.quantity}: {several}", where=where,
-                next_step="Name one with --columns, and rename it in the file if the names are the same",
+                next_step=f"Name one with {_flag(choices)}, and rename it in the file if the names are the same",
             )
-    time, speed, torque = (positions[0] for positions in found)
-    if len({time, speed, torque}) < 3:
-        raise CsvMisnamed("one column would hold two quantities", where=where, next_step="Name all with --columns")
-    return time, speed, torque
+    chosen = tuple(positions[0] for positions in found)
+    if len(set(chosen)) < len(chosen):
+        raise CsvMisnamed("one column would hold two quantities", where=where,
+                          next_step=f"Name all with {_flag(choices)}")
+    return chosen
 
 
-def _no_column(choice: ColumnChoice, names: Sequence[str], where: str) -> CsvMisnamed:
+def _flag(choices: Choices) -> str:
+    """The option that names these columns: `--column` of a reference without a speed, else `--columns`."""
+    return _WHERE if len(choices) == len(QUANTITIES) else REFERENCE_FLAG
+
+
+def _no_column(choice: ColumnChoice, names: Sequence[str], where: str, choices: Choices) -> CsvMisnamed:
     there = [name for name in names if name]
     listed = ", ".join(shown(name) for name in there[:12]) + (", …" if len(there) > 12 else "")
     wanted = choice.name or choice.quantity
@@ -253,7 +269,7 @@ def _no_column(choice: ColumnChoice, names: Sequence[str], where: str) -> CsvMis
     missing = f"no column {shown(wanted)!r}" if choice.name else f"no column is called {choice.quantity}"
     step = f"The columns are: {listed}"
     if not choice.name:
-        step += f". Say which is which: --columns {' '.join(f'{quantity}=…' for quantity in QUANTITIES)}"
+        step += f". Say which is which: {_flag(choices)} {' '.join(f'{one.quantity}=…' for one in choices)}"
     return CsvMisnamed(f"{missing}{hint}", where=where, next_step=step)
 
 
@@ -265,11 +281,11 @@ _LOOKED_AT = 5000   # rows, for the decimal sign
 
 @dataclass(frozen=True)
 class ColumnLayout:
-    """``units`` of time, speed, torque; ``clock``: the time is written as such; ``comma``: the decimal sign."""
+    """``units`` of the columns; ``clock``: the time is written as such; ``comma``: the decimal sign."""
 
     header: Header
     first_line: int
-    units: tuple[ColumnUnit, ColumnUnit, ColumnUnit]
+    units: tuple[ColumnUnit, ...]
     clock: bool
     comma: bool
     assumed: tuple[str, ...]
@@ -283,11 +299,12 @@ def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayo
     first = next((at for at, row in rows.items() if _holds_data(row)), None)
     if first is None:
         raise CsvUnusable(
-            f"no numbers in time, speed and torque in the lines below the header ({_listed(header)})",
+            f"no numbers in {named(choices)} in the lines below the header ({_listed(header)})",
             where=f"{file}:{header.line}", next_step="Look at the file in an editor",
         )
+    quantities = [choice.quantity for choice in choices]
     stated = next(
-        (row for at, row in rows.items() if at < first and any(map(unit_of, QUANTITIES, row))), ["", "", ""]
+        (row for at, row in rows.items() if at < first and any(map(unit_of, quantities, row))), [""] * len(choices)
     )
     clock = ":" in rows[first][0]
     seen = [_wanted(line, header) for line in _telling(lines[first:], header.delimiter)]
@@ -305,10 +322,10 @@ def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayo
             assumed.append(f"{file}: clock times; the first row is at 0 s")
             continue
         name = header.names[header.columns[position]]
-        unit, notes = _unit(choice, name, stated[position], where)
+        unit, notes = _unit(choice, name, stated[position], where, _flag(choices))
         units.append(unit)
         assumed += [f"{file}: {note}" for note in notes]
-    return ColumnLayout(header, first + 1, (units[0], units[1], units[2]), clock, sign == ",", tuple(assumed))
+    return ColumnLayout(header, first + 1, tuple(units), clock, sign == ",", tuple(assumed))
 
 
 def _telling(lines: Sequence[str], delimiter: str) -> list[str]:
@@ -323,7 +340,7 @@ def _wanted(line: str, header: Header) -> list[str]:
 
 
 def _holds_data(row: Sequence[str]) -> bool:
-    """A time and two numbers, or what stands for no number: channels that start late are empty at first."""
+    """A time and numbers, or what stands for no number: channels that start late are empty at first."""
     timed = looks_numeric(row[0]) or (":" in row[0] and any(sign.isdigit() for sign in row[0]))
     values = [looks_numeric(cell) for cell in row[1:]]
     return (timed or is_missing(row[0])) and all(
@@ -331,7 +348,13 @@ def _holds_data(row: Sequence[str]) -> bool:
     ) and timed + sum(values) >= 1
 
 
-def _unit(choice: ColumnChoice, name: str, stated: str, where: str) -> tuple[ColumnUnit, list[str]]:
+def named(choices: Choices) -> str:
+    """``time, speed and torque``."""
+    *first, last = (choice.quantity for choice in choices)
+    return f"{', '.join(first)} and {last}"
+
+
+def _unit(choice: ColumnChoice, name: str, stated: str, where: str, flag: str) -> tuple[ColumnUnit, list[str]]:
     """Return the unit of one column, and remarks about it."""
     quantity = choice.quantity
     below = unit_of(quantity, stated)
@@ -341,7 +364,7 @@ def _unit(choice: ColumnChoice, name: str, stated: str, where: str) -> tuple[Col
         if other is not None and other != choice.unit:
             return choice.unit, [f"{quantity} was read in {choice.unit.symbol} as told; the file says {other.symbol}"]
         return choice.unit, []
-    tell = f"Give it behind a colon: --columns {quantity}='{shown(name)}:{SI[quantity]}'"
+    tell = f"Give it behind a colon: {flag} {quantity}='{shown(name)}:{SI[quantity]}'"
     if stated and below is None and not is_missing(stated):
         raise CsvMisnamed(
             f"{shown(stated)!r} is no known unit of {quantity}; there are {', '.join(known_units(quantity))}",

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.errors import CsvUnusable, MessageCode, UsageError
+from tdhil.errors import CsvMisnamed, CsvUnusable, MessageCode, UsageError
 from tdhil.recording.csv.excitation import load_excitation
-from tdhil.recording.csv.layout import USUAL, Choices, ColumnLayout, find_layout
+from tdhil.recording.csv.layout import REFERENCE_FLAG, USUAL, Choices, ColumnLayout, find_layout, named
 from tdhil.recording.csv.text import (
     LARGEST,
     ClockReader,
@@ -54,13 +54,14 @@ class RowReader:
         header = layout.header
         self._layout = layout
         self._width = len(header.names)
-        self._delimiter, self._columns = header.delimiter, header.columns
+        self._delimiter = header.delimiter
+        self.columns = self._columns = header.columns
         self._clock = ClockReader() if layout.clock else None
         self.ragged, self.missing, self.unreadable = Tally(), Tally(), Tally()
         self.rows = 0              # all that weren't blank
 
     def read(self, block: LineBlock) -> tuple[FloatArray, LineArray]:
-        """(N, 3) time, speed, torque and (N,) line numbers of the usable rows at or below the layout's first line."""
+        """(N, K) the layout's columns and (N,) line numbers of the usable rows at or below the layout's first line."""
         skipped = max(0, self._layout.first_line - block.first)
         lines, first = block.lines[skipped:], block.first + skipped
         values = self._at_once(lines)
@@ -108,7 +109,7 @@ class RowReader:
         return np.column_stack([np.array(times, dtype=np.float64), values])
 
     def _one_by_one(self, lines: list[str], first: int) -> tuple[FloatArray, LineArray]:
-        found: list[tuple[float, float, float]] = []
+        found: list[list[float]] = []
         numbers: list[int] = []
         for at, line in enumerate(lines, first):
             if not line or line.isspace():
@@ -118,9 +119,9 @@ class RowReader:
             if row is not None:
                 found.append(row)
                 numbers.append(at)
-        return np.array(found, dtype=np.float64).reshape(-1, 3), np.array(numbers, dtype=np.int64)
+        return np.array(found, dtype=np.float64).reshape(-1, len(self._columns)), np.array(numbers, dtype=np.int64)
 
-    def _row(self, line: str, at: int) -> tuple[float, float, float] | None:
+    def _row(self, line: str, at: int) -> list[float] | None:
         cells = split_cells(line, self._delimiter)
         # A separator behind the last cell is a habit of some tools, a row without its last, empty cells of others.
         if len(cells) <= max(self._columns) or any(cells[self._width :]):
@@ -129,11 +130,12 @@ class RowReader:
         wanted = [cells[column] for column in self._columns]
         comma = self._layout.comma
         time = number(wanted[0], comma) if self._clock is None else self._clock.seconds(wanted[0])
-        speed, torque = number(wanted[1], comma), number(wanted[2], comma)
-        if time is None or speed is None or torque is None:
+        values = [time, *(number(cell, comma) for cell in wanted[1:])]
+        known = [value for value in values if value is not None]
+        if len(known) < len(values):
             (self.missing if any(map(is_missing, wanted)) else self.unreadable).add(at)
             return None
-        return time, speed, torque
+        return known
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -217,6 +219,33 @@ def read_trace(path: Path, choices: Choices = USUAL, rated_torque_nm: float | No
 
     UsageError if the torque is a share of the rated torque, and that isn't given.
     """
+    (time, speed, torque), warnings = _read_columns(path, choices, rated_torque_nm)
+    return CsvTrace(time, speed, torque, warnings)
+
+
+@dataclass(frozen=True)
+class ReferenceTrace:
+    """Torque of a reference sensor: (N,) each, SI, time rising; ``warnings`` a line each."""
+
+    time_s: FloatArray
+    torque_nm: FloatArray
+    warnings: tuple[str, ...]
+
+
+def read_reference(path: Path, choices: Choices) -> ReferenceTrace:
+    """The trace of a reference sensor, without a speed. Raises as `read_trace`, and CsvUnusable for a row left out.
+
+    A calibration takes every value as the sensor gave it: a value that is missing is refused, and so is a time that
+    does not rise. Only a row that repeats the one before it is left out.
+    """
+    (time, torque), warnings = _read_columns(path, choices, None, whole=True)
+    return ReferenceTrace(time, torque, warnings)
+
+
+def _read_columns(
+    path: Path, choices: Choices, rated_torque_nm: float | None, *, whole: bool = False
+) -> tuple[list[FloatArray], tuple[str, ...]]:
+    """The columns of the choices, and warnings. ``whole``: no row may be left out."""
     file = str(path)
     encoding = encoding_of(path)
     source = blocks(path, encoding)
@@ -224,22 +253,32 @@ def read_trace(path: Path, choices: Choices = USUAL, rated_torque_nm: float | No
     if head is None:
         raise CsvUnusable("the file is empty", where=file)
     layout = find_layout(head.lines, choices, file)
+    if whole and any(unit.of_rated for unit in layout.units):
+        raise CsvMisnamed("the torque of a reference is needed in a unit of torque, not as a share of a rated torque",
+                          where=f"{file}:{layout.header.line}", next_step=f"Such as: {REFERENCE_FLAG} torque=m:Nm")
     factors = _factors(layout, rated_torque_nm, file)
     warnings = [*layout.assumed]
     if encoding == "cp1252":
         warnings.insert(0, f"{file}: not UTF-8; read as Windows-1252 (Latin-1)")
     reader = RowReader(layout)
     columns, lines = _collect(chain([head], source), reader, warnings, file)
-    warnings += _left_out(reader, layout, file)
+    dropped = _left_out(reader, layout, choices, file)
     for column, factor in zip(columns, factors, strict=True):
         np.multiply(column, factor, out=column)
-    columns, lines = _possible(columns, lines, warnings, file)
+    columns, lines = _possible(columns, lines, choices, dropped, file)
     if layout.clock:
         columns[0] -= columns[0][0]
+    if whole:
+        again = np.concatenate([[False], np.all([np.diff(column) == 0.0 for column in columns], axis=0)])
+        columns, lines = [column[~again] for column in columns], lines[~again]
     keep, notes = rising(columns[0], lines, file)
     if not np.all(keep):
         columns = [column[keep] for column in columns]
-    return CsvTrace(columns[0], columns[1], columns[2], (*warnings, *notes))
+    if whole and (dropped or not np.all(keep)):
+        where, _, what = [*dropped, *notes][0].removeprefix(f"{file}:").partition(": ")
+        raise CsvUnusable(f"a reference must be whole: {what}", where=f"{file}:{where}",
+                          next_step="Correct or remove this line in a copy of the file, or export it again")
+    return columns, (*warnings, *dropped, *notes)
 
 
 def _factors(layout: ColumnLayout, rated_torque_nm: float | None, file: str) -> list[float]:
@@ -259,8 +298,8 @@ def _factors(layout: ColumnLayout, rated_torque_nm: float | None, file: str) -> 
 def _collect(
     source: Iterator[LineBlock], reader: RowReader, warnings: list[str], file: str
 ) -> tuple[list[FloatArray], LineArray]:
-    """The three columns and the lines, at most `MAX_ROWS` of them."""
-    parts: tuple[list[FloatArray], ...] = ([], [], [])
+    """The columns and the lines, at most `MAX_ROWS` of them."""
+    parts: tuple[list[FloatArray], ...] = tuple([] for _ in reader.columns)
     numbers: list[LineArray] = []
     room = MAX_ROWS
     for block in source:
@@ -282,7 +321,7 @@ def _collect(
     return columns, np.concatenate(numbers)
 
 
-def _left_out(reader: RowReader, layout: ColumnLayout, file: str) -> list[str]:
+def _left_out(reader: RowReader, layout: ColumnLayout, choices: Choices, file: str) -> list[str]:
     """Warnings for what was dropped; CsvUnusable where that is so much that the rest can't be trusted."""
     ragged, odd = reader.ragged, reader.unreadable
     if ragged.count > _MOST_ODD * reader.rows:
@@ -294,7 +333,7 @@ def _left_out(reader: RowReader, layout: ColumnLayout, file: str) -> list[str]:
         )
     if odd.count > _MOST_ODD * reader.rows:
         raise CsvUnusable(
-            f"{_rows(odd)} something else than a number in time, speed or torque",
+            f"{_rows(odd)} something else than a number in {named(choices).replace(' and ', ' or ')}",
             where=f"{file}:{odd.first}", next_step="Look at this line in an editor",
         )
     causes = ((ragged, "cells missing or too many"), (reader.missing, "no value"), (odd, "no readable number"))
@@ -305,17 +344,17 @@ def _left_out(reader: RowReader, layout: ColumnLayout, file: str) -> list[str]:
 
 
 def _possible(
-    columns: list[FloatArray], lines: LineArray, warnings: list[str], file: str
+    columns: list[FloatArray], lines: LineArray, choices: Choices, dropped: list[str], file: str
 ) -> tuple[list[FloatArray], LineArray]:
     """Without the rows that no machine can have; CsvUnusable if none is left."""
     good = np.ones(len(lines), dtype=np.bool_)
     for column in columns:
         good &= np.abs(column) < LARGEST
     if not np.any(good):
-        raise CsvUnusable("no row has a time, a speed and a torque", where=file, next_step="Look at it in an editor")
+        raise CsvUnusable(f"no row has {named(choices)}", where=file, next_step="Look at it in an editor")
     lost = np.flatnonzero(~good)
     if len(lost):
-        warnings.append(f"{file}:{lines[lost[0]]}: {_row_list(len(lost))} dropped: a number beyond every machine")
+        dropped.append(f"{file}:{lines[lost[0]]}: {_row_list(len(lost))} dropped: a number beyond every machine")
         columns, lines = [column[good] for column in columns], lines[good]
     return columns, lines
 

@@ -1,0 +1,122 @@
+r"""Torque calibration by a drill string of known sizes, which the waves feel as a known resistance.
+
+Until an echo returns, a uniform pipe answers a motion of its top with the torque ζ ω. With G its shear modulus, ρ its
+density, I its polar moment of area and L its length,
+
+    ζ = I √(Gρ),        T = L √(ρ/G)   travel time from end to end.
+
+The drive reports its torque over κ, so a run gives ζ/κ and T. Of the inputs, G is known worst, and it is in T too. So
+z = ζ T^(−e) is compared: e = −1 gives ρ I L, the inertia of the string, without G; e = 0 gives ζ, without L. The
+exponent with the least uncertainty follows from the tolerances (Gauss and Markov): e = Cov(ln ζ, ln T)/Var(ln T).
+
+Tolerances are half-widths of rectangular distributions. Where they lie on one side, as wear does, the middle is taken.
+"""
+
+import math
+from dataclasses import dataclass
+
+from tdhil.calibration.added_body import (
+    CERTAIN,
+    LARGEST_ERROR,
+    FactorLine,
+    MeasuredValue,
+    effective_degrees_of_freedom,
+    measured_value,
+)
+from tdhil.estimation import MeasuredString, normal_quantile
+
+
+@dataclass(frozen=True)
+class PipeInput:
+    """One size or property of the pipe: between ``low`` and ``high``, as factors on the stated value.
+
+    ``of_impedance`` and ``of_delay``: relative sensitivities of ζ and T.
+    """
+
+    source: str
+    low: float
+    high: float
+    of_impedance: float
+    of_delay: float
+
+    @property
+    def rel_sd(self) -> float:
+        """Standard uncertainty of a rectangular distribution, as a share of the stated value."""
+        return 0.5 * (self.high - self.low) / math.sqrt(3.0)
+
+    @property
+    def middle(self) -> float:
+        """Middle of the tolerance, as a factor on the stated value."""
+        return 0.5 * (self.low + self.high)
+
+
+@dataclass(frozen=True)
+class KnownPipe:
+    """Stated ``impedance_nm_s_rad`` ζ and ``delay_s`` T at the motor shaft, and what they rest on."""
+
+    impedance_nm_s_rad: float
+    delay_s: float
+    inputs: tuple[PipeInput, ...]
+
+    @property
+    def delay_rel_sd(self) -> float:
+        """Standard uncertainty of T, as a share."""
+        return math.sqrt(sum((one.of_delay * one.rel_sd) ** 2 for one in self.inputs))
+
+    @property
+    def exponent(self) -> float:
+        """Exponent e of z = ζ T^(−e), with the least uncertainty; T is taken for measured without error."""
+        variance = self.delay_rel_sd**2
+        if variance <= 0.0:
+            return 0.0
+        return sum(one.of_impedance * one.of_delay * one.rel_sd**2 for one in self.inputs) / variance
+
+    @property
+    def value(self) -> float:
+        """Return z of the middle of all tolerances."""
+        e = self.exponent
+        stated = self.impedance_nm_s_rad * self.delay_s**-e
+        return float(stated * math.prod(one.middle ** (one.of_impedance - e * one.of_delay) for one in self.inputs))
+
+
+@dataclass(frozen=True)
+class KnownPipeFit:
+    """``factor`` κ, not to be used with a ``refusal``. ``typed_half_width``: of the torque scale as stated so far."""
+
+    factor: MeasuredValue
+    budget: tuple[FactorLine, ...]
+    typed_half_width: float
+    refusal: str = ""
+    advice: str = ""
+
+
+def calibrate_known_pipe(
+    known: KnownPipe, measured: MeasuredString, *, scale_rel_sd: float = 0.02, confidence: float = 0.95
+) -> KnownPipeFit:
+    """κ = z of the stated pipe over z as measured in the drive's unit. ``scale_rel_sd``: as it is stated so far."""
+    e = known.exponent
+    value = known.value / measured.value.value
+    quantile = normal_quantile(confidence)
+    reach = max(measured.value.high / measured.value.value, measured.value.value / measured.value.low) - 1.0
+    budget = (
+        FactorLine("scatter of the run, filters and string", "normal", CERTAIN, reach / quantile),
+        *(FactorLine(one.source, "rectangular", CERTAIN,
+                     abs(one.of_impedance - e * one.of_delay) * one.rel_sd / one.middle) for one in known.inputs),
+    )
+    sd = value * math.sqrt(sum(line.of_factor**2 for line in budget))
+    dof = effective_degrees_of_freedom([(line.of_factor, line.degrees_of_freedom) for line in budget])
+    factor = measured_value(value, sd, dof, confidence)
+    typed = quantile * scale_rel_sd
+    fit = KnownPipeFit(factor, budget, typed)
+    if factor.half_width_share >= typed:
+        worst = max(budget, key=lambda line: line.of_factor)
+        return KnownPipeFit(
+            factor, budget, typed, f"the pipe gives κ = {value:.3f} to ±{factor.half_width_share:.1%} only, which is"
+            f" wider than the torque scale as stated so far (±{typed:.1%}); most comes from: {worst.source}",
+            "state the measured sizes of the pipe with their tolerances in string.yaml, or use a body of known inertia")
+    if abs(value - 1.0) > LARGEST_ERROR + 2.0 * factor.standard_uncertainty:
+        return KnownPipeFit(
+            factor, budget, typed, f"the calibration factor would be {value:.3g}: more than {LARGEST_ERROR:.0%} from 1"
+            " is no error of a torque scale",
+            "compare the diameters in string.yaml with the pipe, and the gear ratio with the drive")
+    return fit

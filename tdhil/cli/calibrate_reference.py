@@ -1,0 +1,130 @@
+"""`tdhil calibrate torque` without a body: by pairs of torque, a reference sensor's record, or a known pipe."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from tdhil.cli.replay import read_recorded
+from tdhil.cli.results import print_json
+from tdhil.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from tdhil.session import RunRecord
+
+WITHOUT_BODY: Final = ("pairs", "reference", "known_pipe")
+"""Options that replace the bodies; one at a time."""
+_BODY = ("added", "added_sd", "body")
+_NEEDS = {"column": "reference", "reference_sd": "reference"}
+_EXAMPLES = {
+    "pairs": "tdhil calibrate torque run.mcap --pairs pairs.csv --save calibration.json",
+    "reference": "tdhil calibrate torque run.mcap --reference sensor.csv --save calibration.json",
+    "known_pipe": "tdhil calibrate torque run.mcap --known-pipe string.yaml --save calibration.json",
+}
+
+
+def run_without_body(namespace: argparse.Namespace, confidence: float) -> int:
+    """Read, fit, print, save. The kind is the one option of `WITHOUT_BODY` that was given."""
+    kind, *others = [name for name in WITHOUT_BODY if getattr(namespace, name) is not None]
+    unwanted = [*others, *(name for name in _BODY if getattr(namespace, name)),
+                *(name for name, needed in _NEEDS.items() if needed != kind and getattr(namespace, name) is not None)]
+    for name in unwanted:
+        raise UsageError(f"does not go with --{kind.replace('_', '-')}", where=f"--{name.replace('_', '-')}",
+                         next_step=f"Such as: {_EXAMPLES[kind]}")
+    require_new(namespace.save)
+    source = getattr(namespace, kind)
+    if namespace.report is not None:
+        from tdhil.report import check_report_path
+
+        check_report_path(namespace.report, source)
+        for log in namespace.logs:
+            check_report_path(namespace.report, log)
+    document = _KINDS[kind](namespace, confidence)
+    return _told(namespace, document)
+
+
+def require_new(path: Path | None) -> None:
+    """Raise UsageError for a file that is there already."""
+    if path is not None and path.exists():
+        raise UsageError("is there already, and is left as it is", where=f"--save {path}",
+                         next_step="Name another file, or move that one away")
+
+
+def _told(namespace: argparse.Namespace, document: Mapping[str, Any]) -> int:
+    from tdhil.report import PlainConsole, print_factor, stderr_console, write_factor_report
+    from tdhil.session import save_calibration
+
+    console = stderr_console()
+    if namespace.json:
+        print_json(document)
+    else:
+        print_factor(document, PlainConsole())
+    found = document["calibration_factor"] is not None
+    if namespace.save is not None and found:
+        save_calibration({name: value for name, value in document.items() if name != "series"}, namespace.save)
+        console.print(f"calibration: {namespace.save}", markup=False, soft_wrap=True)
+    elif namespace.save is not None:
+        console.print(f"tdhil: nothing was written to {namespace.save}: there is no calibration factor",
+                      style="yellow", markup=False, soft_wrap=True)
+    if namespace.report is not None:
+        written = write_factor_report(document, namespace.report)
+        console.print(f"report: {written}", markup=False, soft_wrap=True)
+    return int(ExitCode.OK if found else ExitCode.NOT_IDENTIFIABLE)
+
+
+def _one_log(namespace: argparse.Namespace, kind: str) -> RunRecord:
+    from tdhil.session import require_file
+
+    if len(namespace.logs) != 1:
+        raise UsageError(f"takes one log, not {len(namespace.logs)}", where=f"--{kind.replace('_', '-')}",
+                         next_step=f"Such as: {_EXAMPLES[kind]}")
+    require_file(namespace.logs[0])
+    return read_recorded(namespace, namespace.logs[0])
+
+
+def _pairs(namespace: argparse.Namespace, confidence: float) -> dict[str, Any]:
+    from tdhil.calibration import calibrate_pairs
+    from tdhil.report import pairs_document
+    from tdhil.session import drive_identity, drive_settings, log_of_calibration, read_pairs
+
+    if len(namespace.logs) > 1 or (namespace.save is not None and not namespace.logs):
+        raise UsageError("takes one log, which names the drive", where="--save" if namespace.save else "--pairs",
+                         next_step=f"Such as: {_EXAMPLES['pairs']}")
+    pairs = read_pairs(namespace.pairs)
+    record = _one_log(namespace, "pairs") if namespace.logs else None
+    try:
+        found = calibrate_pairs(pairs, confidence)
+    except ValueError as error:
+        raise UsageError(str(error), where=str(namespace.pairs)) from None
+    drive = {} if record is None else drive_identity(record.configuration)
+    settings = {} if record is None else drive_settings(record.configuration, record.recording)
+    return pairs_document(
+        found, pairs, str(namespace.pairs), drive, settings, confidence=confidence,
+        date=datetime.now().astimezone().isoformat(timespec="seconds"),
+        simulated=record is not None and record.recording.simulated,
+        runs=() if record is None else (log_of_calibration(record),))
+
+
+def _reference(namespace: argparse.Namespace, confidence: float) -> dict[str, Any]:
+    from tdhil.session import find_by_reference, require_file
+
+    if namespace.reference_sd is not None and not 0.0 <= namespace.reference_sd < 1.0:
+        raise UsageError(f"{namespace.reference_sd:g}: must be a share from 0 to below 1", where="--reference-sd")
+    record = _one_log(namespace, "reference")
+    require_file(namespace.reference)
+    return find_by_reference(record, namespace.reference, namespace.column, namespace.at, namespace.reference_sd,
+                             confidence)
+
+
+def _known_pipe(namespace: argparse.Namespace, confidence: float) -> dict[str, Any]:
+    from tdhil.session import find_by_known_pipe, require_file
+
+    record = _one_log(namespace, "known_pipe")
+    require_file(namespace.known_pipe)
+    return find_by_known_pipe(record, namespace.known_pipe, confidence)
+
+
+_KINDS = {"pairs": _pairs, "reference": _reference, "known_pipe": _known_pipe}

@@ -1,0 +1,85 @@
+"""Parts that every torque calibration shows in the same way, on the card and on the laboratory's page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tdhil.report.blocks import Column, Pairs, ReportSection, Table, shown_date
+from tdhil.report.card import with_interval
+
+if TYPE_CHECKING:
+    from tdhil.calibration import MeasuredValue
+
+Part = Mapping[str, Any]
+
+VERDICT_STYLE = {"valid": "bold green", "not_identifiable": "bold red", "model_rejected": "bold red"}
+VERDICT_COLOUR = {"valid": "green", "not_identifiable": "red", "model_rejected": "red"}
+MANY = 1e4
+"""More degrees of freedom are shown as infinitely many."""
+
+
+def quantity(one: MeasuredValue | None, confidence: float) -> dict[str, Any] | None:
+    """Return a measured value for the document."""
+    return None if one is None else {**asdict(one), "confidence": confidence}
+
+
+def run_name(run: Part) -> str:
+    """Return the short name of a run's log; a file of an earlier version has its path only."""
+    return str(run.get("name") or Path(run["log"]).name)
+
+
+def with_share(part: Part, unit: str) -> str:
+    """Return a quantity with its interval, and half of that as a share."""
+    share = 50.0 * (part["high"] - part["low"]) / part["value"]
+    return f"{with_interval(part['value'], part['low'], part['high'], unit).rstrip()}  ±{share:#.2g} %"
+
+
+def scale_error(factor: Part) -> str:
+    """Return the error of the drive's own torque: ``4.8 % too much torque``."""
+    error = 100.0 * (1.0 / factor["value"] - 1.0)
+    return f"{abs(error):.2g} % too {'much' if error > 0.0 else 'little'} torque"
+
+
+def shown_degrees(dof: float) -> str:
+    """``50``, or ``∞``."""
+    return "∞" if dof > MANY else f"{dof:.0f}"
+
+
+def calibrated_item(document: Part) -> ReportSection:
+    """Identity and settings of the drive; without blocks where neither is known."""
+    drive = document["drive"] or {}
+    identity = [(name, str(drive[name])) for name in ("name", "vendor", "product", "revision", "serial")
+                if name in drive]
+    settings = [(_SETTINGS.get(name, name), str(value)) for name, value in document["settings"].items()
+                if value is not None]
+    return ReportSection("Calibrated item", (Pairs((*identity, *settings)),) if identity or settings else ())
+
+
+_SETTINGS = {"rated_torque_nm": "rated torque, N·m", "torque_count_nm": "one count of torque, N·m",
+             "gear_ratio": "gear ratio"}
+
+
+def recordings(document: Part) -> ReportSection:
+    """Logs of the calibration with date and hash; without blocks where there is none."""
+    rows = tuple((run_name(run), f"{shown_date(run['date'])}, SHA-256 {run['sha256']}") for run in document["runs"])
+    return ReportSection("Recordings", (Pairs(rows),) if rows else ())
+
+
+def date_and_signature(document: Part) -> ReportSection:
+    """The end of the page."""
+    return ReportSection("Date and signature", (Pairs((
+        ("date of calibration", shown_date(document["date"])), ("conditions", "temperature, warm-up: ____________"),
+        ("signature", "______________________"))),))
+
+
+def result_rows(quantities: Iterable[tuple[str, Part, str]]) -> Table:
+    """(name, measured value, unit) each, with the columns of a certificate."""
+    rows = tuple((name, unit, f"{part['value']:.5g}", f"{part['standard_uncertainty']:.3g}",
+                  shown_degrees(part["degrees_of_freedom"]), f"{part['coverage_factor']:.2f}",
+                  f"{0.5 * (part['high'] - part['low']):.3g}") for name, part, unit in quantities)
+    columns = (Column("quantity", 0.26), Column("unit", 0.1), *(Column(name, 0.128, True)
+                                                               for name in ("value", "u", "ν_eff", "k", "U")))
+    return Table(columns, rows)

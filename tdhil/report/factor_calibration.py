@@ -1,0 +1,436 @@
+"""A torque calibration without a body: by pairs of torque or by the record of a reference sensor.
+
+The document is that of `tdhil calibrate torque` with a calibration factor and its budget. It has no moment of inertia.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Group
+from rich.panel import Panel
+from rich.table import Table as Grid
+from rich.text import Text as Words
+
+from tdhil.report.blocks import AnswerBox, Block, Column, Pairs, Picture, Report, ReportSection, Table, Text, shown_date
+from tdhil.report.calibration_page import (
+    VERDICT_COLOUR,
+    VERDICT_STYLE,
+    calibrated_item,
+    date_and_signature,
+    quantity,
+    recordings,
+    result_rows,
+    scale_error,
+    shown_degrees,
+    with_share,
+)
+from tdhil.report.card import sentence, with_interval
+from tdhil.report.console import PlainConsole, names_and_texts
+from tdhil.report.document import SIMULATED
+from tdhil.report.html import write_blocks
+from tdhil.report.plots import DARK, OURS, QUIET
+from tdhil.version import __version__
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
+    from tdhil.calibration import FactorLine, KnownPipe, KnownPipeFit, PairsFit, ReferenceFit, TorquePairs
+    from tdhil.estimation import MeasuredString
+
+Part = Mapping[str, Any]
+
+PAIRS, REFERENCE, KNOWN_PIPE = "pairs", "reference", "known_pipe"
+
+
+def pairs_document(
+    found: PairsFit, pairs: TorquePairs, source: str, drive: Part, settings: Part, *, date: str, confidence: float,
+    simulated: bool, runs: Sequence[Part] = (),
+) -> dict[str, Any]:
+    """Plain data for `json.dumps`; ``source``: the file of the pairs, ``drive``: as a log names it."""
+    return {
+        **_begun(PAIRS, "model_rejected" if found.refusal else "valid",
+                 found.refusal or f"{len(pairs.direction)} pairs give κ to ±{found.factor.half_width_share:.2%}", ""),
+        "calibration_factor": None if found.refusal else quantity(found.factor, confidence),
+        "offset_nm": quantity(found.offset_nm, confidence),
+        "budget": _budget_lines(found.budget),
+        "scatter": asdict(found.scatter),
+        "spread": found.spread,
+        "hysteresis_nm": found.hysteresis_nm,
+        "pairs": [
+            {"reported_nm": float(x), "reference_nm": float(y), "reported_sd_nm": float(x_sd),
+             "reference_sd_nm": float(y_sd), "residual_nm": float(left), "direction": direction}
+            for x, y, x_sd, y_sd, left, direction in zip(
+                pairs.reported_nm, pairs.reference_nm, pairs.reported_sd_nm, pairs.reference_sd_nm, found.residuals_nm,
+                pairs.direction, strict=True)
+        ],
+        "line": {"slope": found.factor.value, "intercept_nm": found.offset_nm.value,
+                 "covariance": found.covariance.tolist()},
+        **_ended(source, runs, drive, settings, date, simulated, ()),
+    }
+
+
+def reference_document(
+    found: ReferenceFit, source: Part, runs: Sequence[Part], drive: Part, settings: Part, *, date: str,
+    confidence: float, simulated: bool, warnings: Sequence[str],
+) -> dict[str, Any]:
+    """Plain data for `json.dumps`; ``source``: file and hash of the sensor's record, and the shaft that it is of."""
+    factor = found.factor
+    reason = found.refusal
+    if not reason and factor is not None:
+        reason = (f"{found.overlap_s:.0f} s of both records give κ to ±{factor.half_width_share:.2%}")
+    series = found.series
+    return {
+        **_begun(REFERENCE, "not_identifiable" if found.refusal else "valid", reason, found.advice),
+        "calibration_factor": None if found.refusal else quantity(factor, confidence),
+        "offset_nm": quantity(found.offset_nm, confidence),
+        "budget": _budget_lines(found.budget),
+        "alignment": {name: _number(getattr(found, name)) for name in (
+            "time_offset_s", "correlation", "overlap_s", "average_s", "filter_s", "swing_nm", "samples",
+            "effective_samples")},
+        "line": None if factor is None or found.offset_nm is None else {
+            "slope": factor.value, "intercept_nm": found.offset_nm.value},
+        "series": None if series is None else {
+            name: [round(float(one), 6) for one in values] for name, values in asdict(series).items()},
+        **_ended(str(source["file"]), runs, drive, settings, date, simulated, warnings),
+        "reference": dict(source),
+    }
+
+
+def known_pipe_document(
+    found: KnownPipeFit | None, measured: MeasuredString | None, known: KnownPipe, refusal: tuple[str, str],
+    source: Part, runs: Sequence[Part], drive: Part, settings: Part, *, date: str, confidence: float, simulated: bool,
+) -> dict[str, Any]:
+    """Plain data for `json.dumps`; ``refusal``: reason and advice where nothing was measured.
+
+    ``measured_factor`` is there also where it is too wide to be used; ``calibration_factor`` is then None.
+    """
+    reason, advice = refusal if found is None else (found.refusal, found.advice)
+    verdict = "not_identifiable" if reason else "valid"
+    factor = None if found is None else quantity(found.factor, confidence)
+    if found is not None and not reason:
+        reason = (f"the pipe gives κ to ±{found.factor.half_width_share:.2%}; the torque scale as stated so far leaves"
+                  f" ±{found.typed_half_width:.1%}")
+    return {
+        **_begun(KNOWN_PIPE, verdict, reason, advice),
+        "calibration_factor": None if verdict != "valid" else factor,
+        "measured_factor": factor,
+        "budget": () if found is None else _budget_lines(found.budget),
+        "typed_half_width": None if found is None else found.typed_half_width,
+        "pipe": {
+            "impedance_nm_s_rad": known.impedance_nm_s_rad, "delay_s": known.delay_s, "exponent": known.exponent,
+            "measured_impedance_nm_s_rad": None if measured is None else measured.impedance_nm_s_rad,
+            "measured_delay_s": None if measured is None else measured.delay_s,
+            "residual": None if measured is None or measured.residual is None else asdict(measured.residual),
+            "inputs": [asdict(one) for one in known.inputs],
+        },
+        **_ended(str(source["file"]), runs, drive, settings, date, simulated, ()),
+        "string": dict(source),
+    }
+
+
+def _begun(method: str, verdict: str, reason: str, advice: str) -> dict[str, Any]:
+    return {"kind": "torque_calibration", "method": method, "verdict": verdict, "reason": reason, "advice": advice}
+
+
+def _ended(
+    source: str, runs: Sequence[Part], drive: Part, settings: Part, date: str, simulated: bool, warnings: Sequence[str]
+) -> dict[str, Any]:
+    return {"source": source, "runs": [dict(run) for run in runs], "drive": dict(drive) or None,
+            "settings": dict(settings), "date": date, "simulated": simulated, "warnings": list(warnings),
+            "tdhil": __version__}
+
+
+def _budget_lines(budget: Sequence[FactorLine]) -> list[dict[str, Any]]:
+    return [asdict(line) for line in budget]
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The card
+
+
+def print_factor(document: Part, console: PlainConsole) -> None:
+    """The card of a calibration without a body, on a console."""
+    rows = names_and_texts(())
+    verdict, factor = document["verdict"], document["calibration_factor"]
+    rows.add_row("verdict", Words(verdict, style=VERDICT_STYLE.get(verdict, "bold")))
+    if factor is not None:
+        rows.add_row("calibration factor", Words(with_share(factor, ""), style="bold"))
+        rows.add_row("", f"true torque = κ · reported torque: the drive reports {scale_error(factor)}")
+    for name, text in _CARD_ROWS[document["method"]](document):
+        rows.add_row(name, text)
+    body: list[Any] = [rows]
+    shown = factor or document.get("measured_factor")
+    if shown and document["budget"]:
+        body.append(_card_budget(document["budget"], shown["coverage_factor"]))
+    body.append(Words(sentence(document["reason"])))
+    if document["advice"]:
+        body.append(Words(sentence(document["advice"]), style="italic"))
+    body += [Words(f"! {warning}", style="yellow") for warning in document["warnings"]]
+    title = _TITLES[document["method"]] + (f" · {SIMULATED}" if document["simulated"] else "")
+    console.print(Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue"))
+
+
+_TITLES = {PAIRS: "torque calibration by pairs", REFERENCE: "torque calibration by a reference sensor",
+           KNOWN_PIPE: "torque calibration by a known pipe"}
+
+
+def _card_budget(budget: Sequence[Part], k: float) -> Grid:
+    table = Grid.grid(padding=(0, 2))
+    table.add_column(style="dim")
+    table.add_column(justify="right", no_wrap=True)
+    table.add_row(Words("uncertainty budget", style="italic"), Words("± % of κ", style="dim"))
+    for line in sorted(budget, key=lambda one: -one["of_factor"]):
+        table.add_row(line["source"], f"{100.0 * k * line['of_factor']:.3f}")
+    return table
+
+
+def _interval(part: Part, unit: str) -> str:
+    return with_interval(part["value"], part["low"], part["high"], unit)
+
+
+def _pairs_rows(document: Part) -> Iterator[tuple[str, str]]:
+    yield "offset", _interval(document["offset_nm"], "N·m")
+    yield "scatter", _scatter(document)
+    yield "hysteresis", _hysteresis(document)
+    for pair in document["pairs"]:
+        yield "pair", (f"{pair['reported_nm']:9.2f} N·m reported, {pair['reference_nm']:9.2f} N·m true,"
+                       f" {pair['residual_nm']:+.2g}, {pair['direction']}")
+
+
+def _scatter(document: Part) -> str:
+    return f"p = {document['scatter']['p_value']:.2g}" + (
+        f"; {document['spread']:.2g} times as much as stated, and counted so" if document["spread"] > 1.0 else "")
+
+
+def _hysteresis(document: Part) -> str:
+    if document["hysteresis_nm"] is None:
+        return "not known: all pairs are of one direction"
+    return f"{document['hysteresis_nm']:+.2g} N·m, rising over falling torque"
+
+
+def _reference_rows(document: Part) -> Iterator[tuple[str, str]]:
+    if document["offset_nm"] is not None:
+        yield "offset", _interval(document["offset_nm"], "N·m")
+    yield from _alignment(document)
+
+
+def _alignment(document: Part) -> Iterator[tuple[str, str]]:
+    found = document["alignment"]
+    if found["time_offset_s"] is not None:
+        yield "time offset", (f"{found['time_offset_s']:+.3f} s, reference less log; correlation"
+                              f" {found['correlation']:.4f}")
+    if found["average_s"] is None:
+        return
+    yield "common band", (f"Gaussian average of {found['average_s']:.2g} s: below"
+                          f" {1.0 / (2.0 * math.pi * found['average_s']):.2g} Hz")
+    slower = "reference" if found["filter_s"] > 0.0 else "reported torque"
+    yield "filters", f"the {slower} is the slower, by a time constant of {abs(found['filter_s']):.2g} s"
+    yield "samples", (f"{found['samples']} averages in {found['overlap_s']:.0f} s, as good as"
+                      f" {found['effective_samples']:.0f} independent ones")
+
+
+def _known_pipe_rows(document: Part) -> Iterator[tuple[str, str]]:
+    pipe = document["pipe"]
+    yield "pipe as stated", (f"{pipe['impedance_nm_s_rad']:.4g} N·m·s/rad; a wave takes {pipe['delay_s']:.4g} s to its"
+                             " end")
+    if pipe["measured_impedance_nm_s_rad"] is not None:
+        yield "measured", (f"{pipe['measured_impedance_nm_s_rad']:.4g} N·m·s/rad in the drive's unit;"
+                           f" {pipe['measured_delay_s']:.4g} s")
+    if pipe["residual"] is not None:
+        yield "residuals", f"p = {pipe['residual']['p_value']:.2g}, of the string's model"
+
+
+_CARD_ROWS = {PAIRS: _pairs_rows, REFERENCE: _reference_rows, KNOWN_PIPE: _known_pipe_rows}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The page
+
+
+def write_factor_report(document: Part, path: Path) -> Path:
+    """The page, as PDF where the name ends so; and where it went. Raises UsageError where it can't be written."""
+    return write_blocks(factor_report(document), path)
+
+
+def factor_report(document: Part) -> Report:
+    """Laid out as a calibration laboratory does, as `calibration_report` is."""
+    factor = document["calibration_factor"]
+    return Report(
+        title="Calibration of a drive's torque",
+        subtitle=shown_date(document["date"]),
+        simulated=f"{SIMULATED}: drive and rig are simulated, nothing real turned" if document["simulated"] else "",
+        answer=AnswerBox(
+            VERDICT_COLOUR.get(document["verdict"], "yellow"),
+            "No number" if factor is None else f"κ = {with_share(factor, '')}",
+            () if factor is None else (f"The drive reports {scale_error(factor)}",), document["verdict"],
+            sentence(document["reason"]), sentence(document["advice"])),
+        warnings=tuple(document["warnings"]),
+        sections=tuple(one for one in _sections(document) if one.blocks),
+        footer=f"tdhil {document['tdhil']}",
+    )
+
+
+def _sections(document: Part) -> Iterator[ReportSection]:
+    yield calibrated_item(document)
+    yield ReportSection("Method", (Text(_METHODS[document["method"]]),))
+    if document["calibration_factor"] is not None:
+        quantities = [("calibration factor κ", document["calibration_factor"], "1")]
+        if document.get("offset_nm"):
+            quantities.append(("offset of the reference a", document["offset_nm"], "N·m"))
+        table = result_rows(quantities)
+        yield ReportSection("Result", (table, Text(_RESULT_NOTE.format(
+            confidence=100.0 * document["calibration_factor"]["confidence"]))))
+        yield ReportSection("Uncertainty budget", (_page_budget(document), Text(_BUDGET_NOTE)))
+    yield from _DATA[document["method"]](document)
+    yield recordings(document)
+    yield date_and_signature(document)
+
+
+_METHODS = {
+    PAIRS: (
+        "Reported torque R and torque T of a reference sensor were noted in pairs, each with its standard"
+        " uncertainty. The line T = κ R + a was fitted with errors in both (York 2004). If the pairs scatter by more"
+        " than they are stated to, all uncertainties are enlarged in proportion. Half of the hysteresis between rising"
+        " and falling torque is a rectangular error. Evaluation of uncertainty: JCGM 100 (GUM)."
+    ),
+    REFERENCE: (
+        "Reported torque R and torque T of a reference sensor were recorded during one run. The time offset is that"
+        " of the largest correlation, refined by least squares. Both torques passed the same Gaussian average, at"
+        " their own sample times. T = κ R + a was fitted with errors in both, together with the first three"
+        " derivatives of R, which stand for the difference of both low-pass filters. Residuals are correlated; their"
+        " autocovariance enters the uncertainty of κ. The reference must carry the whole torque of the drive: an"
+        " inertia that turns between drive and sensor is not part of this model. Evaluation of uncertainty: JCGM 100"
+        " (GUM)."
+    ),
+}
+_METHODS[KNOWN_PIPE] = (
+    "A drill string of known sizes hangs on the shaft. The run was fitted with a string whose impedance ζ was free, in"
+    " the drive's unit of torque, and whose travel time T was measured with it. κ is ζ T^(−e) of the stated sizes over"
+    " the measured one; the exponent e is the one with the least uncertainty for the stated tolerances (−1: the"
+    " string's inertia, 0: its impedance). Tolerances are rectangular. Evaluation of uncertainty: JCGM 100 (GUM)."
+)
+_RESULT_NOTE = (
+    "The expanded uncertainty U is the standard uncertainty multiplied by the coverage factor k for a coverage"
+    " probability of {confidence:g} %."
+)
+_BUDGET_NOTE = (
+    "c·u: contribution to the relative standard uncertainty of κ, %; ν: degrees of freedom of the input quantity."
+)
+
+
+def _page_budget(document: Part) -> Table:
+    rows = [(line["source"], line["distribution"], shown_degrees(line["degrees_of_freedom"]),
+             f"{100.0 * line['of_factor']:.3f}") for line in document["budget"]]
+    factor = document["calibration_factor"]
+    rows.append(("combined", "", shown_degrees(factor["degrees_of_freedom"]),
+                 f"{100.0 * factor['standard_uncertainty'] / factor['value']:.3f}"))
+    return Table((Column("input quantity X", 0.46), Column("distribution", 0.2), Column("ν", 0.14, True),
+                  Column("c·u of κ, %", 0.2, True)), tuple(rows))
+
+
+def _pairs_data(document: Part) -> Iterator[ReportSection]:
+    rows = tuple((pair["direction"], *(f"{pair[name]:.5g}" for name in (
+        "reported_nm", "reported_sd_nm", "reference_nm", "reference_sd_nm")), f"{pair['residual_nm']:+.2g}")
+        for pair in document["pairs"])
+    columns = (Column("direction", 0.15), *(Column(name, 0.17, True) for name in (
+        "R, N·m", "u(R), N·m", "T, N·m", "u(T), N·m", "residual, N·m")))
+    facts = (("source", document["source"]), ("scatter", _scatter(document)), ("hysteresis", _hysteresis(document)))
+    picture = Picture(partial(draw_pairs, document=document), 4.2,
+                      "Reference torque over reported torque, with the line and its 95 % band; below, the residuals of"
+                      " rising and falling torque.")
+    yield ReportSection("Reference over reported torque", (picture, Pairs(facts), Table(columns, rows)))
+
+
+def _reference_data(document: Part) -> Iterator[ReportSection]:
+    reference = document["reference"]
+    facts = [("record", reference["file"]), ("SHA-256", reference["sha256"]), ("shaft", reference["at"]),
+             ("standard uncertainty of its scale", f"{100.0 * reference['rel_sd']:.3g} %")]
+    blocks: list[Block] = [Pairs((*facts, *_alignment(document)))]
+    if document["series"] is not None:
+        blocks.append(Picture(partial(draw_reference, document=document), 5.6,
+                              "Both torques over the time of the log, after the same average; the residuals over time;"
+                              " and the residuals over torque, where a curve would be an error of linearity."))
+    yield ReportSection("Reference and reported torque", tuple(blocks))
+
+
+def _known_pipe_data(document: Part) -> Iterator[ReportSection]:
+    string = document["string"]
+    facts = (("string", string["file"]), ("SHA-256", string["sha256"]),
+             ("exponent e", f"{document['pipe']['exponent']:.2f}"))
+    rows = tuple((one["source"], f"{one['low']:.4g}", f"{one['high']:.4g}", f"{one['of_impedance']:.2f}",
+                  f"{one['of_delay']:.2f}") for one in document["pipe"]["inputs"])
+    columns = (Column("input quantity", 0.4), *(Column(name, 0.15, True) for name in (
+        "least", "largest", "c of ζ", "c of T")))
+    note = Text("least and largest: factors on the stated value; c: relative sensitivity coefficients of ζ and of T.")
+    yield ReportSection("Pipe", (Pairs((*facts, *_known_pipe_rows(document))), Table(columns, rows), note))
+
+
+_DATA = {PAIRS: _pairs_data, REFERENCE: _reference_data, KNOWN_PIPE: _known_pipe_data}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Pictures
+
+
+def draw_pairs(figure: FigureBase, document: Part) -> None:
+    """Above: the pairs, the line and its 95 % band; dotted: an exact torque scale. Below: residuals by direction."""
+    pairs, line = document["pairs"], document["line"]
+    x, y, x_sd, y_sd, left = (np.array([pair[name] for pair in pairs]) for name in (
+        "reported_nm", "reference_nm", "reported_sd_nm", "reference_sd_nm", "residual_nm"))
+    up = np.array([pair["direction"] == "up" for pair in pairs])
+    margin = 0.05 * float(np.ptp(x))
+    at = np.linspace(float(x.min()) - margin, float(x.max()) + margin, 100)
+    design = np.column_stack([at, np.ones_like(at)])
+    band = 1.96 * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", design, np.array(line["covariance"]), design), 0.0))
+    fitted = line["slope"] * at + line["intercept_nm"]
+    top, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    top.fill_between(at, fitted - band, fitted + band, color=OURS, alpha=0.2, lw=0, label="95 % band")
+    top.plot(at, fitted, "-", color=OURS, lw=1.4, label=f"slope κ = {line['slope']:.4f}")
+    top.plot(at, at, ":", color=QUIET, lw=1.2, label="exact torque scale")
+    spread = np.hypot(y_sd, line["slope"] * x_sd)
+    below.fill_between(at, -band, band, color=OURS, alpha=0.2, lw=0)
+    for chosen, marker, name in ((up, "^", "rising torque"), (~up, "v", "falling torque")):
+        if not chosen.any():
+            continue
+        top.plot(x[chosen], y[chosen], marker, color=DARK, ms=5, label=name)
+        below.errorbar(x[chosen], left[chosen], 1.96 * spread[chosen], fmt=marker, color=DARK, ms=4, capsize=3, lw=1.0)
+    top.set_ylabel("reference torque, N·m")
+    top.legend(fontsize="small", loc="best")
+    _residual_axes(below, "reported torque, N·m")
+    top.grid(alpha=0.3)
+
+
+def draw_reference(figure: FigureBase, document: Part) -> None:
+    """Above: both torques over time. Middle: residuals over time. Below: residuals over reported torque."""
+    series = {name: np.array(values) for name, values in document["series"].items()}
+    line = document["line"]
+    top, middle, below = figure.subplots(3, 1, height_ratios=(3, 2, 2))
+    top.plot(series["time_s"], series["reference_nm"], "-", color=DARK, lw=1.6, label="reference")
+    top.plot(series["time_s"], line["slope"] * series["reported_nm"] + line["intercept_nm"], "-", color=OURS, lw=1.0,
+             label="κ · reported + a")
+    top.plot(series["time_s"], series["reported_nm"], ":", color=QUIET, lw=1.0, label="reported")
+    top.set_ylabel("torque, N·m")
+    top.legend(fontsize="small", loc="best")
+    top.grid(alpha=0.3)
+    middle.plot(series["time_s"], series["residual_nm"], "-", color=OURS, lw=0.8)
+    _residual_axes(middle, "time of the log, s")
+    below.plot(series["reported_nm"], series["residual_nm"], ".", color=OURS, ms=3)
+    _residual_axes(below, "reported torque, N·m")
+
+
+def _residual_axes(axes: Axes, across: str) -> None:
+    axes.axhline(0.0, color=QUIET, lw=1.0)
+    axes.set(xlabel=across, ylabel="residual,\nN·m")
+    axes.grid(alpha=0.3)

@@ -1,0 +1,164 @@
+"""A torque calibration without a body: by a reference sensor beside a log, or by a known pipe below the drive."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import datetime
+from hashlib import file_digest
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tdhil.errors import UsageError
+from tdhil.session.run_record import RunRecord
+from tdhil.session.stored_calibration import drive_identity, drive_settings
+from tdhil.session.torque_calibration import sha256_of_log
+
+if TYPE_CHECKING:
+    from tdhil.calibration import KnownPipe
+    from tdhil.soft_torque import StringFile, WaveLine
+
+
+def log_of_calibration(record: RunRecord) -> dict[str, Any]:
+    """Log, name, hash and date of a recording, for the document of a calibration."""
+    return {"log": record.log, "name": Path(record.log).name, "sha256": sha256_of_log(record),
+            "date": record.configuration.get("started")}
+
+
+def find_by_reference(
+    record: RunRecord, trace: Path, columns: Sequence[str] | None, at: str, reference_rel_sd: float | None,
+    confidence: float,
+) -> dict[str, Any]:
+    """Document of the calibration. ``columns``: of the trace, as `QUANTITY=NAME:UNIT`; ``at``: the sensor's shaft.
+
+    Raises UsageError and CsvUnusable for a trace that is not usable, NothingRecorded for a log without motion.
+    """
+    from tdhil.calibration import ASSUMED_REFERENCE_REL_SD, TorqueRecord, calibrate_reference
+    from tdhil.recording import REFERENCE_FLAG, TIME_AND_TORQUE, parse_columns, read_reference
+    from tdhil.report import reference_document
+
+    record.require_motion()
+    recording = record.recording
+    sensor = read_reference(trace, parse_columns(columns or (), TIME_AND_TORQUE, REFERENCE_FLAG))
+    ratio = recording.gear_ratio if at == "main" else 1.0
+    warnings = list(sensor.warnings)
+    rel_sd = reference_rel_sd
+    if rel_sd is None:
+        rel_sd = ASSUMED_REFERENCE_REL_SD
+        warnings.append(f"the standard uncertainty of the sensor's scale was assumed to be {rel_sd:.1%} (accuracy class"
+                        " 0.5); state it with --reference-sd")
+    good = recording.fresh
+    drive = TorqueRecord(recording.time_s[good], recording.torque_nm[good] - recording.torque_offset_nm,
+                         recording.torque_resolution_nm)
+    try:
+        found = calibrate_reference(
+            drive, TorqueRecord(sensor.time_s, sensor.torque_nm / ratio), reference_rel_sd=rel_sd,
+            scale_rel_sd=recording.torque_scale_rel_sd, confidence=confidence)
+    except ValueError as error:
+        raise UsageError(str(error), where=str(trace)) from None
+    if found.series is not None:
+        found = replace(found, series=replace(found.series, time_s=found.series.time_s - float(recording.time_s[0])))
+    digest = _digest(trace)
+    run = log_of_calibration(record)
+    return reference_document(
+        found, {"file": str(trace), "sha256": digest, "at": at, "rel_sd": rel_sd}, (run,),
+        drive_identity(record.configuration), drive_settings(record.configuration, recording),
+        date=str(run["date"] or datetime.now().astimezone().isoformat(timespec="seconds")), confidence=confidence,
+        simulated=recording.simulated, warnings=warnings)
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A pipe of known sizes.
+
+
+DENSITY_TOLERANCE = 0.005
+"""Relative half-width of the density of steel, if it is not stated: 7,810 to 7,890 kg/m³."""
+_STEP = 1e-4
+
+
+def known_pipe_of(file: StringFile, gear_ratio: float) -> KnownPipe:
+    """Impedance and travel time of the string's one section at the motor shaft, with its tolerances.
+
+    Raises ValueError for more than one section, or one without a length.
+    """
+    from tdhil.calibration import KnownPipe, PipeInput
+    from tdhil.soft_torque import ToleranceFile, line_of, string_of
+
+    if len(file.sections) != 1 or file.sections[0].length_m is None:
+        raise ValueError("a known pipe is one section with length_m, from the drive down to the bottom-hole assembly")
+    section = file.sections[0]
+    line = line_of(section)
+
+    def sensitivity(name: str) -> tuple[float, float]:
+        """Relative sensitivities of ζ and T to one size of the pipe's body."""
+        size = float(getattr(section, name))
+        ends = [line_of(section.model_copy(update={name: size * (1.0 + sign * _STEP)})) for sign in (1.0, -1.0)]
+        impedance, delay = ([value(one) for one in ends] for value in (_impedance_of, _delay_of))
+        low, high = ((math.log(pair[0]) - math.log(pair[1])) / (2.0 * _STEP) for pair in (impedance, delay))
+        return low, high
+
+    stated = file.tolerance or ToleranceFile()
+    tolerance = string_of(file).tolerance
+    density = DENSITY_TOLERANCE if stated.density is None else stated.density
+    inputs = [
+        PipeInput("shear modulus of the pipe", *tolerance.shear, *sensitivity("shear_modulus_pa")),
+        PipeInput("density of the pipe", 1.0 - density, 1.0 + density, *sensitivity("density_kg_m3")),
+        PipeInput("length of the pipe", 1.0 - stated.length, 1.0 + stated.length, *sensitivity("length_m")),
+    ]
+    measured = stated.outer_diameter is not None or stated.inner_diameter is not None
+    for source, half, name in (("outer diameter of the pipe", stated.outer_diameter, "outer_diameter_m"),
+                               ("inner diameter of the pipe", stated.inner_diameter, "inner_diameter_m")):
+        if half is not None:
+            inputs.append(PipeInput(source, 1.0 - half, 1.0 + half, *sensitivity(name)))
+    if not measured or "wear" in stated.model_fields_set:
+        inputs.append(PipeInput("wear of the pipe", 1.0 - stated.wear, 1.0, 1.0, 0.0))
+    return KnownPipe(line.impedance_nm_s_rad / gear_ratio**2, line.delay_s, tuple(inputs))
+
+
+def _impedance_of(line: WaveLine) -> float:
+    return line.impedance_nm_s_rad
+
+
+def _delay_of(line: WaveLine) -> float:
+    return line.delay_s
+
+
+def find_by_known_pipe(record: RunRecord, path: Path, confidence: float) -> dict[str, Any]:
+    """Document of the calibration by the pipe in ``path`` (string.yaml). Raises UsageError for another string."""
+    from profiles import load_model
+    from tdhil.calibration import calibrate_known_pipe
+    from tdhil.estimation import Refused, measure_string
+    from tdhil.recording import Pipe
+    from tdhil.report import known_pipe_document
+    from tdhil.soft_torque import StringFile
+
+    record.require_motion()
+    recording = record.recording
+    try:
+        known = known_pipe_of(load_model(path, StringFile), recording.gear_ratio)
+    except ValueError as error:
+        raise UsageError(str(error), where=str(path), next_step="docs/reference/string.md explains the file") from None
+    pipe = Pipe(known.impedance_nm_s_rad * known.delay_s, known.impedance_nm_s_rad / known.delay_s, 1.0)
+    found, measured, refusal = None, None, ("", "")
+    delay_sd = max(known.delay_rel_sd, _LEAST_DELAY_REL_SD)
+    try:
+        measured = measure_string(recording, pipe, delay_sd, known.exponent, confidence)
+        found = calibrate_known_pipe(known, measured, scale_rel_sd=recording.torque_scale_rel_sd, confidence=confidence)
+    except Refused as refused:
+        refusal = f"the log can't be used: {refused.refusal.reason}", refused.refusal.advice
+    run = log_of_calibration(record)
+    return known_pipe_document(
+        found, measured, known, refusal, {"file": str(path), "sha256": _digest(path)}, (run,),
+        drive_identity(record.configuration), drive_settings(record.configuration, recording),
+        date=str(run["date"] or datetime.now().astimezone().isoformat(timespec="seconds")), confidence=confidence,
+        simulated=recording.simulated)
+
+
+_LEAST_DELAY_REL_SD = 0.003
+"""Of a travel time that is known exactly, so that its belief does not outweigh the data."""

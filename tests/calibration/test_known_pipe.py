@@ -1,0 +1,100 @@
+"""A drill string of known sizes: sensitivities, exponent, coverage, and what is said of a pipe known badly."""
+
+import numpy as np
+import pytest
+
+from tdhil.calibration import KnownPipe, PipeInput, calibrate_known_pipe
+from tdhil.estimation import MeasuredString
+from tdhil.estimation.frequency_domain import string_view
+from tdhil.estimation.result import Estimate
+from tdhil.session import known_pipe_of
+from tests.calibration.pipe_lines import MEASURED, string_file, study_case
+
+
+def test_the_sensitivities_are_those_of_the_formulas():
+    known = known_pipe_of(string_file(MEASURED), 4.0)
+    outer, inner = 0.127**4, 0.1086**4
+    polar = np.pi / 32.0 * (outer - inner)
+    assert known.impedance_nm_s_rad == pytest.approx(polar * np.sqrt(79.3e9 * 7850.0) / 16.0)
+    assert known.delay_s == pytest.approx(2300.0 * np.sqrt(7850.0 / 79.3e9))
+    found = {one.source.split(" of ")[0]: (one.of_impedance, one.of_delay) for one in known.inputs}
+    expected = {
+        "shear modulus": (0.5, -0.5), "density": (0.5, 0.5), "length": (0.0, 1.0),
+        "outer diameter": (4.0 * outer / (outer - inner), 0.0), "inner diameter": (-4.0 * inner / (outer - inner), 0.0),
+    }
+    assert found.keys() == expected.keys()
+    for name, pair in expected.items():
+        assert found[name] == pytest.approx(pair, abs=1e-5), name
+
+
+def test_the_measured_travel_time_replaces_a_shear_modulus_that_is_known_badly():
+    """e = −1 is the string's inertia ρ I L, which has no G in it; e = 0 is its impedance."""
+    assert known_pipe_of(string_file(MEASURED), 1.0).exponent == pytest.approx(-1.0, abs=0.05)
+    sharp = string_file({**MEASURED, "shear_modulus": 0.001, "length": 0.1})
+    assert known_pipe_of(sharp, 1.0).exponent == pytest.approx(0.0, abs=0.05)
+
+
+def test_the_exponent_has_the_least_uncertainty():
+    known = known_pipe_of(string_file({**MEASURED, "shear_modulus": 0.01}), 1.0)
+
+    def variance(e):
+        return sum(((one.of_impedance - e * one.of_delay) * one.rel_sd) ** 2 for one in known.inputs)
+
+    assert variance(known.exponent) <= min(variance(known.exponent + step) for step in (-0.01, 0.01))
+
+
+@pytest.mark.parametrize("exponent", [-1.0, -0.4, 0.0, 1.0])
+def test_the_view_is_that_of_the_string(exponent):
+    m = np.array([1500.0, 12.0, 588.0, 0.9, 5.0, 4.0, 0.36, 0.5])
+    inertia, stiffness = 0.36 * 588.0, 0.81 * 588.0 * (1.0 - 0.24)
+    z = np.sqrt(inertia * stiffness) * np.sqrt(inertia / stiffness) ** -exponent
+    view = string_view(exponent)
+    assert view.of(m) == pytest.approx(z, rel=1e-12)
+    seen = m.copy()
+    seen[view.index] = z
+    load, slope = view.back(seen)
+    assert load == pytest.approx(588.0, rel=1e-12)
+    for index in range(len(m)):
+        step = np.zeros(len(m))
+        step[index] = 1e-6 * seen[index]
+        by = (view.back(seen + step)[0] - view.back(seen - step)[0]) / (2.0 * step[index])
+        assert slope[index] == pytest.approx(by, rel=1e-5, abs=1e-9)
+
+
+def measured(value, share=0.005):
+    return MeasuredString(Estimate(value, value * (1.0 - share), value * (1.0 + share)), value, 0.7, None)
+
+
+def known(half):
+    return KnownPipe(290.0, 0.72, (PipeInput("density of the pipe", 1.0 - half, 1.0 + half, 0.5, 0.5),))
+
+
+def test_a_pipe_that_is_known_worse_than_the_scale_is_refused_with_its_worst_line():
+    usual = known_pipe_of(string_file({}), 1.0)
+    fit = calibrate_known_pipe(usual, measured(usual.value))
+    assert "wider than the torque scale as stated so far (±3.9%)" in fit.refusal
+    assert "wear of the pipe" in fit.refusal
+    assert calibrate_known_pipe(usual, measured(usual.value), scale_rel_sd=0.1).refusal == ""
+
+
+def test_what_no_torque_scale_can_be_is_refused():
+    pipe = known(0.01)
+    assert calibrate_known_pipe(pipe, measured(pipe.value)).refusal == ""
+    assert "no error of a torque scale" in calibrate_known_pipe(pipe, measured(1.4 * pipe.value)).refusal
+
+
+@pytest.mark.parametrize("section", [{"length_m": None, "stiffness_nm_rad": 414.0}, None])
+def test_a_string_of_several_sections_or_without_a_length_is_no_known_pipe(section):
+    file = string_file({})
+    first = file.sections[0]
+    sections = (first, first) if section is None else (first.model_copy(update=section),)
+    with pytest.raises(ValueError, match="one section with length_m"):
+        known_pipe_of(file.model_copy(update={"sections": sections}), 1.0)
+
+
+@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(60), marks=pytest.mark.heavy)], ids=["1", "60"])
+def test_the_interval_covers_strings_whose_true_sizes_are_drawn_from_the_tolerances(seeds):
+    cases = [study_case(seed) for seed in seeds]
+    answered = [case for case in cases if not isinstance(case, str)]
+    assert len(answered) >= 0.95 * len(cases)
+    assert np.mean([covers for _, _, covers in answered]) >= 0.93
