@@ -359,9 +359,10 @@ def _reference_data(document: Part) -> Iterator[ReportSection]:
              ("standard uncertainty of its scale", f"{100.0 * reference['rel_sd']:.3g} %")]
     blocks: list[Block] = [Pairs((*facts, *_alignment(document)))]
     if document["series"] is not None:
-        blocks.append(Picture(partial(draw_reference, document=document), 5.6,
-                              "Both torques over the time of the log, after the same average; the residuals over time;"
-                              " and the residuals over torque, where a curve would be an error of linearity."))
+        blocks.append(Picture(partial(draw_reference, document=document), 4.2,
+                              "Both torques over the time of the log, after the same average, and the residuals."))
+        blocks.append(Picture(partial(draw_linearity, document=document), 1.8,
+                              "The residuals over torque. A curve would be an error of linearity."))
     yield ReportSection("Reference and reported torque", tuple(blocks))
 
 
@@ -405,7 +406,8 @@ def draw_pairs(figure: FigureBase, document: Part) -> None:
         if not chosen.any():
             continue
         top.plot(x[chosen], y[chosen], marker, color=DARK, ms=5, label=name)
-        below.errorbar(x[chosen], left[chosen], 1.96 * spread[chosen], fmt=marker, color=DARK, ms=4, capsize=3, lw=1.0)
+        beside = x[chosen] + (0.1 if marker == "^" else -0.1) * margin      # so that error bars stand apart
+        below.errorbar(beside, left[chosen], 1.96 * spread[chosen], fmt=marker, color=DARK, ms=4, capsize=3, lw=1.0)
     top.set_ylabel("reference torque, N·m")
     top.legend(fontsize="small", loc="best")
     _residual_axes(below, "reported torque, N·m")
@@ -413,10 +415,10 @@ def draw_pairs(figure: FigureBase, document: Part) -> None:
 
 
 def draw_reference(figure: FigureBase, document: Part) -> None:
-    """Above: both torques over time. Middle: residuals over time. Below: residuals over reported torque."""
+    """Above: both torques over time. Below: residuals over time."""
     series = {name: np.array(values) for name, values in document["series"].items()}
     line = document["line"]
-    top, middle, below = figure.subplots(3, 1, height_ratios=(3, 2, 2))
+    top, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     top.plot(series["time_s"], series["reference_nm"], "-", color=DARK, lw=1.6, label="reference")
     top.plot(series["time_s"], line["slope"] * series["reported_nm"] + line["intercept_nm"], "-", color=OURS, lw=1.0,
              label="κ · reported + a")
@@ -424,10 +426,16 @@ def draw_reference(figure: FigureBase, document: Part) -> None:
     top.set_ylabel("torque, N·m")
     top.legend(fontsize="small", loc="best")
     top.grid(alpha=0.3)
-    middle.plot(series["time_s"], series["residual_nm"], "-", color=OURS, lw=0.8)
-    _residual_axes(middle, "time of the log, s")
-    below.plot(series["reported_nm"], series["residual_nm"], ".", color=OURS, ms=3)
-    _residual_axes(below, "reported torque, N·m")
+    below.plot(series["time_s"], series["residual_nm"], "-", color=OURS, lw=0.8)
+    _residual_axes(below, "time of the log, s")
+
+
+def draw_linearity(figure: FigureBase, document: Part) -> None:
+    """Residuals over reported torque."""
+    series = document["series"]
+    axes = figure.subplots()
+    axes.plot(series["reported_nm"], series["residual_nm"], ".", color=OURS, ms=3)
+    _residual_axes(axes, "reported torque, N·m")
 
 
 def _residual_axes(axes: Axes, across: str) -> None:

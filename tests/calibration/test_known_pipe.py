@@ -92,9 +92,9 @@ def test_a_string_of_several_sections_or_without_a_length_is_no_known_pipe(secti
         known_pipe_of(file.model_copy(update={"sections": sections}), 1.0)
 
 
-@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(60), marks=pytest.mark.heavy)], ids=["1", "60"])
-def test_the_interval_covers_strings_whose_true_sizes_are_drawn_from_the_tolerances(seeds):
-    cases = [study_case(seed) for seed in seeds]
+@pytest.mark.heavy
+def test_the_interval_covers_strings_whose_true_sizes_are_drawn_from_the_tolerances():
+    cases = [study_case(seed) for seed in range(40)]
     answered = [case for case in cases if not isinstance(case, str)]
     assert len(answered) >= 0.95 * len(cases)
     assert np.mean([covers for _, _, covers in answered]) >= 0.93
