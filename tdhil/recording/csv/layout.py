@@ -365,9 +365,12 @@ def _unit(choice: ColumnChoice, name: str, stated: str, where: str, flag: str) -
             return choice.unit, [f"{quantity} was read in {choice.unit.symbol} as told; the file says {other.symbol}"]
         return choice.unit, []
     tell = f"Give it behind a colon: {flag} {quantity}='{shown(name)}:{SI[quantity]}'"
-    if stated and below is None and not is_missing(stated):
+    odd = stated if below is None and not is_missing(stated) else ""
+    if flag == REFERENCE_FLAG and named is None and below is None:
+        odd = odd or split_name(name)[1]      # a calibration assumes no unit where the file states another
+    if odd:
         raise CsvMisnamed(
-            f"{shown(stated)!r} is no known unit of {quantity}; there are {', '.join(known_units(quantity))}",
+            f"{shown(odd)!r} is no known unit of {quantity}; there are {', '.join(known_units(quantity))}",
             where=where, next_step=tell,
         )
     if below is not None and named is not None and below != named:
