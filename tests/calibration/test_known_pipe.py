@@ -1,5 +1,7 @@
 """A drill string of known sizes: sensitivities, exponent, coverage, and what is said of a pipe known badly."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,8 +9,12 @@ from tdhil.calibration import KnownPipe, PipeInput, calibrate_known_pipe
 from tdhil.estimation import MeasuredString
 from tdhil.estimation.frequency_domain import string_view
 from tdhil.estimation.result import Estimate
-from tdhil.session import known_pipe_of
+from tdhil.report import PlainConsole, print_factor, write_factor_report
+from tdhil.session import find_by_known_pipe, known_pipe_of
+from tests.calibration.bodies import recording
+from tests.calibration.bodies import run as body_run
 from tests.calibration.pipe_lines import MEASURED, string_file, study_case
+from tests.estimation.compliant_bench import Noise, Pipe, run
 
 
 def test_the_sensitivities_are_those_of_the_formulas():
@@ -90,6 +96,41 @@ def test_a_string_of_several_sections_or_without_a_length_is_no_known_pipe(secti
     sections = (first, first) if section is None else (first.model_copy(update=section),)
     with pytest.raises(ValueError, match="one section with length_m"):
         known_pipe_of(file.model_copy(update={"sections": sections}), 1.0)
+
+
+@pytest.mark.heavy
+def test_a_recording_gives_the_factor_and_the_usual_tolerances_do_not(tmp_path):
+    """A string in the time domain (`tests.estimation.compliant_bench`), its torque reported 4 % too large."""
+    recorded = run(Pipe(), [3], noise=Noise(load_nm=55.0, sensor_rad_s=0.025))[0]
+    reported = replace(recorded, torque_nm=1.04 * recorded.torque_nm, torque_scale_rel_sd=0.02)
+    record = body_run(tmp_path, "run.mcap", 0.0, reported).record
+    length = Pipe().delay * np.sqrt(79.3e9 / 7850.0)
+    polar = Pipe().inertia / 7850.0 / length
+    inner = (0.127**4 - 32.0 * polar / np.pi) ** 0.25
+    text = (f"sections: [{{length_m: {length:.3f}, outer_diameter_m: 0.127, inner_diameter_m: {inner:.8f}}}]\n"
+            "bottom: {inertia_kg_m2: 374}\n")
+    (tmp_path / "usual.yaml").write_text(text)
+    (tmp_path / "measured.yaml").write_text(
+        text + "tolerance: {length: 0.005, outer_diameter: 0.002, inner_diameter: 0.002}\n")
+    found = find_by_known_pipe(record, tmp_path / "measured.yaml", 0.95)
+    factor = found["calibration_factor"]
+    assert factor["low"] <= 1.0 / 1.04 <= factor["high"]
+    assert factor["value"] == pytest.approx(1.0 / 1.04, rel=0.01)
+    usual = find_by_known_pipe(record, tmp_path / "usual.yaml", 0.95)
+    assert usual["calibration_factor"] is None and usual["measured_factor"] is not None
+    assert "wider than" in usual["reason"]
+    for document in (found, usual):
+        print_factor(document, PlainConsole())
+        write_factor_report(document, tmp_path / f"{document['verdict']}.html")
+
+
+def test_a_rigid_shaft_holds_no_string(tmp_path):
+    rigid = recording(0.0, 1)
+    (tmp_path / "string.yaml").write_text(
+        "sections: [{length_m: 2300, outer_diameter_m: 0.127, inner_diameter_m: 0.1086}]\n"
+        "bottom: {inertia_kg_m2: 374}\n")
+    found = find_by_known_pipe(body_run(tmp_path, "run.mcap", 0.0, rigid).record, tmp_path / "string.yaml", 0.95)
+    assert found["calibration_factor"] is None and found["advice"] and found["verdict"] == "not_identifiable"
 
 
 @pytest.mark.heavy
