@@ -101,7 +101,7 @@ def test_a_string_of_several_sections_or_without_a_length_is_no_known_pipe(secti
 @pytest.mark.heavy
 def test_a_recording_gives_the_factor_and_the_usual_tolerances_do_not(tmp_path):
     """A string in the time domain (`tests.estimation.compliant_bench`), its torque reported 4 % too large."""
-    recorded = run(Pipe(), [3], noise=Noise(load_nm=55.0, sensor_rad_s=0.025))[0]
+    recorded = run(Pipe(), [3], noise=Noise(5.0, 0.005, 2.0, 0.001, 1.0))[0]
     reported = replace(recorded, torque_nm=1.04 * recorded.torque_nm, torque_scale_rel_sd=0.02)
     record = body_run(tmp_path, "run.mcap", 0.0, reported).record
     length = Pipe().delay * np.sqrt(79.3e9 / 7850.0)
