@@ -15,7 +15,8 @@ Expanded in cumulants, that difference is a delay, a variance v and a third mome
 
 **Errors in both.** After removal of what a, x′, x″ and x‴ explain, κ is the slope of Deming's line. The ratio of both
 noises is estimated from the samples; since low-pass filters may hide it, the regressions that put all noise into one
-signal bound κ, and the distance to them is a rectangular error in the budget.
+signal bound κ, and the distance to them is a rectangular error in the budget. Noise of R is in its derivatives as well,
+which matters where they are nearly proportional to it: one of the bounds takes it off the normal equations.
 
 **Interval.** Residuals are correlated. The variance of κ is Σ_k c_x(k) γ(k)/c_x(0)², with the autocorrelation c_x of
 the torque and the autocovariance γ of the residuals: that of least squares with correlated errors. It is as large as
@@ -46,6 +47,8 @@ LEAST_SWING_COUNTS = 20.0
 """Smallest swing of either torque, in its own noise of the average or its own count."""
 ASSUMED_REFERENCE_REL_SD = 0.003
 """Standard uncertainty of a sensor's scale, if it is not stated: accuracy class 0.5, rectangular (0.5 %/√3)."""
+LEAST_OWN_SHARE = 0.1
+"""Smallest share of the torque's variance that its derivatives do not explain; a tone has none, steps nearly all."""
 _COARSE_S = 0.25             # width of the average for the correlation
 _PER_WIDTH = 2.0             # grid points for one width of the average
 _REACH = 4.0                 # of a Gaussian average, in its widths
@@ -53,6 +56,7 @@ _NARROWEST_S = 0.1
 _WIDER_THAN_FILTERS = 2.0    # width of the average over √|v|
 _WIDEST_SHARE = 0.02         # width of the average, of the overlap
 _ROUNDS, _CLOSE = 12, 1e-4
+_CLEARLY = 0.02              # of the correlation
 _TERMS = 4                   # beside κ: offset, and three derivatives
 _LEAST_EFFECTIVE = 3.0 * _TERMS
 _ALIKE = (0.01, 100.0)       # bounds of the estimated ratio of the noise variances
@@ -184,7 +188,7 @@ def _grid(start_s: float, end_s: float, step_s: float) -> FloatArray:
 
 
 def _coarse_offset(drive: TorqueRecord, sensor: TorqueRecord) -> tuple[float, float]:
-    """Return the time offset with the largest correlation (by its magnitude), and that correlation.
+    """Return the time offset with the largest correlation, or with a clearly larger negative one, and that correlation.
 
     Of every offset at which at least half of the shorter record overlaps, and `LEAST_OVERLAP_S`.
     """
@@ -208,7 +212,9 @@ def _coarse_offset(drive: TorqueRecord, sensor: TorqueRecord) -> tuple[float, fl
     size = np.sqrt(np.maximum(xx, 0.0) * np.maximum(yy, 0.0))
     floor = 1e-9 * math.sqrt(float(np.sum(x * x)) * float(np.sum(y * y)))
     r = np.where(enough & (size > floor), xy / np.maximum(size, max(floor, 1e-300)), 0.0)
-    best = int(np.argmax(np.abs(r)))
+    best, opposite = int(np.argmax(r)), int(np.argmin(r))
+    if -r[opposite] > r[best] + _CLEARLY:       # a tone has both signs, half a period apart
+        best = opposite
     lag = best - (len(x) - 1)
     return float(sensor.time_s[0] - drive.time_s[0] + lag * step), float(r[best])
 
@@ -233,7 +239,9 @@ def _slowest(one: TorqueRecord) -> float:
 class _Fitted:
     slope: float
     low: float                  # all noise in the sensor
-    high: float                 # all noise in the drive's report
+    high: float                 # all noise in the drive's report, its derivatives taken as exact
+    reported: float             # all noise in the drive's report and its derivatives
+    own_share: float            # of the torque's variance, what its derivatives do not explain
     sd: float
     effective: float
     offset: float
@@ -342,8 +350,32 @@ def _line(
     terms = np.linalg.lstsq(others, y - slope * x, rcond=None)[0]
     noise = math.sqrt(float(left @ left) / len(left) * grown * len(left) / effective)
     offset_sd = math.hypot(noise / math.sqrt(len(left)), sd * abs(float(np.mean(x))))
-    return _Fitted(slope, low, high, sd, effective, float(terms[0]), offset_sd, delay_s, width_s,
+    rest = math.sqrt(float(left @ left) / (len(left) - _TERMS - 1.0)) / slope
+    reported = _all_noise_reported(x, y, others, rest, width_s)
+    own_share = uu / max(float(np.sum((x - np.mean(x)) ** 2)), 1e-300)
+    return _Fitted(slope, low, high, reported, own_share, sd, effective, float(terms[0]), offset_sd, delay_s, width_s,
                    2.0 * float(terms[2]) / slope, points, x, y, left)
+
+
+def _all_noise_reported(x: FloatArray, y: FloatArray, others: FloatArray, fit_noise: float, width_s: float) -> float:
+    """κ if all residuals were white noise of the reported torque, which is in its derivatives as well; inf if none is.
+
+    Least squares with noisy regressors: the noise's expected part is taken off the normal equations. The derivatives a
+    and b of white noise of density S behind the average have the covariance ±S Γ((a + b + 1)/2)/(2π σ^(a + b + 1)).
+    """
+    orders = (0, None, None, 2, None)      # the odd derivatives have another phase and take no part in κ
+    noise = np.zeros((len(orders), len(orders)))
+    for i, a in enumerate(orders):
+        for j, b in enumerate(orders):
+            if a is not None and b is not None and (a + b) % 2 == 0:
+                size = math.gamma(0.5 * (a + b + 1)) / (math.sqrt(math.pi) * width_s ** (a + b))
+                noise[i, j] = (-1.0) ** ((a - b) // 2) * size      # as a multiple of the variance of the average
+    design = np.column_stack([x, others])
+    scale = 1.0 / np.linalg.norm(design, axis=0)
+    normal = (design.T @ design - len(x) * fit_noise**2 * noise) * np.outer(scale, scale)
+    if float(np.linalg.eigvalsh(normal)[0]) <= 0.0:
+        return math.inf
+    return float((np.linalg.solve(normal, (design.T @ y) * scale) * scale)[0])
 
 
 def _long_run(u: FloatArray, left: FloatArray, place: FloatArray) -> float:
@@ -377,12 +409,16 @@ def _judged(
 ) -> ReferenceFit:
     """The budget, the interval, and what is refused."""
     k = fit.slope
+    if fit.own_share < LEAST_OWN_SHARE or not math.isfinite(fit.reported):
+        return ReferenceFit("the torque holds too few frequencies: its scale and the low-pass filters look alike",
+                            "change the torque in steps, with some seconds of steady torque between them",
+                            correlation=correlation, time_offset_s=fit.delay_s)
     wide = _fitted(drive, sensor, fit.delay_s, 2.0 * fit.width_s)
     of_band = 0.0
     if wide is not None:
         own = max(wide.sd**2 - fit.sd**2, 0.0)
         of_band = math.sqrt(max((wide.slope - k) ** 2 - own, 0.0))
-    of_noise = max(fit.high - k, k - fit.low, 0.0) / math.sqrt(3.0)
+    of_noise = max(fit.high - k, k - fit.low, abs(fit.reported - fit.low), 0.0) / math.sqrt(3.0)
     dof = fit.effective - _TERMS - 1.0
     budget = (
         FactorLine("scatter of both torques", "Student", dof, fit.sd / k),

@@ -11,7 +11,7 @@ from tdhil.calibration import TorqueRecord, calibrate_reference
 from tdhil.cli.main import main
 from tdhil.errors import CsvUnusable
 from tdhil.recording import REFERENCE_FLAG, TIME_AND_TORQUE, parse_columns, read_reference
-from tests.calibration.reference_records import SensorBench, random_bench, records
+from tests.calibration.reference_records import FINE_S, SensorBench, lagging, random_bench, records
 
 
 def found_of(bench, seed=1, **more):
@@ -90,6 +90,17 @@ def test_what_cannot_be_calibrated_is_refused_by_name():
         assert told in found.refusal and found.advice, found.refusal
     little = found_of(SensorBench(swing_nm=8.0, report_noise_nm=4.0, sensor_noise_nm=4.0, slow_noise_nm=1.0))
     assert "too little" in little.refusal or "too low" in little.refusal
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.5])
+def test_a_tone_alone_tells_no_scale(lag_s):
+    """A sensor with a filter of 0.5 s shows 95 % of a tone of 0.1 Hz, as one with a wrong scale does."""
+    rng, time = np.random.default_rng(1), np.arange(0.0, 200.0, FINE_S)
+    torque = 100.0 + 60.0 * np.sin(0.2 * np.pi * time)
+    some = slice(10_000, None, 5)
+    drive, sensor = (TorqueRecord(time[some], one[some] + rng.standard_normal(len(time[some])))
+                     for one in (torque, lagging(torque, lag_s)))
+    assert "too few frequencies" in calibrate_reference(drive, sensor).refusal
 
 
 def test_a_value_that_is_no_number_or_a_time_that_goes_back_is_an_error():
