@@ -409,7 +409,11 @@ def _judged(
 ) -> ReferenceFit:
     """The budget, the interval, and what is refused."""
     k = fit.slope
-    if fit.own_share < LEAST_OWN_SHARE or not math.isfinite(fit.reported):
+    if not math.isfinite(fit.reported):
+        return ReferenceFit("the torque swings too little for its noise: its scale and the low-pass filters look alike",
+                            "change the torque by more, or record for longer", correlation=correlation,
+                            time_offset_s=fit.delay_s)
+    if fit.own_share < LEAST_OWN_SHARE:
         return ReferenceFit("the torque holds too few frequencies: its scale and the low-pass filters look alike",
                             "change the torque in steps, with some seconds of steady torque between them",
                             correlation=correlation, time_offset_s=fit.delay_s)

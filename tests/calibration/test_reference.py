@@ -65,9 +65,11 @@ def test_the_interval_covers():
         rng = np.random.default_rng([28, seed])
         bench = random_bench(rng)
         found = calibrate_reference(*records(bench, rng), reference_rel_sd=0.0)
-        assert found.refusal == "", seed
+        if found.refusal:
+            assert "too little" in found.refusal, seed
+            continue
         covered.append(found.factor.low <= bench.factor <= found.factor.high)
-    assert np.mean(covered) >= 0.93
+    assert len(covered) >= 190 and np.mean(covered) >= 0.93
 
 
 def shortened(record, keep):
