@@ -315,7 +315,7 @@ class UnexcitedHarmonic:
 
 @dataclass(frozen=True)
 class Distortion:
-    """Test for nonlinear distortion. ``p_value``: how often a linear shaft would show as much; ``detected``: below 1 %.
+    """Test for nonlinear distortion. ``p_value``: how often a linear shaft would show as much; ``detected``: below 0.3 %.
 
     ``by_harmonics``, ``by_speed``: p-values of its two parts, None where that part was not possible; ``odd_share``: of
     the distortion at unexcited harmonics, by power, None without any.
@@ -336,7 +336,7 @@ class CurvePoint:
     hertz: float
     magnitude: Estimate
     phase_rad: Estimate
-    apparent_inertia_kg_m2: float
+    apparent_inertia_kg_m2: Estimate
 
 
 @dataclass(frozen=True)

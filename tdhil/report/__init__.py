@@ -15,6 +15,10 @@ if TYPE_CHECKING:
         evaluation_document as evaluation_document, evaluation_report as evaluation_report,
         print_evaluation as print_evaluation, write_evaluation_report as write_evaluation_report,
     )
+    from tdhil.report.frequency_response import (
+        draw_bode as draw_bode, draw_responses as draw_responses, print_responses as print_responses,
+        response_sentences as response_sentences, save_responses as save_responses,
+    )
     from tdhil.report.html import (
         ShownPicture as ShownPicture, check_report_path as check_report_path, pictures_in as pictures_in,
         write_report as write_report,

@@ -101,14 +101,14 @@ class _StraightLine:
 # ---------------------------------------------------------------------------------------------------------------------
 # From lines to the response
 
-DETECTED_P = 0.01
-"""p-value of the test for distortion below which it counts as detected. 1 % of linear shafts are below it."""
+DETECTED_P = 0.003
+"""p-value of the test for distortion below which it counts as detected. 0.3 % of linear shafts are below it."""
 
 _MOST_HARMONICS = 12     # unexcited ones that are looked at
 _BEYOND = 3              # times the highest excited harmonic: distortion of third order ends there
 _SAMPLES_A_CYCLE = 8     # at least, of an unexcited harmonic
 _NEIGHBOURS = 4          # unexcited harmonics that stand for an excited line
-_CURVE_POINTS = 61
+_CURVE_POINTS = 41
 _CURVE_SPAN = 1.25       # beyond the lowest and the highest line
 
 
@@ -237,9 +237,11 @@ def _drawn(curve: ResponseCurve, hertz: FloatArray) -> tuple[CurvePoint, ...]:
     points = []
     for one, z, magnitude, turn in zip(over.tolist(), *(part.tolist() for part in curve.at(over)), strict=True):
         size, phase = 1.0 / abs(z), -math.atan2(z.imag, z.real)
-        high = size * (1.0 + magnitude)
-        points.append(CurvePoint(one, Estimate(size, size / (1.0 + magnitude), high),
-                                 Estimate(phase, phase - turn, phase + turn), z.imag / (2.0 * math.pi * one)))
+        inertia, half = z.imag / (2.0 * math.pi * one), math.hypot(magnitude * z.imag, turn * z.real) / (
+            2.0 * math.pi * one)
+        points.append(CurvePoint(
+            one, Estimate(size, size / (1.0 + magnitude), size * (1.0 + magnitude)),
+            Estimate(phase, phase - turn, phase + turn), Estimate(inertia, inertia - half, inertia + half)))
     return tuple(points)
 
 
