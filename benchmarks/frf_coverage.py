@@ -179,7 +179,7 @@ def bound(count: int, of: int, upper: bool) -> float:
 
 def study(kind: str, seeds: range) -> bool:
     lines: list[tuple[bool, bool]] = []
-    flagged, none, begun = 0, [], time.monotonic()
+    flagged, none, wrong, begun = 0, [], [], time.monotonic()
     for seed in seeds:
         recording, truth = CASES[kind](seed)
         identified = identify(recording)
@@ -187,9 +187,12 @@ def study(kind: str, seeds: range) -> bool:
         if found is None:
             none.append(f"{seed}: {identified.reason}")
             continue
-        flagged += found.distortion.detected
+        test = found.distortion
+        flagged += test.detected
         if kind in LINEAR:
             lines += covered(found, truth)
+        if test.detected is (kind in LINEAR):
+            wrong.append(f"{seed}: harmonics {test.by_harmonics}, mean speeds {test.by_speed}")
     count = len(seeds) - len(none)
     said, good = f"{kind:>9}: {count} plants", not none
     if kind in LINEAR:
@@ -201,7 +204,8 @@ def study(kind: str, seeds: range) -> bool:
     elif count:
         good &= bound(flagged, count, True) >= LEAST_FLAGGED
     print(f"{said}; distortion flagged in {flagged} ({time.monotonic() - begun:.0f} s)"
-          + "".join(f"\n    without a response: {one}" for one in none), flush=True)
+          + "".join(f"\n    without a response: {one}" for one in none)
+          + "".join(f"\n    flagged wrongly, p-values of {one}" for one in wrong), flush=True)
     return good
 
 

@@ -132,9 +132,10 @@ def _reason(recorded: RunRecord, result: Result) -> str:
 
 
 def _write_picture(responses: Sequence[dict[str, Any]], path: Path) -> None:
-    from tdhil.report import save_responses
+    from tdhil.report import SIMULATED, save_responses
 
-    parts = [(Path(one["log"]).name, one["frequency_response"]) for one in responses if one["frequency_response"]]
+    parts = [(Path(one["log"]).name + (f" · {SIMULATED}" if one["simulated"] else ""), one["frequency_response"])
+             for one in responses if one["frequency_response"]]
     if not parts:
         return
     try:

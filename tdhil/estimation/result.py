@@ -303,6 +303,7 @@ class ResponseLine:
 class UnexcitedHarmonic:
     """A harmonic that was not excited: the amplitude of T − Z W there, N·m, and the part of it that is noise.
 
+    What an error of Z could explain is left out of the amplitude.
     ``p_value``: how often noise alone would be as large.
     """
 
@@ -315,8 +316,9 @@ class UnexcitedHarmonic:
 
 @dataclass(frozen=True)
 class Distortion:
-    """Test for nonlinear distortion. ``p_value``: how often a linear shaft would show as much; ``detected``: below 0.3 %.
+    """Test for nonlinear distortion, ``detected`` at a p-value below 0.3 %.
 
+    ``p_value``: how often a linear shaft would show as much.
     ``by_harmonics``, ``by_speed``: p-values of its two parts, None where that part was not possible; ``odd_share``: of
     the distortion at unexcited harmonics, by power, None without any.
     """

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
         print_evaluation as print_evaluation, write_evaluation_report as write_evaluation_report,
     )
     from tdhil.report.frequency_response import (
-        draw_bode as draw_bode, draw_responses as draw_responses, print_responses as print_responses,
-        response_sentences as response_sentences, save_responses as save_responses,
+        draw_bode as draw_bode, draw_faults as draw_faults, draw_responses as draw_responses,
+        print_responses as print_responses, response_sentences as response_sentences, save_responses as save_responses,
     )
     from tdhil.report.html import (
         ShownPicture as ShownPicture, check_report_path as check_report_path, pictures_in as pictures_in,

@@ -71,7 +71,7 @@ def _causes(distortion: Part) -> list[str]:
         else:
             said.append("Odd and even harmonics are present: look for backlash, stick-slip, or a torque limit.")
     if by_speed is not None and by_speed < 0.01:
-        said.append("The response differs between the mean speeds: friction is no straight line over speed there.")
+        said.append("The response differs between the mean speeds: friction, or a limit, changes with the speed.")
     return said
 
 
@@ -104,6 +104,15 @@ def save_responses(parts: Sequence[tuple[str, Part]], path: Path) -> None:
         draw_responses(figure, parts)
         metadata = {"Date": None, "Creator": None} if path.suffix.lower() == ".svg" else None
         figure.savefig(path, dpi=_PNG_DPI, metadata=metadata)
+
+
+def draw_faults(figure: FigureBase, found: Part) -> None:
+    """Draw the two panels in which faults show: |ω/T| with noise and distortion, and the apparent inertia."""
+    axes = figure.subplots(2, 1, sharex=True)
+    _magnitude(axes[0], found, "each line by itself", DARK)
+    _inertia(axes[1], found, DARK)
+    _finish(axes)
+    axes[0].legend(fontsize="small", loc="best", ncols=2)
 
 
 def draw_responses(figure: FigureBase, parts: Sequence[tuple[str, Part]]) -> None:

@@ -9,8 +9,10 @@ import control
 import numpy as np
 import pytest
 
-from tdhil.estimation import Options, identify, response_columns, unit_of
-from tdhil.estimation.frequency_domain.frequency_response import _pooled
+from tdhil.estimation import Options, identify, response_columns, unit_of, usable_samples
+from tdhil.estimation.case import Case
+from tdhil.estimation.frequency_domain.frequency_response import _pooled, measure_response
+from tdhil.estimation.periodic import measured
 from tdhil.estimation.spectrum import SpectralLine
 from tests.estimation.analytic import closed_form
 
@@ -46,20 +48,22 @@ def linear():
 def test_the_intervals_contain_the_exact_response_of_python_control(linear):
     exact = control.frequency_response(plant(), 2.0 * np.pi * linear.hertz).frdata[0, 0]
     for line, g in zip(linear.lines, exact, strict=True):
-        assert line.magnitude.low < abs(g) < line.magnitude.high
-        assert line.phase_rad.low < np.angle(g) < line.phase_rad.high
-        assert line.apparent_inertia_kg_m2.low < (1.0 / g).imag / (2 * math.pi * line.hertz) < (
-            line.apparent_inertia_kg_m2.high)
+        # twice the half-width of 95 %: one of twelve leaves that in one case of a thousand
+        inertia = (1.0 / g).imag / (2.0 * math.pi * line.hertz)
+        for one, truth in ((line.magnitude, abs(g)), (line.phase_rad, np.angle(g)),
+                           (line.apparent_inertia_kg_m2, inertia)):
+            assert abs(truth - one.value) < 2.0 * (one.high - one.value)
         assert 0.99 < line.coherence <= 1.0
         assert line.magnitude.high / line.magnitude.low < 1.05
 
 
 def test_the_intervals_cover_as_often_as_stated():
     exact = control.frequency_response(plant(), 2.0 * np.pi * np.array([0.1, 0.2, 0.3, 0.4])).frdata[0, 0]
-    # the rigid model is not needed here: a refusal before it leaves the lines as they are
     missed = lines = 0
     for seed in range(40):
-        found = respond(closed_form(noise=3.0, seed=seed, periods=5, offsets=(4.0,)))
+        recording = closed_form(noise=3.0, seed=seed, periods=5, offsets=(4.0,))
+        case = measured(Case(recording, Options(), samples=usable_samples(recording)), recording.excitation)
+        found = measure_response(case, None, (), "none")       # without the fit of a model, which costs most
         for line, g in zip(found.lines, exact, strict=True):
             lines += 1
             missed += not line.magnitude.low < abs(g) < line.magnitude.high
@@ -91,7 +95,7 @@ def test_xarray_has_the_lines_with_their_units(linear):
 def test_the_model_is_drawn_through_the_lines_with_its_band(linear):
     assert linear.model == "rigid+lags"
     hertz = [point.hertz for point in linear.curve]
-    assert hertz == sorted(hertz) and hertz[0] < 0.1 < 0.4 < hertz[-1]
+    assert hertz == sorted(hertz) and hertz[0] < 0.1 and hertz[-1] > 0.4
     exact = control.frequency_response(plant(), 2.0 * np.pi * np.array(hertz)).frdata[0, 0]
     inside = [p.magnitude.low <= abs(g) <= p.magnitude.high and p.phase_rad.low <= np.angle(g) <= p.phase_rad.high
               for p, g in zip(linear.curve, exact, strict=True)]
@@ -128,7 +132,7 @@ def test_a_response_that_differs_between_mean_speeds_is_distortion():
     speeds = [plain.speed_rad_s[(plain.time_s >= one.start_s) & (plain.time_s < one.end_s)] - one.offset_rad_s
               for one in plain.excitation.segments]
     found = respond(with_torque(plain, lambda _, number: 1.5 * number * speeds[number])).distortion
-    assert found.detected and found.by_speed < 0.005
+    assert found.detected and found.by_speed < 0.0015
 
 
 def test_a_constant_friction_and_another_torque_scale_are_no_distortion(linear):

@@ -104,11 +104,13 @@ class _StraightLine:
 DETECTED_P = 0.003
 """p-value of the test for distortion below which it counts as detected. 0.3 % of linear shafts are below it."""
 
-_MOST_HARMONICS = 12     # unexcited ones that are looked at
+_MOST_HARMONICS = 12     # unexcited ones that are tested
 _BEYOND = 3              # times the highest excited harmonic: distortion of third order ends there
 _SAMPLES_A_CYCLE = 8     # at least, of an unexcited harmonic
 _NEIGHBOURS = 4          # unexcited harmonics that stand for an excited line
-_CURVE_POINTS = 41
+_CURVE_POINTS = 31       # at least; more where the curve turns
+_CURVE_TURN = 0.35       # rad, or of ln |Z|, between two points
+_CURVE_PASSES = 3        # in which intervals are halved
 _CURVE_SPAN = 1.25       # beyond the lowest and the highest line
 
 
@@ -234,6 +236,10 @@ def _coherence(line: SpectralLine) -> float:
 
 def _drawn(curve: ResponseCurve, hertz: FloatArray) -> tuple[CurvePoint, ...]:
     over = np.geomspace(hertz.min() / _CURVE_SPAN, hertz.max() * _CURVE_SPAN, _CURVE_POINTS)
+    for _ in range(_CURVE_PASSES):
+        steps = np.abs(np.diff(np.log(curve.at(over)[0])))
+        wide = np.flatnonzero(steps > _CURVE_TURN)
+        over = np.insert(over, wide + 1, np.sqrt(over[wide] * over[wide + 1]))
     points = []
     for one, z, magnitude, turn in zip(over.tolist(), *(part.tolist() for part in curve.at(over)), strict=True):
         size, phase = 1.0 / abs(z), -math.atan2(z.imag, z.real)
@@ -287,15 +293,15 @@ def _unexcited(
         nu = float(sum(len(error) - 1 for _, error, _, _ in parts))
         scatter = sum(float(np.sum(np.abs(error - error.mean()) ** 2)) for _, error, _, _ in parts) / nu
         variance = scatter + float(np.mean([rounding for *_, rounding in parts]))
-        size = float(np.mean([abs(error.mean()) ** 2 for _, error, _, _ in parts]))
+        beyond = [max(abs(complex(error.mean())) - explained, 0.0) for _, error, explained, _ in parts]
+        size = float(np.mean(np.square(beyond)))
         noise = variance * float(np.mean([1.0 / len(error) for _, error, _, _ in parts]))
         if not variance > 0.0:
             continue
-        q = sum(len(error) * max(abs(complex(error.mean())) - explained, 0.0) ** 2
-                for _, error, explained, _ in parts) / variance
-        one = (2.0 * nu + len(parts) - 1.0) * math.log1p(q / nu)
-        statistic, freedom = statistic + one, freedom + 2.0 * len(parts)
-        p_value = float(chdtrc(2.0 * len(parts), one))
+        q = sum(len(error) * one**2 for (_, error, _, _), one in zip(parts, beyond, strict=True)) / variance
+        bartlett = (2.0 * nu + len(parts) - 1.0) * math.log1p(q / nu)
+        statistic, freedom = statistic + bartlett, freedom + 2.0 * len(parts)
+        p_value = float(chdtrc(2.0 * len(parts), bartlett))
         found.append(UnexcitedHarmonic(hertz, parts[0][0], math.sqrt(size), math.sqrt(noise), p_value))
     if not found:
         return (), None
