@@ -379,11 +379,19 @@ class FrequencyResponse:
         return self.response, 2.0 * np.pi * self.hertz
 
     def to_xarray(self) -> xarray.Dataset:
-        """Return the lines along ``hertz``, each quantity with its unit (extra `notebook`)."""
+        """Return the lines along ``hertz``, each quantity with its unit (extra `notebook`).
+
+        Raises ImportError without xarray, with the command that installs it.
+        """
+        try:
+            library = import_module("xarray")
+        except ImportError as error:
+            error.add_note("Install it with: pip install '.[notebook]'")
+            raise
         columns = response_columns(self)
         hertz = columns.pop("hertz")
         units = {name: unit_of(name) for name in columns}
-        found: xarray.Dataset = import_module("xarray").Dataset(
+        found: xarray.Dataset = library.Dataset(
             {name: ("hertz", np.array(values, dtype=np.float64), {"units": units[name]})
              for name, values in columns.items()},
             coords={"hertz": ("hertz", np.array(hertz), {"units": "Hz"})},

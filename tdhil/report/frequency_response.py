@@ -88,7 +88,7 @@ def _half_rel(line: Part) -> float | None:
 def draw_bode(figure: FigureBase, found: Part) -> None:
     """Draw |ω/T| with noise and distortion below it, and the phase."""
     top, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    _magnitude(top, found, "line", DARK)
+    _magnitude(top, found, "each line by itself", DARK)
     _phase(below, found, DARK)
     _finish((top, below))
     top.legend(fontsize="small", loc="best", ncols=2)

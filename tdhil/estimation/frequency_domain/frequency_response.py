@@ -40,7 +40,6 @@ from tdhil.estimation.result import (
     ResponseLine,
     UnexcitedHarmonic,
 )
-from tdhil.estimation.samples import usual_interval
 from tdhil.estimation.spectrum import ComplexArray, SpectralLine, torque_lines, unexcited_lines
 from tdhil.recording import FloatArray
 
@@ -275,9 +274,10 @@ def _unexcited(
     slope = case.constraint.slope if case.constraint is not None else 0.0
     rates = case.levels.warming.own or (0.0,) * len(case.fits)
     for stretch, fit, rate in zip(case.stretches, case.fits, rates, strict=True):
-        harmonics = _harmonics(stretch.segment.lines_hz, stretch.segment.period_s,
-                               usual_interval(case.samples.time_s))
-        if len(fit.speed) < 2 or not harmonics:
+        if len(fit.speed) < 2:
+            continue
+        harmonics = _harmonics(stretch.segment.lines_hz, stretch.segment.period_s, len(stretch.periods[0]))
+        if not harmonics:
             continue
         lines = unexcited_lines(stretch, fit, harmonics)
         z, magnitude, turn = curve.at(np.array(lines.lines_hz))
@@ -309,9 +309,10 @@ def _unexcited(
     return tuple(found), _combined([float(chdtrc(freedom, statistic)), least])
 
 
-def _harmonics(lines_hz: tuple[float, ...], period_s: float, interval_s: float) -> tuple[int, ...]:
+def _harmonics(lines_hz: tuple[float, ...], period_s: float, samples: int) -> tuple[int, ...]:
+    """Return harmonics of the period that are not excited; ``samples``: in a period."""
     excited = {round(hertz * period_s) for hertz in lines_hz}
-    highest = min(_BEYOND * max(excited), int(period_s / (_SAMPLES_A_CYCLE * interval_s)))
+    highest = min(_BEYOND * max(excited), samples // _SAMPLES_A_CYCLE)
     return tuple(h for h in range(1, highest + 1) if h not in excited)[:_MOST_HARMONICS]
 
 
