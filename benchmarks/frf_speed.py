@@ -11,9 +11,11 @@ identification.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")     # as `tdhil` has it
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.identify_speed import best_s, fit_s, synthesised

@@ -11,7 +11,7 @@ from tdhil.estimation.friction_levels import (
 from tdhil.estimation.identification import identify as identify
 from tdhil.estimation.paper_method import STEP_S as STEP_S, line_fit as line_fit, paper_estimate as paper_estimate
 from tdhil.estimation.result import (
-    BudgetLine as BudgetLine, Compliant as Compliant, Distortion as Distortion, Estimate as Estimate,
+    BudgetLine as BudgetLine, Compliant as Compliant, DistortionTest as DistortionTest, Estimate as Estimate,
     FrequencyResponse as FrequencyResponse, FrictionPoint as FrictionPoint,
     Identification as Identification, InertiaEstimate as InertiaEstimate, LineFit as LineFit, Options as Options,
     PaperEstimate as PaperEstimate, Refused as Refused, ResidualTest as ResidualTest, SecondOpinion as SecondOpinion,

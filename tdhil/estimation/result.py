@@ -315,8 +315,8 @@ class UnexcitedHarmonic:
 
 
 @dataclass(frozen=True)
-class Distortion:
-    """Test for nonlinear distortion, ``detected`` at a p-value below 0.3 %.
+class DistortionTest:
+    """Test for nonlinear distortion, ``detected`` at a p-value below 0.1 %.
 
     ``p_value``: how often a linear shaft would show as much.
     ``by_harmonics``, ``by_speed``: p-values of its two parts, None where that part was not possible; ``odd_share``: of
@@ -352,7 +352,7 @@ class FrequencyResponse:
     model: str
     lines: tuple[ResponseLine, ...]
     curve: tuple[CurvePoint, ...]
-    distortion: Distortion
+    distortion: DistortionTest
     mean_speeds_rad_s: tuple[float, ...]
     realisations: int = 1
 

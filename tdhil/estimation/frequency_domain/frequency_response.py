@@ -33,7 +33,7 @@ from tdhil.estimation.frequency_domain.filter_order import FittedModel, excess_r
 from tdhil.estimation.frequency_domain.inference import student_quantile
 from tdhil.estimation.result import (
     CurvePoint,
-    Distortion,
+    DistortionTest,
     Estimate,
     FrequencyResponse,
     ResidualTest,
@@ -100,8 +100,8 @@ class _StraightLine:
 # ---------------------------------------------------------------------------------------------------------------------
 # From lines to the response
 
-DETECTED_P = 0.003
-"""p-value of the test for distortion below which it counts as detected. 0.3 % of linear shafts are below it."""
+DETECTED_P = 0.001
+"""p-value of the test for distortion below which it counts as detected. 0.1 % of linear shafts are below it."""
 
 _MOST_HARMONICS = 12     # unexcited ones that are tested
 _BEYOND = 3              # times the highest excited harmonic: distortion of third order ends there
@@ -148,7 +148,7 @@ def measure_response(
     power = {parity: sum(max(one.torque_nm**2 - one.noise_nm**2, 0.0) for one in harmonics
                          if one.harmonic % 2 == parity) for parity in (0, 1)}
     total = power[0] + power[1]
-    distortion = Distortion(
+    distortion = DistortionTest(
         detected, p_value, by_harmonics, by_speed, power[1] / total if total > 0.0 else None, harmonics)
     confidence = case.options.confidence
     lines = tuple(
