@@ -49,6 +49,7 @@ else:
         "console": "PlainConsole stderr_console",
         "document": "SIMULATED result_document",
         "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",
+        "frequency_response": "draw_bode draw_faults draw_responses print_responses response_sentences save_responses",
         "html": "ShownPicture check_report_path pictures_in write_report",
         "live": "LiveDisplay",
         "page": "STYLE has_extra inline_svg install_command repeatable_figures require_extra",
