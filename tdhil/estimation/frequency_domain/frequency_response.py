@@ -193,8 +193,8 @@ def _told(
     line, omega = one.line, 2.0 * math.pi * one.line.hertz
     speed = math.sqrt(one.energy / float(np.sum(line.periods)))
     nearest = sorted(harmonics, key=lambda each: abs(each.hertz - line.hertz))[:_NEIGHBOURS]
-    beside = float(np.mean([max(each.torque_nm**2 - each.noise_nm**2, 0.0) for each in nearest])) if nearest else 0.0
-    distortion = math.sqrt(max(beside, _excess_between_speeds(one)) / 2.0) / (speed * abs(one.z))
+    beside = float(np.mean([each.torque_nm**2 - each.noise_nm**2 for each in nearest])) if nearest else 0.0
+    distortion = math.sqrt(max(beside, _excess_between_speeds(one), 0.0) / 2.0) / (speed * abs(one.z))
     spread = math.hypot(one.noise_rel, distortion if detected else 0.0)
     half = student_quantile(confidence, max(2.0 * line.nu, 1.0)) * spread
     g = 1.0 / one.z
