@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from tdhil.buses import Connection, PeerPlan
     from tdhil.config import Rig, RunOptions
     from tdhil.errors import ExitCode
-    from tdhil.estimation import Identification, InertiaEstimate, Verdict
+    from tdhil.estimation import FrequencyResponse, Identification, InertiaEstimate, Verdict
     from tdhil.session import OperatorInterface, RunRequest
 
 __all__ = [
@@ -136,6 +136,14 @@ class Result:
     def reason(self) -> str:
         """Return the reason of the verdict, in words."""
         return self.identification.reason
+
+    @property
+    def frf(self) -> FrequencyResponse | None:
+        """Return the frequency response ω/T at every excited line; None without a periodic excitation.
+
+        ``frf.to_frd()`` is for ``control.FRD``, ``frf.to_xarray()`` for a notebook.
+        """
+        return self.identification.frequency_response
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON document of ``tdhil identify --json``, exactly."""

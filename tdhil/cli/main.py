@@ -38,6 +38,7 @@ _GROUPS: Final = {
     },
     "look again": {
         "replay": "identify again, from a log or from a CSV trace",
+        "frf": "show the frequency response with intervals and distortion",
         "compare": "compare runs: settings, inertias and whether they differ",
         "fleet": "identify many logs again, into one table",
         "trend": "show from a fleet's table whether a rig changed over time",

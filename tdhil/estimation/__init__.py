@@ -11,10 +11,12 @@ from tdhil.estimation.friction_levels import (
 from tdhil.estimation.identification import identify as identify
 from tdhil.estimation.paper_method import STEP_S as STEP_S, line_fit as line_fit, paper_estimate as paper_estimate
 from tdhil.estimation.result import (
-    BudgetLine as BudgetLine, Compliant as Compliant, Estimate as Estimate, FrictionPoint as FrictionPoint,
+    BudgetLine as BudgetLine, Compliant as Compliant, DistortionTest as DistortionTest, Estimate as Estimate,
+    FrequencyResponse as FrequencyResponse, FrictionPoint as FrictionPoint,
     Identification as Identification, InertiaEstimate as InertiaEstimate, LineFit as LineFit, Options as Options,
     PaperEstimate as PaperEstimate, Refused as Refused, ResidualTest as ResidualTest, SecondOpinion as SecondOpinion,
-    Verdict as Verdict, normal_quantile as normal_quantile,
+    ResponseLine as ResponseLine, Verdict as Verdict, normal_quantile as normal_quantile,
+    response_columns as response_columns, unit_of as unit_of,
 )
 from tdhil.estimation.rough_estimates import (
     RoughFriction as RoughFriction, RoughInertia as RoughInertia, rough_friction as rough_friction,

@@ -1,6 +1,7 @@
 """The case that identification works on, and the finding that a route brings back: what every verdict is made of."""
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -21,8 +22,8 @@ from tdhil.estimation.result import (
     rejects,
 )
 from tdhil.estimation.samples import Samples, Stretch
-from tdhil.estimation.spectrum import PeriodLines, SpectralLine
-from tdhil.recording import Recording, Stage
+from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine
+from tdhil.recording import FloatArray, Recording, Stage
 
 
 def _no_samples() -> Samples:
@@ -82,6 +83,13 @@ class ModelWords:
     digits: int = 1
 
 
+class ResponseCurve(Protocol):
+    """A fitted model over frequency."""
+
+    def at(self, hertz: FloatArray) -> tuple[ComplexArray, FloatArray, FloatArray]:
+        """Return T/ω (K,), N·m·s/rad, and the half-widths of its interval: relative magnitude, and phase, rad."""
+
+
 _NONE, _WORDLESS = Refusal("", ""), ModelWords()
 
 
@@ -95,7 +103,8 @@ class Finding:
     case's own. ``preface`` and ``remark`` stand before and after the sentence on the model. ``reading_kg_m2``: by how
     much more J may be off on either side for the moment at which torque is read; ``advice``: instead of the usual.
     ``contradiction``: what else in the same run contradicts J beyond chance, so that J does not stand.
-    ``reject_p``: the p-value below which the residuals contradict the model.
+    ``reject_p``: the p-value below which the residuals contradict the model. ``curve``: the model over frequency;
+    ``settled``: its lines without residual oscillation, () for the case's own.
     """
 
     model: str = "none"
@@ -123,6 +132,8 @@ class Finding:
     advice: str = ""
     contradiction: Refusal = _NONE
     reject_p: float = REJECT_P
+    curve: ResponseCurve | None = None
+    settled: tuple[SpectralLine, ...] = ()
 
     @property
     def rejected(self) -> bool:

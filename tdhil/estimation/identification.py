@@ -18,6 +18,7 @@ from tdhil.estimation.cross_checks import (
     torques_judged,
 )
 from tdhil.estimation.data_checks import check_samples
+from tdhil.estimation.frequency_domain import measure_response
 from tdhil.estimation.impedance import measure_impedance, refusal
 from tdhil.estimation.paper_method import paper_estimate
 from tdhil.estimation.periodic import clear_lines, identify_lines, measured
@@ -45,10 +46,14 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
             finding = identify_lines(periodic)
     except Refused as refused:
         finding = Finding(refusal=refused.refusal)
+    seen = finding
     if case.sound:
         finding = cross_checked(finding, case)
     finding = jump_checked(level_checked(angle_checked(finding, case), case), case)
     found = conclude(case, stretched(finding, case.recording))
+    if isinstance(case, PeriodicCase):
+        response = measure_response(case, seen.curve, seen.settled, seen.model)
+        found = replace(found, frequency_response=response)
     asked = case.recording.impedance
     if asked is None:
         return found

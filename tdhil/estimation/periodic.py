@@ -112,8 +112,10 @@ def identify_lines(case: PeriodicCase) -> Finding:
         return identify_before_echo(case)
     asked = shaft_model(case.options.model)
     rigid = None
+    own_lines: tuple[SpectralLine, ...] = ()
     if asked.compliant is not None:
-        finding = identify_compliant(settled(case))
+        own = settled(case)
+        finding, own_lines = identify_compliant(own), own.every
     else:
         rigid = _rigid(case, case.lines)
         weak = tuple(line for line in case.usable if all(line is not one for one in case.lines))
@@ -123,10 +125,13 @@ def identify_lines(case: PeriodicCase) -> Finding:
             doubted = asked.widened and (case.recording.winds_up or (rigid is not None and may_swing(rigid)))
         finding = rigid_finding(rigid, case)
         if doubted:
-            finding = identify_compliant(settled(case), finding, rigid is not None and rigid.first_order)
+            own = settled(case)
+            finding = identify_compliant(own, finding, rigid is not None and rigid.first_order)
+            own_lines = own.every
     if isinstance(finding, Refusal):
         raise Refused(finding.reason, _BEFORE_ECHO_HELPS if _drowned(case) else finding.advice,
                       finding.entry)
+    finding = replace(finding, settled=own_lines)
     if _drowned(case):
         finding = replace(finding, words=replace(finding.words, if_wide=_BEFORE_ECHO_HELPS))
     # A load that swings leaves residuals that a bend takes up, too: only where swinging was looked for it may.

@@ -1,12 +1,23 @@
 """The conclusion of an identification: numbers with intervals, or the reason why there are none."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from enum import Enum
+from importlib import import_module
 from statistics import NormalDist
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from profiles import MessageCode
 from tdhil.config import MODELS
+from tdhil.recording import FloatArray
+
+if TYPE_CHECKING:
+    import xarray
 
 
 def normal_quantile(confidence: float) -> float:
@@ -261,6 +272,163 @@ class LinePoint:
     residual_sd: float
 
 
+# ---------------------------------------------------------------------------------------------------------------------
+# The frequency response, and its lines as a table.
+
+
+@dataclass(frozen=True)
+class ResponseLine:
+    """One excited line. ``magnitude``: |ω/T|, rad/(s·N·m); ``phase_rad``: of ω/T, −π to π, its interval beyond.
+
+    Apparent inertia is Im(T/ω)/2πf, kg·m². ``noise_rel`` and ``distortion_rel``: relative standard uncertainty of the
+    magnitude, and of the phase in rad, from either. The intervals contain the noise, and the distortion where it was
+    detected. ``fitted_magnitude`` and ``fitted_phase_rad``: of the model, None without one; ``residual_sd``: what the
+    model leaves, in standard deviations.
+    """
+
+    hertz: float
+    magnitude: Estimate
+    phase_rad: Estimate
+    apparent_inertia_kg_m2: Estimate
+    noise_rel: float
+    distortion_rel: float
+    coherence: float
+    periods: int
+    fitted_magnitude: float | None
+    fitted_phase_rad: float | None
+    residual_sd: float | None
+
+
+@dataclass(frozen=True)
+class UnexcitedHarmonic:
+    """A harmonic that was not excited: the amplitude of T − Z W there, N·m, and the part of it that is noise.
+
+    What an error of Z could explain is left out of the amplitude.
+    ``p_value``: how often noise alone would be as large.
+    """
+
+    hertz: float
+    harmonic: int
+    torque_nm: float
+    noise_nm: float
+    p_value: float
+
+
+@dataclass(frozen=True)
+class DistortionTest:
+    """Test for nonlinear distortion, ``detected`` at a p-value below 0.1 %.
+
+    ``p_value``: how often a linear shaft would show as much.
+    ``by_harmonics``, ``by_speed``: p-values of its two parts, None where that part was not possible; ``odd_share``: of
+    the distortion at unexcited harmonics, by power, None without any.
+    """
+
+    detected: bool
+    p_value: float | None
+    by_harmonics: float | None
+    by_speed: float | None
+    odd_share: float | None
+    harmonics: tuple[UnexcitedHarmonic, ...]
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """The fitted model at one frequency: |ω/T| and phase of ω/T, with its band."""
+
+    hertz: float
+    magnitude: Estimate
+    phase_rad: Estimate
+    apparent_inertia_kg_m2: Estimate
+
+
+@dataclass(frozen=True)
+class FrequencyResponse:
+    """G = ω/T at the excited lines, rising frequency, as speed and torque are reported, their lags included.
+
+    ``realisations``: of the phases, in this recording; ``mean_speeds_rad_s``: of its segments.
+    """
+
+    confidence: float
+    model: str
+    lines: tuple[ResponseLine, ...]
+    curve: tuple[CurvePoint, ...]
+    distortion: DistortionTest
+    mean_speeds_rad_s: tuple[float, ...]
+    realisations: int = 1
+
+    @property
+    def hertz(self) -> FloatArray:
+        """Return the frequencies (K,), Hz."""
+        return np.array([line.hertz for line in self.lines])
+
+    @property
+    def response(self) -> NDArray[np.complex128]:
+        """Return G = ω/T (K,), rad/(s·N·m)."""
+        found: NDArray[np.complex128] = np.array([line.magnitude.value for line in self.lines]) * np.exp(
+            1j * np.array([line.phase_rad.value for line in self.lines]))
+        return found
+
+    @property
+    def impedance(self) -> NDArray[np.complex128]:
+        """Return Z = T/ω (K,), N·m·s/rad."""
+        found: NDArray[np.complex128] = 1.0 / self.response
+        return found
+
+    def to_frd(self) -> tuple[NDArray[np.complex128], FloatArray]:
+        """Return G = ω/T and the angular frequencies, rad/s: ``control.FRD(*response.to_frd())``."""
+        return self.response, 2.0 * np.pi * self.hertz
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return the lines along ``hertz``, each quantity with its unit (extra `notebook`).
+
+        Raises ImportError without xarray, with the command that installs it.
+        """
+        try:
+            library = import_module("xarray")
+        except ImportError as error:
+            error.add_note("Install it with: pip install '.[notebook]'")
+            raise
+        columns = response_columns(self)
+        hertz = columns.pop("hertz")
+        units = {name: unit_of(name) for name in columns}
+        found: xarray.Dataset = library.Dataset(
+            {name: ("hertz", np.array(values, dtype=np.float64), {"units": units[name]})
+             for name, values in columns.items()},
+            coords={"hertz": ("hertz", np.array(hertz), {"units": "Hz"})},
+            attrs={"confidence": self.confidence, "model": self.model,
+                   "distortion_detected": int(self.distortion.detected)},
+        )
+        return found
+
+
+_UNITS = (("magnitude", "rad/(s N m)"), ("phase_rad", "rad"), ("apparent_inertia", "kg m2"), ("real_rad_s_nm",
+          "rad/(s N m)"), ("imaginary_rad_s_nm", "rad/(s N m)"))
+
+
+def unit_of(column: str) -> str:
+    """Return the unit of a column of `response_columns`; 1 for a ratio or a count."""
+    bare = column.removeprefix("fitted_")
+    return "Hz" if column == "hertz" else next((unit for name, unit in _UNITS if bare.startswith(name)), "1")
+
+
+def response_columns(found: FrequencyResponse) -> dict[str, list[float]]:
+    """Return the lines as a table: column by name; a value that is not known is NaN."""
+    rows = []
+    for line, value in zip(found.lines, found.response.tolist(), strict=True):
+        row: dict[str, Any] = {"hertz": line.hertz, "real_rad_s_nm": value.real, "imaginary_rad_s_nm": value.imag}
+        for name in ("magnitude", "phase_rad", "apparent_inertia_kg_m2"):
+            one: Estimate = getattr(line, name)
+            row |= {name: one.value, f"{name}_low": one.low, f"{name}_high": one.high}
+        for name in ("noise_rel", "distortion_rel", "coherence", "periods", "fitted_magnitude", "fitted_phase_rad",
+                     "residual_sd"):
+            row[name] = getattr(line, name)
+        rows.append({name: math.nan if one is None else float(one) for name, one in row.items()})
+    return {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Refusal:
     """Why there can be no number, and what to do about it; a sentence each."""
@@ -304,4 +472,5 @@ class Identification:
     impedance: DriveImpedance | None = None             # of a run that measured the drive's own
     lines: tuple[LinePoint, ...] = ()                   # rising frequency; for the picture of the report
     torque_ratios: tuple[TorqueRatio, ...] = ()         # of the signals of torque; empty where no setpoint is known
+    frequency_response: FrequencyResponse | None = None     # of a periodic excitation with two periods or more
     entry: MessageCode = MessageCode.NOT_IDENTIFIABLE   # entry of verdict, reason and advice in the table of messages

@@ -157,6 +157,7 @@ ComplexArray = NDArray[np.complex128]
 _SIGNIFICANT = 25.0       # |mean|² over its variance: a line less clear than 5 sd is not excited
 _BLOCK = 8192             # samples worked on at once
 _FLOOR = 1e-14            # relative variance below which scatter is rounding of the arithmetic
+_BLOCKS_A_CYCLE = 20      # of the fastest line, at least
 _SAME = 4.0 * float(np.finfo(np.float64).eps)      # of a frequency: a sum of two that is the third
 
 
@@ -239,6 +240,42 @@ def period_lines(stretch: Stretch, samples: Samples, quanta: tuple[float, float]
         drift=drift,
         rounding=(rounding[0], rounding[1]),
     )
+
+
+def unexcited_lines(stretch: Stretch, fit: PeriodLines, harmonics: tuple[int, ...]) -> PeriodLines:
+    """Return lines at harmonics of the period that are not excited; ``fit``: those of the excited ones.
+
+    Means over short blocks stand for the samples, so that a long record costs little. They lower a line by less than
+    1 %, and do not mix lines.
+    """
+    segment = stretch.segment
+    lines = tuple(harmonic / segment.period_s for harmonic in harmonics)
+    excited = len(segment.lines_hz)
+    every = (*segment.lines_hz, *lines)
+    blocks = _BLOCKS_A_CYCLE * max(1, round(segment.period_s * max(every)))
+    fits = [_fit(_thinned(period, blocks), segment.start_s, every) for period in stretch.periods]
+    table: ComplexArray = np.array([fit[1] for fit in fits]).reshape(-1, 3, len(every))[:, :, excited:]
+    return PeriodLines(
+        lines_hz=lines,
+        speed=table[:, 0] - fit.drift[:, None] * table[:, 2],
+        torque=table[:, 1],
+        ramp=table[:, 2],
+        speed_mean=fit.speed_mean,
+        torque_mean=fit.torque_mean,
+        drift=fit.drift,
+        rounding=fit.rounding,
+    )
+
+
+def _thinned(period: Samples, blocks: int) -> Samples:
+    """Return means over blocks of equally many samples; the samples themselves where these are few."""
+    size = len(period) // blocks
+    if size < 2:
+        return period
+    starts = np.arange(0, len(period), size)
+    counts = np.diff(np.append(starts, len(period)))
+    return Samples(*(np.add.reduceat(signal, starts) / counts
+                     for signal in (period.time_s, period.speed_rad_s, period.torque_nm)))
 
 
 def _least(lines: ComplexArray) -> float:

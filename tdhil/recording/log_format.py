@@ -15,6 +15,7 @@
   10  /modbus          Frames         requests and replies (PDU), in place of /can; older logs have them there
   11  /virtual_string  VirtualString  every cycle of a virtual string, at its main shaft
   12  /frames          Frames         the frames of any other bus, in place of /can
+  13  /frf             Response       the frequency response of the result, for viewers; never read back
 ====  ===============  =============  =====================================================================
 
 A message's log time is the epoch handed in at the start plus its control time, in nanoseconds.
@@ -190,12 +191,19 @@ LOG: Final = 9
 MODBUS: Final = 10
 VIRTUAL_STRING: Final = 11
 OTHER_FRAMES: Final = 12
+FRF: Final = 13
 
 VIRTUAL_COLUMNS: Final = (
     "time_s", "phase", "set_rad_s", "top_rad_s", "innovation_rad_s", "string_nm", "drive_nm", "share", "bit_rad_s",
     "unknown_nm", "put_in_j", "clamped",
 )
 """Values of a `VirtualString`, all doubles: the content of `tdhil.soft_torque.HostLoop.row`."""
+
+FRF_COLUMNS: Final = (
+    "hertz", "magnitude", "magnitude_low", "magnitude_high", "phase_rad", "phase_rad_low", "phase_rad_high",
+    "apparent_inertia_kg_m2", "noise_rel", "distortion_rel", "coherence",
+)
+"""Arrays of a `Response`, a value for each excited line: ω/T in rad/(s·N·m)."""
 
 CHANNELS: Final = {
     SAMPLE: ("/sample", "Sample"),
@@ -210,6 +218,7 @@ CHANNELS: Final = {
     MODBUS: ("/modbus", "Frames"),
     VIRTUAL_STRING: ("/virtual_string", "VirtualString"),
     OTHER_FRAMES: ("/frames", "Frames"),
+    FRF: ("/frf", "Response"),
 }
 FRAME_CHANNELS: Final = {topic: number for number, (topic, message) in CHANNELS.items() if message == "Frames"}
 """The channels of raw frames by topic. A log has messages on one of them."""
@@ -261,6 +270,7 @@ MESSAGES: Final = {
     "Event": fields_of(Event),
     "Text": {"json": "string"},
     "VirtualString": dict.fromkeys(VIRTUAL_COLUMNS, "double"),
+    "Response": dict.fromkeys(FRF_COLUMNS, "double*") | {"distortion_detected": "bool"},
 }
 CLASSES: Final[dict[str, Any]] = message_classes(PACKAGE, ENUMS, MESSAGES) | {"Log": LOG_CLASS}
 

@@ -5,6 +5,7 @@ afterwards isn't logged by mistake.
 """
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import lru_cache
@@ -19,6 +20,8 @@ from tdhil.recording.log_format import (
     CONFIGURATION,
     EVENT,
     EXCITATION,
+    FRF,
+    FRF_COLUMNS,
     MODES,
     RESULT,
     STAGE,
@@ -167,6 +170,19 @@ def configuration_message(run: Mapping[str, Any], facts: Mapping[str, Any]) -> C
 def result_message(result: Mapping[str, Any]) -> Cold:
     """The result as a JSON text."""
     return _text(RESULT, result)
+
+
+def response_message(found: Mapping[str, Any]) -> Cold:
+    """The frequency response of a result document as arrays, which a viewer can plot; an open side is NaN."""
+    def value(line: Mapping[str, Any], name: str) -> float:
+        key, _, side = name.rpartition("_") if name.endswith(("_low", "_high")) else (name, "", "value")
+        one = line[key]
+        number = one[side] if isinstance(one, Mapping) else one
+        return math.nan if number is None else float(number)
+
+    content: dict[str, Any] = {name: [value(line, name) for line in found["lines"]] for name in FRF_COLUMNS}
+    content["distortion_detected"] = bool(found["distortion"]["detected"])
+    return Cold(FRF, None, _bytes("Response", content), flush=False)
 
 
 def _text(channel: int, content: Mapping[str, Any]) -> Cold:

@@ -223,7 +223,7 @@ _CENTURY_NS: Final = 946_684_800 * 10**9       # 2000-01-01
 RARE: Final = 20_000                   # stages, events, problems
 RARE_BYTES: Final = 64 * 2**20         # of everything but samples, commands and frames
 BATCH: Final = 2 * 2**20               # bytes of chunks that are read at once; a longer one is read message by message
-_UNREAD: Final = frozenset({log_format.LOG}) | log_format.RAW_FRAMES
+_UNREAD: Final = frozenset({log_format.FRF, log_format.LOG}) | log_format.RAW_FRAMES
 _EVERY_CYCLE: Final = frozenset({log_format.SAMPLE, log_format.COMMAND})
 
 

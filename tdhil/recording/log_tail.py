@@ -30,7 +30,8 @@ _RECORD: Final = Struct("<BQ")
 _MESSAGE_HEAD: Final = Struct("<HIQQ")         # channel, sequence, log time, publish time
 _MESSAGE: Final = 0x05
 _NUMBERS: Final = {number: number for number in CHANNELS}
-_SKIPPED: Final = frozenset({log_format.COMMAND, log_format.LOG, log_format.VIRTUAL_STRING}) | log_format.RAW_FRAMES
+_SKIPPED: Final = log_format.RAW_FRAMES | {
+    log_format.COMMAND, log_format.FRF, log_format.LOG, log_format.VIRTUAL_STRING}
 MOST: Final = 2**20
 """Approximate bytes read at a time: a viewer that joins a long run late must not delay the others."""
 

@@ -421,6 +421,8 @@ class RunWriter:
     def result(self, result: Mapping[str, Any]) -> None:
         """The result document; may be called again, the last call counts."""
         self._rare(log_messages.result_message(result))
+        if (response := result.get("frequency_response")) is not None:
+            self._rare(log_messages.response_message(response))
 
     def close(self, timeout_s: float = 30.0) -> None:
         """Writes what waits and finishes the file; idempotent. Raises `LogBroken` if the log isn't whole."""

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
         evaluation_document as evaluation_document, evaluation_report as evaluation_report,
         print_evaluation as print_evaluation, write_evaluation_report as write_evaluation_report,
     )
+    from tdhil.report.frequency_response import (
+        draw_bode as draw_bode, draw_faults as draw_faults, draw_responses as draw_responses,
+        print_responses as print_responses, response_sentences as response_sentences, save_responses as save_responses,
+    )
     from tdhil.report.html import (
         ShownPicture as ShownPicture, check_report_path as check_report_path, pictures_in as pictures_in,
         write_report as write_report,
@@ -49,6 +53,7 @@ else:
         "console": "PlainConsole stderr_console",
         "document": "SIMULATED result_document",
         "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",
+        "frequency_response": "draw_bode draw_faults draw_responses print_responses response_sentences save_responses",
         "html": "ShownPicture check_report_path pictures_in write_report",
         "live": "LiveDisplay",
         "page": "STYLE has_extra inline_svg install_command repeatable_figures require_extra",

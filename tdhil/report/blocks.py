@@ -186,6 +186,8 @@ def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Rep
             "residuals of the model in standard deviations; values near 1 are noise.",
         )
         yield ReportSection("Torque over acceleration at each excited frequency", (picture,))
+    if (response := document.get("frequency_response")) is not None:
+        yield ReportSection("Frequency response", tuple(_response(response)))
     if document["budget"]:
         picture = Picture(
             partial(draw_budget, document=document), 0.5 + 0.18 * len(document["budget"]),
@@ -288,6 +290,16 @@ def _numbers(document: Part) -> Iterator[Block]:
         yield Table(_QUANTITIES, tuple(rows))
         yield Text("Intervals without the note 'torque scale included' take the torque scale as exact. Use them to "
                    "compare runs on this drive.")
+
+
+def _response(found: Part) -> Iterator[Block]:
+    """Yield the picture of the frequency response, and what it shows."""
+    from tdhil.report.frequency_response import draw_bode, response_sentences
+
+    yield Picture(
+        partial(draw_bode, found=found), 3.4,
+        "Speed over torque as the drive reports them, lags included, with intervals and the fitted model. Triangles: "
+        "standard uncertainty by noise, and by nonlinear distortion. " + " ".join(response_sentences(found)))
 
 
 def _impedance(found: Part) -> Iterator[Block]:

@@ -50,6 +50,7 @@ def result_document(
         },
         "torque_ratios": [asdict(ratio) for ratio in found.torque_ratios],
         "lines": [asdict(line) for line in found.lines],
+        "frequency_response": None if found.frequency_response is None else asdict(found.frequency_response),
         "periods_used": found.periods_used,
         "samples_used": found.samples_used,
         "warnings": list(found.warnings),

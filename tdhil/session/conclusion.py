@@ -43,6 +43,8 @@ def after_looks(found: Identification, run: Mapping[str, Any], confidence: float
         return found
     if found.inertia is not None:
         found = replace(found, inertia=replace(found.inertia, confidence=confidence))
+    if found.frequency_response is not None:
+        found = replace(found, frequency_response=replace(found.frequency_response, confidence=confidence))
     if found.verdict is Verdict.VALID_WIDE and stopping.get("advice"):
         found = replace(found, advice=str(stopping["advice"]))
     return found

@@ -20,6 +20,8 @@ class Rig:
     inertia: float = 104.0
     viscous: float = 8.0
     coulomb: float = 60.0
+    stribeck: float = 0.0            # more friction at rest, a bell over speed of so many rad/s
+    stribeck_width: float = 2.0
     torque_lag: float = 0.010        # of the motor behind its command
     load_sd: float = 3.0             # Ornstein-Uhlenbeck load disturbance
     load_time: float = 0.5
@@ -142,6 +144,8 @@ def turn_shaft(rig: Rig, motion: Motion, seeds: list[int], mode: str = "torque")
         command = np.clip(command, -rig.torque_limit, rig.torque_limit)
         motor = a_motor * motor + (1.0 - a_motor) * command
         friction = rig.viscous * omega + rig.coulomb * np.sign(omega)
+        if rig.stribeck:
+            friction += rig.stribeck * np.exp(-((omega / rig.stribeck_width) ** 2)) * np.sign(omega)
         omega = omega + DT / rig.inertia * (actual + load[n] - friction)
 
     return Shaft(speed + sensor, torque)

@@ -63,6 +63,22 @@ def test_graphs_of_the_report_have_the_words_of_the_pictures(figures):
 
 
 @pytest.mark.heavy
+@pytest.mark.parametrize("name", ["frf_good", "frf_lag", "frf_stribeck"])
+def test_pictures_of_the_frequency_response_have_the_words_of_the_pictures(name):
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed (pip install '.[report]')")
+    spec = importlib.util.spec_from_file_location("pictures_of_the_response", FOLDER / "frequency_response.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    document = module.document(name)
+    assert document["frequency_response"]["distortion"]["detected"] is (name == "frf_stribeck")
+    assert document["verdict"] == ("model_rejected" if name == "frf_lag" else "valid")
+    words = re.compile(r"<text[^>]*>([^<]*)</text>")
+    kept_picture = (module.IMAGES / f"{name}.svg").read_text(encoding="utf-8")
+    assert words.findall(module.picture(document)) == words.findall(kept_picture), f"stale: draw {name}"
+
+
+@pytest.mark.heavy
 @pytest.mark.one_worker("figures")
 def test_the_card_on_the_pages_is_that_of_the_run(figures):
     for page in figures.WITH_CARD:

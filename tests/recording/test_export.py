@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import shutil
 import subprocess
 import sys
@@ -50,6 +51,27 @@ def test_events_are_a_log_that_viewers_know(tmp_path):
         assert 10**9 * one.timestamp.seconds + one.timestamp.nanos == log_time
     assert type(found[0][2]).DESCRIPTOR.fields_by_name["level"].enum_type.full_name == "foxglove.Log.Level"
     assert [event.kind for event in read_run(path).events] == ["plan", "failure", "bus"]      # once, by us
+
+
+def test_the_frequency_response_is_arrays_that_viewers_plot(tmp_path):
+    path = tmp_path / "run.mcap"
+
+    def estimate(value):
+        return {"value": value, "low": 0.9 * value, "high": None}
+
+    lines = [{"hertz": hertz, "magnitude": estimate(1.0 / hertz), "phase_rad": estimate(-1.0),
+              "apparent_inertia_kg_m2": estimate(104.0), "noise_rel": 0.01, "distortion_rel": 0.0, "coherence": 1.0}
+             for hertz in (0.1, 0.2)]
+    document = {"verdict": "valid", "frequency_response": {"lines": lines, "distortion": {"detected": True}}}
+    with RunWriter(path, epoch_ns=EPOCH_NS, block=True) as writer:
+        fill(writer, RecordingBuilder(), 20)
+        writer.result(document)
+    ((schema, _, found),) = decoded(path, "/frf")
+    assert schema == "tdhil.Response"
+    assert list(found.hertz) == [0.1, 0.2] and list(found.magnitude) == [10.0, 5.0]
+    assert list(found.magnitude_low) == [9.0, 4.5] and all(math.isnan(one) for one in found.magnitude_high)
+    assert found.distortion_detected
+    assert read_run(path).result == document           # what is read back is the document
 
 
 def test_modbus_bytes_stand_on_their_own_topic(tmp_path):

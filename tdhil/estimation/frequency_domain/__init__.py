@@ -14,6 +14,9 @@ from tdhil.estimation.frequency_domain.compliant_fit import (
 from tdhil.estimation.frequency_domain.filter_order import (
     FittedModel as FittedModel, simple_weight as simple_weight,
 )
+from tdhil.estimation.frequency_domain.frequency_response import (
+    ModelCurve as ModelCurve, measure_response as measure_response,
+)
 from tdhil.estimation.frequency_domain.inference import (
     contradicted as contradicted, estimate as estimate, fisher_tail as fisher_tail, profile_edge as profile_edge,
     student_quantile as student_quantile, torque_scale_line as torque_scale_line,

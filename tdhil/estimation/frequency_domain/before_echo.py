@@ -29,6 +29,7 @@ from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Finding, ModelWords, PeriodicCase
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import FittedModel, fit_model
+from tdhil.estimation.frequency_domain.frequency_response import ModelCurve
 from tdhil.estimation.frequency_domain.inference import (
     estimate,
     grown_lines,
@@ -193,6 +194,8 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
             "J is J_r, the motor side of the string, from the time before an echo returns",
             MessageCode.MOTOR_SIDE_ONLY),),
         compliant=Compliant(None, None, None, None, None, None),
+        curve=ModelCurve(fitted, confidence, residual),
+        settled=lines,
     )
     if rejects(residual):
         return replace(finding, compliant=None)

@@ -18,6 +18,7 @@ from tdhil.estimation.frequency_domain.compliant_fit import (
     intervals,
 )
 from tdhil.estimation.frequency_domain.filter_order import excess_rise
+from tdhil.estimation.frequency_domain.frequency_response import ModelCurve
 from tdhil.estimation.frequency_domain.inference import (
     fisher_tail,
     grown_lines,
@@ -468,6 +469,7 @@ def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Fi
         compliant=told.shaft,
         lines=fitted_points(fit.fitted, case.options.confidence),
         warnings=_caveats(chosen, told),
+        curve=ModelCurve(fit.fitted, case.options.confidence, fit.residual),
     )
     if isinstance(rigid, Finding) and rigid.rejected:
         finding = replace(finding, preface=f"{rigid.contradicted}; ")
@@ -475,7 +477,7 @@ def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Fi
         finding = replace(finding, remark=", much better than the lags of a rigid shaft do")
     if chosen.impedance_ratio is not None:
         # a J that does not stand gets no further figures, as where the residuals contradict the model
-        return Finding(name, finding.words, fit.residual, lines=finding.lines,
+        return Finding(name, finding.words, fit.residual, lines=finding.lines, curve=finding.curve,
                        contradiction=_pipe_contradiction(chosen.impedance_ratio))
     if told.inertia.bounded:
         words = replace(finding.words, if_wide=_WHICH) if told.by_model else finding.words

@@ -9,6 +9,7 @@ from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Case, Finding, ModelWords
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import FittedModel, fit_model
+from tdhil.estimation.frequency_domain.frequency_response import ModelCurve
 from tdhil.estimation.frequency_domain.inference import (
     budget_of,
     estimate,
@@ -286,7 +287,8 @@ def rigid_finding(
     as_paper = not shaft_model(case.options.model).lags
     lines = fitted_points(result.fitted, case.options.confidence)
     bare = Finding(case.options.model if as_paper else RIGID, _words(result, as_paper, what), result.residual,
-                   lines=lines, warnings=_caveats(result, as_paper, case.recording.winds_up))
+                   lines=lines, warnings=_caveats(result, as_paper, case.recording.winds_up),
+                   curve=ModelCurve(result.fitted, case.options.confidence, result.residual))
     if bare.rejected:
         return bare
     found = replace(bare, inertia=result.inertia, conditions=_conditions(result, case), viscous_nm_s_rad=result.viscous,

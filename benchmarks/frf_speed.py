@@ -1,0 +1,48 @@
+"""Cost of the frequency response of an hour at 1 kHz, beside the identification whose lines it uses.
+
+    python benchmarks/frf_speed.py [--hours 1.0] [--rate 1000]
+
+The record is that of benchmarks/identify_speed.py. Printed: the identification as a whole, the response alone
+(unexcited harmonics, tests, intervals, the curve of the model), and both in least-squares fits of three columns on the
+same arrays. The best of three counts. The exit code is 1 if the response alone takes more than a tenth of the
+identification.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")     # as `tdhil` has it
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.identify_speed import best_s, fit_s, synthesised
+from tdhil.estimation import Options, identify
+from tdhil.estimation.case import Case
+from tdhil.estimation.frequency_domain import measure_response
+from tdhil.estimation.identification import _sampled
+from tdhil.estimation.periodic import clear_lines, identify_lines, measured
+
+MOST_SHARE = 0.1
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--hours", type=float, default=1.0)
+    parser.add_argument("--rate", type=float, default=1000.0)
+    asked = parser.parse_args()
+    recording = synthesised(asked.hours, asked.rate)
+    case = _sampled(Case(recording, Options()))
+    periodic = clear_lines(measured(case, recording.excitation))
+    finding = identify_lines(periodic)
+    alone = best_s(lambda: measure_response(periodic, finding.curve, finding.settled, finding.model), 3)
+    whole, fit = best_s(lambda: identify(recording), 3), fit_s(recording, 3)
+    print(f"{len(recording.time_s)} samples: identification with response {whole:.2f} s ({whole / fit:.1f} fits), "
+          f"the response alone {alone:.3f} s ({alone / fit:.2f} fits, {alone / whole:.1%} of it)")
+    return 0 if alone <= MOST_SHARE * whole else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,189 @@
+"""`tdhil frf`: the frequency response ω/T of a run, with intervals, noise and nonlinear distortion apart."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from profiles import with_code
+from tdhil.cli.arguments import add_option, add_settings, settings_in
+from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
+from tdhil.cli.results import print_json
+from tdhil.config import OPTION
+from tdhil.errors import ExitCode, MessageCode, UsageError
+from tdhil.session import is_evaluation, require_file
+
+if TYPE_CHECKING:
+    from tdhil.api import Result
+    from tdhil.session import RunRecord
+
+_TABLES: Final = (".csv", ".parquet")
+_PICTURES: Final = (".png", ".svg", ".pdf")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of frf."""
+    # Optional for argparse only: after --columns a file's name is taken as one more column.
+    parser.add_argument("logs", type=Path, nargs="*", metavar="run.mcap|trace.csv",
+                        help="logs of runs with a periodic excitation, or traces in CSV; several are drawn together")
+    add_option(parser, OPTION["json"])
+    parser.add_argument("--out", type=Path, metavar="FILE",
+                        help="the lines as a table: frf.csv, or frf.parquet (extra `parquet`)")
+    parser.add_argument("--plot", type=Path, metavar="FILE",
+                        help="magnitude, phase, apparent inertia and residuals as frf.png, frf.svg or frf.pdf")
+    add_settings(parser, "the run's")
+    add_trace_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Exit 0: every log has a response; 3: a log is not whole; 9: a log has no response."""
+    from tdhil.api import identify
+    from tdhil.report import PlainConsole, print_responses, stderr_console
+
+    logs = _logs(namespace)
+    settings = settings_in(namespace)
+    check_trace(namespace)
+    for path in logs:
+        require_file(path)
+    _check_targets(namespace, logs)
+    found: list[Result] = []
+    for path in logs:
+        recorded = read_recorded(namespace, path)
+        if is_evaluation(recorded.configuration):
+            raise UsageError("contains a virtual string, which has no frequency response", where=str(path),
+                             next_step="Name the log of an identification", entry=MessageCode.WRONG_KIND_OF_FILE)
+        recorded.require_motion()
+        for problem in recorded.problems:
+            stderr_console().print(f"tdhil: {path}: {problem}", style="yellow", markup=False, soft_wrap=True)
+        found.append(identify(recorded, **settings))
+    responses = [_part(one) for one in found]
+    if namespace.out is not None:
+        _write_table(found, namespace.out)
+    if namespace.plot is not None:
+        _write_picture(responses, namespace.plot)
+    if namespace.json:
+        print_json({"kind": "frequency_response", "responses": responses})
+    else:
+        print_responses(responses, PlainConsole())
+    if any(one["frequency_response"] is None for one in responses):
+        return int(ExitCode.NOT_IDENTIFIABLE)
+    whole = all(one.record.assumed is not None or one.record.whole for one in found)
+    return int(ExitCode.OK if whole else ExitCode.PARTIAL)
+
+
+def _logs(namespace: argparse.Namespace) -> list[Path]:
+    logs: list[Path] = list(namespace.logs)
+    while namespace.columns and "=" not in namespace.columns[-1]:
+        logs.insert(len(namespace.logs), Path(namespace.columns.pop()))
+    if not logs:
+        raise UsageError("no log is named", next_step="For example: tdhil frf run.mcap", entry=MessageCode.LOG_NEEDED)
+    return logs
+
+
+def _check_targets(namespace: argparse.Namespace, logs: Sequence[Path]) -> None:
+    """Check both files before a log is read. Raises UsageError."""
+    for flag, path, endings in (("--out", namespace.out, _TABLES), ("--plot", namespace.plot, _PICTURES)):
+        if path is None:
+            continue
+        where = f"{flag} {path}"
+        if path.suffix.lower() not in endings:
+            raise UsageError(f"ends in none of {', '.join(endings)}", where=where,
+                             next_step=f"Such as {flag} frf{endings[0]}", entry=MessageCode.VALUE_NOT_ALLOWED)
+        if path.resolve() in [log.resolve() for log in logs]:
+            raise UsageError("is the log itself", where=where, next_step="Name another file",
+                             entry=MessageCode.SAME_FILE_TWICE)
+        if path.exists():
+            raise UsageError("already exists and was left unchanged", where=where, next_step="Name another file",
+                             entry=MessageCode.FILE_EXISTS)
+        if not path.parent.is_dir():
+            raise UsageError("the folder does not exist", where=where, next_step=f"Make {path.parent} first",
+                             entry=MessageCode.FILE_NOT_WRITABLE)
+    if namespace.out is not None and namespace.out.suffix.lower() == ".parquet":
+        _duckdb()
+    if namespace.plot is not None:
+        from tdhil.report import require_extra
+
+        require_extra("--plot")
+
+
+def _part(result: Result) -> dict[str, Any]:
+    """Return one log's response as plain data; without one, ``reason`` says why."""
+    document = result.document
+    part = {name: document[name] for name in ("log", "simulated", "frequency_response")}
+    return part | {"reason": None if part["frequency_response"] is not None else _reason(result.record, result)}
+
+
+def _reason(recorded: RunRecord, result: Result) -> str:
+    excitation = recorded.recording.excitation
+    if excitation is None or not excitation.segments:
+        return with_code("this recording has no periodic excitation. Run tdhil identify with --excitation multisine, "
+                         "or describe the motion of a trace with --excitation", MessageCode.NO_EXCITATION.code)
+    found = result.identification
+    if found.periods_used and found.periods_used < 2 * len(excitation.segments):
+        return with_code(f"{found.periods_used} usable periods do not show the scatter. Run two whole periods or more "
+                         "at a mean speed (--periods)", MessageCode.TOO_FEW_PERIODS.code)
+    return with_code(f"{found.reason}. Advice: {found.advice}", found.entry.code)
+
+
+def _write_picture(responses: Sequence[dict[str, Any]], path: Path) -> None:
+    from tdhil.report import SIMULATED, save_responses
+
+    parts = [(Path(one["log"]).name + (f" · {SIMULATED}" if one["simulated"] else ""), one["frequency_response"])
+             for one in responses if one["frequency_response"]]
+    if not parts:
+        return
+    try:
+        save_responses(parts, path)
+    except OSError as error:
+        raise UsageError(f"can't be written ({error.strerror or error})", where=f"--plot {path}",
+                         entry=MessageCode.FILE_NOT_WRITABLE) from error
+
+
+def _write_table(found: Sequence[Result], path: Path) -> None:
+    """Write a row for each line of each log. A CSV has all digits, and an empty cell for a value that is not known."""
+    from tdhil.estimation import response_columns
+
+    rows: list[dict[str, Any]] = []
+    for one in found:
+        if (response := one.frf) is not None:
+            columns = response_columns(response)
+            rows += [{"log": str(one.document["log"]), **dict(zip(columns, row, strict=True))}
+                     for row in zip(*columns.values(), strict=True)]
+    if not rows:
+        return
+    try:
+        (_write_parquet if path.suffix.lower() == ".parquet" else _write_csv)(rows, path)
+    except OSError as error:
+        raise UsageError(f"can't be written ({error.strerror or error})", where=f"--out {path}",
+                         entry=MessageCode.FILE_NOT_WRITABLE) from error
+
+
+def _write_csv(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    with path.open("x", encoding="utf-8", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(rows[0])
+        for row in rows:
+            table.writerow(["" if isinstance(cell, float) and math.isnan(cell) else cell for cell in row.values()])
+
+
+def _write_parquet(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    quoted = str(path).replace("'", "''")
+    columns = ", ".join(f"{name} {'VARCHAR' if name == 'log' else 'DOUBLE'}" for name in rows[0])
+    with closing(_duckdb().connect()) as base:
+        base.execute(f"CREATE TABLE lines ({columns})")
+        marks = ", ".join("?" for _ in rows[0])
+        base.executemany(f"INSERT INTO lines VALUES ({marks})", [
+            [None if isinstance(cell, float) and math.isnan(cell) else cell for cell in row.values()] for row in rows])
+        base.execute(f"COPY lines TO '{quoted}' (FORMAT parquet)")
+
+
+def _duckdb() -> Any:
+    from tdhil.fleet import load_duckdb
+
+    return load_duckdb("--out", "end it in .csv")

@@ -1,0 +1,96 @@
+"""`tdhil frf` on traces: the table, files that others read, several logs, and what has no response."""
+
+from __future__ import annotations
+
+import csv
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from tdhil.cli.main import main
+from tests.estimation.analytic import closed_form
+
+
+def write_trace(folder: Path, name: str, **how) -> list[str]:
+    """Write a trace with its motion; return the words of the command line that name both."""
+    recording = closed_form(rate_hz=25.0, noise=3.0, **how)
+    trace, motion = folder / f"{name}.csv", folder / f"{name}.yaml"
+    rows = zip(recording.time_s, recording.speed_rad_s, recording.torque_nm, strict=True)
+    trace.write_text("time_s,speed_rad_s,torque_nm\n" + "".join(f"{t:.4f},{w:.9f},{m:.6f}\n" for t, w, m in rows))
+    motion.write_text(yaml.safe_dump({"kind": "multisine", "mode": "torque", "segments": [
+        {"start_s": one.start_s, "periods": round((one.end_s - one.start_s) / one.period_s), "period_s": one.period_s,
+         "settle_periods": 1, "offset_rad_s": one.offset_rad_s, "lines_hz": list(one.lines_hz)}
+        for one in recording.excitation.segments]}))
+    return [str(trace), "--excitation", str(motion), "--gear", "1", "--torque-scale-sd", "0.03"]
+
+
+@pytest.fixture(scope="module")
+def trace(tmp_path_factory):
+    return write_trace(tmp_path_factory.mktemp("trace"), "run")
+
+
+def test_the_table_fits_eighty_columns_and_says_what_it_shows(trace, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["frf", *trace]) == 0
+    said = capsys.readouterr().out
+    assert max(map(len, said.splitlines())) <= 80
+    rows = [line.split() for line in said.splitlines() if line.startswith("     0.")]
+    assert [row[0] for row in rows] == ["0.1", "0.2", "0.3", "0.4"]
+    assert "No nonlinear distortion was detected" in " ".join(said.split())
+
+
+def test_json_csv_parquet_and_picture_have_the_same_lines(trace, tmp_path, capsys):
+    duckdb = pytest.importorskip("duckdb", reason="duckdb is not installed (pip install '.[parquet]')")
+    table, parquet, picture = (tmp_path / f"frf.{ending}" for ending in ("csv", "parquet", "png"))
+    assert main(["frf", *trace, "--json", "--out", str(table), "--plot", str(picture)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["kind"] == "frequency_response"
+    (one,) = document["responses"]
+    lines = one["frequency_response"]["lines"]
+    with table.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["magnitude_high"]) for row in rows] == [line["magnitude"]["high"] for line in lines]
+    assert {row["log"] for row in rows} == {trace[0]}
+    assert main(["frf", *trace, "--out", str(parquet)]) == 0
+    with duckdb.connect() as base:
+        found = base.execute(f"SELECT hertz, phase_rad, log FROM read_parquet('{parquet}') ORDER BY hertz").fetchall()
+    assert found == [(line["hertz"], line["phase_rad"]["value"], trace[0]) for line in lines]
+    head = picture.read_bytes()
+    assert head.startswith(b"\x89PNG") and struct.unpack(">II", head[16:24])[0] > 900
+
+
+def test_python_has_the_same_response(trace, capsys):
+    import tdhil
+
+    main(["frf", *trace, "--json"])
+    lines = json.loads(capsys.readouterr().out)["responses"][0]["frequency_response"]["lines"]
+    result = tdhil.identify(tdhil.read(trace[0], excitation=trace[2], gear_ratio=1.0, torque_scale_rel_sd=0.03))
+    sizes = [line["magnitude"]["value"] for line in lines]
+    assert np.abs(result.frf.response).tolist() == pytest.approx(sizes, rel=1e-14)
+
+
+def test_what_has_no_response_says_why_and_ends_with_9(tmp_path, capsys):
+    one = write_trace(tmp_path, "one", periods=2)
+    assert main(["frf", *one]) == 9
+    assert "TDH-911" in capsys.readouterr().out
+    assert main(["frf", one[0], "--json"]) == 9
+    (found,) = json.loads(capsys.readouterr().out)["responses"]
+    assert found["frequency_response"] is None and "TDH-903" in found["reason"]
+
+
+@pytest.mark.parametrize("words, code, said", [
+    ([], "TDH-219", "no log is named"),
+    (["missing.mcap"], "TDH-204", "does not exist"),
+    (["TRACE", "--plot", "frf.gif"], "TDH-203", ".png"),
+    (["TRACE", "--out", "frf.xlsx"], "TDH-203", ".parquet"),
+    (["TRACE", "--out", "TRACE"], "TDH-209", "the log itself"),
+    (["TRACE", "--out", "nowhere/frf.csv"], "TDH-206", "folder"),
+])
+def test_mistakes_are_one_line(trace, words, code, said, capsys):
+    assert main(["frf", *(trace[0] if word == "TRACE" else word for word in words)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and code in error and said in error

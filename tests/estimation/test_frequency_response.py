@@ -1,0 +1,198 @@
+"""Frequency response: intervals against exact responses, noise and distortion apart, exports that other tools read."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import control
+import numpy as np
+import pytest
+
+from tdhil.estimation import Options, identify, response_columns, unit_of, usable_samples
+from tdhil.estimation.case import Case
+from tdhil.estimation.frequency_domain.frequency_response import _pooled, measure_response
+from tdhil.estimation.periodic import measured
+from tdhil.estimation.spectrum import SpectralLine
+from tests.estimation.analytic import closed_form
+
+J, B, SPEED_LAG, TORQUE_LAG = 104.0, 8.0, 0.40, 0.15
+
+
+def plant():
+    """Return ω/T of `closed_form` as python-control has it."""
+    s = control.tf("s")
+    return (1 + TORQUE_LAG * s) / ((J * s + B) * (1 + SPEED_LAG * s))
+
+
+def respond(recording):
+    found = identify(recording).frequency_response
+    assert found is not None
+    return found
+
+
+def with_torque(recording, extra):
+    """Add a torque over time to the report; ``extra`` takes the time and the segment's number."""
+    torque = recording.torque_nm.copy()
+    for number, segment in enumerate(recording.excitation.segments):
+        inside = (recording.time_s >= segment.start_s) & (recording.time_s < segment.end_s)
+        torque[inside] += extra(recording.time_s[inside] - segment.start_s, number)
+    return replace(recording, torque_nm=torque)
+
+
+@pytest.fixture(scope="module")
+def linear():
+    return respond(closed_form(noise=3.0))
+
+
+def test_the_intervals_contain_the_exact_response_of_python_control(linear):
+    exact = control.frequency_response(plant(), 2.0 * np.pi * linear.hertz).frdata[0, 0]
+    for line, g in zip(linear.lines, exact, strict=True):
+        # twice the half-width of 95 %: one of twelve leaves that in one case of a thousand
+        inertia = (1.0 / g).imag / (2.0 * math.pi * line.hertz)
+        for one, truth in ((line.magnitude, abs(g)), (line.phase_rad, np.angle(g)),
+                           (line.apparent_inertia_kg_m2, inertia)):
+            assert abs(truth - one.value) < 2.0 * (one.high - one.value)
+        assert 0.99 < line.coherence <= 1.0
+        assert line.magnitude.high / line.magnitude.low < 1.05
+
+
+def test_the_intervals_cover_as_often_as_stated():
+    exact = control.frequency_response(plant(), 2.0 * np.pi * np.array([0.1, 0.2, 0.3, 0.4])).frdata[0, 0]
+    missed = lines = 0
+    for seed in range(40):
+        recording = closed_form(noise=3.0, seed=seed, periods=5, offsets=(4.0,))
+        case = measured(Case(recording, Options(), samples=usable_samples(recording)), recording.excitation)
+        found = measure_response(case, None, (), "none")       # without the fit of a model, which costs most
+        for line, g in zip(found.lines, exact, strict=True):
+            lines += 1
+            missed += not line.magnitude.low < abs(g) < line.magnitude.high
+    # 160 intervals of 95 %: more than 17 misses have a chance of 0.1 %
+    assert lines == 160 and missed <= 17
+
+
+def test_python_control_reads_the_arrays(linear):
+    frd = control.FRD(*linear.to_frd())
+    for line in linear.lines:
+        omega = 2.0 * math.pi * line.hertz
+        assert abs(complex(frd(1j * omega)) - line.magnitude.value * np.exp(1j * line.phase_rad.value)) <= (
+            1e-12 * line.magnitude.value)
+    # its own algebra of responses turns ω/T into T/ω
+    assert np.allclose((1 / frd).frdata[0, 0], linear.impedance, rtol=1e-12, atol=0.0)
+
+
+def test_xarray_has_the_lines_with_their_units(linear):
+    found = linear.to_xarray()
+    assert found.hertz.values.tolist() == linear.hertz.tolist()
+    assert found.magnitude.attrs["units"] == "rad/(s N m)" and found.phase_rad_low.attrs["units"] == "rad"
+    assert found.coherence.attrs["units"] == "1" and unit_of("hertz") == "Hz"
+    g = found.real_rad_s_nm.values + 1j * found.imaginary_rad_s_nm.values
+    assert np.allclose(g, linear.response, rtol=1e-15)
+    assert found.attrs["distortion_detected"] == 0
+    assert set(found.data_vars) | {"hertz"} == set(response_columns(linear))
+
+
+def test_the_model_is_drawn_through_the_lines_with_its_band(linear):
+    assert linear.model == "rigid+lags"
+    hertz = [point.hertz for point in linear.curve]
+    assert hertz == sorted(hertz) and hertz[0] < 0.1 and hertz[-1] > 0.4
+    exact = control.frequency_response(plant(), 2.0 * np.pi * np.array(hertz)).frdata[0, 0]
+    inside = [p.magnitude.low <= abs(g) <= p.magnitude.high and p.phase_rad.low <= np.angle(g) <= p.phase_rad.high
+              for p, g in zip(linear.curve, exact, strict=True)]
+    assert np.mean(inside) > 0.9
+    assert all(line.residual_sd < 4.0 for line in linear.lines)
+
+
+def test_a_linear_shaft_has_no_distortion(linear):
+    found = linear.distortion
+    assert not found.detected and found.p_value > 0.01
+    assert {one.harmonic for one in found.harmonics} == set(range(5, 13))
+    assert found.by_harmonics is not None and found.by_speed is not None
+
+
+@pytest.mark.parametrize("harmonic, odd", [(5, True), (6, False)])
+def test_torque_at_an_unexcited_harmonic_is_distortion(harmonic, odd):
+    bent = with_torque(closed_form(noise=3.0), lambda t, _: 2.0 * np.cos(2.0 * np.pi * harmonic * t / 10.0 + 0.4))
+    found = respond(bent).distortion
+    assert found.detected and found.by_harmonics < 1e-6
+    assert (found.odd_share > 0.7) is odd
+    seen = {one.harmonic: one for one in found.harmonics}[harmonic]
+    assert seen.torque_nm == pytest.approx(2.0, rel=0.1) and seen.p_value < 1e-6
+
+
+def test_detected_distortion_widens_the_intervals(linear):
+    bent = respond(with_torque(closed_form(noise=3.0), lambda t, _: 2.0 * np.cos(2.0 * np.pi * 0.5 * t)))
+    for wide, narrow in zip(bent.lines, linear.lines, strict=True):
+        assert wide.magnitude.high / wide.magnitude.low > narrow.magnitude.high / narrow.magnitude.low
+        assert wide.distortion_rel > wide.noise_rel > 0.0
+
+
+def test_a_response_that_differs_between_mean_speeds_is_distortion():
+    plain = closed_form(noise=3.0)
+    speeds = [plain.speed_rad_s[(plain.time_s >= one.start_s) & (plain.time_s < one.end_s)] - one.offset_rad_s
+              for one in plain.excitation.segments]
+    found = respond(with_torque(plain, lambda _, number: 1.5 * number * speeds[number])).distortion
+    assert found.detected and found.by_speed < 0.0015
+
+
+def test_a_constant_friction_and_another_torque_scale_are_no_distortion(linear):
+    scaled = closed_form(noise=3.0, coulomb=200.0)
+    scaled = replace(scaled, torque_nm=1.1 * scaled.torque_nm)
+    found = respond(scaled)
+    assert not found.distortion.detected
+    assert np.allclose(np.abs(found.response), np.abs(linear.response) / 1.1, rtol=0.01)
+
+
+def test_one_period_has_no_response_and_two_have():
+    assert identify(closed_form(periods=2)).frequency_response is None
+    # two usable periods refuse J, for lack of degrees of freedom, and still show the lines
+    found = respond(closed_form(periods=3, offsets=(4.0,)))
+    assert [line.periods for line in found.lines] == [2, 2, 2, 2]
+    assert found.model == "none" and found.curve == ()
+
+
+def test_a_single_sine_has_a_response_though_it_tells_no_inertia():
+    identified = identify(closed_form(lines=(0.1,), amplitudes=(1.5,), noise=3.0))
+    found = identified.frequency_response
+    assert identified.inertia is None and found is not None
+    exact = complex(plant()(2j * math.pi * 0.1))
+    assert found.lines[0].magnitude.low < abs(exact) < found.lines[0].magnitude.high
+    assert found.lines[0].fitted_magnitude is None and not found.distortion.detected
+
+
+def test_a_recording_without_periodic_excitation_has_no_response():
+    assert identify(replace(closed_form(), excitation=None)).frequency_response is None
+
+
+def test_a_line_in_the_noise_has_an_open_interval():
+    found = respond(closed_form(noise=60.0, amplitudes=(1.5, 0.8, 0.25, 0.0003)))
+    assert math.isinf(found.lines[-1].magnitude.high)
+    assert found.lines[-1].phase_rad.high - found.lines[-1].phase_rad.value == pytest.approx(math.pi)
+    assert math.isfinite(found.lines[0].magnitude.high)
+
+
+def test_the_clearer_signal_is_divided_by():
+    """At an antiresonance the speed drowns; dividing by its square would be biased."""
+    rng = np.random.default_rng(3)
+    z, torque, seen = 200.0 * np.exp(0.3j), 10.0, []
+    for _ in range(400):
+        w = torque / z + 0.03 * (rng.standard_normal(8) + 1j * rng.standard_normal(8)) / math.sqrt(2.0)
+        t = torque + 0.01 * (rng.standard_normal(8) + 1j * rng.standard_normal(8)) / math.sqrt(2.0)
+        line = SpectralLine(0.5, np.array([w.mean()]), np.array([t.mean()]), np.array([8.0]), 0.03**2, 0.01**2, 0j, 7.0)
+        seen.append(1.0 / _pooled(line).z)
+    error = np.array(seen) - 1.0 / z
+    assert abs(error.mean()) < 4.0 * np.std(error) / math.sqrt(len(seen))
+
+
+def test_the_values_are_those_of_the_table_of_lines(linear):
+    identified = identify(closed_form(noise=3.0), Options())
+    for line, point in zip(identified.frequency_response.lines, identified.lines, strict=True):
+        assert line.apparent_inertia_kg_m2.value == pytest.approx(point.apparent_inertia_kg_m2.value, rel=1e-9)
+        assert line.residual_sd == pytest.approx(point.residual_sd, rel=1e-6)
+
+
+def test_thinned_samples_give_the_same_harmonics():
+    quick = with_torque(closed_form(noise=0.0, rate_hz=2000.0), lambda t, _: np.cos(2.0 * np.pi * 0.7 * t))
+    seen = {one.harmonic: one for one in respond(quick).distortion.harmonics}
+    assert seen[7].torque_nm == pytest.approx(1.0, rel=0.01)
+    assert max(one.torque_nm for number, one in seen.items() if number != 7) < 1e-3
