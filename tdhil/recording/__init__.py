@@ -35,7 +35,10 @@ if TYPE_CHECKING:
     from tdhil.recording.salvage import Salvage as Salvage, examine as examine, write_copy as write_copy
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
-        "csv": "Bench USUAL parse_columns read_recording",
+        "csv": (
+            "Bench USUAL parse_columns read_recording REFERENCE_FLAG ReferenceTrace TIME_AND_TORQUE "
+            "read_reference"
+        ),
         "log_format": "CAN CHANNELS CLASSES COMMAND EXCITATION FRAME_CHANNELS RAW_FRAMES SAMPLE VIRTUAL_COLUMNS "
                       "VIRTUAL_STRING schema_name",
         "log_reader": "read_cycles read_frames read_run",

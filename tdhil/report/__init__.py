@@ -59,8 +59,9 @@ else:
         "page": "STYLE has_extra inline_svg install_command repeatable_figures require_extra",
         "plots": "draw_run",
         "speed_calibration": "print_speed_calibration speed_document",
-        "torque_calibration": "calibration_document calibration_report draw_calibration pairs_document "
-                              "print_calibration print_pairs write_calibration_report",
+        "torque_calibration": "calibration_document calibration_report draw_calibration print_calibration "
+                              "write_calibration_report",
         "schedule": "schedule_document",
         "tuning": "TunedFor print_tuning showcase_of tuning_document write_tuning_report",
+        "factor_calibration": "known_pipe_document pairs_document print_factor reference_document write_factor_report",
     })

@@ -90,4 +90,5 @@ else:
         "task": "bench_of excitation_request facts machine_limits stated_lags suited",
         "torque_calibration": "ASSUMED_BODY_REL_SD CalibrationFound CalibrationRun document_of_calibration "
                               "find_calibration find_plan read_pairs sha256_of_log",
+        "reference_calibration": "find_by_known_pipe find_by_reference known_pipe_of log_of_calibration",
     })

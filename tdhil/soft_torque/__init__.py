@@ -64,8 +64,10 @@ if TYPE_CHECKING:
     )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
-        "drill_string": "BitFriction EXACT_STRING BottomEnd DrillString WaveLine PipeSection StringFile "
-                        "identified_string StringTolerance load_string spring_and_mass string_of",
+        "drill_string": (
+            "BitFriction EXACT_STRING BottomEnd DrillString WaveLine PipeSection StringFile identified_string "
+            "StringTolerance load_string spring_and_mass string_of ToleranceFile line_of"
+        ),
         "controller": "ClosedSystem DERIVATIVE_FILTER_S Margins NaturalMode SpeedController TopDrive control_law "
                       "impedance inner_lags margins reflection reflection_at softest_allowed stiff_controller "
                       "tuned_controller",
