@@ -517,6 +517,10 @@ class MessageCode(Enum):
         438, "The disk of the service is full",
         "The service cannot record a run.",
         "Free some space on the disk.")
+    PLAN_HOPELESS = (
+        439, "The requested motion cannot determine the moment of inertia",
+        "The cycle rate is too low for its spectral lines, or it cannot separate the inertia from lags and friction.",
+        "Leave out --frequency and --amplitude, or change them as the message says.")
 
     # --- 5xx: communication ------------------------------------------------------------------------------------------
     COMMUNICATION_LOST = (

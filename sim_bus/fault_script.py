@@ -184,27 +184,36 @@ class FaultKind(Generic[M]):
     takes: str = ""
 
 
+def number(text: str) -> float:
+    """Return the number. Raises ValueError with a text for the user."""
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{text!r} is not a number") from None
+
+
 def share(text: str) -> float:
     """A share as a number or in percent. Raises ValueError."""
-    number = float(text[:-1]) / 100.0 if text.endswith("%") else float(text)
-    if not 0.0 <= number <= 1.0:
+    found = number(text[:-1]) / 100.0 if text.endswith("%") else number(text)
+    if not 0.0 <= found <= 1.0:
         raise ValueError("a share from 0 to 1, or 0% to 100%")
-    return number
+    return found
 
 
 def seconds(text: str) -> float:
     """A time such as 1s or 200ms. Raises ValueError."""
-    number = float(text[:-2]) / 1000.0 if text.endswith("ms") else float(text.removesuffix("s"))
-    if not 0.001 <= number <= 3600.0:
+    found = number(text[:-2]) / 1000.0 if text.endswith("ms") else number(text.removesuffix("s"))
+    if not 0.001 <= found <= 3600.0:
         raise ValueError("a time from 1ms to 3600s")
-    return number
+    return found
 
 
 def factor(text: str) -> float:
     """Return the factor of a reported quantity. Raises ValueError."""
-    if not 0.01 <= float(text) <= 100.0:
+    found = number(text)
+    if not 0.01 <= found <= 100.0:
         raise ValueError("a factor from 0.01 to 100")
-    return float(text)
+    return found
 
 
 def plain(make: Callable[[], M]) -> Callable[[str], M]:
@@ -238,6 +247,9 @@ class Kinds(dict[str, FaultKind[M]]):
             raise FaultRefused(f"no fault is called {fault.name!r}", where=where, next_step="--fault list shows them")
         if fault.value and not kind.takes:
             raise FaultRefused(f"{fault.name} takes no value", where=where, next_step="Leave the = out")
+        if (at := fault.value.partition("@"))[1]:
+            raise FaultRefused(f"{fault.value!r} is no value of {fault.name}: the moment comes before the value",
+                               where=where, next_step=f"Write {fault.name}@{at[2]}={at[0]}")
         try:
             return kind.make(fault.value or kind.value)
         except ValueError as error:

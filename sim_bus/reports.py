@@ -23,7 +23,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
-from sim_bus.fault_script import FaultKind, M, factor, seconds, share
+from sim_bus.fault_script import FaultKind, M, factor, number, seconds, share
 
 
 class Feedback(Enum):
@@ -411,15 +411,15 @@ class _QuantityDistortion:
 
 
 def _amount(text: str) -> float:
-    if not -1e9 <= float(text) <= 1e9:
+    if not -1e9 <= number(text) <= 1e9:
         raise ValueError("a number in SI: rad/s, N·m or rad")
-    return float(text)
+    return number(text)
 
 
 def _step(text: str) -> float:
-    if not 0.0 < float(text) <= 1e9:
+    if not 0.0 < number(text) <= 1e9:
         raise ValueError("a step above 0 in SI: rad/s, N·m or rad")
-    return float(text)
+    return number(text)
 
 
 _WAYS = (

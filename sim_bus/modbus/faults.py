@@ -27,6 +27,7 @@ from sim_bus.fault_script import (
     Moment,
     Passing,
     Scripted,
+    number,
     plain,
     share,
 )
@@ -306,9 +307,9 @@ def _delay_s(text: str) -> float:
 
 
 def _celsius(text: str) -> float:
-    if not 0.0 <= float(text) <= 300.0:
+    if not 0.0 <= number(text) <= 300.0:
         raise ValueError("°C, from 0 to 300")
-    return float(text)
+    return number(text)
 
 
 def _name(text: str) -> Misbehaviour:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 from profiles.quantities import RPM
@@ -15,20 +16,18 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from tdhil.buses import Connection
+    from profiles import Profile
     from tdhil.runner import MachineLimits, Planned
     from tdhil.soft_torque import EvaluationCase
 
 
-def dry_run(
-    options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True, releases_after_stop: bool = False
-) -> int:
-    """Plan and print; exit code 0. Raises PreflightRefused if no plan is possible, as a run would.
+def dry_run(options: RunOptions, rig: Rig | None, simulated: bool, profile: Profile) -> int:
+    """Plan and print; exit code 0. Raises PreflightRefused if no plan is possible, as a run would."""
+    from tdhil.report import stderr_console
 
-    ``can_torque``: the drive has a torque mode; without it stage 5 is planned in speed mode. ``releases_after_stop``:
-    its profile disables the drive after a quick stop.
-    """
-    planned, figures, limits = plan_dry(options, rig, simulated, can_torque, releases_after_stop)
+    told = stderr_console()
+    with told.status("planning …") if told.is_terminal else nullcontext():
+        planned, figures, limits = plan_dry(options, rig, simulated, profile)
     if options.json:
         plain = plan_document(planned, figures, limits)
         plain["simulated"] = simulated
@@ -85,21 +84,23 @@ def dry_run_course(
     return 0
 
 
-def say_unreachable(options: RunOptions, rig: Rig | None, connection: Connection, simulated: bool) -> str | None:
-    """Return, before motion, that --tolerance can't be reached, and the least possible value; None if it can be.
+def say_before(options: RunOptions, rig: Rig | None, profile: Profile, simulated: bool) -> str | None:
+    """Return, before motion, that no interval is expected or that --tolerance can't be reached; else None.
 
     It refers to the rig that rig.yaml expects, or to a typical one. The measured values of the run decide in the end.
     """
     from drivers import PreflightRefused
 
-    if not options.given("tolerance"):
+    if not options.given("tolerance") and not options.given("frequency_hz"):
         return None
     try:
-        planned, figures, _ = plan_dry(
-            options, rig, simulated, connection.profile.can_torque, connection.profile.quick_stop.ends == "off"
-        )
+        planned, figures, _ = plan_dry(options, rig, simulated, profile)
     except PreflightRefused:
         return None         # an assumed rig is no reason to refuse
+    if math.isinf(planned.half_width):
+        known = ", unless the drive reports its filters" if profile.filters else ""
+        return (f"{_conclusions(planned)[0]}{known}. State the lags of the reports in rig.yaml (drive_data), or use"
+                " --excitation multisine")
     if planned.stopping is None or planned.stopping.reachable:
         return None
     assumed = " (for an assumed rig; improve it with `expected:` in rig.yaml)"

@@ -220,6 +220,9 @@ def _print(summary: FleetSummary, as_json: bool) -> None:
     console.print(_counts(found))
     if found["simulated"]:
         console.print(f"{found['simulated']} of them {SIMULATED}", style="magenta")
+    _list(console, "results", [
+        f"{f'{SIMULATED} ' if row.simulated else ''}{row.log}: {_result_text(row)}"
+        for row in summary.rows if row.inertia_kg_m2 is not None])
     _list(console, "failed", [f"{one['log']}: {one['text']}" for one in found["failures"]])
     _list(console, "from a part of the run", [f"{one['log']}: {one['text']}" for one in found["in_part"]])
     _list(console, "different from the result in the log", [

@@ -48,7 +48,9 @@ def show_settings(
             console.print(f"{connection.bus.row_name} {name:<10} {value}  ({source})", style="dim", markup=False)
     for name, value, source in options.rows():
         if options.given(name):
-            console.print(f"{name:<14} {value}  ({source})", style="dim", markup=False)
+            number = options.settings[name].value       # 20rpm is 2.0943951023931953 rad/s in the log
+            shown = f"{number:.6g}" if isinstance(number, float) else value
+            console.print(f"{name:<14} {shown}  ({source})", style="dim", markup=False)
     for key, text, source in rig.conversions if rig is not None else ():
         console.print(f"{key:<14} {text}  ({source})", markup=False)
 
@@ -89,7 +91,7 @@ def run_with(
 
     Raises TdhilError before the drive is touched; afterwards everything ends in an exit code.
     """
-    from tdhil.cli.dry_run import dry_run, dry_run_course, say_unreachable
+    from tdhil.cli.dry_run import dry_run, dry_run_course, say_before
     from tdhil.report import stderr_console
     from tdhil.session import RunRequest, check_unverified, connection_of, plan_peer, suited, with_faults
 
@@ -113,8 +115,7 @@ def run_with(
             bench = suited(rig, plan_peer(options, connection).plant)
             rate_hz = options.rate_hz or connection.profile.usual_rate_hz
             return dry_run_course(options, bench, evaluation, simulated, rate_hz)
-        releases_after_stop = connection.profile.quick_stop.ends == "off"
-        return dry_run(options, rig, simulated, connection.profile.can_torque, releases_after_stop)
+        return dry_run(options, rig, simulated, connection.profile)
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
     show_settings(console, options, connection, peer, rig)
     details = RunDetails.of(vars(namespace))
@@ -122,7 +123,7 @@ def run_with(
         options, connection, peer, rig, overrides=Overrides.of(vars(namespace)), operator=details.operator,
         note=details.note, real_time_priority=bool(details.real_time_priority), evaluation=evaluation,
     )
-    if evaluation is None and (said := say_unreachable(options, rig, connection, simulated)) is not None:
+    if evaluation is None and (said := say_before(options, rig, connection.profile, simulated)) is not None:
         console.print(said, style="yellow", markup=False)
     return _run(request, console, namespace.report, logs)
 

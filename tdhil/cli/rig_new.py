@@ -19,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                      help="vendor/model, or a .yaml file (tdhil profiles lists them; default generic/cia402)")
     new.add_argument("--load", choices=("none", "string"), required=True,
                      help="load on the shaft: none that stores torque, or a drill string")
+    new.add_argument("--name", metavar="NAME", help="name of the rig in reports and in tdhil trend, such as 'bench 3'")
     new.set_defaults(run=run)
 
 
@@ -32,8 +33,8 @@ def run(namespace: argparse.Namespace) -> int:
     named = namespace.profile
     if named.endswith((".yaml", ".yml")):
         named = Path(os.path.relpath(named, path.parent)).as_posix()      # relative to the folder of rig.yaml
-    write_new(path, blank_rig(profile, named, namespace.load))
+    write_new(path, blank_rig(profile, named, namespace.load, namespace.name))
     print(f"{path}: written. Fill these in; until then a real drive does not move:", file=sys.stderr)  # noqa: T201
-    for line in to_fill_in(profile, namespace.load):
+    for line in to_fill_in(profile, namespace.load, namespace.name):
         print(f"  {line}", file=sys.stderr)  # noqa: T201
     return 0

@@ -34,6 +34,11 @@ _PLAIN = re.compile(r"[A-Za-z_./][A-Za-z0-9_./-]*")
 _WORDS = {"true", "false", "null", "yes", "no", "on", "off", "y", "n", "~", ".inf", ".nan"}
 
 
+def _named(name: str | None) -> list[str]:
+    return ["# The rig's own name: results of one name are one history (tdhil trend).",
+            "#name:    # such as bench 3" if name is None else f"name: {scalar(name)}"]
+
+
 def starter(found: FoundDrive, line: Mapping[str, Any], profile: Profile | None) -> str:
     """Return the file's text. ``line``: the content of the section bus: or modbus:."""
     parts = [
@@ -41,6 +46,7 @@ def starter(found: FoundDrive, line: Mapping[str, Any], profile: Profile | None)
         f"# Found: {_comment(found.name)}, {_comment(found.title)}; {_comment(found.identity)}"
         + (" (SIMULATED)" if found.simulated else ""),
         "",
+        *_named(None),
         f"drive: {found.bus}",
     ]
     if line:
@@ -62,13 +68,14 @@ def starter(found: FoundDrive, line: Mapping[str, Any], profile: Profile | None)
     return "\n".join(parts) + "\n"
 
 
-def blank_rig(profile: Profile, named: str, load: str) -> str:
+def blank_rig(profile: Profile, named: str, load: str, name: str | None = None) -> str:
     """Return the file's text without a drive. ``named``: the profile as the operator names it."""
     parts = [
         "# Written by tdhil rig new. Torque and speed refer to the motor shaft. All keys: docs/reference/rig.md,",
         "# whose path tdhil docs prints.",
         "# Fill in the lines with a '#'. Without 'limits' a real drive does not move.",
         "",
+        *_named(name),
         f"drive: {profile.bus}",
         f"profile: {scalar(named)}    # {_comment(profile.title)}",
         "# The drive's address. Without it the embedded simulator runs.",
@@ -89,9 +96,11 @@ def blank_rig(profile: Profile, named: str, load: str) -> str:
     return "\n".join(parts) + "\n"
 
 
-def to_fill_in(profile: Profile, load: str) -> list[str]:
+def to_fill_in(profile: Profile, load: str, name: str | None = None) -> list[str]:
     """Return what a run on a real drive needs besides."""
     found = [f"limits: {', '.join(_LIMITS)}", f"the drive's address: {bus_named(profile.bus).to_fill_in}"]
+    if name is None:
+        found.append("name: without one tdhil trend does not follow this rig")
     if load == "string":
         found.append(f"{', '.join(_STRING)}: without them the file is refused")
     if doubtful(profile):

@@ -80,7 +80,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--depths", type=depths, metavar="FROM:TO:STEP",
                         help="gains over the depth of the well, m: the topmost section of string.yaml gets longer, "
                         "for example 500:6000:250")
-    parser.add_argument("--no-simulation", action="store_true", help="omit the critical speeds")
+    parser.add_argument("--no-simulation", action="store_true",
+                        help="omit the critical speeds (tdhil evaluate needs them)")
     add_option(parser, OPTION["json"])
     parser.add_argument("--report", type=Path, metavar="FILE", help="write a report with pictures: tune.html, or "
                                                                     "tune.pdf")
@@ -101,9 +102,10 @@ def run(namespace: argparse.Namespace) -> int:
     from tdhil.soft_torque import Search, tune
 
     _check(namespace)
+    _check_files(namespace)
     if namespace.report is not None:
         check_report_path(namespace.report, namespace.result)
-    result = read_result(namespace.result)
+    result = read_result(namespace.result)       # a log is identified again, which takes seconds
     case, lags_from = case_of(result, namespace)
     name = namespace.profile or (result.get("profile") or {}).get("name")
     profile = load_profile(str(name)) if name is not None else None
@@ -119,6 +121,9 @@ def run(namespace: argparse.Namespace) -> int:
         document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, profile, tell)
     if namespace.json:
         print_json(document)
+        if namespace.no_simulation:
+            told.print("tune: tdhil evaluate does not accept this file: --no-simulation omits the critical speeds",
+                       style="yellow", markup=False, soft_wrap=True)
     else:
         print_tuning(document, PlainConsole())
     if namespace.report is not None:
@@ -153,6 +158,24 @@ def _check(namespace: argparse.Namespace) -> None:
         if not 0.0 <= lag <= 5.0:
             raise UsageError(f"{lag:g}: must be a time from 0 to 5 s", where="--inner-lags",
                              entry=MessageCode.VALUE_NOT_ALLOWED)
+
+
+def _check_files(namespace: argparse.Namespace) -> None:
+    """Check every file that the command names before any of them is worked with. Raises UsageError, DataFileError."""
+    from tdhil.soft_torque import load_string
+
+    _require_result(namespace.result)
+    if namespace.string is not None:
+        load_string(namespace.string)
+    if namespace.impedance is not None:
+        _require_result(namespace.impedance)
+
+
+def _require_result(path: Path) -> None:
+    if not path.is_file():
+        raise UsageError("this file does not exist", where=str(path),
+                         next_step="Name a result.json of tdhil identify --json, or a run.mcap",
+                         entry=MessageCode.FILE_NOT_FOUND)
 
 
 def depths(text: str) -> tuple[float, ...]:
@@ -200,10 +223,7 @@ def read_result(path: Path) -> Mapping[str, Any]:
     """Return the result's document, from --json or identified again from the log."""
     from tdhil.session import is_log
 
-    if not path.is_file():
-        raise UsageError("this file does not exist", where=str(path),
-                         next_step="Name a result.json of tdhil identify --json, or a run.mcap",
-                         entry=MessageCode.FILE_NOT_FOUND)
+    _require_result(path)
     if is_log(path):
         from tdhil.api import identify, read
 

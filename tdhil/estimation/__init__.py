@@ -4,6 +4,10 @@ from tdhil.estimation.cross_checks import (
     AngleRatio as AngleRatio, angle_ratios as angle_ratios, mean_speed as mean_speed,
     torque_contradiction as torque_contradiction, torque_ratios as torque_ratios,
 )
+from tdhil.estimation.data_checks import (
+    SAMPLED_SHARE as SAMPLED_SHARE, aliased as aliased, least_samples as least_samples,
+    too_few_a_period as too_few_a_period,
+)
 from tdhil.estimation.frequency_domain import torque_answer as torque_answer
 from tdhil.estimation.friction_levels import (
     Levels as Levels, measure_levels as measure_levels, tie_viscous as tie_viscous,

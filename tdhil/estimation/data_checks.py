@@ -118,7 +118,23 @@ def _pile(signal: FloatArray, top: float, quantum: float) -> float | None:
 
 _WHOLE = 2e-3             # of a line that it may be off a whole number of cycles a period
 _NYQUIST = 0.9            # of half the sample rate that lines may reach: the last tenth is too near to its image
+SAMPLED_SHARE = 0.5 * _NYQUIST    # of the sample rate: a line at or above it is refused
 _SECONDS_NOT = 100.0      # so much slower than the lines need: more likely the unit of time is wrong
+
+
+def aliased(highest_hz: float, interval_s: float) -> bool:
+    """Return whether samples so far apart can't separate a spectral line from its image."""
+    return highest_hz * interval_s >= SAMPLED_SHARE
+
+
+def least_samples(lines: int) -> int:
+    """Return the fewest samples a period for these spectral lines: twice the unknowns (two a line, and a mean)."""
+    return 2 * (2 * lines + 1)
+
+
+def too_few_a_period(lines: int, period_s: float, interval_s: float) -> bool:
+    """Return whether a period has too few samples for its spectral lines."""
+    return period_s / interval_s < least_samples(lines)
 
 
 def check_declared(excitation: Excitation, samples: Samples) -> None:
@@ -172,15 +188,15 @@ def _check_rate(segment: Segment, part: Samples) -> None:
     fastest = max(segment.lines_hz)
     if len(part) < 2 or not np.isfinite(interval):
         return
-    if fastest * interval >= 0.5 * _NYQUIST:
+    if aliased(fastest, interval):
         slow = fastest * interval > _SECONDS_NOT
         raise Refused(
             f"aliased: one sample every {interval:.3g} s can't tell a line at {fastest:g} Hz from its image",
             "check the unit of the time stamps" if slow else
-            f"sample at {5.0 * fastest:.3g} Hz or faster, or excite with lower lines",
+            f"sample at {math.ceil(fastest / SAMPLED_SHARE):d} Hz or faster, or excite with lower lines",
             entry=MessageCode.TOO_FEW_SAMPLES,
         )
-    if segment.period_s / interval < 2.0 * (2 * len(segment.lines_hz) + 1):
+    if too_few_a_period(len(segment.lines_hz), segment.period_s, interval):
         raise Refused(
             f"{segment.period_s / interval:.0f} samples a period are too few for {len(segment.lines_hz)} lines",
             "sample faster, or excite with fewer lines", entry=MessageCode.TOO_FEW_SAMPLES,

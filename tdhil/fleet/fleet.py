@@ -91,9 +91,12 @@ class FleetSummary:
 
     @property
     def exit_code(self) -> int:
-        """0: every log has a result; 3: some have none, or aren't done; 10: none has."""
-        bad = sum(row.failed for row in self.rows)
-        if self.rows and bad == len(self.rows):
+        """0: every log has a result; 3: some have none, or aren't done; 10: none has.
+
+        The log of a run that was refused before motion is whole, and has no result to give.
+        """
+        bad = sum(row.failed and not row.no_motion for row in self.rows)
+        if self.rows and all(row.failed for row in self.rows):
             return 10
         return 3 if bad or self.left else 0
 

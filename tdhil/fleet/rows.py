@@ -9,10 +9,11 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Final
 
+from tdhil.errors import NothingRecorded
 from tdhil.recording import ABORTED
 from tdhil.version import __version__
 
-ROW_FORMAT: Final = 2
+ROW_FORMAT: Final = 3
 """Grows when rows of before can't stand beside new ones."""
 
 UNREAD: Final = "unread"
@@ -56,7 +57,7 @@ class FleetRow:
     reason: str | None = _at("reason")
     error_kind: str | None = None
     error_text: str | None = None
-    rig: str | None = _at("rig.name", "rig.file")
+    rig: str | None = _at("rig.name")    # the file's name is no identity: every folder may have its rig.yaml
     date: str | None = _at("date")
     inertia_kg_m2: float | None = _at("inertia_kg_m2.value")
     inertia_low_kg_m2: float | None = _at("inertia_kg_m2.low")
@@ -106,6 +107,7 @@ class FleetRow:
     aborted_stage: str | None = None
     aborted_by: str | None = _at("ended.kind")
     simulated: bool | None = _at("simulated")
+    rehearsed_faults: str | None = None      # scripted in the simulated drive: no history of the rig
     drive_name: str | None = _at("drive.name")
     drive_vendor: int | None = _at("drive.vendor")
     drive_product: int | None = _at("drive.product")
@@ -128,6 +130,11 @@ class FleetRow:
     def failed(self) -> bool:
         """True for the row of a log without a result."""
         return self.error_kind is not None
+
+    @property
+    def no_motion(self) -> bool:
+        """True for the log of a run that ended before anything moved."""
+        return self.error_kind == NothingRecorded.__name__
 
     @property
     def part_text(self) -> str | None:
@@ -192,6 +199,7 @@ def row_of(
     found: dict[str, Any] = {name: _find(document, places) for name, places in PLACES.items()} | {
         "warnings": "\n".join(document.get("warnings") or ()) or None,
         "aborted_stage": next((one["name"] for one in document.get("stages") or () if one["outcome"] == ABORTED), None),
+        "rehearsed_faults": ", ".join(document.get("rehearsed_faults") or ()) or None,
     }
     calibration = document.get("torque_calibration")
     if isinstance(calibration, Mapping):

@@ -80,14 +80,17 @@ def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str
         raise UsageError(what if known else "no log is of a rig that has a name", where="--rig",
                          next_step=f"There are: {shown}" if known else "No log in the table names its rig: `name:` in "
                          "rig.yaml does, or `rig:` in the .yaml beside a trace")
-    standing = [row for row in mine if row.verdict in _GOOD]
+    real = [row for row in mine if row.rehearsed_faults is None]
+    standing = [row for row in real if row.verdict in _GOOD]
     dated = sorted(((_time_s(row), row) for row in standing if _time_s(row) is not None),
                    key=lambda one: (one[0], one[1].log))
     kept = [(float(time_s or 0.0), row) for time_s, row in dated]
     notes = []
-    if len(mine) > len(standing):
-        without = len(mine) - len(standing)
-        notes.append(f"{without} of {counted(len(mine), 'log')} without a result that stands: left out")
+    if len(mine) > len(real):
+        notes.append(f"{counted(len(mine) - len(real), 'rehearsal')} of faults on the simulated drive: left out")
+    if len(real) > len(standing):
+        without = len(real) - len(standing)
+        notes.append(f"{without} of {counted(len(real), 'log')} without a result that stands: left out")
     if len(standing) > len(kept):
         notes.append(f"{counted(len(standing) - len(kept), 'log')} without a date: left out")
     if in_part := [row for _, row in kept if row.part_text is not None]:
@@ -97,8 +100,14 @@ def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str
     if len({row.simulated for _, row in kept}) > 1:
         notes.append("simulated runs and real ones are mixed")
     drives = {drive_of(row) for _, row in kept}
-    if len(drives) > 1:
-        notes.append(f"{len(drives)} drives: each has a torque scale of its own, which stays in their differences")
+    if len(drives) > 1:         # two benches of one name, or another drive on this one: never one series
+        newest = drive_of(kept[-1][1])
+        others = [row for _, row in kept if drive_of(row) != newest]
+        kept = [(time_s, row) for time_s, row in kept if drive_of(row) == newest]
+        notes.append(f"{len(drives)} drives or profiles under this name: the trend is of the newest"
+                     f" ({_drive_text(kept[-1][1])}). Left out: {counted(len(others), 'result')} of"
+                     f" {'; '.join(sorted({_drive_text(row) for row in others}))}. Give each rig a name of its own")
+        drives = {newest}
     calibrations = sorted({row.torque_calibration or "" for _, row in kept})
     if len(calibrations) > 1:
         told = ", ".join(one[:10] or "none" for one in calibrations)
@@ -111,6 +120,11 @@ def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str
         "simulated": any(row.simulated for _, row in kept),
         "quantities": [_followed(quantity, kept) for quantity in QUANTITIES],
     }
+
+
+def _drive_text(row: FleetRow) -> str:
+    serial = f"serial number {row.drive_serial}" if row.drive_serial else "no serial number"
+    return ", ".join(one for one in (row.drive_name, serial, row.profile) if one)
 
 
 def _followed(quantity: Quantity, rows: Sequence[tuple[float, FleetRow]]) -> dict[str, Any]:
@@ -220,7 +234,7 @@ def _settings(
         "load": rig.get("load"),
         "drive": row.drive_name,
         "serial number": row.drive_serial,
-        "revision": row.drive_revision,
+        "revision": None if row.drive_revision is None else f"{row.drive_revision:X}h",
         "profile": row.profile,
         "connection": row.connection,
         "excitation": None if excitation is None else f"{excitation.kind}, {excitation.mode} mode",
@@ -240,6 +254,7 @@ def _settings(
         **{name: asked.get(name, OPTION[name].default) for name in ("confidence", "tolerance")},
         "recorded by": row.recorded_by,
         "simulated": "yes" if row.simulated else "no",
+        "rehearsed faults": row.rehearsed_faults,
         "run": row.part_text or "whole",
     }
     return {name: "–" if value in (None, "") else f"{value:.6g}" if isinstance(value, float) else str(value)

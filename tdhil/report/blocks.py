@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from tdhil.recording import Recording
 from tdhil.report.card import COMPLIANT, estimate_text, inertia_text, minutes, plus_minus, rounded, sentence
-from tdhil.report.document import SIMULATED, coded_reason, coded_warnings
+from tdhil.report.document import coded_reason, coded_warnings, marks
 from tdhil.report.labels import ACCELERATION_REGRESSION, ESTIMATES, MOMENTUM_CROSS_CHECK, UNCERTAINTY_BUDGET
 
 if TYPE_CHECKING:
@@ -109,6 +109,14 @@ class Report:
     footer: str
 
 
+def _simulated(document: Part) -> str:
+    if not document["simulated"]:
+        return ""
+    faults = ", ".join(document.get("rehearsed_faults") or ())
+    told = f"; rehearsed: {faults}. This result is no history of the rig" if faults else ""
+    return f"{marks(document)}: drive and rig are simulated, nothing real turned{told}"
+
+
 def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
     """The report of a result; ``sha256`` is that of the log it comes from."""
     rig = document["rig"] or {}
@@ -116,7 +124,7 @@ def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
     return Report(
         title="Moment of inertia at the motor shaft",
         subtitle=" · ".join(facts),
-        simulated=f"{SIMULATED}: drive and rig are simulated, nothing real turned" if document["simulated"] else "",
+        simulated=_simulated(document),
         answer=_answer(document),
         warnings=coded_warnings(document),
         sections=tuple(section for section in _sections(document, recording, sha256) if section.blocks),

@@ -48,11 +48,15 @@ def shown_degrees(dof: float) -> str:
     return "∞" if dof > MANY else f"{dof:.0f}"
 
 
+_IN_HEX = ("vendor", "product", "revision")
+"""Numbers of 1018h that manuals give in hexadecimal."""
+
+
 def calibrated_item(document: Part) -> ReportSection:
     """Identity and settings of the drive; without blocks where neither is known."""
     drive = document["drive"] or {}
-    identity = [(name, str(drive[name])) for name in ("name", "vendor", "product", "revision", "serial")
-                if name in drive]
+    identity = [(name, f"{drive[name]:X}h" if name in _IN_HEX and isinstance(drive[name], int) else str(drive[name]))
+                for name in ("name", *_IN_HEX, "serial") if name in drive]
     settings = [(_SETTINGS.get(name, name), str(value)) for name, value in document["settings"].items()
                 if value is not None]
     return ReportSection("Calibrated item", (Pairs((*identity, *settings)),) if identity or settings else ())

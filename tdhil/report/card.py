@@ -13,18 +13,29 @@ from rich.table import Table
 from rich.text import Text
 
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import SIMULATED, coded_reason, coded_warnings
+from tdhil.report.document import coded_reason, coded_warnings, marks
 from tdhil.report.labels import ACCELERATION_REGRESSION, ESTIMATES, MOMENTUM_CROSS_CHECK, UNCERTAINTY_BUDGET
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Numbers with as many digits as their interval justifies.
 
 
+_NOTHING = 1e-9
+"""Below it a quantity in SI is the arithmetic's own: 8.8e-12 s is no lag."""
+
+
+def plain_number(number: float, digits: int = 4) -> str:
+    """Return the number to some significant digits, without an exponent from 1e-4 to 1e9; below 1e-9 it is 0."""
+    if abs(number) < _NOTHING:
+        return "0"
+    return f"{float(f'{number:.{digits}g}'):.{9}g}"
+
+
 def with_interval(value: float, low: float, high: float, unit: str) -> str:
     """``103.9 (103.1 to 104.8) kg·m²``: two significant digits of the half-width decide the decimals."""
     half = 0.5 * (high - low)
     if not all(math.isfinite(number) for number in (value, low, high)) or half <= 0.0:
-        return f"{value:.5g} {unit}"
+        return f"{plain_number(value, 5)} {unit}"
     shown = (_digits(number, half) for number in (value, low, high))
     return "{} ({} to {}) ".format(*shown) + unit
 
@@ -37,7 +48,7 @@ def rounded(value: float | None, low: float | None, high: float | None) -> tuple
     def shown(number: float | None) -> str:
         if number is None:
             return "open"
-        return _digits(number, half) if half > 0.0 and math.isfinite(half) else f"{number:.4g}"
+        return _digits(number, half) if half > 0.0 and math.isfinite(half) else plain_number(number)
 
     return shown(value), shown(low), shown(high)
 
@@ -45,7 +56,7 @@ def rounded(value: float | None, low: float | None, high: float | None) -> tuple
 def plus_minus(value: float, half_width: float) -> str:
     """``83.9 ± 3.0``, decimals as in `with_interval`."""
     if not (math.isfinite(value) and math.isfinite(half_width)) or half_width <= 0.0:
-        return f"{value:.4g}"
+        return plain_number(value)
     return f"{_digits(value, half_width)} ± {_digits(half_width, half_width)}"
 
 
@@ -172,7 +183,8 @@ def budget_table(budget: Sequence[Mapping[str, Any]], value: float, notes: bool 
 def estimate_text(part: Mapping[str, Any], unit: str) -> str:
     """An estimate of the document with its interval; an open side is named. At a bound of zero: "at most"."""
     if part["low"] is None or part["high"] is None:
-        return f"{part['value']:.4g} {unit}, open on {'both sides' if part['low'] == part['high'] else 'one side'}"
+        sides = "both sides" if part["low"] == part["high"] else "one side"
+        return f"{plain_number(part['value'])} {unit}, open on {sides}"
     shown, _, most = rounded(part["value"], part["low"], part["high"])
     if part["low"] == 0.0 and part["high"] > 0.0 and float(shown) == 0.0:
         return f"at most {most} {unit}"
@@ -230,6 +242,8 @@ def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
         if stage["outcome"] == "skipped":
             rows.add_row(f"stage {stage['name']}", f"skipped: {stage.get('detail', '')}")
     rows.add_row("model", document["model"])
+    if document.get("rehearsed_faults"):
+        rows.add_row("rehearsed", ", ".join(document["rehearsed_faults"]))
     body: list[RenderableType] = [rows, Text()]
     if inertia is not None and document["budget"]:
         body += [budget_table(document["budget"], inertia["value"], not narrow), Text()]
@@ -239,7 +253,7 @@ def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
     body += [Text(f"! {warning}", style="yellow") for warning in coded_warnings(document)]
     body.append(Text(f"log: {document['log']}", style="dim", overflow="fold"))
     title = "J at the motor shaft" if narrow else "moment of inertia at the motor shaft"
-    title += f" · {SIMULATED}" if document["simulated"] else ""
+    title += f" · {marks(document)}" if document["simulated"] else ""
     return Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue")
 
 

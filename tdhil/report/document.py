@@ -14,6 +14,21 @@ from tdhil.recording import Recording
 from tdhil.version import __version__
 
 SIMULATED = "SIMULATED"
+REHEARSAL = "FAULT REHEARSAL"
+"""Mark of a run of the simulated drive with scripted faults (`--fault`). Its result is no history of the rig."""
+
+
+def rehearsed_faults(run: Mapping[str, Any]) -> list[str]:
+    """Return the faults that were scripted in this run, as the user wrote them; ``run``: the log's configuration."""
+    found = run.get("faults")
+    return [str(one)[:200] for one in found] if isinstance(found, list | tuple) else []
+
+
+def marks(document: Mapping[str, Any]) -> str:
+    """Return what a title adds for a run in which nothing real turned: simulated, and a fault rehearsed."""
+    if not document["simulated"]:
+        return ""
+    return f"{SIMULATED} · {REHEARSAL}" if document.get("rehearsed_faults") else SIMULATED
 
 
 def result_document(
@@ -56,6 +71,7 @@ def result_document(
         "warnings": list(found.warnings),
         "warning_codes": [entry_of(one, MessageCode.RESULT_WARNING).code for one in found.warnings],
         "simulated": recording.simulated,
+        "rehearsed_faults": rehearsed_faults(run),
         "complete": recording.complete,
         "ended": _mapping(run.get("ended")),
         **provenance(run),

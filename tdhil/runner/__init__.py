@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from tdhil.runner.planning import (
         NOTHING_TO_EXPECT as NOTHING_TO_EXPECT, NOT_PREDICTED as NOT_PREDICTED, Planned as Planned,
         plan_acquisition as plan_acquisition, refuse_hopeless as refuse_hopeless,
+        refuse_undersampled as refuse_undersampled, refuse_uninformative as refuse_uninformative,
     )
     from tdhil.runner.preconditions import (
         precondition_warnings as precondition_warnings, refuse_by_plan as refuse_by_plan,
@@ -33,7 +34,8 @@ else:
         "design": "DesignKnowledge assumed_noise interval_confidence",
         "five_stages": "Runner",
         "guard": "Guard",
-        "planning": "NOTHING_TO_EXPECT NOT_PREDICTED Planned plan_acquisition refuse_hopeless",
+        "planning": "NOTHING_TO_EXPECT NOT_PREDICTED Planned plan_acquisition refuse_hopeless refuse_undersampled"
+        " refuse_uninformative",
         "preconditions": "precondition_warnings refuse_by_plan",
         "settings": "ControlAssumptions ExcitationRequest MachineLimits StopRequest",
         "speed_check": "speed_warnings",

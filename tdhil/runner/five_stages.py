@@ -18,7 +18,9 @@ from tdhil.recording import ImpedanceInput, LagPrior, RunLog
 from tdhil.runner import preconditions, stage_log
 from tdhil.runner.background import WorkerProcess, begin
 from tdhil.runner.control_loop import ControlLoop
+from tdhil.runner.excitation import PlanRefused
 from tdhil.runner.guard import Guard
+from tdhil.runner.planning import refuse_undersampled
 from tdhil.runner.preconditions import (
     choose_mode,
     choose_rate,
@@ -30,7 +32,7 @@ from tdhil.runner.preconditions import (
     with_read_filters,
 )
 from tdhil.runner.programs import Run, program_of
-from tdhil.runner.settings import StopRequest
+from tdhil.runner.settings import ExcitationRequest, StopRequest
 from tdhil.runner.stage_log import StageBook
 from tdhil.runner.stages import NOT_YET, measure_offsets
 from tdhil.runner.stop import StopReport, StopSequence
@@ -193,6 +195,8 @@ class Runner:
         self._log.configure(cycle={"period_s": period_s, "rate_hz": 1.0 / period_s})
         self._log.event(self._drive.clock.now_s(), "rate", f"{1.0 / period_s:.4g} cycles per second")
         refuse_slow_reference(task.request, period_s)
+        if task.evaluation is None:
+            _refuse_undersampled(task.request, period_s)
         return replace(task, assumptions=task.assumptions.at_period(period_s))
 
     def _learn_inputs(self, task: Task, preflight: Preflight, prior: LagPrior) -> None:
@@ -264,6 +268,15 @@ class Runner:
             self._log.failure(self._drive.clock.now_s(), error)
         except Exception as also:
             error.add_note(f"and this error could not be logged: {also}")
+
+
+def _refuse_undersampled(request: ExcitationRequest, period_s: float) -> None:
+    """Refuse, before motion, spectral lines that the rate of this run can't show."""
+    try:
+        refuse_undersampled(request, 1.0 / period_s)
+    except PlanRefused as error:
+        raise PreflightRefused(str(error), where="--frequency", next_step=f"{error.next_step}; or raise --rate",
+                               entry=MessageCode.PLAN_HOPELESS) from error
 
 
 def _refusal(preflight: Preflight) -> PreflightRefused:

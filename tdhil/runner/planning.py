@@ -7,9 +7,11 @@ its scatter decides everything after it (`design.stopping_rule`).
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from tdhil.estimation import SAMPLED_SHARE, aliased, least_samples, too_few_a_period
 from tdhil.runner.design import (
     MARGIN,
     SOON_COUNTED,
@@ -19,6 +21,7 @@ from tdhil.runner.design import (
     Stopping,
     choose,
     choose_soonest,
+    expected_half_width,
     half_width,
     interval_confidence,
     least_scale,
@@ -29,6 +32,7 @@ from tdhil.runner.design import (
 from tdhil.runner.excitation import (
     LEAST_COUNTED,
     MotionLimits,
+    PeriodicKind,
     Plan,
     PlanRefused,
     PlanRequest,
@@ -38,6 +42,7 @@ from tdhil.runner.excitation import (
     excitation_kind,
     fit_following,
     held_back_to,
+    make_plan,
     make_swings,
     periodic_kind,
 )
@@ -141,6 +146,65 @@ def plan_acquisition(
     return sooner if sooner.stopping is not None and sooner.stopping.reachable else planned
 
 
+def refuse_undersampled(request: ExcitationRequest, rate_hz: float) -> None:
+    """Raise PlanRefused if samples at the cycle rate can't show the requested spectral lines.
+
+    The rule is the identification's own (`tdhil.estimation.aliased`). Lines that the design chooses are low.
+    """
+    kind = excitation_kind(request.kind)
+    if not isinstance(kind, PeriodicKind) or request.frequency_hz is None or request.impedance is not None:
+        return
+    harmonics, lowest_hz = kind.shape().harmonics, request.frequency_hz
+    highest_hz = harmonics[-1] * lowest_hz
+    most_hz = min(SAMPLED_SHARE * rate_hz / harmonics[-1], rate_hz / least_samples(len(harmonics)))
+    cure = f"Set --frequency below {most_hz:.3g} Hz, or leave it out"
+    if aliased(highest_hz, 1.0 / rate_hz):
+        raise PlanRefused(
+            f"aliasing: the highest spectral line is {highest_hz:.10g} Hz, and {rate_hz:.4g} cycles per second show"
+            f" lines below {SAMPLED_SHARE * rate_hz:.3g} Hz", cure,
+        )
+    if too_few_a_period(len(harmonics), 1.0 / lowest_hz, 1.0 / rate_hz):
+        raise PlanRefused(
+            f"{rate_hz / lowest_hz:.3g} samples a period are too few for the {len(harmonics)} spectral lines", cure
+        )
+
+
+def refuse_uninformative(
+    request: ExcitationRequest, modes: tuple[str, ...], limits: MotionLimits, guess: RigGuess, known: DesignKnowledge
+) -> None:
+    """Raise PlanRefused if no interval of J is expected on any rig of `RIGS` in any of ``modes``.
+
+    A tone is not refused: the acceleration regression (Xu 2026) uses one, and the user has named it.
+    """
+    kind = excitation_kind(request.kind)
+    if not isinstance(kind, PeriodicKind) or len(kind.shape().harmonics) < 2 or request.impedance is not None:
+        return
+    given = {"--frequency": request.frequency_hz, "--amplitude": request.amplitude_rad_s,
+             "--offset": request.offset_rad_s, "--periods": request.periods}
+    named = [flag for flag, value in given.items() if value is not None]
+    if not named or known.winds_up:
+        return
+    for rig in _rigs(guess, limits):
+        for mode in modes:
+            if _informs(replace(request, tolerance=None), mode, limits, rig, known):
+                return
+    raise PlanRefused(NOTHING_TO_EXPECT, f"Leave out {' and '.join(named)}: tdhil then chooses a motion that can")
+
+
+def _informs(
+    request: ExcitationRequest, mode: str, limits: MotionLimits, guess: RigGuess, known: DesignKnowledge
+) -> bool:
+    """Return whether an interval of J is expected on this rig. The usual motion is predicted first: that is quick."""
+    try:
+        usual = make_plan(limits, guess, request_of(request, mode))
+        width = expected_half_width(usual, known.theta(guess), known.noise, known.prior, request.confidence)
+        if math.isinf(width):
+            width = plan_acquisition(request, mode, limits, guess, known, math.inf).half_width
+    except PlanRefused:
+        return False
+    return not math.isinf(width)
+
+
 RIGS = ((1.0, 1.0), (0.1, 0.5), (0.01, 0.0), (1.0, 0.0), (10.0, 0.0))
 """Shares of the assumed inertia and friction: a motion that fits none of these rigs fits no other."""
 
@@ -154,11 +218,7 @@ def refuse_hopeless(
     """
     first: PlanRefused | None = None
     swings = isinstance(excitation_kind(request.kind), SwingKind)
-    for inertia, friction in RIGS:
-        rig = replace(
-            guess, inertia_kg_m2=inertia * guess.inertia_kg_m2, viscous_nm_s_rad=friction * guess.viscous_nm_s_rad,
-            coulomb_nm=max(friction * guess.coulomb_nm, 1e-3 * limits.torque_limit_nm),
-        )
+    for rig in _rigs(guess, limits):
         for mode in modes:
             try:
                 if swings:
@@ -170,6 +230,14 @@ def refuse_hopeless(
                 first = first or error
     if first is not None:
         raise first
+
+
+def _rigs(guess: RigGuess, limits: MotionLimits) -> Iterator[RigGuess]:
+    for inertia, friction in RIGS:
+        yield replace(
+            guess, inertia_kg_m2=inertia * guess.inertia_kg_m2, viscous_nm_s_rad=friction * guess.viscous_nm_s_rad,
+            coulomb_nm=max(friction * guess.coulomb_nm, 1e-3 * limits.torque_limit_nm),
+        )
 
 
 def _reference(

@@ -206,7 +206,31 @@ class RunProcess:
         if outcome.stop is not None and not outcome.stop.confirmed:
             error, code = not_confirmed(outcome.stop), ExitCode.STOP_NOT_CONFIRMED
         self._end(_cut_short(code, confirmed), int(code), error=None if error is None else Told.of(error))
+        if confirmed:
+            self._conclude_part()
         return int(code)
+
+    def _conclude_part(self) -> None:
+        """Write what the motion before the end shows, as `tdhil replay` of the log does. The run has ended already."""
+        from tdhil.errors import TdhilError
+        from tdhil.report import has_extra
+        from tdhil.session import conclude, is_evaluation, read
+
+        try:
+            record = read(self.folder / "run.mcap")
+            record.require_motion()
+            if record.recording.excitation is None or is_evaluation(record.configuration):
+                return
+            found = conclude(record.recording, record.configuration, "run.mcap", record.assumed)
+        except TdhilError:
+            return                             # nothing to identify from; the error of the run says why
+        except Exception as error:
+            tell(f"the part of the run can't be identified: {error}")
+            return
+        write_json(self.folder / "result.json", found.document)
+        self._row(found.document, record.recording.torque_scale_rel_sd)
+        if has_extra():
+            self._report(found.document, record.recording)
 
     def _failed(self, error: BaseException) -> int:
         """End after an error before or after the motion. The Runner itself never raises."""

@@ -98,6 +98,7 @@ class RunView:
     replays: list[ReplayView]
     signed_off: dict[str, Any] | None
     alive: bool
+    rehearsal: bool = False
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge
 
 from tdhil.errors import TdhilError
 from tdhil.service.access import Access
+from tdhil.service.answers import KeptAnswers
 from tdhil.service.fleets import Fleets
 from tdhil.service.live_feed import Feeds
 from tdhil.service.run_channel import lives
@@ -73,6 +74,7 @@ class Site:
         self.replay_names = threading.Lock()
         self.tasks: set[asyncio.Task[None]] = set()
         self._stops = ThreadPoolExecutor(STOPS, "stop")
+        self._answers = KeptAnswers(self.store.runs)
         self._works = anyio.CapacityLimiter(1)         # computations that a page waits for, one at a time
         self._replays = anyio.CapacityLimiter(1)       # slow ones, so that no plan waits behind them
 
@@ -88,11 +90,15 @@ class Site:
         return await asyncio.get_running_loop().run_in_executor(self._stops, stop)
 
     async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """Compute a task, one at a time. Return its document. Raises Refused."""
+        """Compute a task, one at a time. Return its document, kept from before if it can't differ. Raises Refused."""
+        key = self._answers.key(what, asked)
+        if (kept := self._answers.get(key)) is not None:
+            return kept
         work, limiter = partial(self.supervisor.work, what, run, asked), self._works
         if what in ("replay", "calibrate"):
             limiter = self._replays
         found: dict[str, Any] = (await anyio.to_thread.run_sync(work, limiter=limiter))["document"]
+        self._answers.put(key, found)
         return found
 
     def rig_view(self, rig: RigFile) -> RigView:
@@ -117,7 +123,8 @@ class Site:
         limits = None if bench.limits is None else bench.limits.model_dump()
         return RigView(
             rig.id, rig.name, state, simulated, rig.motion, problem, None if holder is None else str(holder), run,
-            blocked, drive, profile, limits, next((one for one in last if one.inertia_kg_m2 is not None), None),
+            blocked, drive, profile, limits,
+            next((one for one in last if one.inertia_kg_m2 is not None and not one.rehearsal), None),
         )
 
     def list_runs(self, rig: str | None, state: str | None, limit: int) -> list[Summary]:
@@ -158,7 +165,7 @@ class Site:
             status.identity, status.safe_action, status.confirmation, request.motion, status.watch, status.stop,
             status.error, status.exit_code, status.verdict,
             self.store.result(run), found, self.replays(run), read_json(folder / "signed_off.json"),
-            lives(folder),
+            lives(folder), request.rehearsal,
         )
 
     def told(self) -> dict[str, Any]:

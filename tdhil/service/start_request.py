@@ -279,10 +279,7 @@ def plan_of(rig: RigFile, asked: Mapping[str, Any]) -> dict[str, Any]:
 
     options, connection = rig.way(asked)
     simulated = options.simulate or not connection.configured
-    profile = connection.profile
-    planned, figures, limits = plan_dry(
-        options, rig.rig, simulated, profile.can_torque, profile.quick_stop.ends == "off"
-    )
+    planned, figures, limits = plan_dry(options, rig.rig, simulated, connection.profile)
     return plan_document(planned, figures, limits)
 
 

@@ -93,6 +93,11 @@ class StoredRequest:
     motion: str
     idempotency_key: str | None = None
 
+    @property
+    def rehearsal(self) -> bool:
+        """Return whether faults of the simulated drive are rehearsed: the result is no history of the rig."""
+        return bool(self.options.get("fault"))
+
     @staticmethod
     def of_plain(plain: Mapping[str, Any]) -> StoredRequest:
         return StoredRequest(**plain)
@@ -115,6 +120,7 @@ class Summary:
     high_kg_m2: float | None = None
     repeatability_rel: float | None = None
     exit_code: int | None = None
+    rehearsal: bool = False                # of a fault on the simulated drive
 
 
 def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any] | None) -> Summary:
@@ -125,7 +131,7 @@ def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any]
         status.at if status.ended else None,
         request.simulated if status.simulated is None else status.simulated,
         (result or {}).get("verdict"), inertia.get("value"), inertia.get("low_total"), inertia.get("high_total"),
-        inertia.get("repeatability_rel"), status.exit_code,
+        inertia.get("repeatability_rel"), status.exit_code, request.rehearsal,
     )
 
 
@@ -251,7 +257,7 @@ class Store:
 
 
 _COLUMNS: Final = tuple(Summary.__dataclass_fields__)
-_VERSION: Final = 1
+_VERSION: Final = 2
 
 
 class Index:
@@ -276,7 +282,8 @@ class Index:
             rows = base.execute(
                 f"select {', '.join(_COLUMNS)} from runs {clause} order by id desc limit ?", (*values, limit)
             ).fetchall()
-        return [Summary(**{**dict(zip(_COLUMNS, row, strict=True)), "simulated": bool(row[6])}) for row in rows]
+        found = (dict(zip(_COLUMNS, row, strict=True)) for row in rows)
+        return [Summary(**{**one, **{name: bool(one[name]) for name in ("simulated", "rehearsal")}}) for one in found]
 
     def rebuild(self) -> int:
         """Make it again from the files. Return the number of runs."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from drivers import Identity, PreflightRefused
@@ -14,6 +14,7 @@ from tdhil.version import __version__
 
 if TYPE_CHECKING:
 
+    from profiles import Profile
     from tdhil.runner import DesignKnowledge, MachineLimits, Planned, excitation
     from tdhil.runner.excitation import RigGuess
     from tdhil.soft_torque import EvaluationCase, SpeedProgram
@@ -40,26 +41,32 @@ class Figure:
 
 
 def plan_dry(
-    options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True, releases_after_stop: bool = False
+    options: RunOptions, rig: Rig | None, simulated: bool, profile: Profile
 ) -> tuple[Planned, tuple[Figure, ...], MachineLimits]:
-    """Return the plan, the values that it uses, and the machine's limits."""
+    """Return the plan, the values that it uses, and the machine's limits.
+
+    Raises PreflightRefused as a run would: no motion fits, or none that was requested can determine J.
+    """
     from tdhil.runner import plan_acquisition, refuse_by_plan
     from tdhil.runner.excitation import PlanRefused
 
     bench = bench_of(Identity(0, 0, 0, 0, "", simulated), rig)
     limits = machine_limits(bench)
-    refuse_by_plan(limits, excitation_request(options), releases_after_stop)
+    # A quick stop that ends with the drive off releases a string.
+    refuse_by_plan(limits, excitation_request(options), profile.quick_stop.ends == "off")
+    _refuse_undersampled(options, profile)
     guess, known, figures = _assumed(bench, limits)
     left_s = limits.time_s - BEFORE_ACQUIRE_S
+    mode, room = _mode(options, profile.can_torque), _room(options, limits)
     try:
-        planned = plan_acquisition(
-            excitation_request(options), _mode(options, can_torque), _room(options, limits), guess, known, left_s
-        )
+        planned = plan_acquisition(excitation_request(options), mode, room, guess, known, left_s)
     except PlanRefused as error:
         raise PreflightRefused(
             str(error), where="plan of stage 5", next_step=error.next_step,
             entry=MessageCode.PLAN_NOT_POSSIBLE,
         ) from error
+    if math.isinf(planned.half_width):
+        _refuse_uninformative(options, (mode,), room, guess, known, profile)
     return planned, figures, limits
 
 
@@ -97,8 +104,11 @@ def plan_document(planned: Planned, figures: tuple[Figure, ...], limits: Machine
     }
 
 
-def refuse_hopeless(options: RunOptions, rig: Rig | None, can_torque: bool) -> None:
+def refuse_hopeless(options: RunOptions, rig: Rig | None, profile: Profile) -> None:
     """Raise PreflightRefused, before the run touches its drive, if no shaft could do it within the limits.
+
+    The same holds for a motion that can't determine J: the cycle rate is too low for its spectral lines, or no interval
+    is expected.
 
     At this point tdhil knows neither the shaft nor whether it is simulated. A simulated rig needs no limits.
     """
@@ -107,13 +117,48 @@ def refuse_hopeless(options: RunOptions, rig: Rig | None, can_torque: bool) -> N
 
     bench = simulated_default_rig(rig)
     limits = machine_limits(bench)
-    modes = (options.mode,) if options.mode else ("torque", "speed") if can_torque else ("speed",)
+    modes = (options.mode,) if options.mode else ("torque", "speed") if profile.can_torque else ("speed",)
     guess, known, _ = _assumed(bench, limits)
+    room = _room(options, limits)
+    _refuse_undersampled(options, profile)
     try:
-        refuse_hopeless_plan(excitation_request(options), modes, _room(options, limits), guess, known)
+        refuse_hopeless_plan(excitation_request(options), modes, room, guess, known)
     except PlanRefused as error:
         raise PreflightRefused(str(error), where="plan of stage 5", next_step=error.next_step,
                                entry=MessageCode.PLAN_NOT_POSSIBLE) from error
+    _refuse_uninformative(options, modes, room, guess, known, profile)
+
+
+def _refuse_undersampled(options: RunOptions, profile: Profile) -> None:
+    from tdhil.runner import refuse_undersampled
+    from tdhil.runner.excitation import PlanRefused
+
+    try:
+        refuse_undersampled(excitation_request(options), options.rate_hz or profile.usual_rate_hz)
+    except PlanRefused as error:
+        raise _hopeless(error) from error
+
+
+def _refuse_uninformative(
+    options: RunOptions, modes: tuple[str, ...], room: excitation.MotionLimits, guess: RigGuess,
+    known: DesignKnowledge, profile: Profile,
+) -> None:
+    """Refuse a motion from which no interval is expected, even with the filters that the drive may report."""
+    from tdhil.runner import refuse_uninformative
+    from tdhil.runner.excitation import PlanRefused
+
+    if profile.filters:
+        prior = known.prior
+        known = replace(known, prior=replace(prior, speed_lag_s=known.speed_lag_s, torque_lag_s=known.torque_lag_s))
+    try:
+        refuse_uninformative(excitation_request(options), modes, room, guess, known)
+    except PlanRefused as error:
+        raise _hopeless(error) from error
+
+
+def _hopeless(error: excitation.PlanRefused) -> PreflightRefused:
+    return PreflightRefused(str(error), where="plan of stage 5", next_step=error.next_step,
+                            entry=MessageCode.PLAN_HOPELESS)
 
 
 def _mode(options: RunOptions, can_torque: bool) -> str:

@@ -65,11 +65,15 @@ class RunRecord:
     def require_motion(self) -> None:
         """Raise NothingRecorded if the run was refused or ended in setup. The error repeats what ended the run.
 
-        It has that run's exit code, except for codes that describe a process and not a run.
+        It has that run's exit code, except for codes that describe a process and not a run. Raises NothingRecoverable
+        for a log that was cut off before its first sample.
         """
-        from tdhil.errors import NothingRecorded
+        from tdhil.errors import NothingRecorded, NothingRecoverable
 
         ended, stages = self.ended, self.recording.stages
+        if ended is None and not self.recording.complete and not len(self.recording.time_s):
+            raise NothingRecoverable("the log was cut off before its first sample", where=self.log,
+                                     next_step="Look for an older copy, or run again")
         if ended is None or (len(self.recording.time_s) and any(stage.name != "setup" for stage in stages)):
             return
         in_stage = f"in stage {stages[-1].name}" if stages else "before its first stage"

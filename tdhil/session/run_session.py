@@ -59,7 +59,7 @@ class RunRequest:
         """Return the request, with limits that suit the plant. Raises PreflightRefused for motion beyond the limits."""
         bench = suited(rig, peer.plant)
         if evaluation is None:
-            refuse_hopeless(options, bench, connection.profile.can_torque)
+            refuse_hopeless(options, bench, connection.profile)
         return cls(options, connection, peer, bench, overrides, operator, note, real_time_priority, evaluation)
 
 

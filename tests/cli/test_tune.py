@@ -362,3 +362,19 @@ def test_the_picture_of_a_schedule_is_drawn(tmp_path):
         draw_schedule(drawn, document)
         assert len(drawn.axes) == (2 if noisy else 1)
         drawn.savefig(tmp_path / "schedule.svg")
+
+
+def test_a_missing_string_is_told_before_the_log_is_identified(tmp_path, monkeypatch, capsys):
+    """Identifying a log again takes seconds: the files are checked first."""
+    log = tmp_path / "run.mcap"
+    log.write_bytes(b"\x89MCAP0\r\n")
+    monkeypatch.setattr("tdhil.cli.tune.read_result", lambda path: pytest.fail("the result was read first"))
+    assert main(["tune", str(log), "--string", str(tmp_path / "nosuch.yaml")]) == ExitCode.USAGE
+    assert "nosuch.yaml" in capsys.readouterr().err
+
+
+def test_a_tuning_that_evaluate_refuses_says_so(tmp_path, capsys):
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(result()))
+    assert main(["tune", str(path), "--string", str(STRING_YAML), "--no-simulation", "--json"]) == 0
+    assert "tdhil evaluate does not accept this file" in capsys.readouterr().err

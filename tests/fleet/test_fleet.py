@@ -21,6 +21,7 @@ from tdhil.cli.main import main
 from tdhil.errors import UsageError
 from tdhil.fleet import (
     FleetRequest,
+    FleetRow,
     FleetSettings,
     FleetSummary,
     LogTask,
@@ -406,6 +407,16 @@ def test_a_cluster_gives_the_same_table(tmp_path, calls, monkeypatch):
         run_fleet(replace(request, again=True), function=poison.quick)
 
 
+def test_a_run_refused_before_motion_is_no_failure_of_the_fleet(tmp_path):
+    """tdhil's own run.refused.mcap is whole. It has no result, and none is missing."""
+    rows = (FleetRow("run.mcap", "valid"),
+            FleetRow("run.refused.mcap", "unread", error_kind="NothingRecorded"))
+    assert FleetSummary(rows, tmp_path / "fleet.csv").exit_code == 0
+    assert FleetSummary(rows[1:], tmp_path / "fleet.csv").exit_code == 10
+    cut = FleetRow("cut.mcap", "unread", error_kind="NothingRecoverable")
+    assert FleetSummary((*rows, cut), tmp_path / "fleet.csv").exit_code == 3
+
+
 def their_versions(asked=[]):  # noqa: B006  (who asks first is the host: both are in one process here)
     asked.append(1)
     return OURS if len(asked) == 1 else OURS | {"numpy": "1.0"}
@@ -426,6 +437,7 @@ def test_the_command(few, tmp_path, capsys, monkeypatch):
     assert main(arguments) == 3
     text = capsys.readouterr().out
     assert "7 logs (7 of them finished before)" in text
+    assert re.search(r"R1-000.mcap: valid\w*, J \d", text)
     assert "empty.mcap: the file is empty" in text
     assert "skipped: 1 CSV file without" in text
     for wrong in (["--jobs", "0"], ["--confidence", "1.5"], ["--time-limit", "0"], ["--memory-limit", "1"]):

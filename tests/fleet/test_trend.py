@@ -11,7 +11,7 @@ import pytest
 from benchmarks.trend_power import draw
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
-from tdhil.fleet.rows import FleetRow
+from tdhil.fleet.rows import FleetRow, FleetSettings, row_of
 from tdhil.fleet.table import write_table
 from tdhil.fleet.trend import scale_of, trend_document
 
@@ -50,6 +50,40 @@ def test_a_step_is_named_with_its_place_and_size():
     assert document["quantities"][1]["text"].startswith("0 results: 4 are needed")
     assert document["notes"] == []
     json.dumps(document, allow_nan=False)
+
+
+def test_a_rehearsed_fault_is_no_history():
+    """A torque scale of 1.1, rehearsed on the simulated drive, once was a change of J with over 99.9 % probability."""
+    found, _ = rows("none")
+    rehearsed = [
+        replace(one, log=f"fault-{one.log}", rehearsed_faults="torque-scale=1.1",
+                inertia_kg_m2=1.1 * one.inertia_kg_m2, inertia_low_kg_m2=1.1 * one.inertia_low_kg_m2,
+                inertia_high_kg_m2=1.1 * one.inertia_high_kg_m2)
+        for one in found[12:]
+    ]
+    document = trend_document([*found, *rehearsed], "R7")
+    assert document["quantities"] == trend_document(found, "R7")["quantities"]
+    assert document["notes"] == ["12 rehearsals of faults on the simulated drive: left out"]
+
+
+def test_logs_of_two_drives_are_never_one_series():
+    """Two benches of one name, J 104 and 140: once they were one rig that had changed by 35 %."""
+    found, _ = rows("none")
+    other = [replace(one, date=f"2025{one.date[4:]}", drive_serial=9, inertia_kg_m2=1.35 * one.inertia_kg_m2,
+                     inertia_low_kg_m2=1.35 * one.inertia_low_kg_m2, inertia_high_kg_m2=1.35 * one.inertia_high_kg_m2)
+             for one in found]
+    document = trend_document([*found, *other], "R7")
+    assert document["quantities"] == trend_document(found, "R7")["quantities"]
+    (note,) = document["notes"]
+    assert "2 drives" in note and "24 results of serial number 9" in note
+    profiles = trend_document([*found, *(replace(one, drive_serial=None, profile="other") for one in other)], "R7")
+    assert profiles["quantities"] == document["quantities"]
+
+
+def test_a_rig_without_a_name_is_known_by_no_file_name():
+    """Every folder may have its rig.yaml: two of them are not one rig."""
+    document = {"verdict": "valid", "reason": "", "rig": {"name": None, "file": "rig.yaml"}}
+    assert row_of("run.mcap", document, settings=FleetSettings()).rig is None
 
 
 def test_what_was_left_out_and_assumed_is_said():

@@ -9,6 +9,7 @@ import pytest
 
 from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.params import RigParams
+from tdhil.recording import RunLog, RunWriter
 from tdhil.recording.log_reader import read_run, read_samples
 from tests.path.path_runs import QUICK, SHORT, TOO_MUCH, Shaft, Terminal, clean_environment, identify, tdhil
 
@@ -145,6 +146,19 @@ def test_errors_are_json_too_where_json_was_asked_for(tmp_path):
     done = identify(tmp_path, "--profile", "generic/cia40")
     assert done.code == done.document["exit_code"] == 2
     assert "generic/cia402" in done.document["error"]["message"]
+
+
+@pytest.mark.parametrize("size", [200, 2000])
+def test_a_log_cut_off_before_its_first_sample_is_told(tmp_path, size):
+    """As after a kill -9 in the first moment: nothing to identify from is no finding about the motion."""
+    writer = RunWriter(tmp_path / "whole.mcap", epoch_ns=0, block=True)
+    RunLog(writer, {"tdhil": "1", "profile": {"text": "x" * 4000}}).close()
+    log = tmp_path / "run.mcap"
+    log.write_bytes((tmp_path / "whole.mcap").read_bytes()[:size])
+    done = tdhil("replay", log)
+    assert done.code == 10
+    assert "cut off before its first sample" in done.err
+    assert done.out == ""
 
 
 @pytest.mark.parametrize("content", [b"", b"not a log", b"\x89MCAP0\r\n"])

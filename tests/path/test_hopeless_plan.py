@@ -1,13 +1,26 @@
 """What no shaft could do is refused before the drive is touched; what this one can't do, in its own words."""
 
-import pytest
+import io
 
+import pytest
+from rich.console import Console
+
+from drivers import PreflightRefused
+from profiles import load_profile
+from tdhil.cli.dry_run import say_before
+from tdhil.cli.identify import show_settings
 from tdhil.config.resolution import resolve
 from tdhil.config.rig import load_rig
+from tdhil.runner.excitation import PlanRefused
+from tdhil.runner.planning import refuse_undersampled
+from tdhil.runner.settings import ExcitationRequest
+from tdhil.session import connection_of, plan_peer
 from tdhil.session.dry_run import refuse_hopeless
 from tests.path.path_runs import tdhil
+from tests.runner.line_drive import Line, LineDrive, run_line
 
 QUICK = ("--seed", 1)
+TORQUE, SPEED = load_profile("generic/cia402"), load_profile("danfoss/fc302")
 
 
 @pytest.mark.heavy(but_first=2)
@@ -22,6 +35,11 @@ QUICK = ("--seed", 1)
     (("--amplitude", 9), "--amplitude"),
     (("--offset", 9.99), "--offset"),
     (("--drive", "modbus", "--max-time", 60), "--max-time"),
+    (("--frequency", 1000), "--frequency below 13.9 Hz"),
+    (("--rate", 20, "--frequency", 3), "--frequency below 1.11 Hz"),
+    (("--excitation", "sine", "--frequency", 500), "--frequency below 41.7 Hz"),
+    (("--drive", "modbus", "--frequency", 20), "--frequency below"),
+    (("--amplitude", 1e-6), "--amplitude"),
 ])
 def test_a_run_refuses_at_once_what_a_dry_run_does(tmp_path, monkeypatch, arguments, option):
     monkeypatch.chdir(tmp_path)
@@ -33,6 +51,37 @@ def test_a_run_refuses_at_once_what_a_dry_run_does(tmp_path, monkeypatch, argume
     assert not list(tmp_path.glob("*.mcap"))
 
 
+def test_a_value_with_another_unit_is_shown_without_the_digits_of_its_conversion():
+    given = {"amplitude_rad_s": 9.94837673636768, "simulate": True}
+    options, connection = connection_of(given, None, resolve(given, None))
+    console = Console(file=io.StringIO(), width=80)
+    show_settings(console, options, connection, plan_peer(options, connection))
+    assert "9.94838  (" in console.file.getvalue()
+
+
+def test_a_frequency_below_the_limit_runs_into_no_aliasing():
+    """The refusal before motion and the one after it are one rule: just below the limit, samples do show the lines."""
+    refuse_undersampled(ExcitationRequest("sine", frequency_hz=16.6), 100.0)
+    with pytest.raises(PlanRefused, match=r"45 Hz.*below 45 Hz"):
+        refuse_undersampled(ExcitationRequest("sine", frequency_hz=45.0), 100.0)
+
+
+def test_a_rate_that_turns_out_lower_is_refused_before_motion():
+    """The drive's line may be slower than the profile says: it is known in preflight, before the shaft moves."""
+    drive = LineDrive(Line(period_s=0.1))
+    outcome = run_line(drive, ExcitationRequest("sine", frequency_hz=5.0)).outcome
+    assert isinstance(outcome.cause, PreflightRefused)
+    assert "aliasing" in str(outcome.cause)
+    assert outcome.stop is None
+
+
+def test_a_tone_runs_and_says_before_it_that_no_interval_is_expected():
+    options = resolve({"excitation": "sine", "frequency_hz": 1.0}, None)
+    said = say_before(options, None, load_profile("generic/cia402"), True)
+    assert said is not None
+    assert "no interval of J is expected" in said
+
+
 @pytest.mark.parametrize("arguments", [
     {}, {"max_time_s": 150.0}, {"tolerance": 0.01}, {"tolerance": 0.01, "max_time_s": 150.0},
     {"excitation": "coast-down"}, {"excitation": "pulses", "mode": "speed"},
@@ -40,9 +89,9 @@ def test_a_run_refuses_at_once_what_a_dry_run_does(tmp_path, monkeypatch, argume
     {"amplitude_rad_s": 1.0, "offset_rad_s": 4.0}, {"excitation": "step", "periods": 3}, {"rate_hz": 20.0},
 ])
 def test_what_may_be_done_is_not_refused(arguments):
-    refuse_hopeless(resolve(arguments, None), None, can_torque=True)
+    refuse_hopeless(resolve(arguments, None), None, TORQUE)
     if arguments.get("excitation") != "coast-down":
-        refuse_hopeless(resolve(arguments, None), None, can_torque=False)
+        refuse_hopeless(resolve(arguments, None), None, SPEED)
 
 
 def test_what_hangs_on_the_shaft_is_left_to_the_run(tmp_path):
@@ -53,7 +102,7 @@ def test_what_hangs_on_the_shaft_is_left_to_the_run(tmp_path):
         " probe_torque_nm: 200, probe_travel_rad: 3}\nexpected: {inertia_kg_m2: 2000}\n"
     )
     options = resolve({"amplitude_rad_s": 1.0, "excitation": "sine", "frequency_hz": 0.5}, load_rig(rig))
-    refuse_hopeless(options, load_rig(rig), can_torque=True)
+    refuse_hopeless(options, load_rig(rig), TORQUE)
 
 
 @pytest.mark.parametrize(("profile", "lets_go"), [

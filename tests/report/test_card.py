@@ -7,9 +7,10 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from tdhil.report.card import estimate_text, percent, plus_minus, print_card, with_interval
+from tdhil.report.blocks import report_of
+from tdhil.report.card import card_text, estimate_text, percent, plain_number, plus_minus, print_card, with_interval
 from tdhil.report.document import result_document
-from tests.report.findings import bare, full, open_sided, recording
+from tests.report.findings import RUN, bare, full, open_sided, recording
 
 
 def shown(found, width=80, **changes):
@@ -91,3 +92,20 @@ def test_a_lag_at_its_bound_of_zero_is_at_most_so_long():
     assert estimate_text({"value": 4.6e-17, "low": 0.0, "high": 0.00197}, "s") == "at most 0.00197 s"
     assert estimate_text({"value": 0.0012, "low": 0.0, "high": 0.002}, "s").startswith("0.0012 (")
     assert estimate_text({"value": 0.0, "low": 0.0, "high": 0.0}, "s").startswith("0 ")
+
+
+def test_a_rehearsal_is_marked_on_card_and_report():
+    run = RUN | {"faults": ["torque-scale=1.1"]}
+    document = result_document(full(), recording(simulated=True), run, "run.mcap")
+    assert document["rehearsed_faults"] == ["torque-scale=1.1"]
+    card = card_text(document, 80)
+    assert "SIMULATED · FAULT REHEARSAL" in card
+    assert "torque-scale=1.1" in card
+    assert "FAULT REHEARSAL" in report_of(document, recording()).simulated
+
+
+@pytest.mark.parametrize(("value", "text"), [
+    (8.829e-12, "0"), (-3e-13, "0"), (20000.0, "20000"), (123456.0, "123500"), (0.00012345, "0.0001234"), (2.5, "2.5"),
+])
+def test_a_number_without_an_interval_has_no_exponent_and_no_arithmetic_dust(value, text):
+    assert plain_number(value) == text

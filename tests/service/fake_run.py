@@ -69,7 +69,8 @@ def main(folder: Path) -> None:
         if what == "deaf":
             (folder / "control.sock").unlink()
         if what in ("ask", "patient"):
-            board.to(State.AWAITING, confirmation=Confirmation(confirming.binding, "this moves", now()),
+            text = f"this moves\n{request.options.get('operator', '')}"       # a checklist, where a test has one
+            board.to(State.AWAITING, confirmation=Confirmation(confirming.binding, text, now()),
                      preflight=(Check("watchdog", "500 ms", "500 ms", "ok", "1016h:1"),),
                      expected_half_width=0.013,
                      expected_s={"setup": 10.0, "acquire": 120.0}, safe_action="quick stop", identity="A drive")

@@ -23,6 +23,7 @@ from typing import Any
 
 import pytest
 
+from drivers import PreflightRefused
 from tdhil.service.store import write_json
 from tdhil.session import hold
 from tests.recording.test_log_tail import write
@@ -190,11 +191,71 @@ def test_from_the_rigs_to_a_result_by_keyboard_alone(page, served, monkeypatch):
     page.locator("button[value=start]:enabled").wait_for()
     page.get_by_role("button", name="Start").focus()
     page.keyboard.press("Enter")
-    page.wait_for_url("**/live")
-    page.get_by_role("link", name="To the result").click()
-    page.get_by_text("J = 104.0 (100.0 to 108.0) kg·m²").wait_for()
+    page.get_by_text("J = 104.0 (100.0 to 108.0) kg·m²").wait_for()       # by itself: the page becomes the result
+    assert "/live" not in page.url
     (run,) = served.service.store.ids()
     assert served.service.store.request(run).options == {"tolerance": 0.025}
+
+
+def test_an_error_names_the_field_and_takes_the_old_plan_away(page, served, monkeypatch):
+    """The terminal's words are options: on the form they are its labels, and the field is marked."""
+    monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": PLAN})
+    page.goto("/start/a")
+    page.get_by_role("button", name="Plan").click()
+    page.get_by_role("row", name="expected interval of J").wait_for()
+
+    def refused(what: str, run: Any, asked: Any) -> Any:
+        raise PreflightRefused("time: 20 s are too short", next_step="Give --max-time 146s or more, not --max-times")
+
+    monkeypatch.setattr(served.service.supervisor, "work", refused)
+    field = page.locator("[name=max_time_s]")
+    label = page.locator("label", has=field).get_attribute("data-label")
+    field.fill("20")
+    page.get_by_role("button", name="Plan").click()
+    page.get_by_role("alert").get_by_text(f"Give “{label}” 146s or more, not --max-times").wait_for()
+    assert field.get_attribute("aria-invalid") == "true"
+    assert field.evaluate("one => one === document.activeElement")
+    assert not page.locator("#plan").is_visible()
+
+
+def test_on_a_phone_the_list_of_runs_shows_j_and_verdict(page, served):
+    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    page.set_viewport_size({"width": 390, "height": 800})
+    page.goto("/runs")
+    for text in ("104.0 (100.0 to 108.0) kg·m²", "valid"):
+        box = page.locator("#runs").get_by_text(text, exact=True).bounding_box()
+        assert box["x"] >= 0 and box["x"] + box["width"] <= 390, text
+
+
+def test_a_stop_that_was_asked_for_is_no_alarm(page, served):
+    run = begin(served)
+    page.goto(f"/runs/{run}/live")
+    page.get_by_role("button", name="Stop", exact=True).click()
+    served.service.wait(run, "stopped")
+    page.goto(f"/runs/{run}")
+    page.get_by_text("stopped, at standstill").wait_for()
+    assert page.locator("#result .alarm").count() == 0
+
+
+def test_what_cant_be_done_here_says_why_before_the_click(page, served):
+    page.goto("/start/watched")
+    page.get_by_text("This rig moves only while a logged-in user watches it").wait_for()
+    assert page.get_by_role("button", name="Start").count() == 0
+    page.goto("/rigs/a/file")
+    page.get_by_text("Read-only: this service has no accounts").wait_for()
+    assert not page.get_by_text("You can change here").is_visible()
+
+
+def test_a_rehearsal_is_marked_wherever_its_run_is_shown(page, served):
+    run = served.service.supervisor.start_run(
+        "a", {"note": "done", "fault": ["torque-scale=1.1"]}, "local").request.id
+    served.service.wait(run, "done")
+    for path in ("/runs", f"/runs/{run}", f"/runs/{run}/live"):
+        page.goto(path)
+        page.get_by_text("REHEARSAL", exact=True).first.wait_for()
+    page.goto("/")
+    page.get_by_role("article", name="Rig a").get_by_text("no result yet").wait_for()
 
 
 def test_a_stop_says_when_it_was_asked_seen_and_at_rest(page, served):
@@ -294,6 +355,23 @@ def test_the_code_is_asked_for_and_a_wrong_one_said(page, served):
     page.get_by_text("the code is wrong").wait_for()
     field.fill("123 456")
     field.press("Enter")
+    served.service.wait(run, "done")
+
+
+def test_every_point_of_the_checklist_is_ticked_before_the_shaft_may_be_moved(page, served):
+    points = "Before you confirm:\n  [ ] brake released\n  [ ] people clear of the shaft\n"
+    run = served.service.supervisor.start_run("real", {"note": "ask", "operator": points}, "local").request.id
+    served.service.wait(run, "awaiting_confirmation")
+    page.goto(f"/runs/{run}/live")
+    move = page.get_by_role("button", name="Move the shaft")
+    page.get_by_label("brake released").check()
+    assert move.is_disabled()
+    page.get_by_label("Six digits").fill("123456")
+    page.get_by_label("Six digits").press("Enter")          # no way round
+    page.get_by_label("people clear of the shaft").check()
+    assert move.is_enabled()
+    assert served.service.store.status(run).state.value == "awaiting_confirmation"
+    move.click()
     served.service.wait(run, "done")
 
 
@@ -436,7 +514,8 @@ def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypat
     results(served, run, monkeypatch)
     page.goto(f"/runs/{run}")
     page.get_by_text("speed was quantised").wait_for()
-    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d", page.locator("time").first.inner_text())
+    shown = page.locator("time").first.inner_text()
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC([+−]\d{1,2}(:\d\d)?)?", shown)      # local, with its zone
     page.get_by_role("row", name="J, 90 % interval to quote").wait_for()
     page.locator(".pictures img").evaluate("one => one.decode()")
     page.get_by_text("Friction over speed, in numbers").click()

@@ -149,6 +149,20 @@ def test_a_simulated_run_from_its_request_to_its_result(tmp_path, nicer):
 
 
 @pytest.mark.heavy
+def test_a_run_that_was_cut_short_shows_what_its_motion_did_show(tmp_path):
+    """The same result as `tdhil replay` of the log: a number from a part of the run is one, with its interval."""
+    asked = Asked(tmp_path, SIMULATED, seed=7, rate_hz=50.0, fault=["sto@acquire+160s"])
+    assert RunProcess(asked.folder).serve() == ExitCode.DRIVE_FAULT
+    status = asked.store.status(asked.run)
+    assert (status.state, status.verdict) == (State.FAILED, None)
+    result = json.loads((asked.folder / "result.json").read_bytes())
+    assert result["inertia_kg_m2"]["low_total"] < 104.0 < result["inertia_kg_m2"]["high_total"]
+    assert result["rehearsed_faults"] == ["sto@acquire+160s"]
+    assert json.loads((asked.folder / "row.json").read_bytes())["aborted_stage"] == "acquire"
+    assert (asked.folder / "report.html").exists() is has_extra()
+
+
+@pytest.mark.heavy
 def test_a_stop_file_reaches_a_run_of_the_service(tmp_path, rigs):
     """As the web leaves it for a process that does not listen yet."""
     service = Service(tmp_path / "data", rigs, fake=False)

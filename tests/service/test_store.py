@@ -10,6 +10,7 @@ import os
 import random
 import sqlite3
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -127,6 +128,15 @@ def test_a_deleted_index_is_made_again_the_same(store):
     assert rows(index) == before
     assert index.rebuild() == 3
     assert rows(index) == before == list(store.summaries())
+
+
+def test_a_rehearsal_is_marked_in_the_list_of_runs(store):
+    """A fault of the simulated drive changes the result: the list, and what lives on it, can tell."""
+    request = replace(store.request(a_run(store)), options={"fault": ["torque-scale=1.1"]})
+    assert summary_of(request, store.status(request.id), None).rehearsal
+    index = Index(store)
+    index.put(summary_of(request, store.status(request.id), None))
+    assert [one.rehearsal for one in index.find()] == [True]
 
 
 def test_it_has_a_rollback_journal(store):

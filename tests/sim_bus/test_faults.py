@@ -37,6 +37,7 @@ def test_the_parts_may_be_left_out():
     ("sto@landing+2s", "no moment"), ("sto@-2s", "no moment"), ("nothing-such", "no fault is called"),
     ("sto=5", "takes no value"), ("frame-loss=200%", "0% to 100%"), ("frame-loss=x", "SHARE"),
     ("emcy=12345", "four hexadecimal"), ("sdo-abort=6072h:999", "an object"), ("torque-scale=0", "0.01 to 100"),
+    ("torque-scale=1.1@setup", "Write torque-scale@setup=1.1"), ("torque-scale=much", "'much' is not a number"),
 ])
 def test_what_is_refused(text, said):
     with pytest.raises(FaultRefused) as caught:

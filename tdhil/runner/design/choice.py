@@ -428,7 +428,7 @@ def _in_time(plan: Plan, wish: PlanRequest, time_s: float | None) -> Plan:
         needed = len(plan.segments) * (LEAST_COUNTED + segment.settle_periods) * segment.reference.period_s + between
         raise PlanRefused(
             f"time: {time_s:.0f} s are too short: this excitation needs {needed:.0f} s",
-            f"Give --max-time {math.ceil(needed)} or more (or remove it; limits.time_s is a limit, too), or a higher"
+            f"Give --max-time {math.ceil(needed)}s or more (or remove it; limits.time_s is a limit, too), or a higher"
             " --frequency",
         )
     return plan.with_counted(counted)

@@ -152,7 +152,7 @@ def make_swings(
         raise PlanRefused(
             f"time: {len(ways)} ways up and down are too few to identify the inertia, {_LEAST_SWINGS} take "
             f"{needed:.0f} s",
-            f"Give --max-time {math.ceil(needed)} or more, --periods {_LEAST_SWINGS} or more, or remove both",
+            f"Give --max-time {math.ceil(needed)}s or more, --periods {_LEAST_SWINGS} or more, or remove both",
         )
     torques = [torque for way in ways if not way.coasting for torque in (way.reference(0.0)[1],
                way.reference(0.999999 * way.duration_s)[1])]

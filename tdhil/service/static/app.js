@@ -117,7 +117,12 @@
   function when(iso) {
     if (!iso) return "";
     const at = new Date(iso);
-    return Number.isNaN(at.getTime()) ? iso : `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${time(at)}`;
+    return Number.isNaN(at.getTime()) ? iso : `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${time(at)} ${zone(at)}`;
+  }
+  /** Return the offset of local time: files and the terminal may show another one. */
+  function zone(at) {
+    const minutes = -at.getTimezoneOffset(), away = Math.abs(minutes);
+    return minutes === 0 ? "UTC" : `UTC${minutes < 0 ? "−" : "+"}${Math.floor(away / 60)}${away % 60 ? `:${two(away % 60)}` : ""}`;
   }
   /** Return a quantity as typed, with this unit if it has none. The service checks it. */
   function quantity(text, unit) {
@@ -128,6 +133,7 @@
     const whole = Math.max(0, Math.round(seconds));
     return whole < 90 ? `${whole} s` : `${Math.floor(whole / 60)} min ${String(whole % 60).padStart(2, "0")} s`;
   }
+  const rehearsal = (yes) => (yes ? el("span", { class: "badge" }, "REHEARSAL") : null);
   const badge = (simulated) => (simulated ? el("span", { class: "badge" }, "SIMULATED") : null);
 
   // -- rigs
@@ -216,6 +222,16 @@
     const form = byId("ask");
     if (!form) return;
     let key = null, keyFor = "";
+    const flagged = [...form.querySelectorAll("[data-flag]")], fieldOf = (label) => label.querySelector("[name]");
+    /** Say an error with the labels of this form in place of the command line's options, and mark these fields. */
+    function refuse(message) {
+      const mine = flagged.filter((one) => new RegExp(`(^|[^\\w-])${one.dataset.flag}(?![\\w-])`).test(message));
+      const text = mine.reduce((said, one) => said.replaceAll(new RegExp(`(^|[^\\w-])${one.dataset.flag}(?![\\w-])`, "g"), `$1“${one.dataset.label}”`), message);
+      mine.map(fieldOf).forEach((one) => { one.setAttribute("aria-invalid", "true"); one.setAttribute("aria-describedby", "said"); });
+      byId("plan").hidden = true;            // the plan of other values
+      show(byId("said"), el("p", { class: "alarm", role: "alert" }, text));
+      if (mine.length) fieldOf(mine[0]).focus();
+    }
     every(3000, async () => {
       const found = await call("GET", `/rigs/${encodeURIComponent(rig)}`);
       const why = { busy: "A run uses this rig.", held: `Held by ${found.holder}.`, blocked: "Blocked until a stop that was not confirmed is signed off." }[found.state];
@@ -227,6 +243,7 @@
       const buttons = [...form.querySelectorAll("button")];
       const options = asked(form);
       buttons.forEach((one) => { one.disabled = true; });
+      flagged.map(fieldOf).forEach((one) => { one.removeAttribute("aria-invalid"); one.removeAttribute("aria-describedby"); });
       show(byId("said"), el("p", { class: "dim" }, wanted === "plan" ? "Planning …" : "Asking …"));
       try {
         if (wanted === "plan") {
@@ -241,7 +258,7 @@
           location.assign(`/runs/${run.id}/live`);
         }
       } catch (error) {
-        show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+        refuse(error instanceof Refused ? error.message : "No answer from tdhil serve.");
       } finally {
         buttons.forEach((one) => { one.disabled = false; });
       }
@@ -292,6 +309,7 @@
     const run = document.body.dataset.run, watched = document.body.dataset.motion === "watched";
     const samples = [[], [], []];
     let status = null, limits = null, message = 0, age = null, timeS = null, dirty = false, asking = null, undelivered = false, unseen = null;
+    let wentOn = new URL(document.referrer || location.href).pathname.startsWith("/start/");     // opened for a run, not for its record
     const speed = plotOf(byId("plot-speed"), "--speed", (one) => [one.speed_min_rad_s, one.speed_max_rad_s]);
     const torque = plotOf(byId("plot-torque"), "--torque", (one) => [-one.torque_nm, one.torque_nm]);
 
@@ -344,18 +362,39 @@
       byId("state").textContent = `${STATES[status.state] || status.state}${status.stage ? `: ${status.stage}` : ""}${error}`;
       byId("state").className = status.state === "stop_not_confirmed" ? "alarm" : "";
       const over = ENDED.includes(status.state);
+      if (!over) wentOn = true;
+      if (status.state === "done" && wentOn) { location.replace(`/runs/${run}`); return; }      // the page becomes the result
       byId("ended").hidden = !over;
       byId("stop").disabled = over;
       const confirm = status.state === "awaiting_confirmation" && status.confirmation;
       byId("confirm").hidden = !confirm;
       if (confirm) {
-        byId("confirm-text").textContent = status.confirmation.text;
+        checklist(status.confirmation.text);
         const marks = { ok: "✓", note: "i" }, half = status.expected_half_width;
         byId("confirm-expected").textContent = `Expected: ${half ? `J to ${percent(half)}, ` : ""}about ${span(Object.values(status.expected_s).reduce((sum, one) => sum + one, 0))}. ${status.identity}; if the host fails: ${status.safe_action}.`;
         show(byId("confirm-checks"), ...status.preflight.map((one) => el("tr", { class: one.outcome }, el("td", {}, marks[one.outcome] || "✗"), el("th", { scope: "row" }, one.name), el("td", {}, one.wanted), el("td", {}, one.found), el("td", {}, one.where))));
       }
       stopTimes();
       watching();
+    }
+
+    /** Show the text of the confirmation; each "[ ]" in it is to be ticked before the shaft may be moved. */
+    function checklist(text) {
+      const where = byId("confirm-text"), move = byId("confirm-form").querySelector("button");
+      if (where.dataset.of === text) return;             // keep what is ticked
+      where.dataset.of = text;
+      const boxes = [];
+      const ready = () => { move.disabled = boxes.some((box) => !box.checked); };
+      show(where, ...text.split("\n").flatMap((line) => {
+        const found = /^\s*\[ \] (.*)$/.exec(line);
+        if (!found) return [`${line}\n`];
+        const box = el("input", { type: "checkbox" });
+        box.addEventListener("change", ready);
+        boxes.push(box);
+        return [el("label", { class: "check" }, box, ` ${found[1]}`)];
+      }));
+      byId("confirm-tick").hidden = !boxes.length;
+      ready();
     }
 
     function stopTimes() {
@@ -580,7 +619,7 @@
   });
 
   const pages = { login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, may, number, ofResult, pages, percent, show, span, when };
+  window.tdhil = { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, may, number, ofResult, pages, percent, rehearsal, show, span, when };
   document.addEventListener("DOMContentLoaded", () => {
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);
     try {

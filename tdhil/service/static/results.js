@@ -1,14 +1,14 @@
 // Results: one run, a comparison, a rig over time, many logs. As in app.js, data from elsewhere are inserted as text.
 "use strict";
 (() => {
-  const { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, number, ofResult, pages, percent, show, span, when } = window.tdhil;
+  const { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, number, ofResult, pages, percent, rehearsal, show, span, when } = window.tdhil;
 
   // -- one run
 
   function resultOf(run) {
     const result = run.result;
     const parts = [el("p", { class: "now" }, el("strong", { class: run.state === "stop_not_confirmed" ? "alarm" : "" }, STATES[run.state] || run.state))];
-    if (run.error) parts.push(el("p", { class: "alarm" }, run.error.message));
+    if (run.error) parts.push(el("p", { class: run.state === "stopped" && run.stop.asked ? "dim" : "alarm" }, run.error.message));
     if (!ENDED.includes(run.state)) parts.push(el("p", {}, el("a", { class: "button", href: `/runs/${run.id}/live` }, "Live")));
     if (!result) return parts;
     const rows = [["verdict", result.verdict]];
@@ -25,16 +25,28 @@
       rows.push([`momentum cross-check, ${one.route}`, `${estimate(one.inertia_kg_m2, "kg·m²")}${agrees}`]);
     }
     const card = el("div", { class: "card" },
-      J ? el("p", { class: "figure" }, `J = ${ofResult(result)}`) : el("p", { class: "figure" }, result.verdict),
+      J ? el("p", { class: "figure large" }, `J = ${ofResult(result)}`) : null,
+      el("p", { class: `verdict ${VERDICTS[result.verdict] || ""}` }, result.verdict),
       region("Numbers", el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))),
       el("p", {}, result.reason || ""), result.advice ? el("p", {}, result.advice) : null);
     parts.push(card);
-    for (const one of result.warnings || []) parts.push(el("p", { class: "alarm" }, one));
-    if ((result.budget || []).length) {
-      parts.push(el("h2", {}, "Uncertainty budget"), region("Uncertainty budget", el("table", {},
-        el("tbody", {}, ...result.budget.map((one) => el("tr", {}, el("th", { scope: "row" }, one.source), el("td", {}, `± ${number(one.half_width_kg_m2, 2)} kg·m²`), el("td", { class: "dim" }, one.note)))))));
-    }
+    const codes = result.warning_codes || [], wanted = run.state === "stopped" && run.stop.asked;
+    (result.warnings || []).forEach((one, k) => parts.push(el("p", { class: wanted && codes[k] === ENDED_EARLY ? "dim" : "alarm" }, one)));
     return parts;
+  }
+  const ENDED_EARLY = "TDH-030";
+  const VERDICTS = { valid: "good", valid_wide: "fair", not_identifiable: "bad", model_rejected: "bad" };
+
+  /** The uncertainty budget as bars, the largest contribution first; an open one has no bar. */
+  function budgetOf(result) {
+    const lines = [...((result && result.budget) || [])].sort((a, b) => (b.half_width_kg_m2 ?? Infinity) - (a.half_width_kg_m2 ?? Infinity));
+    if (!lines.length) return [];
+    const most = Math.max(...lines.map((one) => one.half_width_kg_m2 ?? 0));
+    return [el("details", {}, el("summary", {}, "Uncertainty budget, in numbers"), region("Uncertainty budget", el("table", {},
+      el("tbody", {}, ...lines.map((one) => el("tr", {}, el("th", { scope: "row" }, one.source),
+        el("td", {}, `± ${number(one.half_width_kg_m2, 2)} kg·m²`),
+        el("td", {}, el("meter", { min: 0, max: most || 1, value: one.half_width_kg_m2 ?? 0, "aria-label": `share of the largest: ${one.source}` })),
+        el("td", { class: "dim" }, one.note)))))))];
   }
 
   /** The report's pictures, and the friction curve in numbers below its own. */
@@ -67,6 +79,7 @@
       if (now === shown) return;
       shown = now;
       show(byId("result"), ...resultOf(run));
+      show(byId("budget"), ...budgetOf(run.result));
       byId("replays").hidden = !ENDED.includes(run.state) || !run.files.includes("run.mcap");
       const first = run.result ? [{ asked: {}, result: run.result, state: "done", first: true }] : [];
       show(byId("replay-rows"), ...[...first, ...run.replays].map((one) => el("tr", {},
@@ -119,8 +132,8 @@
         const box = el("input", { type: "checkbox", "aria-label": `compare ${one.rig}, ${when(one.asked)}`, checked: chosen.has(one.id), disabled: one.verdict === null });
         box.addEventListener("change", () => choose(one.id, box.checked));
         return el("tr", {}, el("td", { class: "pick" }, box),
-          el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}` }, when(one.asked))), el("td", {}, one.rig, " ", badge(one.simulated) || ""),
-          el("td", {}, STATES[one.state] || one.state), el("td", {}, inertia(one) || "–"), el("td", {}, one.verdict || ""));
+          el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}` }, when(one.asked))), el("td", {}, one.rig, " ", badge(one.simulated) || "", " ", rehearsal(one.rehearsal) || ""),
+          el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict || ""));
       }) : [el("tr", {}, el("td", { colspan: 6, class: "dim" }, "no run yet"))]));
     });
   }
@@ -223,7 +236,7 @@
       const { runs: ids, comparison } = await call("GET", `/runs/compare?runs=${encodeURIComponent(runs)}`, undefined, {}, 300000);
       const names = comparison.results.map((one, k) => `${one.rig || "?"}, ${when(one.date) || ids[k]}`);
       const dot = (k) => el("span", { class: `dot c${k}`, "aria-hidden": "true" });
-      const heads = ids.map((id, k) => el("th", { scope: "col" }, dot(k), " ", el("a", { href: `/runs/${id}` }, names[k]), " ", badge(comparison.results[k].simulated) || ""));
+      const heads = ids.map((id, k) => el("th", { scope: "col" }, dot(k), " ", el("a", { href: `/runs/${id}` }, names[k]), " ", badge(comparison.results[k].simulated) || "", " ", rehearsal(comparison.results[k].rehearsed_faults) || ""));
       const said = comparison.differences.map((one, k) => {
         const told = one.quantities.find((other) => other.column === "inertia_kg_m2");
         return el("p", { class: told && told.differs ? "now alarm" : "now" }, dot(0), " ", names[0], " and ", dot(k + 1), ` ${names[k + 1]}: ${one.text}.`);
@@ -393,7 +406,7 @@
     const J = interval(row.inertia_kg_m2, row.inertia_low_total_kg_m2, row.inertia_high_total_kg_m2) ?? "–";
     const was = row.changed ? `other: ${row.stored_verdict} ${number(row.stored_inertia_kg_m2)}` : row.changed === false ? "the same" : "";
     return el("tr", row.error_kind ? { class: "refused" } : {}, el("th", { scope: "row" }, own ? el("a", { href: `/runs/${own[1]}` }, own[1]) : row.log),
-      el("td", {}, row.rig || "", " ", badge(row.simulated) || ""), el("td", {}, when(row.date)), el("td", {}, row.error_kind ? `${row.error_kind}: ${row.error_text}` : `${row.verdict}${inPart(row)}`), el("td", {}, J), el("td", {}, was));
+      el("td", {}, row.rig || "", " ", badge(row.simulated) || "", " ", rehearsal(row.rehearsed_faults) || ""), el("td", {}, when(row.date)), el("td", {}, row.error_kind ? `${row.error_kind}: ${row.error_text}` : `${row.verdict}${inPart(row)}`), el("td", {}, J), el("td", {}, was));
   }
 
   // as FleetRow.part_text; older rows have no such field

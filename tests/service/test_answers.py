@@ -1,0 +1,34 @@
+"""Documents of ended runs that are kept: asked twice, computed once, and never older than their logs."""
+
+from __future__ import annotations
+
+from tdhil.service.answers import MOST, KeptAnswers
+
+
+def test_a_comparison_is_kept_until_a_log_changes(tmp_path):
+    log = tmp_path / "one" / "run.mcap"
+    log.parent.mkdir()
+    log.write_bytes(b"1")
+    kept, asked = KeptAnswers(tmp_path), {"runs": ["one"], "runs_folder": str(tmp_path)}
+    kept.put(kept.key("compare", asked), {"n": 1})
+    assert kept.get(kept.key("compare", asked)) == {"n": 1}
+    assert kept.get(kept.key("compare", asked | {"runs": ["one", "one"]})) is None
+    log.write_bytes(b"12")
+    assert kept.get(kept.key("compare", asked)) is None
+
+
+def test_a_trend_is_its_rows_and_anything_else_is_computed_anew(tmp_path):
+    kept = KeptAnswers(tmp_path)
+    kept.put(kept.key("trend", {"rows": [1], "rig": "a"}), {"n": 1})
+    assert kept.get(kept.key("trend", {"rows": [1], "rig": "a"})) == {"n": 1}
+    assert kept.get(kept.key("trend", {"rows": [1, 2], "rig": "a"})) is None
+    assert kept.key("plan", {"rig_file": "rig.yaml"}) is None
+    assert kept.key("compare", {"runs": ["gone"]}) is None
+
+
+def test_no_more_are_kept_than_memory_is_meant_for(tmp_path):
+    kept = KeptAnswers(tmp_path)
+    for rig in range(MOST + 1):
+        kept.put(kept.key("trend", {"rows": [], "rig": str(rig)}), {"n": rig})
+    assert kept.get(kept.key("trend", {"rows": [], "rig": "0"})) is None
+    assert kept.get(kept.key("trend", {"rows": [], "rig": str(MOST)})) == {"n": MOST}
