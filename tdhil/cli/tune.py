@@ -239,7 +239,7 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     if not 0.0 < low <= value <= high:
         raise TuningRefused("the interval of J reaches down to zero", where=str(namespace.result),
                             next_step="Identify again, for longer", entry=MessageCode.NO_INERTIA_TO_TUNE)
-    string, of_string, drawn = _string(result, namespace, square**0.5)
+    string, of_string, drawn = string_for(result, namespace, square**0.5)
     lags, of_lags, lags_from = _lags(result, namespace, measured)
     drive = TopDrive(value, square * _estimate(result, "viscous_nm_s_rad"),
                      square**0.5 * _estimate(result, "coulomb_nm"), lags)
@@ -273,7 +273,7 @@ def _required(result: Mapping[str, Any], namespace: argparse.Namespace) -> Requi
     return RequiredMargins(dead_time_s=DEAD_TIME_PERIODS * control_s)
 
 
-def _string(
+def string_for(
     result: Mapping[str, Any], namespace: argparse.Namespace, ratio: float
 ) -> tuple[DrillString, tuple[Ends, ...], tuple[DrillString, ...]]:
     """Return the string, both ends of the interval of each of its values, and random draws of all of them.

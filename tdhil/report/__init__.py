@@ -42,6 +42,10 @@ if TYPE_CHECKING:
         draw_calibration as draw_calibration, print_calibration as print_calibration,
         write_calibration_report as write_calibration_report,
     )
+    from tdhil.report.severity import (
+        print_severity as print_severity, severity_document as severity_document,
+        write_severity_report as write_severity_report,
+    )
     from tdhil.report.schedule import schedule_document as schedule_document
     from tdhil.report.tuning import (
         TunedFor as TunedFor, print_tuning as print_tuning, showcase_of as showcase_of,

@@ -57,6 +57,11 @@ if TYPE_CHECKING:
     from tdhil.soft_torque.depth_schedule import (
         DepthRow as DepthRow, DepthSchedule as DepthSchedule, at_depth as at_depth, schedule as schedule,
     )
+    from tdhil.soft_torque.torsional_severity import (
+        AT_RISK_INDEX as AT_RISK_INDEX, Course as Course, Episode as Episode, ReflectionCheck as ReflectionCheck,
+        STICK_SLIP_INDEX as STICK_SLIP_INDEX, Severity as Severity, SeverityRefused as SeverityRefused,
+        SurfaceRecord as SurfaceRecord, severity as severity,
+    )
     from tdhil.soft_torque.virtual_string import (
         COLUMNS as COLUMNS, ProgramCourse as ProgramCourse, HostController as HostController, HostLoop as HostLoop,
         RotorObserver as RotorObserver, Phase as Phase, SpeedProgram as SpeedProgram, IdentifiedRig as IdentifiedRig,
