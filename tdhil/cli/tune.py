@@ -92,13 +92,14 @@ def run(namespace: argparse.Namespace) -> int:
     from tdhil.report import (
         PlainConsole,
         check_report_path,
+        map_document,
         print_tuning,
         showcase_of,
         stderr_console,
         tuning_document,
         write_tuning_report,
     )
-    from tdhil.soft_torque import Search, tune
+    from tdhil.soft_torque import Search, operator_map, tune
 
     _check(namespace)
     if namespace.report is not None:
@@ -117,6 +118,10 @@ def run(namespace: argparse.Namespace) -> int:
     document = tuning_document(tuning, tuned_for)
     if namespace.depths is not None:
         document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, profile, tell)
+    if namespace.report is not None:
+        tell("the operator's map: set speed and bit torque")
+        found = operator_map(tuning)
+        document["map"] = None if found is None else map_document(found)
     if namespace.json:
         print_json(document)
     else:

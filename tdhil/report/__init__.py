@@ -46,6 +46,7 @@ if TYPE_CHECKING:
         print_severity as print_severity, severity_document as severity_document,
         write_severity_report as write_severity_report,
     )
+    from tdhil.report.operator_map import map_document as map_document
     from tdhil.report.schedule import schedule_document as schedule_document
     from tdhil.report.tuning import (
         TunedFor as TunedFor, print_tuning as print_tuning, showcase_of as showcase_of,

@@ -57,8 +57,10 @@ if TYPE_CHECKING:
     from tdhil.soft_torque.depth_schedule import (
         DepthRow as DepthRow, DepthSchedule as DepthSchedule, at_depth as at_depth, schedule as schedule,
     )
+    from tdhil.soft_torque.speed_torque_map import OperatorMap as OperatorMap, operator_map as operator_map
     from tdhil.soft_torque.torsional_severity import (
-        AT_RISK_INDEX as AT_RISK_INDEX, Course as Course, Episode as Episode, ReflectionCheck as ReflectionCheck,
+        AT_RISK_INDEX as AT_RISK_INDEX, ReflectionCheck as ReflectionCheck,
+        SeverityCourse as SeverityCourse, StickSlipEpisode as StickSlipEpisode,
         STICK_SLIP_INDEX as STICK_SLIP_INDEX, Severity as Severity, SeverityRefused as SeverityRefused,
         SurfaceRecord as SurfaceRecord, severity as severity,
     )

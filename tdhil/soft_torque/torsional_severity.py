@@ -76,7 +76,7 @@ REFLECTION_TOLERANCE = 0.1
 
 
 NOT_IDENTIFIABLE = 9
-"""Exit code: the record does not determine what was asked for."""
+"""Exit code: the record does not determine the requested quantity."""
 
 
 class SeverityRefused(TdhilError):
@@ -89,7 +89,7 @@ class SeverityRefused(TdhilError):
 
 @dataclass(frozen=True)
 class SurfaceRecord:
-    """What the drive reported, at the main shaft; (N,), times rising."""
+    """Torque and speed as the drive reported them, at the main shaft; (N,), times rising."""
 
     time_s: Array
     speed_rad_s: Array
@@ -99,7 +99,7 @@ class SurfaceRecord:
 
 
 @dataclass(frozen=True)
-class Episode:
+class StickSlipEpisode:
     """A stretch of stick-slip; times of the record."""
 
     start_s: float
@@ -131,7 +131,7 @@ class ReflectionCheck:
 
 
 @dataclass(frozen=True)
-class Course:
+class SeverityCourse:
     """The signals over time, for pictures: (M,) each, NaN where nothing is known."""
 
     time_s: Array
@@ -144,7 +144,7 @@ class Course:
 
 @dataclass(frozen=True)
 class Severity:
-    """What a record says; speeds, torques at the main shaft."""
+    """Result for one record; speeds and torques at the main shaft."""
 
     turning_s: float
     """Time in which the string turned and its downhole speed is known."""
@@ -157,7 +157,7 @@ class Severity:
     stick_slip_share: float
     at_risk_share: float
     """Share of the turning time."""
-    episodes: tuple[Episode, ...]
+    episodes: tuple[StickSlipEpisode, ...]
     period_s: Interval | None
     """Of the oscillation; None: nothing that repeats."""
     cycles: int
@@ -168,7 +168,7 @@ class Severity:
     window_s: float
     reflection: ReflectionCheck | None
     reflection_refused: str
-    course: Course
+    course: SeverityCourse
 
     @property
     def level(self) -> str:
@@ -179,7 +179,7 @@ class Severity:
 
 
 @dataclass(frozen=True)
-class _Stretch:
+class _GaplessPart:
     """One stretch without gaps on the common grid: speed, its derivative, and torque without the reports' lags."""
 
     time_s: Array
@@ -256,7 +256,7 @@ def severity(
 # The record on one grid.
 
 
-def _stretches(record: SurfaceRecord, period_s: float) -> list[_Stretch]:
+def _stretches(record: SurfaceRecord, period_s: float) -> list[_GaplessPart]:
     time = record.time_s
     if len(time) < LEAST_PERIODS * LEAST_SAMPLES_PER_PERIOD:
         raise SeverityRefused(f"the record has {len(time)} samples, which is less than {LEAST_PERIODS:g} periods of"
@@ -280,7 +280,7 @@ def _stretches(record: SurfaceRecord, period_s: float) -> list[_Stretch]:
         highest = min(HARMONICS / period_s, 0.4 / step)
         clean, slope = _without_lag(speed, step, record.speed_lag_s, highest, round(2.0 * period_s / step))
         pull, _ = _without_lag(torque, step, record.torque_lag_s, highest, round(2.0 * period_s / step))
-        found.append(_Stretch(grid, clean, slope, pull))
+        found.append(_GaplessPart(grid, clean, slope, pull))
     if not found:
         raise SeverityRefused(f"no part of the record is free of gaps for {LEAST_PERIODS:g} periods of the string, "
                               f"{LEAST_PERIODS * period_s:.0f} s", next_step="Name a longer record")
@@ -341,7 +341,7 @@ def downhole_speed(speed: Array, torque: Array, step_s: float, string: DrillStri
     return speed
 
 
-def _windows(stretch: _Stretch, string: DrillString, inertia: float, period_s: float, step: float) -> _Windows:
+def _windows(stretch: _GaplessPart, string: DrillString, inertia: float, period_s: float, step: float) -> _Windows:
     from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
     torque = stretch.torque - inertia * stretch.slope
@@ -380,7 +380,7 @@ def _ends_of(string: DrillString) -> list[tuple[DrillString, DrillString]]:
 # Cycles and episodes.
 
 
-def _cycles(stretch: _Stretch, windows: _Windows, in_stick_slip: bool, period_s: float) -> Array:
+def _cycles(stretch: _GaplessPart, windows: _Windows, in_stick_slip: bool, period_s: float) -> Array:
     """Return the lengths, s, of the cycles of the downhole speed: from one rise through the mean to the next."""
     from scipy.ndimage import uniform_filter1d
 
@@ -419,13 +419,13 @@ def _period(cycles: Array) -> Interval | None:
     return Interval(mean, mean - half, mean + half)
 
 
-def _episodes(time_s: Array, index: Array, stuck: Flags, step: float) -> tuple[Episode, ...]:
+def _episodes(time_s: Array, index: Array, stuck: Flags, step: float) -> tuple[StickSlipEpisode, ...]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], stuck, [False]]).astype(np.int8)))
     jumps = set((np.flatnonzero(np.diff(time_s) > 1.5 * step) + 1).tolist())
-    found: list[Episode] = []
+    found: list[StickSlipEpisode] = []
     for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         cuts = [first, *sorted(cut for cut in jumps if first < cut < last), last]
-        found += [Episode(float(time_s[a]), float(time_s[b - 1]), float(np.nanmax(index[a:b])))
+        found += [StickSlipEpisode(float(time_s[a]), float(time_s[b - 1]), float(np.nanmax(index[a:b])))
                   for a, b in pairwise(cuts)]
     return tuple(found)
 
@@ -435,7 +435,7 @@ def _episodes(time_s: Array, index: Array, stuck: Flags, step: float) -> tuple[E
 
 
 def _reflection(
-    stretches: Sequence[_Stretch], string: DrillString, inertia: Interval, period_s: float, step: float,
+    stretches: Sequence[_GaplessPart], string: DrillString, inertia: Interval, period_s: float, step: float,
     expected: tuple[TopDrive, SpeedController] | None,
 ) -> tuple[ReflectionCheck | None, str]:
     hertz = 1.0 / period_s
@@ -467,7 +467,7 @@ def _reflection(
                            Interval(value, max(0.0, low), high), coherence, wanted), ""
 
 
-def _segments(stretch: _Stretch, zeta: float, inertia: float, hertz: float, step: float) -> NDArray[np.complex128]:
+def _segments(stretch: _GaplessPart, zeta: float, inertia: float, hertz: float, step: float) -> NDArray[np.complex128]:
     """(segments, 3): cross spectrum of the waves down and up, and the spectrum of each, summed over the band."""
     size = round(SEGMENT_PERIODS / hertz / step)
     if len(stretch.speed) < size:
@@ -489,11 +489,11 @@ def _segments(stretch: _Stretch, zeta: float, inertia: float, hertz: float, step
     return np.array(found, dtype=np.complex128).reshape(-1, 3)
 
 
-def _course(stretches: Sequence[_Stretch], found: Sequence[_Windows], inertia: float) -> Course:
+def _course(stretches: Sequence[_GaplessPart], found: Sequence[_Windows], inertia: float) -> SeverityCourse:
     """All stretches in one, a NaN between two."""
     def joined(rows: Sequence[Array]) -> Array:
         return np.concatenate([part for row in rows for part in (row, np.full(1, np.nan))])[:-1]
 
-    return Course(joined([one.time_s for one in stretches]), joined([one.speed for one in stretches]),
+    return SeverityCourse(joined([one.time_s for one in stretches]), joined([one.speed for one in stretches]),
                   joined([one.torque - inertia * one.slope for one in stretches]),
                   joined([one.bit for one in found]), joined([one.index for one in found]))
