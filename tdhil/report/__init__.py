@@ -66,6 +66,8 @@ else:
         "speed_calibration": "print_speed_calibration speed_document",
         "torque_calibration": "calibration_document calibration_report draw_calibration print_calibration "
                               "write_calibration_report",
+        "operator_map": "map_document",
+        "severity": "print_severity severity_document write_severity_report",
         "schedule": "schedule_document",
         "tuning": "TunedFor print_tuning showcase_of tuning_document write_tuning_report",
         "factor_calibration": "known_pipe_document pairs_document print_factor reference_document write_factor_report",

@@ -92,6 +92,9 @@ else:
                          "string_modes_hz",
         "tuning": "START_DRAWS tune",
         "depth_schedule": "DepthRow DepthSchedule at_depth schedule",
+        "speed_torque_map": "OperatorMap operator_map",
+        "torsional_severity": "AT_RISK_INDEX ReflectionCheck STICK_SLIP_INDEX Severity SeverityCourse SeverityRefused "
+                              "StickSlipEpisode SurfaceRecord severity",
         "virtual_string": "COLUMNS ProgramCourse HostController HostLoop RotorObserver Phase SpeedProgram "
                           "IdentifiedRig VirtualString",
     })
