@@ -150,7 +150,8 @@ MEANING = {
     ),
     8: ("**the stop is not confirmed**", "**Use the hard-wired emergency stop.**"),
     9: (
-        "`not_identifiable` or `model_rejected`; `tdhil evaluate`: no critical speed, or not that of the string",
+        "`not_identifiable` or `model_rejected`; `tdhil evaluate`: no critical speed, or not that of the string; "
+        "`tdhil severity`: the record says nothing of the string",
         "Run the motion that the card names.",
     ),
     10: (

@@ -743,6 +743,10 @@ class MessageCode(Enum):
         918, "The reported speed jumped during the run",
         "Within a tenth of a second it changed by more than torque and string can do to this shaft.",
         "Check the encoder, its cable and its scale. Repeat the run.")
+    SEVERITY_REFUSED = (
+        925, "The record says nothing of the string's torsional motion",
+        "The record is too short or too slow, has too many gaps, or the string does not turn in it.",
+        "Name a longer record of rotation, with at least sixteen samples in each period of the string.")
 
     # --- 10xx: nothing readable in a file ----------------------------------------------------------------------------
     NOTHING_RECOVERABLE = (

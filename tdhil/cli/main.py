@@ -57,6 +57,7 @@ _GROUPS: Final = {
     "what J is for": {
         "tune": "compute a speed controller that damps the drill string",
         "evaluate": "test a tuned controller on the drive with a virtual string",
+        "severity": "show stick-slip in a record of ordinary drilling",
     },
     "service": {
         "serve": "show rigs, runs and live pages in a browser",

@@ -93,13 +93,14 @@ def run(namespace: argparse.Namespace) -> int:
     from tdhil.report import (
         PlainConsole,
         check_report_path,
+        map_document,
         print_tuning,
         showcase_of,
         stderr_console,
         tuning_document,
         write_tuning_report,
     )
-    from tdhil.soft_torque import Search, tune
+    from tdhil.soft_torque import Search, operator_map, tune
 
     _check(namespace)
     _check_files(namespace)
@@ -119,6 +120,10 @@ def run(namespace: argparse.Namespace) -> int:
     document = tuning_document(tuning, tuned_for)
     if namespace.depths is not None:
         document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, profile, tell)
+    if namespace.report is not None:
+        tell("the operator's map: set speed and bit torque")
+        found = operator_map(tuning)
+        document["map"] = None if found is None else map_document(found)
     if namespace.json:
         print_json(document)
         if namespace.no_simulation:
@@ -259,7 +264,7 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     if not 0.0 < low <= value <= high:
         raise TuningRefused("the interval of J reaches down to zero", where=str(namespace.result),
                             next_step="Identify again, for longer", entry=MessageCode.NO_INERTIA_TO_TUNE)
-    string, of_string, drawn = _string(result, namespace, square**0.5)
+    string, of_string, drawn = string_for(result, namespace, square**0.5)
     lags, of_lags, lags_from = _lags(result, namespace, measured)
     drive = TopDrive(value, square * _estimate(result, "viscous_nm_s_rad"),
                      square**0.5 * _estimate(result, "coulomb_nm"), lags)
@@ -293,7 +298,7 @@ def _required(result: Mapping[str, Any], namespace: argparse.Namespace) -> Requi
     return RequiredMargins(dead_time_s=DEAD_TIME_PERIODS * control_s)
 
 
-def _string(
+def string_for(
     result: Mapping[str, Any], namespace: argparse.Namespace, ratio: float
 ) -> tuple[DrillString, tuple[Ends, ...], tuple[DrillString, ...]]:
     """Return the string, both ends of the interval of each of its values, and random draws of all of them.

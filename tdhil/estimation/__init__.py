@@ -28,6 +28,7 @@ from tdhil.estimation.rough_estimates import (
 )
 from tdhil.estimation.samples import (
     STICK_SLIP_REGULAR as STICK_SLIP_REGULAR, STICK_SLIP_SHARE as STICK_SLIP_SHARE, Samples as Samples,
+        downhole_swing_rad_s as downhole_swing_rad_s,
     Stretch as Stretch, excited_window as excited_window, repeats as repeats, stretches as stretches,
     usable_samples as usable_samples,
 )

@@ -63,6 +63,8 @@ _STARTS_S = ((0.40, 0.15), (0.05, 0.02), (0.1, 0.4))   # s; start values of the 
 _OPEN = 0.5                    # relative half-width of P beyond which no value is given
 _AT_BOUND = 1e-6          # of a parameter's scale: nearer to its bound counts as on it
 _REFERENCE_GAIN = 10.83        # −2 ln L that a reference filter must be worth: one time in a thousand by chance
+_SMALL_FILTER_LOSS = 3.84      # −2 ln L by which the data contradict one of a given size: one time in twenty
+_SMALL_FILTERS_S = tuple(0.01 * k for k in range(1, 16))
 _POINTS = 49                   # of the curve
 
 
@@ -414,10 +416,15 @@ def _real_fit(columns: Sequence[NDArray[np.complex128]], target: NDArray[np.comp
 
 
 class _ThetaSpread:
-    """Covariance of theta, and the degrees of freedom of whatever is made of it."""
+    """Covariance of theta, and the degrees of freedom of whatever is made of it.
 
-    def __init__(self, problem: ImpedanceProblem, fitted: FittedImpedance, confidence: float) -> None:
-        self._fitted, self._confidence = fitted, confidence
+    ``other``: a second fit that the data allow as well. Each interval then covers that of both.
+    """
+
+    def __init__(
+        self, problem: ImpedanceProblem, fitted: FittedImpedance, confidence: float, other: _ThetaSpread | None = None
+    ) -> None:
+        self._fitted, self._confidence, self._other = fitted, confidence, other
         self._moved = np.flatnonzero(fitted.inside)
         slopes = problem.slopes(fitted.theta, fitted.scale)[:, self._moved]
         lines = 2 * problem.x.size
@@ -449,6 +456,10 @@ class _ThetaSpread:
             if extra_sd is not None:
                 half = math.hypot(half, student_quantile(self._confidence, 1e6) * float(extra_sd[index]))
             found.append(Estimate(float(one), float(one - half), float(one + half)))
+        if self._other is not None:
+            also = self._other.around(function, extra_sd)
+            found = [replace(one, low=min(one.low, two.low), high=max(one.high, two.high))
+                     for one, two in zip(found, also, strict=True)]
         return tuple(found)
 
 
@@ -494,7 +505,7 @@ def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProbl
             advice="Check three causes: a string or a brake on the shaft; another structure of the loop (feed-forward,"
             " ramp, notch); report filters other than first-order lags.",
         )
-    spread = _ThetaSpread(problem, fitted, confidence)
+    spread = _ThetaSpread(problem, fitted, confidence, _small_filter(problem, fitted, confidence))
     gains = spread.around(
         lambda theta: np.array([
             theta[GAIN], theta[INTEGRAL], theta[TORQUE_LAG] + theta[SPEED_FILTER], theta[TORQUE_LAG],
@@ -543,6 +554,25 @@ def _undeclared(
     _, instead, wanted, fitted = min(found, key=lambda one: one[:2])
     spread = _ThetaSpread(wanted, fitted, confidence)
     return _not_below_zero(spread.around(lambda theta: theta[[REFERENCE_FILTER]])[0]), instead
+
+
+def _small_filter(problem: ImpedanceProblem, plain: FittedImpedance, confidence: float) -> _ThetaSpread | None:
+    """Return the fit with the largest undeclared reference filter that the data do not contradict; None: none.
+
+    Such a filter moves P by more than P's own interval. By the torque offset no reference filter is in the way.
+    """
+    if problem.by == OFFSET:
+        return None
+    largest, best = None, plain.objective
+    start = plain.theta.copy()
+    for filter_s in _SMALL_FILTERS_S:
+        start[REFERENCE_FILTER] = filter_s
+        fitted = _descended(problem, start, {REFERENCE_FILTER})
+        best = min(best, fitted.objective)
+        if fitted.objective - best > _SMALL_FILTER_LOSS:
+            break
+        largest, start = fitted, fitted.theta.copy()
+    return None if largest is None else _ThetaSpread(problem, largest, confidence)
 
 
 def _filter_words(declared_s: float, shows: Estimate, instead: bool) -> tuple[str, str]:

@@ -42,6 +42,11 @@ if TYPE_CHECKING:
         draw_calibration as draw_calibration, print_calibration as print_calibration,
         write_calibration_report as write_calibration_report,
     )
+    from tdhil.report.severity import (
+        print_severity as print_severity, severity_document as severity_document,
+        write_severity_report as write_severity_report,
+    )
+    from tdhil.report.operator_map import map_document as map_document
     from tdhil.report.schedule import schedule_document as schedule_document
     from tdhil.report.tuning import (
         TunedFor as TunedFor, print_tuning as print_tuning, showcase_of as showcase_of,
@@ -61,6 +66,8 @@ else:
         "speed_calibration": "print_speed_calibration speed_document",
         "torque_calibration": "calibration_document calibration_report draw_calibration print_calibration "
                               "write_calibration_report",
+        "operator_map": "map_document",
+        "severity": "print_severity severity_document write_severity_report",
         "schedule": "schedule_document",
         "tuning": "TunedFor print_tuning showcase_of tuning_document write_tuning_report",
         "factor_calibration": "known_pipe_document pairs_document print_factor reference_document write_factor_report",

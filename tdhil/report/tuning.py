@@ -18,6 +18,7 @@ from tdhil.report.card import with_interval
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED
 from tdhil.report.html import write_blocks
+from tdhil.report.operator_map import map_section
 from tdhil.report.schedule import finite, gain_words, noisy_speed, print_schedule, schedule_section, spread_document
 from tdhil.soft_torque import (
     BAND_HZ,
@@ -508,6 +509,8 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
                     f"Simulated: a stuck bit at a set speed of {showcase.set_rpm:.0f} rpm; the bit in colour, the top "
                     "drive in grey."),
         )))
+    if document.get("map"):
+        sections.append(map_section(document["map"], document["string"]["bit"]["words"]))
     settings = list(_setting_rows(document))
     if settings:
         sections.append(ReportSection("To be typed into the drive, by hand", (

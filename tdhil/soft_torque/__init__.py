@@ -57,6 +57,13 @@ if TYPE_CHECKING:
     from tdhil.soft_torque.depth_schedule import (
         DepthRow as DepthRow, DepthSchedule as DepthSchedule, at_depth as at_depth, schedule as schedule,
     )
+    from tdhil.soft_torque.speed_torque_map import OperatorMap as OperatorMap, operator_map as operator_map
+    from tdhil.soft_torque.torsional_severity import (
+        AT_RISK_INDEX as AT_RISK_INDEX, ReflectionCheck as ReflectionCheck,
+        SeverityCourse as SeverityCourse, StickSlipEpisode as StickSlipEpisode,
+        STICK_SLIP_INDEX as STICK_SLIP_INDEX, Severity as Severity, SeverityRefused as SeverityRefused,
+        SurfaceRecord as SurfaceRecord, severity as severity,
+    )
     from tdhil.soft_torque.virtual_string import (
         COLUMNS as COLUMNS, ProgramCourse as ProgramCourse, HostController as HostController, HostLoop as HostLoop,
         RotorObserver as RotorObserver, Phase as Phase, SpeedProgram as SpeedProgram, IdentifiedRig as IdentifiedRig,
@@ -85,6 +92,9 @@ else:
                          "string_modes_hz",
         "tuning": "START_DRAWS tune",
         "depth_schedule": "DepthRow DepthSchedule at_depth schedule",
+        "speed_torque_map": "OperatorMap operator_map",
+        "torsional_severity": "AT_RISK_INDEX ReflectionCheck STICK_SLIP_INDEX Severity SeverityCourse SeverityRefused "
+                              "StickSlipEpisode SurfaceRecord severity",
         "virtual_string": "COLUMNS ProgramCourse HostController HostLoop RotorObserver Phase SpeedProgram "
                           "IdentifiedRig VirtualString",
     })

@@ -571,7 +571,7 @@ def critical_speeds(strings: Strings, loops: Sequence[Loop], search: Search = Se
     return [CriticalSpeeds(*two) for two in zip(cures, starts, strict=True)]
 
 
-Start = Literal["stuck", "rest"]
+Start = Literal["stuck", "rest", "turning"]
 
 
 def lowest_turning(strings: Strings, loops: Sequence[Loop], how: Start, search: Search) -> list[float | None]:
@@ -583,7 +583,7 @@ def lowest_turning(strings: Strings, loops: Sequence[Loop], how: Start, search: 
     coarse = np.linspace(search.lowest_rpm, search.highest_rpm, max(1, ceil(span / search.coarse_rpm - 1e-9)) + 1)
 
     def turn(speeds_rpm: Array) -> NDArray[np.bool_]:
-        return _ends_turning(strings, loops, how, np.maximum(speeds_rpm, 0.5 * search.resolution_rpm), search)
+        return ends_turning(strings, loops, how, np.maximum(speeds_rpm, 0.5 * search.resolution_rpm), search)
 
     found = _lowest(turn, np.tile(coarse, (len(loops), 1)), float(coarse[1] - coarse[0]) / search.resolution_rpm)
     return [None if one == np.inf else float(max(one, 0.5 * search.resolution_rpm)) for one in found]
@@ -619,14 +619,15 @@ def _first_of_the_rest(turns: NDArray[np.bool_]) -> int:
     return int(sticking[-1]) + 1 if sticking.size else 0
 
 
-def _ends_turning(
+def ends_turning(
     strings: Strings, loops: Sequence[Loop], how: Start, speeds_rpm: Array, search: Search,
     seeds: Sequence[int] | None = None,
 ) -> NDArray[np.bool_]:
+    """Return for each loop and speed whether the bit turns in the end, without a standstill in the calm time."""
     target = speeds_rpm * RPM
-    begin = Begin(how, target if how == "stuck" else np.zeros_like(target))
+    begin = Begin(how, np.zeros_like(target) if how == "rest" else target)
     ramp = search.start_ramp_rpm_s * RPM
-    duration = search.duration_s + (0.0 if how == "stuck" else float(target.max()) / ramp)
+    duration = search.duration_s + (float(target.max()) / ramp if how == "rest" else 0.0)
     trace = simulate(strings, loops, begin, target, ramp, duration, keep_every_s=duration / 4.0,
                      longest_tick_s=search.longest_tick_s, seeds=seeds)
     turned: NDArray[np.bool_] = trace.last_stuck_s < trace.end_s * (1.0 - search.calm_s / duration)
@@ -667,7 +668,7 @@ def lowest_turning_with_noise(
     coarse = np.linspace(log(LOWEST_NOISY_RPM), log(HIGHEST_NOISY_RPM), COARSE_SPEEDS)
 
     def turn(logs: Array) -> NDArray[np.bool_]:
-        return _ends_turning(strings, loops, how, np.exp(logs), search, seeds)
+        return ends_turning(strings, loops, how, np.exp(logs), search, seeds)
 
     found: Array = np.exp(_lowest(turn, np.tile(coarse, (len(loops), 1)), FINE_PARTS))
     return found

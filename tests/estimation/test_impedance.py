@@ -86,6 +86,15 @@ def test_a_reference_filter_that_nobody_declared_is_refused(name):
     assert seen.gain_nm_s_rad is None and seen.points == ()
 
 
+def test_one_too_small_to_show_is_within_the_intervals():
+    """0.03 s that is not declared: with no room for it, these two records put P out of its interval."""
+    drive = machine("the paper's", reference_filter=0.03)
+    for seed in (1, 4):
+        seen = found(record(drive, "reference", seed=seed, draw=seed + 1))
+        assert seen.verdict is Verdict.VALID
+        assert seen.gain_nm_s_rad.low <= drive.gain <= seen.gain_nm_s_rad.high
+
+
 @pytest.mark.heavy
 def test_one_that_is_declared_is_taken_off():
     drive = machine("the paper's", reference_filter=0.1)

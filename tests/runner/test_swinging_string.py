@@ -27,10 +27,11 @@ from tdhil.runner.stages.braking_probe import (
     slow_speed,
 )
 from tdhil.runner.stages.speed import SpeedResult
-from tdhil.runner.stages.steady import Swing, calm_string, swing_of, widest
+from tdhil.runner.stages.steady import Swing, calm_string, is_stick_slip, swing_of, widest
 from tdhil.runner.string_release import SwingDamper
 from tdhil.runner.task import Task
 from tests.runner.fake_drive import PERIOD_S, FakeDrive, FakeLog, World
+from tests.soft_torque.chain_in_time import recorded, reference_case
 
 LIMITS = MachineLimits(
     speed_min_rad_s=0.5, speed_max_rad_s=10.0, torque_nm=4000.0, time_s=1800.0, quick_stop_rad_s2=1.0,
@@ -156,6 +157,22 @@ def test_a_swing_that_noise_keeps_going_is_none_of_a_bit_that_sticks():
     assert calmed.swing.regular > 0.6
     assert 80.0 < calmed.swing.torque_nm < 1800.0
     assert any(kind == "string" and "does not decay" in text for kind, text in here.log.events)
+
+
+def test_a_restless_string_is_stick_slip_only_where_its_bit_stops():
+    """3,000 m under a stiff loop, from a simulator of its own: 120 rpm sticks, 179 and 205 rpm turn under 0.8 kN·m of
+    bit noise. Their torque swings by more than 0.6 ζω, which used to be called stick-slip."""
+    rpm = np.array([[120.0, 179.0, 205.0]])
+    time, torque, top, bit = recorded(**reference_case(noise_nm=800.0, rpm=rpm, periods=9.0))
+    late = time > time[-1] - 24.0
+    pipe = replace(LIMITS, wave_impedance_nm_s_rad=296.5, echo_s=1.888)
+    for k, speed in enumerate((rpm[0] * math.pi / 30.0).tolist()):
+        rows = zip(time[late], torque[late, k], top[late, k], strict=True)
+        swing = swing_of([seen(t_nm, speed=w, time_s=t) for t, t_nm, w in rows], 0.02)
+        sticks = bool((bit[late, k] == 0.0).any())
+        assert swing.regular >= 0.6 and swing.torque_nm > 0.6 * 296.5 * speed
+        assert is_stick_slip(swing, pipe, speed, 0.0) is sticks
+        assert sticks is (k == 0)
 
 
 def seen(torque_nm=200.0, demand_nm=None, speed=3.0, time_s=0.0):

@@ -9,6 +9,7 @@ from __future__ import annotations
 from math import exp, pi, sqrt
 
 import numpy as np
+from scipy.signal import lfilter
 
 
 def lowest_turning_of_chain(
@@ -43,9 +44,13 @@ def lowest_turning_of_chain(
 def ends_turning(
     *, length_m, polar_m4, shear_pa, density, drag, bottom_inertia, bottom_viscous, coulomb_nm, static_nm,
     stribeck_rad_s, noise_nm, noise_correlation_s, inertia, viscous, dry_nm, lags_s, laws, seed, rpm, period_s, lumps,
-    wall_nm=0.0, periods=12.0, calm=3.0,
+    wall_nm=0.0, periods=12.0, calm=3.0, kept=None, keep_every_s=0.02, own_noise=False,
 ):
-    """(laws, speeds): whether the bit, stuck at breakaway at first, does not stand still in the last periods."""
+    """(laws, speeds): whether the bit, stuck at breakaway at first, does not stand still in the last periods.
+
+    ``kept``: a list that takes (time, torque on the rotor, speed of the top, speed of the bit), (cases,) each.
+    ``own_noise``: every case has its own bit noise.
+    """
     cell = length_m / lumps
     spring = shear_pa * polar_m4 / cell
     mass = np.full(lumps + 1, density * polar_m4 * cell)
@@ -75,11 +80,12 @@ def ends_turning(
     smooth, keep_filter = target.copy(), np.exp(-step / filter_s)
     random = np.random.default_rng(seed)
     slow = exp(-step / noise_correlation_s)
-    noise = random.standard_normal() * noise_nm
+    noise = random.standard_normal(cases if own_noise else None) * noise_nm
     count = int(periods * period_s / step)
     last = np.zeros(cases)
     per_mass, per_loss = step / mass[:, None], loss[:, None]
-    draws = random.standard_normal(count) * noise_nm * sqrt(1.0 - slow * slow)
+    draws = random.standard_normal((count, cases) if own_noise else count) * noise_nm * sqrt(1.0 - slow * slow)
+    every = max(1, round(keep_every_s / step))
     for k in range(count):
         noise = slow * noise + draws[k]
         torque = spring * (angle[:-1] - angle[1:])
@@ -105,4 +111,37 @@ def ends_turning(
         speed[-1, holds | (speed[-1] * side < 0.0)] = 0.0
         angle += step * speed
         last[speed[-1] == 0.0] = k
+        if kept is not None and k % every == 0:
+            kept.append((step * (k + 1), demand.copy(), speed[0].copy(), speed[-1].copy()))
     return (last < count * (1.0 - calm / periods)).reshape(np.asarray(rpm).shape)
+
+
+def reference_case(**other):
+    """Keywords of the reference case: 3,000 m of 5 inch pipe, the bit and the top drive of tests/soft_torque/cases."""
+    polar = pi / 32.0 * (0.127**4 - 0.1086**4)
+    return {
+        "length_m": 3000.0, "polar_m4": polar, "shear_pa": 79.3e9, "density": 7850.0, "drag": 0.005,
+        "bottom_inertia": 374.0, "bottom_viscous": 20.0, "coulomb_nm": 2500.0, "static_nm": 5000.0,
+        "stribeck_rad_s": 2.5, "noise_nm": 200.0, "noise_correlation_s": 0.2, "inertia": 1500.0, "viscous": 8.0,
+        "dry_nm": 60.0, "lags_s": (0.020, 0.010, 0.003), "laws": [(20286.0, 26454.0, 0.0, 0.05)], "seed": 1,
+        "period_s": 7.7, "lumps": 20, **other,
+    }
+
+
+def recorded(**said):
+    """Time (N,), and torque on the rotor, speed of the top and speed of the bit, (N, cases) each."""
+    kept = []
+    ends_turning(**said, kept=kept)
+    time, torque, top, bit = zip(*kept, strict=True)
+    return np.array(time), np.array(torque), np.array(top), np.array(bit)
+
+
+def reported(time_s, torque, top, lags_s=(0.1, 0.05), seed=1, noise=(0.01, 40.0), quanta=(0.002, 20.0)):
+    """Time, speed and torque as a drive reports them: first-order lags (speed, torque), noise and resolution."""
+    random = np.random.default_rng([seed, 99])
+    found = []
+    for signal, lag, sd, quantum in zip((top, torque), lags_s, noise, quanta, strict=True):
+        keep = exp(-(time_s[1] - time_s[0]) / lag)
+        late = lfilter([1.0 - keep], [1.0, -keep], signal, zi=[keep * signal[0]])[0]
+        found.append(np.round((late + sd * random.standard_normal(len(late))) / quantum) * quantum)
+    return time_s, found[0], found[1]

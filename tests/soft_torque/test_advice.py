@@ -10,19 +10,25 @@ import pytest
 
 from tdhil.soft_torque import (
     EXACT_STRING,
+    Advice,
     DrawnValues,
     Interval,
     RequiredMargins,
+    Search,
     TopDrive,
     TuneCase,
+    Tuned,
+    Tuning,
     TuningRefused,
     draw_truths,
     loop_margins,
     lowest_turning_with_noise,
+    operator_map,
     tune,
     tuned_controller,
 )
-from tests.soft_torque.cases import DRIVE, SOFT_035, SOFT_1, STRING, string_with
+from tests.soft_torque.cases import DRIVE, SOFT_035, SOFT_1, STIFF, STRING, string_with
+from tests.soft_torque.chain_in_time import ends_turning, reference_case
 
 J = Interval(1500.0, 1440.0, 1560.0)
 
@@ -119,3 +125,23 @@ def test_an_interval_of_draws_says_where_its_end_is_not_known():
     assert DrawnValues((inf, inf)).median is None
     low, high = DrawnValues((8.0, 8.0, 8.1), 10.0).interval()      # no lower set speed was tried
     assert (low, high) == (0.0, 10.0)
+
+
+def test_the_operators_map_agrees_with_a_chain_in_time():
+    """Softer gains leave more green; cells that are clearly stable or clearly stick do so in another simulator."""
+    laws = {"stiff": STIFF, "soft": SOFT_035}
+    tuned = tuple(Tuned(kind, law) for kind, law in laws.items())
+    case = TuneCase(STRING, DRIVE, Interval(1500.0, 1440.0, 1560.0))
+    found = operator_map(Tuning(case, (0.1299,), tuned, Search(), Advice("soft", "stiff", keep=False), ()))
+    row = found.bit_torques_nm.index(2500.0)
+    stable = {kind: [state == "stable" for state in rows[row]] for kind, rows in found.states.items()}
+    assert sum(stable["soft"]) > sum(stable["stiff"]) + 4
+    assert found.states["stiff"][row][0] == "stick-slip" and "at risk" in found.states["stiff"][row]
+    turns = ends_turning(**reference_case(
+        laws=[(law.gain_nm_s_rad, law.integral_nm_rad, 0.0, 0.05) for law in laws.values()],
+        rpm=np.array([[60.0, 120.0, 200.0]] * 2), periods=12.0, lumps=14))
+    for kind, row_turns in zip(laws, turns, strict=True):
+        for speed, one in zip((60.0, 120.0, 200.0), row_turns, strict=True):
+            assert stable[kind][found.speeds_rpm.index(speed)] == one
+    lower = [sum(state == "stable" for state in rows) for rows in found.states["stiff"]]
+    assert lower == sorted(lower, reverse=True)

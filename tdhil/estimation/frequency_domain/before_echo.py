@@ -41,7 +41,7 @@ from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.rigid import fitted_points, known_structure, lag_priors, lags_of, of_reports
 from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
 from tdhil.estimation.result import BudgetLine, Compliant, Refused, ResidualTest, rejects
-from tdhil.estimation.samples import STICK_SLIP_REGULAR, STICK_SLIP_SHARE, repeats
+from tdhil.estimation.samples import STICK_SLIP_REGULAR, STICK_SLIP_SHARE, downhole_swing_rad_s, repeats
 from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine, pooled_lines
 from tdhil.recording import FloatArray, LagPrior, Pipe, Recording, TorqueAnswer
 
@@ -382,9 +382,9 @@ def refuse_stick_slip(case: PeriodicCase) -> None:
         period_s, regular = repeats(rest, _GRID_S)
         if regular < STICK_SLIP_REGULAR or period_s <= 0.0:
             continue
-        if inertia_kg_m2 * 2.0 * np.pi / period_s * swing_rad_s >= (
-            STICK_SLIP_SHARE * pipe.impedance_nm_s_rad * mean_rad_s
-        ):
+        torque_nm = inertia_kg_m2 * 2.0 * np.pi / period_s * swing_rad_s
+        downhole = downhole_swing_rad_s(torque_nm, pipe.impedance_nm_s_rad, pipe.delay_s, period_s)
+        if downhole >= STICK_SLIP_SHARE * mean_rad_s:
             raise Refused(
                 f"stick-slip: besides the excitation the speed swings by ±{swing_rad_s:.2f} rad/s every {period_s:.1f}"
                 f" s about {mean_rad_s:.3g} rad/s, as above a bit that sticks and slips",

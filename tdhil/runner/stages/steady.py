@@ -10,7 +10,7 @@ import numpy as np
 
 from drivers import Command, LimitHit, Mode, Sample
 from profiles import MessageCode
-from tdhil.estimation import STICK_SLIP_REGULAR, STICK_SLIP_SHARE, repeats
+from tdhil.estimation import STICK_SLIP_REGULAR, STICK_SLIP_SHARE, downhole_swing_rad_s, repeats
 from tdhil.recording import FloatArray, Level
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.settings import MachineLimits
@@ -105,7 +105,7 @@ NO_CALMER = 0.75
 """Ratio to the oscillation of the time before; above it the oscillation counts as not decaying."""
 
 STICK_SLIP_TORQUE_SHARE = 0.5
-"""Share of the mean torque that stick-slip reaches. With a known ζ `STICK_SLIP_SHARE` is used instead."""
+"""Share of the mean torque that stick-slip reaches. With a known pipe `STICK_SLIP_SHARE` is used instead."""
 
 MOST_CALMING_S = 120.0    # s; longest wait for a string to become calm
 
@@ -198,7 +198,7 @@ def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, t
         if now.torque_nm >= NO_CALMER * before.torque_nm:
             left = swing_of(samples[-2 * window :], loop.period_s)
             mean_nm = float(trace(samples[-2 * window :]).torque_nm.mean())
-            if _feeds_itself(left, limits.wave_impedance_nm_s_rad, target_rad_s, mean_nm):
+            if is_stick_slip(left, limits, target_rad_s, mean_nm):
                 raise stick_slip(left, target_rad_s, f"at {loop.now_s:.1f} s")
             # The top yields to incoming waves, so its mean may deviate by as much.
             allowed_rad_s = max(2.0 * tolerance_rad_s, 0.5 * left.speed_rad_s)
@@ -224,12 +224,15 @@ def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, t
     )
 
 
-def _feeds_itself(swing: Swing, wave_impedance_nm_s_rad: float, speed_rad_s: float, mean_nm: float) -> bool:
-    """Return whether a periodic oscillation is as large as stick-slip."""
-    by_speed_nm = STICK_SLIP_SHARE * wave_impedance_nm_s_rad * speed_rad_s
-    return swing.regular >= STICK_SLIP_REGULAR and swing.torque_nm >= (
-        by_speed_nm or STICK_SLIP_TORQUE_SHARE * abs(mean_nm)
-    )
+def is_stick_slip(swing: Swing, limits: MachineLimits, speed_rad_s: float, mean_nm: float) -> bool:
+    """Return whether a periodic oscillation is as large as stick-slip: downhole if the pipe is known."""
+    if swing.regular < STICK_SLIP_REGULAR:
+        return False
+    zeta = limits.wave_impedance_nm_s_rad
+    if zeta > 0.0:
+        downhole = downhole_swing_rad_s(swing.torque_nm, zeta, 0.5 * limits.echo_s, swing.period_s)
+        return downhole >= STICK_SLIP_SHARE * speed_rad_s
+    return swing.torque_nm >= STICK_SLIP_TORQUE_SHARE * abs(mean_nm)
 
 
 def stick_slip(swing: Swing, speed_rad_s: float, where: str) -> LimitHit:

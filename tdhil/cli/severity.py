@@ -1,0 +1,151 @@
+"""`tdhil severity`: stick-slip and torsional oscillation in a record of ordinary drilling; nothing moves."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tdhil.cli.arguments import add_option
+from tdhil.cli.evaluate import CONTROLLERS
+from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
+from tdhil.cli.results import print_json
+from tdhil.config import OPTION
+from tdhil.errors import ExitCode, MessageCode, UsageError
+
+if TYPE_CHECKING:
+    from tdhil.recording import Recording
+    from tdhil.soft_torque import DrillString, Interval, Severity, SpeedController, SurfaceRecord, TopDrive
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of severity."""
+    parser.add_argument("log", type=Path, metavar="run.mcap|trace.csv",
+                        help="torque and speed of the top drive during rotation: a log, or a trace in CSV")
+    parser.add_argument("--result", type=Path, required=True, metavar="result.json|run.mcap",
+                        help="result of tdhil identify for this top drive: J, and the lags of its reports")
+    parser.add_argument("--string", type=Path, metavar="string.yaml",
+                        help="drill string (reference/string.md); without it, k and J_L of the result are used")
+    parser.add_argument("--against", type=Path, metavar="LATER",
+                        help="a second record, for example after tuning: both are shown side by side")
+    parser.add_argument("--controller", type=Path, metavar="tune.json",
+                        help="what tdhil tune --json wrote: checks that the last record has the reflection of these "
+                             "gains")
+    parser.add_argument("--use", choices=CONTROLLERS, default="soft", help="controller in that file (default soft)")
+    add_option(parser, OPTION["json"])
+    parser.add_argument("--report", type=Path, metavar="FILE",
+                        help="the result with pictures in one file: severity.html, or severity.pdf on A4")
+    add_trace_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Read, assess, print."""
+    from tdhil.cli.tune import read_result, string_for
+    from tdhil.report import (
+        PlainConsole,
+        check_report_path,
+        print_severity,
+        severity_document,
+        stderr_console,
+        write_severity_report,
+    )
+
+    check_trace(namespace)
+    if namespace.report is not None:
+        check_report_path(namespace.report, namespace.log)
+    result = read_result(namespace.result)
+    ratio, inertia = _inertia(result, namespace)
+    string, _, _ = string_for(result, namespace, ratio)
+    expected = None if namespace.controller is None else _expected(namespace)
+    console = stderr_console()
+    paths = [namespace.log] if namespace.against is None else [namespace.log, namespace.against]
+    found: list[tuple[Severity, str]] = []
+    warnings: list[str] = []
+    simulated = False
+    for path in paths:
+        severity, simulated = _assess(path, namespace, result, string, inertia,
+                                      expected if path == paths[-1] else None, warnings)
+        found.append((severity, str(path)))
+    document = severity_document(found, string, inertia, simulated=simulated, warnings=tuple(dict.fromkeys(warnings)))
+    if namespace.json:
+        print_json(document)
+    else:
+        print_severity(document, PlainConsole())
+    if namespace.report is not None:
+        written = write_severity_report(document, [one for one, _ in found], namespace.report)
+        console.print(f"report: {written}", markup=False, soft_wrap=True)
+    return int(ExitCode.OK)
+
+
+def _assess(
+    path: Path, namespace: argparse.Namespace, result: Mapping[str, Any], string: DrillString, inertia: Interval,
+    expected: tuple[TopDrive, SpeedController] | None, warnings: list[str],
+) -> tuple[Severity, bool]:
+    """Return what one record says, and whether it is simulated; add warnings."""
+    from tdhil.session import require_file
+    from tdhil.soft_torque import severity
+
+    require_file(path)
+    recorded = read_recorded(namespace, path)
+    warnings += [f"{path.name}: {one}" for one in (*(recorded.assumed or ()), *recorded.problems)]
+    record, told = _surface(recorded.recording, result, namespace)
+    warnings += told
+    return severity(record, string, inertia, expected), recorded.recording.simulated
+
+
+def _inertia(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[float, Interval]:
+    """Return the gear ratio, and J at the main shaft with its interval. Raises TuningRefused without J."""
+    from tdhil.soft_torque import Interval, TuningRefused
+
+    inertia, ratio = result["inertia_kg_m2"], result["gear_ratio"]
+    if result["verdict"] not in ("valid", "valid_wide") or not isinstance(inertia, dict):
+        raise TuningRefused(f"the result has no J ({result['verdict']}), and the string's torque is T − J α",
+                            where=str(namespace.result), next_step="Identify again with a motion that identifies J",
+                            entry=MessageCode.NO_INERTIA_TO_TUNE)
+    square = float(ratio) ** 2
+    return float(ratio), Interval(*(square * float(inertia[key]) for key in ("value", "low_total", "high_total")))
+
+
+def _surface(
+    recording: Recording, result: Mapping[str, Any], namespace: argparse.Namespace
+) -> tuple[SurfaceRecord, list[str]]:
+    """Return the record at the main shaft, with the lags of its reports, and warnings."""
+    import numpy as np
+
+    from tdhil.soft_torque import SurfaceRecord
+
+    good = recording.fresh & np.isfinite(recording.speed_rad_s) & np.isfinite(recording.torque_nm)
+    time_s = recording.time_s[good]
+    kept = np.concatenate([[True], np.diff(time_s) > 0.0]) if len(time_s) else np.zeros(0, dtype=bool)
+    ratio = recording.gear_ratio if namespace.gear is not None or recording.gear_ratio != 1.0 else result["gear_ratio"]
+    lags, told = [], []
+    for name, own in (("speed_lag_s", recording.lag_prior.speed_lag_s),
+                      ("torque_lag_s", recording.lag_prior.torque_lag_s)):
+        stated = result.get(name)
+        value = stated.get("value") if isinstance(stated, dict) else None
+        if getattr(namespace, name.removesuffix("_s")) is not None or value is None:
+            value = own
+        if value is None:
+            told.append(f"The lag of the reported {name.split('_')[0]} is not known and counts as 0: state it with "
+                        f"--{name.removesuffix('_s').replace('_', '-')}.")
+        lags.append(max(0.0, float(value or 0.0)))
+    return SurfaceRecord(time_s[kept], recording.speed_rad_s[good][kept] / ratio,
+                         recording.torque_nm[good][kept] * ratio, *lags), told
+
+
+def _expected(namespace: argparse.Namespace) -> tuple[TopDrive, SpeedController]:
+    """Return top drive and controller of the tuning. Raises UsageError if the file has no such controller."""
+    from tdhil.session import load_tuning
+    from tdhil.soft_torque import SpeedController, TopDrive
+
+    tuning = load_tuning(namespace.controller)
+    chosen = next((one for one in tuning["controllers"] if one["kind"] == namespace.use), None)
+    if chosen is None or chosen["refused"]:
+        held = ", ".join(one["kind"] for one in tuning["controllers"] if not one["refused"])
+        raise UsageError(f"it contains no {namespace.use} controller", where=str(namespace.controller),
+                         next_step=f"--use one of: {held}", entry=MessageCode.NOT_A_TUNING)
+    main = tuning["main_shaft"]
+    return (TopDrive(main["inertia_kg_m2"]["value"], main["viscous_nm_s_rad"], main["coulomb_nm"],
+                     tuple(main["inner_lags_s"])), SpeedController(**chosen["at_main_shaft"]))

@@ -1,0 +1,72 @@
+"""The operator's map of a tuning: set speed × bit torque, for the document and the page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from tdhil.report.blocks import Column, Picture, ReportSection, Table, Text
+from tdhil.soft_torque import OperatorMap
+
+if TYPE_CHECKING:
+    from matplotlib.figure import FigureBase
+
+Part = Mapping[str, Any]
+
+HOW_TO_READ = (
+    "Find the bit torque on the left and the set speed below. Green: the bit turns, and comes free if it was stuck. "
+    "Yellow: the bit goes on turning, but does not come free once it is stuck: start at a speed in green, then slow "
+    "down. Red: the bit sticks and slips.")
+_COLOURS = {"stable": "#7fbf7f", "at risk": "#f2d16b", "stick-slip": "#d9695f"}
+
+
+def map_document(found: OperatorMap) -> dict[str, Any]:
+    """Return the map as plain data; a row a bit torque, a cell a set speed."""
+    return {"speeds_rpm": list(found.speeds_rpm), "bit_torques_nm": list(found.bit_torques_nm),
+            "states": {kind: [list(row) for row in rows] for kind, rows in found.states.items()},
+            "how_to_read": HOW_TO_READ}
+
+
+def map_section(document: Part, bit: str) -> ReportSection:
+    """Return picture and table of the map."""
+    kinds = list(document["states"])
+    width = 0.8 / len(kinds)
+    rows = tuple(
+        (f"{torque / 1e3:.2g} kN·m", *(_row_words(document["states"][kind][k], document["speeds_rpm"])
+                                      for kind in kinds))
+        for k, torque in enumerate(document["bit_torques_nm"]))
+    return ReportSection("The operator's map", (
+        Picture(partial(draw_map, document=document), 2.9, HOW_TO_READ),
+        Table((Column("bit torque", 0.2), *(Column(kind, width) for kind in kinds)), rows),
+        Text(f"Simulated every {document['speeds_rpm'][1] - document['speeds_rpm'][0]:.0f} rpm under bit noise, string "
+             f"and J as stated. The bit is that of string.yaml ({bit}), with its torque scaled. The bit torque is that "
+             "of a bit that turns fast."),
+    ))
+
+
+def _row_words(states: Sequence[str], speeds_rpm: Sequence[float]) -> str:
+    """Say from which speed on the row is stable, and up to which speed the bit sticks."""
+    stable = next((speed for k, speed in enumerate(speeds_rpm) if all(one == "stable" for one in states[k:])), None)
+    words = f"not stable up to {speeds_rpm[-1]:.0f} rpm" if stable is None else f"stable from {stable:.0f} rpm"
+    sticking = [speed for speed, one in zip(speeds_rpm, states, strict=True) if one == "stick-slip"]
+    return words + (f", stick-slip up to {sticking[-1]:.0f}" if sticking else "")
+
+
+def draw_map(figure: FigureBase, document: Part) -> None:
+    """Draw a field of cells for each controller."""
+    kinds, speeds = list(document["states"]), document["speeds_rpm"]
+    torques = [torque / 1e3 for torque in document["bit_torques_nm"]]
+    step, rise = speeds[1] - speeds[0], torques[1] - torques[0]
+    every = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
+    for axes, kind in zip(every, kinds, strict=True):
+        for torque, row in zip(torques, document["states"][kind], strict=True):
+            for speed, state in zip(speeds, row, strict=True):
+                axes.bar(speed, rise, step, torque - 0.5 * rise, color=_COLOURS[state], edgecolor="white", lw=0.4)
+        axes.set(title=kind, xlabel="set speed, rpm", xlim=(speeds[0] - 0.5 * step, speeds[-1] + 0.5 * step),
+                 ylim=(torques[0] - 0.5 * rise, torques[-1] + 0.5 * rise))
+        axes.title.set_fontsize("medium")
+    every[0].set_ylabel("bit torque, kN·m")
+
+
+__all__ = ["HOW_TO_READ", "draw_map", "map_document", "map_section"]

@@ -1,0 +1,238 @@
+"""Severity of torsional oscillation: as a document for machines, on a terminal, and as a page with pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich import box
+from rich.table import Table as Grid
+from rich.text import Text as Words
+
+from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table
+from tdhil.report.card import minutes
+from tdhil.report.console import PlainConsole, names_and_texts
+from tdhil.report.document import SIMULATED
+from tdhil.report.html import write_blocks
+from tdhil.report.plots import DARK, OURS, QUIET, envelope
+from tdhil.soft_torque import AT_RISK_INDEX, RPM, STICK_SLIP_INDEX, DrillString, Interval, Severity
+from tdhil.version import __version__
+
+if TYPE_CHECKING:
+    from matplotlib.figure import FigureBase
+
+Part = Mapping[str, Any]
+
+_STYLES = {"stick-slip": "bold red", "at risk": "bold yellow", "smooth": "bold green"}
+_COLOURS = {"stick-slip": "red", "at risk": "yellow", "smooth": "green"}
+MOST_EPISODES = 200
+"""Episodes that the document names."""
+SHOWN_EPISODES = 3
+SHOWN_PERIODS = 12.0
+"""Length of the detail picture, in periods."""
+_EXPLAINED = {
+    "severity index": "half of peak to peak of the downhole speed over the mean speed, in windows of one period of the "
+                      f"string's lowest mode; {STICK_SLIP_INDEX:g} and more with a bit that nearly stops is "
+                      f"stick-slip, {AT_RISK_INDEX:g} and more is at risk",
+    "downhole speed": "from torque and speed at the top by the two travelling waves; ± is half of peak to peak",
+    "string torque": "T − J α at the top of the string",
+    "|r|": "share of a wave from below that the top drive sends back: 1 is a wall, 0 takes it all",
+    "in brackets": "95 % interval over J, length, shear modulus and wear of the string",
+}
+
+
+def severity_document(
+    found: Sequence[tuple[Severity, str]], string: DrillString, inertia: Interval, *, simulated: bool,
+    warnings: tuple[str, ...],
+) -> dict[str, Any]:
+    """Return plain data for `json.dumps`; one record, or two of which the second is later. At the main shaft."""
+    records = [_record(one, name) for one, name in found]
+    return {
+        "kind": "severity", "records": records, "sentence": _sentence(records), "simulated": simulated,
+        "string": {"name": string.name, "impedance_nm_s_rad": string.impedance_nm_s_rad, "echo_s": string.echo_s},
+        "inertia_kg_m2": asdict(inertia), "warnings": list(warnings), "tdhil": __version__,
+    }
+
+
+def _record(one: Severity, name: str) -> dict[str, Any]:
+    check = one.reflection
+    return {
+        "file": name, "level": one.level, "turning_s": one.turning_s, "mean_rpm": one.mean_rad_s / RPM,
+        "severity_index": asdict(one.index), "severity_index_worst_5_percent": one.index_worst,
+        "stick_slip_share": one.stick_slip_share, "at_risk_share": one.at_risk_share,
+        "period_s": None if one.period_s is None else asdict(one.period_s), "cycles": one.cycles,
+        "window_s": one.window_s,
+        "downhole_swing_rpm": {key: value / RPM for key, value in asdict(one.downhole_rad_s).items()},
+        "string_torque_swing_nm": asdict(one.torque_nm),
+        "episodes": [asdict(part) for part in one.episodes[:MOST_EPISODES]], "episode_count": len(one.episodes),
+        "reflection": None if check is None else {
+            "from_hz": check.from_hz, "to_hz": check.to_hz, "measured": asdict(check.measured),
+            "coherence": check.coherence, "expected": check.expected, "verdict": check.verdict,
+        },
+        "reflection_refused": one.reflection_refused or None,
+    }
+
+
+def _sentence(records: Sequence[Part]) -> str:
+    """Return the finding in a sentence; of two records, what changed."""
+    first, last = records[0], records[-1]
+    if len(records) == 1:
+        if first["level"] == "stick-slip":
+            return (f"Stick-slip in {100.0 * first['stick_slip_share']:.0f} % of {minutes(first['turning_s'])} of "
+                    f"rotation at {first['mean_rpm']:.0f} rpm.")
+        if first["level"] == "at risk":
+            return (f"No stick-slip in {minutes(first['turning_s'])} of rotation at {first['mean_rpm']:.0f} rpm, but "
+                    f"the downhole speed swings by ±{first['downhole_swing_rpm']['value']:.0f} rpm.")
+        return f"No stick-slip in {minutes(first['turning_s'])} of rotation at {first['mean_rpm']:.0f} rpm."
+    return (f"Severity index {first['severity_index']['value']:.2f} → {last['severity_index']['value']:.2f}, downhole "
+            f"swing ±{first['downhole_swing_rpm']['value']:.0f} → ±{last['downhole_swing_rpm']['value']:.0f} rpm, "
+            f"stick-slip {100.0 * first['stick_slip_share']:.0f} → {100.0 * last['stick_slip_share']:.0f} % of the "
+            "time.")
+
+
+def print_severity(document: Part, console: PlainConsole) -> None:
+    """Print sentence, figures and what they mean. 80 columns do."""
+    records = document["records"]
+    console.print(Words(document["sentence"], style=_STYLES[records[-1]["level"]]))
+    console.print()
+    simulated = f" · {SIMULATED}" if document["simulated"] else ""
+    console.print(Words(f"torsional severity, {document['string']['name'] or 'drill string'}{simulated}", style="bold"))
+    if len(records) == 1:
+        console.print(names_and_texts([(name, cells[0]) for name, cells in _rows(records)]))
+    else:
+        grid = Grid(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+        for name in ("", "before", "after"):
+            grid.add_column(name, overflow="fold")
+        for name, cells in _rows(records):
+            grid.add_row(name, *cells)
+        console.print(grid)
+    console.print()
+    console.print(names_and_texts(_EXPLAINED.items(), quiet=True))
+    for warning in document["warnings"]:
+        console.print(Words(warning, style="yellow"))
+
+
+def _with(part: Part, digits: int, unit: str = "", sign: str = "") -> str:
+    return (f"{sign}{part['value']:.{digits}f}{unit} ({sign}{part['low']:.{digits}f} to "
+            f"{sign}{part['high']:.{digits}f})")
+
+
+def _rows(records: Sequence[Part]) -> Iterator[tuple[str, list[str]]]:
+    """Yield the name and a cell for each record."""
+    yield "level", [one["level"] for one in records]
+    yield "record", [f"{Path(one['file']).name}, {minutes(one['turning_s'])} of rotation" for one in records]
+    yield "severity index", [f"{_with(one['severity_index'], 2)}; 5 % of the time above "
+                             f"{one['severity_index_worst_5_percent']:.2f}" for one in records]
+    yield "stick-slip", [_episodes(one) for one in records]
+    yield "oscillation", [_period(one) for one in records]
+    yield "downhole speed", [f"{one['mean_rpm']:.0f} {_with(one['downhole_swing_rpm'], 0, ' rpm', '±')}"
+                             for one in records]
+    yield "string torque", [_with(one["string_torque_swing_nm"], 0, " N·m", "±") for one in records]
+    yield "|r| of the top drive", [_reflection(one) for one in records]
+
+
+def _episodes(one: Part) -> str:
+    if not one["episodes"]:
+        return f"none; at risk for {100.0 * one['at_risk_share']:.0f} % of the time"
+    shown = ", ".join(f"{part['start_s']:.0f} to {part['end_s']:.0f} s" for part in one["episodes"][:SHOWN_EPISODES])
+    more = one["episode_count"] - SHOWN_EPISODES
+    return f"{100.0 * one['stick_slip_share']:.0f} % of the time: {shown}" + (f" and {more} more" if more > 0 else "")
+
+
+def _period(one: Part) -> str:
+    part = one["period_s"]
+    if part is None:
+        return "nothing that repeats"
+    return f"every {_with(part, 2, ' s')}, {1.0 / part['value']:.3f} Hz, {one['cycles']} cycles"
+
+
+def _reflection(one: Part) -> str:
+    check = one["reflection"]
+    if check is None:
+        return f"not known: {one['reflection_refused']}"
+    words = f"{_with(check['measured'], 2)} at {check['from_hz']:.2f} to {check['to_hz']:.2f} Hz"
+    if check["expected"] is None:
+        return words
+    return f"{words}; these gains give {check['expected']:.2f}: {check['verdict']}"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# As a page.
+
+
+def write_severity_report(document: Part, found: Sequence[Severity], path: Path) -> Path:
+    """Write the page, HTML or PDF by its name; return where it went. Raises UsageError where it can't be written."""
+    return write_blocks(severity_report(document, found), path)
+
+
+def severity_report(document: Part, found: Sequence[Severity]) -> Report:
+    """Return the blocks of the page."""
+    records = document["records"]
+    last = records[-1]
+    names = ("before", "after") if len(records) > 1 else ("record",)
+    width = 0.8 / len(records)
+    pictures = []
+    for name, one in zip(names, found, strict=True):
+        lead = f"{name}: " if len(records) > 1 else ""
+        pictures += [
+            Picture(partial(draw_detail, one=one), 2.6, f"{lead}speed at the bit (estimated) and at the top, around "
+                    "the highest severity of the record."),
+            Picture(partial(draw_index, one=one), 2.0, f"{lead}severity index over the whole record. Above the red "
+                    "line the bit sticks and slips, above the yellow one it is at risk."),
+        ]
+    rows = tuple((name, *cells) for name, cells in _rows(records))
+    check = last["reflection"]
+    expected = "" if check is None or check["expected"] is None else f"Reflection of the top drive: {check['verdict']}."
+    return Report(
+        title="Torsional severity", subtitle=document["string"]["name"] or "drill string",
+        simulated=f"{SIMULATED}: the record is that of a simulated rig" if document["simulated"] else "",
+        answer=AnswerBox(_COLOURS[last["level"]], last["level"], (expected,) if expected else (),
+                         f"severity index {last['severity_index']['value']:.2f}", document["sentence"], ""),
+        warnings=tuple(document["warnings"]),
+        sections=(
+            ReportSection("Figures", (Table((Column("", 0.2), *(Column(name, width) for name in names)), rows),)),
+            ReportSection("Over time", tuple(pictures)),
+            ReportSection("What the figures mean", (Pairs(tuple(_EXPLAINED.items())),)),
+            ReportSection("What it rests on", (Pairs((
+                ("J, main shaft", f"{document['inertia_kg_m2']['value']:.4g} kg·m² "
+                 f"({document['inertia_kg_m2']['low']:.4g} to {document['inertia_kg_m2']['high']:.4g})"),
+                ("string", f"ζ {document['string']['impedance_nm_s_rad']:.4g} N·m·s/rad, echo after "
+                 f"{document['string']['echo_s']:.3f} s"),
+                *(("record" if len(records) == 1 else name, one["file"])
+                  for name, one in zip(names, records, strict=True)))),)),
+        ),
+        footer=f"tdhil {document['tdhil']}",
+    )
+
+
+def draw_detail(figure: FigureBase, one: Severity) -> None:
+    """Draw bit and top around the highest severity."""
+    axes = figure.subplots()
+    course = one.course
+    known = np.isfinite(course.index)
+    worst = float(course.time_s[int(np.argmax(np.where(known, course.index, -1.0)))])
+    half = 0.5 * SHOWN_PERIODS * one.window_s
+    shown = np.abs(course.time_s - worst) <= half
+    axes.plot(course.time_s[shown], course.bit_rad_s[shown] / RPM, color=OURS, lw=1.2, label="bit, estimated")
+    axes.plot(course.time_s[shown], course.top_rad_s[shown] / RPM, color=DARK, lw=1.0, label="top drive")
+    axes.axhline(0.0, color=QUIET, lw=0.6)
+    axes.set(xlabel="time, s", ylabel="rpm")
+    axes.margins(x=0.0)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small", loc="upper right")
+
+
+def draw_index(figure: FigureBase, one: Severity) -> None:
+    """Draw the severity index over the record."""
+    axes = figure.subplots()
+    time_s, _, high = envelope(one.course.time_s, one.course.index)
+    axes.plot(time_s, high, color=OURS, lw=1.0)
+    axes.axhline(STICK_SLIP_INDEX, color="#b42318", lw=0.8)
+    axes.axhline(AT_RISK_INDEX, color="#8a6100", lw=0.8)
+    axes.set(xlabel="time, s", ylabel="severity index", ylim=(0.0, None))
+    axes.margins(x=0.0)
+    axes.grid(alpha=0.3)

@@ -1,0 +1,81 @@
+"""`tdhil severity` from CSV: one record, two records, the card's width, the page, and mistakes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tdhil.cli.main import main
+from tests.cli.test_tune import result
+
+STRING_YAML = Path(__file__).parents[2] / "examples" / "string.yaml"
+MOTOR = ("--gear", "10")
+
+
+@pytest.fixture
+def bench(tmp_path):
+    """Two records of a motor with a gear of 10: the string swings by 5.6 kN·m every 8.16 s, and by a tenth of it."""
+    (tmp_path / "result.json").write_text(json.dumps(result(torque_lag_s=None)), encoding="utf-8")
+    time_s = 0.05 * np.arange(6000)
+    swing = np.sin(2.0 * np.pi * time_s / 8.16)
+    for name, torque_nm in (("before", 5600.0), ("after", 560.0)):
+        np.savetxt(tmp_path / f"{name}.csv",
+                   np.column_stack([time_s, 10.0 * (10.5 - 1e-5 * torque_nm * swing),
+                                    0.1 * (3000.0 + torque_nm * swing)]),
+                   delimiter=",", header="time_s,speed_rad_s,torque_nm", comments="", fmt="%.5f")
+    return tmp_path
+
+
+def ran(bench, capsys, *words):
+    code = main(["severity", str(bench / "before.csv"), "--result", str(bench / "result.json"),
+                 "--string", str(STRING_YAML), *MOTOR, *words])
+    return (code, *capsys.readouterr())
+
+
+def test_one_record(bench, capsys):
+    code, out, _ = ran(bench, capsys, "--json")
+    assert code == 0
+    (found,) = json.loads(out)["records"]
+    assert found["level"] == "stick-slip"
+    assert found["period_s"]["value"] == pytest.approx(8.16, rel=0.005)
+    # ω_b = τ/ζ sin ΩT, by hand
+    assert found["downhole_swing_rpm"]["value"] == pytest.approx(
+        5600.0 / 296.5 * np.sin(2.0 * np.pi / 8.16 * 0.944) * 30.0 / np.pi, rel=0.05)
+
+
+def test_two_records_side_by_side_in_80_columns_and_as_a_page(bench, capsys):
+    code, out, err = ran(bench, capsys, "--against", str(bench / "after.csv"), "--report", str(bench / "page.html"))
+    assert code == 0
+    assert max(len(line) for line in out.splitlines()) <= 80
+    words = " ".join(out.split())
+    assert "stick-slip 100 → 0 % of the time" in words and "before after" in words
+    assert "--torque-lag" in words
+    assert "report: " in err
+    page = (bench / "page.html").read_text(encoding="utf-8")
+    assert page.count("<svg") == 4 and "Severity index" in page
+
+
+@pytest.mark.parametrize(("change", "code", "message"), [
+    ({"verdict": "not_identifiable", "inertia_kg_m2": None}, 11, "the result has no J"),
+    ({}, 2, "a controller"),
+])
+def test_mistakes(bench, capsys, change, code, message):
+    (bench / "result.json").write_text(json.dumps(result(**change)), encoding="utf-8")
+    other = bench / "tune.json"
+    other.write_text(json.dumps({"main_shaft": {}, "string": {}, "controllers": [], "identified": {}}))
+    words = () if change else ("--controller", str(other))
+    seen, _, err = ran(bench, capsys, *words)
+    assert seen == code
+    assert message in err or "no soft controller" in err
+    assert "Traceback" not in err
+
+
+def test_a_record_at_standstill_is_refused(bench, capsys):
+    still = np.column_stack([0.05 * np.arange(3000), np.zeros(3000), np.full(3000, 5.0)])
+    np.savetxt(bench / "before.csv", still, delimiter=",", header="time_s,speed_rad_s,torque_nm", comments="")
+    code, _, err = ran(bench, capsys)
+    assert code == 9
+    assert "does not turn steadily" in err and "TDH-925" in err
