@@ -39,7 +39,7 @@ def drilled(length_m: float, rpm: list[float], law: str, seed: int, periods: flo
 
 
 def record_of(time_s, torque, top, seed: int) -> SurfaceRecord:
-    """As the drive reports it."""
+    """Return the record that the drive reports."""
     told = reported(time_s, torque, top, LAGS_S, seed)
     return SurfaceRecord(*told, *LAGS_S)
 

@@ -49,7 +49,7 @@ PIPES_M = ((0.1016, 0.0848), (0.127, 0.1086), (0.1397, 0.1214), (0.1492, 0.1297)
 RESOLUTION = 1.06
 """Both searches step by 3 %."""
 HIGHEST_RPM = 300.0
-"""In the ratio of two speeds, for one that was not found up to 240 rpm."""
+"""Speed that stands in a ratio for one that was not found up to 240 rpm."""
 
 
 def rig(seed: int) -> TuneCase:

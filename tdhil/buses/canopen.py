@@ -448,7 +448,7 @@ _OPTIONS: Final = {
     "interface": ("NAME", "kind of adapter, such as socketcan, pcan or vector"),
     "bitrate": ("BIT_S", "bit rate, such as 500000 or 500k; on socketcan the link has it"),
 }
-"""What ``--help`` says of the options of python-can that most runs need: metavar and help."""
+"""Metavar and help of those options of python-can that most runs need."""
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:

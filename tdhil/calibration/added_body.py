@@ -25,13 +25,13 @@ from tdhil.estimation.frequency_domain import student_quantile
 from tdhil.recording import FloatArray
 
 CERTAIN = 1e6
-"""Degrees of freedom that stand for infinitely many: of what is taken for known as well as it is stated."""
+"""Degrees of freedom that stand for infinitely many: those of an input whose stated uncertainty counts as exact."""
 CONTRADICTED_P = 0.001
 """Below, a test contradicts that filters are shared, or that the line is straight."""
 LARGEST_ERROR, LARGEST_IN_SD = 0.15, 5.0
 """A torque scale is off by no more than this share, or so many of its stated standard deviations."""
 _LIKE_GEAR = 0.25
-"""Of i²: so near, a factor points to the wrong shaft."""
+"""Distance from i², as a share of it, within which a factor points to the wrong shaft."""
 
 
 @dataclass(frozen=True)

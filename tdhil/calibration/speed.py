@@ -117,7 +117,7 @@ def calibrate_by_position(
 
 
 _ALIKE = 0.02
-"""As `tdhil.estimation` asks of two stages: both ratios are rounded."""
+"""Largest difference of two ratios, as for two stages in `tdhil.estimation`: both are rounded."""
 
 
 def _concluded(

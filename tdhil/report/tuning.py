@@ -54,8 +54,8 @@ _WHAT = {
     "broadband": "near ζ over more than one mode, as far as lags and J's interval allow",
 }
 SIMULATION_ERROR_RPM, SIMULATION_ERROR_SHARE = 0.5, 0.015
-"""Of a critical speed: half of the search's step, and what the tick and the length of the simulation move it by
-(the stiff loop of the reference case: 182 for 183; collars as sections: 1.5 %)."""
+"""Error of a simulated critical speed, rpm and share: half of the search's step, and the effect of the tick and of the
+simulation's length (stiff loop of the reference case: 182 for 183; collars as sections: 1.5 %)."""
 _COLOURS = {"present": "0.25", "stiff": "#c2410c", "soft": "#1f5fa8", "compensated": "#1a7f37", "broadband": "#7c3aed"}
 _IN_BRACKETS = "95 % interval over J, string, lags and bit drawn together; ψ: over J alone, the string as stated"
 _MEANT = {
@@ -91,12 +91,12 @@ class TunedFor:
     gear_ratio: float
     loop: str
     lags_from: str
-    """Who says what the lags in the loop are."""
+    """Source of the lags in the loop."""
     settings: Mapping[str, tuple[DriveSetting, ...]] = field(default_factory=dict)
-    """In the drive's own parameters, by the controller's kind."""
+    """Settings in the drive's own parameters, by the controller's kind."""
     warnings: tuple[str, ...] = ()
     identified: Mapping[str, Any] = field(default_factory=dict)
-    """Of the result, at the motor: what a virtual string on the same rig has to know."""
+    """Figures of the result at the motor shaft that a virtual string on the same rig needs."""
 
 
 def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
@@ -367,7 +367,7 @@ def _interval(part: Part, digits: int = 2) -> str:
 
 
 def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
-    """(what it is, for each controller that was found)."""
+    """Yield the name of each figure and its values, one for each controller."""
     taken = [one for one in document["controllers"] if not one["refused"]]
     ratio = document["tuned_for"]["gear_ratio"]
     shafts = [("at_main_shaft", ", main"), ("at_motor", ", motor")] if ratio != 1.0 else [("at_motor", "")]

@@ -161,4 +161,4 @@ def find_by_known_pipe(record: RunRecord, path: Path, confidence: float) -> dict
 
 
 _LEAST_DELAY_REL_SD = 0.003
-"""Of a travel time that is known exactly, so that its belief does not outweigh the data."""
+"""Least relative standard deviation of a stated travel time, so that it does not outweigh the data."""

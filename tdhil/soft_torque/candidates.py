@@ -29,7 +29,7 @@ Reals = NDArray[np.float64]
 SOFTNESSES = tuple(float(one) for one in np.geomspace(0.05, 2.0, 17))
 FREQUENCY_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15)
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
-"""Of J, compensated."""
+"""Compensated shares of J."""
 SUPPOSED_BIT = BitFriction(2500.0, 5000.0, 2.5)
 """Only to rank, where no bit is stated."""
 _PHASES = (np.arange(48) + 0.5) * 2.0 * np.pi / 48

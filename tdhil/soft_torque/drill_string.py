@@ -48,10 +48,11 @@ STEEL_DENSITY_KG_M3 = 7850.0
 MUD_DRAG_NM_S_RAD_M = 0.005
 """Viscous drag of mud on 5 inch pipe, of the order that simulations use; not measured."""
 WALL_FRICTION_KINETIC, WALL_FRICTION_STATIC = 0.2, 0.3
-"""Of steel on rock or casing in mud: of the order that torque-and-drag programs use; not measured on this well."""
+"""Friction coefficients of steel on rock or casing in mud, of the order that torque-and-drag programs use; not measured
+on this well."""
 SHEAR_RANGE_PA = (61e9, 80e9)
-"""Where G of a string of steel lies: 79 to 80 GPa by the handbook; U. J. Aarsnes and R. Shor (2018) fitted 61 GPa for
-pipe and 67 GPa for collars to field data, tool joints and connections included."""
+"""Range of the shear modulus G of a steel string, Pa: 79 to 80 GPa by the handbook; U. J. Aarsnes and R. Shor (2018)
+fitted 61 GPa for pipe and 67 GPa for collars to field data, tool joints and connections included."""
 STATED_SHEAR_TOLERANCE = 0.05
 """Relative, of a G that was stated because it was fitted."""
 LENGTH_TOLERANCE = 0.01
@@ -62,7 +63,7 @@ DRAG_FACTOR = 2.5
 """Up or down: the mud's drag is a guess in every string file."""
 BOTTOM_TOLERANCE = 0.10
 BIT_TORQUE_TOLERANCE, STRIBECK_FACTOR, NOISE_FACTOR = 0.15, 1.25, 1.5
-"""Of a bit as stated: relative, and factors up or down; assumptions, as the bit itself is one."""
+"""Tolerances of a stated bit, relative and as factors up or down. They are assumptions, as the bit itself is."""
 BIT_NOISE_SHARE = 0.08
 """Root mean square of the bit's random torque over its Coulomb torque: an assumption, 200 N·m on a bit of 2,500 N·m.
 A log of steady drilling gives the value of a real bit."""
@@ -254,9 +255,9 @@ class StringTolerance:
 
 STRING_AS_USUAL = StringTolerance()
 IDENTIFIED_STRING = StringTolerance(0.0, (1.0, 1.0), (1.0, 1.0), 2.0, 0.0)
-"""Of a string whose k, f and J_L were identified: their own intervals are drawn; its losses are known to a factor."""
+"""Tolerance of an identified string: k, f and J_L are drawn from their own intervals, the losses from a factor."""
 EXACT_STRING = StringTolerance(0.0, (1.0, 1.0), (1.0, 1.0), 1.0, 0.0, 0.0, 1.0, 1.0)
-"""Of a string that is what it is said to be, as a simulated one."""
+"""Tolerance of a string that is known exactly, such as a simulated one."""
 
 
 @dataclass(frozen=True)
@@ -408,8 +409,8 @@ def load_string(path: Path) -> DrillString:
 
 
 SPRING_SHARE, SPRING_LOSS = 0.1, 0.03
-"""Of its load's inertia, that a spring whose weight nobody knows is taken to have: waves need some. And the damping
-ratio of its own first wave: with none at all the stiffest loops would swing on waves that nobody has seen."""
+"""Assumed inertia of a spring of unknown mass, as a share of its load's inertia, since waves need some; and the damping
+ratio of its first wave. Without damping the stiffest loops would oscillate on waves that no measurement shows."""
 
 
 def spring_and_mass(
@@ -434,7 +435,8 @@ def spring_and_mass(
 
 
 LEAST_PIPE_SHARE = 0.03
-"""Of the load's inertia, that a pipe has to have for its characteristic impedance to follow from k, f and J_L."""
+"""Least inertia of a pipe, as a share of the load's: below it k, f and J_L do not determine the characteristic
+impedance."""
 
 
 def identified_string(

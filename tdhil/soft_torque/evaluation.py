@@ -23,16 +23,17 @@ LOWEST_RATE_HZ = 20.0
 MOST_CROSSOVER = 0.35
 """P/J times a cycle: a controller as quick as that swings by the cycle alone."""
 MOST_LAG_S, MOST_LAG_ERROR_S = 0.5, 0.05
-"""Of the reported speed: beyond them it is not known whether the loop is the string's and not the observer's."""
+"""Largest lag of the reported speed and its largest error, s. Beyond them the damping may be the observer's instead of
+the string's."""
 LEAST_DRAG_NM_S_RAD_M = 0.001
-"""Of the virtual mud, per metre: what the loop's own errors put into the string has to go somewhere."""
+"""Least drag of the virtual mud, per metre. It takes up the energy that the loop's own errors put into the string."""
 
 BELOW_RPM = (12.0, 10.0, 8.0, 6.0, 4.0)
 """Below the predicted critical speed, where the bit may be made to stick; the first that the shaft can bear."""
 ABOVE_RPM, ABOVE_SHARE = 20.0, 0.2
-"""So far above it the ramp goes, at least the first of both."""
+"""Distance of the ramp's end above the critical speed, rpm and share; the larger of both."""
 ROOM_SHARE = 0.8
-"""Of the torque limit, that the course may need; the rest is for noise and for what the observer corrects."""
+"""Share of the torque limit that the course may need. The rest is for noise and for the observer's corrections."""
 TOLERANCE_RPM, TOLERANCE_DAMPING = 3.0, 0.03
 """Beyond the predicted intervals that still counts as predicted: as near as this has been seen to come to real strings
 on simulated drives."""
