@@ -12,7 +12,7 @@ from dataclasses import asdict, replace
 
 from drivers import Command, Drive, DriveLimits, Mode, Outcome, Paced, Preflight, PreflightRefused, Sample, Timed
 from profiles import MessageCode
-from tdhil.config import told_before_echo
+from tdhil.config import OPTION, told_before_echo
 from tdhil.estimation import torque_answer
 from tdhil.recording import ImpedanceInput, LagPrior, RunLog
 from tdhil.runner import preconditions, stage_log
@@ -275,7 +275,7 @@ def _refuse_undersampled(request: ExcitationRequest, period_s: float) -> None:
     try:
         refuse_undersampled(request, 1.0 / period_s)
     except PlanRefused as error:
-        raise PreflightRefused(str(error), where="--frequency", next_step=f"{error.next_step}; or raise --rate",
+        raise PreflightRefused(str(error), where=OPTION["frequency_hz"].flag, next_step=f"{error.next_step}; or raise --rate",
                                entry=MessageCode.PLAN_HOPELESS) from error
 
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from tdhil.config import OPTION
 from tdhil.estimation import SAMPLED_SHARE, aliased, least_samples, too_few_a_period
 from tdhil.runner.design import (
     MARGIN,
@@ -169,6 +170,10 @@ def refuse_undersampled(request: ExcitationRequest, rate_hz: float) -> None:
         )
 
 
+_FIXED = ("frequency_hz", "amplitude_rad_s", "offset_rad_s", "periods")
+"""Values of a motion that tdhil does not change, if the user gives them."""
+
+
 def refuse_uninformative(
     request: ExcitationRequest, modes: tuple[str, ...], limits: MotionLimits, guess: RigGuess, known: DesignKnowledge
 ) -> None:
@@ -179,9 +184,7 @@ def refuse_uninformative(
     kind = excitation_kind(request.kind)
     if not isinstance(kind, PeriodicKind) or len(kind.shape().harmonics) < 2 or request.impedance is not None:
         return
-    given = {"--frequency": request.frequency_hz, "--amplitude": request.amplitude_rad_s,
-             "--offset": request.offset_rad_s, "--periods": request.periods}
-    named = [flag for flag, value in given.items() if value is not None]
+    named = [OPTION[name].flag for name in _FIXED if getattr(request, name) is not None]
     if not named or known.winds_up:
         return
     for rig in _rigs(guess, limits):
