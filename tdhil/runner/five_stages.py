@@ -275,8 +275,10 @@ def _refuse_undersampled(request: ExcitationRequest, period_s: float) -> None:
     try:
         refuse_undersampled(request, 1.0 / period_s)
     except PlanRefused as error:
-        raise PreflightRefused(str(error), where=OPTION["frequency_hz"].flag, next_step=f"{error.next_step}; or raise --rate",
-                               entry=MessageCode.PLAN_HOPELESS) from error
+        raise PreflightRefused(
+            str(error), where=OPTION["frequency_hz"].flag, next_step=f"{error.next_step}; or raise --rate",
+            entry=MessageCode.PLAN_HOPELESS,
+        ) from error
 
 
 def _refusal(preflight: Preflight) -> PreflightRefused:

@@ -50,6 +50,7 @@ class ToyProfile(DriveProfile):
     quick_stop: Stated
     watchdog: Stated
     parameters: tuple[Any, ...] = ()
+    filters: tuple[Any, ...] = ()
 
     def entries(self) -> tuple[tuple[str, ProfileEntry], ...]:
         return (("quick_stop", self.quick_stop), ("watchdog", self.watchdog))
