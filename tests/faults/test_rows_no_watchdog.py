@@ -99,7 +99,7 @@ def test_never_with_a_string(unarmed, tmp_path):
 @pytest.mark.heavy
 def test_the_result_says_so_live_and_replayed(rehearse):
     """On one bus, by the shortest way: the rest of it is the same."""
-    run = rehearse(*NOT_ARMED, BY_NAME, "--periods", 2, "--mode", "speed")
+    run = rehearse(*NOT_ARMED, BY_NAME, "--periods", 3, "--mode", "speed")
     assert run.done.code in (0, 9), run.done.err
     assert_accepted(run)
     run.shaft.assert_at_rest()

@@ -32,7 +32,7 @@ from tests.vcan.vcan_runs import root_s_ip, run
 
 RUNS = 10
 FURTHER = ("vcan8",)
-SHORT = ("--mode", "speed", "--frequency", 1, "--periods", 12, "--offset", 5)
+SHORT = ("--mode", "speed", "--excitation", "sine", "--frequency", 1, "--periods", 12, "--offset", 5)
 """Twelve seconds of excitation at one mean speed."""
 LEVEL_S, FIRST_RAMP_S = 2.0, 4.0
 """Of stage 2, instead of 6 and 8: what is rough of its inertia shows in a plan that is too cautious, and in no more."""

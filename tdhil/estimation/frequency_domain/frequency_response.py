@@ -114,7 +114,7 @@ _CURVE_SPAN = 1.25       # beyond the lowest and the highest line
 
 
 @dataclass(frozen=True)
-class _Line:
+class _PooledLine:
     """One line pooled over the segments: Z, the variance of a period's equation error, and Σ P|W̄|²."""
 
     line: SpectralLine
@@ -167,7 +167,7 @@ def measure_response(
     )
 
 
-def _pooled(line: SpectralLine) -> _Line | None:
+def _pooled(line: SpectralLine) -> _PooledLine | None:
     weight_w = float(np.sum(line.periods * np.abs(line.speed) ** 2))
     weight_t = float(np.sum(line.periods * np.abs(line.torque) ** 2))
     cross = complex(np.sum(line.periods * line.torque * line.speed.conj()))
@@ -178,17 +178,17 @@ def _pooled(line: SpectralLine) -> _Line | None:
     alone = line.s_tt + abs(z) ** 2 * line.s_ww
     variance = max(alone - 2.0 * (z.conjugate() * line.s_tw).real, 1e-12 * alone)
     energy = weight_w if by_speed else weight_t / abs(z) ** 2
-    return _Line(line, z, variance, energy, math.sqrt(variance / (2.0 * energy)) / abs(z))
+    return _PooledLine(line, z, variance, energy, math.sqrt(variance / (2.0 * energy)) / abs(z))
 
 
-def _straight(lines: list[_Line]) -> _StraightLine:
+def _straight(lines: list[_PooledLine]) -> _StraightLine:
     omega = np.array([2.0 * math.pi * one.line.hertz for one in lines])
     z = np.array([one.z for one in lines])
     return _StraightLine(float(np.sum(z.imag * omega) / np.sum(omega**2)), float(np.median(z.real)))
 
 
 def _told(
-    one: _Line, harmonics: tuple[UnexcitedHarmonic, ...], detected: bool, fitted: complex | None, confidence: float
+    one: _PooledLine, harmonics: tuple[UnexcitedHarmonic, ...], detected: bool, fitted: complex | None, confidence: float
 ) -> ResponseLine:
     line, omega = one.line, 2.0 * math.pi * one.line.hertz
     speed = math.sqrt(one.energy / float(np.sum(line.periods)))
@@ -217,7 +217,7 @@ def _told(
     )
 
 
-def _residual(one: _Line, fitted: complex) -> float:
+def _residual(one: _PooledLine, fitted: complex) -> float:
     line = one.line
     alone = line.s_tt + abs(fitted) ** 2 * line.s_ww
     variance = max(alone - 2.0 * (fitted.conjugate() * line.s_tw).real, 1e-12 * alone)
@@ -316,7 +316,7 @@ def _harmonics(lines_hz: tuple[float, ...], period_s: float, samples: int) -> tu
     return tuple(h for h in range(1, highest + 1) if h not in excited)[:_MOST_HARMONICS]
 
 
-def _between_speeds(lines: list[_Line]) -> float | None:
+def _between_speeds(lines: list[_PooledLine]) -> float | None:
     """Return the p-value of one Z at all mean speeds; None for a single mean speed."""
     from scipy.special import chdtrc
 
@@ -333,7 +333,7 @@ def _between_speeds(lines: list[_Line]) -> float | None:
     return _combined([float(chdtrc(freedom, statistic)), min(1.0, len(each) * min(each))]) if each else None
 
 
-def _excess_between_speeds(one: _Line) -> float:
+def _excess_between_speeds(one: _PooledLine) -> float:
     """Return E|·|² of the torque by which the mean speeds differ, beyond noise, (N·m)²."""
     more = len(one.line.speed) - 1
     if more < 1:
