@@ -188,7 +188,8 @@ def _straight(lines: list[_PooledLine]) -> _StraightLine:
 
 
 def _told(
-    one: _PooledLine, harmonics: tuple[UnexcitedHarmonic, ...], detected: bool, fitted: complex | None, confidence: float
+    one: _PooledLine, harmonics: tuple[UnexcitedHarmonic, ...], detected: bool, fitted: complex | None,
+    confidence: float,
 ) -> ResponseLine:
     line, omega = one.line, 2.0 * math.pi * one.line.hertz
     speed = math.sqrt(one.energy / float(np.sum(line.periods)))
