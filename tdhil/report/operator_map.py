@@ -63,9 +63,9 @@ def draw_map(figure: FigureBase, document: Part) -> None:
         for torque, row in zip(torques, document["states"][kind], strict=True):
             for speed, state in zip(speeds, row, strict=True):
                 axes.bar(speed, rise, step, torque - 0.5 * rise, color=_COLOURS[state], edgecolor="white", lw=0.4)
-        axes.set(title=kind, xlabel="set speed, rpm", xlim=(speeds[0] - 0.5 * step, speeds[-1] + 0.5 * step),
+        # Below the axes: a report's figure has no room for a title above them.
+        axes.set(xlabel=f"{kind}: set speed, rpm", xlim=(speeds[0] - 0.5 * step, speeds[-1] + 0.5 * step),
                  ylim=(torques[0] - 0.5 * rise, torques[-1] + 0.5 * rise))
-        axes.title.set_fontsize("medium")
     every[0].set_ylabel("bit torque, kN·m")
 
 
