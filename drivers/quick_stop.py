@@ -244,7 +244,7 @@ def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_S) -> Bar
 
 
 def _remarks(readings: list[Seen]) -> list[str]:
-    """Return what the readings showed beside the end: a shaft that ran out, a state that is none."""
+    """Return remarks on the readings besides the end: a shaft that ran out, a state that is not valid."""
     said = []
     coasted = next((one for one in readings if one.state is PowerState.OFF and not one.near_zero), None)
     if coasted is not None:

@@ -140,6 +140,13 @@ class Finding:
         """Do the data contradict the model?"""
         return rejects(self.residual, self.reject_p)
 
+    def taken_back(self, contradiction: Refusal) -> "Finding":
+        """Return what is left where something else in the run contradicts J: no inertia, no figure that needs it."""
+        return Finding(
+            self.model, self.words, self.residual, lines=self.lines, samples_used=self.samples_used,
+            warnings=self.warnings, contradiction=contradiction,
+        )
+
     @property
     def contradicted(self) -> str:
         """The sentence on a model that the data contradict."""

@@ -7,8 +7,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tdhil.report.blocks import Column, Pairs, ReportSection, Table, shown_date
-from tdhil.report.card import with_interval
+from tdhil.report.blocks import AnswerBox, Column, Pairs, Report, ReportSection, Table, shown_date
+from tdhil.report.card import sentence, with_interval
+from tdhil.report.document import SIMULATED
 
 if TYPE_CHECKING:
     from tdhil.calibration import MeasuredValue
@@ -87,3 +88,20 @@ def result_rows(quantities: Iterable[tuple[str, Part, str]]) -> Table:
     columns = (Column("quantity", 0.26), Column("unit", 0.1), *(Column(name, 0.128, True)
                                                                for name in ("value", "u", "ν_eff", "k", "U")))
     return Table(columns, rows)
+
+
+def laboratory_page(document: Part, lines: Iterable[str], sections: Iterable[ReportSection]) -> Report:
+    """Return the page of a torque calibration as a laboratory lays it out; ``lines``: below κ in the answer."""
+    factor = document["calibration_factor"]
+    return Report(
+        title="Calibration of a drive's torque",
+        subtitle=shown_date(document["date"]),
+        simulated=f"{SIMULATED}: drive and rig are simulated, nothing real turned" if document["simulated"] else "",
+        answer=AnswerBox(
+            VERDICT_COLOUR.get(document["verdict"], "yellow"),
+            "No number" if factor is None else f"κ = {with_share(factor, '')}", tuple(lines), document["verdict"],
+            sentence(document["reason"]), sentence(document["advice"])),
+        warnings=tuple(document["warnings"]),
+        sections=tuple(one for one in sections if one.blocks),
+        footer=f"tdhil {document['tdhil']}",
+    )

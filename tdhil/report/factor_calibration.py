@@ -18,12 +18,12 @@ from rich.panel import Panel
 from rich.table import Table as Grid
 from rich.text import Text as Words
 
-from tdhil.report.blocks import AnswerBox, Block, Column, Pairs, Picture, Report, ReportSection, Table, Text, shown_date
+from tdhil.report.blocks import Block, Column, Pairs, Picture, Report, ReportSection, Table, Text
 from tdhil.report.calibration_page import (
-    VERDICT_COLOUR,
     VERDICT_STYLE,
     calibrated_item,
     date_and_signature,
+    laboratory_page,
     quantity,
     recordings,
     result_rows,
@@ -267,19 +267,8 @@ def write_factor_report(document: Part, path: Path) -> Path:
 def factor_report(document: Part) -> Report:
     """Laid out as a calibration laboratory does, as `calibration_report` is."""
     factor = document["calibration_factor"]
-    return Report(
-        title="Calibration of a drive's torque",
-        subtitle=shown_date(document["date"]),
-        simulated=f"{SIMULATED}: drive and rig are simulated, nothing real turned" if document["simulated"] else "",
-        answer=AnswerBox(
-            VERDICT_COLOUR.get(document["verdict"], "yellow"),
-            "No number" if factor is None else f"κ = {with_share(factor, '')}",
-            () if factor is None else (f"The drive reports {scale_error(factor)}",), document["verdict"],
-            sentence(document["reason"]), sentence(document["advice"])),
-        warnings=tuple(document["warnings"]),
-        sections=tuple(one for one in _sections(document) if one.blocks),
-        footer=f"tdhil {document['tdhil']}",
-    )
+    lines = () if factor is None else (f"The drive reports {scale_error(factor)}",)
+    return laboratory_page(document, lines, _sections(document))
 
 
 def _sections(document: Part) -> Iterator[ReportSection]:

@@ -15,17 +15,18 @@ from rich.panel import Panel
 from rich.table import Table as Grid
 from rich.text import Text as Words
 
-from tdhil.report.blocks import AnswerBox, Block, Column, Picture, Report, ReportSection, Table, Text, shown_date
+from tdhil.report.blocks import Block, Column, Picture, Report, ReportSection, Table, Text
 from tdhil.report.calibration_page import (
-    VERDICT_COLOUR,
     VERDICT_STYLE,
     calibrated_item,
     date_and_signature,
+    laboratory_page,
     quantity,
     recordings,
     result_rows,
     run_name,
     scale_error,
+    shown_degrees,
     with_share,
 )
 from tdhil.report.card import plus_minus, sentence
@@ -144,18 +145,7 @@ def calibration_report(document: Part) -> Report:
     lines = []
     if factor is not None and inertia is not None:
         lines = [f"J without the body {with_share(inertia, 'kg·m²')}", f"The drive reports {scale_error(factor)}"]
-    return Report(
-        title="Calibration of a drive's torque",
-        subtitle=shown_date(document["date"]),
-        simulated=f"{SIMULATED}: drive and rig are simulated, nothing real turned" if document["simulated"] else "",
-        answer=AnswerBox(
-            VERDICT_COLOUR.get(document["verdict"], "yellow"),
-            "No number" if factor is None else f"κ = {with_share(factor, '')}", tuple(lines), document["verdict"],
-            sentence(document["reason"]), sentence(document["advice"])),
-        warnings=tuple(document["warnings"]),
-        sections=tuple(one for one in _sections(document) if one.blocks),
-        footer=f"tdhil {document['tdhil']}",
-    )
+    return laboratory_page(document, lines, _sections(document))
 
 
 def _sections(document: Part) -> Iterator[ReportSection]:
@@ -202,7 +192,7 @@ def _factor_budget(document: Part) -> Table:
         dof, sd = line["degrees_of_freedom"], line["standard_uncertainty_kg_m2"]
         shares = [cell for key in ("of_factor", "of_inertia") for cell in (
             f"{100 * line[key] / sd:.3g}" if sd > 0.0 else "", f"{100 * line[key]:.3f}")]
-        rows.append((line["source"], f"{sd:.3g}", line["distribution"], "∞" if dof > 1e4 else f"{dof:.0f}", *shares))
+        rows.append((line["source"], f"{sd:.3g}", line["distribution"], shown_degrees(dof), *shares))
     total = ["combined", "", "", ""]
     for key in ("calibration_factor", "inertia_kg_m2"):
         total += ["", f"{100 * document[key]['standard_uncertainty'] / document[key]['value']:.3f}"]

@@ -211,7 +211,7 @@ class RunProcess:
         return int(code)
 
     def _conclude_part(self) -> None:
-        """Write what the motion before the end shows, as `tdhil replay` of the log does. The run has ended already."""
+        """Write the result of the motion before the end, as `tdhil replay` of the log does. The run has ended."""
         from tdhil.errors import TdhilError
         from tdhil.report import has_extra
         from tdhil.session import conclude, is_evaluation, read

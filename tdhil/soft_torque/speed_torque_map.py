@@ -27,9 +27,9 @@ from tdhil.soft_torque.tune_case import Tuning
 
 MAP_SPEEDS_RPM = tuple(float(one) for one in range(20, 221, 20))
 MAP_TORQUE_SHARES = (0.4, 0.6, 0.8, 1.0, 1.2, 1.4)
-"""Of the stated bit's torque."""
+"""Bit torques of the map, as shares of the stated bit's."""
 MAP_SEEDS = (11, 12, 13)
-"""Of the bit noise: a cell is as bad as the worst of them."""
+"""Seeds of the bit noise. A cell has the worst state of them."""
 
 _STARTS: tuple[Start, Start] = ("turning", "stuck")
 

@@ -42,7 +42,7 @@ Flags = NDArray[np.bool_]
 STEPS_PER_PERIOD = 80.0
 """Samples of the common grid in one period of the lowest mode."""
 LEAST_SAMPLES_PER_PERIOD = 16.0
-"""Of the record: with fewer the downhole speed is not resolved."""
+"""Least samples of the record in that period: fewer do not resolve the downhole speed."""
 HARMONICS = 8.0
 """The highest frequency that is used, in lowest modes: the jump of a bit that breaks away needs some harmonics."""
 GAP_PERIODS = 0.1
@@ -61,7 +61,7 @@ From strings of 1,000 to 6,000 m that were simulated with bit noise (benchmarks/
 AT_RISK_INDEX = 0.5
 """Severity index from which a window counts as at risk of stick-slip."""
 HYSTERESIS = 0.3
-"""Of the amplitude, that a cycle must pass on both sides of the mean."""
+"""Distance from the mean that a cycle must pass on both sides, as a share of the amplitude."""
 MOST_PERIOD_SCATTER = 0.3
 """Relative standard deviation of single cycles up to which they are one oscillation."""
 LEAST_CYCLES = 3
@@ -137,7 +137,7 @@ class SeverityCourse:
     time_s: Array
     top_rad_s: Array
     torque_nm: Array
-    """Of the string, at its top."""
+    """Torque of the string at its top."""
     bit_rad_s: Array
     index: Array
 
@@ -159,7 +159,7 @@ class Severity:
     """Share of the turning time."""
     episodes: tuple[StickSlipEpisode, ...]
     period_s: Interval | None
-    """Of the oscillation; None: nothing that repeats."""
+    """Period of the oscillation; None: nothing repeats."""
     cycles: int
     downhole_rad_s: Interval
     """Half of peak to peak of the downhole speed, in the same windows as ``index``."""

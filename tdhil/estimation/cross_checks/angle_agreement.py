@@ -146,7 +146,4 @@ def angle_checked(finding: Finding, case: Case) -> Finding:
     contradiction = angle_contradiction(case.recording)
     if contradiction is None:
         return finding
-    return Finding(
-        finding.model, finding.words, finding.residual, lines=finding.lines, samples_used=finding.samples_used,
-        warnings=finding.warnings, contradiction=contradiction,
-    )
+    return finding.taken_back(contradiction)

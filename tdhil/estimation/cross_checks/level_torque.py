@@ -98,10 +98,7 @@ def level_checked(finding: Finding, case: Case) -> Finding:
     contradiction = level_contradiction(case.recording, case.samples)
     if contradiction is None:
         return finding
-    return Finding(
-        finding.model, finding.words, finding.residual, lines=finding.lines, samples_used=finding.samples_used,
-        warnings=finding.warnings, contradiction=contradiction,
-    )
+    return finding.taken_back(contradiction)
 
 
 def _mean(samples: Samples, block_s: float) -> tuple[float, float, float] | None:

@@ -55,10 +55,7 @@ def jump_checked(finding: Finding, case: Case) -> Finding:
     contradiction = jump_contradiction(case.recording, inertia.low, inertia.value)
     if contradiction is None:
         return finding
-    return Finding(
-        finding.model, finding.words, finding.residual, lines=finding.lines, samples_used=finding.samples_used,
-        warnings=finding.warnings, contradiction=contradiction,
-    )
+    return finding.taken_back(contradiction)
 
 
 def jump_contradiction(recording: Recording, inertia_low_kg_m2: float, inertia_kg_m2: float) -> Refusal | None:
