@@ -47,9 +47,10 @@ class Standstill:
             and observer.believable
         )
 
-    def see(self, sample: Sample, *, without_torque: bool = False) -> bool:
+    def see(self, sample: Sample, polled_gap_s: float = 0.0, *, without_torque: bool = False) -> bool:
         """Take one sample; true once the shaft has been at rest for long enough.
 
+        ``polled_gap_s``: longest gap between samples that are answers to single requests, if longer, s.
         ``without_torque``: zero torque is commanded, in torque mode.
         """
         # A single lost frame does not undo what the others showed; a longer gap does.
@@ -57,7 +58,7 @@ class Standstill:
         if not self.quiet(sample):
             self._since_s = None
             return False
-        if self._since_s is None or gap_s > self._longest_gap_s:
+        if self._since_s is None or gap_s > max(self._longest_gap_s, polled_gap_s):
             self._since_s = sample.time_s
             return False
         shown = without_torque or sample.standstill or sample.state in NO_TORQUE

@@ -187,6 +187,10 @@ AT_REST_SHARE = 0.005
 LONGEST_GAP_S, LONGEST_GAP_CYCLES = 0.2, 3
 """Standstill must have been watched without a longer gap in the feedback than both; on a slow line a frame may go."""
 
+POLLED_GAP_S = 0.6
+"""The longest gap while polls stand in for the cycle: two polls without an answer, with the pauses after them, on a
+computer that is late. One swing of a drill string lasts longer."""
+
 SILENT_S, SILENT_CYCLES = 1.0, 25
 """After so long, and so many cycles, without any feedback the drive can't be reached: its watchdog stops the shaft."""
 
@@ -535,7 +539,7 @@ class StopSequence:
             patience.see(speed_rad_s, self._loop.period_s)
             if not braking.see(sample.time_s, speed_rad_s) and self._leave_to_watchdog(sample):
                 patience = StopTimeout(self._enough_s + self._limits.watchdog_s, self._at_rest_rad_s)
-            if rest.see(sample) and self._poll_agrees(rest):
+            if rest.see(sample, POLLED_GAP_S if self._polls.standing else 0.0) and self._poll_agrees(rest):
                 self._held_at_rest_nm = math.fsum(self._held) / len(self._held)
                 return sample.time_s
         if observer.doubt is not None and not observer.believable:

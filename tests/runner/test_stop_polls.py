@@ -62,6 +62,21 @@ def test_without_feedback_looks_confirm_it(world, gone, speed):
     assert here.drive.looks <= took_s / EVERY_S + 10
 
 
+def test_polls_of_which_two_in_three_bring_nothing_confirm_it(world):
+    """A computer that is late: the drive has tripped its watchdog, sends no frame, and answers now and then."""
+
+    class Late(LookedAt):
+        def poll(self):
+            self.answers = self.looks % 3 == 2
+            return super().poll()
+
+    here = world(Late())
+    here.turn(5.0)
+    here.drive.gone = "missing"
+    report = here.stop_sequence().run()
+    assert report.confirmed and here.drive.disabled_at == [0.0]
+
+
 def test_what_is_heard_of_the_cycle_is_enough(world):
     here = world(LookedAt(misbehave=None))
     here.turn(5.0)
