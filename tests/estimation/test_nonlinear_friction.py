@@ -184,12 +184,12 @@ def test_the_paper_s_model_is_not_helped():
     assert said.verdict is Verdict.MODEL_REJECTED
 
 
-@pytest.mark.heavy
-def test_on_a_rig_with_stribeck_friction_the_interval_covers():
-    runs = run_stages(Stages(Rig(), periods=8, static=25.0, stribeck_speed=2.0), list(range(12)), rate_hz=100.0)
-    said = [identify(run) for run in runs]
-    assert sum(one.model == MODEL for one in said) >= 6       # the others pass for straight, B widened by the curve
+@pytest.mark.parametrize("runs", [pytest.param(4, marks=pytest.mark.heavy), pytest.param(12, marks=pytest.mark.long)])
+def test_on_a_rig_with_stribeck_friction_the_interval_covers(runs):
+    records = run_stages(Stages(Rig(), periods=8, static=25.0, stribeck_speed=2.0), list(range(runs)), rate_hz=100.0)
+    said = [identify(record) for record in records]
+    assert sum(one.model == MODEL for one in said) >= runs // 2    # the others pass for straight, B widened by the curve
     told = [one.inertia for one in said if one.inertia is not None]
-    assert len(told) >= 11
-    assert sum(not one.low <= 104.0 <= one.high for one in told) <= 2
+    assert len(told) >= runs - 1
+    assert sum(not one.low <= 104.0 <= one.high for one in told) <= runs // 6
     assert abs(np.mean([one.value for one in told]) / 104.0 - 1.0) < 0.005

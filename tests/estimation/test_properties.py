@@ -48,7 +48,7 @@ def test_the_clock_may_start_anywhere(plain, shift):
 TEN_LINES = {"lines": tuple(k / 10.0 for k in range(1, 11)), "amplitudes": (1.5, 0.8, *(0.1,) * 8)}
 
 
-@pytest.mark.heavy
+@pytest.mark.long       # the intervals of a string that is none take a minute
 def test_of_a_string_that_ten_lines_do_not_show_a_rigid_shafts_inertia_is_said_to_be_of_all_that_turns():
     recording = closed_form(**TEN_LINES)
     plain, found = identify(recording), identify(replace(recording, winds_up=True))

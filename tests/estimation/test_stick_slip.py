@@ -47,11 +47,14 @@ def test_stick_slip_is_named_and_never_answered_wrong():
     assert check(shafts) >= 0.6 * len(shafts)
 
 
-@pytest.mark.heavy
-def test_none_of_108_records_in_stick_slip_is_answered_wrong():
+@pytest.mark.parametrize("every", [
+    pytest.param(4, marks=pytest.mark.heavy), pytest.param(1, marks=pytest.mark.long),
+])
+def test_none_of_108_records_in_stick_slip_is_answered_wrong(every):
     shafts = every_shaft()
     assert len(shafts) == 108
-    assert check(shafts) >= 0.7 * len(shafts)
+    some = shafts[1::every] if every > 1 else shafts
+    assert check(some) >= 0.7 * len(some)
 
 
 @pytest.mark.heavy(but_first=1)

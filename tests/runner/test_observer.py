@@ -80,6 +80,13 @@ def test_a_healthy_run_raises_no_doubt(rig, wrong, rel_error, frequency_hz, seed
 
 
 @pytest.mark.heavy
+@settings(phases=PHASES, max_examples=25)
+@any_run
+def test_more_healthy_runs_raise_no_doubt(rig, wrong, rel_error, frequency_hz, seed):
+    healthy(rig, wrong, rel_error, frequency_hz, seed)
+
+
+@pytest.mark.long
 @settings(phases=PHASES)
 @any_run
 def test_many_healthy_runs_raise_no_doubt(rig, wrong, rel_error, frequency_hz, seed):

@@ -74,7 +74,7 @@ def test_the_dead_time_reserve_is_the_smallest_that_destabilises():
     check_reserve(random_cases(50, 1), 3)
 
 
-@pytest.mark.heavy
+@pytest.mark.long
 def test_the_dead_time_reserve_on_many_controllers():
     check_reserve(random_cases(500, 2), 25)
 
