@@ -1,6 +1,6 @@
 """Random healthy rigs through the real path with the embedded simulator: how many runs end with a false alarm?
 
-    python benchmarks/healthy_runs.py [--runs 2000] [--first 1] [--jobs 1] [--out healthy.json] [--against before.json]
+    python benchmarks/healthy_runs.py [--runs 2000] [--first 1] [--jobs 1] [--out rows.jsonl] [--against old.jsonl]
 
 Each seed draws a profile that ships (both buses), a shaft (rigid, two masses, drill string; J from 0.02 to 3000 kg·m²;
 each law of friction), what disturbs it, how late and how coarsely the drive reports, and a cycle rate; the limits fit
@@ -254,25 +254,34 @@ def compared(rows: Sequence[dict[str, Any]], before: Sequence[dict[str, Any]]) -
     return "\n".join(lines), len(wider) + len(gone)
 
 
+def kept(path: Path | None) -> list[dict[str, Any]]:
+    """What an earlier call wrote."""
+    if path is None or not path.exists():
+        return []
+    return [json.loads(text) for text in path.read_text(encoding="utf-8").splitlines()]
+
+
 def main() -> int:
     """Print a line for each run and the counts; 1 if there is a false alarm, or an interval wider than before."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=2000)
     parser.add_argument("--first", type=int, default=1, metavar="SEED")
     parser.add_argument("--jobs", type=int, default=1, help="processes (1)")
-    parser.add_argument("--out", type=Path, help="all results as JSON")
+    parser.add_argument("--out", type=Path, help="the results as JSON lines; seeds that stand there are not run again")
     parser.add_argument("--against", type=Path, metavar="FILE", help="what --out wrote at another commit")
     asked = parser.parse_args()
-    rows = []
-    for row in results(range(asked.first, asked.first + asked.runs), asked.jobs):
-        rows.append(row)
-        print(line(row), flush=True)
+    seeds = range(asked.first, asked.first + asked.runs)
+    rows = [row for row in kept(asked.out) if row["seed"] in seeds]
+    have = {row["seed"] for row in rows}
+    with (asked.out or Path(os.devnull)).open("a", encoding="utf-8") as out:
+        for row in results([seed for seed in seeds if seed not in have], asked.jobs):
+            rows.append(row)
+            print(line(row), flush=True)
+            print(json.dumps(row), file=out, flush=True)
     print(summary(rows))
-    if asked.out is not None:
-        asked.out.write_text(json.dumps({"rows": rows}, indent=1), encoding="utf-8")
     worse = 0
     if asked.against is not None:
-        text, worse = compared(rows, json.loads(asked.against.read_text(encoding="utf-8"))["rows"])
+        text, worse = compared(rows, kept(asked.against))
         print(text)
     return 1 if worse or alarms(rows) else 0
 

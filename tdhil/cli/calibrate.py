@@ -190,6 +190,10 @@ def _plan(namespace: argparse.Namespace) -> int:
                          next_step="Such as: tdhil calibrate torque without.mcap --plan --want 1%")
     if not 0.0 < namespace.want < 1.0:
         raise UsageError(f"{namespace.want:g}: must be a share between 0 and 1", where="--want")
+    for name in WITHOUT_BODY:
+        if getattr(namespace, name) is not None:
+            raise UsageError("is for a body of known inertia, not for another reference",
+                             where=f"--plan, --{name.replace('_', '-')}", next_step="Leave one of them out")
     _positive("--added", namespace.added)
     _positive("--added-sd", namespace.added_sd, zero=True)
     require_file(namespace.logs[0])

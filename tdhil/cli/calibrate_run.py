@@ -9,7 +9,7 @@ from pathlib import Path
 from profiles.quantities import INERTIA
 from tdhil.cli.arguments import amount, hide_rare
 from tdhil.config import OPTION, load_rig, resolve
-from tdhil.errors import UsageError
+from tdhil.errors import ExitCode, UsageError
 
 _EXAMPLE = "tdhil identify --calibrate --added 55"
 _LARGEST = 1e9
@@ -96,4 +96,8 @@ def run_calibration(namespace: argparse.Namespace, run: Run) -> int:
     if code := run(again, logs):
         return code
     step(4, "calibration")
-    return calibrate_two(logs[0], logs[1], namespace.added, namespace.added_sd, saved)
+    code = calibrate_two(logs[0], logs[1], namespace.added, namespace.added_sd, saved)
+    if code == ExitCode.OK:
+        console.print(f"to use it, write in rig.yaml: drive_data: {{torque_calibration: {saved}}}", markup=False,
+                      soft_wrap=True)
+    return code

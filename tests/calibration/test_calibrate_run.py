@@ -142,4 +142,6 @@ def test_both_runs_of_the_simulated_rig_give_the_calibration(tmp_path, capsys):
                  *CALIBRATE, "--added-sd", "0.1"]) == 0
     factor = json.loads((tmp_path / "run-calibration.json").read_text())["calibration_factor"]
     assert factor["low"] <= 1.0 / 1.05 <= factor["high"]
-    assert "calibration factor" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "calibration factor" in said.out
+    assert f"drive_data: {{torque_calibration: {tmp_path / 'run-calibration.json'}}}" in said.err

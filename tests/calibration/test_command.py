@@ -35,6 +35,12 @@ def test_a_log_that_is_not_there_or_the_same_twice_ends_with_2(traces, tmp_path)
     assert main(["calibrate", "torque", "--plan"]) == 2
 
 
+@pytest.mark.parametrize("option", ["--pairs", "--reference", "--known-pipe"])
+def test_a_plan_is_for_a_body_and_says_so(traces, capsys, option):
+    assert main(["calibrate", "torque", traces[0], "--plan", option, "file"]) == 2
+    assert option in capsys.readouterr().err
+
+
 def test_nothing_is_written_over(traces, tmp_path):
     kept = tmp_path / "calibration.json"
     kept.write_text("kept")

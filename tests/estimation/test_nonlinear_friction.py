@@ -188,7 +188,7 @@ def test_the_paper_s_model_is_not_helped():
 def test_on_a_rig_with_stribeck_friction_the_interval_covers(runs):
     records = run_stages(Stages(Rig(), periods=8, static=25.0, stribeck_speed=2.0), list(range(runs)), rate_hz=100.0)
     said = [identify(record) for record in records]
-    assert sum(one.model == MODEL for one in said) >= runs // 2    # the others pass for straight, B widened by the curve
+    assert sum(one.model == MODEL for one in said) >= runs // 2    # the others pass for straight, with a wider B
     told = [one.inertia for one in said if one.inertia is not None]
     assert len(told) >= runs - 1
     assert sum(not one.low <= 104.0 <= one.high for one in told) <= runs // 6
