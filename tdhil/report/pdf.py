@@ -1,7 +1,8 @@
 """The report as PDF on A4: pictures and letters as vectors, by matplotlib alone (docs/decisions/0009).
 
-A sheet is filled from the top. A heading stays with what follows it, a picture with its caption, and a table on one
-sheet unless it is longer than that: then it is split between rows, and its head repeated. All lengths are in points.
+A sheet is filled from the top. A heading stays with what follows it, and a picture with its caption. A table stays on
+one sheet if that leaves at most a quarter of the sheet before it empty. Otherwise it is split between rows, and its
+head is repeated. All lengths are in points.
 """
 
 from __future__ import annotations
@@ -250,6 +251,12 @@ def _picture(sheets: _Sheets, heading: str | None, block: Picture) -> None:
     _headed(sheets, heading, height + 2.0 + len(caption) * SMALL * _LEADING, draw)
 
 
+_MOST_EMPTY = 0.25 * (BOTTOM - TOP)
+"""Largest space that a table leaves empty on a sheet so that it stays in one piece, points."""
+_LEAST_ROWS = 3
+"""Fewest rows of a split table on one sheet."""
+
+
 def _table(sheets: _Sheets, heading: str | None, block: Table | Pairs) -> None:
     columns = block.columns if isinstance(block, Table) else (Column("", 0.27), Column("", 0.73))
     rows = [_TableRow(columns, cells) for cells in block.rows]
@@ -258,7 +265,8 @@ def _table(sheets: _Sheets, heading: str | None, block: Table | Pairs) -> None:
     head_height = head.height if head is not None else 0.0
     height = head_height + sum(row.height for row in rows)
     above = 13.0 + _HEADING if heading is not None else 5.0
-    if height <= max(sheets.room(above), BOTTOM - TOP - 40.0):
+    room, whole = sheets.room(above), BOTTOM - TOP - 40.0
+    if height <= room or (height <= whole and room <= _MOST_EMPTY):
         _headed(sheets, heading, height, lambda on, y: _draw_rows(on, y, head, rows))
         return
     while rows:
@@ -267,7 +275,9 @@ def _table(sheets: _Sheets, heading: str | None, block: Table | Pairs) -> None:
         while fit < len(rows) and used + rows[fit].height <= room:
             used += rows[fit].height
             fit += 1
-        if fit == 0 and not sheets.fresh:
+        if fit < len(rows):
+            fit = min(fit, len(rows) - _LEAST_ROWS)      # no sheet begins or ends with a row or two of a table
+        if fit < _LEAST_ROWS and not sheets.fresh and fit < len(rows):
             sheets.new()
             continue
         part, rows = rows[: max(fit, 1)], rows[max(fit, 1):]

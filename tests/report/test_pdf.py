@@ -89,6 +89,20 @@ def test_no_sheet_but_the_last_is_half_empty():
 
 
 @pytest.mark.heavy
+@pytest.mark.parametrize("lines", [24, 34, 44])
+def test_a_table_leaves_no_sheet_before_it_mostly_empty(lines):
+    """A table of the excited frequencies that fits a sheet of its own: it is split instead, with its head."""
+    everything = full()
+    found = replace(everything, lines=tuple(replace(everything.lines[0], hertz=0.01 * k) for k in range(1, lines + 1)))
+    figures = sheets_of(report(found))
+    for figure in figures[:-1]:
+        lowest = min([y0 for _, _, y0, _, _ in texts_of(figure) if y0 > 40.0])
+        assert lowest < 0.4 * HIGH
+    rows = [sum(bool(re.fullmatch(r"0\.\d\d?", text)) for text, *_ in texts_of(figure)) for figure in figures]
+    assert all(count == 0 or count >= 3 for count in rows)
+
+
+@pytest.mark.heavy
 def test_it_is_a_pdf_with_that_many_pages_and_the_same_twice():
     one, other = pdf_bytes(report(full())), pdf_bytes(report(full()))
     assert one == other
@@ -101,7 +115,7 @@ def test_it_is_a_pdf_with_that_many_pages_and_the_same_twice():
 def test_its_text_can_be_read_by_others(tmp_path):
     (tmp_path / "r.pdf").write_bytes(pdf_bytes(report(full())))
     said = subprocess.run(["pdftotext", "-layout", tmp_path / "r.pdf", "-"], capture_output=True, text=True, check=True)
-    for wanted in ("J_r = 104.0 (99.9 to 108.1) kg·m² ±3.9 %", "Hall B · 2026-03-04 05:06 UTC+01:00", "987654",
+    for wanted in ("J_r = 104.0 (99.9 to 108.1) kg·m² ±3.9 %", "Hall B · 2026-03-04 05:06:07 UTC+01:00", "987654",
                    "friction <b>bends</b> & more", "0123456789abcdef", "page 1 of"):
         assert wanted in said.stdout, wanted
     assert said.stdout.count("SIMULATED") >= len(sheets_of(report(full())))
