@@ -232,6 +232,7 @@ def _draw_trend(figure: FigureBase, document: Mapping[str, Any]) -> None:
     locator = dates.AutoDateLocator(minticks=3, maxticks=8)
     axes[-1].xaxis.set_major_locator(locator)
     axes[-1].xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
+    axes[-1].set_xlabel("UTC")
     figure.align_ylabels(list(axes))
 
 

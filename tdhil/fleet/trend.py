@@ -58,6 +58,14 @@ def drive_of(row: FleetRow) -> str | None:
     return None if row.rig is None else "assumed " + "|".join(str(one) for one in named)
 
 
+def series_of(row: FleetRow) -> tuple[str | None, str | None]:
+    """Return the drive and its profile. Within one name, only runs with the same two are one series.
+
+    Another profile may read the torque in another unit, and its lags are others.
+    """
+    return drive_of(row), row.profile
+
+
 def scale_of(row: FleetRow) -> str | None:
     """Which torque scale it is: the drive's, since its torque calibration. Another one stays in a difference."""
     drive = drive_of(row)
@@ -100,14 +108,15 @@ def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str
     if len({row.simulated for _, row in kept}) > 1:
         notes.append("simulated runs and real ones are mixed")
     drives = {drive_of(row) for _, row in kept}
-    if len(drives) > 1:         # two benches of one name, or another drive on this one: never one series
-        newest = drive_of(kept[-1][1])
-        others = [row for _, row in kept if drive_of(row) != newest]
-        kept = [(time_s, row) for time_s, row in kept if drive_of(row) == newest]
-        notes.append(f"{len(drives)} drives or profiles under this name: the trend is of the newest"
+    series = {series_of(row) for _, row in kept}
+    if len(series) > 1:         # two benches of one name, or another drive or profile on this one: never one series
+        newest = series_of(kept[-1][1])
+        others = [row for _, row in kept if series_of(row) != newest]
+        kept = [(time_s, row) for time_s, row in kept if series_of(row) == newest]
+        notes.append(f"{len(series)} drives or profiles under this name: the trend is of the newest"
                      f" ({_drive_text(kept[-1][1])}). Left out: {counted(len(others), 'result')} of"
                      f" {'; '.join(sorted({_drive_text(row) for row in others}))}. Give each rig a name of its own")
-        drives = {newest}
+        drives = {newest[0]}
     calibrations = sorted({row.torque_calibration or "" for _, row in kept})
     if len(calibrations) > 1:
         told = ", ".join(one[:10] or "none" for one in calibrations)
@@ -175,7 +184,9 @@ def _between(change: Mapping[str, Any]) -> str:
     before, after = (change[f"{end}_date"] or change[end] for end in ("before", "after"))
     if before[:10] != after[:10]:
         return f"between {before[:10]} and {after[:10]}"
-    return f"between {before[:16].replace('T', ' ')} and {after[:16].replace('T', ' ')}"
+    from tdhil.report import shown_date
+
+    return f"between {shown_date(before) or before} and {shown_date(after) or after}"
 
 
 def _change_text(change: Difference, unit: str) -> str:
@@ -222,6 +233,8 @@ def identified(log: Path, settings: FleetSettings) -> Compared:
 def _settings(
     row: FleetRow, document: Mapping[str, Any], recording: Any, run: Mapping[str, Any]
 ) -> dict[str, str]:
+    from tdhil.report import shown_date
+
     rig = document.get("rig") or {}
     excitation, prior = recording.excitation, recording.lag_prior
     segments = () if excitation is None else excitation.segments
@@ -229,7 +242,7 @@ def _settings(
     identify = run.get("identify")
     asked = identify if isinstance(identify, Mapping) else {}
     found: dict[str, Any] = {
-        "date": None if row.date is None else row.date.replace("T", " "),
+        "date": shown_date(row.date) or row.date,
         "rig": row.rig,
         "load": rig.get("load"),
         "drive": row.drive_name,

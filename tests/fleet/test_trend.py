@@ -78,6 +78,9 @@ def test_logs_of_two_drives_are_never_one_series():
     assert "2 drives" in note and "24 results of serial number 9" in note
     profiles = trend_document([*found, *(replace(one, drive_serial=None, profile="other") for one in other)], "R7")
     assert profiles["quantities"] == document["quantities"]
+    same_drive = trend_document([*found, *(replace(one, drive_serial=found[0].drive_serial, profile="other")
+                                           for one in other)], "R7")
+    assert same_drive["quantities"] == document["quantities"]      # another profile reads another torque
 
 
 def test_a_rig_without_a_name_is_known_by_no_file_name():

@@ -76,7 +76,7 @@ def test_everything_is_on_it():
         "does not agree", "J_r, the motor&#39;s side: repeatability", "9 of 3200 cycles without feedback",
         "scatter from period to period",
         "111.5 kg·m²", "116.20 ± 0.80",
-        "Hall B · 2026-03-04 05:06 UTC+01:00", "A. &lt;Person&gt;", "after [31m repair", "987654", "Drive ]0;x",
+        "Hall B · 2026-03-04 05:06:07 UTC+01:00", "A. &lt;Person&gt;", "after [31m repair", "987654", "Drive ]0;x",
         "vendor 2Ah, product 192h, revision 1h", "vendor/model (A drive)", "canopen, channel can0, bitrate 500000",
         "speed 0.5 to 10 rad/s; torque 400 N·m", "drill string",
     ):
