@@ -162,6 +162,12 @@ MEANING = {
         "`tdhil tune`: the requested gains would make the string oscillate",
         "Request a smaller `--a` or `--compensate`.",
     ),
+    12: (
+        "a rehearsed fault (`--fault`) did not cause the reaction that the fault table requires, or an identified "
+        "value contradicts its expected one (`acceptance:`, `--expect`)",
+        "Compare what was required with what was seen. Both are on the card, and in `rehearsal` and `acceptance` of "
+        "the document.",
+    ),
     130: ("interrupted by Ctrl-C; the shaft was stopped", "Replay the log: what came before counts."),
     143: (
         "ended by SIGTERM, SIGHUP, SIGQUIT (Ctrl-\\\\) or SIGTSTP (Ctrl-Z); the shaft was stopped",

@@ -7,8 +7,8 @@ The hundreds of a code are the exit code of the process that ends with it::
     TDH-2xx   use, files, configuration                   2      TDH-9xx   not identifiable, model rejected   9
     TDH-3xx   partial result                              3      TDH-10xx  nothing readable in a file        10
     TDH-4xx   refused before motion                       4      TDH-11xx  tuning refused                    11
-    TDH-5xx   communication                               5      TDH-13xx  interrupted              130 to 192
-    TDH-6xx   drive                                       6
+    TDH-5xx   communication                               5      TDH-12xx  rehearsal, acceptance not passed 12
+    TDH-6xx   drive                                       6      TDH-13xx  interrupted              130 to 192
 
 The table stands here because every room raises errors, and `profiles` lies below every other room. An error class has
 an entry; the place that raises may name a more specific one. A code is never given to another entry: the codes are a
@@ -521,6 +521,10 @@ class MessageCode(Enum):
         439, "The requested motion cannot determine the moment of inertia",
         "The cycle rate is too low for its spectral lines, or it cannot separate the inertia from lags and friction.",
         "Leave out --frequency and --amplitude, or change them as the message says.")
+    NO_RIG_NAME = (
+        440, "No name for the rig of a real drive",
+        "Results are kept and compared by the rig's name and its drive. A real drive does not move without a name.",
+        "Write the key name into rig.yaml. tdhil rig new asks for it.")
 
     # --- 5xx: communication ------------------------------------------------------------------------------------------
     COMMUNICATION_LOST = (
@@ -771,6 +775,16 @@ class MessageCode(Enum):
         1101, "The result has no inertia to tune for",
         "The verdict of the result is a refusal, or its interval includes zero.",
         "Identify again with the motion that the verdict advises.")
+
+    # --- 12xx: rehearsal or acceptance not passed --------------------------------------------------------------------
+    REHEARSAL_FAILED = (
+        1200, "A rehearsed fault did not cause the required reaction",
+        "The run ended in another way than the fault table requires, or its interval misses the true inertia.",
+        "Compare the required reaction with what was seen. A weaker fault may stay below what tdhil detects.")
+    ACCEPTANCE_FAILED = (
+        1201, "An identified value contradicts the expected one",
+        "The interval of the identified value and the tolerance of the expected one have no value in common.",
+        "Find what is off on the card. Correct the machine, or the expected value in rig.yaml.")
 
     # --- 13xx: interrupted -------------------------------------------------------------------------------------------
     INTERRUPTED = (

@@ -438,25 +438,30 @@ _QUANTITIES = {
     Feedback.DEMAND: "the reported torque demand", Feedback.POSITION: "the reported position",
 }
 _ALL = tuple(Feedback)
+_ROW_OF = {Feedback.SPEED: 116, Feedback.TORQUE: 118, Feedback.POSITION: 119}
+"""Row of the fault table for a quantity that is reported wrong. The torque demand has none."""
 
 
 def _of_value(signal: Feedback, words: str, way: _QuantityDistortion) -> ReportFault:
+    row = 117 if (signal, way.name) == (Feedback.SPEED, "scale") else _ROW_OF.get(signal, 0)
     return ReportFault(f"{signal.value}-{way.name}", f"{words} {way.text}",
-                       lambda value: OfValues((signal,), lambda: way.make(value)), way.value, way.takes)
+                       lambda value: OfValues((signal,), lambda: way.make(value)), way.value, way.takes, row)
 
 
 def _of_sensor(way: _QuantityDistortion) -> ReportFault:
     return ReportFault(f"sensor-{way.name}", f"the drive's own speed sensor {way.text}; control and position follow it",
-                       lambda value: OfSensor(lambda: way.make(value)), way.value, way.takes)
+                       lambda value: OfSensor(lambda: way.make(value)), way.value, way.takes, 115)
 
 
 def _of_words(name: str, summary: str, *words: tuple[Feedback, Callable[[], Word]]) -> ReportFault:
-    return ReportFault(name, summary, lambda _: OfWords(tuple((signal, make()) for signal, make in words)))
+    row = 120 if len(words) == len(_ALL) else _ROW_OF.get(words[0][0], 0)
+    return ReportFault(name, summary, lambda _: OfWords(tuple((signal, make()) for signal, make in words)), row=row)
 
 
 def _of_stage(name: str, summary: str, make: Callable[[str], PowerStage], value: str = "",
               takes: str = "") -> ReportFault:
-    return ReportFault(name, summary, lambda text: OfStage(make(text)), value, takes)
+    row = 0 if name == "torque-constant" else 121
+    return ReportFault(name, summary, lambda text: OfStage(make(text)), value, takes, row)
 
 
 _ROWS = (

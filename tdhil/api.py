@@ -269,7 +269,7 @@ def run(
     chosen, connection, peer = _peer(drive, {name: one for name, one in asked.items() if one is not None})
     request = RunRequest.of(chosen, connection, peer, drive.rig, overrides=Overrides.of(asked),
                             operator=details.operator, note=details.note,
-                            real_time_priority=bool(details.real_time_priority))
+                            real_time_priority=bool(details.real_time_priority), expect=details.expect)
     session = RunSession(request, _operator_interface(request, confirm))
     try:
         outcome = session.move(stop)

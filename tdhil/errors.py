@@ -62,6 +62,7 @@ class ExitCode(IntEnum):
     NOT_IDENTIFIABLE = 9        # not identifiable, or the model was rejected
     NOTHING_RECOVERABLE = 10    # nothing recoverable in a log
     TUNING_REFUSED = 11         # the requested gains cannot be recommended
+    NOT_PASSED = 12             # a rehearsal or an acceptance did not pass
     INTERRUPTED = 130           # Ctrl-C (SIGINT)
     TERMINATED = 143            # SIGTERM, SIGHUP, SIGQUIT (Ctrl-\), SIGTSTP (Ctrl-Z)
 

@@ -329,7 +329,7 @@ KINDS: Kinds[Misbehaviour] = Kinds({
     "fault-at-start": FaultKind(30, "the drive is in fault when the host comes", plain(drive_fault)),
     "stuck-state": FaultKind(31, "the control word is ignored", plain(stuck)),
     "mode-not-followed": FaultKind(32, "the drive stays with speed or torque as it is", plain(mode_kept)),
-    "mode-lost": FaultKind(88, "the drive goes over to regulating speed by itself, and stays there",
+    "mode-lost": FaultKind(82, "the drive goes over to regulating speed by itself, and stays there",
                            plain(mode_lost)),
     "sto": FaultKind(33, "safe torque off: the shaft coasts, and nothing enables the drive",
                      plain(safe_torque_off)),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tdhil.buses import Connection
     from tdhil.config import Rig, RunOptions
     from tdhil.runner import RunOutcome
-    from tdhil.session import Ending, RunRequest, RunSession
+    from tdhil.session import Ending, Rehearsal, RunRequest, RunSession
     from tdhil.soft_torque import EvaluationCase
 
 
@@ -122,6 +122,7 @@ def run_with(
     request = RunRequest.of(
         options, connection, peer, rig, overrides=Overrides.of(vars(namespace)), operator=details.operator,
         note=details.note, real_time_priority=bool(details.real_time_priority), evaluation=evaluation,
+        expect=details.expect,
     )
     if evaluation is None and (said := say_before(options, rig, connection.profile, simulated)) is not None:
         console.print(said, style="yellow", markup=False)
@@ -166,7 +167,7 @@ def _finish(
         outcome = session.move(ending.request)
         document: dict[str, Any] | None = None
         if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
-            code = _failed(outcome, str(session.path), options.json, console)
+            code = _failed(outcome, str(session.path), options.json, console, session.rehearsal)
         else:
             with console.status("identifying …") if console.is_terminal else nullcontext():
                 found = session.conclude()
@@ -193,7 +194,9 @@ def _finish(
     return code
 
 
-def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> int:
+def _failed(
+    outcome: RunOutcome, path: str, as_json: bool, console: Console, rehearsal: Rehearsal | None
+) -> int:
     """Print the first cause, the outcome of the stop, and the path of the log."""
     import traceback
 
@@ -216,6 +219,10 @@ def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> 
         code = ExitCode.STOP_NOT_CONFIRMED
     if stop is None or stop.confirmed:
         console.print(f"tdhil: {said}", markup=False, soft_wrap=True)
+    if rehearsal is not None:
+        for line in rehearsal.lines:
+            console.print(f"tdhil: {line}", markup=False, soft_wrap=True)
+        code = ExitCode(rehearsal.exit_code(int(code)))
     console.print(f"tdhil: log: {path} (tdhil replay {path})", markup=False, soft_wrap=True)
     if as_json:
         document = {
@@ -227,7 +234,7 @@ def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> 
                 for stage in outcome.stages
             ],
             "log": path,
-        }
+        } | ({} if rehearsal is None else {"rehearsal": rehearsal.plain()})
         print(json.dumps(document, ensure_ascii=False, indent=2))  # noqa: T201
     return int(code)
 

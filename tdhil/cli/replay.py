@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import SHARE, TIME, TORQUE
 from tdhil.cli.arguments import add_option, add_settings, amount, settings_in
 from tdhil.cli.results import print_result, save_report
-from tdhil.config import OPTION
+from tdhil.config import OPTION, expectations_in, expectations_of
 from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.session import (
     conclude_evaluation,
@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="the result with pictures in one file: report.html, or report.pdf on A4")
     add_option(parser, OPTION["operator"], help="name of the operator, for the report (default: from the log)")
     add_option(parser, OPTION["note"], help="remark for the report (default: from the log)")
+    add_option(parser, OPTION["expect"])
     add_settings(parser, "the run's")
     parser.add_argument("--torque-calibration", type=Path, metavar="calibration.json",
                         help="file of tdhil calibrate torque: every torque in calibrated N·m (default: as the log has)")
@@ -79,7 +80,7 @@ def run(namespace: argparse.Namespace) -> int:
         from tdhil.report import check_report_path
 
         check_report_path(namespace.report, path)
-    recorded = read_recorded(namespace, path).with_said(_said(namespace))
+    recorded = _expecting(namespace, read_recorded(namespace, path).with_said(_said(namespace)))
     return _evaluation(namespace, recorded) if is_evaluation(recorded.configuration) else _identify(namespace, recorded)
 
 
@@ -157,6 +158,16 @@ def _log(namespace: argparse.Namespace) -> Path:
                          entry=MessageCode.LOG_NEEDED)
     log: Path = namespace.log
     return log
+
+
+def _expecting(namespace: argparse.Namespace, recorded: RunRecord) -> RunRecord:
+    """Return the record with the expected values of the command line, each in place of that of the run."""
+    if not namespace.expect:
+        return recorded
+    both = (*expectations_in(recorded.configuration), *expectations_of({}, namespace.expect))
+    found = {one.name: one for one in both}
+    return replace(recorded, configuration={**recorded.configuration,
+                                            "acceptance": [asdict(one) for one in found.values()]})
 
 
 def _said(namespace: argparse.Namespace) -> dict[str, str]:

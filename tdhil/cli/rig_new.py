@@ -6,6 +6,9 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import Final
+
+from profiles import visible
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,12 +32,25 @@ def run(namespace: argparse.Namespace) -> int:
     from tdhil.cli.scan import blank_rig, to_fill_in, write_new
 
     path: Path = namespace.file
+    name = namespace.name or _asked()
     profile = load_profile(namespace.profile)
     named = namespace.profile
     if named.endswith((".yaml", ".yml")):
         named = Path(os.path.relpath(named, path.parent)).as_posix()      # relative to the folder of rig.yaml
-    write_new(path, blank_rig(profile, named, namespace.load, namespace.name))
+    write_new(path, blank_rig(profile, named, namespace.load, name))
     print(f"{path}: written. Fill these in; until then a real drive does not move:", file=sys.stderr)  # noqa: T201
-    for line in to_fill_in(profile, namespace.load, namespace.name):
+    for line in to_fill_in(profile, namespace.load, name):
         print(f"  {line}", file=sys.stderr)  # noqa: T201
     return 0
+
+
+def _asked() -> str | None:
+    """Ask for the rig's name at a terminal. None without an answer: the file then has a blank."""
+    if sys.stdin is None or not sys.stdin.isatty():
+        return None
+    print("Name of this rig, such as bench 3: ", end="", file=sys.stderr, flush=True)  # noqa: T201
+    return visible(sys.stdin.readline().strip())[:_LONGEST_NAME] or None
+
+
+_LONGEST_NAME: Final = 200
+"""Longest name of a rig, characters, as in the schema of rig.yaml."""

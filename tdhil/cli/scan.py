@@ -36,6 +36,7 @@ _WORDS = {"true", "false", "null", "yes", "no", "on", "off", "y", "n", "~", ".in
 
 def _named(name: str | None) -> list[str]:
     return ["# The rig's own name: results of one name are one history (tdhil trend).",
+            "# A real drive does not move without it.",
             "#name:    # such as bench 3" if name is None else f"name: {scalar(name)}"]
 
 
@@ -100,7 +101,7 @@ def to_fill_in(profile: Profile, load: str, name: str | None = None) -> list[str
     """Return what a run on a real drive needs besides."""
     found = [f"limits: {', '.join(_LIMITS)}", f"the drive's address: {bus_named(profile.bus).to_fill_in}"]
     if name is None:
-        found.append("name: without one tdhil trend does not follow this rig")
+        found.append("name: the rig's own name, such as bench 3")
     if load == "string":
         found.append(f"{', '.join(_STRING)}: without them the file is refused")
     if doubtful(profile):

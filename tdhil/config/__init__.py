@@ -10,7 +10,7 @@ if TYPE_CHECKING:
         values_of as values_of, with_keywords as with_keywords,
     )
     from tdhil.config.options import (
-        ASKED_AGAIN as ASKED_AGAIN, OPTION as OPTION, OPTIONS as OPTIONS,
+        ASKED_AGAIN as ASKED_AGAIN, CLOCKS as CLOCKS, OPTION as OPTION, OPTIONS as OPTIONS,
         Topic as Topic, Option as Option,
         Origin as Origin, Overrides as Overrides, RunDetails as RunDetails, RunOptions as RunOptions,
         Setting as Setting, form_options as form_options,
@@ -21,19 +21,28 @@ if TYPE_CHECKING:
         has_plateaus as has_plateaus, imported as imported, load as load,
         told_before_echo as told_before_echo,
     )
-    from tdhil.config.resolution import check_values as check_values, resolve as resolve
+    from tdhil.config.acceptance import (
+        ACCEPTED_QUANTITIES as ACCEPTED_QUANTITIES, Expectation as Expectation, expectations_in as expectations_in,
+        expectations_of as expectations_of,
+    )
+    from tdhil.config.resolution import (
+        check_values as check_values, resolve as resolve, wrong_values as wrong_values,
+    )
     from tdhil.config.rig import (
         DriveData as DriveData, Limits as Limits, Registered as Registered, Rig as Rig,
         load_rig as load_rig, parse_rig as parse_rig,
-        require_limits as require_limits, rig_model as rig_model, simulated_default_rig as simulated_default_rig,
+        require_limits as require_limits, require_name as require_name,
+        rig_model as rig_model, simulated_default_rig as simulated_default_rig,
     )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "keywords": "OF_THE_RESULT OF_THE_RUN OF_THE_SIMULATOR values_of with_keywords",
-        "options": "ASKED_AGAIN OPTION OPTIONS Topic Option Origin Overrides RunDetails RunOptions Setting "
+        "options": "ASKED_AGAIN CLOCKS OPTION OPTIONS Topic Option Origin Overrides RunDetails RunOptions Setting "
                    "form_options",
         "registry": "BUSES DEFAULT_BUS DEFAULT_EXCITATION EXCITATIONS MODELS SPEED_UNIT_TOLERANCE has_plateaus "
                     "imported load told_before_echo",
-        "resolution": "check_values resolve",
-        "rig": "DriveData Limits Registered Rig load_rig parse_rig require_limits rig_model simulated_default_rig",
+        "acceptance": "ACCEPTED_QUANTITIES Expectation expectations_in expectations_of",
+        "resolution": "check_values resolve wrong_values",
+        "rig": "DriveData Limits Registered Rig load_rig parse_rig require_limits require_name rig_model "
+               "simulated_default_rig",
     })

@@ -465,6 +465,11 @@ class RunDetails(_Said):
         form=Form("Rehearse a fault", ("simulated",), hint="sto@hold+2s"),
         help="rehearse a fault of the embedded rig, such as sto@hold+2s; 'list' prints all of them",
     )
+    expect: tuple[str, ...] = option(
+        "--expect", group=Topic.RESULT, default=(), metavar="NAME=VALUE±TOL", api=True,
+        help="accept the result only if it agrees with this value, such as 'inertia=104±5%'; names as in `acceptance:` "
+             "of rig.yaml",
+    )
     real_time_priority: bool | None = option(
         "--real-time-priority", group=Topic.CYCLE, api=True,
         help="real-time priority for the control loop, and locked memory, if the system allows it",

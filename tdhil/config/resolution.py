@@ -61,6 +61,23 @@ def _joined(option: Option, given: Mapping[str, Any], rig: Rig | None) -> Settin
 
 def _check(given: Mapping[str, Any]) -> None:
     """Check the rules of rig.yaml, and name the flags in the error."""
+    data, flags = _as_in_rig(given)
+    check_values(Rig, data, flags)
+
+
+def wrong_values(given: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return every value that rig.yaml would not accept either, as name of the option and message."""
+    data, flags = _as_in_rig({name: tuple(one) if isinstance(one, list) else one for name, one in given.items()})
+    name_of = {option.flag: option.name for option in RESOLVED}
+    try:
+        Rig.model_validate(data)
+    except ValidationError as error:
+        return [(name_of.get(flags.get(path, ""), ""), text) for path, text in messages_of(error, data, Rig)]
+    return []
+
+
+def _as_in_rig(given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[tuple[str | int, ...], str]]:
+    """Return the values at their places in rig.yaml, and the flag of each place."""
     data: dict[str, Any] = {}
     flags: dict[tuple[str | int, ...], str] = {}
     for option in RESOLVED:
@@ -68,7 +85,7 @@ def _check(given: Mapping[str, Any]) -> None:
             *section, key = option.at.split(".")
             (data.setdefault(section[0], {}) if section else data)[key] = given[option.name]
             flags[tuple(option.at.split("."))] = option.flag
-    check_values(Rig, data, flags)
+    return data, flags
 
 
 def check_values(model: type[BaseModel], data: Mapping[str, Any], flags: Mapping[tuple[str | int, ...], str]) -> None:

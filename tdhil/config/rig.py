@@ -41,6 +41,7 @@ from profiles import (
     one_of,
     parse_with_lines,
 )
+from tdhil.config.acceptance import ACCEPTED_QUANTITIES, Expectation
 from tdhil.config.options import CLOCKS, OPTIONS, Option, Topic
 from tdhil.config.registry import BUSES, RegistryEntry, imported, names
 
@@ -278,7 +279,10 @@ class Rig(_Options):
 
     never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
-    name: str | None = Field(default=None, min_length=1, max_length=200, description="name of the rig, in reports")
+    name: str | None = Field(
+        default=None, min_length=1, max_length=200,
+        description="name of the rig in reports and histories; required unless the drive is simulated",
+    )
     limits: Limits | None = Field(default=None, description="required unless the drive is simulated")
     gear: Gear = Gear()
     load: Annotated[Load, BeforeValidator(_load_of)] = Load()
@@ -287,6 +291,9 @@ class Rig(_Options):
     allow_reverse: bool = Field(default=False, description="allow reverse rotation; it can unscrew tool joints")
     drive_data: DriveData = DriveData()
     expected: Expected = Expected()
+    acceptance: dict[str, Annotated[str, Field(max_length=80)]] = Field(
+        default={}, description="expected values with tolerances, such as inertia: 104 ± 5 %; names:"
+        f" {', '.join(ACCEPTED_QUANTITIES)}")
     reference_inertia_kg_m2: Inertia | None = Field(default=None, description="kg·m² at the motor; shown beside J")
     run: RunSection = RunSection()
     service: Service = Service()
@@ -298,6 +305,8 @@ class Rig(_Options):
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
         """Return missing keys of a string, and limits that contradict other keys."""
+        asked = values.get("acceptance")
+        wrong = list(_wrong_expectations(asked)) if isinstance(asked, Mapping) else []
         load = _load_of(values.get("load"))
         is_string = isinstance(load, Mapping) and load.get("kind") == "string"
         findings = [
@@ -314,7 +323,7 @@ class Rig(_Options):
             findings.append(("limits.speed_min_rad_s", "below 0 the shaft turns backwards: needs allow_reverse: true"))
         if rate_hz and watchdog is not None and watchdog * rate_hz < 5:
             findings.append(("limits.watchdog_s", f"must span at least 5 cycles ({5 / rate_hz:g} s at rate_hz)"))
-        return findings
+        return findings + wrong
 
     def line(self, dotted: str) -> int:
         """Return the line in rig.yaml of a key such as ``limits.torque_nm``; 0 if it is not there."""
@@ -347,6 +356,14 @@ class Rig(_Options):
     def folder(self) -> Path:
         """Return the folder in which relative paths of rig.yaml start."""
         return Path(self._file).parent
+
+
+def _wrong_expectations(asked: Mapping[str, Any]) -> Iterator[Finding]:
+    for name, text in asked.items():
+        try:
+            Expectation.of(str(name), str(text))
+        except ValueError as error:
+            yield f"acceptance.{name}", str(error)
 
 
 def rig_model() -> type[Rig]:
@@ -390,6 +407,17 @@ def require_limits(rig: Rig | None) -> Limits:
     step = f"Add a section limits: with {keys} (docs: rig.yaml)" + ("" if file else ", and name the file with --rig")
     raise PreflightRefused("no machine limits for a drive that is not simulated", where=where, next_step=step,
                            entry=MessageCode.NO_LIMITS)
+
+
+def require_name(rig: Rig | None) -> str:
+    """Return the rig's name. Raises PreflightRefused: a result of a real drive belongs to a rig."""
+    if rig is not None and rig.name is not None:
+        return rig.name
+    raise PreflightRefused(
+        "no name for the rig of a drive that is not simulated",
+        where="rig.yaml" if rig is None or not rig._file else rig._file,
+        next_step="Add a line with the rig's own name, such as name: bench 3. Results of one name and one drive are"
+                  " one history", entry=MessageCode.NO_RIG_NAME)
 
 
 _SIMULATED_LIMITS = Limits(

@@ -5,12 +5,16 @@ from typing import TYPE_CHECKING
 from profiles import lazy_names
 
 if TYPE_CHECKING:
+    from tdhil.report.acceptance import AcceptanceVerdict as AcceptanceVerdict, acceptance_of as acceptance_of
+    from tdhil.report.blocks import shown_date as shown_date
     from tdhil.report.card import (
         card_html as card_html, card_text as card_text, inertia_text as inertia_text, minutes as minutes,
-        print_card as print_card, rounded as rounded,
+        print_card as print_card, rounded as rounded, with_interval as with_interval,
     )
     from tdhil.report.console import PlainConsole as PlainConsole, stderr_console as stderr_console
-    from tdhil.report.document import SIMULATED as SIMULATED, result_document as result_document
+    from tdhil.report.document import (
+        SIMULATED as SIMULATED, rehearsal_of as rehearsal_of, result_document as result_document, text_of as text_of,
+    )
     from tdhil.report.evaluation import (
         evaluation_document as evaluation_document, evaluation_report as evaluation_report,
         print_evaluation as print_evaluation, write_evaluation_report as write_evaluation_report,
@@ -54,9 +58,11 @@ if TYPE_CHECKING:
     )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
-        "card": "card_html card_text inertia_text minutes print_card rounded",
+        "acceptance": "AcceptanceVerdict acceptance_of",
+        "blocks": "shown_date",
+        "card": "card_html card_text inertia_text minutes print_card rounded with_interval",
         "console": "PlainConsole stderr_console",
-        "document": "SIMULATED result_document",
+        "document": "SIMULATED rehearsal_of result_document text_of",
         "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",
         "frequency_response": "draw_bode draw_faults draw_responses print_responses response_sentences save_responses",
         "html": "ShownPicture check_report_path pictures_in write_report",

@@ -13,8 +13,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from tdhil.recording import Recording
+from tdhil.report.acceptance import acceptance_rows
 from tdhil.report.card import COMPLIANT, estimate_text, inertia_text, minutes, plus_minus, rounded, sentence
-from tdhil.report.document import coded_reason, coded_warnings, marks
+from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows
 from tdhil.report.labels import ACCELERATION_REGRESSION, ESTIMATES, MOMENTUM_CROSS_CHECK, UNCERTAINTY_BUDGET
 
 if TYPE_CHECKING:
@@ -133,14 +134,14 @@ def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
 
 
 def shown_date(text: str | None) -> str:
-    """``2026-11-22 05:17 UTC+01:00``; '' for none."""
+    """Return a time as every page and report shows it: ``2026-11-22 05:17:03 UTC+01:00``; '' for none."""
     if not text:
         return ""
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:
         return ""
-    return f"{moment:%Y-%m-%d %H:%M} {moment.tzname() or ''}".strip()
+    return f"{moment:%Y-%m-%d %H:%M:%S} {moment.tzname() or ''}".strip()
 
 
 def _answer(document: Part) -> AnswerBox:
@@ -170,6 +171,11 @@ def _answer(document: Part) -> AnswerBox:
 def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[ReportSection]:
     from tdhil.report.plots import draw_budget, draw_friction, draw_lines, draw_opinions, draw_run
 
+    if rehearsed := rehearsal_rows(document.get("rehearsal")):
+        yield ReportSection("Rehearsal", (Pairs(tuple(rehearsed)),))
+    if accepted := acceptance_rows(document.get("acceptance")):
+        signature = ("accepted by", "name, date, signature: ______________________________")
+        yield ReportSection("Acceptance", (Pairs((*accepted, signature)),))
     yield ReportSection("The run", (Pairs(tuple(_run_rows(document, recording))),))
     if len(recording.time_s):
         picture = Picture(partial(draw_run, recording=recording), 2.9, "Reported values, not smoothed. Green: "

@@ -12,8 +12,9 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from tdhil.report.acceptance import acceptance_rows
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import coded_reason, coded_warnings, marks
+from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows
 from tdhil.report.labels import ACCELERATION_REGRESSION, ESTIMATES, MOMENTUM_CROSS_CHECK, UNCERTAINTY_BUDGET
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -213,6 +214,9 @@ _VERDICT_STYLE = {
 }
 
 
+_TEST_STYLE = {"pass": "bold green", "fail": "bold red", "inconclusive": "yellow", "cannot tell": "yellow"}
+
+
 def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
     """A panel of the result document; ``width``: columns that there are."""
     narrow = width < _NARROW
@@ -242,8 +246,10 @@ def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
         if stage["outcome"] == "skipped":
             rows.add_row(f"stage {stage['name']}", f"skipped: {stage.get('detail', '')}")
     rows.add_row("model", document["model"])
-    if document.get("rehearsed_faults"):
+    if document.get("rehearsed_faults") and not document.get("rehearsal"):
         rows.add_row("rehearsed", ", ".join(document["rehearsed_faults"]))
+    for title, text in (*rehearsal_rows(document.get("rehearsal")), *acceptance_rows(document.get("acceptance"))):
+        rows.add_row(title, Text(text, style=_TEST_STYLE.get(text, "")))
     body: list[RenderableType] = [rows, Text()]
     if inertia is not None and document["budget"]:
         body += [budget_table(document["budget"], inertia["value"], not narrow), Text()]

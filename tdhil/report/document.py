@@ -9,8 +9,10 @@ from typing import Any
 
 from profiles import MessageCode, entry_of, with_code
 from tdhil.calibration import CalibrationUnusable, StoredCalibration
+from tdhil.config import expectations_in
 from tdhil.estimation import Identification, InertiaEstimate
 from tdhil.recording import Recording
+from tdhil.report.acceptance import acceptance_of
 from tdhil.version import __version__
 
 SIMULATED = "SIMULATED"
@@ -22,6 +24,34 @@ def rehearsed_faults(run: Mapping[str, Any]) -> list[str]:
     """Return the faults that were scripted in this run, as the user wrote them; ``run``: the log's configuration."""
     found = run.get("faults")
     return [str(one)[:200] for one in found] if isinstance(found, list | tuple) else []
+
+
+def rehearsal_of(run: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the verdict on the rehearsed faults in the log's configuration; None if it has none that can be read."""
+    found = run.get("rehearsal")
+    if not isinstance(found, Mapping) or not isinstance(found.get("faults"), list | tuple):
+        return None
+    rows = [one for one in found["faults"] if isinstance(one, Mapping)]
+    return {
+        "verdict": text_of(found.get("verdict")) or "inconclusive",
+        "seen": text_of(found.get("seen")) or "",
+        "faults": [
+            {name: text_of(one.get(name)) or "" for name in ("fault", "required", "verdict")}
+            | {"row": _count(one.get("row")), "codes": [_count(code) for code in one.get("codes") or ()]}
+            for one in rows
+        ],
+    }
+
+
+def rehearsal_rows(rehearsal: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """Return the verdict on the rehearsed faults as names and texts."""
+    if rehearsal is None:
+        return []
+    required = [
+        f"{one['fault']}: {one['verdict']}. Required ({'row ' + str(one['row']) if one['row'] else 'any fault'}, exit"
+        f" {', '.join(map(str, one['codes']))}): {one['required']}" for one in rehearsal["faults"]
+    ]
+    return [("rehearsal", rehearsal["verdict"]), *(("fault", one) for one in required), ("seen", rehearsal["seen"])]
 
 
 def marks(document: Mapping[str, Any]) -> str:
@@ -49,6 +79,7 @@ def result_document(
         "inertia_main_shaft_kg_m2": _at_main_shaft(found.inertia, recording.gear_ratio),
         "gear_ratio": recording.gear_ratio,
         "reference_inertia_kg_m2": run.get("reference_inertia_kg_m2"),
+        "torque_limit_nm": recording.torque_limit_nm,
         "viscous_nm_s_rad": _estimate(found.viscous_nm_s_rad),
         "coulomb_nm": _estimate(found.coulomb_nm),
         "speed_lag_s": _estimate(found.speed_lag_s),
@@ -72,6 +103,7 @@ def result_document(
         "warning_codes": [entry_of(one, MessageCode.RESULT_WARNING).code for one in found.warnings],
         "simulated": recording.simulated,
         "rehearsed_faults": rehearsed_faults(run),
+        "rehearsal": rehearsal_of(run),
         "complete": recording.complete,
         "ended": _mapping(run.get("ended")),
         **provenance(run),
@@ -88,6 +120,7 @@ def result_document(
     }
     if found.paper is not None:
         document["paper"] = asdict(found.paper.stepped) | {"raw_rate": asdict(found.paper.raw_rate)}
+    document["acceptance"] = acceptance_of(expectations_in(run), document)
     cleaned = _finite(document)
     assert isinstance(cleaned, dict)
     return cleaned

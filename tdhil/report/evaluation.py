@@ -14,7 +14,7 @@ from rich.text import Text as Words
 from tdhil.recording import FloatArray, Recording
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, shown_date
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import SIMULATED, provenance
+from tdhil.report.document import SIMULATED, provenance, rehearsal_of, rehearsal_rows, rehearsed_faults
 from tdhil.report.html import sha256_of, write_blocks
 from tdhil.report.plots import DARK, OURS, QUIET, envelope
 from tdhil.soft_torque import COLUMNS, RPM, Phase
@@ -65,6 +65,8 @@ def evaluation_document(
         f"{bit.describe()}, viscous {case.string.bottom_viscous_nm_s_rad:g} N·m·s/rad",
         "gear_ratio": recording.gear_ratio,
         "simulated": recording.simulated,
+        "rehearsed_faults": rehearsed_faults(run),
+        "rehearsal": rehearsal_of(run),
         "complete": recording.complete,
         **provenance(run),
         "log": log,
@@ -97,6 +99,7 @@ def _damping(part: Part) -> str:
 
 def _rows(document: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "why", document["reason"]
+    yield from rehearsal_rows(document.get("rehearsal"))
     critical, predicted = document["critical_rpm"], document["predicted_critical_rpm"]
     told = f"tune: {predicted['value']:.0f} ({predicted['low']:.0f} to {predicted['high']:.0f})"
     yield "critical speed", (

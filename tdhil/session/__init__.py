@@ -41,6 +41,12 @@ if TYPE_CHECKING:
         find_by_known_pipe as find_by_known_pipe, find_by_reference as find_by_reference,
         known_pipe_of as known_pipe_of, log_of_calibration as log_of_calibration,
     )
+    from tdhil.session.pace import PaceMeasured as PaceMeasured, measure_pace as measure_pace
+    from tdhil.session.rehearsal import (
+        ANY_FAULT as ANY_FAULT, REQUIRED as REQUIRED, Rehearsal as Rehearsal, RehearsalVerdict as RehearsalVerdict,
+        RequiredReaction as RequiredReaction, judge_rehearsal as judge_rehearsal,
+        required_reaction as required_reaction,
+    )
     from tdhil.session.run_record import (
         RunRecord as RunRecord, ByKeyword as ByKeyword, is_log as is_log, read as read,
         require_file as require_file,
@@ -81,6 +87,8 @@ else:
         "log_files": "check_different_files check_log_path is_live make_room",
         "open_drive": "opened_drive plan_peer with_faults",
         "overrides": "UNVERIFIED_FLAG check_unverified doubtful is_accepted",
+        "pace": "PaceMeasured measure_pace",
+        "rehearsal": "ANY_FAULT REQUIRED Rehearsal RehearsalVerdict RequiredReaction judge_rehearsal required_reaction",
         "run_record": "RunRecord ByKeyword is_log read require_file",
         "run_session": "OperatorInterface RunRequest RunSession",
         "speed_calibration": "SECONDS_SD SPEED_REL_SD TURNS_SD TurnsCount add_speed_calibration check_speed_place "

@@ -11,6 +11,7 @@ from tdhil.config import ASKED_AGAIN
 from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.estimation import Identification, Verdict
 from tdhil.recording import Recording
+from tdhil.session.rehearsal import code_with
 from tdhil.session.stored_calibration import apply_calibration
 
 TORQUE_SCALE = "torque scale"
@@ -93,7 +94,18 @@ def conclude(
     measured = identification.impedance
     stands = (identification if measured is None else measured).verdict in (Verdict.VALID, Verdict.VALID_WIDE)
     document = result_document(identification, recording, run, log)
-    return Conclusion(identification, document, ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE)
+    code = code_with(document["rehearsal"], _accepted(document["acceptance"], stands=stands))
+    return Conclusion(identification, document, ExitCode(code))
+
+
+def _accepted(acceptance: Mapping[str, Any] | None, *, stands: bool) -> ExitCode:
+    """Return the exit code of the result: not passed, if it contradicts what is expected; else whether it stands."""
+    from tdhil.report import AcceptanceVerdict
+
+    verdict = None if acceptance is None else acceptance["verdict"]
+    if verdict == AcceptanceVerdict.FAIL:
+        return ExitCode.NOT_PASSED
+    return ExitCode.OK if stands and verdict != AcceptanceVerdict.CANNOT_TELL else ExitCode.NOT_IDENTIFIABLE
 
 
 def _dated(found: Identification, day: str) -> Identification:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tdhil.errors import ExitCode, LogError, MessageCode, UsageError
+from tdhil.session.rehearsal import code_with
 
 if TYPE_CHECKING:
     from tdhil.recording import FloatArray, Recording
@@ -146,4 +147,5 @@ def conclude_evaluation(
                        next_step="Repeat the run") from None
     stands = found.outcome in (EvaluationOutcome.AS_PREDICTED, EvaluationOutcome.DIFFERS)
     document = evaluation_document(found, case, recording, run, log)
-    return EvaluationConclusion(document, ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE)
+    code = code_with(document["rehearsal"], ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE)
+    return EvaluationConclusion(document, ExitCode(code))

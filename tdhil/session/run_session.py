@@ -7,15 +7,16 @@ The command line and the Python API both use it, so that guard, stop and confirm
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from tdhil.buses import Connection, PeerPlan
-from tdhil.config import Overrides, Rig, RunOptions
-from tdhil.errors import LogError, TdhilError
+from tdhil.config import Expectation, Overrides, Rig, RunOptions, expectations_of, require_name
+from tdhil.errors import ExitCode, LogError, TdhilError
 from tdhil.recording import FRAME_CHANNELS, RunLog, RunWriter
 from tdhil.runner import Display, ExcitationRequest, Idle, Runner, RunOutcome, StopRequest, Task
 from tdhil.session.dry_run import refuse_hopeless
@@ -23,6 +24,7 @@ from tdhil.session.log_files import LogPlace
 from tdhil.session.open_drive import opened_drive
 from tdhil.session.overrides import accepted_lines, note, require_accepted
 from tdhil.session.real_time import real_time_priority
+from tdhil.session.rehearsal import Rehearsal, judge_rehearsal
 from tdhil.session.stop_signals import stop_on_signals
 from tdhil.session.stored_calibration import KEPT, calibration_of_rig, refuse_another_drive
 from tdhil.session.task import bench_of, excitation_request, facts, machine_limits, suited
@@ -49,18 +51,21 @@ class RunRequest:
     real_time_priority: bool = False
     evaluation: EvaluationCase | None = None
     """Virtual string in stage 5, in place of an excitation."""
+    acceptance: tuple[Expectation, ...] = ()
+    """Expected values that decide whether the result is accepted."""
 
     @classmethod
     def of(
         cls, options: RunOptions, connection: Connection, peer: PeerPlan, rig: Rig | None, *, overrides: Overrides,
         operator: str | None = None, note: str | None = None, real_time_priority: bool = False,
-        evaluation: EvaluationCase | None = None,
+        evaluation: EvaluationCase | None = None, expect: Sequence[str] = (),
     ) -> RunRequest:
         """Return the request, with limits that suit the plant. Raises PreflightRefused for motion beyond the limits."""
         bench = suited(rig, peer.plant)
         if evaluation is None:
             refuse_hopeless(options, bench, connection.profile)
-        return cls(options, connection, peer, bench, overrides, operator, note, real_time_priority, evaluation)
+        return cls(options, connection, peer, bench, overrides, operator, note, real_time_priority, evaluation,
+                   expectations_of({} if bench is None else bench.acceptance, expect))
 
 
 class OperatorInterface(Protocol):
@@ -103,6 +108,8 @@ class RunSession:
             operator_interface.warn(f"another run writes {place.wanted}: the log of this run is {place.path}")
         self._older_told = False
         self._outcome: RunOutcome | None = None
+        self.rehearsal: Rehearsal | None = None
+        """Verdict on the rehearsed faults, once the run has ended; None without faults."""
         said = {"operator": request.operator, "note": request.note}
         self.log = RunLog(writer, configuration(request) | said)
 
@@ -155,6 +162,8 @@ class RunSession:
                 say=operator_interface.say,
                 confirm_speed=operator_interface.confirm_speed,
             ).run()
+        if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
+            self._judge()
         for fault in peer.never_came:
             with suppress(LogError):
                 log.event(drive.clock.now_s(), "fault", f"--fault {fault} was not triggered")
@@ -172,9 +181,27 @@ class RunSession:
             found = conclude_evaluation(self.log.virtual_string, recording, run, path)
         else:
             found = conclude(recording, run, path)
+        self._judge(found.document, int(found.exit_code))
+        if self.rehearsal is not None:
+            from tdhil.report import rehearsal_of
+
+            plain = rehearsal_of(self.log.run)
+            found = replace(found, document=found.document | {"rehearsal": plain},
+                            exit_code=ExitCode(self.rehearsal.exit_code(int(found.exit_code))))
         with suppress(LogError):  # a log failure must not lose the result; `close` reports it
             self.log.result(found.document)
         return found
+
+    def _judge(self, document: Mapping[str, Any] | None = None, code: int | None = None) -> None:
+        """Judge the rehearsed faults, if any, and write the verdict to the log."""
+        request, outcome = self._request, self._outcome
+        if not request.peer.faults or outcome is None:
+            return
+        other = request.evaluation is not None or request.options.impedance
+        self.rehearsal = judge_rehearsal(request.peer, request.connection.drive, outcome, document, code,
+                                         other_program=bool(other))
+        with suppress(LogError):
+            self.log.configure(rehearsal=self.rehearsal.plain())
 
     def close(self) -> None:
         """Finish the log. Raises LogError; the file has its final name also then."""
@@ -228,6 +255,8 @@ class RunSession:
             accept_wider=overrides.wider_limits,
             accept_speed_unit=overrides.speed_unit,
         )
+        if not identity.simulated:
+            require_name(request.rig)
         asked = excitation_request(request.options, bench)
         if request.evaluation is not None:
             asked = ExcitationRequest(mode="speed" if request.evaluation.own_loop else "torque")
@@ -257,6 +286,7 @@ def configuration(request: RunRequest) -> dict[str, Any]:
         "faults": [fault.text for fault in peer.faults],
         "identify": {"confidence": options.confidence, "tolerance": options.tolerance, "model": options.model},
         "converted": [list(row) for row in rig.conversions] if rig is not None else [],
+        **({"acceptance": [asdict(one) for one in request.acceptance]} if request.acceptance else {}),
         "reference_inertia_kg_m2": None if rig is None else rig.reference_inertia_kg_m2,
     }
 

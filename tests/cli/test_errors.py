@@ -51,7 +51,7 @@ def test_exit_codes(error: BaseException, code: int) -> None:
 
 
 def test_the_table_of_exit_codes() -> None:
-    assert sorted(ExitCode) == [*range(12), 130, 143]
+    assert sorted(ExitCode) == [*range(13), 130, 143]
 
 
 def test_an_attribute_of_an_instance_goes_first() -> None:

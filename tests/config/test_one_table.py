@@ -225,8 +225,8 @@ EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
     "studies/paper/figures.py": ("the paper's own motions", {"sine"}),
     "studies/paper/loop.py": ("the paper's own motions", {"multisine", "sine"}),
     "studies/paper/sweeps.py": ("the paper's own motions", {"sine"}),
-    "service/static/app.js": ("a role, signals of the plots, the key of a sign-off", {
-        "note", "operator", "step", "speed", "torque"}),
+    "service/static/app.js": ("a role, signals of the plots, the key of a sign-off, the clock that a page measures", {
+        "note", "operator", "step", "speed", "torque", "real_time"}),
     "service/static/results.js": ("a rehearsal's request; keys of answers", {
         "fault", "faults", "log", "model", "note", "real_time", "yes"}),
     "service/templates/accounts.html": ("a role", {"operator"}),

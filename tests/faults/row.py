@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from tdhil.session import REQUIRED
+
 HERE = "tests/faults/"
 
 
@@ -14,3 +16,8 @@ class Row:
     codes: str
     tests: tuple[str, ...]
     said: str = ""
+
+
+def must(row):
+    """Return the required reaction to a fault that can be scripted: the product judges a rehearsal by the same text."""
+    return REQUIRED[row].reaction

@@ -17,6 +17,7 @@ from tests.path.path_runs import REAL, Shaft, identify, process
 
 BY_NAME = "--accept-shared-watchdog"
 RIG = (
+    "name: bench 3\n"
     "limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,"
     " watchdog_s: 2.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
 )

@@ -16,6 +16,7 @@ RIG = """
 load: string
 make_up_torque_nm: 29000
 torque_ramp_nm_s: 400
+name: bench 3
 limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,
          watchdog_s: 0.5, probe_torque_nm: 200.0, probe_travel_rad: 3.0}
 """

@@ -18,6 +18,7 @@ pytestmark = pytest.mark.one_worker
 WRITING = {5, 6, 15, 16, 22, 23}
 """Function codes that write (Modbus Application Protocol V1.1b3, section 6)."""
 RIG = """\
+name: bench 3
 modbus: {unit: 1}
 limits:
   speed_min_rad_s: 0.5
@@ -216,6 +217,15 @@ def test_what_was_taken_by_name_stands_in_the_prompt(tmp_path, real):
     assert "watchdog (unverified): this project's own map" in done.err
     kept = read_run(done.log).configuration["unverified"]
     assert [line.split(":")[0] for line in kept] == ["line (likely)", "watchdog (unverified)"]
+
+
+def test_without_a_name_nothing_real_is_moved(tmp_path, real):
+    """A result without a rig belongs to no history; the simulated rig needs none."""
+    (tmp_path / "rig.yaml").write_text(RIG.replace("name: bench 3\n", ""))
+    done = identify(tmp_path, *real, "--yes", "--accept-unverified", "likely", "--accept-unverified", "watchdog")
+    assert (done.code, done.document["error"]["code"]) == (4, "TDH-440")
+    assert "name: bench 3" in done.err and "nothing has moved" in done.err
+    assert [frame for frame in read_frames(done.log) if frame.outgoing and frame.data[0] in WRITING] == []
 
 
 def test_without_limits_nothing_is_moved(tmp_path, real):

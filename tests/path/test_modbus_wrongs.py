@@ -159,8 +159,9 @@ def test_so_no_wrong_of_such_a_setpoint_moves_a_real_shaft_unasked(name, wrong, 
     asked = {f"echoes.{setpoint}" for setpoint in unseen(profile)}
     others = {"likely", *profile.below("unverified")} - asked
     rig = tmp_path / "rig.yaml"
-    rig.write_text("limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, "
-                   "quick_stop_rad_s2: 2.0, probe_torque_nm: 150.0, probe_travel_rad: 3.0}\n", encoding="utf-8")
+    rig.write_text("name: bench 3\nlimits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, "
+                   "time_s: 900.0, quick_stop_rad_s2: 2.0, probe_torque_nm: 150.0, probe_travel_rad: 3.0}\n",
+                   encoding="utf-8")
     done = identify(tmp_path, "--simulate", "--real-time", "--yes", "--profile", name, "--trace", trace, "--rig", rig,
                     *(f"--accept-unverified={one}" for one in others))
     assert done.code == 4, done.err

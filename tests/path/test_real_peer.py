@@ -29,6 +29,7 @@ limits:
   watchdog_s: {WATCHDOG_S}
   probe_torque_nm: 200.0
   probe_travel_rad: 3.0
+name: bench 3
 run: {{excitation: sine, frequency_hz: 0.2}}
 """
 

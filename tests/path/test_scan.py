@@ -33,6 +33,7 @@ QUICK = ("--listen", 0.5)
 def filled(path):
     """The starter file as an engineer would complete it: '#' away, and a value behind each key."""
     text = re.sub(r"^#( *[a-z_0-9]+:)", r"\1", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    text = re.sub(r"^(name:)", r"\1 bench 3", text, flags=re.MULTILINE)
     for name, value in (LIMITS | {"torque_scale_rel_sd": 0.02, "rated_torque_nm": 1000.0}).items():
         text = re.sub(rf"^(  {name}:)", rf"\1 {value}", text, flags=re.MULTILINE)
     text = re.sub(r"^(    [a-z_0-9]+:)", r"\1 1.5", text, flags=re.MULTILINE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
 from pathlib import Path
@@ -135,6 +136,19 @@ def test_a_string_is_refused_until_its_torques_are_there(tmp_path):
     path.write_text(path.read_text().replace("#make_up_torque_nm:", "make_up_torque_nm: 900")
                     .replace("#torque_ramp_nm_s:", "torque_ramp_nm_s: 50"))
     assert load_rig(path).load.kind == "string"
+
+
+@pytest.mark.parametrize(("typed", "name"), [("bench 3\n", "bench 3"), ("\n", None)])
+def test_the_name_is_asked_for_at_a_terminal(tmp_path, monkeypatch, typed, name):
+    class Keyboard(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setattr("sys.stdin", Keyboard(typed))
+    done = tdhil("rig", "new", tmp_path / "rig.yaml", "--load", "none")
+    assert done.code == 0 and "Name of this rig" in done.err
+    assert load_rig(tmp_path / "rig.yaml").name == name
+    assert ("name: the rig's own name" in done.err) is (name is None)
 
 
 def test_what_hangs_on_the_shaft_is_never_guessed(tmp_path):

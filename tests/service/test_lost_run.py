@@ -17,7 +17,7 @@ from tdhil.recording import read_run
 from tdhil.service.run_state import State
 from tests.service.conftest import Service, wait_for
 
-LIMITS = ("limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,"
+LIMITS = ("name: bench 3\nlimits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,"
           " quick_stop_rad_s2: 2.0, watchdog_s: 5.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n")
 
 

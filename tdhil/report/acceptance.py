@@ -1,0 +1,135 @@
+"""Acceptance: each expected value against the identified one, judged by the interval. Pure: it reads the document.
+
+A quantity passes if its whole interval lies within the tolerance, and fails if its interval and the tolerance have no
+value in common. Otherwise the data cannot tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from math import sqrt
+from typing import Any, Final
+
+from profiles import MessageCode, with_code
+from tdhil.config import ACCEPTED_QUANTITIES, Expectation
+
+Part = Mapping[str, Any]
+_WITH_TORQUE: Final = ("inertia", "viscous", "coulomb")
+"""Quantities that a wrong torque scale multiplies by one factor."""
+
+
+class AcceptanceVerdict(StrEnum):
+    """Verdict on one expected value, or on all."""
+
+    PASS = "pass"
+    FAIL = "fail"
+    CANNOT_TELL = "cannot tell"
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """One expected value, and what was identified; None where it was not."""
+
+    name: str
+    label: str
+    unit: str
+    expected: float
+    tolerance: float
+    value: float | None
+    low: float | None
+    high: float | None
+    verdict: AcceptanceVerdict
+    text: str
+
+
+def acceptance_of(expected: Sequence[Expectation], document: Part) -> dict[str, Any] | None:
+    """Return the verdict on all expected values as plain data; None without any."""
+    if not expected:
+        return None
+    rows = tuple(_judged(one, document) for one in expected)
+    found = {one.verdict for one in rows}
+    worst = next(one for one in (AcceptanceVerdict.FAIL, AcceptanceVerdict.CANNOT_TELL, AcceptanceVerdict.PASS)
+                 if one in found)
+    code = MessageCode.ACCEPTANCE_FAILED.code if worst is AcceptanceVerdict.FAIL else ""
+    return {"verdict": worst.value, "code": code, "off": list(_causes(rows)), "quantities": [
+        {**asdict(one), "verdict": one.verdict.value} for one in rows]}
+
+
+def acceptance_rows(acceptance: Part | None) -> list[tuple[str, str]]:
+    """Return it as names and texts."""
+    if acceptance is None:
+        return []
+    return [("acceptance", acceptance["verdict"]), *((one["label"], one["text"]) for one in acceptance["quantities"]),
+            *(("off", with_code(one, acceptance["code"])) for one in acceptance["off"])]
+
+
+def _judged(expected: Expectation, document: Part) -> Accepted:
+    quantity = ACCEPTED_QUANTITIES[expected.name]
+    value, low, high = _identified(expected.name, quantity.at, document)
+    least, most = expected.value - expected.tolerance, expected.value + expected.tolerance
+    wanted = f"expected {expected.value:.5g} ± {expected.tolerance:.3g} {quantity.unit.symbol}"
+    if value is None or low is None or high is None:
+        verdict, seen = AcceptanceVerdict.CANNOT_TELL, "not identified"
+    else:
+        inside, apart = least <= low and high <= most, high < least or most < low
+        verdict = AcceptanceVerdict.PASS if inside else (
+            AcceptanceVerdict.FAIL if apart else AcceptanceVerdict.CANNOT_TELL)
+        seen = f"identified {value:.5g} ({low:.5g} to {high:.5g})"
+    return Accepted(expected.name, quantity.label, quantity.unit.symbol, expected.value, expected.tolerance,
+                    value, low, high, verdict, f"{verdict}: {wanted}, {seen}")
+
+
+def _identified(name: str, at: Iterable[str], document: Part) -> tuple[float | None, float | None, float | None]:
+    """Return value and interval; that of J includes the torque scale. A read value, such as a limit, is exact."""
+    part: Any = document
+    for key in at:
+        part = part.get(key) if isinstance(part, Mapping) else None
+    if isinstance(part, int | float) and not isinstance(part, bool):
+        return float(part), float(part), float(part)
+    if not isinstance(part, Mapping):
+        return None, None, None
+    total = "_total" if name == "inertia" else ""
+    return part.get("value"), part.get(f"low{total}"), part.get(f"high{total}")
+
+
+def _causes(rows: Sequence[Accepted]) -> Iterable[str]:
+    """Yield what is off, in words. One factor in all quantities with torque is one cause: the torque scale."""
+    failed = [one for one in rows if one.verdict is AcceptanceVerdict.FAIL and one.value is not None]
+    named = {one.name for one in failed}
+    ratios = {one.name: _ratio(one) for one in rows if one.name in _WITH_TORQUE and one.value is not None}
+    if len(ratios) == len(_WITH_TORQUE) and {"inertia", "coulomb"} <= named and _one_factor(list(ratios.values())):
+        factor = ratios["inertia"][0]
+        yield (f"everything that comes from the torque is {factor:.3g} times the expected value: another torque scale, "
+               "another rated torque, or another drive")
+        failed = [one for one in failed if one.name not in _WITH_TORQUE]
+    for one in failed:
+        assert one.value is not None
+        told = f"{one.value / one.expected:.3g} times the expected value" if one.expected else f"{one.value:.3g}"
+        yield f"the {one.label} is {told}{_HINTS.get(one.name, '')}"
+
+
+_HINTS: Final = {
+    "inertia": ": another body turns with the shaft, or another gear",
+    "coulomb": ": bearings, seals, brake or a constant load",
+    "viscous": ": lubrication, temperature or fan",
+    "speed-lag": ": the speed filter of the drive has another setting",
+    "torque-lag": ": the torque filter of the drive has another setting",
+    "gain": ": the speed controller of the drive has another gain",
+    "integral-gain": ": the speed controller of the drive has another integral time",
+    "torque-limit": ": the drive or rig.yaml limits the torque elsewhere",
+}
+
+
+def _ratio(one: Accepted) -> tuple[float, float]:
+    """Return identified over expected, and the half-width of its interval."""
+    if not one.expected or one.value is None or one.low is None or one.high is None:
+        return 0.0, float("inf")
+    return one.value / one.expected, 0.5 * (one.high - one.low) / abs(one.expected)
+
+
+def _one_factor(ratios: Sequence[tuple[float, float]]) -> bool:
+    """Return whether all ratios are the same within their intervals; a ratio that says nothing is no proof."""
+    (first, half), *others = ratios
+    return all(abs(one - first) <= sqrt(width**2 + half**2) and width < abs(one - 1.0) + half for one, width in others)

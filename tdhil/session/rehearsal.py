@@ -1,0 +1,270 @@
+"""The verdict on a rehearsed fault: the reaction that the fault table requires, what was seen, pass or fail.
+
+A rehearsal runs on the embedded simulator only, so the true inertia is known. `REQUIRED` is the one place of the
+required reactions of all faults that can be scripted; docs/reference/faults.md is made from it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Final
+
+from profiles import MessageCode, with_code
+from tdhil.buses import PeerPlan, bus_named
+from tdhil.errors import ExitCode, exit_code
+
+if TYPE_CHECKING:
+    from sim_bus import KnownFault, Scripted
+    from tdhil.runner import RunOutcome
+
+
+@dataclass(frozen=True)
+class RequiredReaction:
+    """What a row of the fault table requires. ``codes``: exit codes with which the run may end.
+
+    ``or_covered``: the run may also go on, if the interval of its result covers the true inertia.
+    """
+
+    reaction: str
+    codes: tuple[int, ...]
+    or_covered: bool = False
+
+    @property
+    def words(self) -> str:
+        """Return the reaction without the abbreviations of the table."""
+        return _SHORT.sub(lambda found: _LONG[found[0]], self.reaction)
+
+
+_LONG: Final = {
+    "QS": "stop sequence", "WD": "the drive's own watchdog stops the shaft", "R": "refused before motion",
+    "M": "the degraded part is marked",
+}
+"""Abbreviations of the fault table, in words."""
+_SHORT: Final = re.compile(rf"\b(?:{'|'.join(_LONG)})\b")
+
+
+REQUIRED: Final[Mapping[int, RequiredReaction]] = {
+    12: RequiredReaction("WD", (8,)),
+    17: RequiredReaction("gaps found, uncertainty widens, M", (0, 9)),
+    18: RequiredReaction("found, M", (0, 9)),
+    19: RequiredReaction("age limit, QS", (5, 8)),
+    20: RequiredReaction("QS attempt", (5,)),
+    21: RequiredReaction("abort, never enabled again", (6,)),
+    22: RequiredReaction("abort", (5,)),
+    23: RequiredReaction("QS, code decoded", (6,)),
+    24: RequiredReaction("names object and reason; R", (4,)),
+    25: RequiredReaction("bounded retry, then abort", (5,)),
+    26: RequiredReaction("R; QS in motion", (4, 5, 6, 8)),
+    29: RequiredReaction("R", (4,)),
+    30: RequiredReaction("never reset silently: R", (4,)),
+    31: RequiredReaction("time-out, QS", (6,)),
+    32: RequiredReaction("R; QS where it comes up in motion", (4, 6)),
+    33: RequiredReaction("abort with its own message", (6, 7), or_covered=True),
+    34: RequiredReaction("QS; the drive's own speed limit was set first", (7,)),
+    35: RequiredReaction("QS", (4, 7)),
+    36: RequiredReaction("sign probe, QS", (4,)),
+    38: RequiredReaction("typed error; 6 is retried", (0, 6, 8, 9)),
+    39: RequiredReaction("retry within the watchdog's time, then QS", (0, 8, 9)),
+    40: RequiredReaction("drained and resynchronised", (0, 8, 9)),
+    41: RequiredReaction("sample dropped; the connection is given up", (5, 8)),
+    42: RequiredReaction("dropped and counted", (0, 8, 9)),
+    43: RequiredReaction("WD; no blind reconnect while enabled", (8,)),
+    44: RequiredReaction("known-register check, R", (4,)),
+    45: RequiredReaction("read back, R", (4,)),
+    50: RequiredReaction("R, unless the operator accepts it by name", (4,)),
+    56: RequiredReaction("a free number from the start; QS in motion, however slow it is", (0, 5)),
+    57: RequiredReaction("read back at once, QS", (5,)),
+    58: RequiredReaction("read back, QS", (5,)),
+    59: RequiredReaction("that RPDO is off; QS, at rest", (5,)),
+    60: RequiredReaction("QS, at rest", (5,)),
+    61: RequiredReaction("reported in log, in the result and at the end", (0,)),
+    82: RequiredReaction("QS", (6,)),
+    115: RequiredReaction(
+        "found by torque and inertia; QS; never disabled as at standstill; torque off if the shaft accelerates",
+        (7, 8), or_covered=True),
+    116: RequiredReaction(
+        "QS; standstill by the position, where it goes on; else not confirmed and not disabled", (6, 7, 8),
+        or_covered=True),
+    117: RequiredReaction("QS", (6, 7, 8), or_covered=True),
+    118: RequiredReaction("QS, no J", (6, 7, 9), or_covered=True),
+    119: RequiredReaction("QS", (6, 7, 8), or_covered=True),
+    120: RequiredReaction("no valid state: QS again and again; nothing is disabled", (8,)),
+    121: RequiredReaction(
+        "seen in two ways: torque off, 8; above a drill string only beyond the speed limit", (8,)),
+}
+"""Required reactions by row of docs/reference/faults.md."""
+
+ANY_FAULT: Final = RequiredReaction(
+    "the shaft at standstill, or the loss of it reported; no J whose interval misses the true inertia",
+    (4, 5, 6, 7, 8, 9), or_covered=True,
+)
+"""Required reaction to a fault without a row of its own."""
+
+OTHER_PROGRAMS: Final = (5, 6, 7, 8, 9)
+"""Exit codes of rows 97 and 102: any fault while a virtual string, or the drive's impedance, is in the loop."""
+
+
+class RehearsalVerdict(StrEnum):
+    """Verdict on the rehearsed faults of one run."""
+
+    PASS = "pass"
+    FAIL = "fail"
+    INCONCLUSIVE = "inconclusive"      # not triggered, or the operator ended the run
+
+
+_KEPT_CODES = frozenset({
+    ExitCode.INTERNAL, ExitCode.PARTIAL, ExitCode.STOP_NOT_CONFIRMED, ExitCode.INTERRUPTED, ExitCode.TERMINATED,
+})
+"""Exit codes that a failed rehearsal does not replace: they say more than it does."""
+
+
+@dataclass(frozen=True)
+class RehearsedFault:
+    """One fault of the script. ``row`` of the fault table; 0: it has none."""
+
+    fault: str
+    row: int
+    required: str
+    codes: tuple[int, ...]
+    verdict: RehearsalVerdict
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """The verdict on all faults of one run, and what was seen."""
+
+    verdict: RehearsalVerdict
+    seen: str
+    faults: tuple[RehearsedFault, ...]
+
+    def plain(self) -> dict[str, Any]:
+        """Return it as plain data for the log and the document."""
+        return {**asdict(self), "faults": [{**asdict(one), "codes": list(one.codes)} for one in self.faults]}
+
+    def exit_code(self, code: int) -> int:
+        """Return the exit code of the run: its own, or `NOT_PASSED` in its place."""
+        return code_with(self.plain(), code)
+
+    @property
+    def _code(self) -> str:
+        return MessageCode.REHEARSAL_FAILED.code if self.verdict is RehearsalVerdict.FAIL else ""
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Return it as lines for a terminal."""
+        return (
+            with_code(f"rehearsal: {self.verdict}", self._code),
+            *(f"{one.fault}: {one.verdict}; required ({row_name(one.row)}): {one.required}" for one in self.faults),
+            f"seen: {self.seen}",
+        )
+
+
+def row_name(row: int) -> str:
+    """Return ``row 33``, or that the fault table has none."""
+    return f"row {row}" if row else "no row of its own"
+
+
+def code_with(rehearsal: Mapping[str, Any] | None, code: int) -> int:
+    """Return the exit code of a run with this rehearsal. A code that says more than the rehearsal stays."""
+    failed = rehearsal is not None and rehearsal.get("verdict") == RehearsalVerdict.FAIL
+    return int(ExitCode.NOT_PASSED) if failed and code not in _KEPT_CODES else code
+
+
+def required_reaction(kind: KnownFault) -> RequiredReaction:
+    """Return the required reaction to a fault."""
+    return REQUIRED.get(kind.row, ANY_FAULT)
+
+
+_OF_THE_CYCLE = ("6040h", "6060h", "6071h", "60FFh")
+_STRAY_WRITE = 61
+
+
+def _row(fault: Scripted, kinds: Mapping[str, KnownFault]) -> int:
+    """Return the row of a scripted fault. A stray write to an object that each cycle writes has a row of its own."""
+    if fault.name == "tool-writes" and fault.value.startswith(_OF_THE_CYCLE):
+        return _STRAY_WRITE
+    return kinds[fault.name].row
+
+
+def judge_rehearsal(
+    peer: PeerPlan, drive: str, outcome: RunOutcome, document: Mapping[str, Any] | None = None,
+    own_code: int | None = None, *, other_program: bool = False,
+) -> Rehearsal:
+    """Return the verdict on the faults of this run.
+
+    ``document``: the result, None if the run ended early; ``own_code``: exit code of the result; ``other_program``:
+    the run has a virtual string or measures the drive's impedance.
+    """
+    kinds = {one.name: one for one in bus_named(drive).faults()}
+    code = _code(outcome) if own_code is None else own_code
+    by_hand = code in (ExitCode.INTERRUPTED, ExitCode.TERMINATED)
+    truth = None if any(one.name == "load-lost" for one in peer.faults) else _true_inertia(peer)
+    covered = _covered(document, truth)
+    triggered = [one for one in peer.faults if one.text not in peer.never_came]
+    required = [REQUIRED.get(_row(one, kinds), ANY_FAULT) for one in triggered]
+    allowed = {known for one in required for known in one.codes} | (set(OTHER_PROGRAMS) if other_program else set())
+    short = any(math.isfinite(one.duration_s) for one in triggered)
+    if short or 0 in allowed or any(one.or_covered for one in required):
+        allowed |= {0, 9}                  # a result, or the statement that there is none
+    passed = code in allowed and covered is not False
+    judged = tuple(
+        RehearsedFault(
+            one.text, row, REQUIRED.get(row, ANY_FAULT).words, REQUIRED.get(row, ANY_FAULT).codes,
+            RehearsalVerdict.INCONCLUSIVE if by_hand or one.text in peer.never_came
+            else RehearsalVerdict.PASS if passed else RehearsalVerdict.FAIL,
+        ) for one in peer.faults for row in (_row(one, kinds),)
+    )
+    found = {one.verdict for one in judged}
+    worst = next(one for one in (RehearsalVerdict.FAIL, RehearsalVerdict.INCONCLUSIVE, RehearsalVerdict.PASS)
+                 if one in found)
+    never = f". Not triggered: {', '.join(peer.never_came)}" if peer.never_came else ""
+    return Rehearsal(worst, _seen(outcome, document, code, truth, covered) + never, judged)
+
+
+def _code(outcome: RunOutcome) -> int:
+    if outcome.stop is not None and not outcome.stop.confirmed:
+        return int(ExitCode.STOP_NOT_CONFIRMED)
+    return int(ExitCode.OK if outcome.cause is None else exit_code(outcome.cause))
+
+
+def _true_inertia(peer: PeerPlan) -> float | None:
+    """Return the inertia of a simulated rigid shaft, kg·m²; None for any other: J then means a part of it."""
+    plant = None if peer.plant is None else peer.plant.plant
+    if plant is None or plant.kind != "rigid":
+        return None
+    return float(plant.inertia_kg_m2 + plant.added_inertia_kg_m2)
+
+
+def _covered(document: Mapping[str, Any] | None, truth: float | None) -> bool | None:
+    inertia = None if document is None else document.get("inertia_kg_m2")
+    if inertia is None or truth is None:
+        return None
+    return bool(inertia["low_total"] <= truth <= inertia["high_total"])
+
+
+def _seen(
+    outcome: RunOutcome, document: Mapping[str, Any] | None, code: int, truth: float | None, covered: bool | None
+) -> str:
+    """Return how the run ended, in one line."""
+    from tdhil.report import text_of, with_interval
+
+    stop = outcome.stop
+    stood = "nothing moved" if stop is None else (
+        "standstill confirmed" if stop.confirmed else "standstill NOT confirmed, and reported")
+    degraded = [stage.name for stage in outcome.stages if stage.outcome == "degraded"]
+    marked = f"; degraded: {', '.join(degraded)}" if degraded else ""
+    if document is None:
+        cause = text_of(str(outcome.cause)) if outcome.cause is not None else "the stop was not confirmed"
+        at = f"in stage {outcome.stages[-1].name}" if outcome.stages else "before the first stage"
+        return f"ended {at} with exit {code}: {cause}; {stood}{marked}"
+    inertia = document.get("inertia_kg_m2")
+    told = "no J"
+    if inertia is not None:
+        told = "J " + with_interval(inertia["value"], inertia["low_total"], inertia["high_total"], "kg·m²")
+        if covered is not None:
+            told += f", and the simulated shaft has {truth:g} kg·m²: {'inside' if covered else 'OUTSIDE'} the interval"
+    return f"the run went on to its end (exit {code}): {document['verdict']}, {told}; {stood}{marked}"

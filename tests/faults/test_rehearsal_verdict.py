@@ -1,0 +1,97 @@
+"""A rehearsed fault ends with a verdict: the required reaction, what was seen, pass or fail; and with its exit code."""
+
+import re
+
+import pytest
+
+from sim_bus import RigParams
+from tdhil.buses import PeerPlan, bus_named
+from tdhil.errors import DriveFault, ExitCode, Interrupted, LimitHit, exit_code
+from tdhil.recording import Stage
+from tdhil.report import card_text, rehearsal_of
+from tdhil.runner import RunOutcome
+from tdhil.runner.stop import StopReport
+from tdhil.session import ANY_FAULT, REQUIRED, judge_rehearsal
+from tests.faults.rows import ROWS
+from tests.path.path_runs import tdhil
+
+STOPPED = StopReport(confirmed=True, at_rest_s=9.0, disabled=True)
+LOST = StopReport(confirmed=False, at_rest_s=None, disabled=False)
+STAGES = (Stage("setup", 0.0, 4.0, "ok"), Stage("speed", 4.0, 7.0, "aborted"))
+HOLDS, MISSES = (
+    {"verdict": "valid", "inertia_kg_m2": {"value": 0.5 * (low + high), "low_total": low, "high_total": high}}
+    for low, high in ((99.0, 108.0), (110.0, 118.0))
+)
+
+
+def judged(*faults, cause=None, stop=STOPPED, document=None, code=None, never=()):
+    bus = bus_named("canopen")
+    peer = PeerPlan(True, True, 1, RigParams(), bus.parse_faults(faults), never_came=list(never))
+    return judge_rehearsal(peer, "canopen", RunOutcome(STAGES, cause, stop, None), document, code)
+
+
+@pytest.mark.parametrize(("fault", "found", "verdict", "code"), [
+    ("sto@speed+3s", {"cause": DriveFault("off")}, "pass", 6),
+    ("sto@speed+3s", {"cause": LimitHit("too fast")}, "pass", 7),
+    ("heartbeat-lost@speed", {"cause": LimitHit("too fast")}, "fail", 12),
+    ("heartbeat-lost@speed", {"document": HOLDS, "code": 0}, "fail", 12),
+    ("heartbeat-lost@speed/100ms", {"document": HOLDS, "code": 0}, "pass", 0),
+    ("heartbeat-lost@speed", {"cause": DriveFault("off"), "stop": LOST}, "fail", 8),
+    ("torque-scale=1.01", {"document": HOLDS, "code": 0}, "pass", 0),
+    ("torque-scale=1.1", {"document": MISSES, "code": 0}, "fail", 12),
+    ("torque-scale=1.1", {"document": {"verdict": "not_identifiable", "inertia_kg_m2": None}, "code": 9}, "pass", 9),
+    ("frame-loss=1%", {"document": MISSES, "code": 0}, "fail", 12),
+    ("tool-writes@speed=6040h=6", {"document": HOLDS, "code": 0}, "pass", 0),
+    ("tool-writes@speed=1016h:1=0", {"document": HOLDS, "code": 0}, "fail", 12),
+    ("sto@speed+3s", {"cause": Interrupted(2)}, "inconclusive", 130),
+    ("sto@hold", {"cause": DriveFault("off"), "never": ["sto@hold"]}, "inconclusive", 6),
+    ("demand-scale=1.1", {"document": MISSES, "code": 0}, "fail", 12),
+])
+def test_the_verdict_is_the_row_s(fault, found, verdict, code):
+    rehearsal = judged(fault, **found)
+    own = found.get("code")
+    own = own if own is not None else 8 if found.get("stop") is LOST else exit_code(found["cause"])
+    assert (rehearsal.verdict, rehearsal.exit_code(int(own))) == (verdict, code)
+    (one,) = rehearsal.faults
+    assert one.required == REQUIRED.get(one.row, ANY_FAULT).words
+    assert not re.search(r"\b(QS|WD|R|M)\b", one.required)
+    assert ("TDH-1200" in rehearsal.lines[0]) is (verdict == "fail")
+
+
+def test_a_fault_that_never_came_is_no_pass_beside_one_that_did():
+    rehearsal = judged("emcy@speed+1s", "sto@acquire", cause=DriveFault("7305h"), never=["sto@acquire"])
+    assert [one.verdict for one in rehearsal.faults] == ["pass", "inconclusive"]
+    assert rehearsal.verdict == "inconclusive" and "Not triggered: sto@acquire" in rehearsal.seen
+
+
+@pytest.mark.parametrize("drive", ["canopen", "modbus"])
+def test_every_row_that_a_script_names_has_its_required_reaction(drive):
+    rows = {one.row for one in bus_named(drive).faults() if one.row}
+    assert rows <= set(REQUIRED)
+    assert all(ROWS[row].expected == REQUIRED[row].reaction for row in rows)
+
+
+def test_a_log_may_say_anything():
+    assert rehearsal_of({"rehearsal": {"verdict": 3, "faults": [{"row": "x"}, 5]}})["faults"][0]["row"] == 0
+    assert rehearsal_of({"rehearsal": 5}) is None and rehearsal_of({}) is None
+
+
+def test_a_refusal_that_is_required_passes_in_document_and_on_the_terminal(rehearse):
+    run = rehearse("--fault", "wrong-identity", "--profile", "maxon/epos4")
+    assert run.done.code == ExitCode.REFUSED
+    assert run.done.document["rehearsal"]["verdict"] == "pass"
+    assert run.done.document["rehearsal"]["faults"][0]["row"] == 29
+    assert "tdhil: rehearsal: pass" in run.done.err
+
+
+@pytest.mark.heavy
+def test_a_lie_that_no_signal_shows_fails_in_document_card_and_exit_code(rehearse):
+    """The power stage gives nine tenths of the torque that it reports: J is too large, and the tool cannot know."""
+    run = rehearse("--fault", "torque-constant=0.8")
+    document = run.done.document
+    assert document["inertia_kg_m2"]["low_total"] > 104.0
+    assert run.done.code == ExitCode.NOT_PASSED
+    assert document["rehearsal"]["verdict"] == "fail" and "OUTSIDE" in document["rehearsal"]["seen"]
+    assert "rehearsal" in card_text(document) and "fail" in card_text(document)
+    again = tdhil("replay", run.log, "--json")
+    assert (again.code, again.document["rehearsal"]) == (run.done.code, document["rehearsal"])

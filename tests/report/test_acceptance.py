@@ -1,0 +1,115 @@
+"""Expected against identified: pass, fail or cannot tell by the interval, and what is off in words."""
+
+import pytest
+
+from drivers import DataFileError
+from tdhil.config import Expectation, expectations_in, expectations_of, load_rig
+from tdhil.errors import ExitCode, UsageError
+from tdhil.report import acceptance_of, card_text, result_document
+from tdhil.session.conclusion import _accepted
+from tests.report.findings import RUN, full, recording
+
+EXPECTED = {"inertia": (104.0, 5.0), "viscous": (8.0, 2.0), "coulomb": (60.0, 6.0), "speed-lag": (0.4, 0.05)}
+
+
+def part(value, share):
+    half = value * share
+    return {"value": value, "low": value - half, "high": value + half, "low_total": value - half,
+            "high_total": value + half}
+
+
+def document(inertia=104.0, viscous=8.0, coulomb=60.0, speed_lag=0.4, share=0.02):
+    return {"inertia_kg_m2": part(inertia, share), "viscous_nm_s_rad": part(viscous, 5 * share),
+            "coulomb_nm": part(coulomb, 2 * share), "speed_lag_s": part(speed_lag, 2 * share), "torque_limit_nm": 400.0,
+            "impedance": None}
+
+
+def judged(found, expected=EXPECTED):
+    return acceptance_of([Expectation(name, *one) for name, one in expected.items()], found)
+
+
+def test_a_machine_as_expected_passes():
+    found = judged(document())
+    assert (found["verdict"], found["off"]) == ("pass", [])
+    assert {one["verdict"] for one in found["quantities"]} == {"pass"}
+
+
+@pytest.mark.parametrize(("changed", "name", "words"), [
+    ({"inertia": 135.0}, "inertia", "moment of inertia J is 1.3 times"),
+    ({"speed_lag": 1.2}, "speed-lag", "lag of the reported speed is 3 times the expected value: the speed filter"),
+    ({"coulomb": 90.0}, "coulomb", "Coulomb friction T_c is 1.5 times"),
+    ({"viscous": 16.0}, "viscous", "viscous friction B is 2 times"),
+])
+def test_one_thing_that_is_off_is_named_and_no_other(changed, name, words):
+    found = judged(document(**changed))
+    assert found["verdict"] == "fail"
+    assert [one["name"] for one in found["quantities"] if one["verdict"] == "fail"] == [name]
+    (told,) = found["off"]
+    assert words in told
+
+
+def test_one_factor_in_all_that_has_a_torque_is_one_cause():
+    found = judged(document(inertia=104 * 1.3, viscous=8 * 1.3, coulomb=60 * 1.3))
+    (told,) = found["off"]
+    assert "1.3 times" in told and "torque scale" in told
+
+
+def test_the_interval_decides_and_not_the_value():
+    assert judged(document(inertia=108.0))["verdict"] == "cannot tell"          # reaches beyond the tolerance
+    assert judged(document(inertia=113.0))["verdict"] == "fail"
+    wide = judged(document(share=0.2))
+    assert (wide["verdict"], wide["off"]) == ("cannot tell", [])
+    assert judged({**document(), "speed_lag_s": None})["verdict"] == "cannot tell"
+    assert judged(document(), {"gain": (300.0, 30.0)})["quantities"][0]["text"].endswith("not identified")
+    limit = {"torque-limit": (500.0, 10.0)}
+    (told,) = judged(document(), limit)["off"]
+    assert told.startswith("the torque limit of the run is 0.8 times the expected value")
+    assert acceptance_of([], document()) is None
+
+
+@pytest.mark.parametrize(("verdict", "stands", "code"), [
+    ("pass", True, ExitCode.OK), ("fail", True, ExitCode.NOT_PASSED), ("fail", False, ExitCode.NOT_PASSED),
+    ("cannot tell", True, ExitCode.NOT_IDENTIFIABLE), ("pass", False, ExitCode.NOT_IDENTIFIABLE),
+])
+def test_the_exit_code(verdict, stands, code):
+    assert _accepted({"verdict": verdict}, stands=stands) is code
+    assert _accepted(None, stands=stands) is (ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE)
+
+
+@pytest.mark.parametrize(("name", "text", "value", "tolerance"), [
+    ("inertia", "104 ± 5 %", 104.0, 5.2), ("inertia", "104 kg·m² +/- 2", 104.0, 2.0),
+    ("speed-lag", "400ms±50ms", 0.4, 0.05),
+    ("torque-limit", "2 kNm ± 10 N·m", 2000.0, 10.0), ("coulomb", "60+-3", 60.0, 3.0),
+])
+def test_a_value_with_its_tolerance(name, text, value, tolerance):
+    found = Expectation.of(name, text)
+    assert (found.value, found.tolerance) == (pytest.approx(value), pytest.approx(tolerance))
+
+
+@pytest.mark.parametrize(("given", "words"), [
+    ("inertia=104", "tolerance"), ("mass=1±1", "no quantity is called"), ("inertia", "NAME=VALUE"),
+    ("inertia=104±0", "above 0"), ("inertia=104 s±1", "kg"),
+])
+def test_what_is_none_is_refused_by_name(given, words):
+    with pytest.raises(UsageError, match="--expect") as caught:
+        expectations_of({}, (given,))
+    assert words in str(caught.value)
+
+
+def test_rig_yaml_states_them_and_the_command_line_goes_before(tmp_path):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("acceptance:\n  inertia: 104 ± 5 %\n  speed-lag: 0.4 s ± 50 ms\n")
+    found = expectations_of(load_rig(rig).acceptance, ("inertia=100±1",))
+    assert [(one.name, one.value) for one in found] == [("inertia", 100.0), ("speed-lag", 0.4)]
+    rig.write_text("acceptance:\n  inertia: 104 ± 5 %\n  speed-lag: soon\n")
+    with pytest.raises(DataFileError, match=r"rig.yaml:3.*tolerance"):
+        load_rig(rig)
+
+
+def test_it_stands_in_document_and_card_and_a_log_may_say_anything():
+    run = {**RUN, "acceptance": [{"name": "inertia", "value": 50.0, "tolerance": 1.0}, {"name": "x"}, 7]}
+    assert len(expectations_in(run)) == 1 and expectations_in({"acceptance": 7}) == ()
+    found = result_document(full(), recording(), run, "run.mcap")
+    assert found["acceptance"]["verdict"] == "fail"
+    assert "acceptance" in card_text(found) and "another body" in " ".join(card_text(found).split())
+    assert result_document(full(), recording(), RUN, "run.mcap")["acceptance"] is None

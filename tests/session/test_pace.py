@@ -1,0 +1,28 @@
+"""Whether this computer sustains a rate by the clock: measured with the drive disabled, and said in words."""
+
+import pytest
+
+from tdhil.config import resolve
+from tdhil.session import PaceMeasured, connection_of, measure_pace
+
+
+@pytest.mark.parametrize(("late", "holds", "words"), [
+    (0, True, "sustains 100 cycles per second: 0 of 150"),
+    (3, False, "does not sustain 100 cycles per second now: 3 of"),
+])
+def test_it_is_said_with_its_limit(late, holds, words):
+    found = PaceMeasured(100.0, 150, late, 0.012)
+    assert found.holds is holds
+    assert words in found.text and "half a period (5 ms)" in found.text and "12 ms" in found.text
+    assert found.plain()["holds"] is holds
+
+
+@pytest.mark.real_time
+@pytest.mark.heavy
+@pytest.mark.parametrize("drive", ["canopen", "modbus"])
+def test_the_cycles_are_those_of_the_embedded_drive(drive):
+    given = {"drive": drive, "simulate": True, "real_time": True, "seed": 1}
+    options, connection = connection_of(given, None, resolve(given, None))
+    found = measure_pace(options, connection, None)
+    assert found.cycles == round(1.5 * found.rate_hz)
+    assert 0 <= found.late <= found.cycles and found.worst_s >= 0.0
