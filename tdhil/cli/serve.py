@@ -33,6 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="publish the rigs' states and results to a broker, mqtt[s]://host:port/prefix; user "
                              "and password"
                         " from TDHIL_MQTT_USER and TDHIL_MQTT_PASSWORD_FILE (extra mqtt)")
+    parser.add_argument("--webhook", metavar="URL",
+                        help="send a JSON message to this address when a run has ended or failed, and when a rig's"
+                        " results have changed; signed with the secret in TDHIL_WEBHOOK_SECRET_FILE")
     parser.add_argument("--check-idle", action="store_true",
                         help="do not serve: exit 0 if no run of --data is alive and no tdhil here holds a drive,"
                         " else 4 (before an upgrade)")
@@ -96,7 +99,8 @@ def run(namespace: argparse.Namespace) -> int:
         return check_idle(namespace.data, say)
     viewers = frozenset(one.rstrip("/").lower() for one in namespace.viewer)
     return serve(namespace.rigs, namespace.data, namespace.host, namespace.port, say, viewers=viewers,
-                 mqtt=namespace.mqtt, tls=None if cert is None else Tls(cert, key), names=namespace.allowed_host,
+                 mqtt=namespace.mqtt, webhook=namespace.webhook,
+                 tls=None if cert is None else Tls(cert, key), names=namespace.allowed_host,
                  logs=namespace.logs)
 
 

@@ -113,13 +113,14 @@ def _names(host: str, more: Sequence[str]) -> frozenset[str]:
 
 def serve(
     rigs: Path | None, data: Path, host: str, port: int, say: Say, *, viewers: frozenset[str] = frozenset(),
-    mqtt: str | None = None, tls: Tls | None = None, names: Sequence[str] = (),
+    mqtt: str | None = None, webhook: str | None = None, tls: Tls | None = None, names: Sequence[str] = (),
     logs: Sequence[Path] = (),
 ) -> int:
     """Serve until SIGINT or SIGTERM; then live runs are stopped first. Return the exit code.
 
     ``viewers``: origins of Foxglove or Lichtblick in a browser, which may read logs as they grow.
     ``mqtt``: the address of a broker that receives states and results.
+    ``webhook``: the address that receives a message for each ended run and each change of a rig.
     ``names``: more names of this host; ``logs``: folders of logs for fleet requests, besides the service's runs.
 
     Raises UsageError for unusable arguments or unreadable accounts, and LogUnopened for a folder that can't be made.
@@ -153,8 +154,10 @@ def serve(
     from tdhil.service.store import Index, Store
     from tdhil.service.supervisor import Supervisor
     from tdhil.service.web import Web
+    from tdhil.service.webhook import RUNS, Notifier, Webhook
 
     broker = None if mqtt is None else Broker.of(mqtt)
+    hook = None if webhook is None else Webhook.of(webhook)
     store = Store(data.resolve())
     store.prepare()
     alone = _alone(store.folder)
@@ -163,6 +166,7 @@ def serve(
     web = Web(supervisor, hosts=allowed, viewers=viewers, access=Access(store.folder, login=accounts, say=say),
               logs={str(one): one for one in logs})
     publisher = None if broker is None else Publisher(broker, web.told, say)
+    notifier = None if hook is None else Notifier(hook, lambda: web.list_runs(None, None, RUNS), web.trends_around, say)
     listening = _listen(host, port)
     at = listening.getsockname()[1]
     shown = f"[{host}]" if ":" in host else host
@@ -177,11 +181,15 @@ def serve(
     say("A stop over HTTP is no emergency stop: keep the hard-wired stop within reach. Ctrl-C stops all runs.")
     if publisher is not None:
         publisher.start()
+    if notifier is not None:
+        notifier.start()
     try:
         _uvicorn(web.asgi, listening, supervisor.brake, say, tls, room)
     finally:
         if publisher is not None:
             publisher.close()
+        if notifier is not None:
+            notifier.close()
         listening.close()
         alone.close()
     left = sorted({*supervisor.live(), *supervisor.not_at_rest})

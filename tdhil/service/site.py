@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -35,6 +36,15 @@ STOPS: Final = 16
 """Number of simultaneous stops, each in its own thread, which is started in advance."""
 LEASES: Final = 8
 """Number of threads for leases of watched runs, beside the web's other threads."""
+
+
+TREND_RUNS: Final = 1000
+"""Number of runs that a trend goes back."""
+
+
+def _local(asked: str) -> str:
+    """Return a time in UTC as local time with its zone, as every text of a trend shows it."""
+    return datetime.fromisoformat(asked).astimezone().isoformat(timespec="seconds")
 
 
 class Metrics:
@@ -142,6 +152,21 @@ class Site:
         found = [one for one in (*now_live, *ended) if rig in (None, one.rig) and state in (None, one.state)]
         return sorted(found, key=lambda one: one.id, reverse=True)[:limit]
 
+    def trend_rows(self, rig: str) -> list[dict[str, Any]]:
+        """Return the rows of a rig's history, each with the time that every page shows: when the run was requested."""
+        runs = self.list_runs(rig, "done", TREND_RUNS)
+        return [{**row, "date": _local(one.asked)} for one in runs
+                if (row := read_json(self.store.place(one.id) / "row.json")) is not None]
+
+    def trends_around(self, rig: str, run: str) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+        """Return the rig's trend without this run, and with it."""
+        rows = self.trend_rows(rig)
+        before = [one for one in rows if one.get("log") != run]
+        first, second = (
+            self.supervisor.work("trend", None, {"rows": one, "rig": rig})["document"] if one else {}
+            for one in (before, rows))
+        return first, second
+
     def replays(self, run: str) -> list[ReplayView]:
         """Return the finished replays and the waiting ones."""
         made = {name: adapter(ReplayView).validate_python(one) for name, one in self.store.replays(run)}
@@ -165,7 +190,7 @@ class Site:
             status.identity, status.safe_action, status.confirmation, request.motion, status.watch, status.stop,
             status.error, status.exit_code, status.verdict,
             self.store.result(run), found, self.replays(run), read_json(folder / "signed_off.json"),
-            lives(folder), request.rehearsal,
+            lives(folder), request.rehearsal, None if status.rehearsal is None else dict(status.rehearsal),
         )
 
     def told(self) -> dict[str, Any]:
