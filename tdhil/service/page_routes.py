@@ -15,6 +15,7 @@ from starlette.staticfiles import StaticFiles
 from tdhil.config import form_options
 from tdhil.service.access import principal, require
 from tdhil.service.accounts import Role
+from tdhil.service.api_page import api_page
 from tdhil.service.middleware import off
 from tdhil.version import __version__
 
@@ -63,6 +64,7 @@ class Pages:
             self._page("/fleets/{fleet}", "fleet.html", "fleets"),
             self._page("/audit", "audit.html", "audit", "admin"),
             self._page("/accounts", "accounts.html", "accounts"),
+            self._page("/docs", "docs.html", "docs"),
             Route("/login", self._login),
             Route("/favicon.ico", lambda request: RedirectResponse("/static/icon.svg")),
             Mount("/static", StaticFiles(directory=HERE / "static")),
@@ -81,6 +83,8 @@ class Pages:
                 known["run"] = await off(lambda: site.run_view(request.path_params["run"]))
             if "fleet" in request.path_params:
                 known["fleet"] = await off(lambda: site.fleets.get(request.path_params["fleet"]))
+            if here == "docs":
+                known["api"] = await off(api_page)
             return self.render(request, template, here, **known)
 
         return Route(path, serve)
