@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -13,22 +14,23 @@ MOST: Final = 64
 
 
 class KeptAnswers:
-    """The latest documents of `trend` and `compare`, which depend on nothing but their question and the logs in it."""
+    """The latest documents of `plan`, `trend` and `compare`. Each depends on its question and the files in it alone."""
 
     def __init__(self, runs: Path) -> None:
         self._runs = runs
         self._kept: OrderedDict[str, dict[str, Any]] = OrderedDict()
 
     def key(self, what: str, asked: Mapping[str, Any]) -> str | None:
-        """Return the key of a question, with size and date of its logs; None if its answer is not kept."""
-        if what not in ("trend", "compare"):
+        """Return the key of a question, with its logs and its rig file; None if its answer is not kept."""
+        if what not in ("trend", "compare", "plan"):
             return None
         runs: Sequence[str] = asked["runs"] if what == "compare" else ()
         try:
+            files = [hashlib.sha256(Path(asked["rig_file"]).read_bytes()).hexdigest()] if what == "plan" else []
             logs = [(one.st_size, one.st_mtime_ns) for one in ((self._runs / run / "run.mcap").stat() for run in runs)]
         except OSError:
             return None
-        return json.dumps([what, asked, logs], sort_keys=True)
+        return json.dumps([what, asked, logs, files], sort_keys=True)
 
     def get(self, key: str | None) -> dict[str, Any] | None:
         """Return a kept document, and keep it longer."""

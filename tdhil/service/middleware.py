@@ -19,6 +19,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from drivers import CommunicationLost, DataFileError, PreflightRefused
+from tdhil.config import OPTION
 from tdhil.errors import ExitCode, LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.access import token_in
 from tdhil.service.run_channel import RunRefused
@@ -32,7 +33,8 @@ from tdhil.service.run_state import (
     Told,
     TooManyTries,
 )
-from tdhil.service.schemas import OPTIONS, ErrorView, Route, adapter, plain
+from tdhil.service.schemas import OPTIONS, ErrorView, FieldError, Route, adapter, plain
+from tdhil.service.start_request import ValuesWrong
 
 T = TypeVar("T")
 BODY_LIMIT: Final = 64 * 1024
@@ -130,7 +132,13 @@ def told_of(error: BaseException) -> ErrorView:
     if not isinstance(error, TdhilError):
         return ErrorView(Told("InternalError", "internal error", "internal error", "", _BROKEN_HINT, 1,
                               MessageCode.INTERNAL_ERROR.code))
-    return ErrorView(Told.of(error), getattr(error, "holder", None) if isinstance(error, Conflict) else None)
+    wrong = [_field_of(name, text) for name, text in error.fields] if isinstance(error, ValuesWrong) else None
+    return ErrorView(Told.of(error), getattr(error, "holder", None) if isinstance(error, Conflict) else None, wrong)
+
+
+def _field_of(name: str, text: str) -> FieldError:
+    form = OPTION[name].form if name in OPTION else None
+    return FieldError(name, name if form is None else form.label, text)
 
 
 def error_response(error: BaseException, status: int | None = None, headers: Mapping[str, str] = _NONE) -> Response:

@@ -9,11 +9,12 @@ from tdhil.errors import MessageCode, UsageError
 from tdhil.service.access import address_of, principal, require_options
 from tdhil.service.middleware import off
 from tdhil.service.routing import api
-from tdhil.service.run_state import NotAllowed
+from tdhil.service.run_state import Conflict, NotAllowed
 from tdhil.service.schemas import (
     CalibrationBody,
     CalibrationView,
     FaultView,
+    PaceView,
     PlanView,
     RigFileBody,
     RigFileView,
@@ -23,7 +24,6 @@ from tdhil.service.schemas import (
     TrendView,
 )
 from tdhil.service.start_request import EDITABLE, RigFile, options_of, require_motion, require_unwatched
-from tdhil.service.store import read_json
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 LARGEST_KG_M2: Final = 1e9
 """Largest added moment of inertia that a calibration accepts, kg·m²; no body has more."""
-TREND_RUNS: Final = 1000
-"""Number of runs that a trend goes back."""
 
 
 def routes(site: Site) -> list[Route]:
@@ -47,6 +45,7 @@ def routes(site: Site) -> list[Route]:
         api(site, "trend", trend),
         api(site, "calibration", calibration),
         api(site, "plan", plan),
+        api(site, "pace", pace),
         api(site, "start", start),
         api(site, "stop_rig", stop_rig),
         api(site, "faults", faults),
@@ -90,20 +89,30 @@ async def plan(site: Site, request: Request, body: dict[str, Any]) -> PlanView:
     """Plan a run. Nothing is connected."""
     found = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
     options = options_of(body)
-    await off(lambda: found.way(options))
-    asked = {"rig_file": str(found.path.resolve()), "options": options}
+    _, connection = await off(lambda: found.way(options))
+    asked = {"rig_file": str(found.path.resolve()), "options": options,
+             "profile": hashlib.sha256(connection.profile.model_dump_json().encode()).hexdigest()}
     return PlanView(found.id, found.sha256, await site.work("plan", None, asked))
+
+
+async def pace(site: Site, request: Request, body: None) -> PaceView:
+    """Measure whether this computer sustains the rate of a simulated rig by the clock. Raises NotAllowed."""
+    found = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
+    if not found.simulated:
+        raise NotAllowed("only a simulated rig is measured from here", where=f"rig {found.id}",
+                         next_step="A run on a real drive measures the rate itself, before motion")
+    if site.supervisor.turning():
+        raise Conflict("a real shaft turns, and a measurement would take this computer's time", where=f"rig {found.id}",
+                       next_step="Measure when that run has ended")
+    asked = {"rig_file": str(found.path.resolve()), "options": {}}
+    return PaceView(found.id, await site.work("pace", None, asked))
 
 
 async def trend(site: Site, request: Request, body: None) -> TrendView:
     """Return how the results of a rig changed over time."""
     which = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
 
-    def rows() -> list[dict[str, Any]]:
-        runs = site.list_runs(which.id, "done", TREND_RUNS)
-        return [row for one in runs if (row := read_json(site.store.place(one.id) / "row.json")) is not None]
-
-    found = await off(rows)
+    found = await off(lambda: site.trend_rows(which.id))
     if not found:
         nothing = {"rig": which.id, "logs": 0, "results": 0, "notes": ["no run has a result yet"], "quantities": []}
         return TrendView(which.id, nothing)
@@ -156,13 +165,15 @@ async def stop_rig(site: Site, request: Request, body: Any) -> StoppedView:
 async def faults(site: Site, request: Request, body: None) -> list[FaultView]:
     """Return the faults that can be rehearsed. Raises NotAllowed for a real rig."""
     from tdhil.buses import bus_named
+    from tdhil.session import required_reaction
 
     which = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
     if not which.simulated:
         raise NotAllowed("faults can be rehearsed only on a simulated rig", where=f"rig {which.id}",
                          next_step="Use a rig whose file contains run: {simulate: true}")
     bus = bus_named(which.way()[1].drive)
-    return [FaultView(one.name, one.summary, one.row, one.value, one.takes, one.from_start) for one in bus.faults()]
+    return [FaultView(one.name, one.summary, one.row, one.value, one.takes, one.from_start,
+                      required_reaction(one).words) for one in bus.faults()]
 
 
 async def calibration(site: Site, request: Request, body: CalibrationBody) -> CalibrationView:

@@ -37,6 +37,7 @@ from tdhil.service.store import CONNECTION_FILE, Store, StoredRequest, read_json
 
 if TYPE_CHECKING:
     from tdhil.runner import RunOutcome
+    from tdhil.session import Rehearsal
 
 NICE: Final = 5
 """Nice value of a simulated run in stepped time, which takes all the processor time it can get."""
@@ -162,7 +163,7 @@ class RunProcess:
                 self.operator_interface.lease.end()
             if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
                 session.abandon()
-                return self._ended(outcome)
+                return self._ended(outcome, session.rehearsal)
             self.board.to(State.IDENTIFYING)
             found = session.conclude()
         except BaseException:
@@ -174,7 +175,8 @@ class RunProcess:
         self._row(found.document, recording.torque_scale_rel_sd)
         if report:
             self._report(found.document, recording)
-        self._end(State.DONE, int(found.exit_code), verdict=found.document["verdict"])
+        self._end(State.DONE, int(found.exit_code), verdict=found.document["verdict"],
+                  rehearsal=found.document["rehearsal"])
         return int(found.exit_code)
 
     def _row(self, document: Mapping[str, Any], torque_scale_rel_sd: float) -> None:
@@ -196,7 +198,7 @@ class RunProcess:
         except (UsageError, OSError) as error:
             tell(f"the report can't be written: {error}")
 
-    def _ended(self, outcome: RunOutcome) -> int:
+    def _ended(self, outcome: RunOutcome, rehearsal: Rehearsal | None) -> int:
         from tdhil.errors import ExitCode, exit_code
         from tdhil.runner import not_confirmed
 
@@ -205,10 +207,14 @@ class RunProcess:
         confirmed = None if outcome.stop is None else outcome.stop.confirmed
         if outcome.stop is not None and not outcome.stop.confirmed:
             error, code = not_confirmed(outcome.stop), ExitCode.STOP_NOT_CONFIRMED
-        self._end(_cut_short(code, confirmed), int(code), error=None if error is None else Told.of(error))
+        ended_with, told = int(code), None
+        if rehearsal is not None:
+            ended_with, told = rehearsal.exit_code(int(code)), rehearsal.plain()
+        self._end(_cut_short(code, confirmed), ended_with, error=None if error is None else Told.of(error),
+                  rehearsal=told)
         if confirmed:
             self._conclude_part()
-        return int(code)
+        return ended_with
 
     def _conclude_part(self) -> None:
         """Write the result of the motion before the end, as `tdhil replay` of the log does. The run has ended."""

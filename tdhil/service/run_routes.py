@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ from tdhil.service.schemas import (
 )
 from tdhil.service.start_request import options_of
 from tdhil.service.store import write_json
+from tdhil.version import __version__
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -75,7 +77,18 @@ async def compare(site: Site, request: Request, body: None) -> CompareView:
         if not (await off(partial(site.store.place, one)) / "run.mcap").is_file():
             raise NotThere("this run has no log", where=f"run {one}")
     asked = {"runs": which, "runs_folder": str(site.store.runs)}
-    return CompareView(which, await site.work("compare", None, asked))
+    return CompareView(which, await off(partial(_asked_at, site, which, await site.work("compare", None, asked))))
+
+
+def _asked_at(site: Site, which: list[str], comparison: dict[str, Any]) -> dict[str, Any]:
+    """Return the comparison with the time of each run that every page shows: when it was requested."""
+    times = [site.store.request(one).asked for one in which]
+    return {
+        **comparison,
+        "results": [{**one, "date": at} for one, at in zip(comparison["results"], times, strict=False)],
+        "settings": [{**one, "values": times, "differs": True} if one["name"] == "date" else one
+                     for one in comparison["settings"]],
+    }
 
 
 async def run(site: Site, request: Request, body: None) -> RunView:
@@ -140,6 +153,9 @@ async def ask_replay(site: Site, request: Request, body: ReplayBody) -> tuple[in
     """Identify the run again, in the background. Its first result is kept."""
     which, who = request.path_params["run"], principal(request).name
     asked = settings_of(body)
+    before = await off(lambda: next((one for one in site.replays(which) if _answers(one, asked)), None))
+    if before is not None:
+        return 200, before
     view = await off(lambda: _new_replay(site, which, asked, who))
     rig = (await off(lambda: site.store.request(which))).rig
     site.supervisor.note(who, f"replay {view.name} asked", which, rig, options=asked)
@@ -147,6 +163,11 @@ async def ask_replay(site: Site, request: Request, body: ReplayBody) -> tuple[in
     site.tasks.add(task)
     task.add_done_callback(site.tasks.discard)
     return 202, view
+
+
+def _answers(made: ReplayView, asked: Mapping[str, Any]) -> bool:
+    """Return whether this replay has these settings and is from this version: the result would be the same."""
+    return made.asked == asked and made.result is not None and made.result.get("tdhil") == __version__
 
 
 def _new_replay(site: Site, which: str, asked: dict[str, Any], who: str) -> ReplayView:

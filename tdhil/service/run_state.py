@@ -160,6 +160,7 @@ class Status:
     error: Told | None = None
     exit_code: int | None = None
     verdict: str | None = None
+    rehearsal: Mapping[str, Any] | None = None     # verdict on the rehearsed faults (`tdhil.session.Rehearsal`)
 
     @staticmethod
     def begun(run: str, rig: str, at: str) -> Status:

@@ -99,6 +99,7 @@ class RunView:
     signed_off: dict[str, Any] | None
     alive: bool
     rehearsal: bool = False
+    rehearsal_verdict: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,14 @@ class PlanView:
     rig: str
     rig_sha256: str
     plan: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class PaceView:
+    """Whether this computer sustains a simulated rig's cycle rate by the clock: ``holds``, and ``text``."""
+
+    rig: str
+    pace: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -147,7 +156,7 @@ class FaultView:
     """A fault to rehearse, written ``NAME@STAGE+2s=VALUE``. ``row`` of docs/reference/faults.md; 0: it has none.
 
     ``value``: the default value if none is given; ``takes``: the meaning of the value, '' if there is none.
-    ``from_start``: it has no start time and lasts for the whole run.
+    ``from_start``: it has no start time and lasts for the whole run. ``required``: the reaction that the row requires.
     """
 
     name: str
@@ -156,6 +165,7 @@ class FaultView:
     value: str
     takes: str
     from_start: bool
+    required: str
 
 
 @dataclass(frozen=True)
@@ -238,11 +248,21 @@ class TokenView:
 
 
 @dataclass(frozen=True)
+class FieldError:
+    """One wrong value of a request: the option, its label on the form, and what is wrong."""
+
+    option: str
+    label: str
+    message: str
+
+
+@dataclass(frozen=True)
 class ErrorView:
-    """An error of the error tree."""
+    """An error of the error tree. ``fields``: every wrong value of a request, null for any other error."""
 
     error: Told
     holder: str | None = None
+    fields: list[FieldError] | None = None
 
 
 # -- what is sent ---------------------------------------------------------------------------------------------------
@@ -414,6 +434,8 @@ ROUTES: Final = (
           " and nothing is stored", "operator", {200: CalibrationView}, CalibrationBody, (403, 404, 422)),
     Route("POST", "/rigs/{rig}/plan", "plan", "Plan a run; nothing is connected", "viewer", {200: PlanView},
           OPTIONS, (403, 404, 409, 422)),
+    Route("GET", "/rigs/{rig}/pace", "pace", "Measure whether this computer sustains a simulated rig's cycle rate",
+          "operator", {200: PaceView}, errors=(403, 404, 409, 422)),
     Route("POST", "/rigs/{rig}/runs", "start", "Request a run", "operator", {201: RunView, 200: RunView}, OPTIONS,
           (403, 404, 409, 422, 429, 503, 507),
           headers={"Idempotency-Key": "the same key returns the same run and never starts a second one"}),
@@ -434,7 +456,7 @@ ROUTES: Final = (
     Route("POST", "/runs/{run}/sign-off", "sign_off", "Sign off a stop that was not confirmed", "engineer",
           {200: RunView}, SignOffBody, (403, 404, 409, 422)),
     Route("POST", "/runs/{run}/replays", "ask_replay", "Identify again; the first result is kept", "operator",
-          {202: ReplayView}, ReplayBody, (403, 404, 422)),
+          {202: ReplayView, 200: ReplayView}, ReplayBody, (403, 404, 422)),
     Route("GET", "/runs/{run}/replays/{replay}", "replay", "One replay", "viewer", {200: ReplayView}, errors=(404,)),
     Route("GET", "/runs/{run}/log.mcap", "log", "The log; also while it grows (Range)", "viewer",
           _file("application/octet-stream"), errors=(404,), headers=_RANGE),

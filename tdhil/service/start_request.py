@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -27,9 +27,11 @@ from tdhil.config import (
     RunDetails,
     RunOptions,
     Topic,
+    expectations_of,
     load_rig,
     parse_rig,
     resolve,
+    wrong_values,
 )
 from tdhil.errors import MessageCode, UsageError
 from tdhil.service.run_state import NotAllowed, NotThere
@@ -49,8 +51,9 @@ _NAMES: Final = {one.flag.removeprefix("--").replace("-", "_"): one.name for one
 
 
 def options_of(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options by name. Raises UsageError and NotAllowed, with the option."""
+    """Return the options by name. Raises NotAllowed with the option, and ValuesWrong with every wrong value."""
     found: dict[str, Any] = {}
+    wrong: list[tuple[str, str]] = []
     for given, value in asked.items():
         name = str(given).removeprefix("--").replace("-", "_")
         name = _NAMES.get(name, name)
@@ -60,9 +63,61 @@ def options_of(asked: Mapping[str, Any]) -> dict[str, Any]:
         if name not in TAKEN:
             raise UsageError("is not an option of a run over HTTP", where=str(given)[:60],
                              next_step=f"Options: {', '.join(sorted(TAKEN))}", entry=MessageCode.REQUEST_WRONG)
-        if value is not None:
+        if value is None:
+            continue
+        try:
             found[name] = _value(TAKEN[name], value)
+        except UsageError as error:
+            wrong.append((name, error.what))
+    try:
+        expectations_of({}, RunDetails.of(found).expect)
+    except UsageError as error:
+        wrong.append((OPTION["expect"].name, error.what))
+    wrong += [(name, _limits_in_words(name, found.get(name)) or text) for name, text in wrong_values(found)]
+    if wrong:
+        raise ValuesWrong(wrong)
     return found
+
+
+SMALLEST: Final = 1e-5
+"""A lower limit below it only says that the value must be positive."""
+LARGEST: Final = 1e15
+"""An upper limit above it is that of the number's kind, and not worth a word."""
+
+
+def _limits_in_words(name: str, value: Any) -> str:
+    """Return which limits a number exceeds, in the unit of the form's field; '' if none."""
+    option = OPTION.get(name)
+    if option is None or not option.limits or isinstance(value, bool) or not isinstance(value, int | float):
+        return ""
+    if not option.refusal(value):
+        return ""
+    unit = option.form.unit if option.form is not None and option.form.unit is not None else option.unit
+
+    def shown(limit: float) -> str:
+        if unit is None:
+            return f"{limit:g}"
+        return f"{unit.of_si(limit):.6g}" + ("" if unit.symbol == "1" else f" {unit.symbol}")
+
+    low = option.limits.get("ge", option.limits.get("gt"))
+    high = option.limits.get("le", option.limits.get("lt"))
+    words = []
+    if low is not None:
+        words.append("above 0" if 0.0 <= low < SMALLEST and unit is not None else f"at least {shown(low)}")
+    if high is not None and high < LARGEST:
+        words.append(f"{'at most' if 'le' in option.limits else 'below'} {shown(high)}")
+    return f"must be {' and '.join(words)}, not {shown(value)}"
+
+
+class ValuesWrong(UsageError):
+    """All values of a request that cannot be used. ``fields``: option and message of each."""
+
+    entry = MessageCode.REQUEST_WRONG
+
+    def __init__(self, wrong: Sequence[tuple[str, str]]) -> None:
+        self.fields = tuple(wrong)
+        (name, what), *more = wrong
+        super().__init__("; ".join((what, *(f"{other}: {text}" for other, text in more))), where=name)
 
 
 def _value(option: Option, value: Any) -> Any:
@@ -268,7 +323,7 @@ def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None 
                 raise UsageError("is for a simulated rig", where=one.name, entry=MessageCode.REQUEST_WRONG)
     return RunRequest.of(
         options, connection, replace(peer, left_in=left_in), rig.rig, overrides=Overrides.of(asked),
-        operator=details.operator, note=details.note,
+        operator=details.operator, note=details.note, expect=details.expect,
         real_time_priority=not peer.embedded if details.real_time_priority is None else details.real_time_priority,
     )
 

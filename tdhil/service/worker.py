@@ -17,7 +17,7 @@ from tdhil.errors import UsageError
 from tdhil.numerics import prepare
 from tdhil.service.run_state import Told
 
-NICE: Final = {"plan": 5, "trend": 5}      # a page waits for it
+NICE: Final = {"plan": 5, "trend": 5, "pace": 0}      # a page waits for it; a run by the clock has 0 too
 USUAL_NICE: Final = 19
 
 
@@ -26,6 +26,16 @@ def plan(asked: dict[str, Any]) -> dict[str, Any]:
     from tdhil.service.start_request import plan_of, read_rig
 
     return {"document": plan_of(read_rig(Path(asked["rig_file"])), asked["options"])}
+
+
+def pace(asked: dict[str, Any]) -> dict[str, Any]:
+    """Return whether this computer sustains the cycle rate of a simulated rig by the clock."""
+    from tdhil.config import CLOCKS
+    from tdhil.service.start_request import read_rig
+    from tdhil.session import measure_pace
+
+    found = read_rig(Path(asked["rig_file"]))
+    return {"document": measure_pace(*found.way({**asked["options"], CLOCKS[0]: True}), found.rig).plain()}
 
 
 def replay(asked: dict[str, Any]) -> dict[str, Any]:
@@ -112,8 +122,8 @@ def calibrate(asked: dict[str, Any]) -> dict[str, Any]:
 
 
 WORK: Final = {
-    "plan": plan, "replay": replay, "report": report, "samples": samples, "recover": recover, "trend": trend,
-    "compare": compare, "calibrate": calibrate,
+    "plan": plan, "pace": pace, "replay": replay, "report": report, "samples": samples, "recover": recover,
+    "trend": trend, "compare": compare, "calibrate": calibrate,
 }
 
 

@@ -22,8 +22,21 @@ def test_a_trend_is_its_rows_and_anything_else_is_computed_anew(tmp_path):
     kept.put(kept.key("trend", {"rows": [1], "rig": "a"}), {"n": 1})
     assert kept.get(kept.key("trend", {"rows": [1], "rig": "a"})) == {"n": 1}
     assert kept.get(kept.key("trend", {"rows": [1, 2], "rig": "a"})) is None
-    assert kept.key("plan", {"rig_file": "rig.yaml"}) is None
+    assert kept.key("replay", {"folder": "x"}) is None
+    assert kept.key("plan", {"rig_file": "gone.yaml"}) is None
     assert kept.key("compare", {"runs": ["gone"]}) is None
+
+
+def test_a_plan_is_kept_until_the_rig_s_file_changes(tmp_path):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("name: a")
+    kept, asked = KeptAnswers(tmp_path), {"rig_file": str(rig), "options": {}, "profile": "1"}
+    kept.put(kept.key("plan", asked), {"n": 1})
+    assert kept.get(kept.key("plan", asked)) == {"n": 1}
+    assert kept.get(kept.key("plan", asked | {"profile": "2"})) is None
+    assert kept.get(kept.key("plan", asked | {"options": {"tolerance": 0.01}})) is None
+    rig.write_text("name: b")
+    assert kept.get(kept.key("plan", asked)) is None
 
 
 def test_no_more_are_kept_than_memory_is_meant_for(tmp_path):

@@ -9,6 +9,7 @@ import re
 import signal
 import sqlite3
 import threading
+from datetime import datetime
 from typing import Any
 
 import jsonschema
@@ -225,10 +226,20 @@ def test_a_rig_s_results_over_time_and_runs_side_by_side(call, service, monkeypa
         wait_for("its end", lambda: not service.supervisor.live())
         (service.store.place(runs[-1]) / "row.json").write_text('{"log": "x"}')
     wait_for("the index", lambda: len(call("GET", "/runs?state=done", 200)) == 2)
-    asked = worked(service, monkeypatch, {"quantities": []})
-    assert call("GET", "/rigs/a/trend", 200)["trend"] == {"quantities": []}
-    assert call("GET", f"/runs/compare?runs={','.join(runs)}", 200)["runs"] == runs
-    assert asked == [("trend", {"rows": [{"log": "x"}] * 2, "rig": "a"}),
+    played = {"quantities": [], "results": [{"date": "2026-01-01"}, {"date": None}],
+              "settings": [{"name": "date", "values": ["a", "a"], "differs": False}, {"name": "rig", "values": []}]}
+    asked = worked(service, monkeypatch, played)
+    times = [call("GET", f"/runs/{one}", 200)["asked"] for one in runs]
+    assert call("GET", "/rigs/a/trend", 200)["trend"] == played
+    compared = call("GET", f"/runs/compare?runs={','.join(runs)}", 200)
+    assert compared["runs"] == runs
+    assert [one["date"] for one in compared["comparison"]["results"]] == times          # one time on all pages
+    assert compared["comparison"]["settings"][0]["values"] == times
+    rows = asked[0][1]["rows"]
+    seconds = [[int(datetime.fromisoformat(at).timestamp()) for at in found]
+               for found in ([one["date"] for one in rows], times[::-1])]
+    assert seconds[0] == seconds[1]                 # and in the trend's words as local time, with its zone
+    assert asked == [("trend", {"rows": rows, "rig": "a"}),
                      ("compare", {"runs": runs, "runs_folder": str(service.store.runs)})]
     for wrong in ("", runs[0], f"{runs[0]},{runs[0]}", ",".join("abcdefghi")):
         call("GET", f"/runs/compare?runs={wrong}", 422)

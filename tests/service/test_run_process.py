@@ -155,9 +155,11 @@ def test_a_run_that_was_cut_short_shows_what_its_motion_did_show(tmp_path):
     assert RunProcess(asked.folder).serve() == ExitCode.DRIVE_FAULT
     status = asked.store.status(asked.run)
     assert (status.state, status.verdict) == (State.FAILED, None)
+    assert status.rehearsal["verdict"] == "pass" and "standstill confirmed" in status.rehearsal["seen"]
     result = json.loads((asked.folder / "result.json").read_bytes())
     assert result["inertia_kg_m2"]["low_total"] < 104.0 < result["inertia_kg_m2"]["high_total"]
     assert result["rehearsed_faults"] == ["sto@acquire+160s"]
+    assert result["rehearsal"] == status.rehearsal
     assert json.loads((asked.folder / "row.json").read_bytes())["aborted_stage"] == "acquire"
     assert (asked.folder / "report.html").exists() is has_extra()
 

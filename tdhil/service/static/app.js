@@ -48,7 +48,7 @@
       });
       const found = await answer.json();
       if (answer.status === 401 && document.body.dataset.page !== "login") loggedOut();
-      if (!answer.ok) throw new Refused(found.error ? found.error.message : `HTTP ${answer.status}`);
+      if (!answer.ok) throw Object.assign(new Refused(found.error ? found.error.message : `HTTP ${answer.status}`), { fields: found.fields || [] });
       return found;
     } finally {
       clearTimeout(timer);
@@ -113,7 +113,7 @@
   /** Format local time with an unambiguous month. */
   const two = (one, digits = 2) => String(one).padStart(digits, "0");
   const time = (at) => `${two(at.getHours())}:${two(at.getMinutes())}:${two(at.getSeconds())}`;
-  const clock = (iso) => (iso ? `${time(new Date(iso))}.${two(new Date(iso).getMilliseconds(), 3)}` : "");
+  const clock = (iso) => (iso ? `${time(new Date(iso))}.${two(new Date(iso).getMilliseconds(), 3)} ${zone(new Date(iso))}` : "");
   function when(iso) {
     if (!iso) return "";
     const at = new Date(iso);
@@ -122,7 +122,7 @@
   /** Return the offset of local time: files and the terminal may show another one. */
   function zone(at) {
     const minutes = -at.getTimezoneOffset(), away = Math.abs(minutes);
-    return minutes === 0 ? "UTC" : `UTC${minutes < 0 ? "−" : "+"}${Math.floor(away / 60)}${away % 60 ? `:${two(away % 60)}` : ""}`;
+    return minutes === 0 ? "UTC" : `UTC${minutes < 0 ? "-" : "+"}${two(Math.floor(away / 60))}:${two(away % 60)}`;      // as in reports
   }
   /** Return a quantity as typed, with this unit if it has none. The service checks it. */
   function quantity(text, unit) {
@@ -132,6 +132,25 @@
   function span(seconds) {
     const whole = Math.max(0, Math.round(seconds));
     return whole < 90 ? `${whole} s` : `${Math.floor(whole / 60)} min ${String(whole % 60).padStart(2, "0")} s`;
+  }
+  /** Show what is waited for, since when, and how much of its usual time is over. Return how the wait is ended. */
+  function waiting(where, text, kind, sinceMs = Date.now()) {
+    const key = `tdhil-took-${kind}`, bar = el("progress", { "aria-label": text }), line = el("p", { class: "dim", role: "status" }, text);
+    let usual = null;
+    try { usual = Number(localStorage.getItem(key)) || null; } catch (error) { /* then no usual time is known */ }
+    if (usual) bar.max = usual;
+    const tick = () => {
+      const ms = Date.now() - sinceMs;
+      if (usual && ms < usual) bar.value = ms; else bar.removeAttribute("value");       // longer than usual: it goes on
+      line.textContent = `${text}: ${span(ms / 1000)}${usual ? ` of about ${span(usual / 1000)}` : ""}`;
+    };
+    tick();
+    const timer = setInterval(tick, 500);
+    show(where, line, bar);
+    return (done) => {
+      clearInterval(timer);
+      if (done) try { localStorage.setItem(key, String(Date.now() - sinceMs)); } catch (error) { /* as above */ }
+    };
   }
   const rehearsal = (yes) => (yes ? el("span", { class: "badge" }, "REHEARSAL") : null);
   const badge = (simulated) => (simulated ? el("span", { class: "badge" }, "SIMULATED") : null);
@@ -194,7 +213,7 @@
         if (field.checked) found[field.name] = true;
       } else if (text) {
         found[field.name] = unit ? quantity(text, unit) : kind === "tuple" ? text.split(/[\s,]+/)
-          : kind === "int" && /^\d+$/.test(text) ? Number(text) : text;
+          : kind === "int" && /^-?\d+$/.test(text) ? Number(text) : text;
       }
     }
     return found;
@@ -217,18 +236,72 @@
     ];
   }
 
+  /** Before a run by the clock: measure whether this computer sustains the rate, and say so. Return what a start waits for. */
+  function pacing(rig, form) {
+    const box = form.elements.real_time, where = byId("pace");
+    if (!box || !where) return async () => true;
+    const stepped = where.textContent;
+    let measuring = null, warned = false;
+    const measure = async () => {
+      where.className = "dim";
+      where.textContent = "Measuring whether this computer sustains the cycle rate …";
+      try {
+        const { pace: found } = await call("GET", `/rigs/${encodeURIComponent(rig)}/pace`, undefined, {}, 60000);
+        if (box.checked) {
+          where.className = found.holds ? "" : "alarm";
+          where.textContent = found.text;
+        }
+        return found.holds;
+      } catch (error) {
+        where.className = "alarm";
+        where.textContent = error instanceof Refused ? error.message : "The cycle rate could not be measured.";
+        return false;
+      }
+    };
+    box.addEventListener("change", () => {
+      warned = false;
+      measuring = box.checked ? measure() : null;
+      if (!box.checked) { where.className = "dim"; where.textContent = stepped; }
+    });
+    return async () => {             // a second request starts all the same
+      if (!box.checked || warned || await (measuring ||= measure())) return true;
+      warned = true;
+      where.textContent += " Start again to run all the same.";
+      const closed = where.closest("details");
+      if (closed) closed.open = true;
+      where.scrollIntoView({ block: "center" });
+      return false;
+    };
+  }
+
   function startPage() {
     const rig = document.body.dataset.rig;
     const form = byId("ask");
     if (!form) return;
+    const paced = pacing(rig, form);
     let key = null, keyFor = "";
     const flagged = [...form.querySelectorAll("[data-flag]")], fieldOf = (label) => label.querySelector("[name]");
     /** Say an error with the labels of this form in place of the command line's options, and mark these fields. */
-    function refuse(message) {
+    function refuse(message, fields = []) {
+      byId("plan").hidden = true;            // the plan of other values
+      if (fields.length) {
+        const known = fields.filter((one) => form.elements[one.option]);
+        show(byId("said"), el("div", { class: "alarm", role: "alert" }, el("p", {}, `${fields.length === 1 ? "One value" : `${fields.length} values`} can't be used. Nothing was started.`),
+          el("ul", {}, ...fields.map((one) => el("li", {}, el("strong", {}, one.label), `: ${one.message}`)))));
+        known.forEach((one) => {
+          const field = form.elements[one.option], note = el("span", { class: "alarm wrong", id: `wrong-${one.option}` }, one.message);
+          field.setAttribute("aria-invalid", "true");
+          field.setAttribute("aria-describedby", note.id);
+          field.closest("label").append(note);
+          const closed = field.closest("details");
+          if (closed) closed.open = true;
+        });
+        if (known.length) form.elements[known[0].option].focus();
+        return;
+      }
       const mine = flagged.filter((one) => new RegExp(`(^|[^\\w-])${one.dataset.flag}(?![\\w-])`).test(message));
       const text = mine.reduce((said, one) => said.replaceAll(new RegExp(`(^|[^\\w-])${one.dataset.flag}(?![\\w-])`, "g"), `$1“${one.dataset.label}”`), message);
       mine.map(fieldOf).forEach((one) => { one.setAttribute("aria-invalid", "true"); one.setAttribute("aria-describedby", "said"); });
-      byId("plan").hidden = true;            // the plan of other values
       show(byId("said"), el("p", { class: "alarm", role: "alert" }, text));
       if (mine.length) fieldOf(mine[0]).focus();
     }
@@ -243,13 +316,19 @@
       const buttons = [...form.querySelectorAll("button")];
       const options = asked(form);
       buttons.forEach((one) => { one.disabled = true; });
-      flagged.map(fieldOf).forEach((one) => { one.removeAttribute("aria-invalid"); one.removeAttribute("aria-describedby"); });
-      show(byId("said"), el("p", { class: "dim" }, wanted === "plan" ? "Planning …" : "Asking …"));
+      form.querySelectorAll("[aria-invalid]").forEach((one) => { one.removeAttribute("aria-invalid"); one.removeAttribute("aria-describedby"); });
+      form.querySelectorAll(".wrong").forEach((one) => one.remove());
+      const over = wanted === "plan" ? waiting(byId("said"), "Planning", "plan") : () => {};
+      if (wanted === "plan") byId("plan").hidden = true; else show(byId("said"), el("p", { class: "dim" }, "Asking …"));
+      let planned = false;
       try {
         if (wanted === "plan") {
           const found = await call("POST", `/rigs/${encodeURIComponent(rig)}/plan`, options, {}, 60000);
           show(byId("plan").lastElementChild, ...planTable(found.plan));
           byId("plan").hidden = false;
+          planned = true;
+          show(byId("said"));
+        } else if (!await paced()) {
           show(byId("said"));
         } else {
           const text = JSON.stringify(options);         // the same request twice starts one run
@@ -258,8 +337,9 @@
           location.assign(`/runs/${run.id}/live`);
         }
       } catch (error) {
-        refuse(error instanceof Refused ? error.message : "No answer from tdhil serve.");
+        refuse(error instanceof Refused ? error.message : "No answer from tdhil serve.", error.fields);
       } finally {
+        over(planned);
         buttons.forEach((one) => { one.disabled = false; });
       }
     });
@@ -619,7 +699,7 @@
   });
 
   const pages = { login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, may, number, ofResult, pages, percent, rehearsal, show, span, when };
+  window.tdhil = { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, may, number, ofResult, pacing, pages, percent, rehearsal, show, span, waiting, when, zone };
   document.addEventListener("DOMContentLoaded", () => {
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);
     try {

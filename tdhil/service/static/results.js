@@ -1,7 +1,7 @@
 // Results: one run, a comparison, a rig over time, many logs. As in app.js, data from elsewhere are inserted as text.
 "use strict";
 (() => {
-  const { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, number, ofResult, pages, percent, rehearsal, show, span, when } = window.tdhil;
+  const { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, number, ofResult, pacing, pages, percent, rehearsal, show, span, waiting, when, zone } = window.tdhil;
 
   // -- one run
 
@@ -10,6 +10,8 @@
     const parts = [el("p", { class: "now" }, el("strong", { class: run.state === "stop_not_confirmed" ? "alarm" : "" }, STATES[run.state] || run.state))];
     if (run.error) parts.push(el("p", { class: run.state === "stopped" && run.stop.asked ? "dim" : "alarm" }, run.error.message));
     if (!ENDED.includes(run.state)) parts.push(el("p", {}, el("a", { class: "button", href: `/runs/${run.id}/live` }, "Live")));
+    parts.push(...rehearsed(run));
+    parts.push(...accepted(result));
     if (!result) return parts;
     const rows = [["verdict", result.verdict]];
     const J = result.inertia_kg_m2;
@@ -33,6 +35,31 @@
     const codes = result.warning_codes || [], wanted = run.state === "stopped" && run.stop.asked;
     (result.warnings || []).forEach((one, k) => parts.push(el("p", { class: wanted && codes[k] === ENDED_EARLY ? "dim" : "alarm" }, one)));
     return parts;
+  }
+  /** Expected against identified, each by its interval, and what is off. */
+  function accepted(result) {
+    const found = result && result.acceptance;
+    if (!found) return [];
+    const colour = { pass: "good", fail: "bad" };
+    return [el("section", { class: "card" }, el("h2", {}, "Acceptance"),
+      el("p", { class: `verdict ${colour[found.verdict] || "fair"}` }, found.verdict),
+      ...found.off.map((one) => el("p", { class: "alarm" }, `${one} [${found.code}]`)),
+      region("Acceptance", el("table", { class: "whole" }, el("thead", {}, el("tr", {}, ...["quantity", "expected", "identified", "verdict"].map((one) => el("th", { scope: "col" }, one)))),
+        el("tbody", {}, ...found.quantities.map((one) => el("tr", {}, el("th", { scope: "row" }, one.label),
+          el("td", {}, `${number(one.expected)} ± ${number(one.tolerance, 2)} ${one.unit}`),
+          el("td", {}, one.value === null ? "not identified" : `${of(one)} ${one.unit}`),
+          el("td", { class: `verdict ${colour[one.verdict] || "fair"}` }, one.verdict))))))) ];
+  }
+  /** The verdict on rehearsed faults: required and seen. */
+  function rehearsed(run) {
+    const found = run.rehearsal_verdict;
+    if (!found) return [];
+    const rows = [...found.faults.flatMap((one) => [
+      [one.fault, `${one.verdict}; exit ${one.codes.join(" or ")} is required`],
+      [`required by ${one.row ? `row ${one.row}` : "any fault"}`, one.required]]), ["seen", found.seen]];
+    return [el("section", { class: "card" }, el("h2", {}, "Rehearsal"),
+      el("p", { class: `verdict ${{ pass: "good", fail: "bad" }[found.verdict] || "fair"}` }, found.verdict),
+      region("Rehearsal", el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))))];
   }
   const ENDED_EARLY = "TDH-030";
   const VERDICTS = { valid: "good", valid_wide: "fair", not_identifiable: "bad", model_rejected: "bad" };
@@ -84,9 +111,38 @@
       const first = run.result ? [{ asked: {}, result: run.result, state: "done", first: true }] : [];
       show(byId("replay-rows"), ...[...first, ...run.replays].map((one) => el("tr", {},
         el("th", { scope: "row" }, one.first ? "the run itself" : Object.entries(one.asked).map(([name, value]) => `${name} ${value}`).join(", ") || "as the run"),
-        el("td", {}, one.state === "waiting" ? "…" : one.error ? one.error.message : one.result.verdict),
+        el("td", {}, one.state === "waiting" ? waits(one) : one.error ? one.error.message : one.result.verdict),
         el("td", {}, ofResult(one.result) || "–"),
         el("td", {}, one.result && one.result.inertia_kg_m2 ? percent(one.result.inertia_kg_m2.half_width_total_rel) : ""))));
+    });
+    const clocks = new Map();
+    /** The cell of a replay that goes on: since when, and its usual time. It stays the same element. */
+    function waits(one) {
+      if (!clocks.has(one.name)) {
+        const cell = el("div");
+        waiting(cell, "Identifying again", "replay", Date.parse(one.at));
+        clocks.set(one.name, cell);
+      }
+      return clocks.get(one.name);
+    }
+    const pdf = document.querySelector(".files a[href$='report.pdf']");
+    if (pdf) pdf.addEventListener("click", async (event) => {
+      if (pdf.dataset.ready !== undefined) return;
+      event.preventDefault();            // it is made first, and this page says so
+      const note = el("div");
+      pdf.closest("li").append(note);
+      const over = waiting(note, "The PDF is made", "pdf");
+      try {
+        const answer = await fetch(pdf.href);
+        if (!answer.ok) throw new Refused((await answer.json()).error.message);
+        over(true);
+        pdf.dataset.ready = "";
+        show(note);
+        pdf.click();
+      } catch (error) {
+        over(false);
+        show(note, el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+      }
     });
     const replay = byId("replay");
     replay.addEventListener("submit", async (event) => {
@@ -94,9 +150,11 @@
       const said = byId("replay-said");
       said.hidden = true;
       try {
-        await call("POST", `/runs/${id}/replays`, asked(replay));
+        const found = await call("POST", `/runs/${id}/replays`, asked(replay));
+        if (found.state === "done") { said.textContent = `Replay ${Number(found.name)} below has these settings.`; said.className = "dim"; said.hidden = false; }
       } catch (error) {
         said.textContent = error.message;
+        said.className = "alarm";
         said.hidden = false;
       }
     });
@@ -166,7 +224,7 @@
       plot = new uPlot({
         width: where.clientWidth || 320, height: 240, legend: { show: false }, cursor: { show: false },
         scales: { x: { time, range: () => [xs[0] - side, xs[xs.length - 1] + side] }, y: { range: () => [low - pad, high + pad] } },
-        axes: [{ ...axis, size: 48, label: time ? undefined : label, labelSize: time ? 0 : 22, ...(time ? { values: TIMES } : {}) }, { ...axis, size: 62 }],
+        axes: [{ ...axis, size: 48, label: time ? `local time, ${zone(new Date(1000 * xs[xs.length - 1]))}` : label, labelSize: 22, ...(time ? { values: TIMES } : {}) }, { ...axis, size: 62 }],
         series: [{}, ...series.map(() => ({ stroke: "transparent", paths: () => null, points: { show: false } }))],
         hooks: { draw: [(self) => {
           const c = self.ctx, px = devicePixelRatio;
@@ -199,10 +257,13 @@
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   }
 
-  async function once(where, look) {
+  async function once(where, look, text = "Loading", kind = "faults") {
+    const over = waiting(where, text, kind);
     try {
       await look();
+      over(true);
     } catch (error) {
+      over(false);
       show(where, el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
     }
     alive();
@@ -225,7 +286,7 @@
         points(plot, [{ colour: "--c0", points: quantity.points.map((one) => ({ ...one, x: at(one.date) })) }],
           { time: true, marks: quantity.changes.map((one) => (at(one.before_date) + at(one.after_date)) / 2) });
       }
-    });
+    }, "The results are compared", "history");
   }
 
   // -- comparison
@@ -263,7 +324,7 @@
         el("h2", {}, "Settings"), el("p", { class: "dim" }, "≠ marks different settings."),
         region("Settings", el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...ids.map((id, k) => el("th", { scope: "col" }, dot(k), ` ${k + 1}`)))),
           el("tbody", {}, ...comparison.settings.map((one) => line(`${one.differs ? "≠ " : ""}${one.name}`, one.name === "date" ? one.values.map(when) : one.values.map((value) => ({ True: "yes", False: "no" }[value] ?? value)), one.differs))))));
-    });
+    }, "Each run is identified again", "compare");
   }
   const percentOf = (share) => `${share > 0 ? "+" : ""}${(100 * share).toPrecision(2)} %`;
   const line = (name, values, marked = false) => el("tr", marked ? { class: "differs" } : {}, el("th", { scope: "row" }, name), ...values.map((one) => el("td", {}, one)));
@@ -282,11 +343,13 @@
     const rig = document.body.dataset.rig, form = byId("rehearse");
     if (!form) return;
     form.addEventListener("submit", (event) => event.preventDefault());
+    const paced = pacing(rig, form);
     const seconds = (name) => form.elements[name].value.trim().replace(",", ".").replace(/\s*s$/, "");
     async function begin(fault, value, button) {
       const moment = fault.from_start ? "" : `@${form.elements.stage.value}${seconds("after") ? `+${seconds("after")}s` : ""}`;
       const text = `${fault.name}${moment}${value ? `=${value}` : ""}${!fault.from_start && seconds("duration") ? `/${seconds("duration")}s` : ""}`;
       button.disabled = true;
+      if (!await paced()) { button.disabled = false; return; }
       try {
         const run = await call("POST", `/rigs/${encodeURIComponent(rig)}/runs`, { fault: [text], note: `rehearsal: ${text}`, real_time: form.elements.real_time.checked }, { "Idempotency-Key": crypto.randomUUID() });
         location.assign(`/runs/${run.id}/live`);
@@ -298,12 +361,13 @@
     }
     once(byId("said"), async () => {
       const faults = await call("GET", `/rigs/${encodeURIComponent(rig)}/faults`);
+      show(byId("said"));
       show(byId("faults"), ...faults.map((one) => {
         const value = one.takes ? el("input", { value: one.value, "aria-label": `${one.name}: ${one.takes.toLowerCase()}`, autocomplete: "off" }) : null;
         const button = el("button", { type: "button", class: "quiet", "aria-label": `Rehearse ${one.name}` }, "Rehearse");
         button.addEventListener("click", () => begin(one, value && value.value.trim() !== one.value ? value.value.trim() : "", button));
         return el("li", {}, el("strong", {}, one.name, one.row ? el("span", { class: "dim" }, ` ${one.row}`) : ""),
-          el("span", {}, one.summary, one.from_start ? el("span", { class: "dim" }, "; from the start") : ""), value || el("span"), button);
+          el("span", {}, one.summary, one.from_start ? el("span", { class: "dim" }, "; from the start") : "", el("br"), el("span", { class: "dim" }, `Required: ${one.required}`)), value || el("span"), button);
       }));
     });
   }
