@@ -124,8 +124,11 @@ def run_with(
         note=details.note, real_time_priority=bool(details.real_time_priority), evaluation=evaluation,
         expect=details.expect,
     )
-    if evaluation is None and (said := say_before(options, rig, connection.profile, simulated)) is not None:
-        console.print(said, style="yellow", markup=False)
+    if evaluation is None:
+        with console.status("planning …") if console.is_terminal else nullcontext():
+            said = say_before(options, rig, connection.profile, simulated)
+        if said is not None:
+            console.print(said, style="yellow", markup=False)
     return _run(request, console, namespace.report, logs)
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from math import sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,8 @@ from tdhil.config import OPTION
 from tdhil.errors import ExitCode, MessageCode, UsageError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from profiles import Profile
     from tdhil.report import TunedFor
     from tdhil.soft_torque import (
@@ -106,24 +109,22 @@ def run(namespace: argparse.Namespace) -> int:
     _check_files(namespace)
     if namespace.report is not None:
         check_report_path(namespace.report, namespace.result)
-    result = read_result(namespace.result)       # a log is identified again, which takes seconds
+    told = stderr_console()
+    with _progress(told, "reading the result"):          # a log is identified again, which takes seconds
+        result = read_result(namespace.result)
     case, lags_from = case_of(result, namespace)
     name = namespace.profile or (result.get("profile") or {}).get("name")
     profile = load_profile(str(name)) if name is not None else None
-    told = stderr_console()
-
-    def tell(text: str) -> None:
-        told.print(f"tune: {text} …", style="dim", markup=False)
-
-    tuning = tune(case, None if namespace.no_simulation else Search(), tell)
-    tuned_for = _tuned_for(result, namespace, tuning, lags_from, profile)
-    document = tuning_document(tuning, tuned_for)
-    if namespace.depths is not None:
-        document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, profile, tell)
-    if namespace.report is not None:
-        tell("the operator's map: set speed and bit torque")
-        found = operator_map(tuning)
-        document["map"] = None if found is None else map_document(found)
+    with _progress(told, "tuning") as tell:
+        tuning = tune(case, None if namespace.no_simulation else Search(), tell)
+        tuned_for = _tuned_for(result, namespace, tuning, lags_from, profile)
+        document = tuning_document(tuning, tuned_for)
+        if namespace.depths is not None:
+            document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, profile, tell)
+        if namespace.report is not None:
+            tell("the operator's map: set speed and bit torque")
+            found = operator_map(tuning)
+            document["map"] = None if found is None else map_document(found)
     if namespace.json:
         print_json(document)
         if namespace.no_simulation:
@@ -135,6 +136,25 @@ def run(namespace: argparse.Namespace) -> int:
         written = write_tuning_report(document, showcase_of(tuning), namespace.report)
         told.print(f"report: {written}", markup=False, soft_wrap=True)
     return int(ExitCode.OK)
+
+
+@contextmanager
+def _progress(told: Console, text: str) -> Iterator[Callable[[str], None]]:
+    """Yield what tells each step, a line each; at a terminal the present step also has a moving sign."""
+    def line(step: str) -> None:
+        told.print(f"tune: {step} …", style="dim", markup=False)
+
+    if not told.is_terminal:
+        yield line
+        return
+    from rich.markup import escape
+
+    with told.status(escape(f"tune: {text} …")) as status:
+        def step(what: str) -> None:
+            line(what)
+            status.update(escape(f"tune: {what} …"))
+
+        yield step
 
 
 def _check(namespace: argparse.Namespace) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from dataclasses import replace
@@ -378,3 +379,17 @@ def test_a_tuning_that_evaluate_refuses_says_so(tmp_path, capsys):
     path.write_text(json.dumps(result()))
     assert main(["tune", str(path), "--string", str(STRING_YAML), "--no-simulation", "--json"]) == 0
     assert "tdhil evaluate does not accept this file" in capsys.readouterr().err
+
+
+def test_at_a_terminal_each_step_moves_until_the_next():
+    """Tuning takes a minute: elsewhere each step is a line, at a terminal the present one also has a moving sign."""
+    from rich.console import Console
+
+    from tdhil.cli.tune import _progress
+
+    for terminal in (True, False):
+        out = io.StringIO()
+        with _progress(Console(file=out, force_terminal=terminal, width=80), "tuning") as tell:
+            tell("string's modes [1/2]")
+        assert "tune: string's modes [1/2] …" in out.getvalue()
+        assert ("\x1b[?25l" in out.getvalue()) is terminal          # the cursor is hidden while it moves
