@@ -60,6 +60,8 @@ TURNING_SHARE = 0.05
 class State(Enum):
     """The states by name; `STATUS` has their statusword bits."""
 
+    __hash__ = object.__hash__     # Enum's own is Python code, too slow for a look-up in every cycle
+
     NOT_READY = "not ready to switch on"
     SWITCH_ON_DISABLED = "switch on disabled"
     READY = "ready to switch on"
@@ -293,7 +295,9 @@ class Application:
     @property
     def stopping(self) -> bool:
         """On the way to rest, or held there, by command: quick stop, halt, or a ramp before switching off."""
-        return self.state is State.QUICK_STOP or self.halted or self._after_stop is not None
+        if self.state is State.ENABLED:
+            return bool(self.controlword & HALT) or self._after_stop is not None
+        return self.state is State.QUICK_STOP or self._after_stop is not None
 
     def statusword(self) -> int:
         """6041h."""
@@ -303,10 +307,10 @@ class Application:
         control = self.inverter.control
         if control.limited:
             word |= INTERNAL_LIMIT
-        stopping = self.stopping
+        stopping, enabled = self.stopping, self.state is State.ENABLED
         if stopping:
             reached = self.standstill
-        elif self.state is not State.ENABLED:
+        elif not enabled:
             reached = False
         elif self.mode is OperationMode.PROFILE_VELOCITY:
             reached = self._in_window_s > self.settings.window_s
@@ -317,18 +321,18 @@ class Application:
         if self.mode is OperationMode.PROFILE_VELOCITY:
             specific = self.standstill                                        # speed is zero
         else:
-            cyclic = self.mode in {OperationMode.CYCLIC_VELOCITY, OperationMode.CYCLIC_TORQUE}
-            specific = cyclic and self.state is State.ENABLED and not stopping  # follows the setpoint
+            cyclic = self.mode is OperationMode.CYCLIC_TORQUE or self.mode is OperationMode.CYCLIC_VELOCITY
+            specific = cyclic and enabled and not stopping                    # follows the setpoint
         return word | MODE_SPECIFIC if specific else word
 
     # -- time --------------------------------------------------------------------------------------------
 
     def step(self, dt_s: float) -> None:
         """One step of at most the control period, with the setpoints as `regulate` left them."""
-        self.inverter.step(dt_s)
+        inverter, settings = self.inverter, self.settings
+        inverter.step(dt_s)
         self._time_s += dt_s
-        settings = self.settings
-        speed = self.inverter.control.filtered_rad_s
+        speed = inverter.control.filtered_rad_s
         self._slow_for_s = self._slow_for_s + dt_s if abs(speed) < settings.standstill_rad_s else 0.0
         near = abs(speed - self.target_speed_rad_s) < settings.window_rad_s
         self._in_window_s = self._in_window_s + dt_s if near else 0.0

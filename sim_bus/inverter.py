@@ -165,6 +165,8 @@ class Reporting:
 class Regulation(Enum):
     """Controlled quantity."""
 
+    __hash__ = object.__hash__     # Enum's own is Python code, too slow for a look-up in every step
+
     OFF = "off"
     SPEED = "speed"
     STOP = "stop"
@@ -282,9 +284,16 @@ class Controller:
         if self.reference != self._target:
             self._ramp(dt_s)
         if regulation is Regulation.TORQUE:
-            wanted, speed_limited = self._torque_wanted(dt_s), self._overspeed != 0.0
-            self.demand_nm = demand = max(-self.limits.torque_reverse_nm, min(self.limits.torque_forward_nm, wanted))
-            self.limited = speed_limited or demand != wanted
+            limits = self.limits
+            if self._overspeed == 0.0 and -limits.speed_rad_s <= self.filtered_rad_s <= limits.speed_rad_s:
+                wanted = self.reference        # the usual case: the speed limiter has nothing to do
+            else:
+                wanted = self._torque_wanted(dt_s)
+            demand = wanted
+            if not -limits.torque_reverse_nm <= wanted <= limits.torque_forward_nm:
+                demand = max(-limits.torque_reverse_nm, min(limits.torque_forward_nm, wanted))
+            self.demand_nm = demand
+            self.limited = self._overspeed != 0.0 or demand != wanted
             return demand
         return self._speed_loop(dt_s)
 
@@ -326,17 +335,18 @@ class Controller:
         elif demand < -limits.torque_reverse_nm:
             demand, limited = -limits.torque_reverse_nm, True
             growth = max(growth, 0.0)
-        self._integral = max(-limits.torque_reverse_nm, min(limits.torque_forward_nm, self._integral + growth))
+        integral = self._integral + growth
+        if not -limits.torque_reverse_nm <= integral <= limits.torque_forward_nm:
+            integral = max(-limits.torque_reverse_nm, min(limits.torque_forward_nm, integral))
+        self._integral = integral
         self.demand_nm = demand
         self.limited = limited
         return demand
 
     def _torque_wanted(self, dt_s: float) -> float:
-        """The ramped torque, less what the speed limit takes away."""
+        """The ramped torque, less what the speed limit takes away from a shaft that is, or was, beyond it."""
         params, limit = self._params, self.limits.speed_rad_s
         speed, taken = self.filtered_rad_s, self._overspeed
-        if taken == 0.0 and -limit <= speed <= limit:
-            return self.reference
         forward = taken > 0.0 or (taken == 0.0 and speed > limit)
         excess = speed - limit if forward else speed + limit
         taken += params.speed_integral_gain_nm_rad * excess * dt_s
@@ -360,8 +370,8 @@ class Inverter:
     """Control, power stage and shaft of one simulated drive."""
 
     __slots__ = (
-        "_bottom_load", "_disturbance", "_dt_s", "_lagged_nm", "_move", "_normals", "_speed_scale", "_torque_gain",
-        "_torque_scale", "control", "lies", "params", "reporting", "state", "torque_nm",
+        "_bottom_load", "_disturbance", "_divided_s", "_division", "_dt_s", "_lagged_nm", "_move", "_normals",
+        "_speed_scale", "_torque_gain", "_torque_scale", "control", "lies", "params", "reporting", "state", "torque_nm",
     )
 
     def __init__(self, params: RigParams, rng: np.random.Generator) -> None:
@@ -381,6 +391,7 @@ class Inverter:
         self._lagged_nm = 0.0
         self._torque_scale, self._speed_scale = params.reporting.torque_scale, params.reporting.speed_scale
         self._dt_s = 0.0
+        self._divided_s, self._division = 0.0, (1, 0.0)
         self._torque_gain = 1.0
 
     @property
@@ -434,8 +445,10 @@ class Inverter:
 
     def steps(self, duration_s: float) -> tuple[int, float]:
         """How many equal steps, none longer than the control period, make up ``duration_s``."""
-        count = max(1, -int(-duration_s / self.params.drive.control_period_s * (1.0 - 1e-9) // 1))
-        return count, duration_s / count
+        if duration_s != self._divided_s:
+            count = max(1, -int(-duration_s / self.params.drive.control_period_s * (1.0 - 1e-9) // 1))
+            self._divided_s, self._division = duration_s, (count, duration_s / count)
+        return self._division
 
     def lose_load(self, share: float) -> None:
         """Scripted: what hangs on the motor comes off; a rigid shaft with this share of the motor end's is left."""

@@ -29,6 +29,8 @@ from sim_bus.fault_script import FaultKind, M, factor, number, seconds, share
 class Feedback(Enum):
     """Signal of the drive's feedback."""
 
+    __hash__ = object.__hash__     # Enum's own is Python code, too slow for a look-up in every cycle
+
     SPEED = "speed"
     TORQUE = "torque"
     DEMAND = "demand"

@@ -100,8 +100,8 @@ def profile_units(drive: DriveParams, profile: CanopenProfile, scales: dict[str,
 
 def clamped(value: float, bits: int) -> int:
     """Rounded to the nearest integer that a signed field of ``bits`` can hold."""
-    top = (1 << bits - 1) - 1
-    return max(-top - 1, min(top, round(value)))
+    counts, top = round(value), (1 << bits - 1) - 1
+    return counts if -top <= counts <= top else max(-top - 1, min(top, counts))
 
 
 def wrapped(counts: float, bits: int = 32, *, signed: bool = True) -> int:

@@ -46,7 +46,8 @@ class InlineBus(can.BusABC):
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """The other stations have it and the drive has answered it. CanOperationError on a bus that is shut down."""
-        self._refuse_shut()
+        if self._is_shutdown:
+            self._refuse_shut()
         if len(self._stations) > 1:
             for station in self._stations:
                 if station is not self:
@@ -56,8 +57,9 @@ class InlineBus(can.BusABC):
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """The next frame; None after ``timeout`` s of wall time. CanOperationError on a bus that is shut down."""
         if self._filters is None and not self._is_shutdown:
-            if not self.heard.empty():
-                return self.heard.get_nowait()
+            heard = self.heard
+            if not heard.empty():
+                return heard.get_nowait()
             if timeout is not None and timeout <= 0.0:
                 return None
         return super().recv(timeout)
@@ -142,20 +144,29 @@ class InlineSimulator(Embedded):
     def _hear(self, message: can.Message) -> None:
         with self._one_at_a_time:
             if self._on:
-                self._do(self.simulator.hear, message)
+                try:
+                    self.simulator.hear(message)
+                except BaseException as error:
+                    self._failed(error)
             elif self._cut_short:
                 raise can.CanOperationError("the simulated drive was interrupted")
 
-    def _do(self, act: Callable[..., None], *what: can.Message) -> None:
+    def _do(self, act: Callable[[], None]) -> None:
         try:
-            act(*what)
-        except Exception as error:
+            act()
+        except BaseException as error:
+            self._failed(error)
+
+    def _failed(self, error: BaseException) -> None:
+        """Falls silent. What comes from outside, and is no error of the simulation, goes on its way."""
+        own = isinstance(error, Exception)
+        if own:
             self._failure = error
-            self._off()
-        except BaseException:
+        else:
             self._cut_short = True
-            self._off()
-            raise
+        self._off()
+        if not own:
+            raise error
 
     def _off(self) -> None:
         self._on = False

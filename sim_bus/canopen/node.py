@@ -190,25 +190,28 @@ class Cia402Node:
     def advance_us(self, duration_us: int) -> None:
         """The plant, and all that is timed, moves on."""
         application, inverter = self.application, self.inverter
-        self.on_time(self.time_us)
+        begin_us = now_us = self.time_us
+        self.on_time(begin_us)
         application.regulate()
         count, dt_s = inverter.steps(duration_us * 1e-6)
-        begin_us = self.time_us
+        step = application.step
         for number in range(1, count + 1):
-            application.step(dt_s)
-            self.time_us = begin_us + duration_us * number // count
-            if self.time_us >= self._next_row_us:
-                self._next_row_us = (self.time_us // ROW_PERIOD_US + 1) * ROW_PERIOD_US
-                self.trace.row(
-                    self.time_us * 1e-6, inverter.state.speed_rad_s, inverter.torque_nm, application.state.value,
-                )
-        if self._consumer.expired(self.time_us):
+            step(dt_s)
+            self.time_us = now_us = begin_us + duration_us * number // count
+            if now_us >= self._next_row_us:
+                self._next_row_us = (now_us // ROW_PERIOD_US + 1) * ROW_PERIOD_US
+                if self.trace.active:
+                    self.trace.row(
+                        now_us * 1e-6, inverter.state.speed_rad_s, inverter.torque_nm, application.state.value,
+                    )
+        if self._consumer.expired(now_us):
             self._host_lost("host heartbeat lost")
-        if self._guard.expired(self.time_us):
+        if self._guard.expired(now_us):
             self._host_lost("host's node guarding lost")
-        if self._producer.due(self.time_us) and self.nmt.state is not NmtState.INITIALISING:
+        if self._producer.due(now_us) and self.nmt.state is not NmtState.INITIALISING:
             self._send(0x700 + self.id, bytes([self.nmt.state.value]))
-        self._send_events()
+        if self._event_transmit:
+            self._send_events()
 
     def note(self, event: str) -> None:
         """An event, or a change of state where ``event`` is empty, for the trace."""

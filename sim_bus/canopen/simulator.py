@@ -95,8 +95,30 @@ class Simulator:
 
     def hear(self, message: can.Message) -> None:
         """One frame from the bus; what it makes the drive say has been sent when this returns."""
-        if not (message.is_extended_id or message.is_error_frame):
-            self._frame_came(message)
+        if message.is_extended_id or message.is_error_frame:
+            return
+        node = self.node
+        self._silent_s = 0.0
+        if self._sender.lost:
+            self._sender.revive()
+        if self._running_on:
+            self._follow_wall_clock()
+            self._running_on = False
+            node.note("frames are back: stepped again")
+        elif not node.stepped:
+            self._follow_wall_clock()
+        was_stepped, identifier = node.stepped, message.arbitration_id
+        if message.is_remote_frame:
+            node.on_remote(identifier)
+        elif identifier == CYCLE_ID:
+            if node.stepped and message.data[:1] == CYCLE_ASKED:
+                self._sender.put(CYCLE_ID, CYCLE_ANSWER + message.data[1:2])
+        elif self._faults is not None:
+            self._faults.came(identifier, bytes(message.data))
+        else:
+            node.on_frame(identifier, bytes(message.data))
+        if was_stepped and not node.stepped:
+            self._wall_s = time.monotonic()
 
     def end(self) -> None:
         """The host is gone for good: a rehearsal is played to its end."""
@@ -115,30 +137,6 @@ class Simulator:
             self.node.advance_us(_CHUNK_US)
             turning = abs(self.node.inverter.speed_rad_s) > _AT_REST_RAD_S
             quiet_us = 0 if turning else quiet_us + _CHUNK_US
-
-    def _frame_came(self, message: can.Message) -> None:
-        node = self.node
-        self._silent_s = 0.0
-        if self._sender.lost:
-            self._sender.revive()
-        if self._running_on:
-            self._follow_wall_clock()
-            self._running_on = False
-            node.note("frames are back: stepped again")
-        elif not node.stepped:
-            self._follow_wall_clock()
-        was_stepped = node.stepped
-        if message.is_remote_frame:
-            node.on_remote(message.arbitration_id)
-        elif message.arbitration_id == CYCLE_ID:
-            if node.stepped and message.data[:1] == CYCLE_ASKED:
-                self._sender.put(CYCLE_ID, CYCLE_ANSWER + message.data[1:2])
-        elif self._faults is not None:
-            self._faults.came(message.arbitration_id, bytes(message.data))
-        else:
-            node.on_frame(message.arbitration_id, bytes(message.data))
-        if was_stepped and not node.stepped:
-            self._wall_s = time.monotonic()
 
     def _nothing_came(self, timeout_s: float, before_s: float, stop: threading.Event) -> None:
         self._trace.flush()

@@ -115,6 +115,7 @@ class DrillString:
         self._pass = 2.0 * self.impedance_nm_s_rad / (2.0 * self.impedance_nm_s_rad + self._drag)
         self._top, self._bottom = self._with_string(params), self._with_string(params.bottom)
         self._move, self._bottom_move = advance_of(self._top), advance_of(self._bottom)
+        self._load_nm = params.load_nm
 
     def rest(self) -> StringState:
         """Nothing turns, nothing is twisted."""
@@ -128,16 +129,15 @@ class DrillString:
 
         ``bottom_load_nm`` likewise at the bottom, beside its own, for the ticks that end within the step.
         """
-        drive = torque_nm - load_nm - self.params.load_nm
+        drive = torque_nm - load_nm - self._load_nm
         left = dt_s
         while left > 0.0:
-            until_tick = self.tick_s - state.into_tick_s
+            speed, angle, bristle, low_speed, low_angle, low_bristle, down, up, into_tick_s, tick_angle = state
+            until_tick = self.tick_s - into_tick_s
             piece = min(left, until_tick)
-            speed, bristle, travel = self._move(
-                self._top, state.speed_rad_s, state.bristle_rad, drive + float(state.up_nm[0]), piece)
-            state = state._replace(
-                speed_rad_s=speed, angle_rad=state.angle_rad + travel, bristle_rad=bristle,
-                into_tick_s=state.into_tick_s + piece)
+            speed, bristle, travel = self._move(self._top, speed, bristle, drive + up.item(0), piece)
+            state = StringState(speed, angle + travel, bristle, low_speed, low_angle, low_bristle,
+                                down, up, into_tick_s + piece, tick_angle)
             if piece >= until_tick:
                 state = self._tick(state, bottom_load_nm)
             left -= piece
@@ -150,14 +150,16 @@ class DrillString:
     def _tick(self, state: StringState, bottom_load_nm: float) -> StringState:
         """Waves one cell on, the bottom one tick on."""
         down, up, twice = state.down_nm, state.up_nm, 2.0 * self.impedance_nm_s_rad
-        arrived = float(down[-1])
+        arrived = down.item(-1)
         speed, angle, bristle, travel = self._bottom_end(state, arrived, bottom_load_nm)
-        between = (down[:-1] + up[1:]) * self._pass
-        new_down, new_up = np.empty_like(down), np.empty_like(up)
-        np.subtract(between, up[1:], out=new_down[1:])
-        np.subtract(between, down[:-1], out=new_up[:-1])
+        falling, rising = down[:-1], up[1:]        # what meets between two cells
+        between = falling + rising
+        between *= self._pass
+        new_down, new_up = np.empty(self.cells), np.empty(self.cells)
+        np.subtract(between, rising, new_down[1:])
+        np.subtract(between, falling, new_up[:-1])
         mean = (state.angle_rad - state.tick_angle_rad) / self.tick_s
-        new_down[0] = twice * mean - float(up[0])
+        new_down[0] = twice * mean - up.item(0)
         new_up[-1] = twice * travel / self.tick_s - arrived
         return StringState(state.speed_rad_s, state.angle_rad, state.bristle_rad, speed, angle, bristle,
                            new_down, new_up, 0.0, state.angle_rad)

@@ -50,7 +50,7 @@ class Rigid:
 
     def __init__(self, params: Params) -> None:
         self.rest = rigid.ShaftState
-        self.step = partial(rigid.step, params)
+        self.step = rigid.stepper(params)
 
 
 class TwoMass:

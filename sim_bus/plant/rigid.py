@@ -8,6 +8,7 @@ T_f, with how a step of each model is made, stands in `sim_bus.plant.friction`. 
 is in `sim_bus.plant.two_mass` and `sim_bus.plant.drill_string`; `sim_bus.plant.kinds` chooses.
 """
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 from sim_bus.plant.friction import MotorEnd, advance_of, torque
@@ -32,11 +33,19 @@ def step(params: Params, state: ShaftState, torque_nm: float, dt_s: float, load_
 
     ``load_nm`` acts against positive speed, on top of the constant load.
     """
-    speed, angle, bristle = state
-    drive = torque_nm - load_nm - params.load_nm
-    move = advance_of(params)
-    speed, bristle, travel = move(params, speed, bristle, drive, dt_s)
-    return ShaftState(speed, angle + travel, bristle)
+    return stepper(params)(state, torque_nm, dt_s, load_nm)
+
+
+def stepper(params: Params) -> Callable[..., ShaftState]:
+    """`step` of one shaft, whose friction model is looked up once."""
+    move, constant_nm = advance_of(params), params.load_nm
+
+    def step_on(state: ShaftState, torque_nm: float, dt_s: float, load_nm: float = 0.0) -> ShaftState:
+        speed, angle, bristle = state
+        speed, bristle, travel = move(params, speed, bristle, torque_nm - load_nm - constant_nm, dt_s)
+        return ShaftState(speed, angle + travel, bristle)
+
+    return step_on
 
 
 def friction_torque(params: Params, state: ShaftState, drive_nm: float = 0.0) -> float:
