@@ -109,6 +109,8 @@ class Ticks:
         self._clock = clock
         self._period_s = period_s
         self._longest_stall_s = longest_stall_s
+        counts_s = max(STALL_S, STALL_CYCLES * period_s)
+        self._no_stall_s = min(counts_s, longest_stall_s) if longest_stall_s > 0.0 else counts_s
         self._ended_s = self._began_s = clock.now_s()
         self._next_s = self._ended_s + period_s
         self.overruns = 0
@@ -125,14 +127,16 @@ class Ticks:
         """
         clock, due_s = self._clock, self._next_s
         (until or clock.wait_until)(due_s)
-        now_s = clock.now_s()
-        self.late_s.append(now_s - due_s)
-        if now_s - due_s > 0.5 * self._period_s:
+        now_s = self._began_s = clock.now_s()
+        late_s, half_s = now_s - due_s, 0.5 * self._period_s
+        self.late_s.append(late_s)
+        if late_s > half_s:
             self.overruns += 1
-        self._next_s = max(due_s + self._period_s, now_s + 0.5 * self._period_s)
-        self._began_s = now_s
+        self._next_s = max(due_s + self._period_s, now_s + half_s)
         # Waiting for a missing reply is not a stall; it has its own error.
-        self._refuse_stall(now_s - max(due_s, self._ended_s), now_s)
+        stood_still_s = now_s - max(due_s, self._ended_s)
+        if stood_still_s > self._no_stall_s:
+            self._refuse_stall(stood_still_s, now_s)
 
     def check(self) -> None:
         """Check for a stall just before a setpoint is sent: a process can be frozen anywhere, also after the tick.
@@ -140,7 +144,8 @@ class Ticks:
         Raises CommunicationLost like `wait`.
         """
         now_s = self._clock.now_s()
-        self._refuse_stall(now_s - self._began_s, now_s)
+        if now_s - self._began_s > self._no_stall_s:
+            self._refuse_stall(now_s - self._began_s, now_s)
 
     def check_end(self) -> None:
         """Check for a stall when the cycle's frames are in: a loop that was frozen can't judge the drive's silence.
@@ -148,7 +153,8 @@ class Ticks:
         Raises CommunicationLost like `wait`.
         """
         now_s = self._clock.now_s()
-        self._refuse_stall(now_s - self._began_s, now_s, "")
+        if now_s - self._began_s > self._no_stall_s:
+            self._refuse_stall(now_s - self._began_s, now_s, "")
 
     def stood_still_s(self, within_s: float) -> float:
         """Return the longest stall that ended within the last ``within_s``, s; 0 if there was none."""

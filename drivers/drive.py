@@ -21,12 +21,16 @@ from drivers.clock import Clock
 class Mode(Enum):
     """Quantity that the drive controls."""
 
+    __hash__ = object.__hash__     # Enum's own is Python code, too slow for a look-up in every cycle
+
     SPEED = "speed"
     TORQUE = "torque"
 
 
 class PowerState(Enum):
     """State of the drive as far as a caller needs it (CiA 402, figure of the state machine)."""
+
+    __hash__ = object.__hash__     # Enum's own is Python code, too slow for a look-up in every cycle
 
     NOT_READY = "not ready"
     OFF = "off"                    # switch on disabled: no torque

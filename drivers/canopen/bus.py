@@ -201,14 +201,15 @@ class CanLink:
         if message.is_error_frame:
             self._error_frame(message)
             return -1, b""
+        now_s = self._clock.now_s()
         if not self._clock.stepped:
-            self.stamps.take(message.timestamp, self._clock.now_s())
+            self.stamps.take(message.timestamp, now_s)
         identifier, data = message.arbitration_id, bytes(message.data)
         if identifier == CYCLE_ID and data[:1] == CYCLE_ANSWER:     # no part of the run: optional
             self._answered |= data[1:] == bytes((self._question,))
             return identifier, data
         if self._tap is not None:
-            self._tap(RawFrame(self._clock.now_s(), False, identifier, data))
+            self._tap(RawFrame(now_s, False, identifier, data))
         # A remote frame (node guarding by another master) carries no state. tdhil uses no 29-bit identifiers.
         handler = (self.remote_handlers if message.is_remote_frame else self.handlers).get(identifier)
         if handler is not None and not message.is_extended_id:
@@ -244,7 +245,9 @@ class CanLink:
 
     def drain(self) -> None:
         """Handle all frames that have arrived, without waiting. Raises CommunicationLost if frames keep coming."""
-        deadline_s, taken = time.monotonic() + LONGEST_DRAIN_S, 0
+        if self.receive(0.0) is None:
+            return
+        deadline_s, taken = time.monotonic() + LONGEST_DRAIN_S, 1
         while self.receive(0.0) is not None:
             taken += 1
             if taken > BABBLE_FRAMES and time.monotonic() > deadline_s:

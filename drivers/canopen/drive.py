@@ -291,9 +291,12 @@ class CanopenBus(Cia402Bus):
 
     def check(self) -> None:
         """Raise the errors of the drive. A heartbeat that is still unread does not count as missing."""
-        if self._watch.overdue:
+        watch = self._watch
+        if watch.quiet:
+            return
+        if watch.overdue:
             self._link.drain()
-        self._watch.check()
+        watch.check()
 
     @property
     def others_drive(self) -> bool:

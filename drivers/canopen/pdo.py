@@ -218,12 +218,13 @@ class PdoFeedback:
 
     def begin(self, now_s: float = 0.0, *, sync: bool = True) -> None:
         """Start a cycle, before its SYNC is sent; without ``sync`` the cycle has no SYNC."""
-        if not self._waits:
+        if self._due and not self._waits:
             self._given_up += self._due
             self._due.clear()
-        for waiting in (self._due, self._given_up):
-            while waiting and now_s - waiting[0] > ANSWER_WITHIN_S:
-                waiting.popleft()
+        if self._due or self._given_up:
+            for waiting in (self._due, self._given_up):
+                while waiting and now_s - waiting[0] > ANSWER_WITHIN_S:
+                    waiting.popleft()
         if not self._due:
             self._half = None          # a half of another cycle must not complete this one
         if sync:
@@ -317,7 +318,7 @@ class PdoFeedback:
             self._late_s.append((now_s, now_s - asked_s - self._period_s))
             return
         self.data = data
-        if self._here == 1:
+        if self._here == 1 and self._now_s is not None:
             self._learn(now_s - asked_s)
 
     def _learn(self, took_s: float) -> None:

@@ -164,6 +164,11 @@ class NodeWatch(DriveWatch):
             super().check()
 
     @property
+    def quiet(self) -> bool:
+        """True if `check` has nothing to raise."""
+        return not (self._troubles or self.overdue)
+
+    @property
     def overdue(self) -> bool:
         """True if the drive's heartbeat has been missing for too long, in the frames read so far."""
         silent_s = 0.0 if self._heard_s is None else self._clock.now_s() - self._heard_s

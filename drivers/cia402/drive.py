@@ -120,14 +120,29 @@ class _ModeSent:
 class _Cycles:
     """Cycles, and those without feedback: since the start, and lately."""
 
-    recent: deque[bool]
+    recent: deque[bool]            # whether feedback came, in the last cycles
     all: int = 0
     missed: int = 0
+    missed_lately: int = 0         # of the recent ones
 
     @classmethod
     def at(cls, period_s: float) -> _Cycles:
         """Return the count for a cycle of this period, s."""
         return cls(deque(maxlen=max(THIN_CYCLES, round(THIN_S / period_s))))
+
+    def note(self, fresh: bool) -> None:
+        """Take one more of the recent cycles."""
+        recent = self.recent
+        if len(recent) == recent.maxlen and not recent[0]:
+            self.missed_lately -= 1
+        recent.append(fresh)
+        if not fresh:
+            self.missed_lately += 1
+
+    def forget(self) -> None:
+        """Begin the recent cycles anew."""
+        self.recent.clear()
+        self.missed_lately = 0
 
 
 class Cia402Drive:
@@ -383,31 +398,34 @@ class Cia402Drive:
         CommandRejected. Each error of the drive is raised once, so that a stop can continue to exchange.
         """
         ready, power, bus, back = self._prepared, self._power, self._bus, self._read_back
-        units, content = ready.units, ready.content
-        if command.mode not in ready.codes:
-            raise CommandRejected(f"the drive was not prepared for {command.mode.value} mode", where="6060h")
-        speed_raw = encode_speed(command.speed_rad_s, units, content.target_speed)
-        torque_raw = encode_torque(command.torque_nm, units)
-        offset_raw = encode_torque_offset(command.torque_offset_nm, units)
+        units, content, reported = ready.units, ready.content, self._reported
+        mode_asked, speed_rad_s, torque_nm, offset_nm = command
+        code = ready.codes.get(mode_asked)
+        if code is None:
+            raise CommandRejected(f"the drive was not prepared for {mode_asked.value} mode", where="6060h")
+        target_speed = content.target_speed
+        speed_raw = encode_speed(speed_rad_s, units, target_speed)
+        torque_raw = encode_torque(torque_nm, units)
+        offset_raw = encode_torque_offset(offset_nm, units)
         enabled = power.wish is PowerRequest.ENABLED
-        if not enabled or command.mode is not Mode.SPEED:
+        if not enabled or mode_asked is not Mode.SPEED:
             offset_raw = 0
         bus.ticks.wait(self._listen)
         # Frames that came since the last cycle are checked before this cycle's setpoint is sent.
         now_s = bus.begin(not enabled and not ready.armed)
         if self._standing.by_object or not power.fed:
             return self._exchange_without_setpoints(now_s)
-        code, mode = ready.codes[command.mode], self._mode
+        mode = self._mode
         mode.cycles += 1
-        again = code != self._reported.shown_code and mode.cycles >= _REPEAT_MODE_CYCLES
+        again = code != reported.shown_code and mode.cycles >= _REPEAT_MODE_CYCLES
         changes = code != mode.code or again or mode.overwritten
-        word = DISABLE_VOLTAGE if power.removes_torque else controlword_towards(self._reported.state, power.wish)
+        word = DISABLE_VOLTAGE if power.removes_torque else controlword_towards(reported.state, power.wish)
         if content.vl and word == ENABLE_OPERATION:    # an enabled drive follows its setpoint only if it is released
             word |= VL_RELEASED
         # Noted before: an answer may show them in this cycle.
         if content.offset is not None:
             back.sent(content.offset[0], offset_raw)
-        back.sent(content.target_speed[0], speed_raw)
+        back.sent(target_speed[0], speed_raw)
         back.sent(0x6071, torque_raw)
         back.sent(0x6060, code)
         bus.send(CycleSetpoints(word, torque_raw, speed_raw, code, offset_raw, changes))
@@ -416,9 +434,7 @@ class Cia402Drive:
         sample = self._judge(now_s, bus.receive(now_s, True))
         if power.wish is not PowerRequest.QUICK_STOP:
             back.step(now_s)
-        elif (sample.fresh or bus.others_drive) and self._standing.undone(
-            now_s, self._reported.state, bus.others_drive
-        ):
+        elif (sample.fresh or bus.others_drive) and self._standing.undone(now_s, reported.state, bus.others_drive):
             self._stand()
         return sample
 
@@ -454,16 +470,19 @@ class Cia402Drive:
         if inputs.doubted and self._power.wish is not PowerRequest.ENABLED:
             fresh = False
         if fresh:
-            reported.take(inputs.status, inputs.speed, inputs.torque)
+            status = inputs.status
+            reported.take(status, inputs.speed, inputs.torque)
             self._follow_state()
-            self._follow_remote(inputs.status)
+            self._follow_remote(status)
         bus.ticks.check_end()
         bus.check()
         hidden_s = now_s - reported.shown_s
         if hidden_s > MODE_STALE_S and hidden_s > MODE_STALE_TIMES * bus.intervals_s(self.period_s)[0]:
             reported.shown_code = 0    # the mode is unknown now
         angle = inputs.angle if fresh else None
-        return self._sample(now_s, inputs.age_s, fresh, None if angle is None else self._turned(now_s, angle))
+        position_rad = None if angle is None else self._turned(now_s, angle)
+        ready = self._prepared
+        return reported.sample(now_s, inputs.age_s, fresh, ready.units, ready.modes, position_rad)
 
     def _turned(self, time_s: float, counts: float) -> float | None:
         """Return the motor's angle since the first reading, rad; None if it is unknown."""
@@ -474,13 +493,14 @@ class Cia402Drive:
 
     def _count(self, fresh: bool) -> None:
         """Detect feedback that is too rare to guard a shaft."""
-        recent = self._cycles.recent
+        cycles = self._cycles
         if not (self._power.in_operation and self._power.wish is PowerRequest.ENABLED):
-            recent.clear()
+            cycles.forget()
             return
-        recent.append(fresh)
+        cycles.note(fresh)
+        recent, missed = cycles.recent, cycles.missed_lately
         # If no feedback comes at all, the guard's age limit and the drive's sign of life detect it.
-        if fresh and (missed := recent.count(False)) > THIN_SHARE * (recent.maxlen or 0):
+        if fresh and missed and missed > THIN_SHARE * (recent.maxlen or 0):
             self._bus.watch.thin_feedback(missed, len(recent), self.period_s, self._bus.feedback_place)
             if (timing := self._bus.feedback_timing) is not None:
                 with suppress(CommunicationLost):      # for the stop that follows

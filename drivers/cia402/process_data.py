@@ -60,14 +60,18 @@ class Units:
 
 def encode_speed(speed_rad_s: float, units: Units, target: tuple[int, int, int] = TARGET_VELOCITY) -> int:
     """Convert rad/s at the motor shaft to 60FFh or 6042h. Raises CommandRejected out of range or if not finite."""
-    index, _, bits = target
-    return _encode(speed_rad_s, units.speed_rad_s_per_lsb, bits - 1, f"target velocity {index:04X}h", "rad/s")
+    counts = _counts(speed_rad_s, units.speed_rad_s_per_lsb, target[2] - 1)
+    if counts is None:
+        raise _refused(speed_rad_s, f"target velocity {target[0]:04X}h", "rad/s")
+    return counts
 
 
 def encode_torque(torque_nm: float, units: Units) -> int:
     """Convert N·m at the motor shaft to 6071h. Raises CommandRejected outside i16 or if not finite."""
-    per_lsb = units.target_nm_per_lsb or units.torque_nm_per_lsb
-    return _encode(torque_nm, per_lsb, 15, "target torque 6071h", "N·m")
+    counts = _counts(torque_nm, units.target_nm_per_lsb or units.torque_nm_per_lsb, 15)
+    if counts is None:
+        raise _refused(torque_nm, "target torque 6071h", "N·m")
+    return counts
 
 
 def encode_torque_offset(torque_nm: float, units: Units) -> int:
@@ -76,16 +80,24 @@ def encode_torque_offset(torque_nm: float, units: Units) -> int:
         if torque_nm != 0.0:
             raise CommandRejected("a torque offset was commanded, but none is mapped", where="60B2h")
         return 0
-    return _encode(torque_nm, units.offset_nm_per_lsb, 15, "torque offset 60B2h", "N·m")
+    counts = _counts(torque_nm, units.offset_nm_per_lsb, 15)
+    if counts is None:
+        raise _refused(torque_nm, "torque offset 60B2h", "N·m")
+    return counts
 
 
-def _encode(value: float, per_lsb: float, bits: int, where: str, unit: str) -> int:
+def _counts(value: float, per_lsb: float, bits: int) -> int | None:
+    """Return the value in LSB; None if it is not finite, or out of the range of so many bits beside the sign."""
     if not math.isfinite(value):
-        raise CommandRejected(f"setpoint {value} {unit} is not finite", where=where)
-    raw = round(value / per_lsb)
-    if not -(1 << bits) <= raw < 1 << bits:
-        raise CommandRejected(f"setpoint {value:g} {unit} is outside the range of the object", where=where)
-    return raw
+        return None
+    counts, end = round(value / per_lsb), 1 << bits
+    return counts if -end <= counts < end else None
+
+
+def _refused(value: float, where: str, unit: str) -> CommandRejected:
+    if not math.isfinite(value):
+        return CommandRejected(f"setpoint {value} {unit} is not finite", where=where)
+    return CommandRejected(f"setpoint {value:g} {unit} is outside the range of the object", where=where)
 
 
 VL_RELEASED = 0x0070

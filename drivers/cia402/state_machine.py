@@ -18,6 +18,8 @@ from drivers.drive import PowerRequest, PowerState
 class State(Enum):
     """States of the figure in the standard."""
 
+    __hash__ = object.__hash__     # Enum's own is Python code, too slow for a look-up in every cycle
+
     NOT_READY = "not ready to switch on"
     SWITCH_ON_DISABLED = "switch on disabled"
     READY_TO_SWITCH_ON = "ready to switch on"

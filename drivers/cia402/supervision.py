@@ -84,6 +84,11 @@ class DriveWatch:
         """End the supervision."""
         self.expect_operational = False
 
+    @property
+    def quiet(self) -> bool:
+        """True if `check` has nothing to raise."""
+        return not self._troubles
+
     def check(self) -> None:
         """Raise the oldest error that was not raised yet."""
         if self._troubles:
@@ -235,8 +240,9 @@ class ReadBack:
 
     def sent(self, index: int, value: int) -> None:
         """Record a setpoint that was sent in this cycle."""
-        if index in self._sent:
-            self._sent[index].append(value)
+        sent = self._sent.get(index)
+        if sent is not None:
+            sent.append(value)
 
     def soon(self, index: int, sub: int) -> None:
         """Read this object before its turn, because another master wrote it."""
