@@ -104,17 +104,18 @@ class RecordingBuilder:
 
     def add(self, sample: Sample, command: Command | None = None) -> None:
         """One cycle's feedback, and the command that it answers, where one is known."""
-        enabled = sample[8] is PowerState.ENABLED
-        in_torque = enabled and sample[7] is Mode.TORQUE and command is not None and command[0] is Mode.TORQUE
+        (time_s, _, _, fresh, speed_rad_s, torque_nm, demanded_nm, mode, state, _, limited, _, position_rad) = sample
+        enabled, commanded_nm = state is PowerState.ENABLED, math.nan
+        if enabled and mode is Mode.TORQUE and command is not None and command[0] is Mode.TORQUE:
+            commanded_nm = command[2]
+        if not enabled or demanded_nm is None:
+            demanded_nm = math.nan
         self.add_values(
-            sample[0], sample[4], sample[5], fresh=sample[3], limited=sample[10],
-            commanded_nm=command[2] if in_torque and command is not None else math.nan,
-            demanded_nm=sample[6] if enabled and sample[6] is not None else math.nan,
-            position_rad=sample[12],
+            time_s, speed_rad_s, torque_nm, fresh, limited, commanded_nm, demanded_nm, position_rad,
         )
 
     def add_values(
-        self, time_s: float, speed_rad_s: float, torque_nm: float, *, fresh: bool, limited: bool,
+        self, time_s: float, speed_rad_s: float, torque_nm: float, fresh: bool, limited: bool,
         commanded_nm: float = math.nan, demanded_nm: float = math.nan, position_rad: float | None = None,
     ) -> None:
         """The same, from what a Recording keeps of it."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers import Command, RawFrame, Sample, TdhilError
+from drivers import Command, FrameTap, Sample, TdhilError
 from tdhil.errors import ExitCode, Interrupted, code_of, exit_code
 from tdhil.recording.builder import RecordingBuilder
 from tdhil.recording.log_format import FAILURE, INTERRUPTED, VIRTUAL_COLUMNS, Event
@@ -101,16 +101,14 @@ class RunLog:
         self._dropped = 0
         self._virtual = array("d")
         self._commanded = array("d")
+        self.frame: FrameTap = writer.frame
+        """One raw frame, as it passes on the bus."""
         writer.configuration(self._run, {})
 
     @property
     def run(self) -> dict[str, Any]:
         """The run's configuration so far."""
         return dict(self._run)
-
-    def frame(self, frame: RawFrame) -> None:
-        """One raw frame, as it passes on the bus."""
-        self._writer.frame(frame)
 
     def cycle(self, command: Command, sample: Sample) -> None:
         """One exchange."""
