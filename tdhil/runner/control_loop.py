@@ -63,7 +63,8 @@ class ControlLoop:
         self.log.cycle(command, sample)
         self.before, self.last = self.last, sample
         if self._telling is not None:
-            self._note(self._telling)
+            for line in self._telling.remarks():
+                self._note(line)
         self.guard.check_sample(command, sample)
         if self.guard.pace_is_due():
             self.guard.check_pace(self.drive.counters)
@@ -80,7 +81,8 @@ class ControlLoop:
             self.guard.observer.see(command, sample)
             self.log.cycle(command, sample)
             if self._telling is not None:
-                self._note(self._telling)
+                for line in self._telling.remarks():
+                    self._note(line)
             if self._watch is not None:
                 self._watch(command, sample)
         except Exception as error:
@@ -88,10 +90,9 @@ class ControlLoop:
             del self.stop_side_troubles[10:]
         return sample
 
-    def _note(self, drive: Telling) -> None:
-        for line in drive.remarks():
-            self.remarks.append(line)
-            self.log.event(self.now_s, "bus", line)
+    def _note(self, line: str) -> None:
+        self.remarks.append(line)
+        self.log.event(self.now_s, "bus", line)
 
     def cycles(self, seconds: float) -> int:
         """Return the number of cycles in that time."""

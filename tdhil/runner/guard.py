@@ -39,7 +39,7 @@ from drivers import (
 )
 from profiles import MessageCode
 from tdhil.runner.excitation import MotionLimits, RigGuess
-from tdhil.runner.observer import AT_LIMIT_SHARE, Observer, Signal
+from tdhil.runner.observer import AT_LIMIT_SHARE, Contradiction, Observer, Signal
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
 
 LONGEST_AGE_S = 0.25
@@ -117,7 +117,7 @@ class Guard:
         self._stale = 0
         self.observer = Observer(limits, period_s, speed_resolution_rad_s, torque_resolution_nm, assumptions)
         self._limited_since_s: float | None = None
-        self._mode = _ModeShown()
+        self._mode: _ModeShown | None = None
         self._following = _Following(limits, period_s, speed_resolution_rad_s, assumptions)
         self._pace_cycles = max(10, round(PACE_S / period_s))
         self._pace_from = Counters()
@@ -219,7 +219,10 @@ class Guard:
     def check_sample(self, command: Command, sample: Sample) -> None:
         """Check a sample. Raises CommunicationLost, DriveFault or LimitHit."""
         self.observer.see(command, sample)
-        self._check_age(sample)
+        if sample.fresh:
+            self._stale = 0
+        else:
+            self._check_age(sample)
         if self.expected is not None and sample.state is not self.expected:
             raise DriveFault(
                 f"the drive left the state '{self.expected.value}' and reports '{sample.state.value}'",
@@ -250,14 +253,20 @@ class Guard:
                 entry=MessageCode.TIME_LIMIT,
             )
         self._check_mode(command, sample)
-        self._check_reports(sample)
-        self._check_limited(command, sample)
-        if self.torque_offset_nm > 0.0 and command.mode is Mode.SPEED:
-            self._following.reset()
-            self._check_lower_end(sample)
+        if self.observer.doubt is not None:
+            self._raise_doubt(self.observer.doubt, sample)
+        in_torque_mode = command.mode is Mode.TORQUE
+        if in_torque_mode and sample.limit_active:
+            self._check_limited(sample)
         else:
+            self._limited_since_s = None
+        if self.expected is PowerState.ENABLED and not in_torque_mode and not self.torque_offset_nm > 0.0:
             self._check_following(command, sample)
-        if command.mode is Mode.TORQUE and self.model is not None:
+        else:
+            self._following.reset()
+            if self.torque_offset_nm > 0.0 and not in_torque_mode:
+                self._check_lower_end(sample)
+        if in_torque_mode and self.model is not None:
             self._check_window(self.model, command, sample)
 
     @property
@@ -313,6 +322,9 @@ class Guard:
         limits, speed_rad_s = self._limits, sample.speed_rad_s
         predicted = self.predicted_speed(model, command.torque_nm, speed_rad_s)
         lowest = -limits.speed_max_rad_s if limits.allow_reverse else -self._reverse_rad_s
+        if lowest <= predicted <= limits.speed_max_rad_s:
+            self._check_lower_end(sample)
+            return
 
         def leads() -> str:
             return f"{speed_rad_s:.3f} rad/s reported and {command.torque_nm:.1f} N·m lead to {predicted:.3f} rad/s"
@@ -355,9 +367,6 @@ class Guard:
         return LIGHTEN if self.disturbed else usual
 
     def _check_age(self, sample: Sample) -> None:
-        if sample.fresh:
-            self._stale = 0
-            return
         self._stale += 1
         if self._stale >= self._stale_limit:
             late, missing = self.host_late(), f"no feedback for {self._stale} cycles"
@@ -370,14 +379,11 @@ class Guard:
                 entry=MessageCode.FEEDBACK_LOST,
             )
 
-    def _check_reports(self, sample: Sample) -> None:
+    def _raise_doubt(self, doubt: Contradiction, sample: Sample) -> None:
         """Raise the contradiction that the observer found.
 
         CommunicationLost for feedback that repeats, LimitHit for a shaft that became lighter, else ReportsContradict.
         """
-        doubt = self.observer.doubt
-        if doubt is None:
-            return
         if Signal.ALL in doubt.signals:
             raise CommunicationLost(doubt.what, where=_at(sample), next_step=doubt.helps)
         if doubt.lighter:
@@ -386,8 +392,11 @@ class Guard:
 
     def _check_mode(self, command: Command, sample: Sample) -> None:
         if self.expected is not PowerState.ENABLED:
+            self._mode = None
+            return
+        if self._mode is None:
             self._mode = _ModeShown()
-        elif sample.fresh and not self._mode.see(command.mode, sample):
+        if sample.fresh and not self._mode.see(command.mode, sample):
             shown = "an unknown mode" if sample.mode is None else f"{sample.mode.value} mode"
             raise ModeNotConfirmed(
                 f"the drive left its mode: {command.mode.value} mode is commanded, but it displays {shown}",
@@ -418,9 +427,7 @@ class Guard:
 
     def _check_following(self, command: Command, sample: Sample) -> None:
         following = self._following
-        if self.expected is not PowerState.ENABLED or command.mode is not Mode.SPEED:
-            following.reset()
-        elif sample.fresh and not following.see(command.speed_rad_s, sample):
+        if sample.fresh and not following.see(command.speed_rad_s, sample):
             torque, helps = self.torque_told(following.torque_nm, sample.limit_active)
             raise LimitHit(
                 f"the speed does not follow: {command.speed_rad_s:.3f} rad/s commanded,"
@@ -431,10 +438,8 @@ class Guard:
                 entry=MessageCode.SETPOINT_NOT_FOLLOWED,
             )
 
-    def _check_limited(self, command: Command, sample: Sample) -> None:
-        if command.mode is not Mode.TORQUE or not sample.limit_active:
-            self._limited_since_s = None
-        elif self._limited_since_s is None:
+    def _check_limited(self, sample: Sample) -> None:
+        if self._limited_since_s is None:
             self._limited_since_s = sample.time_s
         elif sample.time_s - self._limited_since_s >= LIMITED_S:
             raise LimitHit(
@@ -483,11 +488,15 @@ class _Following:
         recent = max(1, round(FOLLOW_MEAN_S / period_s))
         self._speeds: deque[float] = deque(maxlen=recent)
         self._torques: deque[float] = deque(maxlen=recent)
-        self.reset()
+        self._start()
 
     def reset(self) -> None:
         """Start again with the next sample."""
-        self._blocks.clear()
+        if self._blocks:
+            self._blocks.clear()
+            self._start()
+
+    def _start(self) -> None:
         self._side = 0.0                   # side of the reference on which the shaft is; 0: within the window
         self._anchor_rad_s = self._anchor_s = self.since_s = 0.0
 

@@ -75,11 +75,17 @@ class MomentumBalance:
         return self._failed[number] >= IN_A_ROW
 
     def _too_steep(self, points: deque[Point], known: ShaftBounds, noise_rad_s: float) -> float:
-        """Return the slope of the reported speed over what (2) allows."""
+        """Return the slope of the reported speed over what (2) allows; 0 if it is clearly allowed."""
         limits, now = self._limits, points[-1]
         blur_rad_s2 = 2.0 * noise_rad_s / SLOPE_S
         if abs(now.slope) <= blur_rad_s2:
             return 0.0                 # within the noise, whatever the torque
+        if not limits.winds_up:
+            # The usual case: the torque of this moment alone, and no friction, allow it. The rest allows only more.
+            now_nm = min(now.torque_most, limits.torque_nm) if now.slope > 0.0 else -max(
+                now.torque_least, -limits.torque_nm)
+            if abs(now.slope) <= STEEPEST * max(0.0, now_nm) / (LIGHTEST_SHARE * known.inertia_low) + blur_rad_s2:
+                return 0.0
         recent = [point for point in points if now.time_s - point.time_s <= MEMORY_S]
         if now.time_s - points[0].time_s < MEMORY_S:
             least_nm, most_nm = -limits.torque_nm, limits.torque_nm
@@ -117,19 +123,19 @@ class MomentumBalance:
         rough = now.rough - start.rough + self._torque_count_nm * window_s
         surplus_low, surplus_high = surplus_nm
         was_surplus_low, was_surplus_high = known.surplus(after)
-        opposed, was_opposed = now.torque_high - surplus_high, after.torque_high - was_surplus_high
+        now_low, now_high, after_low, after_high = now.torque_low, now.torque_high, after.torque_low, after.torque_high
+        opposed, was_opposed = now_high - surplus_high, after_high - was_surplus_high
         too_low = too_high = math.inf
         for inertia in inertias:
             imbalance = inertia * change - impulse
             # Torque that accelerates the shaft, N·m, at both ends: by the slope, and by the torque less friction.
-            rate_low = min(inertia * now.slope_low, surplus_low)
-            rate_high = max(inertia * now.slope_high, surplus_high)
-            from_low = min(inertia * after.slope_low, was_surplus_low)
-            from_high = max(inertia * after.slope_high, was_surplus_high)
-            torque_low = min(now.torque_low, inertia * now.slope_low + opposed)
-            torque_high = max(now.torque_high, inertia * now.slope_high + opposed)
-            was_low = min(after.torque_low, inertia * after.slope_low + was_opposed)
-            was_high = max(after.torque_high, inertia * after.slope_high + was_opposed)
+            by_slope_low, by_slope_high = inertia * now.slope_low, inertia * now.slope_high
+            was_by_slope_low, was_by_slope_high = inertia * after.slope_low, inertia * after.slope_high
+            rate_low, rate_high = min(by_slope_low, surplus_low), max(by_slope_high, surplus_high)
+            from_low, from_high = min(was_by_slope_low, was_surplus_low), max(was_by_slope_high, was_surplus_high)
+            torque_low, torque_high = min(now_low, by_slope_low + opposed), max(now_high, by_slope_high + opposed)
+            was_low = min(after_low, was_by_slope_low + was_opposed)
+            was_high = max(after_high, was_by_slope_high + was_opposed)
             faster, slower = max(0.0, rate_high - from_low), min(0.0, rate_low - from_high)
             more, less = max(0.0, torque_high - was_low), min(0.0, torque_low - was_high)
             room = rough + inertia * noise_rad_s

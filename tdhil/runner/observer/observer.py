@@ -81,6 +81,8 @@ class Observer:
         self.doubt: Contradiction | None = None
         self.backwards = False
         """Set by a stage that saw the shaft turn backwards under a forward torque: the sign of a report is inverted."""
+        self._gap_s = max(LONGEST_GAP_S, 3.0 * period_s)
+        self._block_s = self._point_s - 0.5 * period_s
         self._time_s = self._block_from_s = -math.inf
         self._speed = self._torque = self._before = 0.0
         self._impulse = self._rough = self._way = self._bent = 0.0
@@ -156,7 +158,7 @@ class Observer:
         if not (math.isfinite(speed) and math.isfinite(torque)):
             return
         apart_s = now_s - self._time_s
-        if not 0.0 < apart_s <= max(LONGEST_GAP_S, 3.0 * self._period_s):
+        if not 0.0 < apart_s <= self._gap_s:
             self._restart()
             self._time_s, self._speed, self._torque = now_s, speed, torque
             self._before = speed
@@ -164,20 +166,21 @@ class Observer:
             if sample.position_rad is not None:
                 self._see_angle(sample.position_rad, now_s, speed)
             return
-        mean_nm, mean_rad_s = 0.5 * (torque + self._torque), 0.5 * (speed + self._speed)
+        was_speed, was_torque, was_bent = self._speed, self._torque, self._bent
+        mean_nm, mean_rad_s = 0.5 * (torque + was_torque), 0.5 * (speed + was_speed)
         self._impulse += mean_nm * apart_s
-        self._rough += 0.5 * abs(torque - self._torque) * apart_s
+        self._rough += 0.5 * abs(torque - was_torque) * apart_s
         self._way += mean_rad_s * apart_s
-        bent = speed - 2.0 * self._speed + self._before
-        self._bent += 0.005 * (min(bent * bent, 100.0 * self._bent + 9.0 * self._count_rad_s**2) - self._bent)
-        self._before, self._speed, self._torque, self._time_s = self._speed, speed, torque, now_s
+        bent = speed - 2.0 * was_speed + self._before
+        self._bent = was_bent + 0.005 * (min(bent * bent, 100.0 * was_bent + 9.0 * self._count_rad_s**2) - was_bent)
+        self._before, self._speed, self._torque, self._time_s = was_speed, speed, torque, now_s
         self._cycles += 1
         self.demand_nm = sample.torque_demand_nm
         self._sum_speed += speed
         self._sum_torque += torque
         if sample.position_rad is not None:
             self._see_angle(sample.position_rad, now_s, speed)
-        if now_s - self._block_from_s >= self._point_s - 0.5 * self._period_s:
+        if now_s - self._block_from_s >= self._block_s:
             self._point(command, sample)
 
     def see_reading(self, reading: PositionReading) -> None:
@@ -324,7 +327,8 @@ class Observer:
         if self._angle_revival is not None and (rate := self._angles.rate_rad_s) is not None:
             self._angle_revival.see(point.time_s, rate)
         self._contradict(self._runaway.unanswered(point))
-        self._runaway.see(point, known, self._belief)
+        if self._runaway.begun:
+            self._runaway.see(point, known, self._belief)
         if abs(point.torque) > BEYOND_LIMIT * self._limits.torque_nm:
             self._doubt(
                 frozenset({Signal.TORQUE}),

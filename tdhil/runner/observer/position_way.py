@@ -37,19 +37,31 @@ class PositionWay:
         self.ratio: float | None = None
         self.heard_s = -math.inf
         self.moved = False
+        self._rate_known = True
+        self._rate_rad_s: float | None = None
         self.restart()
 
     def restart(self) -> None:
         self._seen: deque[tuple[float, float, Way]] = deque()
         self._apart = 0
+        self._rate_known, self._rate_rad_s = True, None
 
     @property
     def rate_rad_s(self) -> float | None:
         """Speed by the angle over the last half second, rad/s; None where too little has been reported."""
+        if not self._rate_known:
+            self._rate_known, self._rate_rad_s = True, self._rate()
+        return self._rate_rad_s
+
+    def _rate(self) -> float | None:
         if len(self._seen) < 2:
             return None
-        last = self._seen[-1]
-        first = next((one for one in self._seen if last[0] - one[0] <= 1.01 * ANGLE_WINDOW_S[0]), last)
+        backwards = reversed(self._seen)
+        last = first = next(backwards)
+        for one in backwards:
+            if last[0] - one[0] > 1.01 * ANGLE_WINDOW_S[0]:
+                break
+            first = one
         took_s = last[0] - first[0]
         return (last[1] - first[1]) / took_s if took_s >= 0.4 * ANGLE_WINDOW_S[0] else None
 
@@ -73,6 +85,7 @@ class PositionWay:
             seen = self._seen
         self.heard_s = time_s
         seen.append((time_s, position_rad, way))
+        self._rate_known = False
         self.moved = self.moved or abs(position_rad - seen[0][1]) > max(10.0 * self.count_rad, MOVED_RAD)
         while time_s - seen[0][0] > ANGLE_WINDOW_S[1]:
             seen.popleft()
@@ -81,16 +94,24 @@ class PositionWay:
         if took_s < ANGLE_WINDOW_S[0] or self.ratio is None or way.stretch < 0 or way.stretch != first[2].stretch:
             return None
         turned, reported = position_rad - first[1], self.ratio * (way.way_rad - first[2].way_rad)
-        speeds = [one[2].speed_rad_s for one in seen]
-        late = abs(self.ratio) * self._lag_s * (max(speeds) - min(speeds))
-        allowed = (
-            late + 2.0 * self.count_rad + ANGLE_SHARE * max(abs(turned), abs(reported))
-            + took_s * (0.5 * self._count_rad_s + 0.1 * noise_rad_s + self._still_rad_s)
-        )
-        self._apart = self._apart + 1 if abs(turned - reported) > allowed else 0
+        apart = abs(turned - reported) > self._allowed_rad(0.0, turned, reported, took_s, noise_rad_s)
+        if apart:                      # seldom: then the lag of the speed, which takes all speeds to find, counts too
+            speeds = [one[2].speed_rad_s for one in seen]
+            late = abs(self.ratio) * self._lag_s * (max(speeds) - min(speeds))
+            apart = abs(turned - reported) > self._allowed_rad(late, turned, reported, took_s, noise_rad_s)
+        self._apart = self._apart + 1 if apart else 0
         if self._apart < IN_A_ROW:
             return None
         return (
             f"reported position and reported speed contradict each other: within {took_s:.1f} s the position moved by"
             f" {turned:.2f} rad, and the reported speed accounts for {reported:.2f} rad"
+        )
+
+    def _allowed_rad(
+        self, late_rad: float, turned_rad: float, reported_rad: float, took_s: float, noise_rad_s: float
+    ) -> float:
+        """Largest difference of both ways, rad; ``late_rad``: what the lag of the reported speed accounts for."""
+        return (
+            late_rad + 2.0 * self.count_rad + ANGLE_SHARE * max(abs(turned_rad), abs(reported_rad))
+            + took_s * (0.5 * self._count_rad_s + 0.1 * noise_rad_s + self._still_rad_s)
         )

@@ -91,15 +91,15 @@ class Follower:
         self._step(*reference(self.time_s + self._loop.period_s - start_s))
 
     def _step(self, speed_rad_s: float, torque_nm: float) -> None:
-        limits = self._limits
+        limits, loop = self._limits, self._loop
         if self._control is not None:
-            torque_nm += self._control.update(speed_rad_s - self.reported_rad_s, self._loop.period_s)
-            torque_nm = max(torque_nm, self._loop.guard.least_torque_nm)
+            torque_nm += self._control.update(speed_rad_s - self.reported_rad_s, loop.period_s)
+            torque_nm = max(torque_nm, loop.guard.least_torque_nm)
         torque_nm = kept_within(torque_nm, -limits.torque_nm, limits.torque_nm)
         lowest = -limits.speed_max_rad_s if limits.allow_reverse else 0.0
         setpoint = speed_rad_s + (0.0 if self._dither_rad_s is None else self._dither_rad_s(self.time_s))
         wanted = kept_within(setpoint, lowest, limits.speed_max_rad_s)
-        self.saw(self._loop.cycle(Command(self._mode, wanted, torque_nm)), wanted)
+        self.saw(loop.cycle(Command(self._mode, wanted, torque_nm)), wanted)
 
     def saw(self, sample: Sample, wanted_rad_s: float) -> None:
         """Note the reported speed after a cycle with this setpoint."""
