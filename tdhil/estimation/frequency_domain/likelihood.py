@@ -96,7 +96,9 @@ class Likelihood:
         if self._believing is None:
             return np.zeros(0), np.zeros((0, self.model.size))
         off, slopes = self._believing.beliefs(theta[: self.model.mechanical])
-        return off, np.pad(slopes, ((0, 0), (0, self.model.size - slopes.shape[1])))
+        wide = np.zeros((len(slopes), self.model.size))
+        wide[:, : self.model.mechanical] = slopes
+        return off, wide
 
     def unloaded(self, theta: FloatArray) -> tuple[SpectralLine, ...]:
         """The lines without the torque of the load."""

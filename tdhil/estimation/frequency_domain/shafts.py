@@ -214,12 +214,13 @@ class StringShaft:
         by_load = (1.0 - share) * by_end + share * by_string
         by_viscous = (1.0 - drag_share) * by_end + drag_share * by_string
         by_share = load * s * (by_string - by_end) - by_stiffness * swing**2 * load * _RAYLEIGH
-        return np.stack(
-            [s, np.ones_like(s), s * by_load + by_stiffness * swing**2 * light,
-             2.0 * by_stiffness * swing * load * light, by_damping, by_viscous - 1.0, by_share,
-             m[LOAD_VISCOUS] * (by_string - by_end)],
-            axis=1,
-        )
+        found = np.empty((len(m), len(s)), dtype=np.complex128)
+        found[INERTIA], found[VISCOUS] = s, 1.0
+        found[LOAD] = s * by_load + by_stiffness * swing**2 * light
+        found[SWING] = 2.0 * by_stiffness * swing * load * light
+        found[DAMPING], found[LOAD_VISCOUS] = by_damping, by_viscous - 1.0
+        found[STRING_SHARE], found[DRAG_SHARE] = by_share, m[LOAD_VISCOUS] * (by_string - by_end)
+        return found.T
 
     def bounds(self, rough_inertia: float, s: ComplexArray) -> tuple[FloatArray, FloatArray]:
         low, high = TwoMassShaft().bounds(rough_inertia, s)
@@ -320,12 +321,15 @@ def string_resonances(m: FloatArray) -> tuple[float, float]:
 def _q(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     """The even function tanh √x/√x and its derivative, (1 − x q² − q)/(2x); by series where x is small."""
     small = np.abs(x) < 1e-3
-    safe = np.where(small, 1.0, x)
+    few = True in small.tolist()     # hardly ever
+    safe = np.where(small, 1.0, x) if few else x
     root = np.sqrt(safe)
-    q = np.where(small, 1.0 - x / 3.0 + 2.0 * x**2 / 15.0 - 17.0 * x**3 / 315.0, np.tanh(root) / root)
-    slope = np.where(
-        small, -1.0 / 3.0 + 4.0 * x / 15.0 - 17.0 * x**2 / 105.0, (1.0 - safe * q**2 - q) / (2.0 * safe)
-    )
+    q: ComplexArray = np.tanh(root) / root
+    if few:
+        q = np.where(small, 1.0 - x / 3.0 + 2.0 * x**2 / 15.0 - 17.0 * x**3 / 315.0, q)
+    slope: ComplexArray = (1.0 - safe * q**2 - q) / (2.0 * safe)
+    if few:
+        slope = np.where(small, -1.0 / 3.0 + 4.0 * x / 15.0 - 17.0 * x**2 / 105.0, slope)
     return q, slope
 
 

@@ -19,7 +19,8 @@ added one by one, as long as they gain more than Schwarz's ln n for each of thei
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -62,10 +63,22 @@ class _ScaledSegment:
     period_s: float
     omega: FloatArray        # (K,)
     viscous: float
+    kept: dict[complex, ComplexArray] = field(default_factory=dict)      # columns by mode
 
     def without(self, modes: Sequence[complex]) -> ComplexArray:
         """Return the residual after modes and means, (2, P, K)."""
-        return _centred(self.signals) if not modes else self._fitted(modes)[0]
+        return self._about_mean if not modes else self._fitted(modes)[0]
+
+    @cached_property
+    def _about_mean(self) -> ComplexArray:
+        """The signals about their means over the periods, (2, P, K)."""
+        return _centred(self.signals)
+
+    def keep(self, modes: Sequence[complex]) -> None:
+        """Compute the columns of these modes once: the search of the next one needs them with each of its trials."""
+        for mode in modes:
+            if mode not in self.kept:
+                self.kept[mode] = self._columns(mode)
 
     def swing(self, modes: Sequence[complex]) -> _ModeShare:
         """Return the contribution of the modes."""
@@ -82,8 +95,9 @@ class _ScaledSegment:
 
     def _fitted(self, modes: Sequence[complex]) -> tuple[ComplexArray, FloatArray, FloatArray, ComplexArray]:
         """Return the residual, (2, P, K); amplitudes (M,), the inverse of their normal matrix, and their columns."""
-        columns = np.concatenate([self._columns(mode) for mode in modes], axis=-1)
-        about, signals = _centred(columns), _centred(self.signals)
+        kept = self.kept
+        columns = np.concatenate([kept[mode] if mode in kept else self._columns(mode) for mode in modes], axis=-1)
+        about, signals = _centred(columns), self._about_mean
         size = about.shape[-1]
         table, wanted = about.reshape(-1, size), signals.ravel()
         normal = (table.conj().T @ table).real
@@ -101,12 +115,11 @@ class _ScaledSegment:
             of_speed.append(own - ramp)
             of_both.append(-self.viscous * ramp)
             of_torque.append(own)
-        nothing = np.zeros_like(of_torque[0])
-        speed, both, torque = ((one + other, 1j * (one - other)) for one, other in (of_speed, of_both, of_torque))
-        table: ComplexArray = np.stack([
-            np.stack([*speed, nothing, nothing], axis=-1), np.stack([*both, *torque], axis=-1),
-        ])
-        return table / self.scatter[:, None, :, None]
+        table: ComplexArray = np.zeros((2, *of_torque[0].shape, 4), dtype=np.complex128)
+        for row, first, (one, other) in ((0, 0, of_speed), (1, 0, of_both), (1, 2, of_torque)):
+            table[row, :, :, first], table[row, :, :, first + 1] = one + other, 1j * (one - other)
+        table /= self.scatter[:, None, :, None]
+        return table
 
 
 def _centred(values: ComplexArray) -> ComplexArray:
@@ -153,6 +166,8 @@ def _modes(segments: Sequence[_ScaledSegment]) -> tuple[complex, ...]:
     price = (2.0 + _OF_A_MODE * len(segments)) * float(np.log(numbers))
     grid = _grid(segments[0])
     while len(found) < MOST_MODES:
+        for segment in segments:
+            segment.keep(found)
         more = _refined(segments, min(((*found, mode) for mode in grid), key=lambda modes: _misfit(segments, modes)))
         then = _misfit(segments, more)
         if now - then <= price:
