@@ -9,7 +9,7 @@ A state is an immutable tuple: keeping it is copying it. Each state has the moto
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial, reduce
+from functools import reduce
 from operator import or_
 from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
@@ -58,7 +58,7 @@ class TwoMass:
 
     def __init__(self, params: TwoMassParams) -> None:
         self.rest = two_mass.TwoMassState
-        self.step = partial(two_mass.step, params)
+        self.step = two_mass.stepper(params)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ frequency Ω = √(k (1/J_r + 1/J_L)) is fast by (Ωh)²/24 of it, and keeps its
 c (1/J_r + 1/J_L) h ≤ 0.1.
 """
 
+from collections.abc import Callable
 from math import sqrt
 from typing import Literal, NamedTuple, Self
 
@@ -82,13 +83,25 @@ def step(params: TwoMassParams, state: TwoMassState, torque_nm: float, dt_s: flo
 
     ``bottom_load_nm`` likewise at the bottom, beside its own.
     """
-    mobility = params.mobility_1_kg_m2
+    return stepper(params)(state, torque_nm, dt_s, load_nm, bottom_load_nm)
+
+
+def stepper(params: TwoMassParams) -> Callable[..., TwoMassState]:
+    """`step` of one shaft, with what follows from its parameters alone computed once."""
+    mobility, constant_nm, below_nm = params.mobility_1_kg_m2, params.load_nm, params.bottom.load_nm
     fastest = max(sqrt(params.stiffness_nm_rad * mobility), params.damping_nm_s_rad * mobility)
-    count = 1 + int(fastest * dt_s / _CUT)
-    drive = torque_nm - load_nm - params.load_nm
-    for _ in range(count):
-        state = _piece(params, state, drive, bottom_load_nm, dt_s / count)
-    return state
+    piece = _piece_of(params)
+
+    def step_on(
+        state: TwoMassState, torque_nm: float, dt_s: float, load_nm: float = 0.0, bottom_load_nm: float = 0.0
+    ) -> TwoMassState:
+        count = 1 + int(fastest * dt_s / _CUT)
+        drive, against_bottom = torque_nm - load_nm - constant_nm, below_nm + bottom_load_nm
+        for _ in range(count):
+            state = piece(state, drive, against_bottom, dt_s / count)
+        return state
+
+    return step_on
 
 
 def spring_torque(params: TwoMassParams, state: TwoMassState) -> float:
@@ -97,20 +110,21 @@ def spring_torque(params: TwoMassParams, state: TwoMassState) -> float:
             + params.damping_nm_s_rad * (state.speed_rad_s - state.bottom_speed_rad_s))
 
 
-def _piece(
-    params: TwoMassParams, state: TwoMassState, drive: float, bottom_load_nm: float, dt_s: float
-) -> TwoMassState:
-    bottom, damping = params.bottom, params.damping_nm_s_rad
-    below_nm = bottom.load_nm + bottom_load_nm
-    speed, angle, bristle, low_speed, low_angle, low_bristle = state
+def _piece_of(params: TwoMassParams) -> Callable[[TwoMassState, float, float, float], TwoMassState]:
+    bottom, stiffness, damping = params.bottom, params.stiffness_nm_rad, params.damping_nm_s_rad
     move, low_move = advance_of(params), advance_of(bottom)
-    difference = speed - low_speed
-    spring = params.stiffness_nm_rad * (angle - low_angle + 0.5 * dt_s * difference)
-    torque = spring + damping * difference
-    end, end_bristle, travel = move(params, speed, bristle, drive - torque, dt_s)
-    low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - below_nm, dt_s)
-    if damping > 0.0:
-        torque = spring + 0.5 * damping * (difference + end - low_end)
+
+    def piece(state: TwoMassState, drive: float, below_nm: float, dt_s: float) -> TwoMassState:
+        speed, angle, bristle, low_speed, low_angle, low_bristle = state
+        difference = speed - low_speed
+        spring = stiffness * (angle - low_angle + 0.5 * dt_s * difference)
+        torque = spring + damping * difference
         end, end_bristle, travel = move(params, speed, bristle, drive - torque, dt_s)
         low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - below_nm, dt_s)
-    return TwoMassState(end, angle + travel, end_bristle, low_end, low_angle + low_travel, low_end_bristle)
+        if damping > 0.0:
+            torque = spring + 0.5 * damping * (difference + end - low_end)
+            end, end_bristle, travel = move(params, speed, bristle, drive - torque, dt_s)
+            low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - below_nm, dt_s)
+        return TwoMassState(end, angle + travel, end_bristle, low_end, low_angle + low_travel, low_end_bristle)
+
+    return piece
