@@ -322,9 +322,9 @@ def _q(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     """The even function tanh √x/√x and its derivative, (1 − x q² − q)/(2x); by series where x is small."""
     small = np.abs(x) < 1e-3
     few = True in small.tolist()     # hardly ever
-    safe = np.where(small, 1.0, x) if few else x
-    root = np.sqrt(safe)
-    q: ComplexArray = np.tanh(root) / root
+    safe: ComplexArray = np.where(small, 1.0, x) if few else x
+    root: ComplexArray = np.sqrt(safe)
+    q = np.tanh(root) / root
     if few:
         q = np.where(small, 1.0 - x / 3.0 + 2.0 * x**2 / 15.0 - 17.0 * x**3 / 315.0, q)
     slope: ComplexArray = (1.0 - safe * q**2 - q) / (2.0 * safe)
