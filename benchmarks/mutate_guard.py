@@ -218,8 +218,8 @@ NAMED: tuple[tuple[str, str, str], ...] = (
     ("acquire pulses", "while follower.time_s < end_s:", "while True:"),
     ("identify", "code = code or int(exit_code(error))", "pass"),
     ("identify", "        code = ExitCode.STOP_NOT_CONFIRMED\n", "        pass\n"),
-    ("guard", "elif sample.fresh and not self._mode.see(command.mode, sample):", "elif False:"),
-    ("guard", "elif sample.fresh and not following.see(command.speed_rad_s, sample):", "elif False:"),
+    ("guard", "if sample.fresh and not self._mode.see(command.mode, sample):", "if False:"),
+    ("guard", "if sample.fresh and not following.see(command.speed_rad_s, sample):", "if False:"),
     ("stop", "if not (self._fed and self._watched and", "if not (self._fed and"),
     ("preconditions", "if not preflight.quick_stop_holds:", "if preflight.quick_stop_holds is False:"),
     ("mcap_container", "if found.st_size < self._offset:", "if False:"),
@@ -246,6 +246,7 @@ LONGEST_S, LONGEST = 90, 4
 _FALLS_THROUGH = "the function's last line: what falls off its end gives None, which its only caller takes alike"
 _POWER = "shows after a loss of power alone"
 _FOR_MYPY = "stands in annotations alone, and those are never evaluated"
+_ONLY_SOONER = "ends sooner what would end alike: it only saves time"
 _A_PROCESS = "a process of its own loads the file and not the mutant; tests that begin one fail without the line"
 EQUIVALENT = {
     "stop.py, _slow_down: return False (last)": _FALLS_THROUGH,
@@ -266,6 +267,8 @@ EQUIVALENT = {
         "the function's last line returns the same, and nothing between asks for this",
     "service/run_process.py, _run: self.stop.check(next_step='Nothing has moved')":
         "a stop is seen once more by the Runner, before it moves anything; here it only comes sooner",
+    "canopen/drive.py, check: if watch.quiet:": _ONLY_SOONER,
+    "canopen/drive.py, check: return": _ONLY_SOONER,
     "string_release.py, _yielding: assert self._reference_nm is not None": "says to mypy what its caller has just set",
 }
 """Deletions that change nothing that can be seen, and why. (mypy refuses them all the same.)"""

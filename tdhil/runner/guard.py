@@ -89,6 +89,13 @@ def _at(sample: Sample) -> str:
     return f"guard at {sample.time_s:.3f} s"
 
 
+def _leads(sample: Sample, command: Command, predicted_rad_s: float) -> str:
+    """Return the prediction of the speed in words."""
+    return (
+        f"{sample.speed_rad_s:.3f} rad/s reported and {command.torque_nm:.1f} N·m lead to {predicted_rad_s:.3f} rad/s"
+    )
+
+
 class Guard:
     """Holds the machine's limits over one run.
 
@@ -322,17 +329,11 @@ class Guard:
         limits, speed_rad_s = self._limits, sample.speed_rad_s
         predicted = self.predicted_speed(model, command.torque_nm, speed_rad_s)
         lowest = -limits.speed_max_rad_s if limits.allow_reverse else -self._reverse_rad_s
-        if lowest <= predicted <= limits.speed_max_rad_s:
-            self._check_lower_end(sample)
-            return
-
-        def leads() -> str:
-            return f"{speed_rad_s:.3f} rad/s reported and {command.torque_nm:.1f} N·m lead to {predicted:.3f} rad/s"
-
         if predicted > limits.speed_max_rad_s:
             raise LimitHit(
                 self._besides(
-                    f"the speed is about to leave its window: {leads()}, above {limits.speed_max_rad_s:g} rad/s"
+                    f"the speed is about to leave its window: {_leads(sample, command, predicted)}, above"
+                    f" {limits.speed_max_rad_s:g} rad/s"
                 ),
                 where=_at(sample),
                 next_step=f"The shaft was stopped. {self._helps('Lower the amplitude or the offset')}",
@@ -340,7 +341,7 @@ class Guard:
             )
         if predicted < lowest:
             raise LimitHit(
-                self._besides(f"the shaft is about to turn backwards: {leads()}"),
+                self._besides(f"the shaft is about to turn backwards: {_leads(sample, command, predicted)}"),
                 where=_at(sample),
                 next_step=f"The shaft was stopped. {self._helps('Lower the amplitude or raise the offset')}",
                 entry=MessageCode.TURNED_BACKWARDS,

@@ -78,14 +78,8 @@ class MomentumBalance:
         """Return the slope of the reported speed over what (2) allows; 0 if it is clearly allowed."""
         limits, now = self._limits, points[-1]
         blur_rad_s2 = 2.0 * noise_rad_s / SLOPE_S
-        if abs(now.slope) <= blur_rad_s2:
-            return 0.0                 # within the noise, whatever the torque
-        if not limits.winds_up:
-            # The usual case: the torque of this moment alone, and no friction, allow it. The rest allows only more.
-            now_nm = min(now.torque_most, limits.torque_nm) if now.slope > 0.0 else -max(
-                now.torque_least, -limits.torque_nm)
-            if abs(now.slope) <= STEEPEST * max(0.0, now_nm) / (LIGHTEST_SHARE * known.inertia_low) + blur_rad_s2:
-                return 0.0
+        if abs(now.slope) <= self._clear_rad_s2(now, known) + blur_rad_s2:
+            return 0.0                 # within the noise, or what the torque of this moment alone explains
         recent = [point for point in points if now.time_s - point.time_s <= MEMORY_S]
         if now.time_s - points[0].time_s < MEMORY_S:
             least_nm, most_nm = -limits.torque_nm, limits.torque_nm
@@ -102,6 +96,17 @@ class MomentumBalance:
         most_nm = most_nm - load_low if now.slope > 0.0 else load_high - least_nm
         most = STEEPEST * max(0.0, most_nm) / lightest
         return abs(now.slope) / (most + blur_rad_s2)
+
+    def _clear_rad_s2(self, now: Point, known: ShaftBounds) -> float:
+        """Return the slope that the torque of this moment allows; friction, and the torque before it, only allow more.
+
+        0 above a string, whose load may take all of it.
+        """
+        limits = self._limits
+        if limits.winds_up:
+            return 0.0
+        torque_nm = min(now.torque_most if now.slope > 0.0 else -now.torque_least, limits.torque_nm)
+        return STEEPEST * max(0.0, torque_nm) / (LIGHTEST_SHARE * known.inertia_low)
 
     def _imbalance(
         self, window: tuple[Point, Point, Point], known: ShaftBounds, inertias: tuple[float, ...], noise_rad_s: float,

@@ -37,14 +37,13 @@ class PositionWay:
         self.ratio: float | None = None
         self.heard_s = -math.inf
         self.moved = False
-        self._rate_known = True
-        self._rate_rad_s: float | None = None
         self.restart()
 
     def restart(self) -> None:
         self._seen: deque[tuple[float, float, Way]] = deque()
         self._apart = 0
-        self._rate_known, self._rate_rad_s = True, None
+        self._rate_known = True
+        self._rate_rad_s: float | None = None
 
     @property
     def rate_rad_s(self) -> float | None:
