@@ -17,8 +17,8 @@ from profiles import CYCLE_ID, CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
 from sim_bus.canopen import services as emcy
 from sim_bus.canopen.node import SYNC, Cia402Node
 from sim_bus.canopen.sender import Sender
+from sim_bus.drive_faults import DriveFault, of_drive
 from sim_bus.fault_script import STOP, Cast, FaultKind, Kinds, Passing, Scripted, plain, seconds, share
-from sim_bus.reports import Lie, lying
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What a scripted fault may do: change frames on their way in or out, and lay hands on the drive itself.
@@ -60,9 +60,6 @@ class Misbehaviour(Passing):
 # Faults of the drive itself and of what it turns.
 
 
-_PROFILE_VELOCITY = 3
-
-
 class Emcy(Misbehaviour):
     """An emergency message, and nothing else."""
 
@@ -99,80 +96,17 @@ class ForeignNmt(Misbehaviour):
         self.scene.foreign(0x000, bytes((self._command, self.scene.node.id)))
 
 
-class Deaf(Misbehaviour):
-    """The state machine doesn't move on commands any more."""
+class OfDrive(Misbehaviour):
+    """A fault that a drive may have on any bus."""
+
+    def __init__(self, fault: DriveFault) -> None:
+        self._fault = fault
 
     def begin(self) -> None:
-        self.scene.node.application.deaf = True
+        self._fault.begin(self.scene.node)
 
     def end(self) -> None:
-        self.scene.node.application.deaf = False
-
-
-class SafeTorqueOff(Deaf):
-    """STO: torque off at once, and no enabling while it lasts. The shaft coasts."""
-
-    def begin(self) -> None:
-        self.scene.node.application.power_off()
-        super().begin()
-
-
-class ModeKept(Misbehaviour):
-    """6060h is taken and not followed: 6061h goes on showing the old mode."""
-
-    def begin(self) -> None:
-        self.scene.node.application.keeps_mode = True
-
-    def end(self) -> None:
-        self.scene.node.application.keeps_mode = False
-
-
-class ModeLost(ModeKept):
-    """The drive goes over to its profile velocity mode (3) by itself, and stays there whatever 6060h says."""
-
-    def begin(self) -> None:
-        self.scene.node.application.set_mode(_PROFILE_VELOCITY)
-        super().begin()
-
-
-class LimitedTorque(Misbehaviour):
-    """An internal limit leaves this share of the torque limit."""
-
-    def __init__(self, share: float) -> None:
-        self._share = share
-
-    def begin(self) -> None:
-        limits = self.scene.node.inverter.control.limits
-        self._before = limits.torque_forward_nm, limits.torque_reverse_nm
-        limits.torque_forward_nm *= self._share
-        limits.torque_reverse_nm *= self._share
-
-    def end(self) -> None:
-        limits = self.scene.node.inverter.control.limits
-        limits.torque_forward_nm, limits.torque_reverse_nm = self._before
-
-
-class LoadLost(Misbehaviour):
-    """The coupled load comes off: this share of the motor end's inertia and friction is left."""
-
-    def __init__(self, share: float) -> None:
-        self._share = share
-
-    def begin(self) -> None:
-        self.scene.node.inverter.lose_load(self._share)
-
-
-class Lying(Misbehaviour):
-    """Sensor, power stage or reports of the drive are wrong (`sim_bus.reports`)."""
-
-    def __init__(self, lie: Lie) -> None:
-        self._lie = lie
-
-    def begin(self) -> None:
-        self._lie.begin(self.scene.node.inverter.lies)
-
-    def end(self) -> None:
-        self._lie.end(self.scene.node.inverter.lies)
+        self._fault.end(self.scene.node)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -526,14 +460,6 @@ KINDS: Kinds[Misbehaviour] = Kinds({
                                 plain(lambda: Otherwise(0x1018, 1))),
     "fault-at-start": FaultKind(30, "the drive is in fault when the host comes",
                                 lambda v: FaultReaction(_code(v)), "3210h", "CODE"),
-    "stuck-state": FaultKind(31, "the controlword is ignored", plain(Deaf)),
-    "mode-not-followed": FaultKind(32, "6061h doesn't follow 6060h", plain(ModeKept)),
-    "mode-lost": FaultKind(82, "the drive goes over to mode 3 by itself, and stays there", plain(ModeLost)),
-    "sto": FaultKind(33, "safe torque off: the shaft coasts, and nothing enables the drive", plain(SafeTorqueOff)),
-    "internal-limit": FaultKind(33, "an internal limit leaves this share of the torque",
-                                lambda v: LimitedTorque(share(v)), "10%", "SHARE"),
-    "load-lost": FaultKind(34, "the load comes off: this share of inertia and friction is left",
-                           lambda v: LoadLost(max(0.001, share(v))), "10%", "SHARE"),
     "write-not-kept": FaultKind(45, "a write to an object is answered and not kept",
                                 lambda v: NotKept(*_object(v)), "6080h", "OBJECT"),
     "reads-back-otherwise": FaultKind(45, "an object reads back as something else",
@@ -541,7 +467,7 @@ KINDS: Kinds[Misbehaviour] = Kinds({
     "watchdog-not-armed": FaultKind(50, "the write to 1016h:1 is answered and not kept",
                                     plain(lambda: NotKept(0x1016, 1))),
 })
-KINDS.update(lying(Lying))
+KINDS.update(of_drive(OfDrive))
 make, parse_all, listed, listing = KINDS.make, KINDS.parse_all, KINDS.listed, KINDS.listing
 
 

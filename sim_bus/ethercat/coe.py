@@ -3,35 +3,36 @@
 ::
 
     mailbox    length, address, channel, type | counter << 4 · type 3 is CoE, 0 an error
-    CoE        service << 12: 1 emergency, 2 SDO request, 3 SDO response, 8 SDO information
+    CoE        service << 12: 1 emergency, 2 SDO request, 3 SDO response
     SDO        command, index, subindex, 4 bytes of data or size; more data follows in a normal transfer
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 from struct import Struct
 
-from canopen.objectdictionary import ODVariable
 from canopen.sdo import SdoAbortedError
 
-from sim_bus.canopen.objects import ABORT_LENGTH, ABORT_NO_OBJECT, ObjectStore
+from sim_bus.objects import ABORT_LENGTH, ObjectStore
 
 _MAILBOX, _COE, _SDO = Struct("<HHBB"), Struct("<H"), Struct("<BHB")
 _TYPE_ERROR, _TYPE_COE = 0, 3
-_EMERGENCY, _REQUEST, _RESPONSE, _INFORMATION = 1, 2, 3, 8
+_EMERGENCY, _REQUEST, _RESPONSE = 1, 2, 3
 _HEAD = _MAILBOX.size + _COE.size
 _UNSUPPORTED_PROTOCOL, _INVALID_HEADER = 2, 5
 """Codes of a mailbox error."""
 
-_ABORT_TOGGLE, _ABORT_COMMAND, _ABORT_COMPLETE, _ABORT_GENERAL = 0x05030000, 0x05040001, 0x06010000, 0x08000000
+_ABORT_TOGGLE, _ABORT_COMMAND, _ABORT_COMPLETE, _ABORT_TRANSFER = 0x05030000, 0x05040001, 0x06010000, 0x08000020
 _COMPLETE = 0x10
 _LARGEST = 4096
 """Most bytes that a segmented download may bring."""
 
-_LIST_ASKED, _OBJECT_ASKED, _ENTRY_ASKED, _INFORMATION_ERROR = 1, 3, 5, 7
-_LISTS = 5
-_VARIABLE, _RECORD = 7, 9
-_READ, _WRITE, _MAPPABLE = 0x07, 0x38, 0xC0
+
+class Meddling(Enum):
+    """What a scripted fault makes of the transfers of an object."""
+
+    ABORTED, UNANSWERED, NOT_KEPT, OTHERWISE = range(4)
 
 
 @dataclass
@@ -55,8 +56,9 @@ class CoeServer:
         self._room = mailbox_size - _HEAD
         self._counter = self._last_counter = 0
         self._transfer: _Transfer | None = None
-        self.refuse: Callable[[int, int, bool], int | None] = lambda _index, _subindex, _write: None
-        """Abort code for an access to an object, by index, subindex and direction; None: no objection."""
+        self.meddling: dict[tuple[int, int], Meddling] = {}
+        self.silent = False
+        """Scripted: no message is answered."""
 
     def reset(self) -> None:
         """The mailbox starts anew."""
@@ -75,20 +77,19 @@ class CoeServer:
             return
         self._last_counter = counter
         body = message[_MAILBOX.size:_MAILBOX.size + length]
+        if self.silent:
+            return
         if kind & 0x0F != _TYPE_COE:
             self._error(_UNSUPPORTED_PROTOCOL)
         elif len(body) < _COE.size + _SDO.size:
             self._error(_INVALID_HEADER)
-        elif (service := _COE.unpack_from(body)[0] >> 12) == _REQUEST:
+        elif _COE.unpack_from(body)[0] >> 12 == _REQUEST:
             self._sdo(body[_COE.size:].ljust(8, b"\0"))
-        elif service == _INFORMATION:
-            self._information(body[_COE.size:])
         else:
             self._error(_INVALID_HEADER)
 
     def _send(self, service: int, body: bytes) -> None:
-        content = _COE.pack(service << 12) + body
-        self._message(_TYPE_COE, content)
+        self._message(_TYPE_COE, _COE.pack(service << 12) + body)
 
     def _error(self, code: int) -> None:
         self._message(_TYPE_ERROR, (1).to_bytes(2, "little") + code.to_bytes(2, "little"))
@@ -104,7 +105,12 @@ class CoeServer:
         kind, transfer = command >> 5, self._transfer
         if kind in {0, 3} and transfer is not None:
             index, subindex = transfer.index, transfer.subindex
+        meddling = self.meddling.get((index, subindex))
+        if meddling is Meddling.UNANSWERED:
+            return
         try:
+            if meddling is Meddling.ABORTED:
+                raise SdoAbortedError(_ABORT_TRANSFER)
             if kind == 1:
                 self._download(command, index, subindex, request)
             elif kind == 2:
@@ -119,16 +125,20 @@ class CoeServer:
             self._transfer = None
             self._send(_REQUEST, _SDO.pack(0x80, index, subindex) + int(error.code).to_bytes(4, "little"))
 
-    def _check(self, command: int, index: int, subindex: int, *, write: bool) -> None:
+    def _begin(self, command: int) -> None:
         self._transfer = None
         if command & _COMPLETE:
             raise SdoAbortedError(_ABORT_COMPLETE)
-        if (code := self.refuse(index, subindex, write)) is not None:
-            raise SdoAbortedError(code)
+
+    def _keep(self, index: int, subindex: int, data: bytes) -> None:
+        if self.meddling.get((index, subindex)) is not Meddling.NOT_KEPT:
+            self._store.set_data(index, subindex, data, check_writable=True)
 
     def _upload(self, command: int, index: int, subindex: int) -> None:
-        self._check(command, index, subindex, write=False)
+        self._begin(command)
         data = self._store.get_data(index, subindex, check_readable=True)
+        if self.meddling.get((index, subindex)) is Meddling.OTHERWISE:
+            data = bytes((data[0] ^ 0x04,)) + data[1:]
         if 0 < len(data) <= 4:
             head = _SDO.pack(0x43 | 4 - len(data) << 2, index, subindex)
             self._send(_RESPONSE, head + data.ljust(4, b"\0"))
@@ -139,10 +149,10 @@ class CoeServer:
             self._transfer = _Transfer(index, subindex, data[now:])
 
     def _download(self, command: int, index: int, subindex: int, request: bytes) -> None:
-        self._check(command, index, subindex, write=True)
+        self._begin(command)
         if command & 2:
             data = request[4:8 - (command >> 2 & 3)] if command & 1 else request[4:8]
-            self._store.set_data(index, subindex, data, check_writable=True)
+            self._keep(index, subindex, data)
         else:
             size, data = int.from_bytes(request[4:8], "little"), request[8:]
             if size > _LARGEST:
@@ -150,7 +160,7 @@ class CoeServer:
             if size > len(data):
                 self._transfer = _Transfer(index, subindex, data, size=size, upload=False)
             else:
-                self._store.set_data(index, subindex, data[:size], check_writable=True)
+                self._keep(index, subindex, data[:size])
         self._send(_RESPONSE, _SDO.pack(0x60, index, subindex) + bytes(4))
 
     def _segment(self, transfer: _Transfer, command: int, request: bytes) -> None:
@@ -169,58 +179,7 @@ class CoeServer:
             if last or len(transfer.data) > transfer.size:
                 if len(transfer.data) != transfer.size:
                     raise SdoAbortedError(ABORT_LENGTH)
-                self._store.set_data(transfer.index, transfer.subindex, transfer.data, check_writable=True)
+                self._keep(transfer.index, transfer.subindex, transfer.data)
             self._send(_RESPONSE, bytes((0x20 | toggle,)) + bytes(7))
         if last:
             self._transfer = None
-
-    # -- SDO information ---------------------------------------------------------------------------------
-
-    def _information(self, request: bytes) -> None:
-        asked, body = request[0] & 0x7F, request[4:]
-        number = int.from_bytes(body[:2], "little")
-        try:
-            if asked == _LIST_ASKED:
-                self._list(number)
-            elif asked == _OBJECT_ASKED:
-                self._inform(asked + 1, body[:2] + self._object(number))
-            elif asked == _ENTRY_ASKED and len(body) >= 4:
-                self._inform(asked + 1, body[:3] + b"\0" + self._entry(self._store.variable(number, body[2])))
-            else:
-                raise SdoAbortedError(_ABORT_COMMAND)
-        except SdoAbortedError as error:
-            self._inform(_INFORMATION_ERROR, int(error.code).to_bytes(4, "little"))
-
-    def _inform(self, code: int, content: bytes) -> None:
-        """Sends an answer, in fragments where it is longer than the mailbox."""
-        room = self._room - 4
-        parts = [content[at:at + room] for at in range(0, len(content), room)] or [b""]
-        for number, part in enumerate(parts, 1):
-            left = len(parts) - number
-            self._send(_INFORMATION, bytes((code | 0x80 * (left > 0), 0)) + left.to_bytes(2, "little") + part)
-
-    def _list(self, kind: int) -> None:
-        """List 0: how many objects each list has; 1: all; 2 and 3: those that can be mapped; others are empty."""
-        lists = {1: sorted(self._store.object_dictionary)}
-        for which, writable in ((2, True), (3, False)):
-            lists[which] = [index for index in lists[1] if any(
-                one.pdo_mappable and (one.writable if writable else one.readable) for one in self._variables(index))]
-        content = [len(lists.get(which, ())) for which in range(1, _LISTS + 1)] if kind == 0 else lists.get(kind, [])
-        self._inform(_LIST_ASKED + 1, b"".join(one.to_bytes(2, "little") for one in (kind, *content)))
-
-    def _variables(self, index: int) -> list[ODVariable]:
-        entry = self._store.object_dictionary.get(index)
-        if entry is None:
-            raise SdoAbortedError(ABORT_NO_OBJECT)
-        return [entry] if isinstance(entry, ODVariable) else [entry[sub] for sub in sorted(entry.subindices)]
-
-    def _object(self, index: int) -> bytes:
-        variables, name = self._variables(index), str(self._store.object_dictionary[index].name)
-        single = isinstance(self._store.object_dictionary[index], ODVariable)
-        head = (variables[0].data_type or 0).to_bytes(2, "little")
-        return head + bytes((variables[-1].subindex, _VARIABLE if single else _RECORD)) + name.encode()[:64]
-
-    def _entry(self, variable: ODVariable) -> bytes:
-        access = _READ * variable.readable | _WRITE * variable.writable | _MAPPABLE * bool(variable.pdo_mappable)
-        numbers = (variable.data_type or 0, len(variable), access)
-        return b"".join(one.to_bytes(2, "little") for one in numbers) + str(variable.name).encode()[:64]

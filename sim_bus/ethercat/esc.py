@@ -9,13 +9,14 @@ Knows no state machine, no mailbox protocol and no drive: they are behind `Pdi`.
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from enum import IntEnum
 from struct import Struct
 from typing import Protocol
 
 ETHERTYPE = 0x88A4
 _ETHERNET_SIZE, _DATAGRAM = 14, Struct("<BBHHHH")
+_TIME, _MANAGER_REGISTERS, _FMMU_REGISTERS = Struct("<Q"), Struct("<HHBBBB"), Struct("<IHBBHBBB3x")
 _DATAGRAMS = 1
 """Type of the EtherCAT header that is followed by datagrams."""
 
@@ -38,7 +39,7 @@ _COUNTERS = ((0x0300, 0x0314), (0x0442, 0x0444))
 """Registers that any write clears."""
 
 _DELIVERED = {
-    0x0000: bytes((0x11, 0x00, 0x02, 0x00, FMMUS, MANAGERS, 8, 0x0F, 0x0C, 0x00)),   # bit-wise FMMUs, clock of 64 bits
+    0x0000: bytes((0x11, 0x00, 0x02, 0x00, FMMUS, MANAGERS, 8, 0x0F, 0x0D, 0x00)),   # FMMUs map bytes; clock of 64 bits
     0x0110: bytes((0x13, 0x56)),         # PDI runs; link at port 0 only
     AL_STATUS: b"\1\0", 0x0140: b"\x05\x0C",
     _DIVIDER: (2498).to_bytes(2, "little"), 0x0410: (1000).to_bytes(2, "little"),
@@ -61,35 +62,25 @@ _BROADCAST = {Command.BRD, Command.BWR, Command.BRW}
 
 
 class Pdi(Protocol):
-    """The side of the slave's processor."""
+    """The side of the slave's processor: what it hears from the master, and its inputs at this moment."""
 
-    def al_control(self, word: int) -> None:
-        """The master has requested a state, 0120h."""
-
-    def mailbox(self, message: bytes) -> None:
-        """The master has filled the mailbox."""
-
-    def outputs(self, data: bytes) -> None:
-        """The master has written the process data outputs."""
-
-    def inputs(self) -> bytes:
-        """Return the process data inputs at this moment."""
-
-    def watchdog_expired(self) -> None:
-        """No outputs have been written for the time of 0420h."""
+    def al_control(self, word: int) -> None: ...
+    def mailbox(self, message: bytes) -> None: ...
+    def outputs(self, data: bytes) -> None: ...
+    def inputs(self) -> bytes: ...
+    def watchdog_expired(self) -> None: ...
 
 
 class SyncManager:
     """One SyncManager as its eight registers say."""
 
     def __init__(self, number: int, registers: bytes | bytearray) -> None:
-        self.number = number
-        self.start, self.length = int.from_bytes(registers[0:2], "little"), int.from_bytes(registers[2:4], "little")
-        self.mailbox = registers[4] & 0x03 == 0x02
-        self.host_writes = registers[4] & 0x0C == 0x04
-        self.triggers_watchdog = bool(registers[4] & 0x40)
-        self.enabled = bool(registers[6] & 1) and self.length > 0
+        self.start, self.length, control, _status, active, _pdi = _MANAGER_REGISTERS.unpack(registers)
+        self.mailbox, self.host_writes = control & 0x03 == 0x02, control & 0x0C == 0x04
+        self.triggers_watchdog = bool(control & 0x40)
+        self.enabled = bool(active & 1) and self.length > 0
         self.end = self.start + self.length
+        self.status_at = _MANAGER + 8 * number + 5
 
     def covers(self, begin: int, end: int) -> bool:
         """The range touches its buffer."""
@@ -97,15 +88,17 @@ class SyncManager:
 
 
 class Fmmu:
-    """One fieldbus memory management unit as its sixteen registers say."""
+    """One fieldbus memory management unit as its sixteen registers say; it maps whole bytes."""
 
     def __init__(self, registers: bytes | bytearray) -> None:
-        self.logical, self.length = int.from_bytes(registers[0:4], "little"), int.from_bytes(registers[4:6], "little")
-        self.first_bit, self.last_bit = registers[6] & 7, registers[7] & 7
-        self.physical, self.physical_bit = int.from_bytes(registers[8:10], "little"), registers[10] & 7
-        self.reads, self.writes = bool(registers[11] & 1), bool(registers[11] & 2)
-        self.active = bool(registers[12] & 1) and self.length > 0
-        self.whole = (self.first_bit, self.last_bit, self.physical_bit) == (0, 7, 0)
+        self.logical, self.length, _first, _last, self.physical, _bit, kind, active = _FMMU_REGISTERS.unpack(registers)
+        self.reads, self.writes = bool(kind & 1), bool(kind & 2)
+        self.active = bool(active & 1) and self.length > 0
+
+    def part(self, logical: int, count: int) -> tuple[int, slice]:
+        """The physical address and the place in the datagram of what it maps of that range."""
+        begin, end = max(logical, self.logical), min(logical + count, self.logical + self.length)
+        return self.physical + begin - self.logical, slice(begin - logical, max(begin, end) - logical)
 
 
 class Esc:
@@ -118,7 +111,10 @@ class Esc:
         for at, data in _DELIVERED.items():
             self.memory[at:at + len(data)] = data
         self.memory[0x0012:0x0014] = eeprom[8:10]
-        self.clock_ns = 0
+        self.clock_ns = self.fine_ns = 0
+        """Local time of the distributed clock: that of the plant, and how far the frame is ahead of it."""
+        self.locked: Container[int] = ()
+        """Scripted: registers that keep what they have."""
         self.managers = [SyncManager(n, bytes(8)) for n in range(MANAGERS)]
         self._fmmus: list[Fmmu] = []
         self._waiting: deque[bytes] = deque()
@@ -192,31 +188,16 @@ class Esc:
         """One datagram with a logical address; what the working counter gains. Reads come first."""
         sent, was_read, was_written = bytes(body), False, False
         for fmmu in self._fmmus:
-            begin, end = max(logical, fmmu.logical), min(logical + len(body), fmmu.logical + fmmu.length)
-            if begin >= end or not (fmmu.reads and command in _READS):
-                continue
-            if fmmu.whole:
-                found = self._read(fmmu.physical + begin - fmmu.logical, end - begin)
-                if found is not None:
-                    body[begin - logical:end - logical] = found
-                    was_read = True
-            else:
-                self._read_bits(fmmu, logical, body)
+            at, place = fmmu.part(logical, len(body))
+            count = place.stop - place.start
+            if count and fmmu.reads and command in _READS and (found := self._read(at, count)) is not None:
+                body[place] = found
                 was_read = True
         for fmmu in self._fmmus:
-            begin, end = max(logical, fmmu.logical), min(logical + len(body), fmmu.logical + fmmu.length)
-            if begin < end and fmmu.writes and fmmu.whole and command in _WRITES:
-                was_written |= self._write(fmmu.physical + begin - fmmu.logical, sent[begin - logical:end - logical])
+            at, place = fmmu.part(logical, len(body))
+            if sent[place] and fmmu.writes and command in _WRITES:
+                was_written |= self._write(at, sent[place])
         return was_read + (2 if command == Command.LRW else 1) * was_written
-
-    def _read_bits(self, fmmu: Fmmu, logical: int, body: bytearray) -> None:
-        """Maps bits, as of a mailbox's state, into a datagram."""
-        first = 8 * (fmmu.logical - logical) + fmmu.first_bit
-        for number in range(8 * (fmmu.length - 1) + fmmu.last_bit - fmmu.first_bit + 1):
-            source, target = 8 * fmmu.physical + fmmu.physical_bit + number, first + number
-            if 0 <= target < 8 * len(body):
-                bit = self.memory[source >> 3] >> (source & 7) & 1
-                body[target >> 3] = body[target >> 3] & ~(1 << (target & 7)) | bit << (target & 7)
 
     # -- memory ------------------------------------------------------------------------------------------
 
@@ -239,7 +220,7 @@ class Esc:
             return None
         found = bytes(self.memory[at:end])
         if end >= manager.end:
-            self._mark(manager, full=False)
+            self._mark(manager, 0)
             self._next_answer()
         return found
 
@@ -249,6 +230,8 @@ class Esc:
         parts = [(max(at, a), min(end, b)) for a, b in _WRITABLE if at < b and a < end]
         if end > MEMORY_SIZE or not parts:
             return False
+        if at in self.locked:
+            return True
         manager = next((one for one in self.managers if at >= RAM and one.covers(at, end)), None)
         if manager is not None and (not manager.host_writes or (manager.mailbox and self._full(manager))):
             return False
@@ -275,9 +258,9 @@ class Esc:
         """The last byte of a buffer is there."""
         data = bytes(self.memory[manager.start:manager.end])
         if manager.mailbox:
-            self._mark(manager, full=True)
+            self._mark(manager, 8)
             self._pdi.mailbox(data)
-            self._mark(manager, full=False)
+            self._mark(manager, 0)
             return
         if manager.triggers_watchdog:
             self._unfed_s = 0.0
@@ -285,22 +268,22 @@ class Esc:
         self._pdi.outputs(data)
 
     def _full(self, manager: SyncManager) -> bool:
-        return bool(self.memory[_MANAGER + 8 * manager.number + 5] & 0x08)
+        return bool(self.memory[manager.status_at] & 8)
 
-    def _mark(self, manager: SyncManager, *, full: bool) -> None:
-        at = _MANAGER + 8 * manager.number + 5
-        self.memory[at] = self.memory[at] & ~0x08 | 0x08 * full
+    def _mark(self, manager: SyncManager, full: int) -> None:
+        self.memory[manager.status_at] = self.memory[manager.status_at] & ~8 | full
 
     def _read_fmmus(self) -> None:
-        units = [Fmmu(self.memory[_FMMU + 16 * n:_FMMU + 16 * (n + 1)]) for n in range(FMMUS)]
+        units = (Fmmu(self.memory[at:at + 16]) for at in range(_FMMU, _FMMU + 16 * FMMUS, 16))
         self._fmmus = [one for one in units if one.active]
 
     def _read_managers(self) -> None:
-        for number in range(MANAGERS):
-            at = _MANAGER + 8 * number
-            self.managers[number] = SyncManager(number, self.memory[at:at + 8])
-            if not self.managers[number].enabled:
-                self.memory[at + 5] = 0
+        places = range(_MANAGER, _MANAGER + 8 * MANAGERS, 8)
+        self.locked: Container[int] = ()
+        """Scripted: registers that keep what they have."""
+        self.managers = [SyncManager(n, self.memory[at:at + 8]) for n, at in enumerate(places)]
+        for one in self.managers:
+            self.memory[one.status_at] &= 0xFF * one.enabled
 
     # -- mailbox to the master ---------------------------------------------------------------------------
 
@@ -314,7 +297,7 @@ class Esc:
         """Forgets all messages: the mailbox starts or ends."""
         self._waiting.clear()
         self._last_answer = b""
-        self._mark(self.managers[1], full=False)
+        self._mark(self.managers[1], 0)
 
     def _next_answer(self) -> None:
         if self._waiting:
@@ -325,7 +308,7 @@ class Esc:
         manager = self.managers[1]
         if manager.enabled and manager.mailbox and not manager.host_writes:
             self.memory[manager.start:manager.end] = message[:manager.length].ljust(manager.length, b"\0")
-            self._mark(manager, full=True)
+            self._mark(manager, 8)
 
     def _repeat_answer(self) -> None:
         """The master asks for the last message again: its frame was lost."""
@@ -355,25 +338,26 @@ class Esc:
         self.memory[_WATCHDOG_STATUS] |= 1
 
     def expire_watchdog(self) -> None:
-        """The time has run out."""
+        """The time of the watchdog has run out."""
         self._unfed_s = None
         self.memory[_WATCHDOG_STATUS] &= ~1
         self.memory[_WATCHDOG_COUNT] = min(255, self.memory[_WATCHDOG_COUNT] + 1)
         self._pdi.watchdog_expired()
 
-    def pass_time(self, duration_s: float) -> None:
-        """Time has passed for the watchdog."""
+    def pass_time(self, duration_us: int) -> None:
+        """Time has passed for clock and watchdog."""
+        self.clock_ns += 1000 * duration_us
         if self._unfed_s is not None:
-            self._unfed_s += duration_s
+            self._unfed_s += 1e-6 * duration_us
             if 0.0 < self.watchdog_s < self._unfed_s:
                 self.expire_watchdog()
 
     def _tell_time(self) -> None:
-        offset = int.from_bytes(self.memory[_OFFSET:_OFFSET + 8], "little")
-        system = (self.clock_ns + offset) & (1 << 64) - 1
-        self.memory[_SYSTEM_TIME:_SYSTEM_TIME + 8] = system.to_bytes(8, "little")
+        offset, = _TIME.unpack_from(self.memory, _OFFSET)
+        _TIME.pack_into(self.memory, _SYSTEM_TIME, (self.clock_ns + self.fine_ns + offset) % (1 << 64))
 
     def _latch(self) -> None:
         """Receive times of this frame, at port 0 and at the processing unit."""
-        self.memory[_LATCH:_LATCH + 4] = (self.clock_ns & 0xFFFFFFFF).to_bytes(4, "little")
-        self.memory[_LOCAL_TIME:_LOCAL_TIME + 8] = (self.clock_ns & (1 << 64) - 1).to_bytes(8, "little")
+        now = self.clock_ns + self.fine_ns
+        _TIME.pack_into(self.memory, _LOCAL_TIME, now)
+        self.memory[_LATCH:_LATCH + 4] = self.memory[_LOCAL_TIME:_LOCAL_TIME + 4]

@@ -1,0 +1,196 @@
+"""Scripted faults of one simulated EtherCAT drive; each sets something and restores it. All times are plant time."""
+
+import re
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+
+from sim_bus.drive_faults import DriveFault, of_drive
+from sim_bus.ethercat.coe import Meddling
+from sim_bus.ethercat.slave import Cia402Slave
+from sim_bus.fault_script import STOP, Cast, FaultKind, Kinds, Passing, Scripted, number, plain, share
+
+_SEED = 0xFA17
+_FIRST, _LENGTH, _HEAD = 16, slice(22, 24), 26
+"""Places of the first datagram in a frame: its command, its length, its data."""
+
+_LRD, _LWR, _LRW = 10, 11, 12
+V = TypeVar("V")
+"""Type of a fault's value."""
+
+
+class Misbehaviour(Passing):
+    """Does something to the line or the slave when it begins, and when it ends."""
+
+    line: "Faults"
+
+    def __init__(self, begin: Callable[["Faults"], None], end: Callable[["Faults"], None] | None = None) -> None:
+        self._begin, self._end = begin, end
+
+    def begin(self) -> None:
+        """It starts."""
+        self._begin(self.line)
+
+    def end(self) -> None:
+        """It is over."""
+        if self._end is not None:
+            self._end(self.line)
+
+
+def _set(of: Callable[["Faults"], Any], name: str, value: Callable[["Faults"], object]) -> Misbehaviour:
+    """An attribute has another value while the fault lasts."""
+    before: list[object] = []
+
+    def begin(line: "Faults") -> None:
+        before.append(getattr(of(line), name))
+        setattr(of(line), name, value(line))
+
+    return Misbehaviour(begin, lambda line: setattr(of(line), name, before.pop()))
+
+
+def _do(parse: Callable[[str], V], act: Callable[["Faults", V], None]) -> Callable[[str], Misbehaviour]:
+    """Something that happens once, with the value of the fault."""
+    def make(text: str) -> Misbehaviour:
+        value = parse(text)
+        return Misbehaviour(lambda line: act(line, value))
+
+    return make
+
+
+def _part(name: str) -> Callable[[str], Misbehaviour]:
+    """A share of the frames, by the name of the attribute."""
+    def make(text: str) -> Misbehaviour:
+        part = share(text)
+        return _set(lambda line: line, name, lambda _: part)
+
+    return make
+
+
+def _transfers(how: Meddling) -> Callable[[str], Misbehaviour]:
+    """All transfers of an object."""
+    def make(text: str) -> Misbehaviour:
+        found = re.fullmatch(r"(?:0x)?([0-9A-Fa-f]{4})h?(?::([0-9]{1,3}))?", text)
+        if found is None or int(found[2] or 0) > 255:
+            raise ValueError("an object, such as 6072h or 1018h:1")
+        key = int(found[1], 16), int(found[2] or 0)
+        return _set(lambda line: line.slave.coe, "meddling", lambda line: {**line.slave.coe.meddling, key: how})
+
+    return make
+
+
+def _of_drive(fault: DriveFault) -> Misbehaviour:
+    return Misbehaviour(lambda line: fault.begin(line.slave), lambda line: fault.end(line.slave))
+
+
+def _garbage(line: "Faults") -> bytes:
+    """The EEPROM with an identity of ones and a wrong checksum."""
+    content = bytearray(line.slave.esc.eeprom)
+    content[14], content[16:32] = content[14] ^ 0xFF, b"\xff" * 16
+    return bytes(content)
+
+
+def _jump(line: "Faults", jump_s: float) -> None:
+    line.slave.esc.clock_ns = max(0, line.slave.esc.clock_ns + round(1e9 * jump_s))
+
+
+def _failed(line: "Faults", code: int) -> None:
+    line.slave.report(code)
+    line.slave.application.fault()
+
+
+def _code(text: str) -> int:
+    if not re.fullmatch(r"(?:0x)?[0-9A-Fa-f]{1,4}h?", text):
+        raise ValueError("a hexadecimal code, such as 7305h")
+    return int(text.removeprefix("0x").removesuffix("h"), 16)
+
+
+def _slave(line: "Faults") -> Cia402Slave:
+    return line.slave
+
+
+KINDS: Kinds[Misbehaviour] = Kinds({
+    "bus-dead": FaultKind(12, "nothing gets through any more: cable cut", plain(lambda: _part("loss")("1"))),
+    "frame-loss": FaultKind(17, "this share of all frames is lost, either way", _part("loss"), "1%", "SHARE"),
+    "frozen-feedback": FaultKind(19, "the inputs keep their last values",
+                                 plain(lambda: _set(_slave, "frozen", lambda line: line.slave.inputs()))),
+    "node-reset": FaultKind(21, "the drive restarts: INIT, its torque is off, the shaft coasts",
+                            plain(lambda: Misbehaviour(lambda line: line.slave.restart()))),
+    "emcy": FaultKind(23, "an emergency message, with the drive still enabled",
+                      _do(_code, lambda line, code: line.slave.report(code)), "7305h", "CODE"),
+    "drive-fault": FaultKind(23, "emergency message and fault state, after the drive's own fault reaction",
+                             _do(_code, _failed), "3210h", "CODE"),
+    "sdo-abort": FaultKind(24, "the drive aborts every transfer of an object", _transfers(Meddling.ABORTED), "6072h",
+                           "OBJECT"),
+    "sdo-timeout": FaultKind(25, "the drive doesn't answer when asked for an object",
+                             _transfers(Meddling.UNANSWERED), "6072h", "OBJECT"),
+    "wrong-identity": FaultKind(29, "1018h:1, the vendor, is another one",
+                                plain(lambda: _transfers(Meddling.OTHERWISE)("1018h:1"))),
+    "fault-at-start": FaultKind(30, "the drive is in fault when the host comes", _do(_code, _failed), "3210h", "CODE"),
+    "write-not-kept": FaultKind(45, "a write to an object is answered and not kept", _transfers(Meddling.NOT_KEPT),
+                                "6080h", "OBJECT"),
+    "reads-back-otherwise": FaultKind(45, "an object reads back as something else", _transfers(Meddling.OTHERWISE),
+                                      "6072h", "OBJECT"),
+    "watchdog-not-armed": FaultKind(50, "writes to registers 0400h to 0421h are answered and not kept", plain(
+        lambda: _set(lambda line: line.slave.esc, "locked", lambda _: range(0x0400, 0x0422)))),
+    "mailbox-timeout": FaultKind(0, "no message in the mailbox is answered",
+                                 plain(lambda: _set(lambda line: line.slave.coe, "silent", lambda _: True))),
+    "wrong-working-counter": FaultKind(0, "this share of the process data comes back with a working counter of 0",
+                                       _part("uncounted"), "1%", "SHARE"),
+    "al-error": FaultKind(0, "the slave leaves OPERATIONAL with this AL status code",
+                          _do(_code, lambda line, code: line.slave.al_error(code)), "1Bh", "CODE"),
+    "sm-watchdog": FaultKind(0, "the watchdog of the process data expires, though they come",
+                             plain(lambda: Misbehaviour(lambda line: line.slave.esc.expire_watchdog()))),
+    "sii-garbage": FaultKind(0, "the identity in the EEPROM reads as ones, and its checksum is wrong",
+                             plain(lambda: _set(lambda line: line.slave.esc, "eeprom", _garbage))),
+    "clock-jump": FaultKind(0, "the distributed clock jumps by so many seconds", _do(number, _jump), "1", "SECONDS"),
+    **of_drive(_of_drive),
+})
+parse_all, listed, listing = KINDS.parse_all, KINDS.listed, KINDS.listing
+
+
+class Faults:
+    """The script of one drive, between host and slave."""
+
+    def __init__(self, script: tuple[Scripted, ...], slave: Cia402Slave, seed: int) -> None:
+        self.slave = slave
+        self.loss = self.uncounted = 0.0
+        self._rng = np.random.default_rng((seed, _SEED))
+        self._cast: Cast[Misbehaviour] = Cast(script, KINDS.make)
+        for fault in self._cast.all:
+            fault.line = self
+        if script:
+            slave.on_time = self._moved
+            slave.on_stage = self._on_stage
+            slave.application.on_stop = lambda: self._on_stage(STOP)
+            self._moved(0)
+
+    @property
+    def waiting(self) -> tuple[str, ...]:
+        """Faults whose moment hasn't come, as they were written."""
+        return self._cast.waiting
+
+    def answer(self, frame: bytes) -> bytes:
+        """The frame as it comes back; empty where it is lost. A lost cycle takes its time all the same."""
+        command = frame[_FIRST] if len(frame) > _HEAD else 0
+        if self._happens(self.loss):
+            if command in (_LWR, _LRW):
+                self.slave.pass_cycle()
+            return b""
+        answered = self.slave.answer(frame)
+        if self._happens(self.loss):
+            return b""
+        if command in (_LRD, _LWR, _LRW) and self._happens(self.uncounted):
+            end = _HEAD + (int.from_bytes(frame[_LENGTH], "little") & 0x07FF)
+            answered = answered[:end] + bytes(2) + answered[end + 2:]
+        return answered
+
+    def _happens(self, part: float) -> bool:
+        return part > 0.0 and bool(self._rng.random() < part)
+
+    def _moved(self, now_us: int) -> None:
+        self._cast.moved(now_us, self.slave.note)
+
+    def _on_stage(self, number: int) -> None:
+        self._cast.stage(number, self.slave.time_us)
+        self._moved(self.slave.time_us)

@@ -1,0 +1,65 @@
+"""A simulated drive in plant time: inverter and CiA 402 application, moved on together, and the trace of the shaft.
+
+It owns no clock and no thread, and knows no bus: the caller says how much time has passed.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from sim_bus.cia402 import Application
+from sim_bus.inverter import Inverter
+from sim_bus.params import RigParams
+from sim_bus.trace import ROW_PERIOD_US, ShaftTrace
+
+
+def _ignore(_number: int) -> None:
+    pass
+
+
+class TimedDrive:
+    """Inverter, application and trace, with their time."""
+
+    def __init__(self, params: RigParams, *, seed: int, trace: ShaftTrace, stepped: bool) -> None:
+        self.time_us = 0
+        self.stepped = stepped
+        self.trace = trace
+        self.on_time: Callable[[int], None] = _ignore       # plant time in µs, before each piece of it
+        self.on_stage: Callable[[int], None] = _ignore      # the host says that a stage begins
+        self._next_row_us = 0
+        self.inverter = Inverter(params, np.random.default_rng(seed))
+        self.application = Application(self.inverter)
+
+    def advance_us(self, duration_us: int) -> None:
+        """The plant moves on, in equal steps of at most the control period."""
+        application, inverter = self.application, self.inverter
+        self.on_time(self.time_us)
+        application.regulate()
+        count, dt_s = inverter.steps(duration_us * 1e-6)
+        begin_us = self.time_us
+        for number in range(1, count + 1):
+            application.step(dt_s)
+            self.time_us = begin_us + duration_us * number // count
+            if self.time_us >= self._next_row_us:
+                self._next_row_us = (self.time_us // ROW_PERIOD_US + 1) * ROW_PERIOD_US
+                self.trace.row(
+                    self.time_us * 1e-6, inverter.state.speed_rad_s, inverter.torque_nm, application.state.value,
+                )
+
+    def note(self, event: str) -> None:
+        """An event, or a change of state where ``event`` is empty, for the trace."""
+        self.trace.row(
+            self.time_us * 1e-6, self.inverter.state.speed_rad_s, self.inverter.torque_nm,
+            self.application.state.value, event or f"state: {self.application.state.value}",
+        )
+
+    def tell_stage(self, number: int) -> None:
+        """The host says that a stage begins."""
+        self.note(f"stage {number}")
+        self.on_stage(number)
+
+    def set_stepped(self, value: int) -> None:
+        """5FFEh:2: time moves with the cycles of the host, or by itself."""
+        if bool(value) is not self.stepped:
+            self.stepped = bool(value)
+            self.note("stepped time" if value else "own time")
