@@ -279,8 +279,6 @@ class Esc:
 
     def _read_managers(self) -> None:
         places = range(_MANAGER, _MANAGER + 8 * MANAGERS, 8)
-        self.locked: Container[int] = ()
-        """Scripted: registers that keep what they have."""
         self.managers = [SyncManager(n, self.memory[at:at + 8]) for n, at in enumerate(places)]
         for one in self.managers:
             self.memory[one.status_at] &= 0xFF * one.enabled
@@ -335,7 +333,6 @@ class Esc:
     def stop_watchdog(self) -> None:
         """No outputs are expected any more."""
         self._unfed_s = None
-        self.memory[_WATCHDOG_STATUS] |= 1
 
     def expire_watchdog(self) -> None:
         """The time of the watchdog has run out."""

@@ -153,7 +153,7 @@ class Faults:
     """The script of one drive, between host and slave."""
 
     def __init__(self, script: tuple[Scripted, ...], slave: Cia402Slave, seed: int) -> None:
-        self.slave = slave
+        self.slave: Cia402Slave = slave
         self.loss = self.uncounted = 0.0
         self._rng = np.random.default_rng((seed, _SEED))
         self._cast: Cast[Misbehaviour] = Cast(script, KINDS.make)

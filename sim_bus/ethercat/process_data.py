@@ -125,6 +125,6 @@ class ProcessData:
     def _check_entry(self, entry: int) -> None:
         """An entry names an object that can be mapped in this direction, or a gap, with its length."""
         self._check_state()
-        gap = not entry or (not entry >> 16 and entry & 0xFF in _GAPS)
-        if not gap and not self._store.mappable(entry, receives=self.outputs):
+        gap = not entry >> 16
+        if not (not entry or entry in _GAPS if gap else self._store.mappable(entry, receives=self.outputs)):
             raise SdoAbortedError(od.ABORT_NOT_MAPPABLE)

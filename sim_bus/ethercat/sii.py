@@ -7,6 +7,7 @@
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from struct import pack, pack_into
 from typing import NamedTuple
 
@@ -26,7 +27,8 @@ class Area(NamedTuple):
     kind: int
 
 
-class PdoEntry(NamedTuple):
+@dataclass(frozen=True)
+class PdoEntry:
     """One entry of a PDO."""
 
     index: int
@@ -35,7 +37,8 @@ class PdoEntry(NamedTuple):
     bits: int
 
 
-class Pdo(NamedTuple):
+@dataclass(frozen=True)
+class Pdo:
     """One PDO of a SyncManager."""
 
     index: int

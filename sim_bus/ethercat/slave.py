@@ -231,8 +231,10 @@ class Cia402Slave(TimedDrive):
         store, short, live, hooks = self.store, datatypes.UNSIGNED8, self.store.live, self.store.hooks
         live[key_of(0x1001)], live[key_of(0x603F)] = lambda: self._register, lambda: self.fault_code
         fixed = [(0x1C00, sub, short, False, sub or 4) for sub in (1, 2, 3, 4, 0)]
-        own = [(MARKER_INDEX, 3, datatypes.UNSIGNED32, True, 0), (MARKER_INDEX, MARKER_STAGE, short, True, 0),
-               (MARKER_INDEX, 5, datatypes.VISIBLE_STRING, True, "")]
+        own: list[tuple[int, int, int, bool, int | str]] = [
+            (MARKER_INDEX, 3, datatypes.UNSIGNED32, True, 0), (MARKER_INDEX, MARKER_STAGE, short, True, 0),
+            (MARKER_INDEX, 5, datatypes.VISIBLE_STRING, True, ""),
+        ]
         for index, sub, data_type, writable, value in (*fixed, *own):
             name = "Marker" if writable else "SyncManager type"
             store.add(index, sub, data_type, writable=writable, mappable=False, name=name)
