@@ -12,6 +12,10 @@ from sim_bus.inverter import Inverter
 from sim_bus.params import RigParams
 from sim_bus.trace import ROW_PERIOD_US, ShaftTrace
 
+_CHUNK_US = 2_000
+_RUN_OUT_US, _REST_US = 120_000_000, 1_500_000
+_AT_REST_RAD_S = 0.02
+
 
 def _ignore(_number: int) -> None:
     pass
@@ -45,6 +49,14 @@ class TimedDrive:
                 self.trace.row(
                     self.time_us * 1e-6, inverter.state.speed_rad_s, inverter.torque_nm, application.state.value,
                 )
+
+    def run_out(self) -> None:
+        """After a rehearsal the host is gone: what the drive then does by itself belongs to the trace."""
+        end_us = self.time_us + _RUN_OUT_US
+        quiet_us = 0
+        while quiet_us < _REST_US and self.time_us < end_us:
+            self.advance_us(_CHUNK_US)
+            quiet_us = 0 if abs(self.inverter.speed_rad_s) > _AT_REST_RAD_S else quiet_us + _CHUNK_US
 
     def note(self, event: str) -> None:
         """An event, or a change of state where ``event`` is empty, for the trace."""

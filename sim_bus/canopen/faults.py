@@ -18,7 +18,19 @@ from sim_bus.canopen import services as emcy
 from sim_bus.canopen.node import SYNC, Cia402Node
 from sim_bus.canopen.sender import Sender
 from sim_bus.drive_faults import DriveFault, of_drive
-from sim_bus.fault_script import STOP, Cast, FaultKind, Kinds, Passing, Scripted, plain, seconds, share
+from sim_bus.fault_script import (
+    STOP,
+    Cast,
+    FaultKind,
+    Kinds,
+    Passing,
+    Scripted,
+    error_code,
+    object_place,
+    plain,
+    seconds,
+    share,
+)
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What a scripted fault may do: change frames on their way in or out, and lay hands on the drive itself.
@@ -372,26 +384,10 @@ class Otherwise(Answers):
 # The faults that can be scripted on CANopen: name, row of the fault table, what they do, what their value means.
 
 
-_OBJECT = re.compile(r"(?:0x)?([0-9A-Fa-f]{4})h?(?::([0-9]{1,3}))?")
-
-
-def _code(text: str) -> int:
-    if not re.fullmatch(r"(?:0x)?[0-9A-Fa-f]{4}h?", text):
-        raise ValueError("an error code of four hexadecimal digits, such as 7305h")
-    return int(text.removeprefix("0x").removesuffix("h"), 16)
-
-
 def _frames(text: str) -> int:
     if not (text.isdecimal() and 1 <= int(text) <= 100):
         raise ValueError("a number of frames, 1 to 100")
     return int(text)
-
-
-def _object(text: str) -> tuple[int, int]:
-    found = _OBJECT.fullmatch(text)
-    if found is None or int(found[2] or 0) > 255:
-        raise ValueError("an object, such as 6072h or 1016h:1")
-    return int(found[1], 16), int(found[2] or 0)
 
 
 def _again(text: str) -> bool:
@@ -403,7 +399,7 @@ def _again(text: str) -> bool:
 def _written(text: str) -> tuple[int, int, int, int]:
     """6072h=100 or 1016h:1=0: object, value, and its size in bytes, as CiA 301 and 402 have it."""
     where, _, value = text.partition("=")
-    index, sub = _object(where)
+    index, sub = object_place(where)
     if not re.fullmatch(r"[0-9]{1,10}|[0-9A-Fa-f]{1,8}h", value):
         raise ValueError("an object and what is written to it, such as 6072h=100")
     number = int(value[:-1], 16) if value.endswith("h") else int(value)
@@ -432,13 +428,13 @@ KINDS: Kinds[Misbehaviour] = Kinds({
     "foreign-nmt-stop": FaultKind(22, "a third party sends NMT stop", plain(lambda: ForeignNmt(2))),
     "foreign-nmt-preop": FaultKind(22, "a third party sends NMT pre-operational", plain(lambda: ForeignNmt(128))),
     "emcy": FaultKind(23, "an emergency message, with the drive still enabled",
-                      lambda v: Emcy(_code(v)), "7305h", "CODE"),
+                      lambda v: Emcy(error_code(v)), "7305h", "CODE"),
     "drive-fault": FaultKind(23, "emergency message and fault state, after the drive's own fault reaction",
-                             lambda v: FaultReaction(_code(v)), "3210h", "CODE"),
+                             lambda v: FaultReaction(error_code(v)), "3210h", "CODE"),
     "sdo-abort": FaultKind(24, "the drive aborts every transfer of an object",
-                           lambda v: Aborted(*_object(v)), "6072h", "OBJECT"),
+                           lambda v: Aborted(*object_place(v)), "6072h", "OBJECT"),
     "sdo-timeout": FaultKind(25, "the drive doesn't answer when asked for an object",
-                             lambda v: Unanswered(*_object(v)), "6072h", "OBJECT"),
+                             lambda v: Unanswered(*object_place(v)), "6072h", "OBJECT"),
     "second-master": FaultKind(26,
                                "another host: from the start the drive is enabled already; later, foreign setpoints",
                           plain(SecondMaster)),
@@ -459,11 +455,11 @@ KINDS: Kinds[Misbehaviour] = Kinds({
     "wrong-identity": FaultKind(29, "1018h:1, the vendor, is another one",
                                 plain(lambda: Otherwise(0x1018, 1))),
     "fault-at-start": FaultKind(30, "the drive is in fault when the host comes",
-                                lambda v: FaultReaction(_code(v)), "3210h", "CODE"),
+                                lambda v: FaultReaction(error_code(v)), "3210h", "CODE"),
     "write-not-kept": FaultKind(45, "a write to an object is answered and not kept",
-                                lambda v: NotKept(*_object(v)), "6080h", "OBJECT"),
+                                lambda v: NotKept(*object_place(v)), "6080h", "OBJECT"),
     "reads-back-otherwise": FaultKind(45, "an object reads back as something else",
-                                      lambda v: Otherwise(*_object(v)), "6072h", "OBJECT"),
+                                      lambda v: Otherwise(*object_place(v)), "6072h", "OBJECT"),
     "watchdog-not-armed": FaultKind(50, "the write to 1016h:1 is answered and not kept",
                                     plain(lambda: NotKept(0x1016, 1))),
 })

@@ -5,6 +5,7 @@ import threading
 
 from sim_bus.command_arguments import (
     EXIT_OK,
+    Unusable,
     add_fault_argument,
     add_rig_arguments,
     never_came,
@@ -39,6 +40,8 @@ def run(namespace: argparse.Namespace) -> int:
     def simulate(stop: threading.Event) -> None:
         from sim_bus.ethercat.simulator import Simulator, raw_socket
 
+        if namespace.interface is None:
+            raise Unusable("no interface: give -i NAME")
         simulator = Simulator(rig_of(namespace), seed=namespace.seed, trace=namespace.trace, alias=namespace.alias,
                               stepped=namespace.stepped, faults=parse_all(namespace.fault))
         with raw_socket(namespace.interface) as line:

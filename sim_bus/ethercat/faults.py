@@ -1,6 +1,5 @@
 """Scripted faults of one simulated EtherCAT drive; each sets something and restores it. All times are plant time."""
 
-import re
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -9,7 +8,19 @@ import numpy as np
 from sim_bus.drive_faults import DriveFault, of_drive
 from sim_bus.ethercat.coe import Meddling
 from sim_bus.ethercat.slave import Cia402Slave
-from sim_bus.fault_script import STOP, Cast, FaultKind, Kinds, Passing, Scripted, number, plain, share
+from sim_bus.fault_script import (
+    STOP,
+    Cast,
+    FaultKind,
+    Kinds,
+    Passing,
+    Scripted,
+    error_code,
+    number,
+    object_place,
+    plain,
+    share,
+)
 
 _SEED = 0xFA17
 _FIRST, _LENGTH, _HEAD = 16, slice(22, 24), 26
@@ -25,7 +36,8 @@ class Misbehaviour(Passing):
 
     line: "Faults"
 
-    def __init__(self, begin: Callable[["Faults"], None], end: Callable[["Faults"], None] | None = None) -> None:
+    def __init__(self, begin: Callable[["Faults"], object],
+                 end: Callable[["Faults"], object] | None = None) -> None:
         self._begin, self._end = begin, end
 
     def begin(self) -> None:
@@ -70,11 +82,9 @@ def _part(name: str) -> Callable[[str], Misbehaviour]:
 def _transfers(how: Meddling) -> Callable[[str], Misbehaviour]:
     """All transfers of an object."""
     def make(text: str) -> Misbehaviour:
-        found = re.fullmatch(r"(?:0x)?([0-9A-Fa-f]{4})h?(?::([0-9]{1,3}))?", text)
-        if found is None or int(found[2] or 0) > 255:
-            raise ValueError("an object, such as 6072h or 1018h:1")
-        key = int(found[1], 16), int(found[2] or 0)
-        return _set(lambda line: line.slave.coe, "meddling", lambda line: {**line.slave.coe.meddling, key: how})
+        key = object_place(text)
+        return Misbehaviour(lambda line: line.slave.coe.meddling.update({key: how}),
+                            lambda line: line.slave.coe.meddling.pop(key, None))
 
     return make
 
@@ -99,12 +109,6 @@ def _failed(line: "Faults", code: int) -> None:
     line.slave.application.fault()
 
 
-def _code(text: str) -> int:
-    if not re.fullmatch(r"(?:0x)?[0-9A-Fa-f]{1,4}h?", text):
-        raise ValueError("a hexadecimal code, such as 7305h")
-    return int(text.removeprefix("0x").removesuffix("h"), 16)
-
-
 def _slave(line: "Faults") -> Cia402Slave:
     return line.slave
 
@@ -117,16 +121,17 @@ KINDS: Kinds[Misbehaviour] = Kinds({
     "node-reset": FaultKind(21, "the drive restarts: INIT, its torque is off, the shaft coasts",
                             plain(lambda: Misbehaviour(lambda line: line.slave.restart()))),
     "emcy": FaultKind(23, "an emergency message, with the drive still enabled",
-                      _do(_code, lambda line, code: line.slave.report(code)), "7305h", "CODE"),
+                      _do(error_code, lambda line, code: line.slave.report(code)), "7305h", "CODE"),
     "drive-fault": FaultKind(23, "emergency message and fault state, after the drive's own fault reaction",
-                             _do(_code, _failed), "3210h", "CODE"),
+                             _do(error_code, _failed), "3210h", "CODE"),
     "sdo-abort": FaultKind(24, "the drive aborts every transfer of an object", _transfers(Meddling.ABORTED), "6072h",
                            "OBJECT"),
     "sdo-timeout": FaultKind(25, "the drive doesn't answer when asked for an object",
                              _transfers(Meddling.UNANSWERED), "6072h", "OBJECT"),
     "wrong-identity": FaultKind(29, "1018h:1, the vendor, is another one",
                                 plain(lambda: _transfers(Meddling.OTHERWISE)("1018h:1"))),
-    "fault-at-start": FaultKind(30, "the drive is in fault when the host comes", _do(_code, _failed), "3210h", "CODE"),
+    "fault-at-start": FaultKind(30, "the drive is in fault when the host comes", _do(error_code, _failed), "3210h",
+                                "CODE"),
     "write-not-kept": FaultKind(45, "a write to an object is answered and not kept", _transfers(Meddling.NOT_KEPT),
                                 "6080h", "OBJECT"),
     "reads-back-otherwise": FaultKind(45, "an object reads back as something else", _transfers(Meddling.OTHERWISE),
@@ -138,7 +143,7 @@ KINDS: Kinds[Misbehaviour] = Kinds({
     "wrong-working-counter": FaultKind(0, "this share of the process data comes back with a working counter of 0",
                                        _part("uncounted"), "1%", "SHARE"),
     "al-error": FaultKind(0, "the slave leaves OPERATIONAL with this AL status code",
-                          _do(_code, lambda line, code: line.slave.al_error(code)), "1Bh", "CODE"),
+                          _do(error_code, lambda line, code: line.slave.al_error(code)), "001Bh", "CODE"),
     "sm-watchdog": FaultKind(0, "the watchdog of the process data expires, though they come",
                              plain(lambda: Misbehaviour(lambda line: line.slave.esc.expire_watchdog()))),
     "sii-garbage": FaultKind(0, "the identity in the EEPROM reads as ones, and its checksum is wrong",
@@ -159,6 +164,7 @@ class Faults:
         self._cast: Cast[Misbehaviour] = Cast(script, KINDS.make)
         for fault in self._cast.all:
             fault.line = self
+        self.scripted = bool(script)
         if script:
             slave.on_time = self._moved
             slave.on_stage = self._on_stage

@@ -70,18 +70,21 @@ class Simulator:
         slave.esc.fine_ns = round(1e9 * (now_s - self._plant_s))
 
     def run(self, line: socket.socket, stop: threading.Event) -> None:
-        """Serves a raw socket until ``stop`` is set. The trace is closed at the end."""
+        """Serves a raw socket until ``stop`` is set, and plays a rehearsal to its end. The trace is closed then."""
         line.settimeout(_POLL_S)
         with self.trace:
             while not stop.is_set():
                 try:
                     frame, sender = line.recvfrom(_FRAME_SIZE)
-                except TimeoutError:
+                    if sender[2] != socket.PACKET_OUTGOING and (answer := self.answer(frame, time.monotonic())):
+                        line.send(answer)
+                except OSError as error:
+                    if not isinstance(error, TimeoutError):
+                        stop.wait(_POLL_S)          # the interface is down: nothing comes
                     self.idle(time.monotonic())
                     self.trace.flush()
-                    continue
-                if sender[2] != socket.PACKET_OUTGOING and (answer := self.answer(frame, time.monotonic())):
-                    line.send(answer)
+            if self._faults.scripted and self.slave.stepped and self.slave.cycled:
+                self.slave.run_out()
 
 
 def raw_socket(interface: str) -> socket.socket:

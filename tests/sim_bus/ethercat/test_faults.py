@@ -2,6 +2,7 @@
 
 import pytest
 
+from sim_bus.command import main
 from sim_bus.ethercat import listed, listing, parse_all
 from sim_bus.fault_script import FaultRefused
 from tests.sim_bus.ethercat.host import (
@@ -33,6 +34,15 @@ def test_the_list_names_every_fault_and_each_can_be_made():
             parse_all([wrong])
 
 
+def test_the_command_lists_faults_and_refuses_what_it_cannot_use(capsys):
+    assert main(["ethercat", "--fault", "list"]) == 0
+    assert "wrong-working-counter" in capsys.readouterr().out
+    for arguments, why in (([], "no interface"), (["-i", "nosuchlink0"], "nosuchlink0"),
+                           (["-i", "lo", "--fault", "nothing"], "no fault is called")):
+        assert main(["ethercat", *arguments]) == 2
+        assert why in capsys.readouterr().err
+
+
 def test_lost_frames_take_their_cycle_and_end():
     host = enabled(running("frame-loss@0.1s=30%/2s"), 9)
     before = host.slave.time_us
@@ -58,7 +68,7 @@ def test_a_wrong_working_counter_leaves_the_data():
     assert set(counters[300:]) == {3} and host.read(0x0130) == OP
 
 
-@pytest.mark.parametrize(("fault", "code"), [("al-error@0.1s=2Ch", 0x2C), ("sm-watchdog@0.1s", 0x1B)])
+@pytest.mark.parametrize(("fault", "code"), [("al-error@0.1s=002Ch", 0x2C), ("sm-watchdog@0.1s", 0x1B)])
 def test_the_slave_leaves_operational_and_says_why(fault, code):
     host = enabled(running(fault), 9)
     cycles(host, 40)
