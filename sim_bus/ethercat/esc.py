@@ -33,8 +33,10 @@ _WATCHDOG_UNIT_S = 40e-9
 _SII_READ, _SII_WRITE, _SII_REFUSED = 0x0100, 0x0200, 0x2000
 _WRITABLE = ((0x0010, 0x0012), (0x0100, 0x0104), (0x0120, 0x0122), (0x0200, 0x0202), (0x0300, 0x0314),
              (0x0400, 0x0402), (0x0410, 0x0412), (0x0420, 0x0422), (0x0442, 0x0444), (0x0500, 0x0510),
-             (_FMMU, _FMMU + 16 * FMMUS), (_MANAGER, _MANAGER + 8 * MANAGERS), (0x0900, 0x0904), (0x0910, 0x0918),
-             (0x0920, 0x0936), (0x0980, 0x09A8), (RAM, MEMORY_SIZE))
+             (_FMMU, _FMMU + 16 * FMMUS), (0x0900, 0x0904), (0x0910, 0x0918), (0x0920, 0x0936), (0x0980, 0x09A8),
+             *((at + first, at + end) for at in range(_MANAGER, _MANAGER + 8 * MANAGERS, 8)
+               for first, end in ((0, 5), (6, 7))),         # a SyncManager's status and PDI control are the slave's
+             (RAM, MEMORY_SIZE))
 _COUNTERS = ((0x0300, 0x0314), (0x0442, 0x0444))
 """Registers that any write clears."""
 
@@ -235,21 +237,15 @@ class Esc:
         manager = next((one for one in self.managers if at >= RAM and one.covers(at, end)), None)
         if manager is not None and (not manager.host_writes or (manager.mailbox and self._full(manager))):
             return False
-        keep = {_MANAGER + 8 * n + own: self.memory[_MANAGER + 8 * n + own] for n in range(MANAGERS) for own in (5, 7)}
-        repeat = self.memory[_MANAGER + 8 + 6] & 2
         for begin, stop in parts:
             self.memory[begin:stop] = data[begin - at:stop - at]
         if at < RAM:
-            for own, before in keep.items():
-                self.memory[own] = before
             for first, last in _COUNTERS:
                 if at < last and first < end:
                     self.memory[first:last] = bytes(last - first)
             for first, last, act in self._after_write:
                 if at < last and first < end:
                     act()
-            if self.memory[_MANAGER + 8 + 6] & 2 != repeat:
-                self._repeat_answer()
         elif manager is not None and end >= manager.end:
             self._written(manager)
         return True
@@ -282,6 +278,11 @@ class Esc:
         self.managers = [SyncManager(n, self.memory[at:at + 8]) for n, at in enumerate(places)]
         for one in self.managers:
             self.memory[one.status_at] &= 0xFF * one.enabled
+        request, acknowledged = (self.memory[_MANAGER + 8 + own] & 2 for own in (6, 7))
+        if request != acknowledged:            # the master asks for the last message again: its frame was lost
+            self.memory[_MANAGER + 8 + 7] ^= 2
+            if self._last_answer:
+                self._put(self._last_answer)
 
     # -- mailbox to the master ---------------------------------------------------------------------------
 
@@ -307,13 +308,6 @@ class Esc:
         if manager.enabled and manager.mailbox and not manager.host_writes:
             self.memory[manager.start:manager.end] = message[:manager.length].ljust(manager.length, b"\0")
             self._mark(manager, 8)
-
-    def _repeat_answer(self) -> None:
-        """The master asks for the last message again: its frame was lost."""
-        if self._last_answer:
-            self._put(self._last_answer)
-        acknowledge = _MANAGER + 8 + 7
-        self.memory[acknowledge] = self.memory[acknowledge] & ~2 | self.memory[_MANAGER + 8 + 6] & 2
 
     # -- SII, watchdog, clock ----------------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ import time
 import uuid
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import timedelta
 from importlib import import_module
 from importlib.util import find_spec
@@ -80,29 +81,45 @@ def test_soem(interface):
     master = pysoem.Master()
     master.sdo_read_timeout = master.sdo_write_timeout = 5_000_000
     master.open(interface)
+
+    def sdo(transfer, *of):
+        """SOEM gives up a frame after 2 ms, and then the transfer; on a busy computer it is begun again."""
+        while True:
+            try:
+                return transfer(*of)
+            except pysoem.WkcError:
+                pass
+
+    def found():
+        return master.config_init() == 1 and master.slaves[0].name == "Generic CiA 402 drive"
+
+    def mapped():
+        with suppress(pysoem.ConfigMapError):
+            master.config_map()
+        return (len(slave.output), len(slave.input)) == (10, 14)
+
     try:
-        assert master.config_init() == 1
+        until(found)
         slave = master.slaves[0]
-        assert (slave.name, slave.id, slave.rev) == ("Generic CiA 402 drive", 402, 0x10000)
+        assert (slave.id, slave.rev) == (402, 0x10000)
         assert slave.eeprom_read(4)[:2] == b"\x09\x00"                        # the alias
-        assert slave.sdo_read(0x5FFE, 1) == b"tdhil simulated drive"
+        assert sdo(slave.sdo_read, 0x5FFE, 1) == b"tdhil simulated drive"
         text = bytes(65 + n % 26 for n in range(500))
-        slave.sdo_write(0x5FFE, 5, text)
-        assert slave.sdo_read(0x5FFE, 5, 512) == text
-        slave.sdo_write(0x5FFE, 3, (4000).to_bytes(4, "little"))
+        sdo(slave.sdo_write, 0x5FFE, 5, text)
+        assert sdo(slave.sdo_read, 0x5FFE, 5, 512) == text
+        sdo(slave.sdo_write, 0x5FFE, 3, (4000).to_bytes(4, "little"))
         with pytest.raises(pysoem.SdoError) as refused:
-            slave.sdo_read(0x2222, 0)
+            sdo(slave.sdo_read, 0x2222, 0)
         assert refused.value.abort_code == 0x06020000
         mapping = [0x60400010, 0x60600008, 0x00000008, 0x60710010, 0x60FF0020]
-        slave.sdo_write(0x1C12, 0, b"\0")
-        slave.sdo_write(0x1600, 0, b"\0")
+        sdo(slave.sdo_write, 0x1C12, 0, b"\0")
+        sdo(slave.sdo_write, 0x1600, 0, b"\0")
         for number, entry in enumerate(mapping, 1):
-            slave.sdo_write(0x1600, number, entry.to_bytes(4, "little"))
-        slave.sdo_write(0x1600, 0, bytes((len(mapping),)))
-        slave.sdo_write(0x1C12, 1, (0x1600).to_bytes(2, "little"))
-        slave.sdo_write(0x1C12, 0, b"\1")
-        master.config_map()
-        assert (len(slave.output), len(slave.input)) == (10, 14)
+            sdo(slave.sdo_write, 0x1600, number, entry.to_bytes(4, "little"))
+        sdo(slave.sdo_write, 0x1600, 0, bytes((len(mapping),)))
+        sdo(slave.sdo_write, 0x1C12, 1, (0x1600).to_bytes(2, "little"))
+        sdo(slave.sdo_write, 0x1C12, 0, b"\1")
+        until(mapped)
         assert master.config_dc()
         slave.set_watchdog("processdata", 200.0)
         assert master.state_check(pysoem.SAFEOP_STATE, 5_000_000) == pysoem.SAFEOP_STATE
@@ -120,8 +137,8 @@ def test_soem(interface):
             assert cycle(word, 9) == master.expected_wkc == 3
         for step in range(300):
             assert cycle(0x0F, 9, step) == 3
-        status, mode, torque, speed, _position = inputs(slave.input)
-        assert (status & 0x6F, mode) == (0x27, 9)
+        word, mode, torque, speed, _position = inputs(slave.input)
+        assert (word & 0x6F, mode) == (0x27, 9)
         assert 50 < speed < 300 and torque > 0
         master.state = pysoem.INIT_STATE
         master.write_state()
@@ -135,37 +152,54 @@ def test_kickcat(interface):
     if find_spec("kickcat") is None:
         skip("kickcat is not installed")
     kickcat = import_module("kickcat")
-    link = kickcat.create_link(interface, "")
-    link.set_timeout(timedelta(milliseconds=20))      # it waits for that long on each frame of its start
-    bus = kickcat.Bus(link)
-    bus.init(timedelta(seconds=1))
+    status = kickcat.mailbox.request.MessageStatus
+
+    def patient(act, *of):
+        """KickCAT gives up a frame after its time-out; on a busy computer it is asked again."""
+        end_s = time.monotonic() + STARTING_S
+        while True:
+            try:
+                return act(*of)
+            except RuntimeError:
+                if time.monotonic() > end_s:
+                    raise
+
+    def start():
+        link = kickcat.create_link(interface, "")
+        link.set_timeout(timedelta(milliseconds=20))      # it waits for that long on each frame of its start
+        bus = kickcat.Bus(link)
+        bus.init(timedelta(seconds=1))
+        return bus
+
+    bus = patient(start)
     (slave,) = bus.slaves()
 
     def read(index, sub, size=4):
-        return bus.read_sdo(slave, index, sub, kickcat.Access.PARTIAL, size, SDO_S)
+        return patient(bus.read_sdo, slave, index, sub, kickcat.Access.PARTIAL, size, SDO_S)
 
     def write(index, sub, data):
         message = slave.mailbox.write_sdo(index, sub, False, data, SDO_S)
-        status = kickcat.mailbox.request.MessageStatus
-        until(lambda: bus.process_mailboxes() is not None or message.status() != status.RUNNING)
+        until(lambda: patient(bus.process_mailboxes) is not None or message.status() != status.RUNNING)
         assert message.status() == status.SUCCESS
+
+    def reach(state):
+        bus.request_state(state)
+        bus.wait_for_state(state, SDO_S, bus.process_data_no_check)
 
     assert read(0x1008, 0, 64) == b"Generic CiA 402 drive"
     write(0x5FFE, 3, (4000).to_bytes(4, "little"))
     assert read(0x5FFE, 3) == b"\xa0\x0f\x00\x00"
-    bus.create_mapping()
+    patient(bus.create_mapping)
     assert (slave.output_size, slave.input_size) == (10, 14)
-    bus.request_state(kickcat.State.SAFE_OP)
-    bus.wait_for_state(kickcat.State.SAFE_OP, SDO_S)
+    patient(reach, kickcat.State.SAFE_OP)
     slave.set_output_bytes(outputs(0, 0))
-    bus.request_state(kickcat.State.OPERATIONAL)
-    bus.wait_for_state(kickcat.State.OPERATIONAL, SDO_S, bus.process_data)
+    patient(reach, kickcat.State.OPERATIONAL)
     for word in (0x06, 0x07, 0x0F):
         slave.set_output_bytes(outputs(word, 10))
-        bus.process_data()
+        patient(bus.process_data)
     for _ in range(100):
         slave.set_output_bytes(outputs(0x0F, 10, torque=60))
-        bus.process_data()
-    status, mode, torque, _speed, _position = inputs(slave.input_data)
-    assert (status & 0x6F, mode) == (0x27, 10)
+        patient(bus.process_data)
+    word, mode, torque, _speed, _position = inputs(slave.input_data)
+    assert (word & 0x6F, mode) == (0x27, 10)
     assert torque > 20
