@@ -230,13 +230,16 @@ class Cia402Slave(TimedDrive):
     def _bind(self) -> None:
         store, short, live, hooks = self.store, datatypes.UNSIGNED8, self.store.live, self.store.hooks
         live[key_of(0x1001)], live[key_of(0x603F)] = lambda: self._register, lambda: self.fault_code
-        fixed = [(0x1C00, sub, short, False, sub or 4) for sub in (1, 2, 3, 4, 0)]
-        own: list[tuple[int, int, int, bool, int | str]] = [
-            (MARKER_INDEX, 3, datatypes.UNSIGNED32, True, 0), (MARKER_INDEX, MARKER_STAGE, short, True, 0),
-            (MARKER_INDEX, 5, datatypes.VISIBLE_STRING, True, ""),
+        added: list[tuple[int, int, int, str, int | str]] = [
+            *((0x1C00, sub, short, "SyncManager type", sub or 4) for sub in (1, 2, 3, 4, 0)),
+            (0x60C2, 1, short, "Interpolation time period", 1),
+            (0x60C2, 2, datatypes.INTEGER8, "Interpolation time index", -3), (0x60C2, 0, short, "Entries", 2),
+            (MARKER_INDEX, 3, datatypes.UNSIGNED32, "Stepped period", 0),
+            (MARKER_INDEX, MARKER_STAGE, short, "Stage", 0),
+            (MARKER_INDEX, 5, datatypes.VISIBLE_STRING, "Text", ""),
         ]
-        for index, sub, data_type, writable, value in (*fixed, *own):
-            name = "Marker" if writable else "SyncManager type"
+        for index, sub, data_type, name, value in added:
+            writable = index != 0x1C00 and (index, sub) != (0x60C2, 0)
             store.add(index, sub, data_type, writable=writable, mappable=False, name=name)
             store.set_default(index, sub, value)
         store.set_default(MARKER_INDEX, 0, 5)

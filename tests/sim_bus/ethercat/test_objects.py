@@ -26,6 +26,9 @@ def test_sdo_expedited_normal_and_segmented():
     assert host.upload(0x5FFE, 1) == b"tdhil simulated drive"
     host.download(0x6085, 0, 700, 4)
     assert host.number(0x6085) == 700
+    assert [host.number(0x1C00, sub) for sub in range(5)] == [4, 1, 2, 3, 4]
+    host.download(0x60C2, 1, 4, 1)
+    assert (host.number(0x60C2, 1), host.number(0x60C2, 2)) == (4, -3)
     for size in (0, 1, 4, 110, 111, 117, 230, 237, 512):
         text = bytes(65 + n % 26 for n in range(size))
         if size:
