@@ -6,7 +6,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from sim_bus.drive_faults import DriveFault, of_drive
-from sim_bus.ethercat.coe import Meddling
 from sim_bus.ethercat.slave import Cia402Slave
 from sim_bus.fault_script import (
     STOP,
@@ -21,6 +20,7 @@ from sim_bus.fault_script import (
     plain,
     share,
 )
+from sim_bus.sdo_server import Meddling
 
 _SEED = 0xFA17
 _FIRST, _LENGTH, _HEAD = 16, slice(22, 24), 26
@@ -83,8 +83,8 @@ def _transfers(how: Meddling) -> Callable[[str], Misbehaviour]:
     """All transfers of an object."""
     def make(text: str) -> Misbehaviour:
         key = object_place(text)
-        return Misbehaviour(lambda line: line.slave.coe.meddling.update({key: how}),
-                            lambda line: line.slave.coe.meddling.pop(key, None))
+        return Misbehaviour(lambda line: line.slave.coe.sdo.meddling.update({key: how}),
+                            lambda line: line.slave.coe.sdo.meddling.pop(key, None))
 
     return make
 
