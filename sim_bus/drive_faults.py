@@ -1,15 +1,90 @@
-"""Scripted faults of a drive and of what it turns, on any bus of CiA 402; each sets something and restores it."""
+"""Scripted faults of a drive and of what it turns, on any bus of CiA 402; each sets something and restores it.
+
+And what the faults of a bus are made of: something done where a fault takes place, and the script of one drive.
+"""
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, Generic, TypeVar
 
-from sim_bus.fault_script import FaultKind, plain, share
+from sim_bus.fault_script import STOP, Cast, FaultKind, Passing, Scripted, plain, share
 from sim_bus.reports import Lie, lying
 from sim_bus.timed_drive import TimedDrive
 
 _PROFILE_VELOCITY = 3
 M = TypeVar("M")
 """Type of a fault on the bus in question."""
+
+F = TypeVar("F", bound=Passing)
+P = TypeVar("P")
+"""Type of the place of a fault: a drive and its line."""
+
+V = TypeVar("V")
+"""Type of a fault's value."""
+
+
+class Act(Passing, Generic[P]):
+    """Does something at its place when it begins, and when it ends."""
+
+    place: P
+
+    def __init__(self, begin: Callable[[P], object], end: Callable[[P], object] | None = None) -> None:
+        self._begin, self._end = begin, end
+
+    def begin(self) -> None:
+        """It starts."""
+        self._begin(self.place)
+
+    def end(self) -> None:
+        """It is over."""
+        if self._end is not None:
+            self._end(self.place)
+
+
+def changed(of: Callable[[P], Any], name: str, value: Callable[[P], object]) -> Act[P]:
+    """An attribute has another value while the fault lasts."""
+    before: list[object] = []
+
+    def begin(place: P) -> None:
+        before.append(getattr(of(place), name))
+        setattr(of(place), name, value(place))
+
+    return Act(begin, lambda place: setattr(of(place), name, before.pop()))
+
+
+def once(parse: Callable[[str], V], act: Callable[[P, V], None]) -> Callable[[str], Act[P]]:
+    """Something that happens once, with the value of the fault."""
+    def make(text: str) -> Act[P]:
+        value = parse(text)
+        return Act(lambda place: act(place, value))
+
+    return make
+
+
+class Rehearsal(Generic[F]):
+    """The script of one drive; `happen_to` makes it act."""
+
+    def __init__(self, script: tuple[Scripted, ...], make: Callable[[Scripted], F]) -> None:
+        self.cast: Cast[F] = Cast(script, make)
+
+    def happen_to(self, drive: TimedDrive) -> None:
+        """Let the faults happen to this drive from now on."""
+        self._drive = drive
+        drive.on_time = self.moved
+        drive.on_stage = self._on_stage
+        drive.application.on_stop = lambda: self._on_stage(STOP)
+
+    @property
+    def waiting(self) -> tuple[str, ...]:
+        """Faults whose moment hasn't come, as they were written."""
+        return self.cast.waiting
+
+    def moved(self, now_us: int) -> None:
+        """Plant time has come so far."""
+        self.cast.moved(now_us, self._drive.note)
+
+    def _on_stage(self, number: int) -> None:
+        self.cast.stage(number, self._drive.time_us)
+        self.moved(self._drive.time_us)
 
 
 class DriveFault:

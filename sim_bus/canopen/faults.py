@@ -17,10 +17,8 @@ from profiles import CYCLE_ID, CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
 from sim_bus.canopen import services as emcy
 from sim_bus.canopen.node import SYNC, Cia402Node
 from sim_bus.canopen.sender import Sender
-from sim_bus.drive_faults import DriveFault, of_drive
+from sim_bus.drive_faults import DriveFault, Rehearsal, of_drive
 from sim_bus.fault_script import (
-    STOP,
-    Cast,
     FaultKind,
     Kinds,
     Passing,
@@ -472,11 +470,11 @@ make, parse_all, listed, listing = KINDS.make, KINDS.parse_all, KINDS.listed, KI
 _SEED = 0xFA17
 
 
-class Faults:
+class Faults(Rehearsal[Misbehaviour]):
     """The script of one drive. `attach` makes it act; frames then come in by `came`."""
 
     def __init__(self, script: tuple[Scripted, ...], seed: int = 0) -> None:
-        self._cast: Cast[Misbehaviour] = Cast(script, make)
+        super().__init__(script, make)
         self._rng = np.random.default_rng((seed, _SEED))
         self._ends_cycles = False          # and the host knows
 
@@ -485,21 +483,10 @@ class Faults:
         self._node = node
         self._put: Callable[[int, bytes], None] = sender.put
         scene = Scene(node, sender.put, self._rng)
-        for fault in self._cast.all:
+        for fault in self.cast.all:
             fault.scene = scene
         sender.script = self._outgoing
-        node.on_time = self.moved
-        node.on_stage = self._on_stage
-        node.application.on_stop = lambda: self._on_stage(STOP)
-
-    @property
-    def waiting(self) -> tuple[str, ...]:
-        """Faults whose moment hasn't come, as they were written."""
-        return self._cast.waiting
-
-    def moved(self, now_us: int) -> None:
-        """Plant time has come so far."""
-        self._cast.moved(now_us, self._node.note)
+        self.happen_to(node)
 
     def came(self, can_id: int, data: bytes | bytearray) -> None:
         """A frame from the bus, on its way to the node."""
@@ -508,7 +495,7 @@ class Faults:
             self._ends_cycles = True
             self._put(CYCLE_ID, CYCLES_END)
         frames: list[Frame] = [(can_id, data)]
-        for fault in tuple(self._cast.active):
+        for fault in tuple(self.cast.active):
             frames = [after for before in frames for after in fault.incoming(*before)]
         for frame in frames:
             node.on_frame(*frame)
@@ -523,14 +510,10 @@ class Faults:
     @property
     def _more(self) -> bool:
         """Something goes on, or is still to come."""
-        return bool(self._cast.active or self._cast.waiting)
-
-    def _on_stage(self, number: int) -> None:
-        self._cast.stage(number, self._node.time_us)
-        self.moved(self._node.time_us)
+        return bool(self.cast.active or self.cast.waiting)
 
     def _outgoing(self, can_id: int, data: bytes) -> list[Frame]:
         frames: list[Frame] = [(can_id, data)]
-        for fault in tuple(self._cast.active):
+        for fault in tuple(self.cast.active):
             frames = [after for one, body in frames for after in fault.outgoing(one, bytes(body))]
         return frames

@@ -1,18 +1,14 @@
 """Scripted faults of one simulated EtherCAT drive; each sets something and restores it. All times are plant time."""
 
 from collections.abc import Callable
-from typing import Any, TypeVar
 
 import numpy as np
 
-from sim_bus.drive_faults import DriveFault, of_drive
+from sim_bus.drive_faults import Act, DriveFault, Rehearsal, changed, of_drive, once
 from sim_bus.ethercat.slave import Cia402Slave
 from sim_bus.fault_script import (
-    STOP,
-    Cast,
     FaultKind,
     Kinds,
-    Passing,
     Scripted,
     error_code,
     number,
@@ -27,54 +23,15 @@ _FIRST, _LENGTH, _HEAD = 16, slice(22, 24), 26
 """Places of the first datagram in a frame: its command, its length, its data."""
 
 _LRD, _LWR, _LRW = 10, 11, 12
-V = TypeVar("V")
-"""Type of a fault's value."""
 
-
-class Misbehaviour(Passing):
-    """Does something to the line or the slave when it begins, and when it ends."""
-
-    line: "Faults"
-
-    def __init__(self, begin: Callable[["Faults"], object],
-                 end: Callable[["Faults"], object] | None = None) -> None:
-        self._begin, self._end = begin, end
-
-    def begin(self) -> None:
-        """It starts."""
-        self._begin(self.line)
-
-    def end(self) -> None:
-        """It is over."""
-        if self._end is not None:
-            self._end(self.line)
-
-
-def _set(of: Callable[["Faults"], Any], name: str, value: Callable[["Faults"], object]) -> Misbehaviour:
-    """An attribute has another value while the fault lasts."""
-    before: list[object] = []
-
-    def begin(line: "Faults") -> None:
-        before.append(getattr(of(line), name))
-        setattr(of(line), name, value(line))
-
-    return Misbehaviour(begin, lambda line: setattr(of(line), name, before.pop()))
-
-
-def _do(parse: Callable[[str], V], act: Callable[["Faults", V], None]) -> Callable[[str], Misbehaviour]:
-    """Something that happens once, with the value of the fault."""
-    def make(text: str) -> Misbehaviour:
-        value = parse(text)
-        return Misbehaviour(lambda line: act(line, value))
-
-    return make
+Misbehaviour = Act["Faults"]
 
 
 def _part(name: str) -> Callable[[str], Misbehaviour]:
     """A share of the frames, by the name of the attribute."""
     def make(text: str) -> Misbehaviour:
         part = share(text)
-        return _set(lambda line: line, name, lambda _: part)
+        return changed(lambda line: line, name, lambda _: part)
 
     return make
 
@@ -117,64 +74,57 @@ KINDS: Kinds[Misbehaviour] = Kinds({
     "bus-dead": FaultKind(12, "nothing gets through any more: cable cut", plain(lambda: _part("loss")("1"))),
     "frame-loss": FaultKind(17, "this share of all frames is lost, either way", _part("loss"), "1%", "SHARE"),
     "frozen-feedback": FaultKind(19, "the inputs keep their last values",
-                                 plain(lambda: _set(_slave, "frozen", lambda line: line.slave.inputs()))),
+                                 plain(lambda: changed(_slave, "frozen", lambda line: line.slave.inputs()))),
     "node-reset": FaultKind(21, "the drive restarts: INIT, its torque is off, the shaft coasts",
                             plain(lambda: Misbehaviour(lambda line: line.slave.restart()))),
     "emcy": FaultKind(23, "an emergency message, with the drive still enabled",
-                      _do(error_code, lambda line, code: line.slave.report(code)), "7305h", "CODE"),
+                      once(error_code, lambda line, code: line.slave.report(code)), "7305h", "CODE"),
     "drive-fault": FaultKind(23, "emergency message and fault state, after the drive's own fault reaction",
-                             _do(error_code, _failed), "3210h", "CODE"),
+                             once(error_code, _failed), "3210h", "CODE"),
     "sdo-abort": FaultKind(24, "the drive aborts every transfer of an object", _transfers(Meddling.ABORTED), "6072h",
                            "OBJECT"),
     "sdo-timeout": FaultKind(25, "the drive doesn't answer when asked for an object",
                              _transfers(Meddling.UNANSWERED), "6072h", "OBJECT"),
     "wrong-identity": FaultKind(29, "1018h:1, the vendor, is another one",
                                 plain(lambda: _transfers(Meddling.OTHERWISE)("1018h:1"))),
-    "fault-at-start": FaultKind(30, "the drive is in fault when the host comes", _do(error_code, _failed), "3210h",
+    "fault-at-start": FaultKind(30, "the drive is in fault when the host comes", once(error_code, _failed), "3210h",
                                 "CODE"),
     "write-not-kept": FaultKind(45, "a write to an object is answered and not kept", _transfers(Meddling.NOT_KEPT),
                                 "6080h", "OBJECT"),
     "reads-back-otherwise": FaultKind(45, "an object reads back as something else", _transfers(Meddling.OTHERWISE),
                                       "6072h", "OBJECT"),
     "watchdog-not-armed": FaultKind(50, "writes to registers 0400h to 0421h are answered and not kept", plain(
-        lambda: _set(lambda line: line.slave.esc, "locked", lambda _: range(0x0400, 0x0422)))),
+        lambda: changed(lambda line: line.slave.esc, "locked", lambda _: range(0x0400, 0x0422)))),
     "mailbox-timeout": FaultKind(0, "no message in the mailbox is answered",
-                                 plain(lambda: _set(lambda line: line.slave.coe, "silent", lambda _: True))),
+                                 plain(lambda: changed(lambda line: line.slave.coe, "silent", lambda _: True))),
     "wrong-working-counter": FaultKind(0, "this share of the process data comes back with a working counter of 0",
                                        _part("uncounted"), "1%", "SHARE"),
     "al-error": FaultKind(0, "the slave leaves OPERATIONAL with this AL status code",
-                          _do(error_code, lambda line, code: line.slave.al_error(code)), "001Bh", "CODE"),
+                          once(error_code, lambda line, code: line.slave.al_error(code)), "001Bh", "CODE"),
     "sm-watchdog": FaultKind(0, "the watchdog of the process data expires, though they come",
                              plain(lambda: Misbehaviour(lambda line: line.slave.esc.expire_watchdog()))),
     "sii-garbage": FaultKind(0, "the identity in the EEPROM reads as ones, and its checksum is wrong",
-                             plain(lambda: _set(lambda line: line.slave.esc, "eeprom", _garbage))),
-    "clock-jump": FaultKind(0, "the distributed clock jumps by so many seconds", _do(number, _jump), "1", "SECONDS"),
+                             plain(lambda: changed(lambda line: line.slave.esc, "eeprom", _garbage))),
+    "clock-jump": FaultKind(0, "the distributed clock jumps by so many seconds", once(number, _jump), "1", "SECONDS"),
     **of_drive(_of_drive),
 })
 parse_all, listed, listing = KINDS.parse_all, KINDS.listed, KINDS.listing
 
 
-class Faults:
+class Faults(Rehearsal[Misbehaviour]):
     """The script of one drive, between host and slave."""
 
     def __init__(self, script: tuple[Scripted, ...], slave: Cia402Slave, seed: int) -> None:
+        super().__init__(script, KINDS.make)
         self.slave: Cia402Slave = slave
+        self.scripted = bool(script)
         self.loss = self.uncounted = 0.0
         self._rng = np.random.default_rng((seed, _SEED))
-        self._cast: Cast[Misbehaviour] = Cast(script, KINDS.make)
-        for fault in self._cast.all:
-            fault.line = self
-        self.scripted = bool(script)
+        for fault in self.cast.all:
+            fault.place = self
         if script:
-            slave.on_time = self._moved
-            slave.on_stage = self._on_stage
-            slave.application.on_stop = lambda: self._on_stage(STOP)
-            self._moved(0)
-
-    @property
-    def waiting(self) -> tuple[str, ...]:
-        """Faults whose moment hasn't come, as they were written."""
-        return self._cast.waiting
+            self.happen_to(slave)
+            self.moved(0)
 
     def answer(self, frame: bytes) -> bytes:
         """The frame as it comes back; empty where it is lost. A lost cycle takes its time all the same."""
@@ -193,10 +143,3 @@ class Faults:
 
     def _happens(self, part: float) -> bool:
         return part > 0.0 and bool(self._rng.random() < part)
-
-    def _moved(self, now_us: int) -> None:
-        self._cast.moved(now_us, self.slave.note)
-
-    def _on_stage(self, number: int) -> None:
-        self._cast.stage(number, self.slave.time_us)
-        self._moved(self.slave.time_us)
