@@ -6,9 +6,12 @@ It owns no clock and no thread, and knows no bus: the caller says how much time 
 from collections.abc import Callable
 
 import numpy as np
+from canopen.objectdictionary import datatypes
 
+from profiles import MARKER_INDEX, MARKER_STAGE, MARKER_TEXT
 from sim_bus.cia402 import Application
 from sim_bus.inverter import Inverter
+from sim_bus.objects import ObjectStore, key_of
 from sim_bus.params import RigParams
 from sim_bus.trace import ROW_PERIOD_US, ShaftTrace
 
@@ -64,6 +67,16 @@ class TimedDrive:
             self.time_us * 1e-6, self.inverter.state.speed_rad_s, self.inverter.torque_nm,
             self.application.state.value, event or f"state: {self.application.state.value}",
         )
+
+    def bind_marker(self, store: ObjectStore) -> None:
+        """The marker object: who it is, stepped time, and the stage of the host. Call it after other members."""
+        store.add(MARKER_INDEX, MARKER_STAGE, datatypes.UNSIGNED8, writable=True, mappable=False, name="Stage")
+        store.live[key_of(MARKER_INDEX, 2)] = lambda: int(self.stepped)
+        store.hooks[key_of(MARKER_INDEX, 2)] = self.set_stepped
+        store.hooks[key_of(MARKER_INDEX, MARKER_STAGE)] = self.tell_stage
+        store.values[key_of(MARKER_INDEX, MARKER_STAGE)] = 0
+        store.values[key_of(MARKER_INDEX, 0)] = max(store.object_dictionary[MARKER_INDEX].subindices)
+        store.values[key_of(MARKER_INDEX, 1)] = MARKER_TEXT
 
     def tell_stage(self, number: int) -> None:
         """The host says that a stage begins."""

@@ -9,9 +9,6 @@ One thread calls `on_frame` and `advance_us`; nothing here waits or reads a cloc
 from collections.abc import Callable
 from struct import error as StructError
 
-from canopen.objectdictionary import datatypes
-
-from profiles import MARKER_INDEX, MARKER_STAGE, MARKER_TEXT
 from profiles.canopen import CanopenProfile
 from sim_bus.application_objects import ApplicationObjects
 from sim_bus.canopen import services as emcy
@@ -216,17 +213,11 @@ class Cia402Node(TimedDrive):
     # -- configuration -----------------------------------------------------------------------------------
 
     def _bind(self) -> None:
-        hooks, live = self.store.hooks, self.store.live
+        hooks = self.store.hooks
         hooks[key_of(0x1006)] = self._set_period
         hooks[key_of(0x1016, 1)] = self._set_consumer
         hooks[key_of(0x1017)] = self._producer.configure
-        hooks[key_of(MARKER_INDEX, 2)] = self.set_stepped
-        live[key_of(MARKER_INDEX, 2)] = lambda: int(self.stepped)
-        self.store.add(MARKER_INDEX, MARKER_STAGE, datatypes.UNSIGNED8, writable=True, mappable=False, name="Stage")
-        self.store.values[key_of(MARKER_INDEX, MARKER_STAGE)] = 0
-        hooks[key_of(MARKER_INDEX, MARKER_STAGE)] = self.tell_stage
-        self.store.values[key_of(MARKER_INDEX, 0)] = max(self.store.object_dictionary[MARKER_INDEX].subindices)
-        self.store.values[key_of(MARKER_INDEX, 1)] = MARKER_TEXT
+        self.bind_marker(self.store)
 
     def _set_period(self, period_us: int) -> None:
         self._period_us = period_us

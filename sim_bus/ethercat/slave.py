@@ -11,7 +11,7 @@ from enum import IntEnum
 from canopen.objectdictionary import datatypes
 from canopen.sdo import SdoAbortedError
 
-from profiles import MARKER_INDEX, MARKER_STAGE, MARKER_TEXT
+from profiles import MARKER_INDEX
 from sim_bus.application_objects import ApplicationObjects
 from sim_bus.ethercat.coe import CoeServer
 from sim_bus.ethercat.esc import AL_STATUS, AL_STATUS_CODE, Esc
@@ -86,7 +86,6 @@ class Cia402Slave(TimedDrive):
         self.received = ProcessData(self.store, outputs=True, writable=self._configurable)
         self.sent = ProcessData(self.store, outputs=False, writable=self._configurable)
         self._bind()
-        self.store.restore()
         areas = (Area(0x1000, MAILBOX, 0x26, 1), Area(0x1000 + MAILBOX, MAILBOX, 0x22, 2),
                  Area(_OUTPUTS_AT, self.received.size, 0x64, 3), Area(_INPUTS_AT, self.sent.size, 0x20, 4))
         identity = [int(self.store.number(key_of(0x1018, sub))) for sub in (1, 2, 3, 4)]
@@ -235,16 +234,12 @@ class Cia402Slave(TimedDrive):
             (0x60C2, 1, short, "Interpolation time period", 1),
             (0x60C2, 2, datatypes.INTEGER8, "Interpolation time index", -3), (0x60C2, 0, short, "Entries", 2),
             (MARKER_INDEX, 3, datatypes.UNSIGNED32, "Stepped period", 0),
-            (MARKER_INDEX, MARKER_STAGE, short, "Stage", 0),
             (MARKER_INDEX, 5, datatypes.VISIBLE_STRING, "Text", ""),
         ]
         for index, sub, data_type, name, value in added:
             writable = index != 0x1C00 and (index, sub) != (0x60C2, 0)
             store.add(index, sub, data_type, writable=writable, mappable=False, name=name)
             store.set_default(index, sub, value)
-        store.set_default(MARKER_INDEX, 0, 5)
-        store.set_default(MARKER_INDEX, 1, MARKER_TEXT)
-        live[key_of(MARKER_INDEX, 2)] = lambda: int(self.stepped)
-        hooks[key_of(MARKER_INDEX, 2)] = self.set_stepped
         hooks[key_of(MARKER_INDEX, 3)] = lambda value: setattr(self, "period_us", value)
-        hooks[key_of(MARKER_INDEX, MARKER_STAGE)] = lambda number: self.tell_stage(number) if number else None
+        store.restore()
+        self.bind_marker(store)
