@@ -130,6 +130,12 @@ def _rated_torque_nm(plan: PeerPlan, profile: EthercatProfile, data: DriveData) 
 def _interface(plan: PeerPlan, connection: Connection, trace: Path | None = None) -> Iterator[str]:
     """Yield the network interface, with the simulated drive behind it if requested."""
     if plan.embedded:
+        if connection.profile.name != PLAIN:
+            raise UsageError(
+                f"the simulated EtherCAT drive has the units of {PLAIN} only, not those of {connection.profile.name}",
+                where=OPTION["profile"].flag, next_step="Leave the profile out, or name the drive's network interface",
+                entry=MessageCode.BUS_OPTIONS_WRONG,
+            )
         with _simulated(plan, trace) as interface:
             yield interface
         return
@@ -398,7 +404,6 @@ ETHERCAT = Bus(
     address_flag="--position",
     to_fill_in="ethercat: (interface, and position or alias)",
     flags=MappingProxyType({"position": "--position", "alias": "--alias"}),
-    common_flags=frozenset({"--position"}),
     also=frozenset({"interface"}),
     place=("interface",),
     default_profile=PLAIN,
