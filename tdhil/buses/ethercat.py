@@ -7,6 +7,7 @@ drives before it changes an AL state.
 from __future__ import annotations
 
 import argparse
+import itertools
 import shutil
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
@@ -151,6 +152,7 @@ def _interface(plan: PeerPlan, connection: Connection, trace: Path | None = None
 # pair at its end, also if this program dies.
 
 
+_PAIRS = itertools.count()
 SIMULATOR_STARTS_S = 30.0
 """Longest time for the start of the simulator's process, s."""
 
@@ -163,26 +165,30 @@ def _simulated(plan: PeerPlan, trace: Path | None) -> Iterator[str]:
 
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    ends = (f"ec{os.getpid()}h", f"ec{os.getpid()}d")
-    _ip("link", "add", ends[0], "type", "veth", "peer", "name", ends[1])
-    for end in ends:
-        _ip("link", "set", end, "up")
+    number = next(_PAIRS)
+    ends = (f"ec{os.getpid()}h{number}", f"ec{os.getpid()}d{number}")
     faults = [fault.text for fault in plan.faults]
     asked = (plan.plant, plan.seed or 0, trace, plan.stepped, faults, ends, theirs)
     process = context.Process(target=_serve, args=asked, daemon=True)
-    process.start()
-    theirs.close()
+    _ip("link", "add", ends[0], "type", "veth", "peer", "name", ends[1])
     try:
-        ready = ours.recv() if ours.poll(SIMULATOR_STARTS_S) else "it does not start"
-        if ready:
-            raise SimulatorUnusable(f"the simulated drive can't be started: {ready}", where=ends[1])
+        for end in ends:
+            _ip("link", "set", end, "up")
+        process.start()
+        theirs.close()
+        wrong = ours.recv() if ours.poll(SIMULATOR_STARTS_S) else "it does not start"
+        if wrong:
+            raise SimulatorUnusable(f"the simulated drive can't be started: {wrong}", where=ends[1])
         yield ends[0]
     finally:
         with suppress(OSError, EOFError):
             ours.send("end")
-            if ours.poll(SIMULATOR_STARTS_S):
-                plan.never_came.extend(ours.recv())
-        process.join(SIMULATOR_STARTS_S)
+            if process.pid is not None and ours.poll(SIMULATOR_STARTS_S) and isinstance(left := ours.recv(), list):
+                plan.never_came.extend(left)
+        if process.pid is not None:
+            process.join(SIMULATOR_STARTS_S)
+        with suppress(TdhilError):                     # the process has removed it, if it was started
+            _ip("link", "del", ends[0])
 
 
 def _ip(*words: str) -> None:
