@@ -36,8 +36,8 @@ MAILBOX_S = 0.05
 """Time between two looks at the mailbox for emergency messages, s."""
 STEPPED_ANSWER_US = 200_000
 """Wall time for a frame in stepped time, µs. A frame that takes longer is lost."""
-ANSWER_SHARE = 0.5
-"""Longest wait for the frame of a cycle, as a share of its period."""
+ANSWER_SHARE, CYCLE_SHARE = 0.5, 0.2
+"""Longest wait for the frame of a cycle, and for the answer of a register, as shares of the period."""
 SYNC0_SHARE = 0.5
 """Distance of SYNC0 behind the frame, as a share of the period: as far from the frames as possible on both sides."""
 CLOCK_GAIN, CLOCK_STEP = 0.05, 0.01
@@ -81,7 +81,7 @@ class EthercatBus(cia402.Cia402Bus):
         self._station.reach(PRE_OP)
 
     def confirm(self, identity: Identity) -> None:
-        """Refuse a slave whose SII and objects cia402.name different drives. Raises PreflightRefused."""
+        """Refuse a slave whose SII and objects name different drives. Raises PreflightRefused."""
         slave = self._segment.slave
         if (slave.man, slave.id) != (identity.vendor, identity.product):
             raise PreflightRefused(
@@ -174,7 +174,8 @@ class EthercatBus(cia402.Cia402Bus):
         except DriveFault as error:                    # nothing moves yet: an error becomes a refusal
             raise PreflightRefused(error.what, where=error.where, next_step=error.next_step,
                                    entry=MessageCode.NO_FEEDBACK) from error
-        self._station.wait_us = REGISTER_US if self.clock.stepped else CYCLE_US
+        in_cycle_us = min(CYCLE_US, round(CYCLE_SHARE * self.period_s * 1e6))
+        self._station.wait_us = REGISTER_US if self.clock.stepped else in_cycle_us
         self._slave_watch.start(cia402.DRIVE_SILENT_S)
 
     def set_period(self, period_s: float) -> Sequence[tuple[int, int, bytes]]:
@@ -210,8 +211,8 @@ class EthercatBus(cia402.Cia402Bus):
 
     def send(self, setpoints: cia402.CycleSetpoints) -> None:
         """Send the process data. Outside of OP the drive takes none: then the controlword goes by SDO too, to stop."""
-        self._setpoints.pack(setpoints)
         self.ticks.check()
+        self._setpoints.pack(setpoints)
         self._transmit()
         if self._al_state != OP and not self._asked and setpoints.word & FIRST_WORDS != ENABLE_OPERATION:
             self.put(0x6040, 0, setpoints.word.to_bytes(2, "little"))
@@ -227,6 +228,8 @@ class EthercatBus(cia402.Cia402Bus):
             if not self._sent:
                 self._transmit()
             data = self._take()
+            if self._clocks and data is not None:
+                self._follow_clock(self._segment.master.dc_time)
         self._look(now_s)
         age_s = 0.0 if self.clock.stepped else self.clock.now_s() - now_s
         if data is None or self._feedback is None or len(data) < self._feedback.size:
@@ -250,8 +253,6 @@ class EthercatBus(cia402.Cia402Bus):
         wait_us = STEPPED_ANSWER_US if self.clock.stepped else round(ANSWER_SHARE * self.period_s * 1e6)
         if master.receive_processdata(wait_us) != master.expected_wkc:
             return None
-        if self._clocks:
-            self._follow_clock(master.dc_time)
         data: bytes = self._segment.slave.input
         self._seen(FEEDBACK, data)
         return data

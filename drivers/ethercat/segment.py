@@ -45,7 +45,7 @@ class Segment:
 
     def __init__(self, master: Any, interface: str, position: int = 0, alias: int | None = None) -> None:
         self.master, self.interface = master, interface
-        self._mapped = False
+        self._mapped = self._closed = False
         if all(master.config_init() <= 0 for _ in range(START_TRIES)):
             raise PreflightRefused("no EtherCAT slave answers", where=interface,
                                    next_step="Check the cable, the port (IN of the drive) and the supply of the drive",
@@ -78,8 +78,10 @@ class Segment:
         self._mapped = True
 
     def close(self) -> None:
-        """Close the interface."""
-        self.master.close()
+        """Close the interface, once: SOEM would close another file of this program the second time."""
+        if not self._closed:
+            self._closed = True
+            self.master.close()
 
 
 def _told(error: Exception) -> str:

@@ -212,6 +212,14 @@ def test_a_drive_is_found_by_its_alias():
     assert segment.position == 1
 
 
+def test_the_interface_is_closed_once(bench):
+    closed = []
+    bench.master.close = lambda: closed.append(True)
+    bench.segment.close()
+    bench.segment.close()
+    assert closed == [True]
+
+
 def test_a_refused_state_is_told_with_its_code(bench, monkeypatch):
     write = bench.slave._fpwr
 
