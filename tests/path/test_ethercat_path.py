@@ -15,7 +15,7 @@ SETPOINTS = 2                      # sync manager of the outputs
 def _segment():
     reason = why_not()
     if reason and os.environ.get("TDHIL_REQUIRE_VETH") == "1":
-        pytest.fail(f"no run over EtherCAT was tried: {reason}, and TDHIL_REQUIRE_VETH=1 forbids to skip", pytrace=False)
+        pytest.fail(f"no run over EtherCAT was tried ({reason}); TDHIL_REQUIRE_VETH=1 forbids to skip", pytrace=False)
     if reason:
         pytest.skip(f"no run over EtherCAT was tried: {reason}")
 
