@@ -69,14 +69,15 @@ def _choices(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPars
 def _command(title: str, parser: argparse.ArgumentParser, about: str, level: int) -> Iterator[str]:
     yield from (f"{'#' * level} {title}", "", about, "")
     python_can = False
+    of_python_can = _OF_PYTHON_CAN if any(one.dest == "bus_kwargs" for one in parser._actions) else frozenset[str]()
     for group in parser._action_groups:
         shown = [
             one
             for one in group._group_actions
             if one.help != argparse.SUPPRESS and not isinstance(one, argparse._HelpAction | argparse._SubParsersAction)
         ]
-        python_can |= any(one.dest in _OF_PYTHON_CAN for one in shown)
-        shown = [one for one in shown if one.dest not in _OF_PYTHON_CAN]
+        python_can |= any(one.dest in of_python_can for one in shown)
+        shown = [one for one in shown if one.dest not in of_python_can]
         if shown:
             heading = {"options": "option", "positional arguments": "argument"}.get(group.title or "", group.title)
             yield from (

@@ -185,3 +185,7 @@ class Ticks:
         tick.
         """
         self._next_s = max(self._next_s, self._clock.now_s())
+
+    def shift(self, by_s: float) -> None:
+        """Move the next tick, for a loop that follows the clock of its bus."""
+        self._next_s += by_s

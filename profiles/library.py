@@ -10,16 +10,19 @@ from pydantic import BeforeValidator, ConfigDict
 
 from profiles.canopen import CanopenProfile
 from profiles.errors import DataFileError, Problem
+from profiles.ethercat import EthercatProfile
 from profiles.messages import MessageCode
 from profiles.modbus import ModbusProfile
 from profiles.model import DataModel, one_of
 from profiles.yaml_loader import parse_model, read_text
 
-Profile = CanopenProfile | ModbusProfile
+Profile = CanopenProfile | EthercatProfile | ModbusProfile
 
 _ROOT = Path(__file__).parent
 _SUFFIXES = (".yaml", ".yml")
-SCHEMAS: dict[str, type[CanopenProfile] | type[ModbusProfile]] = {"canopen": CanopenProfile, "modbus": ModbusProfile}
+SCHEMAS: dict[str, type[CanopenProfile] | type[EthercatProfile] | type[ModbusProfile]] = {
+    "canopen": CanopenProfile, "ethercat": EthercatProfile, "modbus": ModbusProfile,
+}
 """Schema of a profile, by its bus."""
 
 
@@ -132,5 +135,6 @@ def _unknown(name: str, names: tuple[str, ...]) -> str:
         parts = {part: known for known in reversed(names) for part in known.split("/")}
         close = [parts[part] for part in difflib.get_close_matches(name[:80].lower(), parts, n=2, cutoff=0.6)]
     meant = " or ".join(f"'{item}'" for item in close)
-    known = f"did you mean {meant}?" if close else f"these ship: {', '.join(names)}."
+    makes = dict.fromkeys(one.partition("/")[0] for one in names)
+    known = f"did you mean {meant}?" if close else f"profiles ship for {', '.join(makes)}."
     return f"none named '{shown}'; {known} A file of your own is named by its path, ending in .yaml"

@@ -5,16 +5,17 @@ from collections.abc import Sequence
 
 _KINDS = {
     "canopen": "a CiA 402 drive on a CAN bus",
+    "ethercat": "a CiA 402 drive on EtherCAT (CoE)",
     "modbus": "a drive on Modbus TCP or RTU, which wears a profile",
 }
 
 
 def add_kinds(parser: argparse.ArgumentParser) -> None:
     """A sub-command for each kind; the chosen one's ``run`` is left in the namespace."""
-    from sim_bus import canopen, modbus
+    from sim_bus import canopen, ethercat, modbus
 
     kinds = parser.add_subparsers(dest="kind", required=True, metavar="KIND")
-    for name, module in (("canopen", canopen), ("modbus", modbus)):
+    for name, module in (("canopen", canopen), ("ethercat", ethercat), ("modbus", modbus)):
         kind = kinds.add_parser(name, help=_KINDS[name], description=f"Simulates {_KINDS[name]}.")
         module.add_arguments(kind)
         kind.set_defaults(run=module.run)

@@ -25,6 +25,7 @@ _NUMBER = r"\d+(?:\.\d+)?"
 _FAULT = re.compile(
     rf"(?P<name>[a-z][a-z0-9-]*)(?:@(?P<when>[^=/]+))?(?:=(?P<value>[^/]+))?(?:/(?P<duration>{_NUMBER}m?s))?"
 )
+_OBJECT = re.compile(r"(?:0x)?([0-9A-Fa-f]{4})h?(?::([0-9]{1,3}))?")
 _WHEN = re.compile(rf"(?:(?P<stage>[a-z]+)(?:\+(?P<after>{_NUMBER}m?s))?|(?P<time>{_NUMBER}m?s))")
 
 
@@ -214,6 +215,21 @@ def factor(text: str) -> float:
     if not 0.01 <= found <= 100.0:
         raise ValueError("a factor from 0.01 to 100")
     return found
+
+
+def error_code(text: str) -> int:
+    """Return a code such as 7305h. Raises ValueError."""
+    if not re.fullmatch(r"(?:0x)?[0-9A-Fa-f]{4}h?", text):
+        raise ValueError("an error code of four hexadecimal digits, such as 7305h")
+    return int(text.removeprefix("0x").removesuffix("h"), 16)
+
+
+def object_place(text: str) -> tuple[int, int]:
+    """Return index and subindex of an object such as 1016h:1. Raises ValueError."""
+    found = _OBJECT.fullmatch(text)
+    if found is None or int(found[2] or 0) > 255:
+        raise ValueError("an object, such as 6072h or 1016h:1")
+    return int(found[1], 16), int(found[2] or 0)
 
 
 def plain(make: Callable[[], M]) -> Callable[[str], M]:

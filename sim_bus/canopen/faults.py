@@ -17,8 +17,18 @@ from profiles import CYCLE_ID, CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
 from sim_bus.canopen import services as emcy
 from sim_bus.canopen.node import SYNC, Cia402Node
 from sim_bus.canopen.sender import Sender
-from sim_bus.fault_script import STOP, Cast, FaultKind, Kinds, Passing, Scripted, plain, seconds, share
-from sim_bus.reports import Lie, lying
+from sim_bus.drive_faults import DriveFault, Rehearsal, of_drive
+from sim_bus.fault_script import (
+    FaultKind,
+    Kinds,
+    Passing,
+    Scripted,
+    error_code,
+    object_place,
+    plain,
+    seconds,
+    share,
+)
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What a scripted fault may do: change frames on their way in or out, and lay hands on the drive itself.
@@ -60,9 +70,6 @@ class Misbehaviour(Passing):
 # Faults of the drive itself and of what it turns.
 
 
-_PROFILE_VELOCITY = 3
-
-
 class Emcy(Misbehaviour):
     """An emergency message, and nothing else."""
 
@@ -99,80 +106,17 @@ class ForeignNmt(Misbehaviour):
         self.scene.foreign(0x000, bytes((self._command, self.scene.node.id)))
 
 
-class Deaf(Misbehaviour):
-    """The state machine doesn't move on commands any more."""
+class OfDrive(Misbehaviour):
+    """A fault that a drive may have on any bus."""
+
+    def __init__(self, fault: DriveFault) -> None:
+        self._fault = fault
 
     def begin(self) -> None:
-        self.scene.node.application.deaf = True
+        self._fault.begin(self.scene.node)
 
     def end(self) -> None:
-        self.scene.node.application.deaf = False
-
-
-class SafeTorqueOff(Deaf):
-    """STO: torque off at once, and no enabling while it lasts. The shaft coasts."""
-
-    def begin(self) -> None:
-        self.scene.node.application.power_off()
-        super().begin()
-
-
-class ModeKept(Misbehaviour):
-    """6060h is taken and not followed: 6061h goes on showing the old mode."""
-
-    def begin(self) -> None:
-        self.scene.node.application.keeps_mode = True
-
-    def end(self) -> None:
-        self.scene.node.application.keeps_mode = False
-
-
-class ModeLost(ModeKept):
-    """The drive goes over to its profile velocity mode (3) by itself, and stays there whatever 6060h says."""
-
-    def begin(self) -> None:
-        self.scene.node.application.set_mode(_PROFILE_VELOCITY)
-        super().begin()
-
-
-class LimitedTorque(Misbehaviour):
-    """An internal limit leaves this share of the torque limit."""
-
-    def __init__(self, share: float) -> None:
-        self._share = share
-
-    def begin(self) -> None:
-        limits = self.scene.node.inverter.control.limits
-        self._before = limits.torque_forward_nm, limits.torque_reverse_nm
-        limits.torque_forward_nm *= self._share
-        limits.torque_reverse_nm *= self._share
-
-    def end(self) -> None:
-        limits = self.scene.node.inverter.control.limits
-        limits.torque_forward_nm, limits.torque_reverse_nm = self._before
-
-
-class LoadLost(Misbehaviour):
-    """The coupled load comes off: this share of the motor end's inertia and friction is left."""
-
-    def __init__(self, share: float) -> None:
-        self._share = share
-
-    def begin(self) -> None:
-        self.scene.node.inverter.lose_load(self._share)
-
-
-class Lying(Misbehaviour):
-    """Sensor, power stage or reports of the drive are wrong (`sim_bus.reports`)."""
-
-    def __init__(self, lie: Lie) -> None:
-        self._lie = lie
-
-    def begin(self) -> None:
-        self._lie.begin(self.scene.node.inverter.lies)
-
-    def end(self) -> None:
-        self._lie.end(self.scene.node.inverter.lies)
+        self._fault.end(self.scene.node)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -438,26 +382,10 @@ class Otherwise(Answers):
 # The faults that can be scripted on CANopen: name, row of the fault table, what they do, what their value means.
 
 
-_OBJECT = re.compile(r"(?:0x)?([0-9A-Fa-f]{4})h?(?::([0-9]{1,3}))?")
-
-
-def _code(text: str) -> int:
-    if not re.fullmatch(r"(?:0x)?[0-9A-Fa-f]{4}h?", text):
-        raise ValueError("an error code of four hexadecimal digits, such as 7305h")
-    return int(text.removeprefix("0x").removesuffix("h"), 16)
-
-
 def _frames(text: str) -> int:
     if not (text.isdecimal() and 1 <= int(text) <= 100):
         raise ValueError("a number of frames, 1 to 100")
     return int(text)
-
-
-def _object(text: str) -> tuple[int, int]:
-    found = _OBJECT.fullmatch(text)
-    if found is None or int(found[2] or 0) > 255:
-        raise ValueError("an object, such as 6072h or 1016h:1")
-    return int(found[1], 16), int(found[2] or 0)
 
 
 def _again(text: str) -> bool:
@@ -469,7 +397,7 @@ def _again(text: str) -> bool:
 def _written(text: str) -> tuple[int, int, int, int]:
     """6072h=100 or 1016h:1=0: object, value, and its size in bytes, as CiA 301 and 402 have it."""
     where, _, value = text.partition("=")
-    index, sub = _object(where)
+    index, sub = object_place(where)
     if not re.fullmatch(r"[0-9]{1,10}|[0-9A-Fa-f]{1,8}h", value):
         raise ValueError("an object and what is written to it, such as 6072h=100")
     number = int(value[:-1], 16) if value.endswith("h") else int(value)
@@ -498,13 +426,13 @@ KINDS: Kinds[Misbehaviour] = Kinds({
     "foreign-nmt-stop": FaultKind(22, "a third party sends NMT stop", plain(lambda: ForeignNmt(2))),
     "foreign-nmt-preop": FaultKind(22, "a third party sends NMT pre-operational", plain(lambda: ForeignNmt(128))),
     "emcy": FaultKind(23, "an emergency message, with the drive still enabled",
-                      lambda v: Emcy(_code(v)), "7305h", "CODE"),
+                      lambda v: Emcy(error_code(v)), "7305h", "CODE"),
     "drive-fault": FaultKind(23, "emergency message and fault state, after the drive's own fault reaction",
-                             lambda v: FaultReaction(_code(v)), "3210h", "CODE"),
+                             lambda v: FaultReaction(error_code(v)), "3210h", "CODE"),
     "sdo-abort": FaultKind(24, "the drive aborts every transfer of an object",
-                           lambda v: Aborted(*_object(v)), "6072h", "OBJECT"),
+                           lambda v: Aborted(*object_place(v)), "6072h", "OBJECT"),
     "sdo-timeout": FaultKind(25, "the drive doesn't answer when asked for an object",
-                             lambda v: Unanswered(*_object(v)), "6072h", "OBJECT"),
+                             lambda v: Unanswered(*object_place(v)), "6072h", "OBJECT"),
     "second-master": FaultKind(26,
                                "another host: from the start the drive is enabled already; later, foreign setpoints",
                           plain(SecondMaster)),
@@ -525,23 +453,15 @@ KINDS: Kinds[Misbehaviour] = Kinds({
     "wrong-identity": FaultKind(29, "1018h:1, the vendor, is another one",
                                 plain(lambda: Otherwise(0x1018, 1))),
     "fault-at-start": FaultKind(30, "the drive is in fault when the host comes",
-                                lambda v: FaultReaction(_code(v)), "3210h", "CODE"),
-    "stuck-state": FaultKind(31, "the controlword is ignored", plain(Deaf)),
-    "mode-not-followed": FaultKind(32, "6061h doesn't follow 6060h", plain(ModeKept)),
-    "mode-lost": FaultKind(82, "the drive goes over to mode 3 by itself, and stays there", plain(ModeLost)),
-    "sto": FaultKind(33, "safe torque off: the shaft coasts, and nothing enables the drive", plain(SafeTorqueOff)),
-    "internal-limit": FaultKind(33, "an internal limit leaves this share of the torque",
-                                lambda v: LimitedTorque(share(v)), "10%", "SHARE"),
-    "load-lost": FaultKind(34, "the load comes off: this share of inertia and friction is left",
-                           lambda v: LoadLost(max(0.001, share(v))), "10%", "SHARE"),
+                                lambda v: FaultReaction(error_code(v)), "3210h", "CODE"),
     "write-not-kept": FaultKind(45, "a write to an object is answered and not kept",
-                                lambda v: NotKept(*_object(v)), "6080h", "OBJECT"),
+                                lambda v: NotKept(*object_place(v)), "6080h", "OBJECT"),
     "reads-back-otherwise": FaultKind(45, "an object reads back as something else",
-                                      lambda v: Otherwise(*_object(v)), "6072h", "OBJECT"),
+                                      lambda v: Otherwise(*object_place(v)), "6072h", "OBJECT"),
     "watchdog-not-armed": FaultKind(50, "the write to 1016h:1 is answered and not kept",
                                     plain(lambda: NotKept(0x1016, 1))),
 })
-KINDS.update(lying(Lying))
+KINDS.update(of_drive(OfDrive))
 make, parse_all, listed, listing = KINDS.make, KINDS.parse_all, KINDS.listed, KINDS.listing
 
 
@@ -550,11 +470,11 @@ make, parse_all, listed, listing = KINDS.make, KINDS.parse_all, KINDS.listed, KI
 _SEED = 0xFA17
 
 
-class Faults:
+class Faults(Rehearsal[Misbehaviour]):
     """The script of one drive. `attach` makes it act; frames then come in by `came`."""
 
     def __init__(self, script: tuple[Scripted, ...], seed: int = 0) -> None:
-        self._cast: Cast[Misbehaviour] = Cast(script, make)
+        super().__init__(script, make)
         self._rng = np.random.default_rng((seed, _SEED))
         self._ends_cycles = False          # and the host knows
 
@@ -563,21 +483,10 @@ class Faults:
         self._node = node
         self._put: Callable[[int, bytes], None] = sender.put
         scene = Scene(node, sender.put, self._rng)
-        for fault in self._cast.all:
+        for fault in self.cast.all:
             fault.scene = scene
         sender.script = self._outgoing
-        node.on_time = self.moved
-        node.on_stage = self._on_stage
-        node.application.on_stop = lambda: self._on_stage(STOP)
-
-    @property
-    def waiting(self) -> tuple[str, ...]:
-        """Faults whose moment hasn't come, as they were written."""
-        return self._cast.waiting
-
-    def moved(self, now_us: int) -> None:
-        """Plant time has come so far."""
-        self._cast.moved(now_us, self._node.note)
+        self.happen_to(node)
 
     def came(self, can_id: int, data: bytes | bytearray) -> None:
         """A frame from the bus, on its way to the node."""
@@ -586,7 +495,7 @@ class Faults:
             self._ends_cycles = True
             self._put(CYCLE_ID, CYCLES_END)
         frames: list[Frame] = [(can_id, data)]
-        for fault in tuple(self._cast.active):
+        for fault in tuple(self.cast.active):
             frames = [after for before in frames for after in fault.incoming(*before)]
         for frame in frames:
             node.on_frame(*frame)
@@ -601,14 +510,10 @@ class Faults:
     @property
     def _more(self) -> bool:
         """Something goes on, or is still to come."""
-        return bool(self._cast.active or self._cast.waiting)
-
-    def _on_stage(self, number: int) -> None:
-        self._cast.stage(number, self._node.time_us)
-        self.moved(self._node.time_us)
+        return bool(self.cast.active or self.cast.waiting)
 
     def _outgoing(self, can_id: int, data: bytes) -> list[Frame]:
         frames: list[Frame] = [(can_id, data)]
-        for fault in tuple(self._cast.active):
+        for fault in tuple(self.cast.active):
             frames = [after for one, body in frames for after in fault.outgoing(one, bytes(body))]
         return frames

@@ -7,17 +7,11 @@ One thread calls `on_frame` and `advance_us`; nothing here waits or reads a cloc
 """
 
 from collections.abc import Callable
-from importlib.resources import files
 from struct import error as StructError
 
-import numpy as np
-from canopen.objectdictionary import datatypes
-
-from profiles import MARKER_INDEX, MARKER_STAGE, MARKER_TEXT
 from profiles.canopen import CanopenProfile
+from sim_bus.application_objects import ApplicationObjects
 from sim_bus.canopen import services as emcy
-from sim_bus.canopen.application_objects import ApplicationObjects
-from sim_bus.canopen.objects import ObjectStore, key_of
 from sim_bus.canopen.pdo import ReceivePdo, TransmitPdo
 from sim_bus.canopen.profile_emulation import WornProfile
 from sim_bus.canopen.sender import PassiveNetwork, Sender
@@ -30,10 +24,10 @@ from sim_bus.canopen.services import (
     NmtCommand,
     NmtState,
 )
-from sim_bus.cia402 import Application
-from sim_bus.inverter import Inverter
+from sim_bus.objects import ObjectStore, generic_eds, key_of
 from sim_bus.params import RigParams
-from sim_bus.trace import ROW_PERIOD_US, ShaftTrace
+from sim_bus.timed_drive import TimedDrive
+from sim_bus.trace import ShaftTrace
 
 SYNC = 0x080
 COMMUNICATION_AREA = (0x1000, 0x1FFF)
@@ -42,31 +36,15 @@ MANUFACTURER_AREA = (0x2000, 0x5FFD)      # the marker stays as it is
 Route = Callable[[bytes | bytearray], None]
 
 
-def _ignore(_number: int) -> None:
-    pass
-
-
-def generic_eds() -> str:
-    """The path of our own EDS."""
-    return str(files("profiles") / "generic" / "cia402.eds")
-
-
-class Cia402Node:
+class Cia402Node(TimedDrive):
     """A CiA 402 slave over a simulated inverter; of our own EDS, or wearing a ``profile``."""
 
     def __init__(self, sender: Sender, params: RigParams, *, node_id: int, seed: int, trace: ShaftTrace,
                  stepped: bool, profile: CanopenProfile | None = None) -> None:
+        super().__init__(params, seed=seed, trace=trace, stepped=stepped)
         self.id = node_id
-        self.time_us = 0
-        self.stepped = stepped
         self.sync_seen = False
-        self.trace = trace
-        self.on_time: Callable[[int], None] = _ignore       # plant time in µs, before each piece of it
-        self.on_stage: Callable[[int], None] = _ignore      # the host says that a stage begins
         self._send = sender.send
-        self._next_row_us = 0
-        self.inverter = Inverter(params, np.random.default_rng(seed))
-        self.application = Application(self.inverter)
         self.store = ObjectStore(node_id, generic_eds())
         self.network = PassiveNetwork(sender)
         self.network.add_node(self.store)
@@ -189,21 +167,8 @@ class Cia402Node:
 
     def advance_us(self, duration_us: int) -> None:
         """The plant, and all that is timed, moves on."""
-        application, inverter = self.application, self.inverter
-        begin_us = now_us = self.time_us
-        self.on_time(begin_us)
-        application.regulate()
-        count, dt_s = inverter.steps(duration_us * 1e-6)
-        step = application.step
-        for number in range(1, count + 1):
-            step(dt_s)
-            self.time_us = now_us = begin_us + duration_us * number // count
-            if now_us >= self._next_row_us:
-                self._next_row_us = (now_us // ROW_PERIOD_US + 1) * ROW_PERIOD_US
-                if self.trace.active:
-                    self.trace.row(
-                        now_us * 1e-6, inverter.state.speed_rad_s, inverter.torque_nm, application.state.value,
-                    )
+        super().advance_us(duration_us)
+        now_us = self.time_us
         if self._consumer.expired(now_us):
             self._host_lost("host heartbeat lost")
         if self._guard.expired(now_us):
@@ -212,13 +177,6 @@ class Cia402Node:
             self._send(0x700 + self.id, bytes([self.nmt.state.value]))
         if self._event_transmit:
             self._send_events()
-
-    def note(self, event: str) -> None:
-        """An event, or a change of state where ``event`` is empty, for the trace."""
-        self.trace.row(
-            self.time_us * 1e-6, self.inverter.state.speed_rad_s, self.inverter.torque_nm,
-            self.application.state.value, event or f"state: {self.application.state.value}",
-        )
 
     def _send_events(self) -> None:
         if self._operational:
@@ -257,29 +215,14 @@ class Cia402Node:
     # -- configuration -----------------------------------------------------------------------------------
 
     def _bind(self) -> None:
-        hooks, live = self.store.hooks, self.store.live
+        hooks = self.store.hooks
         hooks[key_of(0x1006)] = self._set_period
         hooks[key_of(0x1016, 1)] = self._set_consumer
         hooks[key_of(0x1017)] = self._producer.configure
-        hooks[key_of(MARKER_INDEX, 2)] = self._set_stepped
-        live[key_of(MARKER_INDEX, 2)] = lambda: int(self.stepped)
-        self.store.add(MARKER_INDEX, MARKER_STAGE, datatypes.UNSIGNED8, writable=True, mappable=False, name="Stage")
-        self.store.values[key_of(MARKER_INDEX, MARKER_STAGE)] = 0
-        hooks[key_of(MARKER_INDEX, MARKER_STAGE)] = self._set_stage
-        self.store.values[key_of(MARKER_INDEX, 0)] = max(self.store.object_dictionary[MARKER_INDEX].subindices)
-        self.store.values[key_of(MARKER_INDEX, 1)] = MARKER_TEXT
+        self.bind_marker(self.store)
 
     def _set_period(self, period_us: int) -> None:
         self._period_us = period_us
-
-    def _set_stepped(self, value: int) -> None:
-        if bool(value) is not self.stepped:
-            self.stepped = bool(value)
-            self.note("stepped time" if value else "own time")
-
-    def _set_stage(self, number: int) -> None:
-        self.note(f"stage {number}")
-        self.on_stage(number)
 
     def _set_consumer(self, value: int) -> None:
         self._consumer.configure(value)

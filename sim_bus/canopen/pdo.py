@@ -12,18 +12,13 @@ Remapping as CiA 301 asks: bit 31 set, count 0, entries, count, bit 31 cleared; 
 from collections.abc import Callable
 from struct import Struct
 
-from canopen.objectdictionary import datatypes
 from canopen.sdo import SdoAbortedError
 
-from sim_bus.canopen import objects as od
-from sim_bus.canopen.objects import ObjectStore, key_of
+from sim_bus import objects as od
+from sim_bus.objects import FORMATS, ObjectStore, key_of
 
 INVALID = 1 << 31
 EXTENDED = 1 << 29
-_FORMATS = {
-    datatypes.INTEGER8: "b", datatypes.UNSIGNED8: "B", datatypes.INTEGER16: "h", datatypes.UNSIGNED16: "H",
-    datatypes.INTEGER32: "i", datatypes.UNSIGNED32: "I", datatypes.REAL32: "f",
-}
 _LAST_DUMMY = 0x0007
 Setter = Callable[[int], None]
 Getter = Callable[[], float]
@@ -126,19 +121,18 @@ class Pdo:
         self.entries[number] = value
 
     def _check(self, entry: int) -> None:
-        index, subindex, bits = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
-        variable = self.store.variable(index, subindex)
-        if index <= _LAST_DUMMY:
-            mappable = self.receives
+        if entry >> 16 <= _LAST_DUMMY:
+            variable = self.store.variable(entry >> 16, entry >> 8 & 0xFF)
+            mappable = self.receives and variable.data_type in FORMATS and entry & 0xFF == len(variable)
         else:
-            mappable = variable.pdo_mappable and (variable.writable if self.receives else variable.readable)
-        if not mappable or variable.data_type not in _FORMATS or bits != len(variable):
+            mappable = self.store.mappable(entry, receives=self.receives)
+        if not mappable:
             raise SdoAbortedError(od.ABORT_NOT_MAPPABLE)
 
     def _layout(self) -> tuple[Struct, list[int]]:
         """The frame's layout and the keys in it."""
         keys = [entry >> 8 for entry in self.entries[: self.count]]
-        formats = [_FORMATS[self.store.variable(key >> 8, key & 0xFF).data_type] for key in keys]
+        formats = [FORMATS[self.store.variable(key >> 8, key & 0xFF).data_type] for key in keys]
         return Struct("<" + "".join(formats)), keys
 
 

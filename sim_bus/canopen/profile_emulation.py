@@ -11,10 +11,10 @@ from canopen.objectdictionary import datatypes
 
 from profiles import MARKER_INDEX
 from profiles.canopen import CanopenProfile, Parameter
-from sim_bus.canopen.application_objects import TURN, ObjectUnits, clamped, counts_per_turn, profile_units, wrapped
-from sim_bus.canopen.objects import ObjectStore, key_of
+from sim_bus.application_objects import TURN, ObjectUnits, clamped, counts_per_turn, profile_units, wrapped
 from sim_bus.canopen.services import LifeGuard
 from sim_bus.cia402 import Application, OperationMode
+from sim_bus.objects import ObjectStore, key_of
 from sim_bus.reports import Feedback
 
 # ---------------------------------------------------------------------------------------------------------------------

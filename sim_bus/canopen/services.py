@@ -7,7 +7,7 @@ from struct import Struct
 
 from canopen.sdo import SdoAbortedError
 
-from sim_bus.canopen.objects import ABORT_NO_DATA, ABORT_VALUE, ObjectStore, key_of
+from sim_bus.objects import ABORT_NO_DATA, ABORT_VALUE, ObjectStore, key_of
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Error register 1001h, error history 1003h, error code 603Fh and the EMCY that tells of them (CiA 301).

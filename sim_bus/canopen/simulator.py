@@ -29,9 +29,6 @@ _CHUNK_US = 2_000
 _POLL_OWN_TIME_S = 0.005
 _POLL_STEPPED_S = 0.05
 _RETRY_S = 0.05
-_RUN_OUT_US = 120_000_000
-_REST_US = 1_500_000
-_AT_REST_RAD_S = 0.02
 
 
 class Simulator:
@@ -123,20 +120,11 @@ class Simulator:
     def end(self) -> None:
         """The host is gone for good: a rehearsal is played to its end."""
         if self._faults is not None and self.node.stepped and self.node.sync_seen:
-            self._run_out()
+            self.node.run_out()
 
     def close_trace(self) -> None:
         """Closes the trace; safe to repeat."""
         self._trace.close()
-
-    def _run_out(self) -> None:
-        """After a rehearsal the host is gone: what the drive then does by itself belongs to the trace."""
-        end_us = self.node.time_us + _RUN_OUT_US
-        quiet_us = 0
-        while quiet_us < _REST_US and self.node.time_us < end_us:
-            self.node.advance_us(_CHUNK_US)
-            turning = abs(self.node.inverter.speed_rad_s) > _AT_REST_RAD_S
-            quiet_us = 0 if turning else quiet_us + _CHUNK_US
 
     def _nothing_came(self, timeout_s: float, before_s: float, stop: threading.Event) -> None:
         self._trace.flush()

@@ -205,6 +205,7 @@ class Bus:
     flags: Mapping[str, str]
     """Options of the command line that no other bus has: name in the namespace → flag."""
     common_flags: frozenset[str] = frozenset()      # flags that the short ``--help`` shows
+    also: frozenset[str] = frozenset()  # options of another bus that this bus reads too (names in the namespace)
     place: tuple[str, ...]              # settings of which one must be given to reach a drive
     default_profile: str                # profile if none is named
     add_arguments: Callable[[argparse.ArgumentParser], None]
@@ -264,9 +265,10 @@ class Bus:
     profile_sections: tuple[str, ...] | None = None
     """Entries of a profile that its page shows one by one; None: all but the parameters."""
 
-    def asked_for(self, cli: Mapping[str, Any]) -> str | None:
-        """Return the given flag that belongs only to this bus; None if there is none."""
-        return next((flag for name, flag in self.flags.items() if cli.get(name) is not None), None)
+    def asked_for(self, cli: Mapping[str, Any], besides: frozenset[str] = frozenset()) -> str | None:
+        """Return the given flag that belongs only to this bus, ``besides`` these; None if there is none."""
+        return next((flag for name, flag in self.flags.items() if cli.get(name) is not None and name not in besides),
+                    None)
 
     def section_of(self, rig: Rig) -> Any:
         """Return its section of rig.yaml; an empty one if the file has none. None if the bus has no section."""

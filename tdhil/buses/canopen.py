@@ -17,7 +17,7 @@ import os
 import shutil
 import socket
 import subprocess
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from configparser import ConfigParser
 from configparser import Error as ConfigParserError
 from contextlib import ExitStack, contextmanager
@@ -35,17 +35,16 @@ from drivers import (
     MonotonicClock,
     ObjectRefused,
     PreflightRefused,
-    PreflightTable,
     Problem,
     TdhilError,
-    cia402,
 )
 from drivers import canopen as driver
 from profiles import MARKER_INDEX, MARKER_TEXT, DataModel, Finding, Profile, load_profile, profile_names, visible
 from profiles.canopen import CanopenProfile
 from profiles.quantities import BIT_RATE, TIME, read
 from tdhil.buses.bus import Bus, Connection, FoundDrive, Line, Opening, PeerPlan, ProfileTable, ValueSeen, one_host
-from tdhil.buses.doctor_finding import DoctorFinding, Grade, attempted, bad, note, of_check, of_error, ok
+from tdhil.buses.cia402_findings import drive_type, identity_findings, match, settings_findings, watchdog_object
+from tdhil.buses.doctor_finding import DoctorFinding, Grade, attempted, bad, note, of_error, ok
 from tdhil.buses.profile_text import object_table
 from tdhil.config import DriveData, Origin, Rig, RunOptions, Setting
 from tdhil.errors import MessageCode, UsageError
@@ -445,7 +444,7 @@ _ADAPTER = ("host", "port", "serial", "unique_hardware_id", "app_name")     # th
 
 _OPTIONS: Final = {
     "channel": ("NAME", "channel of the adapter, such as can0"),
-    "interface": ("NAME", "kind of adapter, such as socketcan, pcan or vector"),
+    "interface": ("NAME", "kind of adapter, such as socketcan, pcan or vector; on EtherCAT the network interface"),
     "bitrate": ("BIT_S", "bit rate, such as 500000 or 500k; on socketcan the link has it"),
 }
 """Metavar and help of those options of python-can that most runs need."""
@@ -459,6 +458,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     for action in parser._actions:  # python-can's own type does not accept 500k
         if action.dest in ("bitrate", "data_bitrate"):
             action.type = _bit_rate
+        if action.dest == "interface":  # `_check` knows python-can's; on another bus it is a network interface
+            action.choices = None
         if (named := _OPTIONS.get(action.dest)) is not None:
             action.metavar, action.help = named
 
@@ -601,29 +602,10 @@ def _embedded(
 # Scan. It reads only.
 
 
-_CIA402 = 402
-
-
 def identify_all(link: driver.CanLink, heard: driver.Heard) -> tuple[FoundDrive, ...]:
     """Return name and profile of every node that answered."""
     profiles = [profile for name in profile_names() if isinstance(profile := load_profile(name), CanopenProfile)]
     return tuple(_identify(link, node, heard, profiles) for node in sorted(heard.device_types))
-
-
-def match(device_type: int, identity: tuple[int | None, int | None, int | None],
-          profiles: Iterable[CanopenProfile]) -> tuple[str | None, str]:
-    """Return (profile, reason): the one whose identity (vendor, product, revision of 1018h) fits best."""
-    best, most = None, 0
-    for profile in profiles:
-        wanted = (profile.identity.vendor, profile.identity.product, profile.identity.revision)
-        asked = [(want, have) for want, have in zip(wanted, identity, strict=True) if want is not None]
-        if len(asked) > most and all(want == have for want, have in asked):
-            best, most = profile.name, len(asked)
-    if best is not None:
-        return best, ("vendor", "vendor and product", "vendor, product and revision")[most - 1]
-    if device_type & 0xFFFF == _CIA402:
-        return "generic/cia402", "a CiA 402 drive without a profile of its own: check every unit"
-    return None, f"not a CiA 402 drive (device type {device_type:08X}h)"
 
 
 def _identify(link: driver.CanLink, node: int, heard: driver.Heard, profiles: list[CanopenProfile]) -> FoundDrive:
@@ -759,36 +741,12 @@ def drive_findings(
         yield bad("drive", f"{error.what}, and {link.error_frames} error frames were received",
                   "The bit rate is most likely wrong: compare it with the drive's; check cable and termination")
         return
-    kind = "a CiA 402 drive" if device & 0xFFFF == 402 else f"device type {device:08X}h, which is not a CiA 402 drive"
-    answers = f"node {node} answers: {kind}"
-    yield ok("drive", answers) if device & 0xFFFF == 402 else bad("drive", answers, "See tdhil scan")
-    yield from _identity(objects, profile)
+    yield drive_type(f"node {node}", device)
+    yield from identity_findings(objects, profile)
     yield from _watchdog(objects, profile)
-    yield _modes(objects, profile)
-    table = PreflightTable()
-    cia402.find_units(table, objects, profile, rated_torque_nm)
-    cia402.check_parameters(table, objects, profile)
-    yield from map(of_check, table.checks)
-    yield _state(objects)
+    yield from settings_findings(objects, profile, rated_torque_nm)
     if link.error_frames:
         yield note("error frames", f"{link.error_frames} received", "Check bit rate, termination and cable")
-
-
-def _identity(objects: driver.SdoObjects, profile: CanopenProfile) -> Iterator[DoctorFinding]:
-    found = {part: objects.read_if_there(0x1018, sub) for sub, part in ((1, "vendor"), (2, "product"), (3, "revision"))}
-    text = ", ".join(f"{part} {value:X}h" for part, value in found.items() if value is not None) or "not reported"
-    wrong = [
-        f"{part} {wanted:X}h"
-        for part in found
-        if (wanted := getattr(profile.identity, part)) is not None and wanted != found[part]
-    ]
-    yield bad("identity", f"{text}; profile {profile.name} needs {', '.join(wrong)}", "Choose its own with --profile") \
-        if wrong else ok("identity", text)
-    try:
-        marked = objects.read_bytes(MARKER_INDEX, 1).decode("ascii", "replace").rstrip("\0") == MARKER_TEXT
-    except ObjectRefused:
-        marked = False
-    yield note("peer", "SIMULATED: it has the simulator's marker") if marked else ok("peer", "not a simulator")
 
 
 def _watchdog(objects: driver.SdoObjects, profile: CanopenProfile) -> Iterator[DoctorFinding]:
@@ -801,34 +759,7 @@ def _watchdog(objects: driver.SdoObjects, profile: CanopenProfile) -> Iterator[D
     if dog.reaction_index is not None:
         wanted.append((dog.reaction_index, dog.reaction_sub))
     for at in wanted:
-        try:
-            value = objects.read_bytes(*at)
-            yield ok("watchdog", f"{cia402.name(*at)} exists and reads {int.from_bytes(value, 'little'):X}h")
-        except ObjectRefused:
-            step = "Choose the drive's own profile: without a watchdog nothing is moved, "
-            step += f"unless accepted with {NO_WATCHDOG_FLAG}"
-            yield bad("watchdog", f"the drive has no {cia402.name(*at)}", step)
-
-
-def _modes(objects: driver.SdoObjects, profile: CanopenProfile) -> DoctorFinding:
-    supported = objects.read_if_there(0x6502)
-    if supported is None:
-        return note("modes", "the drive does not report its modes (6502h)")
-    has = [code for code in (*profile.modes.speed, *profile.modes.torque) if code < 1 or supported >> code - 1 & 1]
-    speed = [code for code in has if code in profile.modes.speed]
-    text = f"profile: speed {speed or 'none'}, torque {[code for code in has if code not in speed] or 'none'}"
-    return ok("modes", text) if speed else bad("modes", text, "None controls speed: check the profile")
-
-
-def _state(objects: driver.SdoObjects) -> DoctorFinding:
-    state = cia402.decode(objects.read(0x6041))
-    if state in (cia402.State.FAULT, cia402.State.FAULT_REACTION_ACTIVE):
-        code = objects.read_if_there(0x603F)
-        known = f", error code {code:04X}h" if code is not None else ""
-        return bad("state", f"{state.value}{known}", "Remove its cause, then start a run with --reset-fault")
-    if state is cia402.State.OPERATION_ENABLED:
-        return bad("state", "operation enabled: another master controls it", "Take that master off the bus first")
-    return ok("state", state.value)
+        yield watchdog_object(objects, *at)
 
 
 def _link(text: str | None, channel: str) -> dict[str, Any] | None:

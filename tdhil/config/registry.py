@@ -68,6 +68,7 @@ MODELS: dict[str, RegistryEntry] = {
 BUSES: dict[str, BusEntry] = {
     "canopen": BusEntry("tdhil.buses.canopen:CANOPEN", "CANopen, CiA 402", loggers=("can", "canopen")),
     "modbus": BusEntry("tdhil.buses.modbus:MODBUS", "Modbus TCP or RTU"),
+    "ethercat": BusEntry("tdhil.buses.ethercat:ETHERCAT", "EtherCAT, CiA 402 (CoE)"),
 }
 """Buses of a drive. The schema of the profiles of a bus is in the list of `profiles.library`, below all our lists."""
 

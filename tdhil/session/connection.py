@@ -27,7 +27,7 @@ def connection_of(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) 
     options = choose_drive(cli, rig, options)
     bus = bus_named(options.drive)
     for other in all_buses():
-        flag = None if other.name == bus.name else other.asked_for(cli)
+        flag = None if other.name == bus.name else other.asked_for(cli, bus.also)
         if flag is not None:
             raise UsageError(
                 f"belongs to {other.title}, but the drive is on {bus.title}", where=flag,

@@ -76,14 +76,22 @@ def _memory():
     return MemoryBench
 
 
+def _ethercat():
+    from tests.drivers.ethercat_bench import EthercatBench
+
+    return EthercatBench
+
+
 MAKERS = {
-    "abb-fcan": _abb, "canopen": _canopen, "epos4": _epos4, "memory": _memory, "modbus": _modbus, "s120-canopen": _s120,
+    "abb-fcan": _abb, "canopen": _canopen, "epos4": _epos4, "ethercat": _ethercat, "memory": _memory,
+    "modbus": _modbus, "s120-canopen": _s120,
 }
 
 
 @pytest.fixture(params=[
-    # One of each bus at once; the vendors' profiles, which CI tries as well, differ from them by what they declare.
-    pytest.param(name, marks=() if name in ("canopen", "memory", "modbus") else pytest.mark.heavy)
+    # One of each bus at once; the vendors' profiles, which CI tries as well, differ from them by what they declare. So
+    # does the drive in memory: EtherCAT's has the same inside.
+    pytest.param(name, marks=() if name in ("canopen", "ethercat", "modbus") else pytest.mark.heavy)
     for name in sorted(MAKERS)
 ])
 def make_bench(request):

@@ -11,14 +11,13 @@ from math import pi
 import numpy as np
 import pytest
 
-from sim_bus.canopen.application_objects import ApplicationObjects
+from sim_bus.application_objects import ApplicationObjects
 from sim_bus.canopen.faults import KINDS as CANOPEN
-from sim_bus.canopen.node import generic_eds
-from sim_bus.canopen.objects import ObjectStore, key_of
 from sim_bus.cia402 import Application
 from sim_bus.inverter import Inverter
 from sim_bus.modbus.faults import KINDS as MODBUS
 from sim_bus.modbus.faults import parse_all as parse_modbus
+from sim_bus.objects import ObjectStore, generic_eds, key_of
 from sim_bus.params import FAITHFUL, NoiseParams, RigParams
 from sim_bus.reports import LIES
 from tests.sim_bus.modbus_host import GenericHost, drive

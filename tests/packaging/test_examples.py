@@ -19,6 +19,7 @@ from tdhil.config.rig import load_rig, require_limits, rig_model
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "rig.yaml"
 MODBUS = ROOT / "examples" / "rig_modbus.yaml"
+ETHERCAT = ROOT / "examples" / "rig_ethercat.yaml"
 PLANT = ROOT / "examples" / "plant.yaml"
 
 
@@ -53,6 +54,12 @@ def test_modbus_example_is_a_bench_that_may_move():
     assert (rig.drive, rig.modbus.host, rig.modbus.serial) == ("modbus", "192.0.2.10", None)
 
 
+def test_ethercat_example_is_a_bench_that_may_move():
+    rig = load_rig(ETHERCAT)
+    require_limits(rig)
+    assert (rig.drive, rig.ethercat.interface, rig.ethercat.position) == ("ethercat", "eth1", 0)
+
+
 def test_modbus_example_is_valid_on_a_serial_line_too(tmp_path):
     text = MODBUS.read_text(encoding="utf-8")
     text = re.sub(r"^# (serial|baud|parity|stop_bits|parameters):", r"  \1:", text, flags=re.MULTILINE)
@@ -66,7 +73,7 @@ def test_modbus_example_is_valid_on_a_serial_line_too(tmp_path):
 
 
 def test_the_examples_show_every_key_but_those_for_trying_things_out():
-    text = EXAMPLE.read_text(encoding="utf-8") + MODBUS.read_text(encoding="utf-8")
+    text = "".join(path.read_text(encoding="utf-8") for path in (EXAMPLE, ETHERCAT, MODBUS))
     missing = {key for key in keys(rig_model()) if not re.search(rf"^[# ]*{key.split('.')[-1]}:", text, re.MULTILINE)}
     assert missing == {"bus.options", "run.mode", "run.frequency_hz", "run.amplitude_rad_s", "run.offset_rad_s",
                        "run.periods", "run.seed", "run.simulate", "run.real_time", "run.stepped",

@@ -22,8 +22,8 @@ PACKAGES = {
 }
 LAZY = sorted(package for package, path in PACKAGES.items() if "lazy_names(__name__" in path.read_text("utf-8"))
 # Modules whose names are clear only together with the module, and the main modules of the processes.
-OPEN = {"profiles.quantities", "profiles.canopen", "profiles.cia402", "profiles.modbus", "drivers.undo_journal",
-        "drivers.own_limits", "tdhil.session.real_time", "tdhil.cli.main"}
+OPEN = {"profiles.quantities", "profiles.canopen", "profiles.cia402", "profiles.ethercat", "profiles.modbus",
+        "drivers.undo_journal", "drivers.own_limits", "tdhil.session.real_time", "tdhil.cli.main"}
 
 
 IMPORT = re.compile(rf"^ *from ((?:{'|'.join(ROOMS)})(?:\.\w+)*) import (\([^)]*\)|.*)", re.MULTILINE)

@@ -90,7 +90,7 @@ def test_it_runs_from_the_wheel_alone(wheel, tmp_path):
     code = (
         f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import tdhil; "
         f"assert tdhil.__file__.startswith({str(tmp_path)!r}), tdhil.__file__; "
-        "from profiles.library import load_profile; from sim_bus.canopen.node import generic_eds; "
+        "from profiles.library import load_profile; from sim_bus.objects import generic_eds; "
         "from tdhil.cli.docs import docs_folder; "
         "print(load_profile('generic/cia402').name, generic_eds(), docs_folder())"
     )

@@ -9,7 +9,7 @@ import pytest
 
 from profiles.library import load_profile, profile_names
 from profiles.modbus import ModbusProfile
-from sim_bus.canopen.application_objects import ApplicationObjects
+from sim_bus.application_objects import ApplicationObjects
 from sim_bus.inverter import Controller
 from sim_bus.modbus.registers import Map
 from tests.path.path_runs import Shaft, identify

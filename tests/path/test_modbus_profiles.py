@@ -10,7 +10,9 @@ from tests.path.path_runs import Shaft, identify
 
 TRUE_KG_M2 = 104.0
 # generic/cia402 is what tests/path/test_five_stages.py runs; EPOS4 takes four times as long as any other.
-NAMES = [name for name in profile_names() if name not in ("generic/cia402", "maxon/epos4")]
+# The simulated EtherCAT drive wears its own profile alone (tests/path/test_ethercat_path.py), and says so.
+NAMES = [name for name in profile_names()
+         if name not in ("generic/cia402", "maxon/epos4") and load_profile(name).bus != "ethercat"]
 
 
 def weighed(name):

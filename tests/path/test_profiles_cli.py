@@ -80,7 +80,7 @@ def test_a_vendor_shows_what_the_vendor_has(asked, wanted, monkeypatch):
 
 
 @pytest.mark.parametrize(("asked", "name"), [
-    ("maxon", "maxon/epos4"), ("epos", "maxon/epos4"), ("MS300", "delta/ms300"),
+    ("nanotec", "nanotec/c5-e"), ("c5", "nanotec/c5-e"), ("MS300", "delta/ms300"),
 ])
 def test_what_only_one_begins_with_is_that_one(asked, name):
     done = tdhil("profiles", "show", asked)

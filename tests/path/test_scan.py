@@ -285,7 +285,8 @@ def test_a_starter_loads_for_every_profile_as_it_is_and_filled_in(tmp_path, name
     profile = load_profile(name)
     found = FoundDrive(profile.bus, 7, "drive", "vendor 1h", False, name, "why")
     path = tmp_path / "rig.yaml"
-    line = {"interface": "socketcan", "channel": "can0"} if profile.bus == "canopen" else {"host": "192.0.2.10"}
+    line = {"canopen": {"interface": "socketcan", "channel": "can0"}, "ethercat": {"interface": "eth1", "position": 7},
+            "modbus": {"host": "192.0.2.10"}}[profile.bus]
     path.write_text(starter(found, line, profile), encoding="utf-8")
     assert load_rig(path).limits is None
     rig = filled(path)

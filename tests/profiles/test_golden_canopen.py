@@ -167,14 +167,14 @@ def test_the_simulated_drive_reports_so(bench, golden):
 
 def test_a_drive_behind_a_gateway_has_no_watchdog_and_is_refused(monkeypatch):
     """Its own watches EtherCAT: nothing on the CAN side may pass for one; only by name it is taken."""
-    monkeypatch.setitem(GOLDEN["beckhoff-ax8000"]["limits"], "accept_no_watchdog", False)
-    bench = Bench(GOLDEN["beckhoff-ax8000"])
+    monkeypatch.setitem(GOLDEN["beckhoff-ax8000-gateway"]["limits"], "accept_no_watchdog", False)
+    bench = Bench(GOLDEN["beckhoff-ax8000-gateway"])
     assert [check.name for check in bench.found.refused] == ["watchdog"]
     bench.close()
 
 
 def test_a_scaling_that_is_set_otherwise_is_refused():
-    golden = GOLDEN["beckhoff-ax8000"]
+    golden = GOLDEN["beckhoff-ax8000-gateway"]
     bench = Bench(golden | {"stands": [{"index": 0x3005, "sub": 2, "value": 8448}]})
     assert [check.name for check in bench.found.refused] == ["3005h:02 Scaling index velocity NC"]
     bench.close()

@@ -80,7 +80,7 @@ def test_a_copy_of_generic_is_a_profile_of_ones_own(tmp_path: Path) -> None:
         ("confidence: verified", "confidence: sure", "'verified', 'likely' or 'unverified' is wanted"),
         ("eds: cia402.eds", "eds: ../x.eds", "plain name"),
         ("rpm_per_lsb: 0.1", "rpm_per_lsb: 0", "greater than 0"),
-        ("bus: canopen", "bus: profibus", "'canopen' or 'modbus' is wanted"),
+        ("bus: canopen", "bus: profibus", "'canopen', 'ethercat' or 'modbus' is wanted"),
     ],
 )
 def test_wrong_profiles(tmp_path: Path, old: str, new: str, words: str) -> None:

@@ -18,6 +18,7 @@ CANOPEN = ("bus: {interface: socketcan, channel: can3, bitrate: 250000, options:
 WAYS = (
     CANOPEN, "modbus: {host: 192.0.2.1, port: 1502, unit: 7}\n",
     "modbus: {serial: /dev/ttyUSB3, baud: 38400, parity: N, stop_bits: 2, unit: 3}\n",
+    "ethercat: {interface: eth3, position: 3}\n",
 )
 
 
@@ -46,7 +47,7 @@ def test_the_way_to_a_drive_comes_back_without_its_files(tmp_path, monkeypatch, 
 @pytest.mark.parametrize("name", profile_names())
 def test_a_profile_comes_back_as_it_was(tmp_path, name):
     profile = load_profile(name)
-    way = CANOPEN if profile.bus == "canopen" else WAYS[1]
+    way = {"canopen": CANOPEN, "modbus": WAYS[1], "ethercat": WAYS[-1]}[profile.bus]
     (tmp_path / "rig.yaml").write_text(f"profile: {name}\n{way}")
     assert connection_of_kept(kept(tmp_path / "rig.yaml")[2])[1].profile == profile
 

@@ -9,7 +9,7 @@ import canopen
 import pytest
 
 from profiles.simulator_marker import MARKER_INDEX, MARKER_TEXT
-from sim_bus.canopen.node import generic_eds
+from sim_bus.objects import generic_eds
 
 Open = Callable[..., tuple[Any, Any]]
 

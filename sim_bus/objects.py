@@ -6,11 +6,12 @@ of canopen's LocalNode, of which the SDO server is kept: its callbacks start a h
 """
 
 from collections.abc import Callable
+from importlib.resources import files
 from math import isfinite
 
 import canopen
 from canopen import objectdictionary
-from canopen.objectdictionary import ODArray, ODRecord, ODVariable
+from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 from canopen.sdo import SdoAbortedError
 
 ABORT_READ_WRITE_ONLY = 0x06010001
@@ -26,12 +27,23 @@ ABORT_TOO_LOW = 0x06090032
 ABORT_STATE = 0x08000022
 ABORT_NO_DATA = 0x08000024
 
+FORMATS = {
+    datatypes.INTEGER8: "b", datatypes.UNSIGNED8: "B", datatypes.INTEGER16: "h", datatypes.UNSIGNED16: "H",
+    datatypes.INTEGER32: "i", datatypes.UNSIGNED32: "I", datatypes.REAL32: "f",
+}
+"""Formats of what a PDO may carry, by data type, for `struct`."""
+
 Value = int | float | str
 
 
 def key_of(index: int, subindex: int = 0) -> int:
     """The key of an object."""
     return index << 8 | subindex
+
+
+def generic_eds() -> str:
+    """The path of our own EDS."""
+    return str(files("profiles") / "generic" / "cia402.eds")
 
 
 class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
@@ -99,6 +111,12 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
         if subindex not in found.subindices:
             raise SdoAbortedError(ABORT_NO_SUBINDEX)
         return found.subindices[subindex]
+
+    def mappable(self, entry: int, *, receives: bool) -> bool:
+        """Whether a mapping entry (index << 16 | subindex << 8 | bits) names an object that a PDO may carry."""
+        variable = self.variable(entry >> 16, entry >> 8 & 0xFF)
+        able = variable.pdo_mappable and (variable.writable if receives else variable.readable)
+        return bool(able) and variable.data_type in FORMATS and entry & 0xFF == len(variable)
 
     def write(self, key: int, value: int) -> None:
         """Checks a number against the limits and the hook, then stores it; an SDO abort says what is wrong."""

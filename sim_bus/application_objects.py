@@ -20,9 +20,9 @@ from math import floor, pi
 from canopen.sdo import SdoAbortedError
 
 from profiles.canopen import CanopenProfile
-from sim_bus.canopen.objects import ABORT_VALUE, ObjectStore, key_of
 from sim_bus.cia402 import Application, ApplicationSettings
 from sim_bus.inverter import RPM
+from sim_bus.objects import ABORT_VALUE, ObjectStore, key_of
 from sim_bus.params import DriveParams
 from sim_bus.reports import Feedback
 

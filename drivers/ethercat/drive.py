@@ -1,0 +1,403 @@
+"""CiA 402 on EtherCAT (CoE): the process data, AL states and the watchdog for `drivers.cia402.drive.Cia402Drive`.
+
+One cycle; this loop sends all of it::
+
+    tick ─ LRW(6040h 6071h 60FFh 6060h ─► 6041h 6077h 606Ch 6061h [6074h] [6064h]) ─ AL status ─ mailbox (when due)
+
+The working counter shows whether the drive took the setpoints and gave its feedback: with a wrong one the cycle has no
+feedback. The AL state is read in every cycle. Where the slave controller has distributed clocks, SYNC0 has the period
+of the cycle, and the ticks of this loop follow the clock of the segment.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+
+from drivers import cia402
+from drivers.clock import Clock
+from drivers.drive import DriveLimits, FrameTap, Identity, RawFrame
+from drivers.errors import CommunicationLost, DriveFault, ObjectRefused, PreflightRefused
+from drivers.ethercat.mailbox import CoeObjects, Mailbox, answered, download, upload
+from drivers.ethercat.pdo import Feedback, Image, Setpoints, map_images, settings
+from drivers.ethercat.segment import Segment
+from drivers.ethercat.station import CYCLE_US, INIT, OP, PRE_OP, REGISTER_US, SAFE_OP, has_clocks
+from drivers.ethercat.supervision import ProcessDataWatchdog, SlaveWatch
+from drivers.preflight import PreflightTable
+from drivers.undo_journal import UndoJournal
+from profiles import MARKER_INDEX, MessageCode
+from profiles.cia402 import Position
+from profiles.ethercat import EthercatProfile
+
+INTERPOLATION = 0x60C2
+"""Period of the setpoints in the cyclic synchronous modes: value (u8), exponent of ten (i8), in s."""
+MAILBOX_S = 0.05
+"""Time between two looks at the mailbox for emergency messages, s."""
+STEPPED_ANSWER_US = 200_000
+"""Wall time for a frame in stepped time, µs. A frame that takes longer is lost."""
+ANSWER_SHARE, CYCLE_SHARE = 0.5, 0.2
+"""Longest wait for the frame of a cycle, and for the answer of a register, as shares of the period."""
+SYNC0_SHARE = 0.5
+"""Distance of SYNC0 behind the frame, as a share of the period: as far from the frames as possible on both sides."""
+CLOCK_GAIN, CLOCK_STEP = 0.05, 0.01
+"""Share of the deviation from the segment's clock that one tick corrects, and its limit as a share of the period."""
+QUICK_STOP, ENABLE_OPERATION, FIRST_WORDS = 0x0002, 0x000F, 0x000F
+SETPOINTS, FEEDBACK = 2, 3
+"""Identifiers of the process data in the log: the sync managers."""
+
+
+class EthercatBus(cia402.Cia402Bus):
+    """One slave. ``tap`` gets the process data and the mailbox messages; the identifier is the sync manager."""
+
+    feedback_place = "working counter"
+
+    def __init__(
+        self, segment: Segment, profile: EthercatProfile, clock: Clock, *, period_s: float, tap: FrameTap | None = None,
+    ) -> None:
+        self._segment, self._station, self._profile, self._tap = segment, segment.station, profile, tap
+        self._mailbox = Mailbox(segment.station, clock, tap)
+        self._slave_watch = SlaveWatch(segment.station.place, clock)
+        super().__init__(CoeObjects(self._mailbox), self._slave_watch, clock, period_s)
+        self.place = segment.station.place
+        self._slave_watch.on_restart = self.reported.restarted
+        self._mailbox.on_emergency = self._slave_watch.on_emergency
+        self._mailbox.on_answer = self._on_answer
+        self._watchdog = ProcessDataWatchdog(segment.station)
+        self._content = cia402.CyclicObjects()
+        self._images = (Image({}, 0), Image({}, 0))
+        self._setpoints = Setpoints(self._images[0], self._content)
+        self._feedback: Feedback | None = None         # None: nothing can be decoded
+        self._position: Position | None = None
+        self._asked, self._looked_s, self._al_state = 0, 0.0, OP
+        self._sent, self._fed, self._clocks = False, True, False
+
+    # -- before motion ---------------------------------------------------------------------------------------
+
+    def take(self) -> None:
+        """Put the slave into PRE-OP. Raises DriveFault if it refuses."""
+        self._station.wait_us = REGISTER_US
+        self._stop_clock()
+        self._station.reach(PRE_OP)
+
+    def confirm(self, identity: Identity) -> None:
+        """Refuse a slave whose SII and objects name different drives. Raises PreflightRefused."""
+        slave = self._segment.slave
+        if (slave.man, slave.id) != (identity.vendor, identity.product):
+            raise PreflightRefused(
+                f"the SII names vendor {slave.man:X}h and product {slave.id:X}h, the objects (1018h) vendor "
+                f"{identity.vendor:X}h and product {identity.product:X}h", where=self.place,
+                next_step="The EEPROM of the slave controller may be damaged or of another drive; see the manufacturer",
+                entry=MessageCode.PREFLIGHT_REFUSED,
+            )
+
+    def map_cyclic(
+        self, table: PreflightTable, content: cia402.CyclicObjects, demand: bool, position: Position | None
+    ) -> Sequence[cia402.FeedbackSetting]:
+        """Map and assign the PDOs, in PRE-OP."""
+        objects, profile = self.objects, self._profile
+        self._content = content
+        mapped: list[Position | None] = []
+
+        def work() -> tuple[str, bool]:
+            for angle in dict.fromkeys((position, None)):
+                try:
+                    self._images = map_images(objects, profile, content, demand, angle)
+                except PreflightRefused:
+                    if angle is None:
+                        raise
+                    continue
+                mapped.append(angle)
+                break
+            return "as wanted" if mapped[0] == position else "as wanted, without the angle", True
+
+        table.attempt("PDO mapping", "setpoints and feedback", "1C12h, 1C13h", work)
+        carried = mapped[0] if mapped else None
+        place = None if carried is None else (carried.index, carried.sub)
+        self._position = carried if place in self._images[1].offsets else None
+        self.angle_mapped = self._position is not None
+        actual = profile.torque.actual
+        self._setpoints = Setpoints(self._images[0], content)
+        self._feedback = Feedback(self._images[1], content, self._position, "i16" if actual is None else actual.type)
+        return settings(objects, profile) if mapped else ()
+
+    def arm(self, table: PreflightTable, limits: DriveLimits) -> float:
+        """Set the period of the cycle, arm the watchdog of the process data and read it back."""
+        self._set_cycle(table)
+        return self._watchdog.arm(table, self.objects, self._profile, limits, self.period_s)
+
+    def _set_cycle(self, table: PreflightTable) -> None:
+        objects, period_us = self.objects, round(self.period_s * 1e6)
+        if self.clock.stepped:
+            for title, sub, value, bits in (("simulator's cycle", 3, period_us, 32), ("stepped time", 2, 1, 8)):
+                back = objects.change(MARKER_INDEX, sub, value, bits)
+                table.row(title, str(value), str(back), back == value, cia402.name(MARKER_INDEX, sub))
+        try:
+            found = self._set_interpolation()
+            table.row("cycle", f"{period_us} µs", f"{found} µs", found == period_us, "60C2h")
+        except ObjectRefused:
+            table.note("cycle", f"{period_us} µs; the drive has no 60C2h and follows the frames", "60C2h")
+        self._clocks = (
+            not self.clock.stepped and self._profile.cyclic.distributed_clocks
+            and has_clocks(self._station)
+        )
+        table.note("distributed clocks", "SYNC0 in the middle of the cycle" if self._clocks else "not used",
+                   "register 0008h")
+
+    def _set_interpolation(self) -> int:
+        """Write 60C2h. Return the period read back, µs. Raises ObjectRefused."""
+        value, exponent = interpolation(self.period_s)
+        exponent = self.objects.change(INTERPOLATION, 2, exponent, 8)
+        value = self.objects.change(INTERPOLATION, 1, value, 8)
+        exponent -= 256 if exponent > 127 else 0
+        return round(value * 10.0 ** (exponent + 6))
+
+    def setting(self, index: int) -> tuple[str, cia402.Group] | None:
+        """Return an empty title for the timing, which is not read back in motion."""
+        return ("", cia402.Group.REST) if index == INTERPOLATION else None
+
+    def start(self) -> None:
+        """Bring the slave to OP with setpoints of zero, and supervise it.
+
+        Raises PreflightRefused if it does not get there.
+        """
+        if self._feedback is None or not self._images[1].offsets:
+            return                                     # the mapping was refused: nothing may move
+        self._setpoints.stop(0)
+        try:
+            self._segment.map(self._images[0].size, self._images[1].size)
+            self._start_clock()
+            self._station.reach(SAFE_OP)
+            self._watchdog.check_trigger()
+            self._station.reach(OP, self._frame)
+            self._al_state = OP
+        except DriveFault as error:                    # nothing moves yet: an error becomes a refusal
+            raise PreflightRefused(error.what, where=error.where, next_step=error.next_step,
+                                   entry=MessageCode.NO_FEEDBACK) from error
+        in_cycle_us = min(CYCLE_US, round(CYCLE_SHARE * self.period_s * 1e6))
+        self._station.wait_us = REGISTER_US if self.clock.stepped else in_cycle_us
+        self._slave_watch.start(cia402.DRIVE_SILENT_S)
+
+    def set_period(self, period_s: float) -> Sequence[tuple[int, int, bytes]]:
+        """Change the period in PRE-OP, with 60C2h."""
+        self.period_s = period_s
+        self.watch.stop()
+        self.take()
+        with suppress(ObjectRefused):                  # then it follows the frames
+            self._set_interpolation()
+        return ()
+
+    def _start_clock(self) -> None:
+        if self._clocks:
+            self._segment.master.config_dc()
+            self._segment.slave.dc_sync(True, round(self.period_s * 1e9))
+
+    def _stop_clock(self) -> None:
+        if self._clocks:
+            self._segment.slave.dc_sync(False, 0)
+
+    # -- the cycle -------------------------------------------------------------------------------------------
+
+    def listen_until(self, tick_s: float) -> None:
+        """Wait until the tick. A simulated drive that is left to its watchdog goes on in its own time."""
+        if self.clock.stepped and not self._fed:
+            time.sleep(self.period_s)
+        self.clock.wait_until(tick_s)
+
+    def begin(self, try_again: bool) -> float:
+        """Raise the errors so far. The setpoints themselves feed the watchdog. Return the control time, s."""
+        self.check()
+        return self.clock.now_s()
+
+    def send(self, setpoints: cia402.CycleSetpoints) -> None:
+        """Send the process data. Outside of OP the drive takes none: then the controlword goes by SDO too, to stop."""
+        self.ticks.check()
+        self._setpoints.pack(setpoints)
+        self._transmit()
+        if self._al_state != OP and not self._asked and setpoints.word & FIRST_WORDS != ENABLE_OPERATION:
+            self.put(0x6040, 0, setpoints.word.to_bytes(2, "little"))
+
+    def receive(self, now_s: float, sync: bool) -> cia402.CycleInputs:
+        """Take the frame back, and look at working counter, AL state and mailbox.
+
+        Without ``sync``, or if the watchdog is no longer fed, the feedback is read from the slave's memory.
+        """
+        if not (sync and self._fed):
+            data = self._from_memory()
+        else:
+            if not self._sent:
+                self._transmit()
+            data = self._take()
+            if self._clocks and data is not None:
+                self._follow_clock(self._segment.master.dc_time)
+        self._look(now_s)
+        age_s = 0.0 if self.clock.stepped else self.clock.now_s() - now_s
+        if data is None or self._feedback is None or len(data) < self._feedback.size:
+            return cia402.CycleInputs(age_s)
+        self._slave_watch.heard()
+        status, torque, speed, shown, demand, angle = self._feedback.unpack(data)
+        self.reported.take_slow(now_s, shown, demand)
+        return cia402.CycleInputs(age_s, True, False, status, torque, speed, angle)
+
+    def _transmit(self) -> None:
+        data = bytes(self._setpoints.data)
+        self._segment.slave.output = data
+        self._seen(SETPOINTS, data)
+        self._segment.master.send_processdata()
+        self._sent = True
+
+    def _take(self) -> bytes | None:
+        """Return the inputs of the frame that was sent; None with a wrong working counter."""
+        self._sent = False
+        master = self._segment.master
+        wait_us = STEPPED_ANSWER_US if self.clock.stepped else round(ANSWER_SHARE * self.period_s * 1e6)
+        if master.receive_processdata(wait_us) != master.expected_wkc:
+            return None
+        data: bytes = self._segment.slave.input
+        self._seen(FEEDBACK, data)
+        return data
+
+    def _follow_clock(self, dc_time_ns: int) -> None:
+        """Shift the next tick towards the middle between two SYNC0, which follow the segment's clock."""
+        period_ns = self.period_s * 1e9
+        behind = dc_time_ns / period_ns % 1.0 - SYNC0_SHARE
+        self.ticks.shift(-max(-CLOCK_STEP, min(CLOCK_STEP, CLOCK_GAIN * behind)) * self.period_s)
+
+    def _from_memory(self) -> bytes | None:
+        """Return the inputs without a frame that carries setpoints; None without an answer."""
+        with suppress(CommunicationLost):
+            start, length = self._station.sync_manager(FEEDBACK)
+            if length == self._images[1].size:
+                return self._station.read(start, length)
+        return None
+
+    def _look(self, now_s: float) -> None:
+        """Look at AL state, mailbox and watchdog registers. An unanswered datagram shows in the working counter too."""
+        with suppress(CommunicationLost):
+            found = self._station.al_status()
+            self._al_state = found.state
+            self._slave_watch.on_al_status(found)
+            if self._asked or now_s - self._looked_s >= MAILBOX_S:
+                self._looked_s = now_s
+                self._asked = max(0, self._asked - 1)
+                self._mailbox.look()
+            self._watchdog.look(now_s, self.watch)
+
+    def _frame(self) -> None:
+        """Exchange one frame beside the cycle."""
+        self._transmit()
+        self._take()
+
+    def _seen(self, identifier: int, data: bytes) -> None:
+        if self._tap is not None:
+            self._tap(RawFrame(self.clock.now_s(), identifier == SETPOINTS, identifier, data))
+
+    def feed(self) -> None:
+        """Feed the watchdog: exchange the setpoints of the last cycle. In stepped time only a cycle does."""
+        if self._fed and self._feedback is not None and not self.clock.stepped:
+            self._frame()
+        else:
+            self.feed_between()
+
+    def feed_between(self) -> None:
+        """Feed the watchdog between two cycles. A simulated drive gets a frame by which no time passes."""
+        if self.clock.stepped or not self._fed:
+            with suppress(CommunicationLost):
+                self._station.al_status()
+        elif self.watch.expect_operational:
+            self._frame()
+
+    def stop_feeding(self) -> None:
+        """Send no setpoints any more. A simulated drive in stepped time then goes on in its own time."""
+        if self._fed and self.clock.stepped:
+            self.put(MARKER_INDEX, 2, bytes(1))
+        self._fed = False
+
+    # -- beside the cycle ------------------------------------------------------------------------------------
+
+    def ask(self, index: int, sub: int) -> None:
+        """Send a read request without waiting. A full mailbox counts as a missing answer."""
+        with suppress(CommunicationLost):
+            self._mailbox.post(upload(index, sub))
+            self._asked = round(MAILBOX_S / self.period_s) + 1
+
+    def put(self, index: int, sub: int, data: bytes) -> None:
+        """Send a write request without waiting. The controlword also goes into the process data, which replace it."""
+        if (index, sub) == (0x6040, 0):
+            self._setpoints.stop(int.from_bytes(data, "little"))
+        with suppress(CommunicationLost, ObjectRefused):
+            self._mailbox.post(download(index, sub, data))
+            self._asked = round(MAILBOX_S / self.period_s) + 1
+
+    def _on_answer(self, sdo: bytes) -> None:
+        found = answered(sdo)
+        if found is not None:
+            self._asked = 0
+            self.on_answer(*found)
+
+    def disable_setpoints(self) -> int:
+        """Set the process data to quick stop and setpoints of zero, which they keep. No PDO is switched off."""
+        self._setpoints.stop(QUICK_STOP)
+        return 0
+
+    def pause(self) -> None:
+        """Wait 10 ms of wall time for a drive that needs it between two objects."""
+        if not self.clock.stepped:
+            time.sleep(0.01)
+
+    def reach(self) -> None:
+        """Make the objects readable, and feed the watchdog without setpoints that drive the shaft."""
+        if self._setpoints.word & FIRST_WORDS == ENABLE_OPERATION:
+            self._setpoints.stop(QUICK_STOP)
+        with suppress(CommunicationLost):
+            if self._station.al_status().state == INIT:
+                self._station.ask_for(PRE_OP)
+        self.feed()
+
+    def changed(self, index: int, sub: int) -> None:
+        """Ignore the feedback from now on if its mapping was changed: it cannot be decoded."""
+        if index in (0x1C13, *self._profile.cyclic.tx_pdos):
+            self._feedback = None
+
+    # -- afterwards ------------------------------------------------------------------------------------------
+
+    def release(self) -> None:
+        """Put the slave into PRE-OP, where its settings are restored. Raises CommunicationLost."""
+        try:
+            self.take()
+        except DriveFault as error:
+            raise CommunicationLost(error.what, where=error.where, next_step=error.next_step) from error
+
+    def close(self) -> None:
+        """Close the interface."""
+        self._segment.close()
+
+
+def interpolation(period_s: float) -> tuple[int, int]:
+    """Return value and exponent of 60C2h for a period, s. Raises ObjectRefused if there is none."""
+    for exponent in (-3, -4, -5, -6):
+        value = period_s / 10.0**exponent
+        if 1 <= round(value) <= 0xFF and abs(value - round(value)) < 1e-6:
+            return round(value), exponent
+    raise ObjectRefused(f"{period_s * 1e6:g} µs can't be written", where="60C2h")
+
+
+class EthercatDrive(cia402.Cia402Drive):
+    """A CiA 402 drive on EtherCAT: one slave. See `Cia402Drive` and `EthercatBus`."""
+
+    def __init__(
+        self,
+        segment: Segment,
+        profile: EthercatProfile,
+        clock: Clock,
+        *,
+        rate_hz: float | None = None,
+        rated_torque_nm: float | None = None,
+        tap: FrameTap | None = None,
+        journal: UndoJournal | None = None,
+    ) -> None:
+        period_s = round(1e6 / (rate_hz or profile.cyclic.rate_hz)) * 1e-6
+        super().__init__(
+            EthercatBus(segment, profile, clock, period_s=period_s, tap=tap), profile,
+            fixed_rate=rate_hz is not None, rated_torque_nm=rated_torque_nm, journal=journal,
+        )

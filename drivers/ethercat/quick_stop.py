@@ -1,0 +1,66 @@
+"""The bare quick stop of a CiA 402 drive on EtherCAT (`drivers.quick_stop`): controlword 6040h by SDO.
+
+The AL state stays as it is, because leaving OP may let a shaft coast. Setpoints of another master replace the
+controlword with the next frame. Then the slave is put into SAFE-OP, where it takes no setpoints of any master.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drivers.cia402 import Cia402Target
+from drivers.clock import Clock
+from drivers.errors import ObjectRefused
+from drivers.ethercat.mailbox import CoeObjects, Mailbox
+from drivers.ethercat.raw import RawSegment, RawStation
+from drivers.ethercat.segment import open_segment
+from drivers.ethercat.station import INIT, OP, SAFE_OP, Station, station_of
+from profiles import MARKER_INDEX
+from profiles.ethercat import EthercatProfile
+
+BY_SDO_TRIES = 5
+"""Attempts by SDO alone; after them the slave is put into SAFE-OP."""
+
+
+class EthercatTarget(Cia402Target):
+    """One slave. ``close`` closes what was opened for it."""
+
+    def __init__(self, station: Station, profile: EthercatProfile, clock: Clock, close: Callable[[], None]) -> None:
+        self._station = station
+        super().__init__(CoeObjects(Mailbox(station, clock)), profile, clock)
+        self.close = close
+
+    def enforce(self, attempt: int) -> None:
+        """Take the slave out of OP if the quick stop by SDO has no effect."""
+        if attempt > BY_SDO_TRIES and self._station.al_status().state == OP:
+            self._station.ask_for(SAFE_OP)
+            self._said.append("setpoints of another master reversed the quick stop: the drive was put into SAFE-OP")
+
+    def keep_time(self) -> None:
+        """Let a simulated drive in stepped time advance by itself; otherwise it would never reach standstill."""
+        try:
+            if self._objects.read_if_there(MARKER_INDEX, 2):
+                self._objects.write(MARKER_INDEX, 2, 0, 8)
+        except ObjectRefused:
+            return
+
+
+def open_target(
+    interface: str, position: int, alias: int | None, profile: EthercatProfile, clock: Clock
+) -> EthercatTarget:
+    """Open one slave for a quick stop. Its AL state stays, unless it is INIT, where no master drives it.
+
+    Raises PreflightRefused, and CommunicationLost if no slave answers.
+    """
+    look = RawSegment(interface)
+    try:
+        stations = [RawStation(look, number) for number in range(look.count())]
+        station = station_of(stations, interface, position, alias)
+        if station.al_status().state != INIT:
+            return EthercatTarget(station, profile, clock, look.close)
+    except BaseException:
+        look.close()
+        raise
+    look.close()
+    segment = open_segment(interface, position, alias)
+    return EthercatTarget(segment.station, profile, clock, segment.close)

@@ -1,0 +1,171 @@
+"""Supervision of a slave during a run: AL state, working counter, emergency messages, watchdog of the process data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drivers.cia402 import HOST_SILENT, DriveWatch, Objects, arm, emcy_text
+from drivers.clock import Clock
+from drivers.drive import DriveLimits
+from drivers.errors import CommunicationLost, DriveFault, PreflightRefused
+from drivers.ethercat.station import (
+    INIT,
+    OP,
+    SM_WATCHDOG,
+    WATCHDOG_DIVIDER,
+    WATCHDOG_TICK_S,
+    WATCHDOG_TIME,
+    WATCHDOG_TRIGGER,
+    AlStatus,
+    Station,
+)
+from drivers.preflight import DIES, PreflightTable
+from profiles import MessageCode
+from profiles.ethercat import EthercatProfile
+
+OUTPUT_MANAGER = 2
+"""Sync manager of the setpoints."""
+READ_BACK_S = 0.5
+"""Time between two read-backs of the watchdog's registers, s."""
+
+
+class SlaveWatch(DriveWatch):
+    """Follows one slave. ``allowed_silence_s``: longest time without a right working counter, s; 0: not supervised."""
+
+    def __init__(self, place: str, clock: Clock) -> None:
+        super().__init__(place)
+        self._clock = clock
+        self._heard_s = 0.0
+        self.allowed_silence_s = 0.0
+        self.on_restart: Callable[[], None] = lambda: None
+
+    def start(self, allowed_silence_s: float) -> None:
+        """Treat silence, AL states other than OP and emergency messages as errors from now on."""
+        self._heard_s, self.allowed_silence_s = self._clock.now_s(), allowed_silence_s
+        super().start(allowed_silence_s)
+
+    def heard(self) -> None:
+        """Note a cycle with the right working counter."""
+        self._heard_s = self._clock.now_s()
+
+    def check(self) -> None:
+        """Raise the oldest error that was not raised yet."""
+        silent_s = self._clock.now_s() - self._heard_s
+        if self.expect_operational and 0.0 < self.allowed_silence_s < silent_s:
+            self.keep("heartbeat", CommunicationLost(
+                f"no frame came back with the right working counter for {silent_s:.2f} s", where=self.place,
+                next_step="Check the cable and the drive's supply. The drive's own watchdog stops the shaft",
+                entry=MessageCode.FEEDBACK_LOST,
+            ))
+        super().check()
+
+    def on_al_status(self, found: AlStatus) -> None:
+        """Handle the AL state of one cycle."""
+        if (found.state == OP and not found.error) or not self.expect_operational:
+            return
+        if found.error and found.code == SM_WATCHDOG:
+            self.keep(HOST_SILENT, CommunicationLost(
+                f"the drive's watchdog has tripped: {found.text}", where=f"host or bus, reported by {self.place}",
+                next_step="This host was silent for too long (frozen, asleep, overloaded) or its frames were lost",
+                entry=MessageCode.WATCHDOG_ACTED,
+            ))
+        elif found.error:
+            self.keep("al", DriveFault(
+                f"the drive left OP: {found.text}", where=self.place,
+                next_step="See the manual of the drive for this AL status code, then start again",
+                entry=MessageCode.STATE_LEFT,
+            ))
+        elif found.state == INIT:
+            self.on_restart()
+            self.keep("boot-up", DriveFault(
+                "the drive restarted during the run, or another master set it to INIT", where=self.place,
+                next_step="tdhil does not enable it again. Find the cause, then start again",
+                entry=MessageCode.DRIVE_RESTARTED,
+            ))
+        else:
+            self.keep("nmt", CommunicationLost(
+                f"another master put the drive into {found.text}", where=self.place,
+                next_step="Disconnect the second master from the segment, and start again",
+                entry=MessageCode.FOREIGN_MASTER,
+            ))
+
+    def on_emergency(self, data: bytes) -> None:
+        """Handle an emergency message: error code u16, error register u8, manufacturer's bytes; code 0: no error left.
+
+        Codes A0xxh report a refused change of the AL state (ETG.1000.6); the AL status code tells more.
+        """
+        code = int.from_bytes(data[:2], "little")
+        if code and code >> 8 != 0xA0 and self.expect_operational:
+            extra = data[3:].hex(" ")
+            self.keep("emcy", DriveFault(
+                emcy_text(code) + (f" (manufacturer's bytes {extra})" if any(data[3:]) else ""), where=self.place,
+                next_step="Find the cause at the drive, then start again with --reset-fault",
+                entry=MessageCode.DRIVE_FAULT,
+            ))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The watchdog of the process data: each write to sync manager 2 triggers it. Without one for 0420h x (0400h + 2) x 40
+# ns, the drive leaves OP with AL status code 001Bh. CiA 402 drives then react as 6007h states.
+
+
+class ProcessDataWatchdog:
+    """The registers of the watchdog of one slave."""
+
+    def __init__(self, station: Station) -> None:
+        self._station = station
+        self._wanted: tuple[int, int] | None = None
+        self._looked_s = 0.0
+
+    def arm(
+        self, table: PreflightTable, objects: Objects, profile: EthercatProfile, limits: DriveLimits, period_s: float
+    ) -> float:
+        """Arm it and read it back (`drivers.cia402.arm`). Return the period at which it is fed, s; 0: none."""
+
+        def armed(tried: PreflightTable, time_ms: int) -> float:
+            tried.attempt("watchdog", f"{time_ms} ms", "registers 0400h, 0420h",
+                          lambda: self._set(objects, time_ms), DIES)
+            return period_s
+
+        return arm(table, objects, profile.watchdog, armed, lambda: not self._station.number(WATCHDOG_TIME),
+                   watchdog_s=limits.watchdog_s, period_s=period_s, accept_none=limits.accept_no_watchdog)
+
+    def _set(self, objects: Objects, time_ms: int) -> tuple[str, bool]:
+        station = self._station
+        step_s = (station.number(WATCHDOG_DIVIDER) + 2) * WATCHDOG_TICK_S
+        counts, before = round(time_ms * 1e-3 / step_s), station.read(WATCHDOG_TIME, 2)
+        if not 0 < counts <= 0xFFFF:
+            raise PreflightRefused(f"its longest time is {0xFFFF * step_s:.3g} s", where="register 0400h",
+                                   next_step="Lower limits.watchdog_s", entry=MessageCode.WATCHDOG_NOT_ARMED)
+        objects.on_restore(lambda: station.write(WATCHDOG_TIME, before))
+        station.write(WATCHDOG_TIME, counts.to_bytes(2, "little"))
+        back = self._read()
+        self._wanted = back
+        return f"{back[1] * (back[0] + 2) * WATCHDOG_TICK_S * 1e3:.6g} ms", back[1] == counts
+
+    def _read(self) -> tuple[int, int]:
+        return self._station.number(WATCHDOG_DIVIDER), self._station.number(WATCHDOG_TIME)
+
+    def check_trigger(self) -> None:
+        """Refuse a sync manager of the setpoints that does not trigger the watchdog. Raises PreflightRefused."""
+        if self._wanted is None or self._station.sync_manager_control(OUTPUT_MANAGER) & WATCHDOG_TRIGGER:
+            return
+        raise PreflightRefused(
+            "the setpoints do not trigger the watchdog: bit 6 of register 0814h is 0", where=self._station.place,
+            next_step="The drive's SII describes its sync manager 2 so; see its manual for another watchdog",
+            entry=MessageCode.WATCHDOG_NOT_ARMED,
+        )
+
+    def look(self, now_s: float, watch: DriveWatch) -> None:
+        """Read the registers back in motion, every `READ_BACK_S`. Raises CommunicationLost without an answer."""
+        if self._wanted is None or now_s - self._looked_s < READ_BACK_S:
+            return
+        self._looked_s = now_s
+        found = self._read()
+        if found != self._wanted:
+            self._station.write(WATCHDOG_TIME, self._wanted[1].to_bytes(2, "little"))
+            watch.interference(
+                "the drive's watchdog was changed by another master during the run: registers 0400h, 0420h were "
+                f"{self._wanted[0]}, {self._wanted[1]}, and are {found[0]}, {found[1]} now", self._station.place,
+                "Find the master or tool on this segment, disconnect it, and start again", kind="changed watchdog",
+            )

@@ -1,0 +1,101 @@
+"""The simulated drive with its time and its faults, as a pure function of frames, and its loop on a raw socket."""
+
+import socket
+import threading
+import time
+from pathlib import Path
+
+from sim_bus.command_arguments import Unusable
+from sim_bus.ethercat.esc import ETHERTYPE
+from sim_bus.ethercat.faults import Faults
+from sim_bus.ethercat.slave import Cia402Slave
+from sim_bus.fault_script import Scripted
+from sim_bus.params import RigParams
+from sim_bus.trace import ShaftTrace
+
+_CHUNK_US = 2_000
+_POLL_S = 0.005
+_FRAME_SIZE = 2048
+
+
+class Simulator:
+    """A simulated drive. Its caller says what time it is: `answer` and `idle` wait for nothing and read no clock.
+
+    Stepped time moves with the outputs of the host. After ``silence_s`` without a frame the drive runs on in its own
+    time, so that its watchdog acts. Frames that come again make it go on stepped.
+    """
+
+    def __init__(self, params: RigParams | None = None, *, seed: int = 0, trace: Path | None = None,
+                 stepped: bool = False, silence_s: float = 1.0, alias: int = 0,
+                 faults: tuple[Scripted, ...] = ()) -> None:
+        self.trace = ShaftTrace(trace)
+        self.slave = Cia402Slave(params or RigParams(), seed=seed, trace=self.trace, stepped=stepped, alias=alias)
+        self._faults = Faults(faults, self.slave, seed)
+        self._silence_s = silence_s
+        self._silent_s = self._last_s = self._plant_s = 0.0
+        self._running_on = False
+
+    @property
+    def faults_waiting(self) -> tuple[str, ...]:
+        """Scripted faults whose moment hasn't come, as they were written."""
+        return self._faults.waiting
+
+    def answer(self, frame: bytes, now_s: float) -> bytes:
+        """Return the frame as it comes back at ``now_s`` of the caller's clock; empty where it is lost."""
+        self._follow(now_s)
+        self._silent_s = 0.0
+        if self._running_on:
+            self._running_on = False
+            self.slave.note("frames are back: stepped again")
+        return self._faults.answer(frame)
+
+    def idle(self, now_s: float, waited_s: float = _POLL_S) -> None:
+        """No frame has come for ``waited_s``; a caller that had no processor time knows of no more than that."""
+        self._silent_s += waited_s
+        if self.slave.stepped and self.slave.cycled and self._silent_s >= self._silence_s and not self._running_on:
+            self._running_on, self._plant_s = True, now_s
+            self.slave.note("host silent: running on in own time")
+        self._follow(now_s)
+
+    def _follow(self, now_s: float) -> None:
+        """In its own time, the plant catches up with the caller's clock, in whole chunks."""
+        slave, before_s, self._last_s = self.slave, self._last_s, now_s
+        if not before_s or (slave.stepped and not self._running_on):
+            self._plant_s, slave.esc.fine_ns = now_s, 0
+            return
+        chunks = int((now_s - self._plant_s) * 1e6) // _CHUNK_US
+        for _ in range(chunks):
+            slave.advance_us(_CHUNK_US)
+        self._plant_s += chunks * _CHUNK_US * 1e-6
+        slave.esc.fine_ns = round(1e9 * (now_s - self._plant_s))
+
+    def run(self, line: socket.socket, stop: threading.Event) -> None:
+        """Serves a raw socket until ``stop`` is set, and plays a rehearsal to its end. The trace is closed then."""
+        line.settimeout(_POLL_S)
+        with self.trace:
+            while not stop.is_set():
+                try:
+                    frame, sender = line.recvfrom(_FRAME_SIZE)
+                    if sender[2] != socket.PACKET_OUTGOING and (answer := self.answer(frame, time.monotonic())):
+                        line.send(answer)
+                except OSError as error:
+                    if not isinstance(error, TimeoutError):
+                        stop.wait(_POLL_S)          # the interface is down: nothing comes
+                    self.idle(time.monotonic())
+                    self.trace.flush()
+            if self._faults.scripted and self.slave.stepped and self.slave.cycled:
+                self.slave.run_out()
+
+
+def raw_socket(interface: str) -> socket.socket:
+    """Return a raw socket for EtherCAT frames on an interface. Raises Unusable with the reason."""
+    family = getattr(socket, "AF_PACKET", None)
+    if family is None:
+        raise Unusable("no raw Ethernet sockets on this system: a simulated EtherCAT drive needs Linux")
+    try:
+        line = socket.socket(family, socket.SOCK_RAW, socket.htons(ETHERTYPE))
+        line.bind((interface, ETHERTYPE))
+    except OSError as error:
+        why = error.strerror or str(error)
+        raise Unusable(f"no raw socket on {interface}: {why}; it needs root or CAP_NET_RAW") from error
+    return line

@@ -1,0 +1,245 @@
+"""EtherCAT face of the simulated drive: state machine of the slave, objects, process data.
+
+One thread calls `Cia402Slave.answer` and `Cia402Slave.advance_us`; nothing here waits or reads a clock. In stepped time
+a frame that brings outputs 1. gets the reported values as its inputs, 2. lets its outputs act, and then 3. the plant
+moves on by exactly 5FFEh:3 (µs), in equal steps of at most the control period.
+"""
+
+from contextlib import suppress
+from enum import IntEnum
+
+from canopen.objectdictionary import datatypes
+from canopen.sdo import SdoAbortedError
+
+from profiles import MARKER_INDEX
+from sim_bus.application_objects import ApplicationObjects
+from sim_bus.ethercat.coe import CoeServer
+from sim_bus.ethercat.esc import AL_STATUS, AL_STATUS_CODE, Esc
+from sim_bus.ethercat.process_data import ProcessData
+from sim_bus.ethercat.sii import Area, eeprom
+from sim_bus.objects import ABORT_LENGTH, ObjectStore, generic_eds, key_of
+from sim_bus.params import RigParams
+from sim_bus.timed_drive import TimedDrive
+from sim_bus.trace import ShaftTrace
+
+MAILBOX = 128
+"""Bytes of each mailbox."""
+
+_OUTPUTS_AT, _INPUTS_AT = 0x1200, 0x1400
+_CAN_ONLY = (0x1005, 0x1006, 0x1014, 0x1016, 0x1017, 0x1029, 0x1200,
+             *(base + number for base in (0x1400, 0x1600, 0x1800, 0x1A00) for number in range(4)))
+_TEXT, _TEXT_LIMIT = key_of(MARKER_INDEX, 5), 512
+"""Object for segmented transfers: a text of at most so many bytes."""
+
+HOST_LOST = 0x8130
+"""Error code when the process data end while torque may flow (CiA 301: heartbeat error)."""
+
+_GENERIC, _COMMUNICATION = 0x01, 0x10
+
+
+class AlState(IntEnum):
+    """States of the slave, as 0120h and 0130h have them."""
+
+    INIT, PRE_OPERATIONAL, BOOT, SAFE_OPERATIONAL, OPERATIONAL = 1, 2, 3, 4, 8
+
+
+_NEXT = {AlState.INIT: AlState.PRE_OPERATIONAL, AlState.PRE_OPERATIONAL: AlState.SAFE_OPERATIONAL,
+         AlState.SAFE_OPERATIONAL: AlState.OPERATIONAL}
+INVALID_CHANGE, UNKNOWN_STATE, NO_BOOT, MAILBOX_WRONG = 0x0011, 0x0012, 0x0013, 0x0016
+WATCHDOG, OUTPUTS_WRONG, INPUTS_WRONG = 0x001B, 0x001D, 0x001E
+"""AL status codes (ETG.1000.6, table 11)."""
+
+_ERROR = 0x10
+
+
+class SlaveObjects(ObjectStore):
+    """The objects, with a text of any length to write and read back."""
+
+    def set_data(self, index: int, subindex: int, data: bytes, check_writable: bool = False) -> None:
+        """An SDO download."""
+        if key_of(index, subindex) != _TEXT:
+            super().set_data(index, subindex, data, check_writable)
+        elif len(data) > _TEXT_LIMIT or not data.isascii():
+            raise SdoAbortedError(ABORT_LENGTH)
+        else:
+            self.values[_TEXT] = data.decode("ascii")
+
+
+class Cia402Slave(TimedDrive):
+    """A CiA 402 drive on EtherCAT over a simulated inverter."""
+
+    def __init__(self, params: RigParams, *, seed: int, trace: ShaftTrace, stepped: bool, alias: int = 0) -> None:
+        super().__init__(params, seed=seed, trace=trace, stepped=stepped)
+        self.state = AlState.INIT
+        self.cycled = False
+        """Outputs have come."""
+        self.period_us = 0
+        """5FFEh:3: period of a cycle in stepped time."""
+        self.frozen: bytes | None = None
+        """Scripted: the inputs whatever the drive does."""
+        self.fault_code = self._register = 0
+        self._outputs_came = self._op_requested = False
+        self.store = SlaveObjects(1, generic_eds())
+        for index in _CAN_ONLY:
+            self.store.remove(index)
+        self._setters = ApplicationObjects(self.store, self.application).setters
+        self.received = ProcessData(self.store, outputs=True, writable=self._configurable)
+        self.sent = ProcessData(self.store, outputs=False, writable=self._configurable)
+        self._bind()
+        areas = (Area(0x1000, MAILBOX, 0x26, 1), Area(0x1000 + MAILBOX, MAILBOX, 0x22, 2),
+                 Area(_OUTPUTS_AT, self.received.size, 0x64, 3), Area(_INPUTS_AT, self.sent.size, 0x20, 4))
+        identity = [int(self.store.number(key_of(0x1018, sub))) for sub in (1, 2, 3, 4)]
+        self.esc = Esc(self, eeprom(identity, alias, str(self.store.values[key_of(0x1008)]), areas,
+                                    [self.received.delivered(), self.sent.delivered()]))
+        self.coe = CoeServer(self.store, self.esc.post, MAILBOX)
+        self.application.on_event = self.note
+        self.application.on_fault_reset = lambda: self.report(0)
+        self.note("power on")
+
+    def answer(self, frame: bytes) -> bytes:
+        """Return the frame as it leaves the slave."""
+        answered = self.esc.answer(frame)
+        if self._outputs_came:
+            self._outputs_came = False
+            self.pass_cycle()
+        return answered
+
+    def pass_cycle(self) -> None:
+        """The host has sent its outputs; whether they were heard or not, in stepped time it is one period later."""
+        self.cycled = True
+        if self.stepped and self.period_us:
+            self.advance_us(self.period_us)
+
+    def advance_us(self, duration_us: int) -> None:
+        """The plant, and all that is timed, moves on."""
+        super().advance_us(duration_us)
+        self.esc.pass_time(duration_us)
+
+    # -- the slave controller's other side ---------------------------------------------------------------
+
+    def mailbox(self, message: bytes) -> None:
+        """The master has filled the mailbox."""
+        if self.state is not AlState.INIT:
+            self.coe.take(message)
+
+    def outputs(self, data: bytes) -> None:
+        """The master has written the process data outputs; they act in OPERATIONAL."""
+        self._outputs_came = True
+        if self._op_requested:
+            self._enter(AlState.OPERATIONAL)
+        if self.state is not AlState.OPERATIONAL:
+            return
+        for key, value in self.received.unpack(data):
+            setter = self._setters.get(key)
+            if setter is not None:
+                setter(int(value))
+            else:
+                with suppress(SdoAbortedError):      # a value out of range is dropped: a PDO has no way to say no
+                    self.store.write(key, int(value))
+
+    def inputs(self) -> bytes:
+        """Return the process data inputs at this moment."""
+        return self.sent.pack() if self.frozen is None else self.frozen
+
+    def watchdog_expired(self) -> None:
+        """No outputs have come for the time of 0420h."""
+        if self.state is AlState.OPERATIONAL:
+            self.al_error(WATCHDOG)
+
+    def al_control(self, word: int) -> None:
+        """The master has requested a state. An error must be acknowledged first."""
+        if self.esc.word(AL_STATUS) & _ERROR and not word & _ERROR:
+            return
+        self._op_requested = False
+        target = word & 0x0F
+        if code := self._refusal(target):
+            self._tell(code)
+        elif target == AlState.OPERATIONAL and self.state is AlState.SAFE_OPERATIONAL:
+            self._op_requested = True             # with the first valid outputs
+            self._tell(0)
+        else:
+            self._enter(AlState(target))
+
+    def al_error(self, code: int) -> None:
+        """The slave leaves OPERATIONAL by itself, and says why."""
+        if self.state is AlState.OPERATIONAL:
+            self._enter(AlState.SAFE_OPERATIONAL)
+        self._tell(code)
+
+    def restart(self) -> None:
+        """The drive restarts: no torque, INIT."""
+        self.application.power_off()
+        self._enter(AlState.INIT)
+
+    def _configurable(self) -> bool:
+        return self.state is AlState.PRE_OPERATIONAL
+
+    def _refusal(self, target: int) -> int:
+        """The AL status code of a state that can't be entered; 0: it can."""
+        if target == AlState.BOOT or target not in list(AlState):
+            return NO_BOOT if target == AlState.BOOT else UNKNOWN_STATE
+        if target <= self.state:
+            return 0
+        if target != _NEXT[self.state]:
+            return INVALID_CHANGE
+        managers = self.esc.managers
+        if target == AlState.PRE_OPERATIONAL:
+            fits = all(one.enabled and one.mailbox and one.length == MAILBOX for one in managers[:2])
+            return 0 if fits and managers[0].host_writes and not managers[1].host_writes else MAILBOX_WRONG
+        for data, code in ((self.received, OUTPUTS_WRONG), (self.sent, INPUTS_WRONG)):
+            one = managers[data.manager]
+            fits = not one.mailbox and one.host_writes is data.outputs and one.length == data.size
+            if one.enabled is not (data.size > 0) or (one.enabled and not fits):
+                return code
+        return 0
+
+    def _enter(self, state: AlState) -> None:
+        before, self.state = self.state, state
+        self._op_requested = False
+        self._tell(0)
+        if state is before:
+            return
+        self.note(f"AL {state.name.lower().replace('_', '-')}")
+        if AlState.INIT in {before, state}:
+            self.esc.clear_mailbox()
+            self.coe.reset()
+        if state is AlState.OPERATIONAL:
+            self.application.warning = False
+        elif before is AlState.OPERATIONAL:
+            self.esc.stop_watchdog()
+            if self.application.energised:         # the reaction of 6007h where torque may flow
+                self.report(HOST_LOST)
+                self.application.warning = True
+                self.application.abort_connection()
+
+    def _tell(self, code: int) -> None:
+        self.esc.set_word(AL_STATUS, self.state | _ERROR * (code > 0))
+        self.esc.set_word(AL_STATUS_CODE, code)
+        if code:
+            self.note(f"AL status code {code:04X}h")
+
+    # -- objects -----------------------------------------------------------------------------------------
+
+    def report(self, code: int) -> None:
+        """An error of the drive in 603Fh, 1001h and an emergency message; 0: none any more."""
+        if code or self.fault_code:
+            self.fault_code, self._register = code, (_GENERIC | _COMMUNICATION) * (code > 0)
+            self.coe.emergency(code, self._register)
+
+    def _bind(self) -> None:
+        store, short, live, hooks = self.store, datatypes.UNSIGNED8, self.store.live, self.store.hooks
+        live[key_of(0x1001)], live[key_of(0x603F)] = lambda: self._register, lambda: self.fault_code
+        added: list[tuple[int, int, int, str, int | str]] = [
+            *((0x1C00, sub, short, "SyncManager type", sub or 4) for sub in (1, 2, 3, 4, 0)),
+            (0x60C2, 1, short, "Interpolation time period", 1),
+            (0x60C2, 2, datatypes.INTEGER8, "Interpolation time index", -3), (0x60C2, 0, short, "Entries", 2),
+            (MARKER_INDEX, 3, datatypes.UNSIGNED32, "Stepped period", 0),
+            (MARKER_INDEX, 5, datatypes.VISIBLE_STRING, "Text", ""),
+        ]
+        for index, sub, data_type, name, value in added:
+            writable = index != 0x1C00 and (index, sub) != (0x60C2, 0)
+            store.add(index, sub, data_type, writable=writable, mappable=False, name=name)
+            store.set_default(index, sub, value)
+        hooks[key_of(MARKER_INDEX, 3)] = lambda value: setattr(self, "period_us", value)
+        store.restore()
+        self.bind_marker(store)

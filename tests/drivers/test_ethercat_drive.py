@@ -1,0 +1,428 @@
+"""What is particular to EtherCAT: working counter, AL states, watchdog registers, PDOs, clocks, the raw datagrams."""
+
+import errno
+import socket
+import struct
+
+import pytest
+
+from drivers.clock import SteppedClock
+from drivers.drive import Outcome, PowerState
+from drivers.errors import CommunicationLost, DriveFault, PreflightRefused
+from drivers.ethercat import raw
+from drivers.ethercat.drive import interpolation
+from drivers.ethercat.quick_stop import EthercatTarget
+from drivers.ethercat.scan import found_slave
+from drivers.ethercat.segment import Segment
+from drivers.quick_stop import Ended, bare_stop
+from profiles import MessageCode
+from profiles.library import load_profile
+from sim_bus.params import FAITHFUL, QUIET, RigParams
+from tests.drivers.drive_benches import LIMITS, Run
+from tests.drivers.ethercat_bench import EthercatBench
+from tests.drivers.fake_soem import FakeMaster, FakeSlave
+
+STILL = RigParams(noise=QUIET, reporting=FAITHFUL)
+
+
+@pytest.fixture
+def bench():
+    return EthercatBench()
+
+
+@pytest.fixture
+def turning(bench):
+    run = Run(bench)
+    run.ready()
+    run.enable()
+    run.go(0.4, speed=1.0)
+    return run
+
+
+def error_of(run, cycles=400):
+    """Return the first error of the following cycles."""
+    for _ in range(cycles):
+        try:
+            run.cycle(speed=1.0)
+        except (CommunicationLost, DriveFault) as error:
+            return error
+    raise AssertionError("no error")
+
+
+def row(found, name):
+    return next(check for check in found.checks if check.name == name)
+
+
+# -- the cycle ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_lost_frame_is_a_cycle_without_feedback(turning):
+    missed = turning.drive.counters.missed
+    for _ in range(10):
+        turning.bench.slave.lost = 1
+        before = turning.samples[-1]
+        lost = turning.cycle(speed=1.0)
+        assert not lost.fresh
+        assert lost.speed_rad_s == before.speed_rad_s
+        assert all(turning.cycle(speed=1.0).fresh for _ in range(9))
+    assert turning.drive.counters.missed == missed + 10
+
+
+def test_a_wrong_working_counter_is_lost_feedback_and_ends_the_run(turning):
+    turning.bench.master.counter = 1
+    assert not turning.cycle(speed=1.0).fresh
+    error = error_of(turning)
+    assert isinstance(error, CommunicationLost)
+    assert "right working counter" in error.what
+
+
+def test_a_slave_that_vanishes_is_reported(turning):
+    turning.bench.slave.dead = True
+    error = error_of(turning)
+    assert (error.entry, "working counter" in error.what) == (MessageCode.FEEDBACK_LOST, True)
+    turning.drive.quick_stop()
+    assert turning.drive.poll() is None                         # it raises nothing: a stop goes on
+
+
+@pytest.mark.parametrize(("state", "code", "entry", "said"), [
+    (4, 0x001A, MessageCode.STATE_LEFT, "SAFE-OP, AL status code 001Ah (synchronization error)"),
+    (4, 0x001B, MessageCode.WATCHDOG_ACTED, "AL status code 001Bh (sync manager watchdog)"),
+    (2, 0x9999, MessageCode.STATE_LEFT, "PRE-OP, AL status code 9999h (see the manual of the drive)"),
+])
+def test_an_al_error_is_told_with_its_code(turning, state, code, entry, said):
+    turning.bench.slave.fall(state, code)
+    error = error_of(turning)
+    assert error.entry is entry
+    assert said in error.what
+
+
+@pytest.mark.parametrize(("state", "entry"), [(4, MessageCode.FOREIGN_MASTER), (1, MessageCode.DRIVE_RESTARTED)])
+def test_an_al_state_without_an_error_is_another_masters(turning, state, entry):
+    turning.bench.slave.number(0x0130, state)
+    assert error_of(turning).entry is entry
+
+
+def test_an_emergency_ends_the_run(turning):
+    turning.bench.slave.emergency(0x4310)
+    error = error_of(turning)
+    assert isinstance(error, DriveFault)
+    assert "4310" in error.what
+
+
+def test_an_emergency_about_an_al_state_adds_nothing(turning):
+    turning.bench.slave.emergency(0xA000)
+    turning.go(0.3, speed=1.0)
+
+
+def test_each_error_is_raised_once_and_the_stop_goes_on(turning):
+    turning.bench.slave.emergency(0x4310)
+    error_of(turning)
+    turning.stop()
+
+
+def test_outside_of_op_the_drive_is_stopped_and_disabled_by_sdo(turning):
+    """It takes no setpoints there, though the working counter is right."""
+    turning.bench.slave.fall(4, 0x001A)
+    error_of(turning)
+    turning.stop()
+    assert turning.bench.slave.state & 0xF == 4
+    assert turning.bench.slave.application.controlword == 0
+
+
+# -- the watchdog ------------------------------------------------------------------------------------------------------
+
+
+def test_the_watchdog_is_armed_and_read_back(bench):
+    run = Run(bench)
+    found = run.ready()
+    assert row(found, "watchdog").found == "500 ms"
+    assert bench.slave.number(0x0420) == 5000                   # of 100 µs, by the divider of 2498
+
+
+def test_a_watchdog_that_was_changed_is_written_back_and_ends_the_run(turning):
+    turning.bench.slave.number(0x0420, 0)
+    error = error_of(turning)
+    assert "registers 0400h, 0420h were 2498, 5000, and are 2498, 0 now" in error.what
+    assert turning.bench.slave.number(0x0420) == 5000
+
+
+def test_a_watchdog_beyond_its_range_is_refused(bench):
+    bench.slave.number(0x0400, 0)                               # 80 ns: at most 5.2 ms
+    bench.drive.connect()
+    found = bench.drive.preflight(LIMITS)
+    assert "its longest time is 0.00524 s" in row(found, "watchdog").found
+    assert found.watchdog_s == 0.0
+
+
+def test_setpoints_that_do_not_trigger_the_watchdog_are_refused(bench):
+    bench.slave.memory[0x0814] &= ~0x40
+    bench.drive.connect()
+    with pytest.raises(PreflightRefused, match="do not trigger the watchdog"):
+        bench.drive.preflight(LIMITS)
+
+
+def test_after_stop_feeding_no_setpoint_is_sent_but_feedback_comes(turning, monkeypatch):
+    monkeypatch.setattr("drivers.ethercat.drive.time.sleep", lambda _: None)
+    turning.bench.heard()
+    turning.drive.stop_feeding()
+    assert turning.go(0.1, speed=1.0).fresh
+    turning.drive.poll()
+    assert [identifier for identifier, _ in turning.bench.heard() if identifier in (2, 3)] == []
+    assert turning.bench.slave.drive.data[0x5FFE, 2] == b"\0"    # the simulated drive goes on in its own time
+
+
+def test_a_poll_never_enables_again(turning):
+    turning.drive.poll()
+    assert turning.drive._bus._setpoints.word == 0x0002
+    assert turning.bench.slave.application.controlword == 0x000F         # nothing was sent by it in stepped time
+
+
+def test_a_quick_stop_that_is_not_executed_stays_in_the_process_data(turning):
+    bus = turning.drive._bus
+    assert bus.disable_setpoints() == 0
+    bus.put(0x6040, 0, (0x0007).to_bytes(2, "little"))
+    bus.receive(0.0, True)
+    sent = [data for identifier, data in turning.bench.slave.heard if identifier == 2]
+    assert sent[-1][:8] == struct.pack("<Hhi", 0x0007, 0, 0)
+
+
+# -- before motion -----------------------------------------------------------------------------------------------------
+
+
+def test_a_slave_whose_sii_and_objects_differ_is_refused(bench):
+    bench.slave.id = 99
+    with pytest.raises(PreflightRefused, match="the SII names vendor 4h and product 63h"):
+        bench.drive.connect()
+
+
+@pytest.mark.parametrize(("slaves", "options", "said"), [
+    (0, {}, "no EtherCAT slave answers"),
+    (1, {"position": 1}, "no slaves are at position 1; 1 answer"),
+    (2, {"alias": 7}, "no slaves are with station alias 7"),
+    (2, {"alias": 5}, "2 slaves are with station alias 5"),
+])
+def test_a_drive_that_is_not_there_is_refused(slaves, options, said):
+    master = FakeMaster(*(FakeSlave(STILL, alias=5) for _ in range(slaves)))
+    with pytest.raises(PreflightRefused, match=said):
+        Segment(master, "fake0", **options)
+
+
+def test_a_drive_is_found_by_its_alias():
+    segment = Segment(FakeMaster(FakeSlave(STILL, alias=5), FakeSlave(STILL, alias=7)), "fake0", alias=7)
+    assert segment.position == 1
+
+
+def test_the_interface_is_closed_once(bench):
+    closed = []
+    bench.master.close = lambda: closed.append(True)
+    bench.segment.close()
+    bench.segment.close()
+    assert closed == [True]
+
+
+def test_a_refused_state_is_told_with_its_code(bench, monkeypatch):
+    write = bench.slave._fpwr
+
+    def refuses(address, data, timeout_us=2000):
+        if address == 0x0120 and data[0] == 8:
+            bench.slave.number(0x0130, 0x14)
+            bench.slave.number(0x0134, 0x0030)
+        else:
+            write(address, data)
+
+    monkeypatch.setattr(bench.slave, "_fpwr", refuses)
+    bench.drive.connect()
+    with pytest.raises(PreflightRefused, match=r"to OP: it shows SAFE-OP, AL status code 0030h \(invalid DC SYNC"):
+        bench.drive.preflight(LIMITS)
+
+
+def with_fixed_pdos(bench, rx, tx):
+    """Let the slave have PDOs of its own content, and the profile name them."""
+    for base, pdos in ((0x1600, rx), (0x1A00, tx)):
+        for number, entries in enumerate(pdos):
+            bench.slave.objects(base + number, 4, entries)
+    profile = load_profile("generic/cia402-ethercat")
+    cyclic = profile.cyclic.model_copy(update={
+        "fixed": True, "rx_pdos": tuple(0x1600 + k for k in range(len(rx))),
+        "tx_pdos": tuple(0x1A00 + k for k in range(len(tx))),
+    })
+    bench.drive._bus._profile = profile.model_copy(update={"cyclic": cyclic})
+
+
+def test_fixed_pdos_are_used_in_their_own_order(bench):
+    with_fixed_pdos(bench, [[0x60FF0020], [0x60600008, 0x00000008, 0x60710010], [0x60400010]],
+                    [[0x60610008, 0x606C0020], [0x60770010], [0x60410010]])
+    run = Run(bench)
+    run.ready()
+    run.enable()
+    last = run.go(3.0, speed=2.0)
+    assert last.speed_rad_s == pytest.approx(2.0, abs=0.05)
+    assert last.state is PowerState.ENABLED
+
+
+def test_fixed_pdos_without_an_object_that_is_needed_are_refused(bench):
+    with_fixed_pdos(bench, [[0x60400010, 0x60FF0020, 0x60600008]], [[0x60410010, 0x606C0020, 0x60610008]])
+    bench.drive.connect()
+    check = row(bench.drive.preflight(LIMITS), "PDO mapping")
+    assert check.outcome is Outcome.REFUSED
+    assert "do not carry 6071h, 6077h" in check.found
+
+
+@pytest.mark.parametrize(("period_s", "wanted"), [
+    (0.001, (1, -3)), (0.004, (4, -3)), (0.05, (50, -3)), (0.00125, (125, -5)), (0.0005, (5, -4)),
+])
+def test_the_period_of_the_setpoints(period_s, wanted):
+    assert interpolation(period_s) == wanted
+
+
+def test_another_rate_is_set_in_pre_op(bench):
+    run = Run(bench)
+    run.ready()
+    run.drive.set_rate(125.0)
+    assert (bench.settings(((0x60C2, 1),)), bench.slave.state) == ({"60C2h:1": 8}, 8)
+
+
+# -- distributed clocks ------------------------------------------------------------------------------------------------
+
+
+class DriftingClock(SteppedClock):
+    """Control time that is no stepped time, for a loop that is never late."""
+
+    stepped = False
+
+
+def test_the_cycle_follows_the_clock_of_the_segment():
+    clock = DriftingClock()
+    bench = EthercatBench(clock=clock, clocks=True, rate_hz=250.0)
+    bench.slave.dc_sync = lambda *asked: bench.slave.sync0.append(asked)
+    type(bench.master).dc_time = property(lambda self: round(clock.now_s() * (1.0 + 200e-6) * 1e9) + 900_000)
+    try:
+        run = Run(bench)
+        run.ready()
+        assert bench.slave.sync0 == [(True, 4_000_000)]
+        run.go(12.0)                                             # 2.4 ms of drift
+        assert bench.master.dc_time % 4_000_000 == pytest.approx(2_000_000, abs=100_000)
+        run.drive.close()
+        assert bench.slave.sync0[-1] == (False, 0)
+    finally:
+        type(bench.master).dc_time = 0
+
+
+# -- the bare stop, and the scan ---------------------------------------------------------------------------------------
+
+
+def test_a_bare_stop_keeps_the_al_state(turning, monkeypatch):
+    slave, clock = turning.bench.slave, SteppedClock()
+    target = EthercatTarget(turning.bench.segment.station, load_profile("generic/cia402-ethercat"), clock,
+                            lambda: None)
+
+    def wait_until(time_s):
+        slave.advance(max(0.0, time_s - clock.now_s()))
+        return SteppedClock.wait_until(clock, time_s)
+
+    monkeypatch.setattr(clock, "wait_until", wait_until)
+    report = bare_stop(target, clock)
+    assert report.ended is Ended.AT_REST
+    assert abs(turning.bench.true_speed_rad_s) < 0.01
+    assert slave.state == 8
+
+
+def test_a_stop_that_is_reversed_takes_the_drive_out_of_op(turning):
+    target = EthercatTarget(turning.bench.segment.station, load_profile("generic/cia402-ethercat"), SteppedClock(),
+                            lambda: None)
+    target.enforce(5)
+    assert turning.bench.slave.state == 8
+    target.enforce(6)
+    assert turning.bench.slave.state == 4
+    assert "was put into SAFE-OP" in target.remarks()[0]
+
+
+def test_a_scan_reads_what_a_slave_says_of_itself(bench):
+    found = found_slave(0, bench.segment.station)
+    assert (found.identity, found.title, found.simulated) == ((4, 4, 3, 4), "objects behind a mailbox", True)
+    assert found_slave(0, bench.segment.station, driven=True).device_type is None      # its mailbox is its master's
+    bench.slave.number(0x0130, 1)
+    assert found_slave(0, bench.segment.station).device_type is None
+
+
+# -- raw datagrams -----------------------------------------------------------------------------------------------------
+
+
+class Wire:
+    """A socket on which one slave answers, or nothing does."""
+
+    def __init__(self, status=8, answers=True):
+        self.status, self.answers, self.came = status, answers, []
+
+    def bind(self, address):
+        self.bound = address
+
+    def send(self, frame):
+        assert frame[12:14] == b"\x88\xa4"
+        assert len(frame) >= 60
+        if self.answers:
+            back = bytearray(frame)
+            size = struct.unpack_from("<H", frame, 22)[0] & 0x7FF
+            if frame[16] != 2:
+                back[26 : 26 + size] = self.status.to_bytes(2, "little").ljust(size, b"\0")
+            back[26 + size] = 1
+            self.came += [bytes(60), bytes(back)]                # another master's frame comes first
+
+    def settimeout(self, seconds):
+        pass
+
+    def recv(self, size):
+        if not self.came:
+            raise TimeoutError
+        return self.came.pop(0)
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def wired(monkeypatch):
+    def make(**options):
+        wire = Wire(**options)
+        monkeypatch.setattr(raw.socket, "socket", lambda *_: wire)
+        monkeypatch.setattr(raw, "ANSWER_S", 0.001)
+        return raw.RawSegment("eth9")
+
+    return make
+
+
+@pytest.mark.parametrize(("status", "driven"), [(8, True), (4, False), (0x14, False), (2, False), (1, False)])
+def test_a_segment_that_another_master_drives_is_refused(wired, status, driven):
+    segment = wired(status=status)
+    assert segment.count() == 1
+    if driven:
+        with pytest.raises(PreflightRefused, match="another master drives this segment"):
+            raw.refuse_driven(segment)
+    else:
+        raw.refuse_driven(segment)
+
+
+def test_a_segment_without_slaves(wired):
+    segment = wired(answers=False)
+    assert segment.count() == 0
+    with pytest.raises(CommunicationLost, match="no frame comes back"):
+        raw.RawStation(segment, 0).al_status()
+
+
+@pytest.mark.parametrize(("error", "said"), [
+    (PermissionError(errno.EPERM, "not permitted"), "setcap"), (OSError(errno.ENODEV, "No such device"), "ip"),
+])
+def test_an_interface_that_cannot_be_opened(monkeypatch, error, said):
+    def refuses(*_):
+        raise error
+
+    monkeypatch.setattr(raw.socket, "socket", refuses)
+    with pytest.raises(PreflightRefused) as caught:
+        raw.RawSegment("eth9")
+    assert said in caught.value.next_step
+
+
+def test_a_system_without_raw_sockets(monkeypatch):
+    monkeypatch.delattr(socket, "AF_PACKET")
+    with pytest.raises(PreflightRefused, match="no raw sockets"):
+        raw.RawSegment("eth9")
