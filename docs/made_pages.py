@@ -160,8 +160,8 @@ MEANING = {
         "Look for another copy of the file.",
     ),
     11: (
-        "`tdhil tune`: the requested gains would make the string oscillate",
-        "Request a smaller `--a` or `--compensate`.",
+        "`tdhil tune`: no gains keep the margins, or the requested ones would oscillate",
+        "Request a smaller `--a` or `--compensate`, or a lower `--bandwidth`.",
     ),
     12: (
         "a rehearsed fault (`--fault`) did not cause the reaction that the fault table requires, or an identified "

@@ -157,6 +157,26 @@ class MessageCode(Enum):
         50, "Warning about the torque calibration",
         "The torque calibration does not fit this run, or was not applied.",
         "Calibrate the torque again with this drive, or leave the calibration out.")
+    LOOP_BEYOND_RESPONSE = (
+        55, "The tuned loop is faster than the measured frequency response",
+        "The bandwidth lies above the highest excited frequency, where a resonance would not have been seen.",
+        "Identify with a higher --frequency, or request a lower --bandwidth.")
+    LOOP_LAGS_ASSUMED = (
+        56, "The lags of the speed loop are assumed",
+        "The speed filter, the torque loop and the dead time were neither measured nor stated.",
+        "Measure them with tdhil identify --impedance, or state them with --inner-lags and --dead-time.")
+    LOOP_ONE_MODE_ONLY = (
+        57, "Only the lowest mode of the string is in the loop",
+        "The shaft is a distributed string, and the loop is tuned for its lowest mode.",
+        "Use tdhil tune soft-torque for the string.")
+    LOOP_UNLIKE_RESPONSE = (
+        58, "The measured response differs from the shaft that was tuned for",
+        "At some lines, shaft and model differ by more than the intervals explain.",
+        "Compare the lines with tdhil frf, and test the gains at a low bandwidth first.")
+    PRESENT_GAINS_THIN = (
+        59, "The present gains have thin margins",
+        "In the worst case, the gains in the drive keep less margin than requested.",
+        "Lower the present gains, or type in the tuned ones.")
 
     # --- 1xx: internal error -----------------------------------------------------------------------------------------
     INTERNAL_ERROR = (

@@ -20,6 +20,7 @@
     │   ├── LogRefused              too little space to begin with; nothing moved                4
     │   └── NothingRecoverable      not one message of the file can be read                     10
     ├── TuningRefused               `tdhil tune`: such gains would make the string swing        11
+    ├── LoopTuningRefused           `tdhil tune speed`: no gains keep the margins               11
     └── Interrupted                 Ctrl-C (130); SIGTERM, SIGHUP, SIGQUIT, SIGTSTP (143); signal n (128 + n)
 
 Codes 3 (partial result) and 9 (not identifiable, model rejected) belong to results, which are no errors; a log that

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(namespace: argparse.Namespace) -> int:
     """Read the three files, then run like every run."""
     from tdhil.cli.identify import run_with
-    from tdhil.cli.tune import read_result
+    from tdhil.cli.tune_inputs import read_result
     from tdhil.session import evaluation_case, load_tuning
     from tdhil.soft_torque import load_string
 

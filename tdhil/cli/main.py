@@ -55,7 +55,7 @@ _GROUPS: Final = {
         "calibrate": "compute the scale of torque or speed from known quantities",
     },
     "what J is for": {
-        "tune": "compute a speed controller that damps the drill string",
+        "tune": "compute gains: of the speed loop, or against stick-slip",
         "evaluate": "test a tuned controller on the drive with a virtual string",
         "severity": "show stick-slip in a record of ordinary drilling",
     },

@@ -24,6 +24,8 @@ class CommandParser(argparse.ArgumentParser):
     def __init__(self, *args: Any, **words: Any) -> None:
         super().__init__(*args, **words)
         self._rare: list[argparse.Action] = []
+        self.usual_action = ""
+        """Action of a command with several, for a command line that names none."""
 
     def set_rare(self, rare: list[argparse.Action]) -> None:
         """Hide these options from ``--help``, and add ``--help-all``."""
@@ -57,10 +59,18 @@ class CommandParser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
         """Refuse an unknown option where the options are known: argparse leaves it to the outermost parser."""
-        found, unknown = super().parse_known_args(args, namespace)
+        found, unknown = super().parse_known_args(self._with_action(args), namespace)
         if unknown:
             raise self._unknown(unknown)
         return found, unknown
+
+    def _with_action(self, args: Any) -> Any:
+        """Return the words with the usual action before them, if the first word is no action and asks for no help."""
+        if not self.usual_action or args is None:
+            return args
+        actions = next(one for one in self._actions if isinstance(one, argparse._SubParsersAction))
+        known = {*actions.choices, "-h", "--help", HELP_ALL}
+        return args if args and args[0] in known else [self.usual_action, *args]
 
     def _unknown(self, words: list[str]) -> UsageError:
         from tdhil.cli.arguments import meant

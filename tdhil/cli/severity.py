@@ -42,7 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """Read, assess, print."""
-    from tdhil.cli.tune import read_result, string_for
+    from tdhil.cli.tune_inputs import read_result
+    from tdhil.cli.tune_soft_torque import string_for
     from tdhil.report import (
         PlainConsole,
         check_report_path,

@@ -51,6 +51,11 @@ if TYPE_CHECKING:
         write_severity_report as write_severity_report,
     )
     from tdhil.report.operator_map import map_document as map_document
+    from tdhil.report.speed_loop import (
+        LoopTunedFor as LoopTunedFor, check_picture_path as check_picture_path, loop_document as loop_document,
+        print_loop_tuning as print_loop_tuning, save_loop_picture as save_loop_picture,
+        write_loop_report as write_loop_report,
+    )
     from tdhil.report.schedule import schedule_document as schedule_document
     from tdhil.report.tuning import (
         TunedFor as TunedFor, print_tuning as print_tuning, showcase_of as showcase_of,
@@ -75,6 +80,8 @@ else:
         "operator_map": "map_document",
         "severity": "print_severity severity_document write_severity_report",
         "schedule": "schedule_document",
+        "speed_loop": "LoopTunedFor check_picture_path loop_document print_loop_tuning save_loop_picture "
+                      "write_loop_report",
         "tuning": "TunedFor print_tuning showcase_of tuning_document write_tuning_report",
         "factor_calibration": "known_pipe_document pairs_document print_factor reference_document write_factor_report",
     })

@@ -121,7 +121,7 @@ def result_document(
     if found.paper is not None:
         document["paper"] = asdict(found.paper.stepped) | {"raw_rate": asdict(found.paper.raw_rate)}
     document["acceptance"] = acceptance_of(expectations_in(run), document)
-    cleaned = _finite(document)
+    cleaned = only_finite(document)
     assert isinstance(cleaned, dict)
     return cleaned
 
@@ -242,11 +242,12 @@ def _estimate(estimate: Any) -> dict[str, float] | None:
     return None if estimate is None else asdict(estimate)
 
 
-def _finite(value: Any) -> Any:
+def only_finite(value: Any) -> Any:
+    """Return plain data with null for each number that JSON does not know."""
     if isinstance(value, dict):
-        return {key: _finite(part) for key, part in value.items()}
+        return {key: only_finite(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(part) for part in value]
+        return [only_finite(part) for part in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 SAME_STRING = 1e-6
 _CONFIDENCE = 0.95        # of the interval of the torque ratio
-_TUNE_AGAIN = "tdhil tune result.json --string string.yaml --json > tune.json"
+_TUNE_AGAIN = "tdhil tune soft-torque result.json --string string.yaml --json > tune.json"
 
 
 def load_document(path: Path, wanted: str, keys: frozenset[str], next_step: str) -> Mapping[str, Any]:

@@ -369,7 +369,7 @@ def test_a_missing_string_is_told_before_the_log_is_identified(tmp_path, monkeyp
     """Identifying a log again takes seconds: the files are checked first."""
     log = tmp_path / "run.mcap"
     log.write_bytes(b"\x89MCAP0\r\n")
-    monkeypatch.setattr("tdhil.cli.tune.read_result", lambda path: pytest.fail("the result was read first"))
+    monkeypatch.setattr("tdhil.cli.tune_soft_torque.read_result", lambda path: pytest.fail("the result was read first"))
     assert main(["tune", str(log), "--string", str(tmp_path / "nosuch.yaml")]) == ExitCode.USAGE
     assert "nosuch.yaml" in capsys.readouterr().err
 
@@ -385,7 +385,7 @@ def test_at_a_terminal_each_step_moves_until_the_next():
     """Tuning takes a minute: elsewhere each step is a line, at a terminal the present one also has a moving sign."""
     from rich.console import Console
 
-    from tdhil.cli.tune import _progress
+    from tdhil.cli.tune_soft_torque import _progress
 
     for terminal in (True, False):
         out = io.StringIO()
@@ -393,3 +393,17 @@ def test_at_a_terminal_each_step_moves_until_the_next():
             tell("string's modes [1/2]")
         assert "tune: string's modes [1/2] …" in out.getvalue()
         assert ("\x1b[?25l" in out.getvalue()) is terminal          # the cursor is hidden while it moves
+
+
+def test_the_old_call_means_soft_torque(tmp_path, capsys):
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(result(verdict="model_rejected")), encoding="utf-8")
+    said = []
+    for words in (["tune"], ["tune", "soft-torque"]):
+        assert main([*words, str(path), "--string", str(STRING_YAML)]) == 11
+        said.append(capsys.readouterr().err)
+    assert said[0] == said[1] and "no J to tune for" in said[0]
+    assert main(["tune", "--string", str(STRING_YAML), str(path)]) == 11      # options first, as before
+    with pytest.raises(SystemExit):
+        main(["tune", "--help"])
+    assert "speed|soft-torque" in capsys.readouterr().out

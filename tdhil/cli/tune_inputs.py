@@ -1,0 +1,119 @@
+"""Files that `tdhil tune` reads: a result, and a measurement of the drive's own impedance."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from math import sqrt
+from pathlib import Path
+from typing import Any
+
+from tdhil.errors import MessageCode, UsageError
+
+
+def require_result(path: Path) -> None:
+    """Raise UsageError if there is no such file."""
+    if not path.is_file():
+        raise UsageError("this file does not exist", where=str(path),
+                         next_step="Name a result.json of tdhil identify --json, or a run.mcap",
+                         entry=MessageCode.FILE_NOT_FOUND)
+
+
+def read_result(path: Path) -> Mapping[str, Any]:
+    """Return the result's document, from --json or identified again from the log."""
+    from tdhil.session import is_log
+
+    require_result(path)
+    if is_log(path):
+        from tdhil.api import identify, read
+
+        return identify(read(path)).document
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"is neither a log nor JSON ({str(error)[:80]})", where=str(path),
+                         next_step="Name a result.json of tdhil identify --json, or a run.mcap",
+                         entry=MessageCode.WRONG_KIND_OF_FILE) from None
+    if not isinstance(document, dict) or not {"inertia_kg_m2", "gear_ratio", "verdict"} <= document.keys():
+        raise UsageError("is JSON, but not a result of tdhil identify", where=str(path),
+                         next_step="Write one with: tdhil identify --json > result.json",
+                         entry=MessageCode.WRONG_KIND_OF_FILE)
+    return document
+
+
+def read_impedance(path: Path, result: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the section `impedance` of a result for the same shaft. Raises UsageError and TuningRefused."""
+    from tdhil.soft_torque import TuningRefused
+
+    document = read_result(path)
+    found = document.get("impedance")
+    if not isinstance(found, dict):
+        raise UsageError("this run did not measure the drive's own impedance", where=f"--impedance {path}",
+                         next_step="tdhil identify --impedance offset … --json > z.json",
+                         entry=MessageCode.WRONG_KIND_OF_FILE)
+    if found.get("verdict") != "valid":
+        raise TuningRefused(f"the drive's own impedance is {found.get('verdict')}: {found.get('reason')}",
+                            where=f"--impedance {path}", next_step=str(found.get("advice", "")))
+    if document["gear_ratio"] != result["gear_ratio"]:
+        raise UsageError(f"was measured with a gear ratio of {document['gear_ratio']:g}, and J with "
+                         f"{result['gear_ratio']:g}", where=f"--impedance {path}", entry=MessageCode.WRONG_KIND_OF_FILE)
+    for key in ("gain_nm_s_rad", "integral_nm_rad", "torque_lag_s", "speed_filter_s"):
+        if not isinstance(found.get(key), dict) or not is_number(found[key].get("value")):
+            raise UsageError(f"{key} is not a number", where=f"--impedance {path}",
+                             entry=MessageCode.WRONG_KIND_OF_FILE)
+    return found
+
+
+def measured_lags(measured: Mapping[str, Any]) -> tuple[list[float], list[list[float]]]:
+    """Return the lags of speed and torque, and the main axes of their 95 % coverage region.
+
+    Their sum is known better than each: its half-width gives their correlation.
+    """
+    import numpy as np
+
+    keys = ("speed_filter_s", "torque_lag_s")
+    values = [ends_of(measured[key])[1] for key in keys]
+    halves = [ends_of(measured[key])[2] - value for key, value in zip(keys, values, strict=True)]
+    both = halves[0] * halves[1]
+    together = 0.0
+    if isinstance(measured.get("inner_lag_s"), dict):
+        _, value, high = ends_of(measured["inner_lag_s"])
+        together = min(both, max(-both, 0.5 * ((high - value) ** 2 - halves[0] ** 2 - halves[1] ** 2)))
+    sizes, axes = np.linalg.eigh(np.array([[halves[0] ** 2, together], [together, halves[1] ** 2]]))
+    return values, [(sqrt(max(0.0, size)) * axis).tolist() for size, axis in zip(sizes, axes.T, strict=True)]
+
+
+def bounded_estimate(part: Any) -> tuple[float, float, float] | None:
+    """Return (low, value, high) of an estimate that is bounded and positive."""
+    if not isinstance(part, dict) or not all(is_number(part.get(key)) for key in ("low", "value", "high")):
+        return None
+    low, value, high = (float(part[key]) for key in ("low", "value", "high"))
+    return (low, value, high) if 0.0 < low <= value <= high else None
+
+
+def ends_of(part: Mapping[str, Any], times: float = 1.0) -> tuple[float, float, float]:
+    """Return (low, value, high), none below 0; a missing end is the value."""
+    value = max(0.0, float(part["value"]))
+    low, high = (float(part[key]) if is_number(part.get(key)) else value for key in ("low", "high"))
+    return times * max(0.0, min(low, value)), times * value, times * max(high, value)
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value of a JSON document is a number."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def positive_number(result: Mapping[str, Any], key: str, path: Path) -> float:
+    """Return a number of the result in ``path``. Raises UsageError if it is not positive."""
+    value = result[key]
+    if not is_number(value) or value <= 0.0:
+        raise UsageError(f"{key} is not a positive number", where=str(path),
+                         entry=MessageCode.WRONG_KIND_OF_FILE)
+    return float(value)
+
+
+def estimated(result: Mapping[str, Any], key: str) -> float:
+    """Return an estimate; 0 if the result does not have it, or it is negative."""
+    part = result.get(key)
+    value = part.get("value") if isinstance(part, dict) else None
+    return max(0.0, float(value)) if isinstance(value, int | float) else 0.0

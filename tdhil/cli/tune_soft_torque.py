@@ -1,0 +1,456 @@
+"""`tdhil tune soft-torque`: a speed controller that damps the drill string, from a result's J; nothing moves."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from math import sqrt
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from profiles import load_profile
+from profiles.quantities import RPM, TIME, TORQUE
+from tdhil.cli.arguments import add_option, amount, share
+from tdhil.cli.results import print_json
+from tdhil.cli.tune_inputs import (
+    bounded_estimate,
+    ends_of,
+    estimated,
+    is_number,
+    measured_lags,
+    positive_number,
+    read_impedance,
+    read_result,
+    require_result,
+)
+from tdhil.config import OPTION
+from tdhil.errors import ExitCode, MessageCode, UsageError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from profiles import Profile
+    from tdhil.report import TunedFor
+    from tdhil.soft_torque import (
+        DrillString,
+        DriveSetting,
+        Moved,
+        RequiredMargins,
+        SpeedController,
+        TuneCase,
+        Tuning,
+    )
+
+    Ends = tuple[Moved, Moved]
+
+IDENTIFIED = ("inertia_kg_m2", "viscous_nm_s_rad", "coulomb_nm", "speed_lag_s", "torque_lag_s", "gear_ratio")
+"""Keys of the result that `tdhil evaluate` needs."""
+CONTROL_PERIOD_S, DEAD_TIME_PERIODS = 0.002, 10.0
+"""Assumed control period of an inverter's speed loop, s; and the dead-time reserve in such periods."""
+STATED_LAG_TOLERANCE, ASSUMED_LAG_TOLERANCE = 0.1, 0.5
+"""Relative uncertainty of each lag that was not measured."""
+MOST_DEPTHS = 60
+"""Depths of one schedule: each takes some seconds."""
+IDENTIFIED_DRAWS, IDENTIFIED_SEED = 20, 3
+MOST_IMPEDANCE_SPREAD = 0.15
+"""Relative half-width of ζ up to which an identified pipe counts as known."""
+ASSUMED_LAGS_S = (0.020, 0.010, 0.003)
+"""Speed filter, torque loop and sampling of an inverter in vector control, s: typical, not measured."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of tune soft-torque."""
+    parser.add_argument("result", type=Path, metavar="result.json|run.mcap",
+                        help="result of tdhil identify --json, or the log of a run")
+    parser.add_argument("--string", type=Path, metavar="string.yaml",
+                        help="drill string, bottom and bit (reference/string.md); without it, k and J_L of the result "
+                             "are used, for a shaft that was identified as compliant")
+    parser.add_argument("--impedance", type=Path, metavar="z.json|z.mcap",
+                        help="result of identify --impedance: adds the drive's present gains for comparison, and its "
+                        "inner lags")
+    parser.add_argument("--loop", choices=("drive", "bus"), default="drive",
+                        help="place of the speed loop: in the drive (default), or in a host over the bus")
+    parser.add_argument("--inner-lags", type=amount(TIME), nargs="+", metavar="S",
+                        help="time constants inside the drive's speed loop (default 0.02 0.01 0.003, assumed)")
+    parser.add_argument("--present", type=float, nargs=2, metavar=("P", "I"),
+                        help="gains in the drive now, N·m·s/rad and N·m/rad at the motor shaft")
+    parser.add_argument("--phase-margin", type=float, default=60.0, metavar="DEG",
+                        help="phase margin of the stiff controller (default 60)")
+    parser.add_argument("--margins", nargs=3, metavar=("DEG", "DB", "S"),
+                        help="phase margin, gain margin and dead-time reserve that every sampled machine and string "
+                        "keeps (default 30 6 and ten control periods: 20ms for a loop in the drive)")
+    parser.add_argument("--a", type=float, metavar="A",
+                        help="softness, P = ζ/a (default: the one with the lowest critical speed)")
+    parser.add_argument("--compensate", type=share, metavar="SHARE",
+                        help="share of J to compensate (default: the one with the lowest critical speed)")
+    parser.add_argument("--profile", metavar="NAME",
+                        help="profile of the drive, for its parameters (default: the result's)")
+    parser.add_argument("--rated-torque", type=amount(TORQUE), metavar="NM",
+                        help="rated torque of the motor, for gains in %%")
+    parser.add_argument("--rated-speed", type=amount(RPM), metavar="RPM",
+                        help="rated speed of the motor, for gains in %%")
+    parser.add_argument("--depths", type=depths, metavar="FROM:TO:STEP",
+                        help="gains over the depth of the well, m: the topmost section of string.yaml gets longer, "
+                        "for example 500:6000:250")
+    parser.add_argument("--no-simulation", action="store_true",
+                        help="omit the critical speeds (tdhil evaluate needs them)")
+    add_option(parser, OPTION["json"])
+    parser.add_argument("--report", type=Path, metavar="FILE", help="write a report with pictures: tune.html, or "
+                                                                    "tune.pdf")
+    parser.set_defaults(run=run)
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Read, tune, print."""
+    from tdhil.report import (
+        PlainConsole,
+        check_report_path,
+        map_document,
+        print_tuning,
+        showcase_of,
+        stderr_console,
+        tuning_document,
+        write_tuning_report,
+    )
+    from tdhil.soft_torque import Search, operator_map, tune
+
+    _check(namespace)
+    _check_files(namespace)
+    if namespace.report is not None:
+        check_report_path(namespace.report, namespace.result)
+    told = stderr_console()
+    with _progress(told, "reading the result"):          # a log is identified again, which takes seconds
+        result = read_result(namespace.result)
+    case, lags_from = case_of(result, namespace)
+    name = namespace.profile or (result.get("profile") or {}).get("name")
+    profile = load_profile(str(name)) if name is not None else None
+    with _progress(told, "tuning") as tell:
+        tuning = tune(case, None if namespace.no_simulation else Search(), tell)
+        tuned_for = _tuned_for(result, namespace, tuning, lags_from, profile)
+        document = tuning_document(tuning, tuned_for)
+        if namespace.depths is not None:
+            document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, profile, tell)
+        if namespace.report is not None:
+            tell("the operator's map: set speed and bit torque")
+            found = operator_map(tuning)
+            document["map"] = None if found is None else map_document(found)
+    if namespace.json:
+        print_json(document)
+        if namespace.no_simulation:
+            told.print("tune: tdhil evaluate does not accept this file: --no-simulation omits the critical speeds",
+                       style="yellow", markup=False, soft_wrap=True)
+    else:
+        print_tuning(document, PlainConsole())
+    if namespace.report is not None:
+        written = write_tuning_report(document, showcase_of(tuning), namespace.report)
+        told.print(f"report: {written}", markup=False, soft_wrap=True)
+    return int(ExitCode.OK)
+
+
+@contextmanager
+def _progress(told: Console, text: str) -> Iterator[Callable[[str], None]]:
+    """Yield what tells each step, a line each; at a terminal the present step also has a moving sign."""
+    def line(step: str) -> None:
+        told.print(f"tune: {step} …", style="dim", markup=False)
+
+    if not told.is_terminal:
+        yield line
+        return
+    from rich.markup import escape
+
+    with told.status(escape(f"tune: {text} …")) as status:
+        def step(what: str) -> None:
+            line(what)
+            status.update(escape(f"tune: {what} …"))
+
+        yield step
+
+
+def _check(namespace: argparse.Namespace) -> None:
+    for name, low, high, wanted in (
+        ("phase_margin", 20.0, 85.0, "from 20 to 85 degrees"),
+        ("a", 0.01, 10.0, "from 0.01 to 10"),
+        ("compensate", 0.0, 1.0, "a share from 0 to 1"),
+        ("rated_torque", 1e-6, 1e9, "a positive number of N·m"),
+        ("rated_speed", 1e-3, 1e6, "a positive number of rpm"),
+    ):
+        value = getattr(namespace, name)
+        if value is not None and not low <= value <= high:
+            raise UsageError(f"{value:g}: must be {wanted}", where=f"--{name.replace('_', '-')}",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
+    for value in namespace.present or ():
+        if not 0.0 < value < 1e9:
+            raise UsageError(f"{value:g}: must be a positive number", where="--present",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
+    if namespace.present is not None and namespace.impedance is not None:
+        raise UsageError("--present and --impedance both state the present gains", where="--present",
+                         next_step="Leave one of them out", entry=MessageCode.VALUE_NOT_ALLOWED)
+    if namespace.depths is not None and namespace.string is None:
+        raise UsageError("--depths needs the string: its topmost section gets longer", where="--depths",
+                         next_step="--string string.yaml", entry=MessageCode.STRING_MISSING)
+    for lag in namespace.inner_lags or ():
+        if not 0.0 <= lag <= 5.0:
+            raise UsageError(f"{lag:g}: must be a time from 0 to 5 s", where="--inner-lags",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
+
+
+def _check_files(namespace: argparse.Namespace) -> None:
+    """Check every file that the command names before any of them is worked with. Raises UsageError, DataFileError."""
+    from tdhil.soft_torque import load_string
+
+    require_result(namespace.result)
+    if namespace.string is not None:
+        load_string(namespace.string)
+    if namespace.impedance is not None:
+        require_result(namespace.impedance)
+
+
+def depths(text: str) -> tuple[float, ...]:
+    """Return the depths of FROM:TO:STEP in m, both ends included."""
+    try:
+        begin, end, step = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text[:40]}: is not FROM:TO:STEP, for example 500:6000:250") from None
+    if not (0.0 < begin < end <= 20_000.0 and 0.0 < step <= end - begin):
+        raise argparse.ArgumentTypeError(f"{text[:40]}: FROM must be below TO, both up to 20000 m, and STEP not larger "
+                                         "than their difference")
+    found = [begin]
+    while found[-1] + step < end - 1e-9:
+        found.append(found[-1] + step)
+    if len(found) + 1 > MOST_DEPTHS:
+        raise argparse.ArgumentTypeError(f"{text[:40]}: has {len(found) + 1} depths; at most {MOST_DEPTHS}")
+    return (*found, end)
+
+
+def _schedule(
+    case: TuneCase, namespace: argparse.Namespace, ratio: float, profile: Profile | None, tell: Callable[[str], None]
+) -> dict[str, Any]:
+    """Return gains over depth: soft ones, which any drive takes, or compensated ones if --compensate asks for them."""
+    from tdhil.report import schedule_document
+    from tdhil.soft_torque import at_depth, drive_settings, schedule
+
+    try:
+        at_depth(case.string, namespace.depths[0])
+    except ValueError as error:
+        raise UsageError(str(error), where="--depths", next_step="Begin deeper than that",
+                         entry=MessageCode.VALUE_NOT_ALLOWED) from None
+    found = schedule(case, namespace.depths, "compensated" if namespace.compensate else "soft",
+                     simulated=not namespace.no_simulation, told=tell)
+    parameters = profile.speed_controller if profile is not None and namespace.loop == "drive" else None
+
+    def settings(law: SpeedController) -> Sequence[DriveSetting]:
+        if parameters is None:
+            return ()
+        return drive_settings(parameters, law, namespace.rated_torque, namespace.rated_speed)
+
+    return schedule_document(found, ratio, settings)
+
+
+def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[TuneCase, str]:
+    """Return the case at the main shaft, and the source of the lags. Raises TuningRefused without J."""
+    from tdhil.soft_torque import Interval, SpeedController, TopDrive, TuneCase, TuningRefused
+
+    measured = None if namespace.impedance is None else read_impedance(namespace.impedance, result)
+    inertia = result["inertia_kg_m2"]
+    stands = result["verdict"] in ("valid", "valid_wide") and isinstance(inertia, dict)
+    if not stands or not all(is_number(inertia.get(key)) for key in ("value", "low_total", "high_total")):
+        raise TuningRefused(
+            f"the result has no J to tune for ({result['verdict']})", where=str(namespace.result),
+            next_step="Identify again with a motion that identifies J" if not result.get("impedance") else
+            "It is from a measurement of the drive's own impedance: name a result with J, and this one with "
+            f"--impedance {namespace.result}", entry=MessageCode.NO_INERTIA_TO_TUNE)
+    square = positive_number(result, "gear_ratio", namespace.result) ** 2
+    low, value, high = (square * float(inertia[key]) for key in ("low_total", "value", "high_total"))
+    if not 0.0 < low <= value <= high:
+        raise TuningRefused("the interval of J reaches down to zero", where=str(namespace.result),
+                            next_step="Identify again, for longer", entry=MessageCode.NO_INERTIA_TO_TUNE)
+    string, of_string, drawn = string_for(result, namespace, square**0.5)
+    lags, of_lags, lags_from = _lags(result, namespace, measured)
+    drive = TopDrive(value, square * estimated(result, "viscous_nm_s_rad"),
+                     square**0.5 * estimated(result, "coulomb_nm"), lags)
+    present, of_present = (None, ()) if measured is None else _present(measured, square)
+    if namespace.present is not None:
+        present = SpeedController(square * namespace.present[0], square * namespace.present[1])
+    case = TuneCase(string, drive, Interval(value, low, high), namespace.phase_margin, namespace.a,
+                    namespace.compensate, present, (*of_string, *of_lags, *of_present),
+                    required=_required(result, namespace), string_draws=drawn,
+                    lag_tolerance=STATED_LAG_TOLERANCE if namespace.inner_lags else ASSUMED_LAG_TOLERANCE)
+    return case, lags_from
+
+
+def _required(result: Mapping[str, Any], namespace: argparse.Namespace) -> RequiredMargins:
+    """Return the requested margins, or the usual ones: ten control periods of dead time."""
+    from tdhil.soft_torque import RequiredMargins
+
+    if namespace.margins is not None:
+        try:
+            degrees, decibels = (float(one) for one in namespace.margins[:2])
+            seconds = amount(TIME)(namespace.margins[2])
+        except (ValueError, argparse.ArgumentTypeError) as error:
+            raise UsageError(str(error), where="--margins", next_step="For example --margins 30 6 20ms",
+                             entry=MessageCode.VALUE_NOT_ALLOWED) from None
+        if not (0.0 <= degrees <= 90.0 and 0.0 <= decibels <= 40.0 and 0.0 <= seconds <= 10.0):
+            raise UsageError("must be 0 to 90 degrees, 0 to 40 dB and 0 to 10 s", where="--margins",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
+        return RequiredMargins(degrees, decibels, seconds)
+    period: Any = (result.get("cycle") or {}).get("period_s")
+    control_s = float(period) if namespace.loop == "bus" and is_number(period) else CONTROL_PERIOD_S
+    return RequiredMargins(dead_time_s=DEAD_TIME_PERIODS * control_s)
+
+
+def string_for(
+    result: Mapping[str, Any], namespace: argparse.Namespace, ratio: float
+) -> tuple[DrillString, tuple[Ends, ...], tuple[DrillString, ...]]:
+    """Return the string, both ends of the interval of each of its values, and random draws of all of them.
+
+    The string comes from its file. Without one it is identified: a pipe if k, f and J_L together show one, else a
+    spring with a mass.
+    """
+    from tdhil.soft_torque import Moved, identified_string, load_string, spring_and_mass
+
+    if namespace.string is not None:
+        return load_string(namespace.string), (), ()
+    shaft = result.get("compliant") or {}
+    spring, swing = (bounded_estimate(shaft.get(key)) for key in ("stiffness_nm_rad", "antiresonance_hz"))
+    if spring is None or swing is None:
+        why = ("does not determine the spring's stiffness or load" if shaft else "is of a rigid shaft")
+        raise UsageError(f"--string is missing, and the result {why}", where=str(namespace.result),
+                         next_step="--string string.yaml (reference/string.md) describes the pipe and its load",
+                         entry=MessageCode.STRING_MISSING)
+    loss = bounded_estimate(shaft.get("damping_nm_s_rad")) or (0.0, 0.0, 0.0)
+    load = bounded_estimate(shaft.get("load_inertia_kg_m2")) if result.get("model") == "string" else None
+    values = [spring, swing, loss, *([load] if load is not None else [])]
+    name = f"k and J_L as identified ({result.get('model')})"
+
+    def pipe(k: float, hertz: float, damping: float, inertia: float) -> DrillString | None:
+        return identified_string(ratio**2 * k, hertz, ratio**2 * inertia, ratio**2 * damping, name)
+
+    def string(numbers: Sequence[float]) -> DrillString:
+        found = pipe(*numbers) if len(numbers) == 4 else None
+        return found or spring_and_mass(ratio**2 * numbers[0], numbers[1], ratio**2 * numbers[2], name)
+
+    middle = [one[1] for one in values]
+    if load is not None and not _known_pipe(values, pipe):
+        values, middle = values[:3], middle[:3]
+
+    def moved(at: int, end: int) -> DrillString:
+        return string([*middle[:at], values[at][end], *middle[at + 1 :]])
+
+    ends = tuple((Moved(string=moved(at, 0)), Moved(string=moved(at, 2))) for at in range(len(values)))
+    return string(middle), ends, tuple(string(one) for one in _drawn(values))
+
+
+def _drawn(values: Sequence[tuple[float, float, float]]) -> list[list[float]]:
+    """Draws of independent normal estimates: (low, value, high) of each is its 95 % interval."""
+    import numpy as np
+
+    random = np.random.default_rng(IDENTIFIED_SEED)
+    return [[max(1e-12, value + z / 1.96 * (high - value if z > 0.0 else value - low))
+             for (low, value, high), z in zip(values, random.standard_normal(len(values)), strict=True)]
+            for _ in range(IDENTIFIED_DRAWS)]
+
+
+def _known_pipe(
+    values: Sequence[tuple[float, float, float]], pipe: Callable[..., DrillString | None]
+) -> bool:
+    """Return whether every draw of k, f and J_L is a pipe, and all have about the same ζ."""
+    import numpy as np
+
+    found = [pipe(*one) for one in _drawn(values)]
+    known = [one.impedance_nm_s_rad for one in found if one is not None]
+    return len(known) == len(found) and 1.96 * float(np.std(known)) <= MOST_IMPEDANCE_SPREAD * float(np.mean(known))
+
+
+def _present(measured: Mapping[str, Any], square: float) -> tuple[SpeedController, tuple[Ends, ...]]:
+    """Return the present controller of the drive, and both ends of each gain."""
+    from tdhil.soft_torque import Moved, SpeedController
+
+    gain, integral = ((ends_of(measured[key], square)) for key in ("gain_nm_s_rad", "integral_nm_rad"))
+    law = SpeedController(gain[1], integral[1])
+    return law, (
+        (Moved(present=SpeedController(gain[0], integral[1])), Moved(present=SpeedController(gain[2], integral[1]))),
+        (Moved(present=SpeedController(gain[1], integral[0])), Moved(present=SpeedController(gain[1], integral[2]))),
+    )
+
+
+def _lags(
+    result: Mapping[str, Any], namespace: argparse.Namespace, measured: Mapping[str, Any] | None
+) -> tuple[tuple[float, ...], tuple[Ends, ...], str]:
+    """Return the time constants in the loop, both ends of their intervals, and their source."""
+    inner = list(namespace.inner_lags or ASSUMED_LAGS_S)
+    axes: list[list[float]] = []
+    said = "as stated" if namespace.inner_lags else "assumed, not measured"
+    if measured is not None and not namespace.inner_lags:
+        inner, axes = measured_lags(measured)
+        said = "as measured (--impedance)"
+    if namespace.loop == "drive":
+        if not any(inner):
+            raise UsageError("there is no lag in the drive's loop, so nothing limits its gains", where="--inner-lags",
+                             next_step="State the filter of its speed, its torque loop and its sampling",
+                             entry=MessageCode.LAGS_MISSING)
+        return _moved_lags(inner, axes, said)
+    reported = result.get("speed_lag_s")
+    if not isinstance(reported, dict) or not is_number(reported.get("value")):
+        raise UsageError("the result has no lag of the reported speed", where="--loop bus",
+                         next_step="Identify with a multisine, which identifies it", entry=MessageCode.LAGS_MISSING)
+    period: Any = (result.get("cycle") or {}).get("period_s")
+    waiting = 1.5 * float(period) if is_number(period) else 0.0
+    low, late, high = ends_of(reported)
+    # of a measured loop, the speed that the drive itself sees is no part of it
+    rest = [sqrt(sum(axis[k] ** 2 for axis in axes)) for k in range(1, len(inner))] if axes else []
+    others = [[0.0, 0.0, *(half if k == at else 0.0 for k in range(len(rest)))] for at, half in enumerate(rest)]
+    return _moved_lags(
+        [late, waiting, *inner[1:]], [[0.5 * (high - low), 0.0, *(0.0 for _ in inner[1:])], *others],
+        f"the reported speed's lag as identified and a cycle and a half; the rest {said}")
+
+
+def _moved_lags(
+    lags: list[float], axes: list[list[float]], said: str
+) -> tuple[tuple[float, ...], tuple[Ends, ...], str]:
+    from tdhil.soft_torque import Moved
+
+    def at(axis: list[float], sign: float) -> tuple[float, ...]:
+        moved = (lag + sign * one for lag, one in zip(lags, axis, strict=True))
+        return tuple(lag for lag in moved if lag > 0.0)
+
+    ends = tuple((Moved(inner_lags_s=at(axis, -1.0)), Moved(inner_lags_s=at(axis, 1.0))) for axis in axes if any(axis))
+    return at([0.0] * len(lags), 1.0), ends, said
+
+
+def _tuned_for(
+    result: Mapping[str, Any], namespace: argparse.Namespace, tuning: Tuning, lags_from: str, profile: Profile | None
+) -> TunedFor:
+    from tdhil.report import TunedFor
+    from tdhil.soft_torque import drive_settings
+
+    settings: dict[str, tuple[DriveSetting, ...]] = {}
+    warnings = []
+    ratio = float(result["gear_ratio"])
+    if profile is not None and namespace.loop == "drive":
+        parameters = profile.speed_controller
+        for one in tuning.tuned:
+            if one.controller is not None and parameters is not None:
+                at_motor = one.controller.at_shaft(ratio)
+                settings[one.kind] = drive_settings(parameters, at_motor, namespace.rated_torque, namespace.rated_speed)
+        if parameters is not None and parameters.note:
+            warnings.append(f"{profile.name}: {parameters.note}")
+        if any(one.compensated_share for one in tuning.tuned):
+            warnings.append("inertia compensation needs the derivative of the measured speed in the drive; few drives "
+                            "have it, and a feed-forward of the set speed's acceleration is not it")
+    if not namespace.inner_lags and namespace.impedance is None:
+        warnings.append("the lags inside the loop are assumed; they decide how much of J can be compensated: state "
+                        "them with --inner-lags")
+    if namespace.string is None and not tuning.case.string.supposed:
+        warnings.append(f"the pipe is the one that k, f and J_L as identified have in common, ζ = "
+                        f"{tuning.case.string.impedance_nm_s_rad:.4g} N·m·s/rad; name the bit in a string.yaml for "
+                        "critical speeds")
+    elif namespace.string is None:
+        warnings.append("|r|, a and the modes above the lowest one assume a spring with a tenth of the mass of its "
+                        "load and a damping of at least 0.01: describe the pipe in a string.yaml for better values, "
+                        "and the bit for critical speeds")
+    elif tuning.case.string.bit is None:
+        warnings.append("no bit is stated in string.yaml: critical speeds need one")
+    return TunedFor(str(namespace.result), bool(result.get("simulated")),
+                    None if profile is None else profile.name, ratio, namespace.loop, lags_from,
+                    settings, tuple(warnings), {key: result.get(key) for key in IDENTIFIED})

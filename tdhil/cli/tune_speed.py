@@ -1,0 +1,289 @@
+"""`tdhil tune speed`: P, I and a notch for the drive's own speed loop, from a result; numbers only, nothing moves."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from profiles import load_profile
+from profiles.quantities import FREQUENCY, RPM, TIME, TORQUE
+from tdhil.cli.arguments import add_option, amount
+from tdhil.cli.results import print_json
+from tdhil.cli.tune_inputs import (
+    bounded_estimate,
+    ends_of,
+    is_number,
+    positive_number,
+    read_impedance,
+    read_result,
+    require_result,
+)
+from tdhil.config import OPTION
+from tdhil.errors import ExitCode, MessageCode, UsageError
+
+if TYPE_CHECKING:
+    from profiles import Profile
+    from tdhil.report import LoopTunedFor
+    from tdhil.speed_loop import LoopDesign, MeasuredShaft, PiGains, Range, SpeedLoopCase, UncertainPlant
+
+    Lags = tuple[tuple[Range, ...], Range, str]
+
+ASSUMED_LAGS_S = (0.020, 0.010)
+"""Speed filter and torque loop of an inverter in vector control, s: typical, not measured."""
+ASSUMED_DEAD_TIME_S = 0.003
+"""One and a half control periods of 2 ms."""
+STATED_TOLERANCE, ASSUMED_TOLERANCE = 0.1, 0.5
+"""Relative half-width of each lag's interval, as stated and as assumed."""
+_PICTURES = (".png", ".svg", ".pdf")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of tune speed."""
+    parser.add_argument("result", type=Path, metavar="result.json|run.mcap",
+                        help="result of tdhil identify --json, or the log of a run")
+    parser.add_argument("--bandwidth", type=amount(FREQUENCY), metavar="HZ",
+                        help="frequency up to which the speed follows within 3 dB (default: the largest that keeps "
+                        "the margins)")
+    parser.add_argument("--phase-margin", type=float, default=45.0, metavar="DEG",
+                        help="phase margin in the worst case of all intervals (default 45)")
+    parser.add_argument("--gain-margin", type=float, default=8.0, metavar="DB",
+                        help="gain margin in the worst case of all intervals (default 8)")
+    parser.add_argument("--impedance", type=Path, metavar="z.json|z.mcap",
+                        help="result of identify --impedance: the lags of the drive's speed loop and its present gains")
+    parser.add_argument("--inner-lags", type=amount(TIME), nargs="+", metavar="S",
+                        help="time constants inside the drive's speed loop, the speed filter first (default 0.02 "
+                        "0.01, assumed)")
+    parser.add_argument("--dead-time", type=amount(TIME), metavar="S",
+                        help="dead time of sampling and computing (default 0.003, assumed)")
+    parser.add_argument("--present", type=float, nargs=2, metavar=("P", "I"),
+                        help="gains in the drive now, N·m·s/rad and N·m/rad at the motor shaft, for comparison")
+    parser.add_argument("--no-notch", action="store_true", help="use no notch filter; not every drive has one")
+    parser.add_argument("--profile", metavar="NAME",
+                        help="profile of the drive, for its parameters (default: the result's)")
+    parser.add_argument("--rated-torque", type=amount(TORQUE), metavar="NM",
+                        help="rated torque of the motor, for gains in %%")
+    parser.add_argument("--rated-speed", type=amount(RPM), metavar="RPM",
+                        help="rated speed of the motor, for gains in %%")
+    add_option(parser, OPTION["json"])
+    parser.add_argument("--plot", type=Path, metavar="FILE",
+                        help="loop, sensitivity and step response as tune.png, tune.svg or tune.pdf")
+    parser.add_argument("--report", type=Path, metavar="FILE", help="write a report with pictures: tune.html, or "
+                                                                    "tune.pdf")
+    parser.set_defaults(run=run)
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Read, tune, print."""
+    from tdhil.report import (
+        PlainConsole,
+        check_picture_path,
+        check_report_path,
+        loop_document,
+        print_loop_tuning,
+        save_loop_picture,
+        stderr_console,
+        write_loop_report,
+    )
+    from tdhil.speed_loop import design_speed_loop
+
+    _check(namespace)
+    if namespace.report is not None:
+        check_report_path(namespace.report, namespace.result)
+    if namespace.plot is not None:
+        check_picture_path(namespace.plot, namespace.result)
+    result = read_result(namespace.result)       # a log is identified again, which takes seconds
+    measured = None if namespace.impedance is None else read_impedance(namespace.impedance, result)
+    lags, dead_time, lags_from = lags_in(namespace.inner_lags, namespace.dead_time, measured)
+    plant = plant_of(result, lags, dead_time, namespace.result)
+    design = design_speed_loop(_case(namespace, plant, measured))
+    name = namespace.profile or (result.get("profile") or {}).get("name")
+    profile = load_profile(str(name)) if name is not None else None
+    document = loop_document(design, shaft_in(result), _tuned_for(result, namespace, design, lags_from, profile))
+    if namespace.json:
+        print_json(document)
+    else:
+        print_loop_tuning(document, PlainConsole())
+    told = stderr_console()
+    if namespace.plot is not None:
+        save_loop_picture(document, namespace.plot)
+        told.print(f"plot: {namespace.plot}", markup=False, soft_wrap=True)
+    if namespace.report is not None:
+        told.print(f"report: {write_loop_report(document, namespace.report)}", markup=False, soft_wrap=True)
+    return int(ExitCode.OK)
+
+
+def _check(namespace: argparse.Namespace) -> None:
+    """Check the options and that the files exist. Raises UsageError."""
+    for name, low, high, wanted in (
+        ("bandwidth", 1e-4, 1e4, "from 0.0001 to 10000 Hz"),
+        ("phase_margin", 20.0, 80.0, "from 20 to 80 degrees"),
+        ("gain_margin", 3.0, 40.0, "from 3 to 40 dB"),
+        ("dead_time", 0.0, 1.0, "a time from 0 to 1 s"),
+        ("rated_torque", 1e-6, 1e9, "a positive number of N·m"),
+        ("rated_speed", 1e-3, 1e6, "a positive number of rpm"),
+    ):
+        value = getattr(namespace, name)
+        if value is not None and not low <= value <= high:
+            raise UsageError(f"{value:g}: must be {wanted}", where=f"--{name.replace('_', '-')}",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
+    for value in namespace.present or ():
+        if not 0.0 < value < 1e9:
+            raise UsageError(f"{value:g}: must be a positive number", where="--present",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
+    if namespace.impedance is not None and (namespace.present or namespace.inner_lags or namespace.dead_time):
+        raise UsageError("states lags and present gains, and another option states them too", where="--impedance",
+                         next_step="Leave out --present, --inner-lags and --dead-time, or --impedance",
+                         entry=MessageCode.VALUE_NOT_ALLOWED)
+    for lag in namespace.inner_lags or ():
+        if not 0.0 <= lag <= 5.0:
+            raise UsageError(f"{lag:g}: must be a time from 0 to 5 s", where="--inner-lags",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
+    if namespace.plot is not None and namespace.plot.suffix.lower() not in _PICTURES:
+        raise UsageError(f"ends in none of {', '.join(_PICTURES)}", where=f"--plot {namespace.plot}",
+                         next_step="Such as --plot tune.png", entry=MessageCode.VALUE_NOT_ALLOWED)
+    require_result(namespace.result)
+    if namespace.impedance is not None:
+        require_result(namespace.impedance)
+
+
+def lags_in(
+    stated: Sequence[float] | None, dead_time_s: float | None, measured: Mapping[str, Any] | None
+) -> Lags:
+    """Return the lags of the drive's speed loop, its dead time, and their source. Raises UsageError if all are 0."""
+    from tdhil.speed_loop import Range
+
+    def open_by(value: float, tolerance: float) -> Range:
+        return Range(value, value * (1.0 - tolerance), value * (1.0 + tolerance))
+
+    if measured is not None:
+        lags, dead, said = _lags_as_measured(measured), Range(0.0, 0.0, 0.0), "as measured (--impedance)"
+    else:
+        lags = tuple(open_by(lag, STATED_TOLERANCE) for lag in stated or ()) or tuple(
+            open_by(lag, ASSUMED_TOLERANCE) for lag in ASSUMED_LAGS_S)
+        dead = (open_by(ASSUMED_DEAD_TIME_S, ASSUMED_TOLERANCE) if dead_time_s is None
+                else open_by(dead_time_s, STATED_TOLERANCE))
+        said = "assumed, not measured" if not stated else (
+            "as stated" if dead_time_s is not None else "as stated; the dead time is assumed")
+    if not any(lag.value for lag in lags) and not dead.value:
+        raise UsageError("there is no lag in the drive's loop, so nothing limits its gains", where="--inner-lags",
+                         next_step="State the filter of its speed, its torque loop and its sampling",
+                         entry=MessageCode.LAGS_MISSING)
+    return lags, dead, said
+
+
+def _lags_as_measured(measured: Mapping[str, Any]) -> tuple[Range, ...]:
+    """Return speed filter and torque lag. Their sum is known better than each, and it decides the margins."""
+    from tdhil.speed_loop import Range
+
+    ends = [ends_of(measured[key]) for key in ("speed_filter_s", "torque_lag_s")]
+    below, above = (sum(abs(one[end] - one[1]) for one in ends) for end in (0, 2))
+    if isinstance(measured.get("inner_lag_s"), dict):
+        low, value, high = ends_of(measured["inner_lag_s"])
+        shares = [min(1.0, (value - low) / below) if below else 1.0, min(1.0, (high - value) / above) if above else 1.0]
+    else:
+        shares = [1.0, 1.0]
+    return tuple(Range(value, value - shares[0] * (value - low), value + shares[1] * (high - value))
+                 for low, value, high in ends)
+
+
+def plant_of(result: Mapping[str, Any], lags: tuple[Range, ...], dead_time: Range, path: Path) -> UncertainPlant:
+    """Return what the result knows of the loop, at the motor shaft. Raises LoopTuningRefused without J."""
+    from tdhil.speed_loop import LoopTuningRefused, Range, UncertainPlant
+
+    positive_number(result, "gear_ratio", path)
+    inertia = result["inertia_kg_m2"]
+    if (result["verdict"] not in ("valid", "valid_wide") or not isinstance(inertia, dict)
+            or not all(is_number(inertia.get(key)) for key in ("value", "low_total", "high_total"))):
+        raise LoopTuningRefused(f"the result has no J to tune for ({result['verdict']})", where=str(path),
+                                next_step="Identify again with a motion that identifies J",
+                                entry=MessageCode.NO_INERTIA_TO_TUNE)
+    low, value, high = (float(inertia[key]) for key in ("low_total", "value", "high_total"))
+    if not 0.0 < low <= value <= high:
+        raise LoopTuningRefused("the interval of J reaches down to zero", where=str(path),
+                                next_step="Identify again, for longer", entry=MessageCode.NO_INERTIA_TO_TUNE)
+    damping = _range_or_none(result.get("viscous_nm_s_rad")) or Range(0.0, 0.0, 0.0)
+    shaft = result.get("compliant")
+    if not isinstance(shaft, dict):
+        return UncertainPlant(Range(value, low, high), damping, lags, dead_time)
+    swings = [bounded_estimate(shaft.get(key)) for key in ("antiresonance_hz", "resonance_hz")]
+    if swings[0] is None or swings[1] is None:
+        raise LoopTuningRefused("the shaft is compliant, but its antiresonance or resonance is open", where=str(path),
+                                next_step="Identify again with excited frequencies on both sides of the resonance",
+                                entry=MessageCode.NO_INERTIA_TO_TUNE)
+    return UncertainPlant(Range(value, low, high), damping, lags, dead_time, _range(swings[0]), _range(swings[1]),
+                          _range_or_none(shaft.get("damping_nm_s_rad")) or Range(0.0, 0.0, 0.0))
+
+
+def _has_value(part: Any) -> bool:
+    return isinstance(part, dict) and is_number(part.get("value"))
+
+
+def _range_or_none(part: Any) -> Range | None:
+    """Return an estimate, none of it below 0; None if the result does not have it."""
+    return _range(ends_of(part)) if isinstance(part, dict) and _has_value(part) else None
+
+
+def _range(ends: tuple[float, float, float]) -> Range:
+    from tdhil.speed_loop import Range
+
+    low, value, high = ends
+    return Range(value, low, high)
+
+
+def _case(
+    namespace: argparse.Namespace, plant: UncertainPlant, measured: Mapping[str, Any] | None
+) -> SpeedLoopCase:
+    from tdhil.speed_loop import PiGains, SpeedLoopCase
+
+    present: PiGains | None = None
+    if namespace.present is not None:
+        present = PiGains(*namespace.present)
+    elif measured is not None:
+        gain, integral = (ends_of(measured[key])[1] for key in ("gain_nm_s_rad", "integral_nm_rad"))
+        present = PiGains(gain, integral) if gain > 0.0 and integral > 0.0 else None
+    return SpeedLoopCase(plant, namespace.phase_margin, namespace.gain_margin, namespace.bandwidth, present,
+                         not namespace.no_notch)
+
+
+def shaft_in(result: Mapping[str, Any]) -> MeasuredShaft | None:
+    """Return the measured response of the shaft itself; None if the result has no response or no lags."""
+    from tdhil.speed_loop import measured_shaft
+
+    response = result.get("frequency_response")
+    if not isinstance(response, dict) or not all(_has_value(result.get(key)) for key in
+                                                 ("speed_lag_s", "torque_lag_s")):
+        return None
+    hertz, reported, halves = [], [], []
+    for line in response["lines"]:
+        size, phase = line["magnitude"], float(line["phase_rad"]["value"])
+        hertz.append(float(line["hertz"]))
+        reported.append(float(size["value"]) * complex(math.cos(phase), math.sin(phase)))
+        halves.append(math.inf if size["high"] is None else float(size["value"]) / float(size["low"]) - 1.0)
+    skew = result.get("skew_s")
+    return measured_shaft(hertz, reported, halves, float(result["speed_lag_s"]["value"]),
+                          float(result["torque_lag_s"]["value"]),
+                          float(skew["value"]) if isinstance(skew, dict) and _has_value(skew) else 0.0)
+
+
+def _tuned_for(
+    result: Mapping[str, Any], namespace: argparse.Namespace, design: LoopDesign, lags_from: str,
+    profile: Profile | None,
+) -> LoopTunedFor:
+    from tdhil.report import LoopTunedFor
+    from tdhil.soft_torque import SpeedController, drive_settings
+
+    settings = {}
+    warnings = []
+    if profile is not None and profile.speed_controller is not None:
+        for row in design.rows:
+            law = SpeedController(row.gains.gain_nm_s_rad, row.gains.integral_nm_rad)
+            settings[row.kind] = drive_settings(profile.speed_controller, law, namespace.rated_torque,
+                                                namespace.rated_speed)
+        if profile.speed_controller.note:
+            warnings.append(f"{profile.name}: {profile.speed_controller.note}")
+    return LoopTunedFor(str(namespace.result), bool(result.get("simulated")), str(result.get("model")),
+                        None if profile is None else profile.name, float(result["gear_ratio"]), lags_from, settings,
+                        tuple(warnings))

@@ -1,0 +1,476 @@
+"""`tdhil tune speed`'s findings: as a document for machines, on a terminal, as a picture and as a page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich import box
+from rich.table import Table as Grid
+from rich.text import Text as Words
+
+from profiles import CodedText, MessageCode, entry_of, with_code
+from tdhil.errors import UsageError
+from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
+from tdhil.report.card import with_interval
+from tdhil.report.console import PlainConsole, names_and_texts
+from tdhil.report.document import SIMULATED, only_finite
+from tdhil.report.html import write_blocks
+from tdhil.report.page import repeatable_figures, require_extra
+from tdhil.report.schedule import gain_words
+from tdhil.soft_torque import DriveSetting
+from tdhil.speed_loop import (
+    LoopCurve,
+    LoopDesign,
+    LoopRow,
+    MeasuredShaft,
+    deviation_from_model,
+    loop_at_lines,
+    loop_curve,
+)
+from tdhil.version import __version__
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
+Part = Mapping[str, Any]
+
+_COLOURS = {"present": "0.35", "tuned": "#1f5fa8"}
+_PNG_DPI = 150
+"""Dots per inch of a PNG."""
+_SIZE_IN = (7.0, 8.4)
+"""Inches, of a picture with all panels."""
+_STEP_POINTS = 300
+"""Points of a step response in the document."""
+_UNLIKE = 3.0
+"""Half-widths by which a line may differ from the shaft that was tuned for."""
+_UNLIKE_REL = 0.1
+"""Relative difference below which no line is named."""
+_BEYOND_LINES = 1.0
+"""Bandwidth over the highest excited frequency from which a warning follows."""
+_EXPLAINED = {
+    "P, I": "gains at the motor shaft, N·m·s/rad and N·m/rad",
+    "margins": "of the open loop: as believed, and the least over all corners of the intervals",
+    "peak |S|": "greatest factor by which the loop enlarges a disturbance",
+    "bandwidth": "frequency up to which the speed follows the set speed within 3 dB",
+    "step": "small step of the set speed, without torque limit, ramp or setpoint filter; settled within 5 %",
+}
+
+
+@dataclass(frozen=True)
+class LoopTunedFor:
+    """Source of the numbers."""
+
+    source: str
+    """The result or log."""
+    simulated: bool
+    model: str
+    profile: str | None
+    gear_ratio: float
+    lags_from: str
+    settings: Mapping[str, tuple[DriveSetting, ...]] = field(default_factory=dict)
+    """Settings in the drive's own parameters, by the row's kind."""
+    warnings: tuple[str, ...] = ()
+
+
+def loop_document(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: LoopTunedFor) -> dict[str, Any]:
+    """Plain data for `json.dumps`, at the motor shaft; what is infinite is null."""
+    case, plant = design.case, design.case.plant
+    lowest_hz = None if shaft is None else float(shaft.hertz.min())
+    warnings = [*tuned_for.warnings, *_warnings(design, shaft, tuned_for)]
+    document = {
+        "kind": "speed_loop_tuning",
+        "tuned_for": {
+            "source": tuned_for.source, "simulated": tuned_for.simulated, "model": tuned_for.model,
+            "profile": tuned_for.profile, "gear_ratio": tuned_for.gear_ratio,
+        },
+        "plant": {name: None if part is None else [asdict(one) for one in part] if isinstance(part, tuple)
+                  else asdict(part) for name, part in vars(plant).items()} | {
+            "total_inertia_kg_m2": plant.believed.total_inertia_kg_m2, "lags_from": tuned_for.lags_from,
+        },
+        "required": {"phase_deg": case.phase_deg, "gain_db": case.gain_db, "bandwidth_hz": case.bandwidth_hz},
+        "controllers": [_controller(row, design, tuned_for.settings.get(row.kind, ())) for row in design.rows],
+        "bandwidth_without_notch_hz": design.without_notch_hz,
+        "sentence": _sentence(design),
+        "curves": {row.kind: _curves(loop_curve(design, row.gains, lowest_hz)) for row in design.rows},
+        "measured": None if shaft is None else {
+            "hertz": shaft.hertz.tolist(), "half_rel": shaft.half_rel.tolist(),
+            "deviation_rel": deviation_from_model(design, shaft).tolist(),
+            "loops": {row.kind: _points(loop_at_lines(design, row.gains, shaft)) for row in design.rows},
+        },
+        "steps": {row.kind: _step(row) for row in design.rows},
+        "warnings": [str(one) for one in warnings],
+        "warning_codes": [entry_of(one, MessageCode.RESULT_WARNING).code for one in warnings],
+        "tdhil": __version__,
+    }
+    cleaned = only_finite(document)
+    assert isinstance(cleaned, dict)
+    return cleaned
+
+
+def _controller(row: LoopRow, design: LoopDesign, settings: tuple[DriveSetting, ...]) -> dict[str, Any]:
+    gains = row.gains
+    return {
+        "kind": row.kind,
+        "gain_nm_s_rad": gains.gain_nm_s_rad, "integral_nm_rad": gains.integral_nm_rad,
+        "integral_time_s": gains.gain_nm_s_rad / gains.integral_nm_rad,
+        "notch": None if gains.notch is None else asdict(gains.notch),
+        "drive_parameters": [asdict(one) for one in settings],
+        "as_believed": asdict(row.believed), "worst": asdict(row.worst),
+        "failed": list(_failed(row, design)),
+        **{name: asdict(getattr(row, name)) for name in ("bandwidth_hz", "overshoot_share", "rise_s", "settling_s")},
+    }
+
+
+def _failed(row: LoopRow, design: LoopDesign) -> Iterator[str]:
+    """Yield each margin that is thinner than required in the worst case."""
+    worst, case = row.worst, design.case
+    if not worst.stable:
+        yield "unstable in the worst case"
+        return
+    if worst.conditional:
+        yield "unstable with a lower gain, such as at the torque limit"
+    if worst.phase_deg < case.phase_deg:
+        yield f"phase margin {worst.phase_deg:.0f}° (limit {case.phase_deg:g}°)"
+    if worst.gain_db < case.gain_db:
+        yield f"gain margin {worst.gain_db:.1f} dB (limit {case.gain_db:g} dB)"
+
+
+def _warnings(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: LoopTunedFor) -> Iterator[str]:
+    for row in design.rows[:-1]:
+        if failed := list(_failed(row, design)):
+            yield CodedText(f"The present gains have thin margins: {', '.join(failed)}.",
+                            MessageCode.PRESENT_GAINS_THIN)
+    if "assumed" in tuned_for.lags_from:
+        yield CodedText(
+            "The lags of the speed loop are assumed, and they limit its gains. Measure them with tdhil identify "
+            "--impedance, or state --inner-lags and --dead-time.", MessageCode.LOOP_LAGS_ASSUMED)
+    if tuned_for.model.startswith("string"):
+        yield CodedText("The loop has the lowest mode of the string only. Use tdhil tune soft-torque for the string.",
+                        MessageCode.LOOP_ONE_MODE_ONLY)
+    if shaft is None:
+        return
+    highest, bandwidth = float(shaft.hertz.max()), design.tuned.bandwidth_hz.value
+    if bandwidth > _BEYOND_LINES * highest:
+        yield CodedText(
+            f"The bandwidth of {bandwidth:.3g} Hz is above the highest excited frequency of {highest:.3g} Hz. A "
+            "resonance in between was not measured. Identify with a higher --frequency, or request --bandwidth "
+            f"{highest:.2g}.", MessageCode.LOOP_BEYOND_RESPONSE)
+    off = deviation_from_model(design, shaft)
+    unlike = (off > _UNLIKE * shaft.half_rel) & (off > _UNLIKE_REL)
+    if np.any(unlike):
+        at = ", ".join(f"{hertz:.3g}" for hertz in shaft.hertz[unlike])
+        yield CodedText(f"The measured response differs from the shaft that was tuned for at {at} Hz, by up to "
+                        f"{100.0 * float(off[unlike].max()):.0f} %.", MessageCode.LOOP_UNLIKE_RESPONSE)
+
+
+def _sentence(design: LoopDesign) -> str:
+    tuned, case = design.tuned, design.case
+    notch = tuned.gains.notch
+    with_notch = "" if notch is None else f", with a notch at {notch.hertz:.3g} Hz"
+    said = (f"Type in P = {gain_words(tuned.gains.gain_nm_s_rad)} N·m·s/rad and "
+            f"I = {gain_words(tuned.gains.integral_nm_rad)} N·m/rad{with_notch}.")
+    kind = "requested" if case.bandwidth_hz is not None else "largest"
+    said += (f" The {kind} bandwidth is {tuned.bandwidth_hz.value:.3g} Hz, with at least {tuned.worst.phase_deg:.0f}° "
+             f"and {_number(tuned.worst.gain_db, 1)} dB in the worst case.")
+    present = next((row for row in design.rows if row.kind == "present"), None)
+    if present is not None and present.worst.stable:
+        said += f" The present gains have {present.bandwidth_hz.value:.3g} Hz and {present.worst.phase_deg:.0f}°."
+    return said
+
+
+def _curves(curve: LoopCurve) -> dict[str, Any]:
+    names = ("value", "low", "high")
+    return {"hertz": curve.hertz.tolist()} | {
+        name: {end: part.tolist() for end, part in zip(names, getattr(curve, name), strict=True)}
+        for name in ("gain", "phase_deg", "sensitivity")}
+
+
+def _points(loop: np.ndarray[Any, np.dtype[np.complex128]]) -> dict[str, list[float]]:
+    phase = np.degrees(np.angle(loop))
+    phase = np.where(phase > 45.0, phase - 360.0, phase)
+    return {"gain": np.abs(loop).tolist(), "phase_deg": phase.tolist(),
+            "sensitivity": np.abs(1.0 / (1.0 + loop)).tolist()}
+
+
+def _step(row: LoopRow) -> dict[str, list[float]]:
+    """Return the response until twice the settling time, in so many points."""
+    settled = row.settling_s.high
+    end = len(row.time_s) if not math.isfinite(settled) else int(np.searchsorted(row.time_s, 2.0 * settled)) + 1
+    every = max(1, end // _STEP_POINTS)
+    return {name: getattr(row, part)[:end:every].tolist() for name, part in
+            (("time_s", "time_s"), ("value", "speed"), ("low", "lowest"), ("high", "highest"))}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# On a terminal
+
+
+def print_loop_tuning(document: Part, console: PlainConsole) -> None:
+    """Print gains, margins and step response, and what they rest on. 80 columns do."""
+    simulated = f" · {SIMULATED}" if document["tuned_for"]["simulated"] else ""
+    console.print(Words(document["sentence"], style="bold green"))
+    console.print()
+    console.print(Words(f"speed loop of the drive{simulated}", style="bold"))
+    console.print(names_and_texts(_rests_on(document)))
+    console.print()
+    grid = Grid(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    grid.add_column("at the motor shaft")
+    for one in document["controllers"]:
+        grid.add_column(one["kind"], justify="right")
+    for name, cells in _rows(document):
+        grid.add_row(name, *(Words(cell[1:], style="bold red") if cell.startswith("!") else cell for cell in cells))
+    console.print(grid)
+    console.print(names_and_texts(_EXPLAINED.items(), quiet=True))
+    settings = list(_setting_rows(document))
+    if settings:
+        console.print()
+        console.print(Words("to be typed into the drive, by hand", style="bold"))
+        own = Grid.grid(padding=(0, 2))
+        own.add_column(overflow="fold")
+        own.add_column(overflow="fold")
+        for title, value, sure in settings:
+            own.add_row(title, f"{value} ({sure})")
+        console.print(own)
+    if document["warnings"]:
+        console.print()
+    for warning, code in zip(document["warnings"], document["warning_codes"], strict=True):
+        console.print(Words(with_code(warning, code), style="yellow"))
+
+
+def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
+    plant = document["plant"]
+    name = "J" if plant["resonance_hz"] is None else "J, motor side"
+    yield name, _with_ends(plant["inertia_kg_m2"], "kg·m²")
+    yield "viscous friction", _with_ends(plant["viscous_nm_s_rad"], "N·m·s/rad")
+    if plant["resonance_hz"] is not None:
+        yield "antiresonance", _with_ends(plant["antiresonance_hz"], "Hz")
+        yield "resonance", _with_ends(plant["resonance_hz"], "Hz")
+    dead = plant["dead_time_s"]
+    lags = " + ".join(f"{1e3 * lag['value']:.3g}" for lag in plant["lags_s"])
+    together = [1e3 * (dead[end] + sum(lag[end] for lag in plant["lags_s"])) for end in ("low", "high")]
+    yield "lags in the loop", (f"{lags} ms, dead time {1e3 * dead['value']:.3g} ms; together {together[0]:.3g} to "
+                               f"{together[1]:.3g} ms; {plant['lags_from']}")
+    required = document["required"]
+    yield "margins asked for", f"{required['phase_deg']:g}° and {required['gain_db']:g} dB in the worst case"
+    if document["measured"]:
+        off, hertz = document["measured"]["deviation_rel"], document["measured"]["hertz"]
+        yield "measured response", (f"{len(hertz)} lines from {min(hertz):.3g} to {max(hertz):.3g} Hz; without the "
+                                    f"lags of the reports, up to {_percent(max(off))} % from this shaft")
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.0f}" if share > 0.1 else f"{100.0 * share:.2g}"
+
+
+def _with_ends(part: Part, unit: str) -> str:
+    return with_interval(part["value"], part["low"], part["high"], unit)
+
+
+def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
+    """Yield the name of each figure and its values, one for each controller; "!" before a thin margin."""
+    every = document["controllers"]
+    yield "P, N·m·s/rad", [gain_words(one["gain_nm_s_rad"]) for one in every]
+    yield "I, N·m/rad", [gain_words(one["integral_nm_rad"]) for one in every]
+    yield "T_I = P/I, s", [gain_words(one["integral_time_s"]) for one in every]
+    if any(one["notch"] for one in every):
+        yield "notch, Hz; dampings", [_notch(one["notch"]) for one in every]
+    limits = document["required"]
+    for name, key, digits, unit in (("phase margin", "phase_deg", 0, "°"), ("gain margin", "gain_db", 1, " dB")):
+        yield f"{name}, believed", [_margin(one["as_believed"], key, digits, unit) for one in every]
+        yield f"{name}, worst", [
+            ("!" if not one["worst"]["stable"] or (one["worst"][key] or math.inf) < limits[key] else "")
+            + _margin(one["worst"], key, digits, unit) for one in every]
+    yield "peak |S|, worst", [_number(one["worst"]["peak_sensitivity"], 2) if one["worst"]["stable"] else "!unstable"
+                              for one in every]
+    yield "bandwidth, Hz", [_ends(one["bandwidth_hz"]) for one in every]
+    yield "step: overshoot, %", [_ends(one["overshoot_share"], 100.0) for one in every]
+    yield "step: rise 10–90 %, s", [_ends(one["rise_s"]) for one in every]
+    yield "step: settling, s", [_ends(one["settling_s"]) for one in every]
+
+
+def _margin(part: Part, key: str, digits: int, unit: str) -> str:
+    return f"{_number(part[key], digits)}{unit}" if part["stable"] and part[key] is not None else (
+        "no limit" if part["stable"] else "unstable")
+
+
+def _notch(part: Part | None) -> str:
+    return "–" if part is None else (f"{part['hertz']:.3g}; {part['numerator_damping']:g} / "
+                                     f"{part['denominator_damping']:g}")
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "∞" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def _ends(part: Part, times: float = 1.0) -> str:
+    """``2.31 (2.22–2.42)``."""
+    if part["value"] is None or part["high"] is None:
+        return "–"
+    return f"{times * part['value']:.3g} ({times * part['low']:.3g}–{times * part['high']:.3g})"
+
+
+def _setting_rows(document: Part) -> Iterator[tuple[str, str, str]]:
+    """Yield (parameter, what to type, how sure), of the tuned gains."""
+    for one in document["controllers"][-1]["drive_parameters"]:
+        value = one["why"] if one["value"] is None else f"{gain_words(one['value'])} {one['unit']}"
+        yield one["title"], value, one["confidence"]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Pictures and the page
+
+
+def check_picture_path(path: Path, source: Path) -> None:
+    """Check before the work that a picture can be made and put there. Raises UsageError."""
+    require_extra("--plot")
+    where = f"--plot {path}"
+    if path.resolve() == source.resolve():
+        raise UsageError("is the result itself", where=where, next_step="Name another file",
+                         entry=MessageCode.SAME_FILE_TWICE)
+    if path.exists():
+        raise UsageError("already exists and was left unchanged", where=where, next_step="Name another file",
+                         entry=MessageCode.FILE_EXISTS)
+    if not path.parent.is_dir():
+        raise UsageError("the folder does not exist", where=where, next_step=f"Make {path.parent} first",
+                         entry=MessageCode.FILE_NOT_WRITABLE)
+
+
+def save_loop_picture(document: Part, path: Path) -> None:
+    """Write loop, sensitivity and step response as one picture. Raises UsageError if it can't be written."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with repeatable_figures(), rc_context({"font.size": 9.0}):
+        figure = Figure(figsize=_SIZE_IN, layout="constrained")
+        grid = figure.add_gridspec(2, 1, height_ratios=(3, 1))
+        draw_loop(figure.add_subfigure(grid[0]), document)
+        draw_step(figure.add_subfigure(grid[1]), document)
+        metadata = {"Date": None, "Creator": None} if path.suffix.lower() == ".svg" else None
+        try:
+            figure.savefig(path, dpi=_PNG_DPI, metadata=metadata)
+        except OSError as error:
+            raise UsageError(f"can't be written ({error.strerror or error})", where=f"--plot {path}",
+                             entry=MessageCode.FILE_NOT_WRITABLE) from error
+
+
+def draw_loop(figure: FigureBase, document: Part) -> None:
+    """Draw |L|, its phase, and |S|, with the band of all corners and the measured lines."""
+    axes = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 2))
+    measured = document["measured"]
+    for one in document["controllers"]:
+        kind = one["kind"]
+        curve, colour = document["curves"][kind], _COLOURS[kind]
+        for place, name in zip(axes, ("gain", "phase_deg", "sensitivity"), strict=True):
+            part = curve[name]
+            place.fill_between(curve["hertz"], part["low"], part["high"], color=colour, alpha=0.2, lw=0)
+            place.plot(curve["hertz"], part["value"], color=colour, lw=1.4, label=kind)
+            if measured:
+                place.plot(measured["hertz"], measured["loops"][kind][name], "o", color=colour, ms=4,
+                           label=f"{kind}, at measured lines")
+    required = document["required"]
+    axes[0].axhline(1.0, color="0.3", lw=0.8)
+    axes[0].set(yscale="log", ylabel="|L|")
+    axes[1].axhline(-180.0, color="0.3", lw=0.8)
+    axes[1].axhline(-180.0 + required["phase_deg"], color="#c2410c", lw=0.9, ls="--",
+                    label=f"{required['phase_deg']:g}° margin")
+    rigid = document["plant"]["resonance_hz"] is None
+    axes[1].set(ylabel="phase of L, °", ylim=(-270.0, -30.0 if rigid else 90.0),
+                yticks=(-270, -225, -180, -135, -90, -45) if rigid else (-270, -180, -90, 0, 90))
+    axes[2].axhline(1.0, color="0.3", lw=0.8)
+    axes[2].set(yscale="log", ylabel="|S|", xlabel="frequency, Hz")
+    hertz = document["curves"]["tuned"]["hertz"]
+    axes[2].set_xlim(hertz[0], hertz[-1])
+    axes[2].set_xscale("log")
+    for place in axes:
+        place.grid(alpha=0.3, which="both")
+    _plain_ticks(axes[2])
+    axes[0].legend(fontsize="small", loc="lower left")
+    axes[1].legend(handles=[line for line in axes[1].lines if "margin" in str(line.get_label())], fontsize="small",
+                   loc="lower left")
+
+
+def _plain_ticks(axes: Axes) -> None:
+    def text(value: float, _: object = None) -> str:
+        return f"{value:g}" if f"{value:.0e}"[0] in "125" else ""
+
+    for which in ("major", "minor"):
+        getattr(axes.xaxis, f"set_{which}_formatter")(text)
+
+
+def draw_step(figure: FigureBase, document: Part) -> None:
+    """Draw the response to a unit step of the set speed, with the band of all corners."""
+    axes = figure.subplots()
+    longest = 0.0
+    for one in document["controllers"]:
+        kind, colour = one["kind"], _COLOURS[one["kind"]]
+        step = document["steps"][kind]
+        if step["value"][0] is None:
+            continue
+        axes.fill_between(step["time_s"], step["low"], step["high"], color=colour, alpha=0.2, lw=0)
+        axes.plot(step["time_s"], step["value"], color=colour, lw=1.4, label=kind)
+        settled = one["settling_s"]["high"]
+        longest = max(longest, 1.6 * settled if settled is not None else step["time_s"][-1])
+    axes.axhline(1.0, color="0.3", lw=0.8)
+    axes.set(xlabel="time, s", ylabel="speed / step of set speed", xlim=(0.0, longest or None))
+    axes.set_ylim(bottom=0.0)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small", loc="lower right")
+
+
+def write_loop_report(document: Part, path: Path) -> Path:
+    """Write the page, HTML or PDF by its name; return where it went. Raises UsageError if it can't be written."""
+    return write_blocks(loop_report(document), path)
+
+
+def loop_report(document: Part) -> Report:
+    """Return the blocks of the page."""
+    every = document["controllers"]
+    tuned = every[-1]
+    share = 0.6 / len(every)
+    table = Table((Column("at the motor shaft", 0.4), *(Column(one["kind"], share, number=True) for one in every)),
+                  tuple((name, *(cell.replace("!", "⚠ ") for cell in cells)) for name, cells in _rows(document)))
+    sections = [
+        ReportSection("Gains and margins", (table, Pairs(tuple(_EXPLAINED.items())))),
+        ReportSection("Open loop and sensitivity", (
+            Picture(partial(draw_loop, document=document), 5.2,
+                    "Lines: as believed. Bands: all corners of the intervals. Points: the measured shaft without the "
+                    "lags of the reports. Good: |L| falls through 1 once, its phase stays above the dashed line there, "
+                    "and |S| stays below 2."),
+        )),
+        ReportSection("Step of the set speed", (
+            Picture(partial(draw_step, document=document), 2.4,
+                    "Speed of the motor after a small step, without torque limit, ramp or setpoint filter."),
+        )),
+    ]
+    settings = list(_setting_rows(document))
+    if settings:
+        sections.append(ReportSection("To be typed into the drive, by hand", (
+            Table((Column("parameter", 0.4), Column("value", 0.45), Column("how sure", 0.15)), tuple(settings)),
+            Text("Nothing here was written into any drive. Change one value at a time, at a low speed, with the "
+                 "hard-wired stop in reach."),
+        )))
+    tuned_for = document["tuned_for"]
+    sections.append(ReportSection("What it rests on", (Pairs((
+        *_rests_on(document), ("from", tuned_for["source"]), ("model", tuned_for["model"]),
+        ("profile", tuned_for["profile"] or "none"))),)))
+    worst = tuned["worst"]
+    return Report(
+        title="Speed loop of the drive",
+        subtitle=f"tuned for a bandwidth of {tuned['bandwidth_hz']['value']:.3g} Hz",
+        simulated=f"{SIMULATED}: the result is that of a simulated rig" if tuned_for["simulated"] else "",
+        answer=AnswerBox(
+            "green", f"P = {gain_words(tuned['gain_nm_s_rad'])} N·m·s/rad, "
+            f"I = {gain_words(tuned['integral_nm_rad'])} N·m/rad", ("at the motor shaft",),
+            f"keeps {_number(worst['phase_deg'], 0)}° and {_number(worst['gain_db'], 1)} dB in the worst case",
+            document["sentence"], ""),
+        warnings=tuple(map(with_code, document["warnings"], document["warning_codes"])),
+        sections=tuple(sections),
+        footer=f"tdhil {document['tdhil']}",
+    )

@@ -1,0 +1,333 @@
+r"""P, I and a notch that keep their margins on every plant of the uncertainty box.
+
+**Rule.** I = P²/(4 J) with the total J: a rigid shaft without lags is then critically damped (T_I = P/I = 4 J/P), and
+the integral part costs 14° of phase. P is the one free number: the largest that keeps phase margin and gain margin on
+all corners, or the one with the requested bandwidth.
+
+**Corners.** J, friction, lags (all together), antiresonance, resonance and the spring's damping, each at both ends of
+its 95 % interval. `benchmarks/speed_loop_margins.py` measures how often the true loop keeps the margins.
+
+**Notch.** Where the shaft has a resonance, notches of several widths and depths at that frequency are tried. One is
+offered if the largest bandwidth grows by `NOTCH_GAIN` or more, or if nothing else fits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import product
+from math import inf, isfinite, sqrt
+
+import numpy as np
+
+from profiles import MessageCode, TdhilError
+from tdhil.speed_loop.loop import (
+    Complexes,
+    LoopPlant,
+    NotchFilter,
+    PiGains,
+    Reals,
+    SpeedLoopMargins,
+    SpringLoad,
+    controller_response,
+    frequency_grid,
+    margins_of,
+)
+from tdhil.speed_loop.step import StepFigures, is_stable_loop, step_figures, step_responses
+
+LOOP_TUNING_REFUSED = 11
+"""Exit code: no gains keep the margins, or the requested bandwidth leaves too little."""
+INTEGRAL_RATIO = 4.0
+"""T_I P/J: 4 is critical damping."""
+NOTCH_GAIN = 1.25
+"""Factor on the bandwidth from which a notch is worth its filter."""
+NOTCHES = tuple((depth * width, width) for width in (0.4, 1.0) for depth in (0.1, 0.3))
+"""Damping of numerator and denominator of the notches that are tried."""
+LEAST_SPLIT = 1.02
+"""Resonance over antiresonance, at least: closer, and there is no load."""
+_GAINS = np.geomspace(3.0, 1e-3, 70)
+"""P that are tried, in units of J/Στ, from the largest down."""
+_HALVINGS = 8
+"""Of the factor between two of them: P is found to 0.1 %."""
+_FINER_HALVINGS = 48
+_AT_ONCE = 8
+"""Corners whose margins are computed together: the first that fails ends the test."""
+_STEP_SPAN = 30.0
+"""Length of a step response, in units of J/P."""
+
+
+class LoopTuningRefused(TdhilError):
+    """Refusal: no gains keep the margins for this machine. The message states what was found."""
+
+    entry = MessageCode.TUNING_REFUSED
+
+    exit_code = LOOP_TUNING_REFUSED
+
+
+@dataclass(frozen=True)
+class Range:
+    """A value and both ends of its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def ends(self) -> tuple[float, ...]:
+        """Both ends; one if they are equal."""
+        return (self.low,) if self.low == self.high else (self.low, self.high)
+
+
+@dataclass(frozen=True)
+class UncertainPlant:
+    """Loop with the interval of each of its quantities, at the motor shaft."""
+
+    inertia_kg_m2: Range
+    """J, or J_r of a shaft with a spring."""
+    viscous_nm_s_rad: Range
+    lags_s: tuple[Range, ...]
+    dead_time_s: Range
+    antiresonance_hz: Range | None = None
+    """None: a rigid shaft; so are the next two."""
+    resonance_hz: Range | None = None
+    damping_nm_s_rad: Range | None = None
+
+    @property
+    def believed(self) -> LoopPlant:
+        """Everything at its value."""
+        spring = None
+        if self.antiresonance_hz is not None and self.resonance_hz is not None:
+            spring = _spring(self.antiresonance_hz.value, self.resonance_hz.value,
+                             self.damping_nm_s_rad.value if self.damping_nm_s_rad else 0.0)
+        return LoopPlant(self.inertia_kg_m2.value, self.viscous_nm_s_rad.value,
+                         tuple(lag.value for lag in self.lags_s), self.dead_time_s.value, spring)
+
+    def corners(self) -> tuple[LoopPlant, ...]:
+        """All corners of the box; the lags move together."""
+        lags = ((tuple(lag.low for lag in self.lags_s), self.dead_time_s.low),
+                (tuple(lag.high for lag in self.lags_s), self.dead_time_s.high))
+        springs: list[SpringLoad | None] = [None]
+        if self.antiresonance_hz is not None and self.resonance_hz is not None:
+            dampings = self.damping_nm_s_rad.ends if self.damping_nm_s_rad else (0.0,)
+            springs = [_spring(*one) for one in product(self.antiresonance_hz.ends, self.resonance_hz.ends, dampings)]
+        return tuple(
+            LoopPlant(inertia, viscous, late, dead, spring)
+            for inertia, viscous, (late, dead), spring in product(
+                self.inertia_kg_m2.ends, self.viscous_nm_s_rad.ends, dict.fromkeys(lags), springs))
+
+
+def _spring(antiresonance_hz: float, resonance_hz: float, damping_nm_s_rad: float) -> SpringLoad:
+    return SpringLoad(antiresonance_hz, max(resonance_hz, LEAST_SPLIT * antiresonance_hz), damping_nm_s_rad)
+
+
+@dataclass(frozen=True)
+class SpeedLoopCase:
+    """Plant, required margins and requests of one tuning."""
+
+    plant: UncertainPlant
+    phase_deg: float = 45.0
+    """Phase margin on every corner; so is the gain margin."""
+    gain_db: float = 8.0
+    bandwidth_hz: float | None = None
+    """Requested bandwidth; None: the largest that fits."""
+    present: PiGains | None = None
+    try_notch: bool = True
+
+
+@dataclass(frozen=True)
+class LoopRow:
+    """Gains, and what follows from them."""
+
+    kind: str
+    """present or tuned."""
+    gains: PiGains
+    believed: SpeedLoopMargins
+    worst: SpeedLoopMargins
+    """The least of each margin over all corners; the greatest peak of the sensitivity."""
+    bandwidth_hz: Range
+    overshoot_share: Range
+    rise_s: Range
+    settling_s: Range
+    time_s: Reals = field(repr=False)
+    speed: Reals = field(repr=False)
+    """Response to a unit step of the set speed, all as believed."""
+    lowest: Reals = field(repr=False)
+    highest: Reals = field(repr=False)
+
+
+@dataclass(frozen=True)
+class LoopDesign:
+    """The result."""
+
+    case: SpeedLoopCase
+    rows: tuple[LoopRow, ...]
+    """The present gains if they are known, then the tuned ones."""
+    without_notch_hz: float | None
+    """Largest bandwidth without the notch, for gains with one; None: no gains fit without it."""
+
+    @property
+    def tuned(self) -> LoopRow:
+        """The gains to type in."""
+        return self.rows[-1]
+
+
+class _GainSearch:
+    """The loops of all corners without their controller, on one grid."""
+
+    def __init__(self, case: SpeedLoopCase) -> None:
+        self.case = case
+        self.believed = case.plant.believed
+        self.corners = case.plant.corners()
+        every = (self.believed, *self.corners)
+        self.omega = frequency_grid(every, case.present)
+        self.s: Complexes = np.asarray(1j * self.omega, dtype=np.complex128)
+        self.without = np.array([plant.without_controller(self.s) for plant in every])
+        self.filters = np.array([plant.speed_filter(self.s) for plant in every])
+        self._batches = [slice(first, first + _AT_ONCE) for first in range(1, len(every), _AT_ONCE)]
+        self.total = self.believed.total_inertia_kg_m2
+        self.unit = self.total / self.believed.total_lag_s
+
+    def gains(self, proportional: float, notch: NotchFilter | None) -> PiGains:
+        return PiGains(proportional, proportional**2 / (INTEGRAL_RATIO * self.total), notch)
+
+    def margins(self, gains: PiGains) -> tuple[SpeedLoopMargins, ...]:
+        """The believed plant's, then each corner's."""
+        return margins_of(self.without * controller_response(gains, self.s), self.filters, self.omega)
+
+    def at_believed(self, gains: PiGains) -> SpeedLoopMargins:
+        """The believed plant's alone."""
+        return margins_of(self.without[:1] * controller_response(gains, self.s), self.filters[:1], self.omega)[0]
+
+    def bandwidth_hz(self, gains: PiGains) -> float:
+        """The believed plant's."""
+        return self.at_believed(gains).bandwidth_hz
+
+    def fits(self, gains: PiGains) -> bool:
+        """True if all corners keep the margins."""
+        asked = self.case.phase_deg, self.case.gain_db
+        if not self.at_believed(gains).keeps(*asked):
+            return False
+        law = controller_response(gains, self.s)
+        for number, some in enumerate(self._batches):
+            if not all(one.keeps(*asked) for one in margins_of(self.without[some] * law, self.filters[some],
+                                                               self.omega)):
+                self._batches.insert(0, self._batches.pop(number))      # what fails now will fail next time
+                return False
+        return True
+
+    def largest(self, notch: NotchFilter | None) -> PiGains | None:
+        """Return the largest gains that fit; None without any."""
+        above = None
+        for proportional in _GAINS * self.unit:
+            if self.fits(self.gains(float(proportional), notch)):
+                return self._between(float(proportional), above, notch)
+            above = float(proportional)
+        return None
+
+    def _between(self, fits: float, above: float | None, notch: NotchFilter | None) -> PiGains:
+        if above is not None:
+            for _ in range(_HALVINGS):
+                middle = sqrt(fits * above)
+                if self.fits(self.gains(middle, notch)):
+                    fits = middle
+                else:
+                    above = middle
+        return self.gains(fits, notch)
+
+    def with_bandwidth(self, hertz: float, notch: NotchFilter | None) -> PiGains:
+        """Return the gains whose believed bandwidth is ``hertz``."""
+        low, high = float(_GAINS[-1]) * self.unit * 1e-2, float(_GAINS[0]) * self.unit * 1e2
+        for _ in range(_FINER_HALVINGS):
+            middle = sqrt(low * high)
+            if self.bandwidth_hz(self.gains(middle, notch)) < hertz:
+                low = middle
+            else:
+                high = middle
+        return self.gains(high, notch)
+
+    def notches(self) -> tuple[NotchFilter, ...]:
+        """Return the notches to try; () for a rigid shaft."""
+        spring = self.believed.spring
+        if spring is None or not self.case.try_notch:
+            return ()
+        return tuple(NotchFilter(spring.resonance_hz, *damping) for damping in NOTCHES)
+
+
+def design_speed_loop(case: SpeedLoopCase) -> LoopDesign:
+    """Return the gains. Raises LoopTuningRefused if none keep the margins, or the requested bandwidth does not."""
+    search = _GainSearch(case)
+    plain = search.largest(None)
+    without_hz = None if plain is None else search.bandwidth_hz(plain)
+    found = plain
+    if case.bandwidth_hz is None or without_hz is None or case.bandwidth_hz > without_hz:
+        found = _best(search, plain, without_hz)
+    if found is None:
+        raise LoopTuningRefused(
+            f"no gains keep {case.phase_deg:g}° and {case.gain_db:g} dB on every corner of the intervals",
+            next_step="Identify again for narrower intervals, state the lags better, or accept thinner margins "
+                      "with --phase-margin and --gain-margin")
+    if case.bandwidth_hz is not None:
+        found = _requested(search, found, case.bandwidth_hz)
+    if not all(is_stable_loop(plant, found) for plant in (search.believed, *search.corners)):
+        raise LoopTuningRefused("the poles of the tuned loop contradict its margins",
+                                next_step="Request a lower --bandwidth")
+    rows = [] if case.present is None else [_row("present", search, case.present)]
+    return LoopDesign(case, (*rows, _row("tuned", search, found)), without_hz if found.notch is not None else None)
+
+
+def _best(search: _GainSearch, plain: PiGains | None, without_hz: float | None) -> PiGains | None:
+    """Return the largest gains, with a notch if it is worth it."""
+    offered = [(search.bandwidth_hz(gains), gains) for notch in search.notches()
+               if (gains := search.largest(notch)) is not None]
+    if not offered:
+        return plain
+    hertz, gains = max(offered, key=lambda one: one[0])
+    return gains if without_hz is None or hertz >= NOTCH_GAIN * without_hz else plain
+
+
+def _requested(search: _GainSearch, largest: PiGains, hertz: float) -> PiGains:
+    case = search.case
+    found = search.with_bandwidth(hertz, largest.notch)
+    if search.fits(found):
+        return found
+    worst = worst_of(search.margins(found))
+    what = ("the loop is unstable or conditionally stable at a corner of the intervals" if not worst.stable
+            or worst.conditional else f"the worst case has {worst.phase_deg:.0f}° and {worst.gain_db:.1f} dB")
+    raise LoopTuningRefused(
+        f"a bandwidth of {hertz:g} Hz leaves too little margin: {what} (limits {case.phase_deg:g}° and "
+        f"{case.gain_db:g} dB). The largest bandwidth that fits is {search.bandwidth_hz(largest):.3g} Hz",
+        next_step=f"Request --bandwidth {search.bandwidth_hz(largest):.2g} or less")
+
+
+def worst_of(margins: tuple[SpeedLoopMargins, ...]) -> SpeedLoopMargins:
+    """Return the worst of each figure."""
+    return SpeedLoopMargins(
+        all(one.stable for one in margins), min(one.phase_deg for one in margins), min(one.gain_db for one in margins),
+        min(one.bandwidth_hz for one in margins), max(one.peak_sensitivity for one in margins),
+        any(one.conditional for one in margins))
+
+
+def _row(kind: str, search: _GainSearch, gains: PiGains) -> LoopRow:
+    margins = search.margins(gains)
+    every = (search.believed, *search.corners)
+    stable = [plant for plant, one in zip(every, margins, strict=True) if one.stable and is_stable_loop(plant, gains)]
+    span = _STEP_SPAN * search.total / max(gains.gain_nm_s_rad, 1e-9 * search.unit)
+    time_s, speeds = step_responses(stable, gains, span)
+    figures = [step_figures(time_s, speed) for speed in speeds]
+    whole = len(stable) == len(every)
+    shown = speeds if whole else np.full((1, len(time_s)), np.nan)
+    bandwidths = [one.bandwidth_hz for one in margins]
+    overshoot, rise, settling = (_spread(figures, name, whole) for name in
+                                 ("overshoot_share", "rise_s", "settling_s"))
+    return LoopRow(
+        kind, gains, margins[0], worst_of(margins), Range(bandwidths[0], min(bandwidths), max(bandwidths)),
+        overshoot, rise, settling, time_s, shown[0], shown.min(axis=0), shown.max(axis=0))
+
+
+def _spread(figures: list[StepFigures], name: str, whole: bool) -> Range:
+    """Return a figure's range; infinite if a corner is unstable."""
+    values = [float(getattr(one, name)) for one in figures]
+    if not whole or not all(isfinite(value) for value in values):
+        return Range(inf, min(values, default=inf), inf)
+    return Range(values[0], min(values), max(values))
+
+

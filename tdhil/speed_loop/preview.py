@@ -1,0 +1,88 @@
+"""Loop and sensitivity over frequency, with the band of all corners, and the loop at the measured lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+
+from tdhil.speed_loop.design import LoopDesign
+from tdhil.speed_loop.loop import Complexes, PiGains, Reals, controller_response, loop_response
+
+_CURVE_POINTS = 140
+
+
+@dataclass(frozen=True)
+class LoopCurve:
+    """|L|, phase and |S| over frequency, all as believed, and the least and greatest over all corners."""
+
+    hertz: Reals
+    gain: tuple[Reals, Reals, Reals]
+    """As believed, least, greatest; so are the next two."""
+    phase_deg: tuple[Reals, Reals, Reals]
+    sensitivity: tuple[Reals, Reals, Reals]
+
+
+@dataclass(frozen=True)
+class MeasuredShaft:
+    """ω/T of the shaft itself at the excited lines: the response as reported, without the lags of the reports."""
+
+    hertz: Reals
+    response: Complexes
+    half_rel: Reals
+    """Half-width of the 95 % interval, relative in magnitude and rad in phase; infinite if it is open."""
+
+
+def curve_range_hz(design: LoopDesign, lowest_hz: float | None = None) -> tuple[float, float]:
+    """Return the ends of the frequencies to show; ``lowest_hz`` is among them."""
+    bandwidths = [row.bandwidth_hz.value for row in design.rows if row.bandwidth_hz.value > 0.0]
+    spring = design.case.plant.believed.spring
+    marks = [] if spring is None else [0.5 * spring.antiresonance_hz, 2.0 * spring.resonance_hz]
+    lowest = [] if lowest_hz is None else [0.9 * lowest_hz]
+    return min([0.1 * one for one in bandwidths] + marks + lowest), max([8.0 * one for one in bandwidths] + marks)
+
+
+def loop_curve(design: LoopDesign, gains: PiGains, lowest_hz: float | None = None) -> LoopCurve:
+    """Return the curves of these gains on the plant of the design, from ``lowest_hz`` or a tenth of the bandwidth."""
+    low, high = curve_range_hz(design, lowest_hz)
+    hertz = np.geomspace(low, high, _CURVE_POINTS)
+    spring = design.case.plant.believed.spring
+    if spring is not None:
+        near = np.linspace(0.9, 1.1, 21)
+        hertz = np.unique(np.concatenate([hertz, spring.antiresonance_hz * near, spring.resonance_hz * near]))
+    plants = (design.case.plant.believed, *design.case.plant.corners())
+    loops = np.array([loop_response(plant, gains, 2.0 * pi * hertz) for plant in plants])
+    phase = np.degrees(np.unwrap(np.angle(loops), axis=1))
+    phase -= 360.0 * np.round((phase[:, :1] + 135.0) / 360.0)
+    return LoopCurve(hertz, *(_banded(part) for part in (np.abs(loops), phase, np.abs(1.0 / (1.0 + loops)))))
+
+
+def _banded(values: Reals) -> tuple[Reals, Reals, Reals]:
+    return values[0], values.min(axis=0), values.max(axis=0)
+
+
+def measured_shaft(
+    hertz: Sequence[float], reported: Sequence[complex], half_rel: Sequence[float],
+    speed_lag_s: float, torque_lag_s: float, skew_s: float,
+) -> MeasuredShaft:
+    """Take the lags of the reports out of ω/T as reported: T/ω is Z (1 + τ_w s)/(1 + τ_T s) e^(−d s)."""
+    s = 2j * pi * np.asarray(hertz)
+    undone = (1.0 + speed_lag_s * s) / (1.0 + torque_lag_s * s) * np.exp(-skew_s * s)
+    return MeasuredShaft(np.asarray(hertz, dtype=np.float64), np.asarray(reported) * undone,
+                         np.asarray(half_rel, dtype=np.float64))
+
+
+def loop_at_lines(design: LoopDesign, gains: PiGains, shaft: MeasuredShaft) -> Complexes:
+    """Return L at the measured lines: controller and lags as believed, the shaft as measured."""
+    believed = design.case.plant.believed
+    s: Complexes = np.asarray(2j * pi * shaft.hertz, dtype=np.complex128)
+    others = believed.without_controller(s) / believed.shaft(s)
+    return np.asarray(controller_response(gains, s) * others * shaft.response, dtype=np.complex128)
+
+
+def deviation_from_model(design: LoopDesign, shaft: MeasuredShaft) -> Reals:
+    """Return |G measured / G believed − 1| at each line."""
+    s: Complexes = np.asarray(2j * pi * shaft.hertz, dtype=np.complex128)
+    return np.abs(shaft.response / design.case.plant.believed.shaft(s) - 1.0)

@@ -1,0 +1,110 @@
+"""Gains from intervals: the margins hold on every corner and inside the box, a notch where it helps, refusals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tdhil.speed_loop import (
+    LoopPlant,
+    LoopTuningRefused,
+    PiGains,
+    Range,
+    SpeedLoopCase,
+    UncertainPlant,
+    design_speed_loop,
+    deviation_from_model,
+    loop_at_lines,
+    loop_curve,
+    measured_shaft,
+    speed_loop_margins,
+)
+
+RIGID = UncertainPlant(Range(104.0, 99.7, 108.1), Range(8.0, 7.6, 8.4),
+                       (Range(0.02, 0.018, 0.022), Range(0.01, 0.009, 0.011)), Range(0.003, 0.0015, 0.0045))
+COMPLIANT = UncertainPlant(
+    Range(1.0, 0.97, 1.03), Range(0.05, 0.04, 0.06), (Range(0.002, 0.0018, 0.0022), Range(0.001, 0.0009, 0.0011)),
+    Range(0.0005, 0.0004, 0.0006), Range(60.0, 59.0, 61.0), Range(120.0, 118.0, 122.0), Range(2.0, 1.0, 3.0))
+
+
+def inside(plant: UncertainPlant, seed: int) -> LoopPlant:
+    """A plant drawn from within all intervals."""
+    rng = np.random.default_rng(seed)
+
+    def drawn(part: Range) -> Range:
+        value = rng.uniform(part.low, part.high)
+        return Range(value, value, value)
+
+    springs = {name: drawn(getattr(plant, name)) for name in ("antiresonance_hz", "resonance_hz", "damping_nm_s_rad")
+               if getattr(plant, name) is not None}
+    return replace(plant, inertia_kg_m2=drawn(plant.inertia_kg_m2), viscous_nm_s_rad=drawn(plant.viscous_nm_s_rad),
+                   lags_s=tuple(map(drawn, plant.lags_s)), dead_time_s=drawn(plant.dead_time_s), **springs).believed
+
+
+def test_the_largest_gains_use_up_the_phase_margin_in_the_worst_case():
+    tuned = design_speed_loop(SpeedLoopCase(RIGID)).tuned
+    assert tuned.worst.phase_deg == pytest.approx(45.0, abs=0.1) and tuned.worst.phase_deg >= 45.0
+    assert tuned.worst.gain_db > 8.0
+    assert tuned.believed.phase_deg > tuned.worst.phase_deg
+    assert tuned.gains.integral_nm_rad == pytest.approx(tuned.gains.gain_nm_s_rad**2 / (4.0 * 104.0))
+    assert tuned.bandwidth_hz.low < tuned.bandwidth_hz.value < tuned.bandwidth_hz.high
+    assert tuned.overshoot_share.low < tuned.overshoot_share.value < tuned.overshoot_share.high
+    wider = replace(RIGID, lags_s=(Range(0.02, 0.01, 0.03), Range(0.01, 0.005, 0.015)))
+    assert design_speed_loop(SpeedLoopCase(wider)).tuned.gains.gain_nm_s_rad < 0.9 * tuned.gains.gain_nm_s_rad
+
+
+@pytest.mark.heavy
+def test_a_notch_is_used_where_a_resonance_limits_the_gains():
+    design = design_speed_loop(SpeedLoopCase(COMPLIANT))
+    notch, plain = design.tuned.gains.notch, design_speed_loop(SpeedLoopCase(COMPLIANT, try_notch=False)).tuned
+    assert notch is not None and notch.hertz == 120.0
+    assert plain.gains.notch is None
+    assert design.without_notch_hz == pytest.approx(plain.bandwidth_hz.value)
+    assert design.tuned.bandwidth_hz.value > 3.0 * plain.bandwidth_hz.value
+    assert plain.worst.gain_db == pytest.approx(8.0, abs=0.05)
+
+
+@pytest.mark.heavy(but_first=1)
+@pytest.mark.parametrize("plant", [RIGID, COMPLIANT], ids=["rigid", "two-mass"])
+def test_the_margins_hold_inside_the_box_too(plant):
+    gains = design_speed_loop(SpeedLoopCase(plant)).tuned.gains
+    for found in speed_loop_margins([inside(plant, seed) for seed in range(60)], gains):
+        assert found.keeps(44.9, 7.95)
+
+
+def test_a_requested_bandwidth_is_met_or_refused_with_the_largest_that_fits():
+    design = design_speed_loop(SpeedLoopCase(RIGID, bandwidth_hz=1.0, present=PiGains(300.0, 300.0)))
+    assert [row.kind for row in design.rows] == ["present", "tuned"]
+    assert design.tuned.bandwidth_hz.value == pytest.approx(1.0, rel=1e-6)
+    with pytest.raises(LoopTuningRefused, match=r"bandwidth of 10 Hz .* The largest bandwidth that fits is 4\.75 Hz"):
+        design_speed_loop(SpeedLoopCase(RIGID, bandwidth_hz=10.0))
+
+
+def test_lags_that_may_be_zero_still_have_a_worst_case():
+    """A measured lag has an interval from 0."""
+    open_lags = replace(RIGID, lags_s=(Range(0.02, 0.0, 0.03),), dead_time_s=Range(0.0, 0.0, 0.0))
+    tuned = design_speed_loop(SpeedLoopCase(open_lags)).tuned
+    assert tuned.worst.phase_deg == pytest.approx(45.0, abs=0.1)
+
+
+def test_a_present_loop_that_is_unstable_has_no_step_response():
+    row = design_speed_loop(SpeedLoopCase(RIGID, present=PiGains(3e4, 1e6))).rows[0]
+    assert not row.worst.stable
+    assert np.isinf(row.settling_s.high) and np.isnan(row.speed).all()
+
+
+def test_the_measured_shaft_is_put_into_the_loop():
+    """A report with lags on both signals gives the same loop as the shaft that it is of."""
+    design = design_speed_loop(SpeedLoopCase(RIGID))
+    believed, gains = design.case.plant.believed, design.tuned.gains
+    hertz = np.array([0.1, 0.4, 1.0])      # all far below the bandwidth
+    s = 2j * np.pi * hertz
+    reported = believed.shaft(s) * (1.0 + 0.15 * s) / (1.0 + 0.4 * s) * np.exp(0.002 * s)
+    shaft = measured_shaft(hertz, reported, [0.01] * 3, 0.4, 0.15, 0.002)
+    assert np.max(deviation_from_model(design, shaft)) < 1e-12
+    curve = loop_curve(design, gains, 0.1)
+    at_lines = np.interp(np.log(hertz), np.log(curve.hertz), np.log(curve.gain[0]))
+    assert np.log(np.abs(loop_at_lines(design, gains, shaft))) == pytest.approx(at_lines, abs=2e-3)
+    assert all(np.all(part[1] <= part[0]) and np.all(part[0] <= part[2]) for part in (curve.gain, curve.sensitivity))
