@@ -3,6 +3,7 @@
 | page | made from |
 |---|---|
 | reference/command-line.md | the parsers of `tdhil.cli` |
+| reference/candidates.md | the table of `tdhil.estimation.candidates` |
 | reference/exit-codes.md | `tdhil.errors.ExitCode` and the tree of errors |
 | reference/http-api.md | the OpenAPI document of `tdhil serve` |
 """
@@ -123,6 +124,42 @@ def _cell(text: str) -> str:
 def _sentence(text: str) -> str:
     text = _cell(text)
     return text if not text or text[-1] in ".?" else f"{text[0].upper()}{text[1:]}."
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Candidates of the identification
+
+
+def candidates() -> str:
+    """The page of the models that are tried for J, a part for each walk."""
+    from tdhil.estimation.candidates import Route, rows
+
+    out = [
+        MADE + "# Candidates of the identification",
+        "",
+        "tdhil tries these models for J, from the first row to the last. A row is tried where it applies to the answer "
+        "so far. [Models](../explanation/models.md) states the rule of selection and the rule of the interval.",
+        "",
+    ]
+    for route in Route:
+        out += [f"## {route.value[0].upper()}{route.value[1:]}", ""]
+        for row in rows(route):
+            out += [
+                f"### {row.name[0].upper()}{row.name[1:]}",
+                "",
+                "| | |",
+                "|---|---|",
+                f"| model | {_cell(row.model)} |",
+                f"| data | {_cell(row.data)} |",
+                f"| prior knowledge | {_cell(row.prior)} |",
+                f"| tried | {_cell(row.tried)} |",
+                f"| stands | {_cell(row.stands)} |",
+                f"| interval of J | {_cell(row.interval)} |",
+                f"| reason | {_cell(row.reason)} |",
+                f"| test | `{row.test}` |",
+                "",
+            ]
+    return "\n".join(out).rstrip() + "\n"
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -299,7 +336,8 @@ def _schema(answer: dict[str, Any]) -> str:
     return ""
 
 
-PAGES = {"command-line.md": command_line, "exit-codes.md": exit_codes, "http-api.md": http_api}
+PAGES = {"candidates.md": candidates, "command-line.md": command_line, "exit-codes.md": exit_codes,
+         "http-api.md": http_api}
 
 if __name__ == "__main__":
     for name, make in PAGES.items():

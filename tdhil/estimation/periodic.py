@@ -1,22 +1,34 @@
 """Periodic excitation in, a finding out: the frequency domain's route.
 
 1. Which whole periods are there, with which lines, and what do the levels say of B?  2. Can they have been so, and do
-enough lines stand clear of the scatter?  3. What does the simplest shaft make of them, and does another do better?
+enough lines stand clear of the scatter?  3. Which candidate stands (`tdhil.estimation.candidates`)?
 """
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from profiles import CodedText, MessageCode
 from tdhil.config import told_before_echo
+from tdhil.estimation.candidates import (
+    BEFORE_ECHO,
+    BENT_FRICTION,
+    CLEAR_LINES,
+    LOAD_SWINGS,
+    WEAK_LINES,
+    Route,
+    Trial,
+    walk,
+)
 from tdhil.estimation.case import Case, Finding, PeriodicCase
 from tdhil.estimation.cross_checks import Inertia, friction_curve
 from tdhil.estimation.data_checks import check_motion
 from tdhil.estimation.excitation_checks import check_lines, hints
 from tdhil.estimation.frequency_domain import (
     RigidResult,
+    ShaftModel,
     contradicted,
     fit_rigid,
     identify_before_echo,
@@ -103,42 +115,103 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
     return replace(case, lines=lines, usable=usable_lines(every, _LEAST_NU), warnings=warnings, sound=True)
 
 
-def identify_lines(case: PeriodicCase) -> Finding:
-    """Identify the simplest requested shaft that the data do not contradict. Raises Refused where none tells J.
+@dataclass(frozen=True)
+class _LineWalk:
+    """What stands in the walk over the rows of the lines. ``weak``: a line that is weak in one signal contradicted."""
 
-    Straight friction that they hardly allow gives way to one that bends, where that says clearly more.
-    """
-    if _before_echo(case):
-        return identify_before_echo(case)
-    asked = shaft_model(case.options.model)
-    rigid = None
-    own_lines: tuple[SpectralLine, ...] = ()
-    if asked.compliant is not None:
-        own = settled(case)
-        finding, own_lines = identify_compliant(own), own.every
-    else:
-        rigid = _rigid(case, case.lines)
-        weak = tuple(line for line in case.usable if all(line is not one for one in case.lines))
-        if rigid is not None and contradicted(rigid.fitted.problem, rigid.fitted.whole.theta, weak):
-            rigid, doubted = _rigid(case, case.usable), asked.widened
-        else:
-            doubted = asked.widened and (case.recording.winds_up or (rigid is not None and may_swing(rigid)))
-        finding = rigid_finding(rigid, case)
-        if doubted:
-            own = settled(case)
-            finding = identify_compliant(own, finding, rigid is not None and rigid.first_order)
-            own_lines = own.every
+    case: PeriodicCase
+    rigid: RigidResult | None = None
+    weak: bool = False
+    finding: Finding | Refusal | None = None
+    ended: bool = False
+
+    @property
+    def asked(self) -> ShaftModel:
+        return shaft_model(self.case.options.model)
+
+
+def identify_lines(case: PeriodicCase) -> Finding:
+    """Walk the rows of the lines (`tdhil.estimation.candidates`). Raises Refused if no row gives J."""
+    finding = walk(Route.LINES, _TRIALS, _LineWalk(case)).finding
     if isinstance(finding, Refusal):
         raise Refused(finding.reason, _BEFORE_ECHO_HELPS if _drowned(case) else finding.advice,
                       finding.entry)
-    finding = replace(finding, settled=own_lines)
-    if _drowned(case):
-        finding = replace(finding, words=replace(finding.words, if_wide=_BEFORE_ECHO_HELPS))
-    # A load that swings leaves residuals that a bend takes up, too: only where swinging was looked for it may.
-    hardly = finding.rejected or (asked.widened and finding.compliant is None and doubtful(finding.residual))
-    if hardly and rigid is not None and asked.lags:
-        return identify_bent(case, rigid) or finding
+    assert finding is not None
     return finding
+
+
+def _try_before_echo(now: _LineWalk) -> _LineWalk:
+    return replace(now, finding=identify_before_echo(now.case), ended=True)
+
+
+def _try_clear_lines(now: _LineWalk) -> _LineWalk:
+    return _with_rigid(now, now.case.lines)
+
+
+def _try_weak_lines(now: _LineWalk) -> _LineWalk:
+    return replace(_with_rigid(now, now.case.usable), weak=True)
+
+
+def _with_rigid(now: _LineWalk, lines: tuple[SpectralLine, ...]) -> _LineWalk:
+    rigid = _rigid(now.case, lines)
+    return replace(now, rigid=rigid, finding=_advised(rigid_finding(rigid, now.case), now.case))
+
+
+def _weak_lines_contradict(now: _LineWalk) -> bool:
+    if now.rigid is None:
+        return False
+    weak = tuple(line for line in now.case.usable if all(line is not one for one in now.case.lines))
+    return contradicted(now.rigid.fitted.problem, now.rigid.fitted.whole.theta, weak)
+
+
+def _load_may_swing(now: _LineWalk) -> bool:
+    if now.asked.compliant is not None:
+        return True
+    return now.asked.widened and (
+        now.weak or now.case.recording.winds_up or (now.rigid is not None and may_swing(now.rigid)))
+
+
+def _try_load(now: _LineWalk) -> _LineWalk:
+    own = settled(now.case)
+    if now.finding is None:
+        found = identify_compliant(own)
+    else:
+        found = identify_compliant(own, now.finding, now.rigid is not None and now.rigid.first_order)
+    if isinstance(found, Finding):
+        found = replace(found, settled=own.every)
+    return replace(now, finding=_advised(found, now.case))
+
+
+def _is_bent(now: _LineWalk) -> bool:
+    """Return whether straight friction is rejected, or hardly allowed.
+
+    A load that swings leaves residuals that a bend explains too, so in doubt it is tried only after the load.
+    """
+    finding = now.finding
+    if not isinstance(finding, Finding) or now.rigid is None or not now.asked.lags:
+        return False
+    return finding.rejected or (now.asked.widened and finding.compliant is None and doubtful(finding.residual))
+
+
+def _try_bent(now: _LineWalk) -> _LineWalk:
+    assert now.rigid is not None
+    return replace(now, finding=identify_bent(now.case, now.rigid) or now.finding)
+
+
+_TRIALS: Mapping[str, Trial[_LineWalk]] = {
+    BEFORE_ECHO: Trial(lambda now: _before_echo(now.case), _try_before_echo),
+    CLEAR_LINES: Trial(lambda now: now.asked.compliant is None, _try_clear_lines),
+    WEAK_LINES: Trial(_weak_lines_contradict, _try_weak_lines),
+    LOAD_SWINGS: Trial(_load_may_swing, _try_load),
+    BENT_FRICTION: Trial(_is_bent, _try_bent),
+}
+
+
+def _advised(finding: Finding | Refusal, case: PeriodicCase) -> Finding | Refusal:
+    """The finding; where a string drowned lines, a wide interval is answered with the motion before the echo."""
+    if isinstance(finding, Refusal) or not _drowned(case):
+        return finding
+    return replace(finding, words=replace(finding.words, if_wide=_BEFORE_ECHO_HELPS))
 
 
 def _before_echo(case: PeriodicCase) -> bool:

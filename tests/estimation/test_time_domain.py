@@ -8,6 +8,7 @@ from scipy.signal import lfilter
 
 from tdhil.estimation import Options, ResidualTest, Verdict, identify
 from tdhil.estimation.frequency_domain import Fit
+from tdhil.estimation.result import Estimate
 from tdhil.estimation.samples import Samples, usable_samples
 from tdhil.estimation.time_domain import fit as fitting
 from tdhil.estimation.time_domain import solve as solving
@@ -83,10 +84,13 @@ def test_the_truth_solves_the_bins_of_short_stretches_at_low_rates_too(rate_hz, 
 
 @pytest.mark.heavy
 def test_windage_follows_the_shaft_s_own_speed_not_the_reported_one():
-    """Friction's slope at the mean speed is 17 N·m·s/rad, behind a lag of 0.4 s: J had been read 5 kg·m² too large."""
+    """Friction's slope at the mean speed is 17 N·m·s/rad, behind a lag of 0.4 s: J had been read 5 kg·m² too large.
+    With straight friction only it is 0.2 % too large.
+    """
     windy = replace(quiet(FIELD), viscous=2.0, quadratic=1.8)
     said = found(simulate(windy, "torque pulses", [1])[0])
-    assert said.inertia.value == pytest.approx(104.0, rel=2e-3)
+    assert any("friction is no straight line over speed" in warning for warning in said.warnings)
+    assert said.inertia.value == pytest.approx(104.0, rel=1e-3)
     assert said.inertia.low <= 104.0 <= said.inertia.high
 
 
@@ -177,6 +181,41 @@ def test_where_the_wide_band_leaves_the_inertia_open_the_narrow_one_speaks(monke
     solved = solve(bins, placed, (), float(np.ptp(recording.torque_nm)), 0.95)
     assert solved.bins == len(narrow.problem.bins)
     assert solved.inertia.bounded
+
+
+def _shifted(fit, by):
+    return replace(fit, theta=fit.theta * np.where(np.arange(PARAMETERS) == 0, by, 1.0))
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("by", [0.99, 1.01])
+def test_the_interval_joins_that_of_one_pole_filters_in_each_band(monkeypatch, by):
+    """Undeclared pulses missed in 5 of 109 records where only the profile counted, and 2 sd of the narrow band."""
+    recording = simulate(FIELD, "torque pulses", [3])[0]
+    bins, placed, span = bins_of(recording), windows_of(recording), float(np.ptp(recording.torque_nm))
+    wide, narrow = search(bins, (), span)
+
+    def solved(*bands):
+        monkeypatch.setattr(solving, "search", lambda *_: bands)
+        return solve(bins, placed, (), span, 0.95).inertia
+
+    def holds(inertia, middle, near):
+        rounding = 1e-12 * middle
+        return inertia.low <= middle - near + rounding and middle + near - rounding <= inertia.high
+
+    apart = replace(narrow, fit=_shifted(narrow.fit, by))
+    alone = solved(wide)
+    near = min(solving._one_pole_reach(apart, placed, 0.95), 0.5 * (alone.high - alone.low))
+    joined = solved(wide, apart)
+    assert holds(joined, apart.fit.theta[0], near)
+    assert joined.high - joined.low > alone.high - alone.low
+    structured = 2.0 - by          # a structure that −2 ln L prefers by 40, on the other side
+    monkeypatch.setattr(solving, "best_shapes", lambda problem, near: replace(
+        _shifted(near, structured), objective=near.objective - 40.0))
+    monkeypatch.setattr(solving, "profile", lambda problem, best, *_: Estimate(
+        *(float(best.theta[0]) * share for share in (1.0, 0.993, 1.007))))
+    near = min(solving._one_pole_reach(wide, placed, 0.95), 0.007 * structured * float(wide.fit.theta[0]))
+    assert holds(solved(wide), wide.fit.theta[0], near)
 
 
 @pytest.mark.heavy

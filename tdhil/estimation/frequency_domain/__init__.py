@@ -31,7 +31,8 @@ from tdhil.estimation.frequency_domain.rigid import (
     simultaneous as simultaneous, unfiltered as unfiltered,
 )
 from tdhil.estimation.frequency_domain.shafts import (
-    DELAY_SURER as DELAY_SURER, KnownStringShaft as KnownStringShaft, LOAD as LOAD, TwoMassShaft as TwoMassShaft,
+    DELAY_SURER as DELAY_SURER, KnownStringShaft as KnownStringShaft, LOAD as LOAD, ShaftModel as ShaftModel,
+    TwoMassShaft as TwoMassShaft,
     VISCOUS as VISCOUS, shaft_model as shaft_model,
 )
 from tdhil.estimation.frequency_domain.signal_filters import (

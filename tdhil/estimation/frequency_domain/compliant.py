@@ -1,11 +1,23 @@
 """The verdict on a shaft that is not rigid: what stands, why, and what the run could not tell."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from profiles import CodedText, MessageCode
+from tdhil.estimation.candidates import (
+    A_STRING,
+    BY_DIFFERENCE,
+    KNOWN_PIPE,
+    REQUESTED,
+    SCALED_PIPE,
+    TWO_MASSES,
+    Route,
+    Trial,
+    walk,
+)
 from tdhil.estimation.case import Finding, ModelWords, PeriodicCase
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.compliant_fit import (
@@ -42,6 +54,7 @@ from tdhil.estimation.frequency_domain.shafts import (
     TWO_MASS,
     VISCOUS,
     KnownStringShaft,
+    Shaft,
     ShaftModel,
     StringShaft,
     TwoMassShaft,
@@ -111,52 +124,111 @@ def _clear(line: SpectralLine) -> bool:
     return bool(np.all(speed | torque))
 
 
+@dataclass(frozen=True)
+class _LoadWalk:
+    """What stands in the walk over the rows of the load.
+
+    ``near``: two masses fitted beside a pipe that is ``contradicted``; ``two``: two masses, where they are tried;
+    ``counted``: by the difference of the mean speeds already.
+    """
+
+    asked: str
+    lines: tuple[SpectralLine, ...]
+    constraint: ViscousConstraint | None
+    priors: tuple[GaussianPrior, ...]
+    fixed: Fixed
+    pipe: Pipe | None
+    is_string: bool
+    counted: bool = False
+    near: CompliantFit | None = None
+    contradicted: bool = False
+    chosen: Chosen | Refusal | None = None
+    ended: bool = False
+
+    @property
+    def model(self) -> ShaftModel:
+        return shaft_model(self.asked)
+
+    def countable(self, model: ShaftModel, known: int = 0) -> bool:
+        """Do the lines give as many equations as this shaft has unknowns?"""
+        return _refuse_count(model, self.lines, self.constraint, self.priors, known) is None
+
+    def fitted(self, shaft: Shaft, near: CompliantFit | None = None) -> CompliantFit:
+        return fit_compliant(shaft, self.lines, self.constraint, self.priors, self.fixed, near)
+
+    def with_pipe(self, pipe: Pipe | None) -> "_LoadWalk":
+        """Return the walk with this pipe; it has ended if the lines are too few for the simplest shaft then."""
+        simplest = self.model if self.model.compliant is not None else (
+            STRING if self.is_string and pipe is None else TWO_MASS)
+        refusal = _refuse_count(simplest, self.lines, self.constraint, self.priors)
+        return replace(self, chosen=refusal, ended=refusal is not None)
+
+
 def choose(
     asked: str, lines: tuple[SpectralLine, ...], constraint: ViscousConstraint | None,
     priors: tuple[GaussianPrior, ...],
     fixed: Fixed, pipe: Pipe | None = None, is_string: bool = False
 ) -> Chosen | Refusal:
-    """``asked``: by its name, a compliant shaft; or two masses and the string are tried. ``priors`` and ``fixed`` as
-    with a rigid shaft. A ``pipe`` that is known makes it a string, unless the data contradict that. ``is_string``: the
-    rig says that a string hangs there, so that two masses never stand without the string beside them.
+    """Walk the rows of the load (`tdhil.estimation.candidates`). ``asked``: the name of the requested model; ``priors``
+    and ``fixed`` as with a rigid shaft. ``is_string``: rig.yaml declares a string, so two masses never stand without
+    the string beside them.
     """
-    model = shaft_model(asked)
-    compliant = model.compliant
-    simplest = model if compliant is not None else STRING if is_string and pipe is None else TWO_MASS
-    refusal = _refuse_count(simplest, lines, constraint, priors)
-    if refusal is not None:
-        return refusal
+    return _chosen_of(_LoadWalk(asked, lines, constraint, priors, fixed, pipe, is_string))
 
-    if pipe is not None and model.piped and _refuse_count(STRING, lines, constraint, priors, _BY_PIPE) is None:
-        near = fit_compliant(TwoMassShaft(), lines, constraint, priors, fixed)
-        known = fit_compliant(KnownStringShaft(pipe), lines, constraint, priors, fixed, near)
-        if not rejects(known.residual) and plausible(known):
-            return Chosen(known, pipe=pipe)
-        other = choose(asked, lines, constraint, priors, fixed, is_string=is_string)
-        if not isinstance(other, Chosen):
-            return other
-        scaled = KnownStringShaft(pipe, _ANY_IMPEDANCE)
-        fit = fit_compliant(scaled, lines, constraint, priors, fixed, near)
-        ratio = scaled.impedance_ratio(fit.mechanical)
-        least, most = _PIPE_RATIOS
-        found = not rejects(fit.residual) and plausible(fit) and not least <= ratio <= most
-        return replace(other, other_pipe=True, impedance_ratio=ratio if found else None)
-    if compliant is not None:
-        forced = fit_compliant(compliant(), lines, constraint, priors, fixed)
-        return Chosen(forced, rejected=rejects(forced.residual))
-    two = fit_compliant(TwoMassShaft(), lines, constraint, priors, fixed)
+
+def _chosen_of(begin: _LoadWalk) -> Chosen | Refusal:
+    chosen = walk(Route.LOAD, _TRIALS, begin.with_pipe(begin.pipe)).chosen
+    assert chosen is not None
+    return chosen
+
+
+def _try_pipe(standing: _LoadWalk) -> _LoadWalk:
+    """Hold the string to the known pipe. If the data contradict it, the other rows are tried without it."""
+    assert standing.pipe is not None
+    near = standing.fitted(TwoMassShaft())
+    known = standing.fitted(KnownStringShaft(standing.pipe), near)
+    if not rejects(known.residual) and plausible(known):
+        return replace(standing, chosen=Chosen(known, pipe=standing.pipe), ended=True)
+    return replace(standing.with_pipe(None), near=near, contradicted=True)
+
+
+def _try_requested(standing: _LoadWalk) -> _LoadWalk:
+    assert standing.model.compliant is not None
+    forced = standing.fitted(standing.model.compliant())
+    return replace(standing, chosen=Chosen(forced, rejected=rejects(forced.residual)))
+
+
+def _try_two_masses(standing: _LoadWalk) -> _LoadWalk:
+    two = standing.fitted(TwoMassShaft())
     if two.residual is None:      # a shaft taken in place of one that was contradicted must be one that could be, too
-        return Refusal(
-            f"{len(lines)} excited lines leave nothing to test two masses on a spring with",
+        refusal = Refusal(
+            f"{len(standing.lines)} excited lines leave nothing to test two masses on a spring with",
             "excite more lines about two mean speeds, from well below the resonance to well above it",
             entry=MessageCode.TOO_FEW_LINES,
         )
-    if _refuse_count(STRING, lines, constraint, priors) is not None:
-        return Chosen(two, rejected=rejects(two.residual) or not plausible(two))
-    string = fit_compliant(StringShaft(), lines, constraint, priors, fixed, two)
-    if not rejects(two.residual) and not _outdoes(string, two):
-        return Chosen(two, string, rejected=not plausible(two))
-    return Chosen(string, rejected=rejects(string.residual) or not plausible(string))
+        return replace(standing, chosen=refusal, ended=True)
+    return replace(standing, chosen=Chosen(two, rejected=rejects(two.residual) or not plausible(two)))
+
+
+def _try_string(standing: _LoadWalk) -> _LoadWalk:
+    """Fit the string; it stands beside two masses that the data allow and that it does not outdo."""
+    two = standing.chosen.fit if isinstance(standing.chosen, Chosen) else None
+    string = standing.fitted(StringShaft(), two)
+    if two is not None and not rejects(two.residual) and not _outdoes(string, two):
+        return replace(standing, chosen=Chosen(two, string, rejected=not plausible(two)))
+    return replace(standing, chosen=Chosen(string, rejected=rejects(string.residual) or not plausible(string)))
+
+
+def _try_scaled_pipe(standing: _LoadWalk) -> _LoadWalk:
+    """Compare the impedance of a string that has the travel time of the contradicted pipe with that of the pipe."""
+    assert standing.pipe is not None and isinstance(standing.chosen, Chosen)
+    scaled = KnownStringShaft(standing.pipe, _ANY_IMPEDANCE)
+    fit = standing.fitted(scaled, standing.near)
+    ratio = scaled.impedance_ratio(fit.mechanical)
+    least, most = _PIPE_RATIOS
+    found = not rejects(fit.residual) and plausible(fit) and not least <= ratio <= most
+    return replace(
+        standing, chosen=replace(standing.chosen, other_pipe=True, impedance_ratio=ratio if found else None))
 
 
 # Where the motor all but stands still the load swings widest, faster than the mean speed it may be. Its dry friction
@@ -172,18 +244,35 @@ _BY_THE_SWING = 0.1          # of its frequency
 _LEAST_NU = 2.0              # complex degrees of freedom of a difference, at least: the likelihood's tails need them
 
 
-def choose_unlike(
-    found: Chosen, asked: str, lines: tuple[SpectralLine, ...], constraint: ViscousConstraint | None,
-    priors: tuple[GaussianPrior, ...], fixed: Fixed, pipe: Pipe | None = None
-) -> Chosen:
-    """Choose again in place of ``found``, which is rejected, with lines that count by how the mean speeds differ."""
-    swing_hz = float(found.fit.mechanical[SWING]) / (2.0 * math.pi)
+def _try_by_difference(standing: _LoadWalk) -> _LoadWalk:
+    """Choose again, with lines that count by how the mean speeds differ."""
+    assert isinstance(standing.chosen, Chosen)
+    lines = standing.lines
+    swing_hz = float(standing.chosen.fit.mechanical[SWING]) / (2.0 * math.pi)
     counted = tuple(_by_difference(line) for line in lines)
     unlike = tuple(line.hertz for line, before in zip(counted, lines, strict=True) if line is not before)
     if len(unlike) > len(lines) // 2 or not any(abs(hz / swing_hz - 1.0) <= _BY_THE_SWING for hz in unlike):
-        return found
-    again = choose(asked, counted, constraint, priors, fixed, pipe)
-    return replace(again, unlike_hz=unlike) if isinstance(again, Chosen) and not again.rejected else found
+        return standing
+    again = _chosen_of(_LoadWalk(standing.asked, counted, standing.constraint, standing.priors, standing.fixed,
+                                 standing.pipe, standing.is_string, counted=True))
+    if not isinstance(again, Chosen) or again.rejected:
+        return standing
+    return replace(standing, chosen=replace(again, unlike_hz=unlike))
+
+
+def _is_rejected(standing: _LoadWalk) -> bool:
+    return isinstance(standing.chosen, Chosen) and standing.chosen.rejected
+
+
+_TRIALS: Mapping[str, Trial[_LoadWalk]] = {
+    KNOWN_PIPE: Trial(
+        lambda now: now.pipe is not None and now.model.piped and now.countable(STRING, _BY_PIPE), _try_pipe),
+    REQUESTED: Trial(lambda now: now.model.compliant is not None, _try_requested),
+    TWO_MASSES: Trial(lambda now: now.model.compliant is None, _try_two_masses),
+    A_STRING: Trial(lambda now: now.model.compliant is None and now.countable(STRING), _try_string),
+    SCALED_PIPE: Trial(lambda now: now.contradicted, _try_scaled_pipe),
+    BY_DIFFERENCE: Trial(lambda now: _is_rejected(now) and not now.counted, _try_by_difference),
+}
 
 
 def _by_difference(line: SpectralLine) -> SpectralLine:
@@ -443,13 +532,11 @@ def identify_compliant(
 
 
 def _chosen(case: PeriodicCase) -> Chosen | Refusal:
-    """Apply `choose` to the lines, and `choose_unlike` where the data contradict its result."""
-    recording, asked = case.recording, case.options.model
+    """Apply `choose` to the usable lines."""
+    recording = case.recording
     priors, fixed = known_of(recording.lag_prior, len(case.usable), case.constraint)
-    chosen = choose(asked, case.usable, case.constraint, priors, fixed, recording.pipe, recording.winds_up)
-    if isinstance(chosen, Chosen) and chosen.rejected:
-        return choose_unlike(chosen, asked, case.usable, case.constraint, priors, fixed, recording.pipe)
-    return chosen
+    return choose(
+        case.options.model, case.usable, case.constraint, priors, fixed, recording.pipe, recording.winds_up)
 
 
 def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Finding | Refusal | None) -> Finding:

@@ -1,11 +1,12 @@
 """Values from bins: J and the other parameters with intervals, the uncertainty budget, and the test of the model."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tdhil.estimation.candidates import NARROW_BAND, SQUARE, STRAIGHT, WIDE_BAND, Route, Trial, walk
 from tdhil.estimation.frequency_domain import (
     Fit,
     GaussianPrior,
@@ -257,8 +258,6 @@ def _shares(problem: FitProblem, theta: FloatArray, direction: FloatArray) -> fl
 # ---------------------------------------------------------------------------------------------------------------------
 
 _SURELY = 3.0       # times the reach², friction is taken as bent; from once it, both are held possible
-_NARROWER_SD = 2.0  # of a narrower band: about its own 95 %. With 1, undeclared ramps and pulses behind one long lag
-                    # missed in 8 of 93 records of `random_rigs.py`, and in two of them only for that
 _OF_REPORTS = (SPEED_LAG, TORQUE_LAG, SKEW, SPEED_SHAPE, TORQUE_SHAPE)
 
 
@@ -298,52 +297,119 @@ class ShaftEquation:
         return self.spread.factor * self.spread.quantile
 
 
+@dataclass(frozen=True)
+class _BandWalk:
+    """What stands in the walk over the bands. ``bands``: the wide one, if there is one, and the narrow one.
+
+    ``stated``: indices of the lags that were stated.
+    """
+
+    bands: tuple[FoundFit, ...]
+    placed: tuple[TaperWindow, ...]
+    stated: tuple[int, ...]
+    confidence: float
+    solved: Solved | None = None
+    ended: bool = False
+
+
 def solve(
     bins: Bins, placed: tuple[TaperWindow, ...], priors: tuple[GaussianPrior, ...], torque_span_nm: float,
     confidence: float
 ) -> Solved | None:
-    """Solve in the wide band where it tells J, can be tested, and the model holds, else in the narrow one.
-
-    None where too few bins stand clear of the noise.
-    """
-    solved = None
+    """Walk the rows of a record (`tdhil.estimation.candidates`). None where too few bins stand clear of the noise."""
     bands = search(bins, priors, torque_span_nm)
-    for number, found in enumerate(bands):
-        solved = _solve(found, placed, tuple(prior.index for prior in priors), confidence, bands[number + 1 :])
-        tells = solved.inertia.bounded and solved.inertia.low > 0.0
-        if tells and solved.residual is not None and not doubtful(solved.residual):
-            break
-    return solved
+    stated = tuple(prior.index for prior in priors)
+    return walk(Route.RECORD, _BAND_TRIALS, _BandWalk(bands, placed, stated, confidence)).solved
 
 
-def _solve(
-    found: FoundFit, placed: tuple[TaperWindow, ...], stated: tuple[int, ...], confidence: float,
-    narrower: tuple[FoundFit, ...]
-) -> Solved:
-    """Include what lies within `_NARROWER_SD` standard deviations of a narrower band's answer in the interval.
+def _holds(solved: Solved | None) -> bool:
+    """Return whether J is bounded, and the model was tested and is not in doubt."""
+    if solved is None or not (solved.inertia.bounded and solved.inertia.low > 0.0):
+        return False
+    return solved.residual is not None and not doubtful(solved.residual)
 
-    There a filter of any structure is right, if less sharp; where the bands agree that changes nothing.
+
+def _try_wide(now: _BandWalk) -> _BandWalk:
+    return replace(now, solved=_solve(now, now.bands[0], now.bands[1:]))
+
+
+def _try_narrow(now: _BandWalk) -> _BandWalk:
+    return replace(now, solved=_solve(now, now.bands[-1], ()))
+
+
+_BAND_TRIALS: Mapping[str, Trial[_BandWalk]] = {
+    WIDE_BAND: Trial(lambda now: len(now.bands) > 1, _try_wide),
+    NARROW_BAND: Trial(lambda now: bool(now.bands) and not _holds(now.solved), _try_narrow),
+}
+
+
+@dataclass(frozen=True)
+class _FrictionWalk:
+    """What stands in the walk over the friction in a band: the equation ``chosen``, and J with its interval.
+
+    ``square``: the problem with friction of the speed squared, and its fit.
     """
-    straight = _shaft(found.problem, found.fit, placed, stated, confidence)
+
+    band: FoundFit
+    square: tuple[FitProblem, Fit]
+    placed: tuple[TaperWindow, ...]
+    stated: tuple[int, ...]
+    confidence: float
+    straight: ShaftEquation | None = None
+    chosen: ShaftEquation | None = None
+    inertia: Estimate | None = None
+    bent: bool = False
+    ended: bool = False
+
+    def explains(self, times: float) -> bool:
+        """Does friction of the speed squared lower −2 ln L by more than so many times the square of J's reach?"""
+        if self.straight is None:
+            return False
+        return self.band.fit.objective - self.square[1].objective > times * self.straight.reach**2
+
+
+def _try_straight(now: _FrictionWalk) -> _FrictionWalk:
+    straight = _shaft(now.band.problem, now.band.fit, now.placed, now.stated, now.confidence)
+    return replace(now, straight=straight, chosen=straight, inertia=straight.inertia)
+
+
+def _try_square(now: _FrictionWalk) -> _FrictionWalk:
+    curved = _shaft(*now.square, now.placed, now.stated, now.confidence)
+    if now.explains(_SURELY):
+        return replace(now, chosen=curved, inertia=curved.inertia, bent=True)
+    assert now.inertia is not None
+    return replace(now, inertia=_joined(now.inertia, curved.inertia.low, curved.inertia.high))
+
+
+_FRICTION_TRIALS: Mapping[str, Trial[_FrictionWalk]] = {
+    STRAIGHT: Trial(lambda now: True, _try_straight),
+    SQUARE: Trial(lambda now: now.explains(1.0), _try_square),
+}
+
+
+def _joined(one: Estimate, low: float, high: float) -> Estimate:
+    return Estimate(one.value, min(one.low, low), max(one.high, high))
+
+
+def _solve(now: _BandWalk, found: FoundFit, narrower: tuple[FoundFit, ...]) -> Solved:
+    """Solve in one band. J's interval also holds that of one-pole filters in each narrower band.
+
+    There a filter of any structure is right, if less sharp; where the bands agree that changes nothing. A narrower
+    band adds no more than the half-width on either side, since it may say almost nothing.
+    """
+    stated, confidence = now.stated, now.confidence
     bent_problem = replace(found.problem, free=(*found.problem.free, BEND))
-    bent_fit = minimise(bent_problem, found.fit.theta)
-    drop = found.fit.objective - bent_fit.objective
-    chosen, value = straight, straight.inertia
-    bent = drop > _SURELY * straight.reach**2
-    if drop > straight.reach**2:
-        curved = _shaft(bent_problem, bent_fit, placed, stated, confidence)
-        other = curved.inertia
-        if bent:
-            chosen, value = curved, other
-        else:
-            value = Estimate(value.value, min(value.low, other.low), max(value.high, other.high))
+    square = bent_problem, minimise(bent_problem, found.fit.theta)
+    frictions = walk(Route.BAND, _FRICTION_TRIALS, _FrictionWalk(found, square, now.placed, stated, confidence))
+    assert frictions.chosen is not None and frictions.inertia is not None
+    chosen, value, bent = frictions.chosen, frictions.inertia, frictions.bent
     for band in narrower:
         middle = float(band.fit.theta[INERTIA])
-        near = min(_NARROWER_SD * _deviation(band), 0.5 * (value.high - value.low))
-        value = Estimate(value.value, min(value.low, middle - near), max(value.high, middle + near))
+        near = min(_one_pole_reach(band, now.placed, confidence), 0.5 * (value.high - value.low))
+        value = _joined(value, middle - near, middle + near)
     problem = chosen.problem
     residual = local_test(problem, chosen.fit.theta, chosen.spread.factor)
-    shift = float(bent_fit.theta[INERTIA]) - float(found.fit.theta[INERTIA])
+    shift = float(square[1].theta[INERTIA]) - float(found.fit.theta[INERTIA])
     budget = _budget(chosen, value, shift, bent, stated)
 
     def estimate(index: int) -> Estimate:
@@ -367,7 +433,11 @@ def _solve(
 def _shaft(
     problem: FitProblem, fit: Fit, placed: tuple[TaperWindow, ...], stated: tuple[int, ...], confidence: float
 ) -> ShaftEquation:
-    """J's interval over every structure of the filters; its value of one pole each and of any, as each weighs."""
+    """J's interval over every structure of the filters, joined with that of one pole each; the value as each weighs.
+
+    Where the structures lower −2 ln L by chance, their profile alone excludes the truth (docs/decisions/0045). One pole
+    each adds no more than the half-width on either side: its quadratic interval ignores the bounds of the lags.
+    """
     scores = block_scores(problem, placed, fit.theta)
     own = spread(problem, fit, scores, INERTIA, confidence)
     reach, scale = own.factor * own.quantile, float(problem.box.scale[INERTIA])
@@ -378,15 +448,16 @@ def _shaft(
     shaped = weight < 0.5
     wide = profile(open_problem, best, INERTIA, reach, min(max(reach * own.sd, 1e-7 * scale), 0.5 * scale))
     value = float(weight * fit.theta[INERTIA] + (1.0 - weight) * best.theta[INERTIA])
-    inertia = Estimate(value, min(wide.low, value) + min(own.lean, 0.0), max(wide.high, value) + max(own.lean, 0.0))
+    near, middle = min(reach * own.sd, 0.5 * (wide.high - wide.low)), float(fit.theta[INERTIA])
+    seen = (value, wide.low, wide.high, middle - near, middle + near)
+    inertia = Estimate(value, min(seen) + min(own.lean, 0.0), max(seen) + max(own.lean, 0.0))
     return ShaftEquation(open_problem if shaped else problem, best if shaped else fit, scores, own, inertia, shaped)
 
 
-def _deviation(found: FoundFit) -> float:
-    """Standard deviation of J, with one pole each."""
-    spread_of, _ = covariance(found.problem, found.fit.theta, found.problem.free)
-    at = found.problem.free.index(INERTIA)
-    return math.sqrt(max(float(spread_of[at, at]), 0.0))
+def _one_pole_reach(found: FoundFit, placed: tuple[TaperWindow, ...], confidence: float) -> float:
+    """Half-width of J in one band, quadratic, with one pole each."""
+    own = spread(found.problem, found.fit, block_scores(found.problem, placed, found.fit.theta), INERTIA, confidence)
+    return own.factor * own.quantile * own.sd
 
 
 def _estimate(shaft: ShaftEquation, index: int, confidence: float) -> Estimate:

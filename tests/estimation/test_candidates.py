@@ -1,0 +1,61 @@
+"""The table of candidates: each row is tried in its place, and has a test that fails without it."""
+
+import ast
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import pytest
+
+from tdhil.estimation import candidates, periodic
+from tdhil.estimation.candidates import CANDIDATES, Candidate, Route, Trial, rows, walk
+from tdhil.estimation.frequency_domain import compliant
+from tdhil.estimation.time_domain import solve
+
+ROOT = Path(__file__).parents[2]
+TRIALS = {
+    Route.LINES: periodic._TRIALS,
+    Route.LOAD: compliant._TRIALS,
+    Route.RECORD: solve._BAND_TRIALS,
+    Route.BAND: solve._FRICTION_TRIALS,
+}
+
+
+@pytest.mark.parametrize("route", Route, ids=lambda route: route.name)
+def test_each_route_has_a_trial_for_each_of_its_rows(route):
+    assert set(TRIALS[route]) == {row.name for row in rows(route)}
+
+
+def test_each_row_is_complete_and_has_its_own_name():
+    assert len({row.name for row in CANDIDATES}) == len(CANDIDATES)
+    for row in CANDIDATES:
+        assert all(str(value).strip() for value in vars(row).values()), row.name
+
+
+@pytest.mark.parametrize("row", CANDIDATES, ids=lambda row: row.name)
+def test_the_test_of_each_row_is_there(row):
+    path, _, name = row.test.partition("::")
+    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+    assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+
+
+@dataclass(frozen=True)
+class Tried:
+    names: tuple[str, ...] = ()
+    ended: bool = field(default=False)
+
+
+def _row(name):
+    return Candidate(name, Route.LOAD, *("-" for _ in range(8)))
+
+
+def _trial(name, applies=True, ends=False):
+    return Trial(lambda now: applies, lambda now: replace(now, names=(*now.names, name), ended=ends))
+
+
+def test_rows_are_tried_in_the_order_of_the_table_and_the_last_ends_the_walk(monkeypatch):
+    monkeypatch.setattr(candidates, "CANDIDATES", (_row("a"), _row("b"), _row("c"), _row("d")))
+    trials = {"d": _trial("d"), "c": _trial("c", ends=True), "b": _trial("b", applies=False), "a": _trial("a")}
+    assert walk(Route.LOAD, trials, Tried()).names == ("a", "c")
+    assert walk(Route.LINES, trials, Tried()).names == ()
+    with pytest.raises(KeyError):
+        walk(Route.LOAD, {"a": _trial("a")}, Tried())
