@@ -15,7 +15,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from tdhil.estimation.candidates import CANDIDATES, Candidate
+from tdhil.estimation.candidates import CANDIDATES, CandidateModel
 
 ROOT = Path(__file__).resolve().parents[1]
 _RUN = """
@@ -27,7 +27,7 @@ sys.exit(pytest.main([sys.argv[1], "--long", "-q", "-x", "-p", "no:cacheprovider
 _PASSED, _FAILED = 0, 1      # exit codes of pytest
 
 
-def code_of(row: Candidate, left_out: str) -> int:
+def code_of(row: CandidateModel, left_out: str) -> int:
     """Run the row's test and return pytest's exit code; ``left_out``: name of a row, or empty."""
     done = subprocess.run([sys.executable, "-c", _RUN, row.test, left_out], cwd=ROOT, capture_output=True, check=False)
     return done.returncode

@@ -132,7 +132,7 @@ def _sentence(text: str) -> str:
 
 def candidates() -> str:
     """The page of the models that are tried for J, a part for each walk."""
-    from tdhil.estimation.candidates import Route, rows
+    from tdhil.estimation.candidates import FitRoute, rows
 
     out = [
         MADE + "# Candidates of the identification",
@@ -141,7 +141,7 @@ def candidates() -> str:
         "so far. [Models](../explanation/models.md) states the rule of selection and the rule of the interval.",
         "",
     ]
-    for route in Route:
+    for route in FitRoute:
         out += [f"## {route.value[0].upper()}{route.value[1:]}", ""]
         for row in rows(route):
             out += [

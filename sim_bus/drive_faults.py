@@ -22,8 +22,8 @@ V = TypeVar("V")
 """Type of a fault's value."""
 
 
-class Act(Passing, Generic[P]):
-    """Does something at its place when it begins, and when it ends."""
+class FaultAct(Passing, Generic[P]):
+    """Act at its place when it begins, and when it ends."""
 
     place: P
 
@@ -40,7 +40,7 @@ class Act(Passing, Generic[P]):
             self._end(self.place)
 
 
-def changed(of: Callable[[P], Any], name: str, value: Callable[[P], object]) -> Act[P]:
+def changed(of: Callable[[P], Any], name: str, value: Callable[[P], object]) -> FaultAct[P]:
     """An attribute has another value while the fault lasts."""
     before: list[object] = []
 
@@ -48,19 +48,19 @@ def changed(of: Callable[[P], Any], name: str, value: Callable[[P], object]) -> 
         before.append(getattr(of(place), name))
         setattr(of(place), name, value(place))
 
-    return Act(begin, lambda place: setattr(of(place), name, before.pop()))
+    return FaultAct(begin, lambda place: setattr(of(place), name, before.pop()))
 
 
-def once(parse: Callable[[str], V], act: Callable[[P, V], None]) -> Callable[[str], Act[P]]:
+def once(parse: Callable[[str], V], act: Callable[[P, V], None]) -> Callable[[str], FaultAct[P]]:
     """Something that happens once, with the value of the fault."""
-    def make(text: str) -> Act[P]:
+    def make(text: str) -> FaultAct[P]:
         value = parse(text)
-        return Act(lambda place: act(place, value))
+        return FaultAct(lambda place: act(place, value))
 
     return make
 
 
-class Rehearsal(Generic[F]):
+class FaultSchedule(Generic[F]):
     """The script of one drive; `happen_to` makes it act."""
 
     def __init__(self, script: tuple[Scripted, ...], make: Callable[[Scripted], F]) -> None:
@@ -87,7 +87,7 @@ class Rehearsal(Generic[F]):
         self.moved(self._drive.time_us)
 
 
-class DriveFault:
+class InjectedFault:
     """Nothing by itself; a fault overrides what it needs."""
 
     def begin(self, drive: TimedDrive) -> None:
@@ -97,7 +97,7 @@ class DriveFault:
         """It is over."""
 
 
-class Deaf(DriveFault):
+class Deaf(InjectedFault):
     """The state machine doesn't move on commands any more."""
 
     def begin(self, drive: TimedDrive) -> None:
@@ -115,7 +115,7 @@ class SafeTorqueOff(Deaf):
         super().begin(drive)
 
 
-class ModeKept(DriveFault):
+class ModeKept(InjectedFault):
     """6060h is taken and not followed: 6061h goes on showing the old mode."""
 
     def begin(self, drive: TimedDrive) -> None:
@@ -133,7 +133,7 @@ class ModeLost(ModeKept):
         super().begin(drive)
 
 
-class LimitedTorque(DriveFault):
+class LimitedTorque(InjectedFault):
     """An internal limit leaves this share of the torque limit."""
 
     def __init__(self, share: float) -> None:
@@ -150,7 +150,7 @@ class LimitedTorque(DriveFault):
         limits.torque_forward_nm, limits.torque_reverse_nm = self._before
 
 
-class LoadLost(DriveFault):
+class LoadLost(InjectedFault):
     """The coupled load comes off: this share of the motor end's inertia and friction is left."""
 
     def __init__(self, share: float) -> None:
@@ -160,7 +160,7 @@ class LoadLost(DriveFault):
         drive.inverter.lose_load(self._share)
 
 
-class Lying(DriveFault):
+class Lying(InjectedFault):
     """Sensor, power stage or reports of the drive are wrong (`sim_bus.reports`)."""
 
     def __init__(self, lie: Lie) -> None:
@@ -173,7 +173,7 @@ class Lying(DriveFault):
         self._lie.end(drive.inverter.lies)
 
 
-def of_drive(act: Callable[[DriveFault], M]) -> dict[str, FaultKind[M]]:
+def of_drive(act: Callable[[InjectedFault], M]) -> dict[str, FaultKind[M]]:
     """The table as faults of one bus; ``act`` makes one of its faults."""
     return {
         "stuck-state": FaultKind(31, "the controlword is ignored", plain(lambda: act(Deaf()))),

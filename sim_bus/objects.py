@@ -113,7 +113,7 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
         return found.subindices[subindex]
 
     def mappable(self, entry: int, *, receives: bool) -> bool:
-        """Whether a mapping entry (index << 16 | subindex << 8 | bits) names an object that a PDO may carry."""
+        """Return whether a mapping entry (index << 16 | subindex << 8 | bits) names an object that a PDO may carry."""
         variable = self.variable(entry >> 16, entry >> 8 & 0xFF)
         able = variable.pdo_mappable and (variable.writable if receives else variable.readable)
         return bool(able) and variable.data_type in FORMATS and entry & 0xFF == len(variable)

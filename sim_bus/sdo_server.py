@@ -28,7 +28,7 @@ _LARGEST = 4096
 
 
 class Meddling(Enum):
-    """What a scripted fault makes of the transfers of an object."""
+    """Effect of a scripted fault on the transfers of an object."""
 
     ABORTED, UNANSWERED, NOT_KEPT, OTHERWISE = range(4)
 

@@ -38,7 +38,7 @@ ACCELERATES_RAD_S = 0.3
 BEFORE_S = 3.0
 """Before the quick stop of a release above a string: the comparison uses the speed of this time before, s."""
 
-EXIT_CODES = frozenset({0, 3, 4, 5, 6, 7, 8, 9, 130, 143})
+EXIT_CODES = frozenset({0, 3, 4, 5, 6, 7, 8, 9, 12, 130, 143})
 """Exit codes of `tdhil.errors`, except 1 (an internal error) and 2 (an impossible request)."""
 
 _REMOVED = "torque removed"

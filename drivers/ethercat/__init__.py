@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from drivers.ethercat.scan import (
         FoundSlave as FoundSlave, found_slave as found_slave, objects_of as objects_of, stations_at as stations_at,
     )
-    from drivers.ethercat.segment import Segment as Segment, open_segment as open_segment
+    from drivers.ethercat.segment import EthercatSegment as EthercatSegment, open_segment as open_segment
     from drivers.ethercat.station import (
         Station as Station, has_clocks as has_clocks, station_of as station_of, watchdog_s as watchdog_s,
     )
@@ -19,6 +19,6 @@ else:
         "drive": "EthercatDrive",
         "quick_stop": "EthercatTarget open_target",
         "scan": "FoundSlave found_slave objects_of stations_at",
-        "segment": "Segment open_segment",
+        "segment": "EthercatSegment open_segment",
         "station": "Station has_clocks station_of watchdog_s",
     })

@@ -20,8 +20,8 @@ from drivers.clock import Clock
 from drivers.drive import DriveLimits, FrameTap, Identity, RawFrame
 from drivers.errors import CommunicationLost, DriveFault, ObjectRefused, PreflightRefused
 from drivers.ethercat.mailbox import CoeObjects, Mailbox, answered, download, upload
-from drivers.ethercat.pdo import Feedback, Image, Setpoints, map_images, settings
-from drivers.ethercat.segment import Segment
+from drivers.ethercat.pdo import FeedbackImage, Image, SetpointImage, map_images, settings
+from drivers.ethercat.segment import EthercatSegment
 from drivers.ethercat.station import CYCLE_US, INIT, OP, PRE_OP, REGISTER_US, SAFE_OP, has_clocks
 from drivers.ethercat.supervision import ProcessDataWatchdog, SlaveWatch
 from drivers.preflight import PreflightTable
@@ -53,7 +53,8 @@ class EthercatBus(cia402.Cia402Bus):
     feedback_place = "working counter"
 
     def __init__(
-        self, segment: Segment, profile: EthercatProfile, clock: Clock, *, period_s: float, tap: FrameTap | None = None,
+        self, segment: EthercatSegment, profile: EthercatProfile, clock: Clock, *, period_s: float,
+        tap: FrameTap | None = None,
     ) -> None:
         self._segment, self._station, self._profile, self._tap = segment, segment.station, profile, tap
         self._mailbox = Mailbox(segment.station, clock, tap)
@@ -66,8 +67,8 @@ class EthercatBus(cia402.Cia402Bus):
         self._watchdog = ProcessDataWatchdog(segment.station)
         self._content = cia402.CyclicObjects()
         self._images = (Image({}, 0), Image({}, 0))
-        self._setpoints = Setpoints(self._images[0], self._content)
-        self._feedback: Feedback | None = None         # None: nothing can be decoded
+        self._setpoints = SetpointImage(self._images[0], self._content)
+        self._feedback: FeedbackImage | None = None         # None: nothing can be decoded
         self._position: Position | None = None
         self._asked, self._looked_s, self._al_state = 0, 0.0, OP
         self._sent, self._fed, self._clocks = False, True, False
@@ -117,8 +118,9 @@ class EthercatBus(cia402.Cia402Bus):
         self._position = carried if place in self._images[1].offsets else None
         self.angle_mapped = self._position is not None
         actual = profile.torque.actual
-        self._setpoints = Setpoints(self._images[0], content)
-        self._feedback = Feedback(self._images[1], content, self._position, "i16" if actual is None else actual.type)
+        self._setpoints = SetpointImage(self._images[0], content)
+        kind = "i16" if actual is None else actual.type
+        self._feedback = FeedbackImage(self._images[1], content, self._position, kind)
         return settings(objects, profile) if mapped else ()
 
     def arm(self, table: PreflightTable, limits: DriveLimits) -> float:
@@ -387,7 +389,7 @@ class EthercatDrive(cia402.Cia402Drive):
 
     def __init__(
         self,
-        segment: Segment,
+        segment: EthercatSegment,
         profile: EthercatProfile,
         clock: Clock,
         *,

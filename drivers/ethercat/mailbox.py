@@ -67,7 +67,7 @@ class Mailbox:
         self.on_emergency: Callable[[bytes], None] = lambda data: None
         """Called with the eight bytes of an emergency message."""
         self.on_answer: Callable[[bytes], None] = lambda sdo: None
-        """Called with each SDO answer that nobody waits for."""
+        """Called with each SDO answer that no request waits for."""
 
     def find(self) -> None:
         """Read where the two mailboxes are. Raises CommunicationLost if the slave has none."""

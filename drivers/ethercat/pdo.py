@@ -49,7 +49,7 @@ class Image:
                 if self.offsets.get((index, sub), (0, 0))[1] != bits]
 
 
-class Setpoints:
+class SetpointImage:
     """Outputs of the host in one cycle, packed into the image."""
 
     def __init__(self, image: Image, content: cia402.CyclicObjects) -> None:
@@ -81,7 +81,7 @@ class Setpoints:
                 place[0].pack_into(self.data, place[1], value)
 
 
-class Feedback:
+class FeedbackImage:
     """Inputs of the host: values of the objects in the image. An object that is not mapped gives None."""
 
     def __init__(

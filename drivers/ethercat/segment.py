@@ -37,7 +37,7 @@ class SoemStation(Station):
             raise not_answered(f"the slave does not take {offset:04X}h", self.place) from error
 
 
-class Segment:
+class EthercatSegment:
     """The slaves of one interface, in PRE-OP, and the one at ``position`` or with the configured station ``alias``.
 
     Raises PreflightRefused if there is none. `close` closes the interface.
@@ -88,7 +88,7 @@ def _told(error: Exception) -> str:
     return ", ".join(str(getattr(one, "desc", one)) for one in getattr(error, "error_list", [error]))
 
 
-def open_segment(interface: str, position: int = 0, alias: int | None = None) -> Segment:
+def open_segment(interface: str, position: int = 0, alias: int | None = None) -> EthercatSegment:
     """Open an interface with pysoem, after a look at the AL states: a segment that is driven stays untouched.
 
     Raises PreflightRefused, and CommunicationLost if pysoem is missing.
@@ -104,7 +104,7 @@ def open_segment(interface: str, position: int = 0, alias: int | None = None) ->
     except (ConnectionError, OSError) as error:
         raise unusable(interface, error) from error
     try:
-        return Segment(master, interface, position, alias)
+        return EthercatSegment(master, interface, position, alias)
     except BaseException:
         master.close()
         raise
@@ -117,7 +117,7 @@ def new_master() -> Any:
     except ImportError as error:
         raise PreflightRefused("EtherCAT needs the package pysoem", where="pysoem",
                                next_step="Install it: pip install 'tdhil[ethercat]'",
-                               entry=MessageCode.PACKAGE_MISSING) from error
+                               entry=MessageCode.PREFLIGHT_REFUSED) from error
     pysoem.settings.timeouts.ret = FRAME_US
     return pysoem.Master()
 

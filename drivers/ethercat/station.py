@@ -150,11 +150,12 @@ def station_of(stations: Sequence[Station], interface: str, position: int, alias
              if (number == position if alias is None else one.number(ALIAS) == alias)]
     if len(found) != 1:
         wanted = f"at position {position}" if alias is None else f"with station alias {alias}"
-        raise PreflightRefused(
-            f"{len(found) or 'no'} slaves are {wanted}; {len(stations)} answer", where=interface,
-            next_step="See tdhil scan; positions begin at 0",
-            entry=MessageCode.NODE_ID_CONFLICT if found else MessageCode.NO_DRIVE_FOUND,
-        )
+        what, next_step = f"are {wanted}; {len(stations)} answer", "See tdhil scan; positions begin at 0"
+        if found:
+            raise PreflightRefused(f"{len(found)} slaves {what}", where=interface, next_step=next_step,
+                                   entry=MessageCode.NODE_ID_CONFLICT)
+        raise PreflightRefused(f"no slaves {what}", where=interface, next_step=next_step,
+                               entry=MessageCode.NO_DRIVE_FOUND)
     return stations[found[0]]
 
 

@@ -17,7 +17,7 @@ from profiles import CYCLE_ID, CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
 from sim_bus.canopen import services as emcy
 from sim_bus.canopen.node import SYNC, Cia402Node
 from sim_bus.canopen.sender import Sender
-from sim_bus.drive_faults import DriveFault, Rehearsal, of_drive
+from sim_bus.drive_faults import FaultSchedule, InjectedFault, of_drive
 from sim_bus.fault_script import (
     FaultKind,
     Kinds,
@@ -109,7 +109,7 @@ class ForeignNmt(Misbehaviour):
 class OfDrive(Misbehaviour):
     """A fault that a drive may have on any bus."""
 
-    def __init__(self, fault: DriveFault) -> None:
+    def __init__(self, fault: InjectedFault) -> None:
         self._fault = fault
 
     def begin(self) -> None:
@@ -470,7 +470,7 @@ make, parse_all, listed, listing = KINDS.make, KINDS.parse_all, KINDS.listed, KI
 _SEED = 0xFA17
 
 
-class Faults(Rehearsal[Misbehaviour]):
+class Faults(FaultSchedule[Misbehaviour]):
     """The script of one drive. `attach` makes it act; frames then come in by `came`."""
 
     def __init__(self, script: tuple[Scripted, ...], seed: int = 0) -> None:

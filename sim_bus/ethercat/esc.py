@@ -50,17 +50,23 @@ _DELIVERED = {
 """Contents of the registers after power-on."""
 
 
-class Command(IntEnum):
+class EscCommand(IntEnum):
     """Datagram commands: auto-increment, station, broadcast, logical; read, write, both; read multiple write."""
 
     NOP, APRD, APWR, APRW, FPRD, FPWR, FPRW, BRD, BWR, BRW, LRD, LWR, LRW, ARMW, FRMW = range(15)
 
 
-_READS = {Command.APRD, Command.APRW, Command.FPRD, Command.FPRW, Command.BRD, Command.BRW, Command.LRD, Command.LRW}
-_WRITES = {Command.APWR, Command.APRW, Command.FPWR, Command.FPRW, Command.BWR, Command.BRW, Command.LWR, Command.LRW}
-_LOGICAL = {Command.LRD, Command.LWR, Command.LRW}
-_BY_POSITION = {Command.APRD, Command.APWR, Command.APRW, Command.ARMW}
-_BROADCAST = {Command.BRD, Command.BWR, Command.BRW}
+_READS = {
+    EscCommand.APRD, EscCommand.APRW, EscCommand.FPRD, EscCommand.FPRW, EscCommand.BRD, EscCommand.BRW,
+    EscCommand.LRD, EscCommand.LRW,
+}
+_WRITES = {
+    EscCommand.APWR, EscCommand.APRW, EscCommand.FPWR, EscCommand.FPRW, EscCommand.BWR, EscCommand.BRW,
+    EscCommand.LWR, EscCommand.LRW,
+}
+_LOGICAL = {EscCommand.LRD, EscCommand.LWR, EscCommand.LRW}
+_BY_POSITION = {EscCommand.APRD, EscCommand.APWR, EscCommand.APRW, EscCommand.ARMW}
+_BROADCAST = {EscCommand.BRD, EscCommand.BWR, EscCommand.BRW}
 
 
 class Pdi(Protocol):
@@ -158,7 +164,7 @@ class Esc:
             gained = 0
             if command in _LOGICAL:
                 gained = self._logical(command, position | offset << 16, body)
-            elif Command.NOP < command <= Command.FRMW:
+            elif EscCommand.NOP < command <= EscCommand.FRMW:
                 gained, position = self._physical(command, position, offset, body)
             _DATAGRAM.pack_into(data, begin - _DATAGRAM.size, command, index, position, offset, length, event)
             data[begin:at - 2] = body
@@ -176,14 +182,14 @@ class Esc:
             alias = self.memory[_DL_ALIAS] & 1 and position == self.word(0x0012)
             addressed = position == self.word(_STATION) or bool(alias)
         reads, writes = command in _READS and addressed, command in _WRITES and addressed
-        if command in (Command.ARMW, Command.FRMW):
+        if command in (EscCommand.ARMW, EscCommand.FRMW):
             reads, writes = addressed, not addressed
         sent, gained = bytes(body), 0
         if reads and (found := self._read(offset, len(body))) is not None:
             body[:] = bytes(a | b for a, b in zip(body, found, strict=True)) if command in _BROADCAST else found
             gained = 1
         if writes and self._write(offset, sent):
-            gained += 2 if command in (Command.APRW, Command.FPRW, Command.BRW) else 1
+            gained += 2 if command in (EscCommand.APRW, EscCommand.FPRW, EscCommand.BRW) else 1
         return gained, position
 
     def _logical(self, command: int, logical: int, body: bytearray) -> int:
@@ -199,12 +205,12 @@ class Esc:
             at, place = fmmu.part(logical, len(body))
             if sent[place] and fmmu.writes and command in _WRITES:
                 was_written |= self._write(at, sent[place])
-        return was_read + (2 if command == Command.LRW else 1) * was_written
+        return was_read + (2 if command == EscCommand.LRW else 1) * was_written
 
     # -- memory ------------------------------------------------------------------------------------------
 
     def _read(self, at: int, count: int) -> bytes | None:
-        """What a master reads there; None where it may not."""
+        """Return what a master reads there; None where it may not."""
         end = at + count
         if end > MEMORY_SIZE:
             return None
@@ -325,7 +331,7 @@ class Esc:
         return (self.word(_DIVIDER) + 2) * _WATCHDOG_UNIT_S * self.word(_WATCHDOG)
 
     def stop_watchdog(self) -> None:
-        """No outputs are expected any more."""
+        """Expect no outputs any more."""
         self._unfed_s = None
 
     def expire_watchdog(self) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sim_bus.drive_faults import Act, DriveFault, Rehearsal, changed, of_drive, once
+from sim_bus.drive_faults import FaultAct, FaultSchedule, InjectedFault, changed, of_drive, once
 from sim_bus.ethercat.slave import Cia402Slave
 from sim_bus.fault_script import (
     FaultKind,
@@ -24,7 +24,7 @@ _FIRST, _LENGTH, _HEAD = 16, slice(22, 24), 26
 
 _LRD, _LWR, _LRW = 10, 11, 12
 
-Misbehaviour = Act["Faults"]
+Misbehaviour = FaultAct["Faults"]
 
 
 def _part(name: str) -> Callable[[str], Misbehaviour]:
@@ -46,7 +46,7 @@ def _transfers(how: Meddling) -> Callable[[str], Misbehaviour]:
     return make
 
 
-def _of_drive(fault: DriveFault) -> Misbehaviour:
+def _of_drive(fault: InjectedFault) -> Misbehaviour:
     return Misbehaviour(lambda line: fault.begin(line.slave), lambda line: fault.end(line.slave))
 
 
@@ -111,7 +111,7 @@ KINDS: Kinds[Misbehaviour] = Kinds({
 parse_all, listed, listing = KINDS.parse_all, KINDS.listed, KINDS.listing
 
 
-class Faults(Rehearsal[Misbehaviour]):
+class Faults(FaultSchedule[Misbehaviour]):
     """The script of one drive, between host and slave."""
 
     def __init__(self, script: tuple[Scripted, ...], slave: Cia402Slave, seed: int) -> None:

@@ -7,7 +7,7 @@ from canopen.objectdictionary import datatypes
 from canopen.sdo import SdoAbortedError
 
 from sim_bus import objects as od
-from sim_bus.ethercat.sii import Pdo, PdoEntry
+from sim_bus.ethercat.sii import PdoEntry, SiiPdo
 from sim_bus.objects import FORMATS, ObjectStore, key_of
 
 PDOS, ENTRIES, SIZE_LIMIT = 4, 8, 64
@@ -88,10 +88,10 @@ class ProcessData:
         """The keys of the outputs, with their values."""
         return list(zip(self._keys, self._struct.unpack_from(data), strict=True))
 
-    def delivered(self) -> Pdo:
+    def delivered(self) -> SiiPdo:
         """The first PDO as the EEPROM tells it."""
         entries = [PdoEntry(one >> 16, one >> 8 & 0xFF, self._kind(one), one & 0xFF) for one in self._mappings[0].used]
-        return Pdo(self.first, self.manager, entries)
+        return SiiPdo(self.first, self.manager, entries)
 
     def compile(self) -> None:
         """Builds the fast path of what is assigned; refused outside PRE-OPERATIONAL."""

@@ -38,7 +38,7 @@ class PdoEntry:
 
 
 @dataclass(frozen=True)
-class Pdo:
+class SiiPdo:
     """One PDO of a SyncManager."""
 
     index: int
@@ -56,7 +56,7 @@ def checksum(head: bytes) -> int:
     return crc
 
 
-def eeprom(identity: Sequence[int], alias: int, name: str, areas: Sequence[Area], pdos: Sequence[Pdo]) -> bytes:
+def eeprom(identity: Sequence[int], alias: int, name: str, areas: Sequence[Area], pdos: Sequence[SiiPdo]) -> bytes:
     """Return the EEPROM of a slave. ``identity``: vendor, product, revision, serial; ``areas``: SM0 to SM3."""
     words = bytearray(0x80)
     pack_into("<HHHHH", words, 0, 0x0C05, 0, 0, 0, alias)
@@ -80,6 +80,6 @@ def _category(kind: int, content: bytes) -> bytes:
     return pack("<HH", kind, len(content) // 2) + content
 
 
-def _pdo(pdo: Pdo) -> bytes:
+def _pdo(pdo: SiiPdo) -> bytes:
     entries = b"".join(pack("<HBBBBH", one.index, one.subindex, 0, one.data_type, one.bits, 0) for one in pdo.entries)
     return pack("<HBBBBH", pdo.index, len(pdo.entries), pdo.manager, 0, 0, 0) + entries

@@ -50,7 +50,7 @@ class Simulator:
         return self._faults.answer(frame)
 
     def idle(self, now_s: float, waited_s: float = _POLL_S) -> None:
-        """No frame has come for ``waited_s``; a caller that had no processor time knows of no more than that."""
+        """Note that no frame has come for ``waited_s``, or for less, if the caller had no processor time."""
         self._silent_s += waited_s
         if self.slave.stepped and self.slave.cycled and self._silent_s >= self._silence_s and not self._running_on:
             self._running_on, self._plant_s = True, now_s
@@ -58,7 +58,7 @@ class Simulator:
         self._follow(now_s)
 
     def _follow(self, now_s: float) -> None:
-        """In its own time, the plant catches up with the caller's clock, in whole chunks."""
+        """Let the plant catch up in its own time with the caller's clock, in whole chunks."""
         slave, before_s, self._last_s = self.slave, self._last_s, now_s
         if not before_s or (slave.stepped and not self._running_on):
             self._plant_s, slave.esc.fine_ns = now_s, 0

@@ -142,7 +142,7 @@ class Cia402Slave(TimedDrive):
         return self.sent.pack() if self.frozen is None else self.frozen
 
     def watchdog_expired(self) -> None:
-        """No outputs have come for the time of 0420h."""
+        """React to outputs that have not come for the time of 0420h."""
         if self.state is AlState.OPERATIONAL:
             self.al_error(WATCHDOG)
 

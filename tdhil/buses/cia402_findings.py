@@ -1,4 +1,4 @@
-"""What scan and doctor find out about a CiA 402 drive by its objects, on any bus. Nothing is written."""
+"""Findings of scan and doctor about a CiA 402 drive by its objects, on any bus. Nothing is written."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 The rule of selection stands in `walk`. A route goes through its rows in the order of the table. A row is tried where it
 applies to what stands so far, and its answer stands from then on. A row that ends the walk is the last. Each route
-gives its rows their two functions (`Trial`); only the table knows the order.
+gives its rows their two functions (`ModelTrial`); only the table knows the order.
 
 The rule of the interval: J's interval holds every value that some candidate allows which the data do not contradict.
 For one candidate these are the values over every structure of the reporting filters, joined with those of one-pole
@@ -18,7 +18,7 @@ from enum import StrEnum
 from typing import Generic, Protocol, TypeVar
 
 
-class Route(StrEnum):
+class FitRoute(StrEnum):
     """The walks. ``LOAD`` is a walk within the row `LOAD_SWINGS` of ``LINES``, ``BAND`` within each of ``RECORD``."""
 
     LINES = "periodic excitation: spectral lines"
@@ -28,7 +28,7 @@ class Route(StrEnum):
 
 
 @dataclass(frozen=True)
-class Candidate:
+class CandidateModel:
     """One row: ``model`` is fitted to ``data`` with the knowledge ``prior``.
 
     ``tried``: where the row applies. ``stands``: when its answer replaces the one before. ``interval``: what J's
@@ -36,7 +36,7 @@ class Candidate:
     """
 
     name: str
-    route: Route
+    route: FitRoute
     model: str
     data: str
     prior: str
@@ -59,35 +59,35 @@ _OF_LINES = "B from the mean speeds"
 _FAMILY = "profile over two poles, an average and a delay, joined with that of one pole each while it is the likelier"
 _RECORD_FAMILY = "profile over two poles, an average and a delay, joined with that of one pole each"
 
-CANDIDATES: tuple[Candidate, ...] = (
-    Candidate(
-        BEFORE_ECHO, Route.LINES, model="inertia with the wave resistance of a pipe",
+CANDIDATES: tuple[CandidateModel, ...] = (
+    CandidateModel(
+        BEFORE_ECHO, FitRoute.LINES, model="inertia with the wave resistance of a pipe",
         data="all lines of the excitation", prior="the sizes of the pipe",
         tried="the excitation is prbs, and the requested model may be a string", stands="always; the walk ends",
         interval="profile of its fit",
         reason="a bit on bottom changes the echo from period to period; before the echo J does not depend on the bit",
         test="tests/estimation/test_before_echo.py::test_the_inertia_is_covered",
     ),
-    Candidate(
-        CLEAR_LINES, Route.LINES, model="rigid shaft; without lags for --model paper",
+    CandidateModel(
+        CLEAR_LINES, FitRoute.LINES, model="rigid shaft; without lags for --model paper",
         data="lines with speed and torque clear of the scatter", prior=f"{_OF_LAGS}; {_OF_LINES}",
         tried="no compliant shaft is requested", stands="always, as the first", interval=_FAMILY,
         reason="the simplest model comes first",
         test="tests/estimation/test_nonlinear_friction.py::test_straight_friction_is_not_bent",
     ),
-    Candidate(
-        WEAK_LINES, Route.LINES, model="rigid shaft", data="lines with speed or torque clear of the scatter",
+    CandidateModel(
+        WEAK_LINES, FitRoute.LINES, model="rigid shaft", data="lines with speed or torque clear of the scatter",
         prior="as before", tried="a line that is weak in one signal contradicts the rigid shaft",
         stands="always; the load is then looked at, too", interval="as before",
         reason="at a resonance one of the two signals nearly vanishes, and that line tells most",
         test="tests/estimation/test_two_mass.py::test_a_line_that_stands_still_at_the_antiresonance_is_no_weak_line",
     ),
-    Candidate(
-        LOAD_SWINGS, Route.LINES, model="the rows of the load", data="the same lines without residual oscillation",
+    CandidateModel(
+        LOAD_SWINGS, FitRoute.LINES, model="the rows of the load", data="the same lines without residual oscillation",
         prior="as before",
-        tried="a compliant shaft is requested; with --model auto also if the residuals or a weak line contradict the"
-              " rigid shaft, if it is in doubt (no one-pole filters, p below 0.3, two masses explain much more), or if"
-              " rig.yaml declares a string",
+        tried="a compliant shaft is requested, or rig.yaml declares a string; with --model auto also if the residuals"
+              " or a weak line contradict the rigid shaft; or if it is in doubt (no one-pole filters, p below 0.3, two"
+              " masses explain much more)",
         stands="a shaft of these rows stands; with a declared string the rigid shaft stands only with one-pole filters"
                " and no string in sight",
         interval="see the rows of the load",
@@ -95,8 +95,8 @@ CANDIDATES: tuple[Candidate, ...] = (
                " declared, whatever the residuals allow",
         test="tests/estimation/test_two_mass.py::test_auto_finds_two_masses_and_says_so",
     ),
-    Candidate(
-        BENT_FRICTION, Route.LINES, model="rigid shaft whose friction is bent over speed (Stribeck, fan)",
+    CandidateModel(
+        BENT_FRICTION, FitRoute.LINES, model="rigid shaft whose friction is bent over speed (Stribeck, fan)",
         data="the lines of the rigid shaft, and the mean torques", prior="as before",
         tried="the rigid shaft is rejected; with --model auto also if p is below 0.01 and no load swings",
         stands="the residuals allow it, and −2 ln L falls by more than 2 ln n",
@@ -104,36 +104,36 @@ CANDIDATES: tuple[Candidate, ...] = (
         reason="friction that is not straight leaks into the lines; the residuals contradict the shaft, but not its J",
         test="tests/estimation/test_nonlinear_friction.py::test_a_bend_is_seen_behind_short_lags",
     ),
-    Candidate(
-        KNOWN_PIPE, Route.LOAD, model="string", data="lines with speed or torque clear of the scatter",
+    CandidateModel(
+        KNOWN_PIPE, FitRoute.LOAD, model="string", data="lines with speed or torque clear of the scatter",
         prior="inertia and stiffness of the pipe, with their tolerance", tried="rig.yaml gives the sizes of the pipe",
         stands="the residuals allow it, and the lines see its swing; the walk ends", interval=_FAMILY,
         reason="two equations more: four lines suffice for a string",
         test="tests/estimation/test_two_mass.py::test_what_is_known_of_a_pipe_counts_as_equations",
     ),
-    Candidate(
-        REQUESTED, Route.LOAD, model="the requested shaft", data="the same lines", prior="none of the load",
+    CandidateModel(
+        REQUESTED, FitRoute.LOAD, model="the requested shaft", data="the same lines", prior="none of the load",
         tried="--model two-mass or --model string", stands="the residuals allow it", interval=_FAMILY,
         reason="the user knows the shaft",
         test="tests/estimation/test_two_mass.py::test_a_model_that_is_asked_for_is_the_one_that_is_fitted",
     ),
-    Candidate(
-        TWO_MASSES, Route.LOAD, model="two masses on a spring", data="the same lines", prior="none of the load",
+    CandidateModel(
+        TWO_MASSES, FitRoute.LOAD, model="two masses on a spring", data="the same lines", prior="none of the load",
         tried="no compliant shaft is requested", stands="the residuals allow it, and the lines see its swing",
         interval=f"{_FAMILY}; joined with that of the string beside it",
         reason="the simplest shaft that swings; a third of a light string seems to turn with the motor, so that J holds"
                " the values of both",
         test="tests/estimation/test_two_mass.py::test_auto_finds_two_masses_and_says_so",
     ),
-    Candidate(
-        A_STRING, Route.LOAD, model="string with a mass at its end", data="the same lines", prior="none of the load",
+    CandidateModel(
+        A_STRING, FitRoute.LOAD, model="string with a mass at its end", data="the same lines", prior="none of the load",
         tried="no compliant shaft is requested, and the lines give as many equations as a string has unknowns",
         stands="two masses are contradicted, or the string explains more than chance does (p of 0.001)",
         interval=_FAMILY, reason="a spring with mass",
         test="tests/estimation/test_string.py::test_auto_finds_the_string",
     ),
-    Candidate(
-        SCALED_PIPE, Route.LOAD, model="string with the travel time of the pipe and a free impedance",
+    CandidateModel(
+        SCALED_PIPE, FitRoute.LOAD, model="string with the travel time of the pipe and a free impedance",
         data="the same lines", prior="the travel time of the pipe", tried="the data contradict the pipe",
         stands="never; at 0.75 to 1.33 times the impedance the pipe is left out with a warning, beyond that J does not"
                " stand",
@@ -141,8 +141,8 @@ CANDIDATES: tuple[Candidate, ...] = (
         reason="the scale of torque or speed is wrong if the travel time is that of the pipe and the impedance is not",
         test="tests/estimation/test_string.py::test_a_torque_scale_that_the_pipe_contradicts_leaves_no_inertia",
     ),
-    Candidate(
-        BY_DIFFERENCE, Route.LOAD, model="the rows before, again",
+    CandidateModel(
+        BY_DIFFERENCE, FitRoute.LOAD, model="the rows before, again",
         data="the same lines; a line on which the mean speeds differ counts by this difference", prior="as before",
         tried="no shaft is allowed, a line at the swing differs between the mean speeds, and half of the lines do not",
         stands="a shaft is allowed now", interval="as before",
@@ -150,16 +150,16 @@ CANDIDATES: tuple[Candidate, ...] = (
         test="tests/estimation/test_two_mass.py::"
              "test_a_line_by_the_swing_that_the_mean_speeds_differ_at_counts_by_the_difference",
     ),
-    Candidate(
-        WIDE_BAND, Route.RECORD, model="rigid shaft: the rows of the friction",
+    CandidateModel(
+        WIDE_BAND, FitRoute.RECORD, model="rigid shaft: the rows of the friction",
         data="frequencies up to 3 rad of the longer lag", prior=_OF_LAGS,
         tried="the record has frequencies beyond the narrow band", stands="J is bounded, and p is 0.01 or more",
         interval="the rows of the friction; joined with that of one-pole filters in the narrow band",
         reason="half of what tells the lags stands beyond 1.2 rad",
         test="tests/estimation/test_time_domain.py::test_what_stands_clear_beyond_the_lags_counts",
     ),
-    Candidate(
-        NARROW_BAND, Route.RECORD, model="rigid shaft: the rows of the friction",
+    CandidateModel(
+        NARROW_BAND, FitRoute.RECORD, model="rigid shaft: the rows of the friction",
         data="frequencies up to 1.2 rad of the longer lag", prior=_OF_LAGS,
         tried="the wide band leaves J open, cannot be tested, or has p below 0.01", stands="always",
         interval="the rows of the friction",
@@ -167,14 +167,14 @@ CANDIDATES: tuple[Candidate, ...] = (
         test="tests/estimation/test_time_domain.py::"
              "test_the_wide_band_is_left_where_the_model_is_doubtful_in_it_or_untested",
     ),
-    Candidate(
-        STRAIGHT, Route.BAND, model="friction of T_c and B", data="the frequencies of the band", prior="as before",
+    CandidateModel(
+        STRAIGHT, FitRoute.BAND, model="friction of T_c and B", data="the frequencies of the band", prior="as before",
         tried="always", stands="always, as the first", interval=_RECORD_FAMILY,
         reason="the simplest friction comes first",
         test="tests/estimation/test_time_domain.py::test_what_stands_clear_beyond_the_lags_counts",
     ),
-    Candidate(
-        SQUARE, Route.BAND, model="friction of T_c, B and a part that grows with the speed squared",
+    CandidateModel(
+        SQUARE, FitRoute.BAND, model="friction of T_c, B and a part that grows with the speed squared",
         data="the frequencies of the band", prior="as before",
         tried="it lowers −2 ln L by more than the square of J's quantile",
         stands="it lowers −2 ln L by more than three times this square",
@@ -185,30 +185,30 @@ CANDIDATES: tuple[Candidate, ...] = (
 )
 
 
-class Standing(Protocol):
-    """What stands so far in a walk; ``ended``: no further row is tried."""
+class WalkState(Protocol):
+    """State of a walk so far; ``ended``: no further row is tried."""
 
     @property
     def ended(self) -> bool: ...
 
 
-S = TypeVar("S", bound=Standing)
+S = TypeVar("S", bound=WalkState)
 
 
 @dataclass(frozen=True)
-class Trial(Generic[S]):
+class ModelTrial(Generic[S]):
     """The two functions of a row: whether it ``applies`` to what stands, and what stands after its ``fit``."""
 
     applies: Callable[[S], bool]
     fit: Callable[[S], S]
 
 
-def rows(route: Route) -> tuple[Candidate, ...]:
+def rows(route: FitRoute) -> tuple[CandidateModel, ...]:
     """Return the rows of a route in their order."""
     return tuple(row for row in CANDIDATES if row.route is route)
 
 
-def walk(route: Route, trials: Mapping[str, Trial[S]], standing: S) -> S:
+def walk(route: FitRoute, trials: Mapping[str, ModelTrial[S]], standing: S) -> S:
     """Return what stands after the rows of a route. Raises KeyError for a row without a trial."""
     for row in rows(route):
         trial = trials[row.name]

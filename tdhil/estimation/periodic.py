@@ -18,8 +18,8 @@ from tdhil.estimation.candidates import (
     CLEAR_LINES,
     LOAD_SWINGS,
     WEAK_LINES,
-    Route,
-    Trial,
+    FitRoute,
+    ModelTrial,
     walk,
 )
 from tdhil.estimation.case import Case, Finding, PeriodicCase
@@ -117,7 +117,7 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
 
 @dataclass(frozen=True)
 class _LineWalk:
-    """What stands in the walk over the rows of the lines. ``weak``: a line that is weak in one signal contradicted."""
+    """State of the walk over the rows of the lines. ``weak``: a line that is weak in one signal contradicted."""
 
     case: PeriodicCase
     rigid: RigidResult | None = None
@@ -132,7 +132,7 @@ class _LineWalk:
 
 def identify_lines(case: PeriodicCase) -> Finding:
     """Walk the rows of the lines (`tdhil.estimation.candidates`). Raises Refused if no row gives J."""
-    finding = walk(Route.LINES, _TRIALS, _LineWalk(case)).finding
+    finding = walk(FitRoute.LINES, _TRIALS, _LineWalk(case)).finding
     if isinstance(finding, Refusal):
         raise Refused(finding.reason, _BEFORE_ECHO_HELPS if _drowned(case) else finding.advice,
                       finding.entry)
@@ -198,12 +198,12 @@ def _try_bent(now: _LineWalk) -> _LineWalk:
     return replace(now, finding=identify_bent(now.case, now.rigid) or now.finding)
 
 
-_TRIALS: Mapping[str, Trial[_LineWalk]] = {
-    BEFORE_ECHO: Trial(lambda now: _before_echo(now.case), _try_before_echo),
-    CLEAR_LINES: Trial(lambda now: now.asked.compliant is None, _try_clear_lines),
-    WEAK_LINES: Trial(_weak_lines_contradict, _try_weak_lines),
-    LOAD_SWINGS: Trial(_load_may_swing, _try_load),
-    BENT_FRICTION: Trial(_is_bent, _try_bent),
+_TRIALS: Mapping[str, ModelTrial[_LineWalk]] = {
+    BEFORE_ECHO: ModelTrial(lambda now: _before_echo(now.case), _try_before_echo),
+    CLEAR_LINES: ModelTrial(lambda now: now.asked.compliant is None, _try_clear_lines),
+    WEAK_LINES: ModelTrial(_weak_lines_contradict, _try_weak_lines),
+    LOAD_SWINGS: ModelTrial(_load_may_swing, _try_load),
+    BENT_FRICTION: ModelTrial(_is_bent, _try_bent),
 }
 
 

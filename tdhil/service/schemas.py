@@ -113,7 +113,7 @@ class PlanView:
 
 @dataclass(frozen=True)
 class PaceView:
-    """Whether this computer sustains a simulated rig's cycle rate by the clock: ``holds``, and ``text``."""
+    """Answer whether this computer sustains a simulated rig's cycle rate by the clock: ``holds``, and ``text``."""
 
     rig: str
     pace: dict[str, Any]

@@ -1,4 +1,7 @@
-"""Whether this computer sustains a cycle rate with the embedded simulator by the clock, measured without motion."""
+"""Measurement of whether this computer sustains a cycle rate with the embedded simulator by the clock.
+
+Nothing moves.
+"""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RequiredReaction:
-    """What a row of the fault table requires. ``codes``: exit codes with which the run may end.
+    """Requirement of a row of the fault table. ``codes``: exit codes with which the run may end.
 
     ``or_covered``: the run may also go on, if the interval of its result covers the true inertia.
     """
@@ -46,6 +46,9 @@ _LONG: Final = {
 """Abbreviations of the fault table, in words."""
 _SHORT: Final = re.compile(rf"\b(?:{'|'.join(_LONG)})\b")
 
+
+ANY_STOP: Final = (4, 5, 6, 7, 8, 9)
+"""Exit codes of a run that a report which lies has ended: whichever check notices it first names it."""
 
 REQUIRED: Final[Mapping[int, RequiredReaction]] = {
     12: RequiredReaction("WD", (8,)),
@@ -75,7 +78,7 @@ REQUIRED: Final[Mapping[int, RequiredReaction]] = {
     43: RequiredReaction("WD; no blind reconnect while enabled", (8,)),
     44: RequiredReaction("known-register check, R", (4,)),
     45: RequiredReaction("read back, R", (4,)),
-    50: RequiredReaction("R, unless the operator accepts it by name", (4,)),
+    50: RequiredReaction("R, unless the operator accepts it by name", (4,), or_covered=True),
     56: RequiredReaction("a free number from the start; QS in motion, however slow it is", (0, 5)),
     57: RequiredReaction("read back at once, QS", (5,)),
     58: RequiredReaction("read back, QS", (5,)),
@@ -85,22 +88,24 @@ REQUIRED: Final[Mapping[int, RequiredReaction]] = {
     82: RequiredReaction("QS", (6,)),
     115: RequiredReaction(
         "found by torque and inertia; QS; never disabled as at standstill; torque off if the shaft accelerates",
-        (7, 8), or_covered=True),
+        ANY_STOP, or_covered=True),
     116: RequiredReaction(
-        "QS; standstill by the position, where it goes on; else not confirmed and not disabled", (6, 7, 8),
+        "QS; standstill by the position, where it goes on; else not confirmed and not disabled", ANY_STOP,
         or_covered=True),
-    117: RequiredReaction("QS", (6, 7, 8), or_covered=True),
-    118: RequiredReaction("QS, no J", (6, 7, 9), or_covered=True),
-    119: RequiredReaction("QS", (6, 7, 8), or_covered=True),
-    120: RequiredReaction("no valid state: QS again and again; nothing is disabled", (8,)),
+    117: RequiredReaction("QS", ANY_STOP, or_covered=True),
+    118: RequiredReaction("QS, no J", ANY_STOP, or_covered=True),
+    119: RequiredReaction("QS", ANY_STOP, or_covered=True),
+    120: RequiredReaction(
+        "no valid state: QS again and again; nothing is disabled", ANY_STOP, or_covered=True),
     121: RequiredReaction(
-        "seen in two ways: torque off, 8; above a drill string only beyond the speed limit", (8,)),
+        "seen in two ways: torque off, 8; above a drill string only beyond the speed limit",
+        ANY_STOP, or_covered=True),
 }
 """Required reactions by row of docs/reference/faults.md."""
 
 ANY_FAULT: Final = RequiredReaction(
     "the shaft at standstill, or the loss of it reported; no J whose interval misses the true inertia",
-    (4, 5, 6, 7, 8, 9), or_covered=True,
+    ANY_STOP, or_covered=True,
 )
 """Required reaction to a fault without a row of its own."""
 

@@ -7,7 +7,7 @@ import pytest
 
 from drivers import ethercat as driver
 from drivers.errors import DataFileError
-from drivers.ethercat.segment import Segment
+from drivers.ethercat.segment import EthercatSegment
 from profiles.library import load_profile
 from sim_bus.params import FAITHFUL, QUIET, RigParams
 from tdhil.buses import ethercat
@@ -23,7 +23,7 @@ STILL = RigParams(noise=QUIET, reporting=FAITHFUL)
 def segment(monkeypatch):
     """Two slaves behind every interface; the second has an alias."""
     slaves = [FakeSlave(STILL, alias=alias, clocks=True) for alias in (0, 7)]
-    found = Segment(FakeMaster(*slaves), "eth9")
+    found = EthercatSegment(FakeMaster(*slaves), "eth9")
     said = SimpleNamespace(driven="", slaves=slaves)
 
     @contextmanager

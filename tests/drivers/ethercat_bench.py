@@ -5,7 +5,7 @@ import struct
 from drivers.clock import SteppedClock
 from drivers.drive import Mode, PowerState
 from drivers.ethercat.drive import EthercatDrive
-from drivers.ethercat.segment import Segment
+from drivers.ethercat.segment import EthercatSegment
 from profiles.library import load_profile
 from sim_bus.params import FAITHFUL, QUIET, RigParams
 from tests.drivers.drive_benches import LIMITS
@@ -33,7 +33,7 @@ class EthercatBench:
         self.slave.man, self.slave.id = 4, 4
         self.slave.drive.data[0x1018, 1] = self.slave.drive.data[0x1018, 2] = (4).to_bytes(4, "little")
         self.master, self.frames = FakeMaster(self.slave), []
-        self.segment = Segment(self.master, "fake0")
+        self.segment = EthercatSegment(self.master, "fake0")
         self.drive = EthercatDrive(
             self.segment, load_profile("generic/cia402-ethercat"), clock or SteppedClock(), tap=self.frames.append,
             **options,

@@ -13,7 +13,7 @@ from drivers.ethercat import raw
 from drivers.ethercat.drive import interpolation
 from drivers.ethercat.quick_stop import EthercatTarget
 from drivers.ethercat.scan import found_slave
-from drivers.ethercat.segment import Segment
+from drivers.ethercat.segment import EthercatSegment
 from drivers.quick_stop import Ended, bare_stop
 from profiles import MessageCode
 from profiles.library import load_profile
@@ -204,11 +204,11 @@ def test_a_slave_whose_sii_and_objects_differ_is_refused(bench):
 def test_a_drive_that_is_not_there_is_refused(slaves, options, said):
     master = FakeMaster(*(FakeSlave(STILL, alias=5) for _ in range(slaves)))
     with pytest.raises(PreflightRefused, match=said):
-        Segment(master, "fake0", **options)
+        EthercatSegment(master, "fake0", **options)
 
 
 def test_a_drive_is_found_by_its_alias():
-    segment = Segment(FakeMaster(FakeSlave(STILL, alias=5), FakeSlave(STILL, alias=7)), "fake0", alias=7)
+    segment = EthercatSegment(FakeMaster(FakeSlave(STILL, alias=5), FakeSlave(STILL, alias=7)), "fake0", alias=7)
     assert segment.position == 1
 
 

@@ -7,20 +7,20 @@ from pathlib import Path
 import pytest
 
 from tdhil.estimation import candidates, periodic
-from tdhil.estimation.candidates import CANDIDATES, Candidate, Route, Trial, rows, walk
+from tdhil.estimation.candidates import CANDIDATES, CandidateModel, FitRoute, ModelTrial, rows, walk
 from tdhil.estimation.frequency_domain import compliant
 from tdhil.estimation.time_domain import solve
 
 ROOT = Path(__file__).parents[2]
 TRIALS = {
-    Route.LINES: periodic._TRIALS,
-    Route.LOAD: compliant._TRIALS,
-    Route.RECORD: solve._BAND_TRIALS,
-    Route.BAND: solve._FRICTION_TRIALS,
+    FitRoute.LINES: periodic._TRIALS,
+    FitRoute.LOAD: compliant._TRIALS,
+    FitRoute.RECORD: solve._BAND_TRIALS,
+    FitRoute.BAND: solve._FRICTION_TRIALS,
 }
 
 
-@pytest.mark.parametrize("route", Route, ids=lambda route: route.name)
+@pytest.mark.parametrize("route", FitRoute, ids=lambda route: route.name)
 def test_each_route_has_a_trial_for_each_of_its_rows(route):
     assert set(TRIALS[route]) == {row.name for row in rows(route)}
 
@@ -45,17 +45,17 @@ class Tried:
 
 
 def _row(name):
-    return Candidate(name, Route.LOAD, *("-" for _ in range(8)))
+    return CandidateModel(name, FitRoute.LOAD, *("-" for _ in range(8)))
 
 
 def _trial(name, applies=True, ends=False):
-    return Trial(lambda now: applies, lambda now: replace(now, names=(*now.names, name), ended=ends))
+    return ModelTrial(lambda now: applies, lambda now: replace(now, names=(*now.names, name), ended=ends))
 
 
 def test_rows_are_tried_in_the_order_of_the_table_and_the_last_ends_the_walk(monkeypatch):
     monkeypatch.setattr(candidates, "CANDIDATES", (_row("a"), _row("b"), _row("c"), _row("d")))
     trials = {"d": _trial("d"), "c": _trial("c", ends=True), "b": _trial("b", applies=False), "a": _trial("a")}
-    assert walk(Route.LOAD, trials, Tried()).names == ("a", "c")
-    assert walk(Route.LINES, trials, Tried()).names == ()
+    assert walk(FitRoute.LOAD, trials, Tried()).names == ("a", "c")
+    assert walk(FitRoute.LINES, trials, Tried()).names == ()
     with pytest.raises(KeyError):
-        walk(Route.LOAD, {"a": _trial("a")}, Tried())
+        walk(FitRoute.LOAD, {"a": _trial("a")}, Tried())

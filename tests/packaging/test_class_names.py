@@ -20,17 +20,21 @@ SHARED = {
               "one line of the preflight table: as the driver makes it, and as the service's document names it"),
     "DrillString": ({"tdhil/soft_torque/drill_string.py", "sim_bus/plant/drill_string.py"},
                     "the same string, written twice on purpose: the simulator shares no physics with what it proves"),
-    "Faults": ({"sim_bus/canopen/faults.py", "sim_bus/modbus/faults.py"},
-               "the script of one drive, on either bus"),
+    "Cyclic": ({"profiles/canopen.py", "profiles/ethercat.py"}, "the same section of a profile, on either bus"),
+    "Faults": ({"sim_bus/canopen/faults.py", "sim_bus/ethercat/faults.py", "sim_bus/modbus/faults.py"},
+               "the script of one drive, on any bus"),
     "Misbehaviour": ({"sim_bus/canopen/faults.py", "sim_bus/modbus/faults.py"},
                      "what a fault of the bus in question overrides"),
     "Parameter": ({"profiles/cia402.py", "profiles/modbus.py"}, "the same section of a profile, on either bus"),
     "Position": ({"profiles/cia402.py", "profiles/modbus.py"}, "the same section of a profile, on either bus"),
     "QuickStop": ({"profiles/cia402.py", "profiles/modbus.py"}, "the same section of a profile, on either bus"),
     "Scene": ({"sim_bus/canopen/faults.py", "sim_bus/modbus/faults.py"}, "where a fault happens, on either bus"),
+    "Simulator": ({"sim_bus/canopen/simulator.py", "sim_bus/ethercat/simulator.py"},
+                  "the simulated drive with its time, on either bus"),
     "State": ({"drivers/cia402/state_machine.py", "sim_bus/cia402.py", "tdhil/service/run_state.py"},
               "the states of CiA 402, which driver and simulator each take from the standard; and those of a run, as "
               "the service's document names them"),
+    "Watchdog": ({"profiles/canopen.py", "profiles/ethercat.py"}, "the same section of a profile, on either bus"),
 }
 
 

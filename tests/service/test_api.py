@@ -423,12 +423,12 @@ def test_a_rig_that_may_not_move_from_here(call):
     ({"plant": "x"}, 422, "is not an option"),
     ({"tolerance": "a lot"}, 422, "tolerance"),
     ({"tolerance": True}, 422, "must be a number"),
-    ({"tolerance": 7}, 422, "--tolerance"),
-    ({"excitation": "<script>"}, 422, "--excitation"),
+    ({"tolerance": 7}, 422, "tolerance: must be above 0"),
+    ({"excitation": "<script>"}, 422, "excitation: "),
     ({"accept_wider_limit": "all"}, 422, "must be torque"),
     ({"note": 7}, 422, "must be a text"),
     ({"fault": {"a": 1}}, 422, "must be a text"),
-    ({"seed": -1}, 422, "--seed"),
+    ({"seed": -1}, 422, "seed: must be at least 0"),
 ])
 def test_options_that_are_refused_begin_nothing(call, service, options, status, words):
     refused = call("POST", "/rigs/a/runs", status, json=options)["error"]

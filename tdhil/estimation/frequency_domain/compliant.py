@@ -14,8 +14,8 @@ from tdhil.estimation.candidates import (
     REQUESTED,
     SCALED_PIPE,
     TWO_MASSES,
-    Route,
-    Trial,
+    FitRoute,
+    ModelTrial,
     walk,
 )
 from tdhil.estimation.case import Finding, ModelWords, PeriodicCase
@@ -126,7 +126,7 @@ def _clear(line: SpectralLine) -> bool:
 
 @dataclass(frozen=True)
 class _LoadWalk:
-    """What stands in the walk over the rows of the load.
+    """State of the walk over the rows of the load.
 
     ``near``: two masses fitted beside a pipe that is ``contradicted``; ``two``: two masses, where they are tried;
     ``counted``: by the difference of the mean speeds already.
@@ -177,7 +177,7 @@ def choose(
 
 
 def _chosen_of(begin: _LoadWalk) -> Chosen | Refusal:
-    chosen = walk(Route.LOAD, _TRIALS, begin.with_pipe(begin.pipe)).chosen
+    chosen = walk(FitRoute.LOAD, _TRIALS, begin.with_pipe(begin.pipe)).chosen
     assert chosen is not None
     return chosen
 
@@ -264,14 +264,14 @@ def _is_rejected(standing: _LoadWalk) -> bool:
     return isinstance(standing.chosen, Chosen) and standing.chosen.rejected
 
 
-_TRIALS: Mapping[str, Trial[_LoadWalk]] = {
-    KNOWN_PIPE: Trial(
+_TRIALS: Mapping[str, ModelTrial[_LoadWalk]] = {
+    KNOWN_PIPE: ModelTrial(
         lambda now: now.pipe is not None and now.model.piped and now.countable(STRING, _BY_PIPE), _try_pipe),
-    REQUESTED: Trial(lambda now: now.model.compliant is not None, _try_requested),
-    TWO_MASSES: Trial(lambda now: now.model.compliant is None, _try_two_masses),
-    A_STRING: Trial(lambda now: now.model.compliant is None and now.countable(STRING), _try_string),
-    SCALED_PIPE: Trial(lambda now: now.contradicted, _try_scaled_pipe),
-    BY_DIFFERENCE: Trial(lambda now: _is_rejected(now) and not now.counted, _try_by_difference),
+    REQUESTED: ModelTrial(lambda now: now.model.compliant is not None, _try_requested),
+    TWO_MASSES: ModelTrial(lambda now: now.model.compliant is None, _try_two_masses),
+    A_STRING: ModelTrial(lambda now: now.model.compliant is None and now.countable(STRING), _try_string),
+    SCALED_PIPE: ModelTrial(lambda now: now.contradicted, _try_scaled_pipe),
+    BY_DIFFERENCE: ModelTrial(lambda now: _is_rejected(now) and not now.counted, _try_by_difference),
 }
 
 

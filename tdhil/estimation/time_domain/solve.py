@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tdhil.estimation.candidates import NARROW_BAND, SQUARE, STRAIGHT, WIDE_BAND, Route, Trial, walk
+from tdhil.estimation.candidates import NARROW_BAND, SQUARE, STRAIGHT, WIDE_BAND, FitRoute, ModelTrial, walk
 from tdhil.estimation.frequency_domain import (
     Fit,
     GaussianPrior,
@@ -299,7 +299,7 @@ class ShaftEquation:
 
 @dataclass(frozen=True)
 class _BandWalk:
-    """What stands in the walk over the bands. ``bands``: the wide one, if there is one, and the narrow one.
+    """State of the walk over the bands. ``bands``: the wide one, if there is one, and the narrow one.
 
     ``stated``: indices of the lags that were stated.
     """
@@ -319,7 +319,7 @@ def solve(
     """Walk the rows of a record (`tdhil.estimation.candidates`). None where too few bins stand clear of the noise."""
     bands = search(bins, priors, torque_span_nm)
     stated = tuple(prior.index for prior in priors)
-    return walk(Route.RECORD, _BAND_TRIALS, _BandWalk(bands, placed, stated, confidence)).solved
+    return walk(FitRoute.RECORD, _BAND_TRIALS, _BandWalk(bands, placed, stated, confidence)).solved
 
 
 def _holds(solved: Solved | None) -> bool:
@@ -337,15 +337,15 @@ def _try_narrow(now: _BandWalk) -> _BandWalk:
     return replace(now, solved=_solve(now, now.bands[-1], ()))
 
 
-_BAND_TRIALS: Mapping[str, Trial[_BandWalk]] = {
-    WIDE_BAND: Trial(lambda now: len(now.bands) > 1, _try_wide),
-    NARROW_BAND: Trial(lambda now: bool(now.bands) and not _holds(now.solved), _try_narrow),
+_BAND_TRIALS: Mapping[str, ModelTrial[_BandWalk]] = {
+    WIDE_BAND: ModelTrial(lambda now: len(now.bands) > 1, _try_wide),
+    NARROW_BAND: ModelTrial(lambda now: bool(now.bands) and not _holds(now.solved), _try_narrow),
 }
 
 
 @dataclass(frozen=True)
 class _FrictionWalk:
-    """What stands in the walk over the friction in a band: the equation ``chosen``, and J with its interval.
+    """State of the walk over the friction in a band: the equation ``chosen``, and J with its interval.
 
     ``square``: the problem with friction of the speed squared, and its fit.
     """
@@ -362,7 +362,7 @@ class _FrictionWalk:
     ended: bool = False
 
     def explains(self, times: float) -> bool:
-        """Does friction of the speed squared lower −2 ln L by more than so many times the square of J's reach?"""
+        """Return whether friction of ω² lowers −2 ln L by more than so many times the square of J's reach."""
         if self.straight is None:
             return False
         return self.band.fit.objective - self.square[1].objective > times * self.straight.reach**2
@@ -381,9 +381,9 @@ def _try_square(now: _FrictionWalk) -> _FrictionWalk:
     return replace(now, inertia=_joined(now.inertia, curved.inertia.low, curved.inertia.high))
 
 
-_FRICTION_TRIALS: Mapping[str, Trial[_FrictionWalk]] = {
-    STRAIGHT: Trial(lambda now: True, _try_straight),
-    SQUARE: Trial(lambda now: now.explains(1.0), _try_square),
+_FRICTION_TRIALS: Mapping[str, ModelTrial[_FrictionWalk]] = {
+    STRAIGHT: ModelTrial(lambda now: True, _try_straight),
+    SQUARE: ModelTrial(lambda now: now.explains(1.0), _try_square),
 }
 
 
@@ -400,7 +400,7 @@ def _solve(now: _BandWalk, found: FoundFit, narrower: tuple[FoundFit, ...]) -> S
     stated, confidence = now.stated, now.confidence
     bent_problem = replace(found.problem, free=(*found.problem.free, BEND))
     square = bent_problem, minimise(bent_problem, found.fit.theta)
-    frictions = walk(Route.BAND, _FRICTION_TRIALS, _FrictionWalk(found, square, now.placed, stated, confidence))
+    frictions = walk(FitRoute.BAND, _FRICTION_TRIALS, _FrictionWalk(found, square, now.placed, stated, confidence))
     assert frictions.chosen is not None and frictions.inertia is not None
     chosen, value, bent = frictions.chosen, frictions.inertia, frictions.bent
     for band in narrower:
