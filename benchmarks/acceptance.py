@@ -25,7 +25,7 @@ CHANGES = {
 
 
 def one(folder, seed, values):
-    """What a run says: its verdict, and what is off."""
+    """Result of a run: its verdict, and what is off."""
     plant = folder / f"{seed}.yaml"
     plant.write_text(PLANT.format(**(USUAL | values)), encoding="utf-8")
     command = [sys.executable, "-m", "tdhil", "identify", "--simulate", "--seed", str(seed), "--rate", "50", "--json",

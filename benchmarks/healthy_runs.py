@@ -255,7 +255,7 @@ def compared(rows: Sequence[dict[str, Any]], before: Sequence[dict[str, Any]]) -
 
 
 def kept(path: Path | None) -> list[dict[str, Any]]:
-    """What an earlier call wrote."""
+    """Return the rows of an earlier call."""
     if path is None or not path.exists():
         return []
     return [json.loads(text) for text in path.read_text(encoding="utf-8").splitlines()]

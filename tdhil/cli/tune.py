@@ -8,7 +8,7 @@ from tdhil.cli import tune_soft_torque, tune_speed
 from tdhil.cli.parser import CommandParser
 
 SOFT_TORQUE = "soft-torque"
-"""What `tdhil tune soft-torque result.json` has always meant."""
+"""Purpose of `tdhil tune result.json`, without a further word."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

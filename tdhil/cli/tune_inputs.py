@@ -1,14 +1,19 @@
-"""Files that `tdhil tune` reads: a result, and a measurement of the drive's own impedance."""
+"""Inputs of both purposes of `tdhil tune`: a result, the drive's own impedance, and the options that both have."""
 
 from __future__ import annotations
 
+import argparse
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from math import sqrt
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
+from profiles import load_profile
 from tdhil.errors import MessageCode, UsageError
+
+if TYPE_CHECKING:
+    from profiles import Profile
 
 
 def require_result(path: Path) -> None:
@@ -117,3 +122,45 @@ def estimated(result: Mapping[str, Any], key: str) -> float:
     part = result.get(key)
     value = part.get("value") if isinstance(part, dict) else None
     return max(0.0, float(value)) if isinstance(value, int | float) else 0.0
+
+
+def profile_for(namespace: argparse.Namespace, result: Mapping[str, Any]) -> Profile | None:
+    """Return the profile of --profile, or else the result's; None if neither names one."""
+    name = namespace.profile or (result.get("profile") or {}).get("name")
+    return load_profile(str(name)) if name is not None else None
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Options that both purposes have.
+
+
+RATED: Final = (
+    ("rated_torque", 1e-6, 1e9, "a positive number of N·m"),
+    ("rated_speed", 1e-3, 1e6, "a positive number of rpm"),
+)
+"""Limits of the motor's ratings: attribute, least, greatest, both in words."""
+
+
+def check_limits(namespace: argparse.Namespace, limits: Iterable[tuple[str, float, float, str]]) -> None:
+    """Check options against their limits and `RATED`. Raises UsageError."""
+    for name, low, high, wanted in (*limits, *RATED):
+        value = getattr(namespace, name)
+        if value is not None and not low <= value <= high:
+            raise UsageError(f"{value:g}: must be {wanted}", where=f"--{name.replace('_', '-')}",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
+
+
+def check_present(namespace: argparse.Namespace) -> None:
+    """Check the gains of --present. Raises UsageError."""
+    for value in namespace.present or ():
+        if not 0.0 < value < 1e9:
+            raise UsageError(f"{value:g}: must be a positive number", where="--present",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
+
+
+def check_inner_lags(namespace: argparse.Namespace) -> None:
+    """Check the times of --inner-lags. Raises UsageError."""
+    for lag in namespace.inner_lags or ():
+        if not 0.0 <= lag <= 5.0:
+            raise UsageError(f"{lag:g}: must be a time from 0 to 5 s", where="--inner-lags",
+                             entry=MessageCode.VALUE_NOT_ALLOWED)

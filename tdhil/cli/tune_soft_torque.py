@@ -9,17 +9,20 @@ from math import sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from profiles import load_profile
 from profiles.quantities import RPM, TIME, TORQUE
 from tdhil.cli.arguments import add_option, amount, share
 from tdhil.cli.results import print_json
 from tdhil.cli.tune_inputs import (
     bounded_estimate,
+    check_inner_lags,
+    check_limits,
+    check_present,
     ends_of,
     estimated,
     is_number,
     measured_lags,
     positive_number,
+    profile_for,
     read_impedance,
     read_result,
     require_result,
@@ -123,8 +126,7 @@ def run(namespace: argparse.Namespace) -> int:
     with _progress(told, "reading the result"):          # a log is identified again, which takes seconds
         result = read_result(namespace.result)
     case, lags_from = case_of(result, namespace)
-    name = namespace.profile or (result.get("profile") or {}).get("name")
-    profile = load_profile(str(name)) if name is not None else None
+    profile = profile_for(namespace, result)
     with _progress(told, "tuning") as tell:
         tuning = tune(case, None if namespace.no_simulation else Search(), tell)
         tuned_for = _tuned_for(result, namespace, tuning, lags_from, profile)
@@ -168,31 +170,19 @@ def _progress(told: Console, text: str) -> Iterator[Callable[[str], None]]:
 
 
 def _check(namespace: argparse.Namespace) -> None:
-    for name, low, high, wanted in (
+    check_limits(namespace, (
         ("phase_margin", 20.0, 85.0, "from 20 to 85 degrees"),
         ("a", 0.01, 10.0, "from 0.01 to 10"),
         ("compensate", 0.0, 1.0, "a share from 0 to 1"),
-        ("rated_torque", 1e-6, 1e9, "a positive number of N·m"),
-        ("rated_speed", 1e-3, 1e6, "a positive number of rpm"),
-    ):
-        value = getattr(namespace, name)
-        if value is not None and not low <= value <= high:
-            raise UsageError(f"{value:g}: must be {wanted}", where=f"--{name.replace('_', '-')}",
-                             entry=MessageCode.VALUE_NOT_ALLOWED)
-    for value in namespace.present or ():
-        if not 0.0 < value < 1e9:
-            raise UsageError(f"{value:g}: must be a positive number", where="--present",
-                             entry=MessageCode.VALUE_NOT_ALLOWED)
+    ))
+    check_present(namespace)
     if namespace.present is not None and namespace.impedance is not None:
         raise UsageError("--present and --impedance both state the present gains", where="--present",
                          next_step="Leave one of them out", entry=MessageCode.VALUE_NOT_ALLOWED)
     if namespace.depths is not None and namespace.string is None:
         raise UsageError("--depths needs the string: its topmost section gets longer", where="--depths",
                          next_step="--string string.yaml", entry=MessageCode.STRING_MISSING)
-    for lag in namespace.inner_lags or ():
-        if not 0.0 <= lag <= 5.0:
-            raise UsageError(f"{lag:g}: must be a time from 0 to 5 s", where="--inner-lags",
-                             entry=MessageCode.VALUE_NOT_ALLOWED)
+    check_inner_lags(namespace)
 
 
 def _check_files(namespace: argparse.Namespace) -> None:

@@ -8,15 +8,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from profiles import load_profile
 from profiles.quantities import FREQUENCY, RPM, TIME, TORQUE
 from tdhil.cli.arguments import add_option, amount
 from tdhil.cli.results import print_json
 from tdhil.cli.tune_inputs import (
     bounded_estimate,
+    check_inner_lags,
+    check_limits,
+    check_present,
     ends_of,
     is_number,
     positive_number,
+    profile_for,
     read_impedance,
     read_result,
     require_result,
@@ -99,8 +102,7 @@ def run(namespace: argparse.Namespace) -> int:
     lags, dead_time, lags_from = lags_in(namespace.inner_lags, namespace.dead_time, measured)
     plant = plant_of(result, lags, dead_time, namespace.result)
     design = design_speed_loop(_case(namespace, plant, measured))
-    name = namespace.profile or (result.get("profile") or {}).get("name")
-    profile = load_profile(str(name)) if name is not None else None
+    profile = profile_for(namespace, result)
     document = loop_document(design, shaft_in(result), _tuned_for(result, namespace, design, lags_from, profile))
     if namespace.json:
         print_json(document)
@@ -117,30 +119,18 @@ def run(namespace: argparse.Namespace) -> int:
 
 def _check(namespace: argparse.Namespace) -> None:
     """Check the options and that the files exist. Raises UsageError."""
-    for name, low, high, wanted in (
+    check_limits(namespace, (
         ("bandwidth", 1e-4, 1e4, "from 0.0001 to 10000 Hz"),
         ("phase_margin", 20.0, 80.0, "from 20 to 80 degrees"),
         ("gain_margin", 3.0, 40.0, "from 3 to 40 dB"),
         ("dead_time", 0.0, 1.0, "a time from 0 to 1 s"),
-        ("rated_torque", 1e-6, 1e9, "a positive number of N·m"),
-        ("rated_speed", 1e-3, 1e6, "a positive number of rpm"),
-    ):
-        value = getattr(namespace, name)
-        if value is not None and not low <= value <= high:
-            raise UsageError(f"{value:g}: must be {wanted}", where=f"--{name.replace('_', '-')}",
-                             entry=MessageCode.VALUE_NOT_ALLOWED)
-    for value in namespace.present or ():
-        if not 0.0 < value < 1e9:
-            raise UsageError(f"{value:g}: must be a positive number", where="--present",
-                             entry=MessageCode.VALUE_NOT_ALLOWED)
+    ))
+    check_present(namespace)
     if namespace.impedance is not None and (namespace.present or namespace.inner_lags or namespace.dead_time):
         raise UsageError("states lags and present gains, and another option states them too", where="--impedance",
                          next_step="Leave out --present, --inner-lags and --dead-time, or --impedance",
                          entry=MessageCode.VALUE_NOT_ALLOWED)
-    for lag in namespace.inner_lags or ():
-        if not 0.0 <= lag <= 5.0:
-            raise UsageError(f"{lag:g}: must be a time from 0 to 5 s", where="--inner-lags",
-                             entry=MessageCode.VALUE_NOT_ALLOWED)
+    check_inner_lags(namespace)
     if namespace.plot is not None and namespace.plot.suffix.lower() not in _PICTURES:
         raise UsageError(f"ends in none of {', '.join(_PICTURES)}", where=f"--plot {namespace.plot}",
                          next_step="Such as --plot tune.png", entry=MessageCode.VALUE_NOT_ALLOWED)

@@ -80,7 +80,7 @@ class LoopTunedFor:
 
 
 def loop_document(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: LoopTunedFor) -> dict[str, Any]:
-    """Plain data for `json.dumps`, at the motor shaft; what is infinite is null."""
+    """Plain data for `json.dumps`, at the motor shaft; null in place of an infinite value."""
     case, plant = design.case, design.case.plant
     lowest_hz = None if shaft is None else float(shaft.hertz.min())
     warnings = [*tuned_for.warnings, *_warnings(design, shaft, tuned_for)]

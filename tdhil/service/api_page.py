@@ -32,7 +32,7 @@ class ApiAnswer:
 
 @dataclass(frozen=True)
 class ApiRoute:
-    """One route. ``body``: fields of the request's object; ``body_text``: what the object is."""
+    """One route. ``body``: fields of the request's object; ``body_text``: meaning of the object."""
 
     id: str
     method: str

@@ -47,7 +47,7 @@ LEAST_SPLIT = 1.02
 _GAINS = np.geomspace(3.0, 1e-3, 70)
 """P that are tried, in units of J/Στ, from the largest down."""
 _HALVINGS = 8
-"""Of the factor between two of them: P is found to 0.1 %."""
+"""Tolerance of the factor between two of them: P is found to 0.1 %."""
 _FINER_HALVINGS = 48
 _AT_ONCE = 8
 """Corners whose margins are computed together: the first that fails ends the test."""
@@ -87,7 +87,7 @@ class UncertainPlant:
     lags_s: tuple[Range, ...]
     dead_time_s: Range
     antiresonance_hz: Range | None = None
-    """None: a rigid shaft; so are the next two."""
+    """A rigid shaft has None, here and in the next two."""
     resonance_hz: Range | None = None
     damping_nm_s_rad: Range | None = None
 

@@ -32,7 +32,7 @@ Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 _POINTS_A_DECADE = 80
-"""Of the common grid of frequencies."""
+"""Settings of the common grid of frequencies."""
 _AROUND = 100
 """Further points around each resonance and antiresonance."""
 _LOWEST, _HIGHEST = 2e-4, 30.0

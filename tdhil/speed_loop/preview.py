@@ -20,7 +20,7 @@ class LoopCurve:
 
     hertz: Reals
     gain: tuple[Reals, Reals, Reals]
-    """As believed, least, greatest; so are the next two."""
+    """Believed, least and greatest value, here and in the next two."""
     phase_deg: tuple[Reals, Reals, Reals]
     sensitivity: tuple[Reals, Reals, Reals]
 
