@@ -43,7 +43,14 @@ from profiles import MARKER_INDEX, MARKER_TEXT, DataModel, Finding, Profile, loa
 from profiles.canopen import CanopenProfile
 from profiles.quantities import BIT_RATE, TIME, read
 from tdhil.buses.bus import Bus, Connection, FoundDrive, Line, Opening, PeerPlan, ProfileTable, ValueSeen, one_host
-from tdhil.buses.cia402_findings import drive_type, identity_findings, match, settings_findings, watchdog_object
+from tdhil.buses.cia402_findings import (
+    drive_type,
+    identity_findings,
+    identity_text,
+    match,
+    settings_findings,
+    watchdog_object,
+)
 from tdhil.buses.doctor_finding import DoctorFinding, Grade, attempted, bad, note, of_error, ok
 from tdhil.buses.profile_text import object_table
 from tdhil.config import DriveData, Origin, Rig, RunOptions, Setting
@@ -618,11 +625,8 @@ def _identify(link: driver.CanLink, node: int, heard: driver.Heard, profiles: li
         simulated = _text(objects, MARKER_INDEX, 1) == MARKER_TEXT
     except CommunicationLost:
         values += [None] * (4 - len(values))           # it answered once and then no more: show what is known
-    vendor, product, revision, serial = values
-    profile, why = match(heard.device_types[node], (vendor, product, revision), profiles)
-    parts = (("vendor", vendor), ("product", product), ("revision", revision), ("serial", serial))
-    identity = ", ".join(f"{part} {value:X}h" for part, value in parts if value is not None)
-    return FoundDrive("canopen", node, title, identity or "not reported (1018h)", simulated, profile, why,
+    profile, why = match(heard.device_types[node], values[:3], profiles)
+    return FoundDrive("canopen", node, title, identity_text(values) or "not reported (1018h)", simulated, profile, why,
                       heard.states.get(node, ""))
 
 
