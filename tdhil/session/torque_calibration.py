@@ -63,10 +63,12 @@ def sha256_of_log(record: RunRecord) -> str:
 
 
 def _names(runs: Sequence[CalibrationRun]) -> list[str]:
-    """Return a short name of each run's log: the file's, or with its folder where two are the same."""
+    """Return a short name of each run's log: the file, or the folder if all files have the same name, or both."""
     paths = [Path(run.record.log) for run in runs]
-    names = [path.name for path in paths]
-    return names if len(set(names)) == len(names) else [f"{path.parent.name}/{path.name}" for path in paths]
+    for names in ([path.name for path in paths], [path.parent.name for path in paths]):
+        if len(set(names)) == len(names):
+            return names
+    return [f"{path.parent.name}/{path.name}" for path in paths]
 
 
 def find_calibration(runs: Sequence[CalibrationRun], at: str, confidence: float = 0.95) -> CalibrationFound:
@@ -191,8 +193,8 @@ def _differ(a: Any, b: Any) -> bool:
 def _not_stated(runs: Sequence[CalibrationRun]) -> Sequence[str]:
     found = []
     if any(run.added_kg_m2 and run.added_sd_kg_m2 is None for run in runs):
-        found.append(f"the standard uncertainty of the body was assumed to be {ASSUMED_BODY_REL_SD:.1%} of its inertia;"
-                     " state it with --added-sd")
+        found.append("state the standard uncertainty of the body: it is not given, and"
+                     f" {ASSUMED_BODY_REL_SD:.1%} of its inertia is assumed")
     if any(not drive_identity(run.record.configuration) for run in runs):
         found.append("a trace does not name its drive: whether all are of the same drive was not checked")
     return found

@@ -157,7 +157,7 @@ def test_an_uncertainty_that_is_not_stated_is_assumed_and_said(tmp_path):
     runs = two(tmp_path)
     runs[1] = replace(runs[1], added_sd_kg_m2=None)
     found = find_calibration(runs, "motor")
-    assert any("--added-sd" in warning for warning in found.warnings)
+    assert any("standard uncertainty of the body" in warning for warning in found.warnings)
     assert any(line.source.startswith("body") for line in found.calibration.budget)
 
 

@@ -208,4 +208,4 @@ def test_the_worker_calibrates_as_the_command_does(tmp_path, monkeypatch):
                               "added_sd_kg_m2": None, "at": "motor"})["document"]
     factor = found["calibration_factor"]
     assert factor["low"] <= 1.0 / bodies.SCALE <= factor["high"]
-    assert any("--added-sd" in warning for warning in found["warnings"])
+    assert any("standard uncertainty of the body" in warning for warning in found["warnings"])

@@ -425,7 +425,7 @@
     const parts = [el("div", { class: "card" }, el("p", { class: "figure" }, factor ? `κ = ${of(factor)}` : found.verdict),
       region("Numbers", el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => line(name, [text]))))),
       el("p", {}, sentence(found.reason)), found.advice ? el("p", {}, sentence(found.advice)) : null)];
-    for (const one of found.warnings) parts.push(el("p", { class: "alarm" }, sentence(one)));
+    for (const one of found.warnings) parts.push(el("p", { class: "caution" }, sentence(one)));
     if (!factor) return parts;
     parts.push(el("h3", {}, "Uncertainty budget"), region("Uncertainty budget", el("table", {},
       el("thead", {}, el("tr", {}, ...["", "± % of κ", "± % of J"].map((one) => el("th", { scope: "col" }, one)))),
