@@ -374,6 +374,49 @@ def test_a_rehearsal_is_marked_wherever_its_run_is_shown(page, served):
     page.get_by_role("article", name="Rig a").get_by_text("no result yet").wait_for()
 
 
+def test_the_recorded_motion_can_be_zoomed_read_and_exported(page, served):
+    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    write(served.service.store.place(run) / "run.mcap")         # 0 to 1.99 s, speed 10 rad/s², torque -20 N·m/s
+    page.goto(f"/runs/{run}/live")
+    charts, readout = page.locator("#plot-speed .u-over, #plot-torque .u-over"), page.locator("#readout")
+    whole, box = page.get_by_role("button", name="Whole run"), charts.first.bounding_box()
+    wait_for("the samples", lambda: page.evaluate("document.getElementById('speed').textContent") != "–")
+    assert whole.is_disabled()
+
+    def move(share: float) -> list[float]:
+        page.mouse.move(box["x"] + share * box["width"], box["y"] + 40, steps=3)
+        readout.get_by_text("N·m").wait_for()
+        return [float(one) for one in re.findall(r"-?[\d.]+", readout.inner_text().replace("N·m", ""))]
+
+    def saved(name: str) -> bytes:
+        with page.expect_download() as download:
+            page.get_by_role("button", name=name, exact=True).click()
+        assert download.value.suggested_filename.startswith(run)
+        return Path(download.value.path()).read_bytes()
+
+    time_s, speed_rad_s, torque_nm = move(0.5)
+    assert (time_s, speed_rad_s, torque_nm) == pytest.approx((1.0, 10.0 * time_s, -20.0 * time_s), abs=0.06)
+    move(0.25)
+    page.mouse.down()
+    move(0.5)
+    page.mouse.up()
+    assert whole.is_enabled()
+    # both charts show the same part, and only that part is exported
+    assert move(0.0)[0] == pytest.approx(0.5, abs=0.06) and move(0.999)[0] == pytest.approx(1.0, abs=0.06)
+    head, *rows = saved("CSV").decode().splitlines()
+    assert head == "time_s,speed_rad_s,torque_nm" and 9 <= len(rows) <= 15      # spacing 0.04 or 0.05 s
+    assert all(0.45 <= float(row.split(",")[0]) <= 1.05 for row in rows)
+    assert saved("PNG").startswith(b"\x89PNG")
+    page.get_by_role("button", name="Speeds in rad/s").click()
+    time_s, speed_rpm, _ = move(0.5)
+    assert "rpm" in readout.inner_text() and speed_rpm == pytest.approx(95.5 * time_s, rel=0.02)
+    charts.last.dblclick()
+    assert whole.is_disabled()
+    page.goto("/start/a")                                       # the unit is kept
+    page.get_by_role("button", name="Speeds in rpm").wait_for()
+
+
 def test_a_stop_says_when_it_was_asked_seen_and_at_rest(page, served):
     run = begin(served)
     page.goto(f"/runs/{run}/live")

@@ -109,6 +109,35 @@
     const J = result && result.inertia_kg_m2;
     return J ? withUnit(interval(J.value, J.low_total, J.high_total)) : null;
   }
+  // Speeds are shown in the unit that the reader has chosen. Data and files have rad/s.
+  const RPM = 60 / (2 * Math.PI), UNIT_KEY = "tdhil-speed-unit", redo = [];
+  let inRpm = false;
+  try { inRpm = localStorage.getItem(UNIT_KEY) === "rpm"; } catch (error) { /* then rad/s */ }
+  const speedUnit = () => (inRpm ? "rpm" : "rad/s");
+  const inSpeedUnit = (value) => (inRpm ? RPM * value : value);
+  const onSpeedUnit = (draw) => { redo.push(draw); };
+  /** Make an element whose text contains speeds; the text follows the chosen unit. */
+  function ofSpeed(text) {
+    const found = el("span", {}, text());
+    onSpeedUnit(() => { found.textContent = text(); });
+    return found;
+  }
+  function speedUnits() {
+    const button = byId("speed-unit");
+    const label = () => {
+      button.textContent = speedUnit();
+      button.setAttribute("aria-label", `Speeds in ${speedUnit()}. Change to ${inRpm ? "rad/s" : "rpm"}`);
+      for (const one of document.querySelectorAll("[data-speed-unit]")) one.textContent = speedUnit();
+      for (const one of document.querySelectorAll("[data-speed]")) one.textContent = number(inSpeedUnit(Number(one.dataset.speed)), 3);
+    };
+    label();
+    button.addEventListener("click", () => {
+      inRpm = !inRpm;
+      try { localStorage.setItem(UNIT_KEY, speedUnit()); } catch (error) { /* then for this page only */ }
+      label();
+      redo.forEach((draw) => draw());
+    });
+  }
   const percent = (share) => (share === null || share === undefined ? "" : `±${(100 * share).toPrecision(2)} %`);
   /** Format local time with an unambiguous month. */
   const two = (one, digits = 2) => String(one).padStart(digits, "0");
@@ -220,12 +249,12 @@
   }
 
   function planTable(plan) {
-    const half = plan.expected_half_width;
+    const half = plan.expected_half_width, speed = (value) => number(inSpeedUnit(value), 3);
     const rows = [
       ["expected interval of J (repeatability)", half === null ? "not predicted" : percent(half)],
       ["time", `${span(plan.duration_s + 90)}, of which ${span(plan.duration_s)} are stage 5`],
       ["motion", `${plan.excitation} in ${plan.mode} mode`],
-      ["speed, rad/s", `${number(plan.speed_rad_s.min, 3)} to ${number(plan.speed_rad_s.max, 3)} (limits ${number(plan.limits.speed_min_rad_s, 3)} to ${number(plan.limits.speed_max_rad_s, 3)})`],
+      ["speed", ofSpeed(() => `${speed(plan.speed_rad_s.min)} to ${speed(plan.speed_rad_s.max)} ${speedUnit()} (limits ${speed(plan.limits.speed_min_rad_s)} to ${speed(plan.limits.speed_max_rad_s)})`)],
       ["torque, N·m", `${number(plan.torque_nm.min, 3)} to ${number(plan.torque_nm.max, 3)} (limit ±${number(plan.limits.torque_nm, 3)})`],
     ];
     const advice = plan.stopping && !plan.stopping.reachable ? el("p", { class: "alarm" }, `±${number(100 * plan.stopping.tolerance, 3)} % can't be reached: ${plan.stopping.advice}`) : null;
@@ -347,51 +376,12 @@
 
   // -- live
 
-  function plotOf(where, colour, limitsOf) {
-    const style = () => getComputedStyle(document.documentElement);
-    let plot = null, limits = null, data = [[], []];
-    const draw = () => {
-      if (plot) plot.destroy();
-      const ink = style().getPropertyValue("--dim").trim(), line = style().getPropertyValue("--line").trim();
-      const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line } };
-      plot = new uPlot({
-        width: where.clientWidth || 320, height: 190, legend: { show: false }, cursor: { show: false },
-        scales: { x: { time: false }, y: { range: (self, low, high) => {
-          const all = [low, high, ...(limits ? limitsOf(limits).filter((one) => one !== null) : [])].filter((one) => Number.isFinite(one));
-          const from = Math.min(0, ...all), to = all.length ? Math.max(...all, from + 1e-3) : from + 1, pad = 0.06 * (to - from);
-          return [from - pad, to + pad];
-        } } },
-        axes: [{ ...axis, size: 34, values: (self, ticks) => ticks.map((one) => `${one} s`) }, { ...axis, size: 52 }],
-        series: [{}, { stroke: style().getPropertyValue(colour).trim(), width: 1.5, points: { show: false } }],
-        hooks: { draw: [(self) => {
-          if (!limits) return;
-          const c = self.ctx;
-          c.save();
-          c.strokeStyle = style().getPropertyValue("--limit").trim();
-          c.lineWidth = 1.5 * devicePixelRatio;
-          c.setLineDash([6 * devicePixelRatio, 4 * devicePixelRatio]);
-          for (const value of limitsOf(limits)) {
-            if (value === null) continue;
-            const y = self.valToPos(value, "y", true);
-            c.beginPath(); c.moveTo(self.bbox.left, y); c.lineTo(self.bbox.left + self.bbox.width, y); c.stroke();
-          }
-          c.restore();
-        }] },
-      }, data, where);
-    };
-    draw();
-    new ResizeObserver(() => plot.setSize({ width: where.clientWidth || 320, height: 190 })).observe(where);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
-    return { set: (t, y) => { data = [t, y]; plot.setData(data); }, limit: (found) => { limits = found; plot.redraw(); } };
-  }
-
   function livePage() {
     const run = document.body.dataset.run, watched = document.body.dataset.motion === "watched";
     const samples = [[], [], []];
-    let status = null, limits = null, message = 0, age = null, timeS = null, dirty = false, asking = null, undelivered = false, unseen = null;
+    let status = null, message = 0, age = null, timeS = null, dirty = false, asking = null, undelivered = false, unseen = null;
     let wentOn = new URL(document.referrer || location.href).pathname.startsWith("/start/");     // opened for a run, not for its record
-    const speed = plotOf(byId("plot-speed"), "--speed", (one) => [one.speed_min_rad_s, one.speed_max_rad_s]);
-    const torque = plotOf(byId("plot-torque"), "--torque", (one) => [-one.torque_nm, one.torque_nm]);
+    const charts = window.tdhil.motion(run);
 
     function take(found) {
       message = Date.now();
@@ -402,9 +392,10 @@
       if (found.samples) { found.samples.forEach((column, k) => { for (const one of column) samples[k].push(one); }); dirty = true; }
       for (const one of found.events || []) event(one);
       for (const one of found.stages || []) done[one.name] = one;
-      if (found.limits) { limits = found.limits; speed.limit(limits); torque.limit(limits); }
+      if (found.limits) charts.limit(found.limits);
       if (found.status) { status = found.status; state(); }
       if (found.stages || found.status) stages();
+      if (found.stages) charts.stages(Object.values(done));
     }
     let done = {};
 
@@ -616,10 +607,9 @@
       }
       if (dirty) {
         dirty = false;
-        speed.set(samples[0], samples[1]);
-        torque.set(samples[0], samples[2]);
+        charts.set(samples);
         const last = samples[0].length - 1;
-        byId("speed").textContent = last < 0 || samples[1][last] === null ? "–" : samples[1][last].toFixed(2);
+        byId("speed").textContent = last < 0 || samples[1][last] === null ? "–" : inSpeedUnit(samples[1][last]).toFixed(2);
         byId("torque").textContent = last < 0 || samples[2][last] === null ? "–" : samples[2][last].toFixed(0);
       }
     }, 150);
@@ -699,8 +689,9 @@
   });
 
   const pages = { login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, may, number, ofResult, pacing, pages, percent, rehearsal, show, span, waiting, when, zone };
+  window.tdhil = { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, waiting, when, zone };
   document.addEventListener("DOMContentLoaded", () => {
+    speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);
     try {
       (pages[document.body.dataset.page] || (() => {}))();

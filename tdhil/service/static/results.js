@@ -1,7 +1,7 @@
 // Results: one run, a comparison, a rig over time, many logs. As in app.js, data from elsewhere are inserted as text.
 "use strict";
 (() => {
-  const { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, number, ofResult, pacing, pages, percent, rehearsal, show, span, waiting, when, zone } = window.tdhil;
+  const { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inSpeedUnit, inertia, interval, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, waiting, when, zone } = window.tdhil;
 
   // -- one run
 
@@ -83,8 +83,8 @@
       el("h2", {}, one.heading),
       el("figure", {}, el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: one.caption, loading: "lazy" }), el("figcaption", {}, one.caption))]));
     const curve = (result && result.friction_curve) || [];
-    if (curve.length) byId("pictures").append(numbers("Friction over speed, in numbers", ["speed, rad/s", "torque, N·m"],
-      curve.map((one) => [number(one.speed_rad_s), of(one.torque_nm)])));
+    if (curve.length) byId("pictures").append(numbers("Friction over speed, in numbers", ["speed", "torque, N·m"],
+      curve.map((one) => [ofSpeed(() => `${number(inSpeedUnit(one.speed_rad_s))} ${speedUnit()}`), of(one.torque_nm)])));
   }
   const of = (one) => interval(one.value, one.low, one.high) ?? "–";
   const region = (label, table) => el("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": label }, table);

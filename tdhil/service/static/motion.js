@@ -1,0 +1,182 @@
+// Speed and torque of a run over one time axis: zoom, pan, values under the cursor, export of the view.
+"use strict";
+(() => {
+  const { byId, el, inSpeedUnit, onSpeedUnit, speedUnit } = window.tdhil;
+  const HEIGHT = 190;
+  const LEAST_S = 0.2;           // shortest view: five displayed samples
+  const DRAG_PX = 6;             // a shorter drag is a click
+  const STEP = 0.25, ZOOM = 2;   // a press of a button moves by a quarter of the view, or halves it
+  const HINT = "Drag across a chart to zoom. Double-click shows the whole run.";
+  const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+  /** Nearest index of `time` to `at`; `time` rises. */
+  function nearest(time, at) {
+    let low = 0, high = time.length - 1;
+    while (high - low > 1) {
+      const middle = (low + high) >> 1;
+      if (time[middle] < at) low = middle; else high = middle;
+    }
+    return at - time[low] < time[high] - at ? low : high;
+  }
+
+  function save(name, blob) {
+    const href = URL.createObjectURL(blob);
+    el("a", { href, download: name }).click();
+    setTimeout(() => URL.revokeObjectURL(href), 10000);
+  }
+
+  /** Charts of the live page. `set` takes [time s, speed rad/s, torque N·m]; `limit` the guard's limits; `stages` [{name, end_s}]. */
+  function motion(run) {
+    const readout = byId("readout"), buttons = byId("view-tools");
+    let samples = [[], [], []], limits = null, stages = [], view = null;
+    const charts = [
+      { where: byId("plot-speed"), column: 1, colour: "--speed", shown: inSpeedUnit, of: (one) => [one.speed_min_rad_s, one.speed_max_rad_s] },
+      { where: byId("plot-torque"), column: 2, colour: "--torque", shown: (one) => one, of: (one) => [-one.torque_nm, one.torque_nm] },
+    ];
+    const limitsOf = (chart) => (limits ? chart.of(limits).filter((one) => one !== null).map(chart.shown) : []);
+    const whole = () => [samples[0][0] ?? 0, samples[0][samples[0].length - 1] ?? 1];
+    const range = () => view || whole();
+
+    /** Show a part of the run; null shows the whole run and follows a live one. */
+    function look(next) {
+      if (next) {
+        const [first, last] = whole();
+        const width = Math.min(Math.max(next[1] - next[0], LEAST_S), last - first);
+        const from = Math.min(Math.max(next[0], first), last - width);
+        next = width >= last - first ? null : [from, from + width];
+      }
+      view = next;
+      const [low, high] = range();
+      for (const chart of charts) chart.plot.setScale("x", { min: low, max: high });
+      for (const one of buttons.querySelectorAll("[data-part]")) one.disabled = !view;
+    }
+    function zoom(factor, at) {
+      const [low, high] = range(), middle = at ?? (low + high) / 2;
+      look([middle - (middle - low) / factor, middle + (high - middle) / factor]);
+    }
+    function pan(share) {
+      const [low, high] = range(), by = share * (high - low);
+      look([low + by, high + by]);
+    }
+    function read(at) {
+      const text = at === null || !samples[0].length ? HINT : (() => {
+        const k = nearest(samples[0], at), speed = samples[1][k], torque = samples[2][k];
+        const value = (one, digits) => (one === null ? "no value" : one.toFixed(digits));
+        return `${samples[0][k].toFixed(2)} s: ${value(speed === null ? null : inSpeedUnit(speed), 3)} ${speedUnit()}, ${value(torque, 1)} N·m`;
+      })();
+      if (readout.textContent !== text) readout.textContent = text;
+    }
+
+    function marks(chart, self) {
+      const c = self.ctx, px = devicePixelRatio, { left, top, width, height } = self.bbox;
+      c.save();
+      c.beginPath(); c.rect(left, top, width, height); c.clip();
+      c.lineWidth = px;
+      c.font = `${11 * px}px system-ui, sans-serif`;
+      c.textAlign = "left";
+      c.textBaseline = "bottom";
+      c.strokeStyle = colour("--line");
+      c.fillStyle = colour("--dim");
+      let from = samples[0][0] ?? 0;
+      for (const stage of stages) {
+        const x = self.valToPos(stage.end_s, "x", true), before = Math.max(self.valToPos(from, "x", true), left);
+        c.beginPath(); c.moveTo(x, top); c.lineTo(x, top + height); c.stroke();
+        if (chart.column === 1 && x - before > c.measureText(stage.name).width + 8 * px) c.fillText(stage.name, before + 4 * px, top + height - 3 * px);
+        from = stage.end_s;
+      }
+      c.strokeStyle = colour("--limit");
+      c.lineWidth = 1.5 * px;
+      c.setLineDash([6 * px, 4 * px]);
+      for (const value of limitsOf(chart)) {
+        const y = self.valToPos(value, "y", true);
+        c.beginPath(); c.moveTo(left, y); c.lineTo(left + width, y); c.stroke();
+      }
+      c.restore();
+    }
+
+    const data = (chart) => [samples[0], samples[chart.column].map((one) => (one === null ? null : chart.shown(one)))];
+    function draw() {
+      for (const chart of charts) {
+        if (chart.plot) chart.plot.destroy();
+        const axis = { stroke: colour("--dim"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") } };
+        chart.plot = new uPlot({
+          width: chart.where.clientWidth || 320, height: HEIGHT, legend: { show: false },
+          cursor: { y: false, sync: { key: "motion" }, drag: { x: true, y: false, setScale: false, dist: DRAG_PX }, bind: { dblclick: () => () => look(null) } },
+          scales: {
+            x: { time: false, range: () => range() },
+            y: { range: (self, low, high) => {
+              const all = [low, high, ...limitsOf(chart)].filter((one) => Number.isFinite(one));
+              const from = Math.min(0, ...all), to = all.length ? Math.max(...all, from + 1e-3) : from + 1, pad = 0.06 * (to - from);
+              return [from - pad, to + pad];
+            } },
+          },
+          axes: [{ ...axis, size: 34, values: (self, ticks) => ticks.map((one) => `${one} s`) }, { ...axis, size: 52 }],
+          series: [{}, { stroke: colour(chart.colour), width: 1.5, points: { show: false } }],
+          hooks: {
+            draw: [(self) => marks(chart, self)],
+            setCursor: [(self) => { if (self.cursor.event) read(self.cursor.left >= 0 ? self.posToVal(self.cursor.left, "x") : null); }],
+            setSelect: [(self) => {
+              const { left, width } = self.select;
+              if (width < DRAG_PX) return;
+              const part = [self.posToVal(left, "x"), self.posToVal(left + width, "x")];
+              self.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
+              look(part);
+            }],
+          },
+        }, data(chart), chart.where);
+        chart.plot.over.addEventListener("mouseleave", () => read(null));
+      }
+      look(view);
+    }
+
+    for (const chart of charts) {
+      chart.where.addEventListener("wheel", (event) => {          // a wheel alone scrolls the page
+        const sideways = event.shiftKey ? event.deltaY || event.deltaX : event.deltaX;
+        if (event.ctrlKey) zoom(event.deltaY < 0 ? ZOOM ** 0.5 : ZOOM ** -0.5, chart.plot.posToVal(event.offsetX - chart.plot.over.offsetLeft, "x"));
+        else if (Math.abs(sideways) > Math.abs(event.shiftKey ? 0 : event.deltaY)) pan(Math.sign(sideways) * STEP / 4);
+        else return;
+        event.preventDefault();
+      }, { passive: false });
+      new ResizeObserver(() => chart.plot.setSize({ width: chart.where.clientWidth || 320, height: HEIGHT })).observe(chart.where);
+    }
+
+    /** Both charts as one picture, as they are on the screen. */
+    function picture() {
+      const parts = charts.map((chart) => ({ canvas: chart.plot.ctx.canvas, title: chart.where.parentElement.querySelector("figcaption").textContent }));
+      const px = devicePixelRatio, head = 22 * px, paper = el("canvas"), c = paper.getContext("2d");
+      paper.width = parts[0].canvas.width;
+      paper.height = parts.reduce((sum, one) => sum + one.canvas.height + head, 0);
+      c.fillStyle = colour("--ground");
+      c.fillRect(0, 0, paper.width, paper.height);
+      c.fillStyle = colour("--ink");
+      c.font = `${13 * px}px system-ui, sans-serif`;
+      let y = 0;
+      for (const one of parts) {
+        c.fillText(one.title, 8 * px, y + 15 * px);
+        c.drawImage(one.canvas, 0, y + head);
+        y += one.canvas.height + head;
+      }
+      paper.toBlob((blob) => save(`${run}-${part()}.png`, blob));
+    }
+    const part = () => range().map((one) => `${Math.round(one)}s`).join("-");
+    function table() {
+      const [low, high] = range(), rows = ["time_s,speed_rad_s,torque_nm"];
+      samples[0].forEach((at, k) => { if (at >= low && at <= high) rows.push([at, samples[1][k] ?? "", samples[2][k] ?? ""].join(",")); });
+      save(`${run}-${part()}.csv`, new Blob([`${rows.join("\n")}\n`], { type: "text/csv" }));
+    }
+    const tools = { in: () => zoom(ZOOM), out: () => zoom(1 / ZOOM), back: () => pan(-STEP), on: () => pan(STEP), whole: () => look(null), png: picture, csv: table };
+    for (const one of buttons.querySelectorAll("[data-tool]")) one.addEventListener("click", tools[one.dataset.tool]);
+
+    draw();
+    read(null);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+    onSpeedUnit(draw);
+    return {
+      set: (found) => { samples = found; for (const chart of charts) chart.plot.setData(data(chart)); },
+      limit: (found) => { limits = found; for (const chart of charts) chart.plot.setData(data(chart)); },
+      stages: (found) => { stages = found; for (const chart of charts) chart.plot.redraw(false); },
+    };
+  }
+
+  window.tdhil.motion = motion;
+})();
