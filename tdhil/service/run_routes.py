@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import anyio
 
@@ -39,6 +39,9 @@ if TYPE_CHECKING:
     from tdhil.service.site import Site
     from tdhil.service.store import Summary
 
+LONGEST_SEARCH: Final = 200
+"""Longest text of a search, characters."""
+
 
 def routes(site: Site) -> list[Route]:
     """Return the routes. ``compare`` comes before ``run``, whose path it matches too."""
@@ -64,7 +67,10 @@ async def runs(site: Site, request: Request, body: None) -> list[Summary]:
     if (state := query.get("state")) is not None and state not in set(State):
         raise UsageError(f"{state[:40]!r} is not a state", where="state",
                          next_step=f"States: {', '.join(State)}", entry=MessageCode.REQUEST_WRONG)
-    return await off(lambda: site.list_runs(query.get("rig"), state, int(limit)))
+    text = query.get("text", "")
+    if len(text) > LONGEST_SEARCH:
+        raise UsageError(f"must be at most {LONGEST_SEARCH} characters", where="text", entry=MessageCode.REQUEST_WRONG)
+    return await off(lambda: site.list_runs(query.get("rig"), state, int(limit), text))
 
 
 async def compare(site: Site, request: Request, body: None) -> CompareView:

@@ -443,6 +443,7 @@ ROUTES: Final = (
           " needs an operator if no tdhil moves it", "viewer", {200: StoppedView}, Nothing, (403, 404, 503, 504)),
     Route("GET", "/runs", "runs", "The runs, the newest first", "viewer", {200: list[Summary]},
           query={"rig": "runs of this rig only", "state": "runs in this state only",
+                 "text": "runs with these words in id, rig, state, time, user, verdict, operator or note",
                  "limit": "most runs to return (100)"}),
     Route("GET", "/runs/compare", "compare", "Compare runs", "viewer", {200: CompareView}, errors=(404, 422),
           query={"runs": "two to eight runs, separated by commas"}),

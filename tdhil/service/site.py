@@ -137,7 +137,7 @@ class Site:
             next((one for one in last if one.inertia_kg_m2 is not None and not one.rehearsal), None),
         )
 
-    def list_runs(self, rig: str | None, state: str | None, limit: int) -> list[Summary]:
+    def list_runs(self, rig: str | None, state: str | None, limit: int, text: str = "") -> list[Summary]:
         """Return runs from the index; from the files if it is not available or out of date, as for a live run."""
         live = self.supervisor.ahead_of_the_index()
         now_live = []
@@ -145,11 +145,12 @@ class Site:
             with suppress(NotThere):
                 now_live.append(self.store.summary(run))
         try:
-            ended = [one for one in self.supervisor.index.find(rig=rig, state=state, limit=limit + len(live))
+            ended = [one for one in self.supervisor.index.find(rig=rig, state=state, text=text, limit=limit + len(live))
                      if one.id not in live]
         except (sqlite3.Error, OSError):
             ended = [one for one in self.store.summaries() if one.id not in live]
-        found = [one for one in (*now_live, *ended) if rig in (None, one.rig) and state in (None, one.state)]
+        found = [one for one in (*now_live, *ended)
+                 if rig in (None, one.rig) and state in (None, one.state) and one.contains(text)]
         return sorted(found, key=lambda one: one.id, reverse=True)[:limit]
 
     def trend_rows(self, rig: str) -> list[dict[str, Any]]:

@@ -121,6 +121,17 @@ class Summary:
     repeatability_rel: float | None = None
     exit_code: int | None = None
     rehearsal: bool = False                # of a fault on the simulated drive
+    operator: str | None = None
+    note: str | None = None
+
+    def contains(self, text: str) -> bool:
+        """Return whether every word of ``text`` occurs in a text of this row, in upper or lower case."""
+        said = " ".join(str(getattr(self, name) or "") for name in SEARCHED).casefold()
+        return all(word in said for word in text.casefold().split())
+
+
+SEARCHED: Final = ("id", "rig", "state", "asked", "asked_by", "verdict", "operator", "note")
+"""Columns of `Summary` that a search looks into."""
 
 
 def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any] | None) -> Summary:
@@ -132,6 +143,7 @@ def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any]
         request.simulated if status.simulated is None else status.simulated,
         (result or {}).get("verdict"), inertia.get("value"), inertia.get("low_total"), inertia.get("high_total"),
         inertia.get("repeatability_rel"), status.exit_code, request.rehearsal,
+        *(None if (said := request.options.get(name)) is None else str(said) for name in ("operator", "note")),
     )
 
 
@@ -257,7 +269,7 @@ class Store:
 
 
 _COLUMNS: Final = tuple(Summary.__dataclass_fields__)
-_VERSION: Final = 2
+_VERSION: Final = 3
 
 
 class Index:
@@ -273,10 +285,15 @@ class Index:
         with self._lock, closing(self._open()) as base, base:
             self._put(base, summary)
 
-    def find(self, *, rig: str | None = None, state: str | None = None, limit: int = 100) -> list[Summary]:
-        """Return matching rows, the newest first. Raises sqlite3.Error."""
+    def find(
+        self, *, rig: str | None = None, state: str | None = None, text: str = "", limit: int = 100
+    ) -> list[Summary]:
+        """Return matching rows, the newest first; ``text``: as of `Summary.contains`. Raises sqlite3.Error."""
         where = [f"{name} = ?" for name, value in (("rig", rig), ("state", state)) if value is not None]
         values = [value for value in (rig, state) if value is not None]
+        for word in text.split():
+            where.append("instr(casefold(" + " || ' ' || ".join(f"ifnull({name}, '')" for name in SEARCHED) + "), ?)")
+            values.append(word.casefold())
         clause = f"where {' and '.join(where)}" if where else ""
         with self._lock, closing(self._open()) as base:
             rows = base.execute(
@@ -296,6 +313,7 @@ class Index:
         new = not self._path.exists()
         base = sqlite3.connect(self._path, timeout=0.5)
         try:
+            base.create_function("casefold", 1, str.casefold, deterministic=True)
             base.execute("pragma journal_mode = delete")
             base.execute("pragma synchronous = full")
             (version,) = base.execute("pragma user_version").fetchone()

@@ -344,6 +344,27 @@ def test_on_a_phone_the_list_of_runs_shows_j_and_verdict(page, served):
         assert box["x"] >= 0 and box["x"] + box["width"] <= 390, text
 
 
+def test_the_list_of_runs_can_be_searched_and_sorted(page, served):
+    for rig, operator in (("a", "Anna"), ("b", "Berta"), ("a", "Carla")):
+        run = served.service.supervisor.start_run(rig, {"note": "done", "operator": operator}, "local").request.id
+        served.service.wait(run, "done")
+    page.goto("/runs")
+    names, search = page.locator("#runs td:last-child"), page.get_by_label("Search")
+    page.get_by_text("Carla: done").wait_for()
+    assert set(names.all_inner_texts()) == {"Carla: done", "Berta: done", "Anna: done"}
+    page.get_by_role("button", name="operator, note").click()
+    assert names.all_inner_texts() == ["Anna: done", "Berta: done", "Carla: done"]
+    page.get_by_role("button", name="when").click()
+    search.fill("anna done")
+    page.get_by_text("Carla: done").wait_for(state="detached")
+    assert names.all_inner_texts() == ["Anna: done"]
+    search.fill("nothing of the kind")
+    page.get_by_text("no run matches").wait_for()
+    search.fill("")
+    page.get_by_label("State").select_option("failed")
+    page.get_by_text("no run matches").wait_for()
+
+
 def test_a_stop_that_was_asked_for_is_no_alarm(page, served):
     run = begin(served)
     page.goto(f"/runs/{run}/live")
@@ -678,7 +699,7 @@ def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypat
     page.get_by_role("row", name="J, 90 % interval to quote").wait_for()
     page.locator(".pictures img").evaluate("one => one.decode()")
     page.get_by_text("Friction over speed, in numbers").click()
-    page.get_by_role("row", name="2 76").wait_for()
+    page.get_by_role("row", name="2 rad/s 76").wait_for()
     names = [one.inner_text() for one in page.locator(".files a").all()]
     assert names == ["run.mcap", "report.html", "report.pdf", "result.json", "samples.csv"]
     again = {"verdict": "valid_wide", "inertia_kg_m2": {**estimate(104.5), "low_total": 99.0, "high_total": 110.0,

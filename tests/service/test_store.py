@@ -130,6 +130,22 @@ def test_a_deleted_index_is_made_again_the_same(store):
     assert rows(index) == before == list(store.summaries())
 
 
+@pytest.mark.parametrize(("text", "expected"), [
+    ("", 2), ("ÖLMÜHLE", 1), ("hans b", 1), ("after repair hans", 1), ("hans after-market", 0), ("100%", 0),
+    ("'; drop", 0),
+])
+def test_a_search_finds_each_word_in_any_text_of_a_run(store, text, expected):
+    """Index and files agree, in upper and lower case; a text of SQL or with its wildcards is only a text."""
+    index = Index(store)
+    options = {"operator": "Hans", "note": "after repair, Ölmühle"}
+    for rig, said in (("b", options), ("a", {})):
+        request = replace(store.request(a_run(store, rig)), options=said)
+        index.put(summary_of(request, store.status(request.id), None))
+    every = index.find()
+    assert len(index.find(text=text)) == expected
+    assert index.find(text=text) == [one for one in every if one.contains(text)]
+
+
 def test_a_rehearsal_is_marked_in_the_list_of_runs(store):
     """A fault of the simulated drive changes the result: the list, and what lives on it, can tell."""
     request = replace(store.request(a_run(store)), options={"fault": ["torque-scale=1.1"]})

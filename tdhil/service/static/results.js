@@ -182,18 +182,41 @@
       link.disabled = !enough;
       byId("chosen").textContent = chosen.size ? `${chosen.size} chosen${chosen.size > 8 ? ", eight at most" : ""}` : "Choose two to eight runs.";
     }
-    every(3000, async () => {
-      const runs = await call("GET", "/runs"), now = JSON.stringify(runs);
-      if (now === shown) return;                  // keep the keyboard focus
-      shown = now;
+    const form = byId("search"), heads = [...document.querySelectorAll("[data-key]")];
+    let found = [], key = "id", down = true, asking = 0;
+    form.elements.state.append(...Object.entries(STATES).map(([state, text]) => el("option", { value: state }, text)));
+    function draw() {
+      const said = (one) => [one.operator, one.note].filter(Boolean).join(": ") || null, value = (one) => (key === "note" ? said(one) : one[key]);
+      const order = (a, b) => (a === null) - (b === null) || (typeof a === "number" ? a - b : String(a).localeCompare(String(b)));
+      const runs = [...found].sort((a, b) => (value(a) === null || value(b) === null ? order(value(a), value(b)) : (down ? -1 : 1) * order(value(a), value(b))) || (a.id < b.id ? 1 : -1));
       show(byId("runs"), ...(runs.length ? runs.map((one) => {
         const box = el("input", { type: "checkbox", "aria-label": `compare ${one.rig}, ${when(one.asked)}`, checked: chosen.has(one.id), disabled: one.verdict === null });
         box.addEventListener("change", () => choose(one.id, box.checked));
         return el("tr", {}, el("td", { class: "pick" }, box),
           el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}` }, when(one.asked))), el("td", {}, one.rig, " ", badge(one.simulated) || "", " ", rehearsal(one.rehearsal) || ""),
-          el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict || ""));
-      }) : [el("tr", {}, el("td", { colspan: 6, class: "dim" }, "no run yet"))]));
+          el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict || ""),
+          el("td", {}, said(one) || ""));
+      }) : [el("tr", {}, el("td", { colspan: 7, class: "dim" }, form.elements.text.value || form.elements.state.value ? "no run matches" : "no run yet"))]));
+    }
+    async function look() {
+      const query = new URLSearchParams(), mine = ++asking;
+      for (const name of ["text", "state"]) if (form.elements[name].value.trim()) query.set(name, form.elements[name].value.trim());
+      const runs = await call("GET", `/runs?${query}`), now = JSON.stringify(runs);
+      if (mine !== asking || now === shown) return;          // a later request is on its way; or keep the keyboard focus
+      shown = now;
+      found = runs;
+      draw();
+    }
+    const again = () => look().catch((error) => { if (error instanceof Refused) away(error.message); });
+    form.addEventListener("input", again);
+    form.addEventListener("submit", (event) => { event.preventDefault(); again(); });
+    for (const one of heads) one.addEventListener("click", () => {
+      down = one.dataset.key === key ? !down : one.dataset.key === "id";
+      key = one.dataset.key;
+      heads.forEach((head) => { if (head === one) head.parentElement.setAttribute("aria-sort", down ? "descending" : "ascending"); else head.parentElement.removeAttribute("aria-sort"); });
+      draw();
     });
+    every(3000, look);
   }
 
   // -- pictures of several runs
