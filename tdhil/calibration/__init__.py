@@ -1,4 +1,6 @@
-"""The scales of a drive's torque and speed: from known bodies, from a reference, from turns; and their file. Pure."""
+"""Calibration of a drive's torque and speed: from known bodies, a reference sensor, a known pipe, or counted turns.
+Pure.
+"""
 
 from tdhil.calibration.added_body import (
     BodyRun as BodyRun, CalibrationCase as CalibrationCase, CalibrationLine as CalibrationLine,

@@ -1,17 +1,19 @@
 r"""Torque calibration by bodies of known inertia: the line of identified over added inertia.
 
-The drive reports T/κ, κ the *calibration factor* of its torque. A run on an inertia J with a body b on it identifies
+The drive reports T/κ, with the *calibration factor* κ of its torque. A run with inertia J and an added body b
+identifies
 
     y = (J + b)/κ,        a straight line over b: slope 1/κ, intercept J/κ,
 
-so that two runs, without a body (y₁) and with one (y₂), give κ = b/(y₂ − y₁) and J = b y₁/(y₂ − y₁). What is off by the
-same share in both cancels in J. Of relative errors x₁ and x₂ of the runs remains
+Two runs, without a body (y₁) and with one (y₂), give κ = b/(y₂ − y₁) and J = b y₁/(y₂ − y₁). An equal relative error of
+both runs cancels in J. Relative errors x₁ and x₂ of the runs give
 
-    dJ/J = (1 + J/b)(x₁ − x₂),        dκ/κ = (y₁ x₁ − y₂ x₂)/(y₂ − y₁),        and of the body db/b in either.
+    dJ/J = (1 + J/b)(x₁ − x₂),        dκ/κ = (y₁ x₁ − y₂ x₂)/(y₂ − y₁),        plus db/b of the body in either.
 
-With more runs than two the line is fitted by generalised least squares, weights C⁻¹ with C the runs' covariance plus
-that of the bodies, and the residuals test that it is straight. Uncertainties are propagated to first order (GUM 5.2),
-degrees of freedom by Welch and Satterthwaite (GUM G.4); coverage intervals are symmetric with Student's quantile.
+With more than two runs the line is fitted by generalised least squares with the weights C⁻¹; C is the covariance of the
+runs plus that of the bodies. The residuals test whether the line is straight. Uncertainties are propagated to first
+order (GUM 5.2), degrees of freedom by Welch and Satterthwaite (GUM G.4); coverage intervals are symmetric with
+Student's quantile.
 """
 
 import math
@@ -25,32 +27,33 @@ from tdhil.estimation.frequency_domain import student_quantile
 from tdhil.recording import FloatArray
 
 CERTAIN = 1e6
-"""Degrees of freedom that stand for infinitely many: those of an input whose stated uncertainty counts as exact."""
+"""Degrees of freedom that count as infinite: those of an input whose stated uncertainty is taken as exact."""
 CONTRADICTED_P = 0.001
-"""Below, a test contradicts that filters are shared, or that the line is straight."""
+"""p-value below which a test contradicts shared filters or a straight line."""
 LARGEST_ERROR, LARGEST_IN_SD = 0.15, 5.0
-"""A torque scale is off by no more than this share, or so many of its stated standard deviations."""
+"""Largest plausible error of a torque scale: this share, or this multiple of its stated standard deviation."""
 _LIKE_GEAR = 0.25
-"""Distance from i², as a share of it, within which a factor points to the wrong shaft."""
+"""Relative distance from i² within which a factor suggests the wrong shaft."""
 
 
 @dataclass(frozen=True)
 class BodyRun:
-    """One run. ``added_kg_m2`` and ``added_sd_kg_m2`` at the motor; 0 without a body. ``name`` in messages."""
+    """One run. ``added_kg_m2`` and ``added_sd_kg_m2`` at the motor shaft; 0 without a body. ``name``: in messages."""
 
     name: str
     added_kg_m2: float
     added_sd_kg_m2: float = 0.0
     noise_share: float = 0.0
-    """Standard uncertainty of its J with the filters known, as a share."""
+    """Relative standard uncertainty of its J for known filters."""
 
 
 @dataclass(frozen=True)
 class CalibrationCase:
     """All runs. ``reported_kg_m2`` (n,) in the drive's unit, ``covariance`` (n, n) with its ``degrees_of_freedom``.
 
-    ``covariance_known`` (n, n): with the filters of the reports known. ``sharing``: do the runs share them; None: not
-    tested. ``scale_rel_sd``: of the torque scale as it is stated so far. ``gear_ratio`` i = ω_motor/ω_main.
+    ``covariance_known`` (n, n): for known filters of the reports. ``sharing``: test whether the runs share the filters;
+    None: not tested. ``scale_rel_sd``: stated standard uncertainty of the torque scale before this calibration.
+    ``gear_ratio`` i = ω_motor/ω_main.
     """
 
     runs: tuple[BodyRun, ...]
@@ -67,7 +70,7 @@ class CalibrationCase:
 
 @dataclass(frozen=True)
 class MeasuredValue:
-    """A value with its standard uncertainty, effective degrees of freedom, and coverage interval."""
+    """Value with its standard uncertainty, effective degrees of freedom, and coverage interval."""
 
     value: float
     standard_uncertainty: float
@@ -78,13 +81,13 @@ class MeasuredValue:
 
     @property
     def half_width_share(self) -> float:
-        """Half the interval, as a share of the value."""
+        """Return half the interval, as a share of the value."""
         return 0.5 * (self.high - self.low) / abs(self.value)
 
 
 @dataclass(frozen=True)
 class CalibrationLine:
-    """One input quantity of the budget (GUM 8, EA-4/02): what it adds to κ and to J, as a share of each (1 sd)."""
+    """Input quantity of the budget (GUM 8, EA-4/02): its relative contribution to κ and to J (1 sd)."""
 
     source: str
     standard_uncertainty_kg_m2: float
@@ -96,7 +99,7 @@ class CalibrationLine:
 
 @dataclass(frozen=True)
 class FactorLine:
-    """One input quantity of the budget of κ (1 sd): what it adds to κ, as a share of it."""
+    """Input quantity of the budget of κ: its relative contribution to κ (1 sd)."""
 
     source: str
     distribution: str
@@ -117,10 +120,10 @@ class FittedPoint:
 
 @dataclass(frozen=True)
 class TorqueCalibration:
-    """``factor`` κ: true over reported torque; ``inertia_kg_m2``: true J without a body. None where refused.
+    """Result: ``factor`` κ, true over reported torque; ``inertia_kg_m2``, true J without a body. Both None if refused.
 
-    ``least_added_kg_m2``: of a body that would do, where the one that was used is too small; else None.
-    ``line``: slope 1/κ and intercept J/κ with their covariance (2, 2) as rows, for the picture.
+    ``least_added_kg_m2``: inertia of a sufficient body, if the used body is too small; else None. ``line``: slope 1/κ
+    and intercept J/κ with their covariance (2, 2) as rows, for the figure.
     """
 
     verdict: Verdict
@@ -139,7 +142,7 @@ class TorqueCalibration:
 
 
 def calibrate_torque(case: CalibrationCase) -> TorqueCalibration:
-    """κ and J from the runs, or the reason why not. Raises ValueError for fewer than two different bodies."""
+    """Return κ and J from the runs, or a refusal. Raises ValueError for fewer than two different bodies."""
     added = np.array([run.added_kg_m2 for run in case.runs])
     if len(added) < 2 or float(np.ptp(added)) <= 0.0:
         raise ValueError("two runs with different bodies are needed")
@@ -179,7 +182,7 @@ def calibrate_torque(case: CalibrationCase) -> TorqueCalibration:
         if least is not None:
             advice = f"use a body of {least:.3g} kg·m² or more at the motor, or measure for longer"
         return replace(refused, reason=reason, advice=advice, least_added_kg_m2=least)
-    # The factor's own uncertainty doesn't count against it.
+    # the uncertainty of the factor itself is added to the allowed error
     most = max(LARGEST_ERROR, LARGEST_IN_SD * case.scale_rel_sd) + student_quantile(case.confidence, CERTAIN) * (
         factor.standard_uncertainty)
     if abs(factor.value - 1.0) > most:
@@ -209,13 +212,13 @@ def _shaft(case: CalibrationCase, factor: float) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The line, and what follows from it.
+# Line, and the values derived from it.
 
 
 @dataclass(frozen=True)
 class _FittedLine:
     beta: FloatArray                   # intercept, slope
-    by_reported: FloatArray            # (2, n): ∂beta/∂y; of the bodies −slope times that
+    by_reported: FloatArray            # ∂beta/∂y, (2, n); the derivative by the bodies is −slope times that
     covariance: FloatArray
     linearity: ResidualTest | None
 
@@ -249,12 +252,12 @@ def _line(case: CalibrationCase, added: FloatArray) -> _FittedLine:
 def _propagated(
     case: CalibrationCase, line: _FittedLine
 ) -> tuple[MeasuredValue, MeasuredValue, tuple[CalibrationLine, ...]]:
-    """κ, J, and the budget of both."""
+    """Return κ, J, and the budget of both."""
     intercept, slope = line.beta
     factor, inertia = 1.0 / slope, intercept / slope
     of_factor = -(factor**2) * line.by_reported[1]
     of_inertia = factor * line.by_reported[0] - inertia * factor * line.by_reported[1]
-    both = np.stack([of_factor / factor, of_inertia / inertia])           # shares, by kg·m² in the drive's unit
+    both = np.stack([of_factor / factor, of_inertia / inertia])           # relative, per kg·m² in the drive's unit
     lines = []
     known = np.diag(case.covariance_known)
     for k, run in enumerate(case.runs):
@@ -280,9 +283,10 @@ def _propagated(
 
 
 def effective_degrees_of_freedom(parts: Sequence[tuple[float, float]]) -> float:
-    """Welch and Satterthwaite (GUM G.2b) of (standard uncertainty, its degrees of freedom); at most `CERTAIN`.
+    """Return the degrees of freedom by Welch and Satterthwaite (GUM G.2b), at most `CERTAIN`.
 
-    A part with `CERTAIN` has infinitely many and drops out of the sum.
+    ``parts``: pairs of standard uncertainty and its degrees of freedom. A part with `CERTAIN` counts as infinite and
+    drops out of the sum.
     """
     variance = sum(sd**2 for sd, _ in parts)
     uncertain = sum(sd**4 / dof for sd, dof in parts if dof < CERTAIN)
@@ -290,16 +294,16 @@ def effective_degrees_of_freedom(parts: Sequence[tuple[float, float]]) -> float:
 
 
 def measured_value(value: float, standard_uncertainty: float, dof: float, confidence: float) -> MeasuredValue:
-    """With the interval that Student's quantile makes of it."""
+    """Return the value with its interval by Student's quantile."""
     k = student_quantile(confidence, dof)
     half = k * standard_uncertainty
     return MeasuredValue(value, standard_uncertainty, dof, k, value - half, value + half)
 
 
 def _least(case: CalibrationCase, inertia: MeasuredValue) -> float | None:
-    """The body with which J would be as sure as it is with the stated scale; None where none is.
+    """Return the body, kg·m², for which J is as certain as with the stated scale; None if no body is sufficient.
 
-    Of two runs: half-width = (1 + J/b) w, w that of the difference of the runs' relative errors.
+    For two runs: half-width = (1 + J/b) w, with w, the half-width of the difference of the runs' relative errors.
     """
     body = max(run.added_kg_m2 for run in case.runs) - min(run.added_kg_m2 for run in case.runs)
     w = inertia.half_width_share / (1.0 + inertia.value / body) if inertia.value > 0.0 else math.inf
@@ -308,7 +312,7 @@ def _least(case: CalibrationCase, inertia: MeasuredValue) -> float | None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Beforehand: which body, and for how long?
+# Plan before a calibration: size of the body, and duration of the runs.
 
 
 _SIZES = (0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0)
@@ -317,9 +321,10 @@ _SIZES = (0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0)
 
 @dataclass(frozen=True)
 class RunPlan:
-    """With a body of ``added_kg_m2`` at the motor: half-width of J, as a share, after two runs like the one at hand.
+    """Relative half-width of J after two runs like the present one, with a body of ``added_kg_m2`` at the motor shaft.
 
-    ``minutes``: of stage 5 in each of two runs until J is as sure as is wanted; None where no time is enough.
+    ``minutes``: duration of stage 5 in each of two runs for the requested uncertainty of J; None if no duration is
+    sufficient.
     """
 
     added_kg_m2: float
@@ -334,9 +339,10 @@ def plan_bodies(
     inertia_kg_m2: float, noise_share: float, minutes: float, wanted: float, added_sd_share: float, *,
     confidence: float = 0.95, sizes: Sequence[float] = (),
 ) -> tuple[RunPlan, ...]:
-    """Plan two runs with each body. ``noise_share``: standard uncertainty of J of a run of ``minutes``, filters known.
+    """Plan two runs with each body. ``noise_share``: relative standard uncertainty of J of a run of ``minutes``.
 
-    ``added_sd_share``: of the body's inertia, as a share of it; ``sizes``: bodies, kg·m²; else shares of J.
+    ``added_sd_share``: relative standard uncertainty of the body's inertia. ``noise_share`` is for known filters.
+    ``sizes``: bodies, kg·m²; default: shares of J.
     """
     k = student_quantile(confidence, CERTAIN)
     plans = []

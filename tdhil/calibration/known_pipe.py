@@ -1,15 +1,16 @@
-r"""Torque calibration by a drill string of known sizes, which the waves feel as a known resistance.
+r"""Torque calibration by a drill string of known sizes, which is a known resistance to waves.
 
-Until an echo returns, a uniform pipe answers a motion of its top with the torque ζ ω. With G its shear modulus, ρ its
-density, I its polar moment of area and L its length,
+Until an echo returns, a uniform pipe responds to a motion of its top with the torque ζ ω. With its shear modulus G,
+density ρ, polar moment of area I and length L,
 
     ζ = I √(Gρ),        T = L √(ρ/G)   travel time from end to end.
 
-The drive reports its torque over κ, so a run gives ζ/κ and T. Of the inputs, G is known worst, and it is in T too. So
+The drive reports its torque over κ, so a run gives ζ/κ and T. G is the least certain input, and is also in T. Therefore
 z = ζ T^(−e) is compared: e = −1 gives ρ I L, the inertia of the string, without G; e = 0 gives ζ, without L. The
 exponent with the least uncertainty follows from the tolerances (Gauss and Markov): e = Cov(ln ζ, ln T)/Var(ln T).
 
-Tolerances are half-widths of rectangular distributions. Where they lie on one side, as wear does, the middle is taken.
+Tolerances are half-widths of rectangular distributions. A one-sided tolerance, such as wear, is represented by its
+middle.
 """
 
 import math
@@ -28,7 +29,7 @@ from tdhil.estimation import MeasuredString, normal_quantile
 
 @dataclass(frozen=True)
 class PipeInput:
-    """One size or property of the pipe: between ``low`` and ``high``, as factors on the stated value.
+    """Size or property of the pipe: between ``low`` and ``high``, as factors on the stated value.
 
     ``of_impedance`` and ``of_delay``: relative sensitivities of ζ and T.
     """
@@ -52,7 +53,7 @@ class PipeInput:
 
 @dataclass(frozen=True)
 class KnownPipe:
-    """Stated ``impedance_nm_s_rad`` ζ and ``delay_s`` T at the motor shaft, and what they rest on."""
+    """Stated pipe: ``impedance_nm_s_rad`` ζ and ``delay_s`` T at the motor shaft, and the inputs behind them."""
 
     impedance_nm_s_rad: float
     delay_s: float
@@ -60,12 +61,12 @@ class KnownPipe:
 
     @property
     def delay_rel_sd(self) -> float:
-        """Standard uncertainty of T, as a share."""
+        """Relative standard uncertainty of T."""
         return math.sqrt(sum((one.of_delay * one.rel_sd) ** 2 for one in self.inputs))
 
     @property
     def exponent(self) -> float:
-        """Exponent e of z = ζ T^(−e), with the least uncertainty; T is taken for measured without error."""
+        """Exponent e of z = ζ T^(−e) with the least uncertainty; T is assumed to be measured without error."""
         variance = self.delay_rel_sd**2
         if variance <= 0.0:
             return 0.0
@@ -73,7 +74,7 @@ class KnownPipe:
 
     @property
     def value(self) -> float:
-        """Return z of the middle of all tolerances."""
+        """Return z for the middle of all tolerances."""
         e = self.exponent
         stated = self.impedance_nm_s_rad * self.delay_s**-e
         return float(stated * math.prod(one.middle ** (one.of_impedance - e * one.of_delay) for one in self.inputs))
@@ -81,7 +82,7 @@ class KnownPipe:
 
 @dataclass(frozen=True)
 class KnownPipeFit:
-    """``factor`` κ, not to be used with a ``refusal``. ``typed_half_width``: of the torque scale as stated so far."""
+    """Result. ``factor`` κ is invalid with a ``refusal``. ``typed_half_width``: of the torque scale stated before."""
 
     factor: MeasuredValue
     budget: tuple[FactorLine, ...]
@@ -93,7 +94,7 @@ class KnownPipeFit:
 def calibrate_known_pipe(
     known: KnownPipe, measured: MeasuredString, *, scale_rel_sd: float = 0.02, confidence: float = 0.95
 ) -> KnownPipeFit:
-    """κ = z of the stated pipe over z as measured in the drive's unit. ``scale_rel_sd``: as it is stated so far."""
+    """Return κ = z of the stated pipe over z in the drive's unit. ``scale_rel_sd``: stated before the calibration."""
     e = known.exponent
     value = known.value / measured.value.value
     quantile = normal_quantile(confidence)

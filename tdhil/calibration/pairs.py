@@ -6,11 +6,11 @@ Pairs of reference torque T and reported torque R, each with its standard uncert
 
 with the true points (X_i, Y_i) on the line. Source: D. York, N. M. Evensen, M. L. Martínez and J. De Basabe Delgado
 (2004), Unified equations for the slope, intercept, and standard errors of the best straight line, Am. J. Phys. 72, 367,
-equations 13; without correlation of the errors. The standard errors are those of that paper, times √(χ²/(n − 2)) where
-the pairs scatter by more than they are stated to, and then with n − 2 degrees of freedom.
+equations 13; without correlation of the errors. The standard errors are those of that paper. If the pairs scatter more
+than stated, the errors are multiplied by √(χ²/(n − 2)) and have n − 2 degrees of freedom.
 
-**Hysteresis.** Readings with rising and with falling torque differ where friction stands between the sensor and the
-shaft. The mean of R − line over each direction is shown, and half of their difference is the half-width of a
+**Hysteresis.** Readings with rising and with falling torque differ if there is friction between the sensor and the
+shaft. The mean of R − line over each direction is reported. Half of their difference is the half-width h of a
 rectangular error that both directions share: it adds h/√3 over the mean torque to the relative uncertainty of κ.
 """
 
@@ -38,7 +38,7 @@ UP, DOWN = "up", "down"
 
 @dataclass(frozen=True)
 class TorquePairs:
-    """``reported_nm`` and ``reference_nm`` (n,), their standard uncertainties, and ``direction``: up or down."""
+    """Pairs ``reported_nm`` and ``reference_nm`` (n,), their standard uncertainties, and ``direction``: up or down."""
 
     reported_nm: FloatArray
     reported_sd_nm: FloatArray
@@ -49,10 +49,12 @@ class TorquePairs:
 
 @dataclass(frozen=True)
 class PairsFit:
-    """``factor`` κ and ``offset_nm`` a with ``covariance`` of both (2, 2); residuals (n,) of T over the line, N·m.
+    """Result: ``factor`` κ and ``offset_nm`` a with ``covariance`` of both (2, 2); residuals (n,) of T over the line,
+    N·m.
 
-    ``hysteresis_nm``: reading with rising less reading with falling torque, about the line; None with one direction.
-    ``refusal``: why the factor can't be used, '' where it can. ``spread``: √(χ²/(n − 2)) if above 1, else 1.
+    ``hysteresis_nm``: reading with rising torque less reading with falling torque, about the line; None with one
+    direction. ``refusal``: reason why the factor is unusable, '' if it is usable. ``spread``: √(χ²/(n − 2)) if above 1,
+    else 1.
     """
 
     factor: MeasuredValue
@@ -69,7 +71,7 @@ class PairsFit:
 def line_with_errors_in_both(
     x: FloatArray, x_sd: FloatArray, y: FloatArray, y_sd: FloatArray
 ) -> tuple[float, float, FloatArray, float]:
-    """Slope, intercept, their covariance (2, 2) and χ² by York's equations. Raises ValueError for no line."""
+    """Return slope, intercept, their covariance (2, 2) and χ² by York's equations. Raises ValueError for no line."""
     if len(x) < LEAST_PAIRS or not float(np.ptp(x)) > 0.0:
         raise ValueError(f"{LEAST_PAIRS} pairs at two torques or more are needed")
     slope = float(np.polyfit(x, y, 1)[0])
@@ -92,7 +94,7 @@ def line_with_errors_in_both(
 
 
 def calibrate_pairs(pairs: TorquePairs, confidence: float = 0.95) -> PairsFit:
-    """κ from pairs of reference and reported torque. Raises ValueError for too few of them."""
+    """Return κ from pairs of reference and reported torque. Raises ValueError for too few pairs."""
     from scipy.special import chdtrc
 
     slope, intercept, covariance, chi2 = line_with_errors_in_both(

@@ -1,26 +1,26 @@
-r"""Torque calibration against the record of a reference sensor: time offset, common band, line with errors in both.
+r"""Torque calibration against the recording of a reference sensor: time offset, common band, line with errors in both.
 
-The drive reports R = T/κ, the sensor Y = T + a, each behind a low-pass filter of its own and in a time of its own.
+The drive reports R = T/κ, the sensor Y = T + a, each with its own low-pass filter and its own time base.
 
-**Time offset.** The largest correlation of both records over all offsets gives it coarsely. Least squares refine it.
+**Time offset.** The largest correlation of both records over all offsets gives a coarse value. Least squares refine it.
 
 **Common band.** Both signals pass the same Gaussian average, taken at the samples' own times, so nothing is
 interpolated and nothing is aliased. Its width follows from the slower sampling and from the difference of both filters.
-Expanded in cumulants, that difference is a delay, a variance v and a third moment, so that with x the average of R
+In cumulants, that difference is a delay, a variance v and a third moment. With x, the average of R,
 
     y(t + d) = a + κ (x + β₁ x′ + β₂ x″ + β₃ x‴),        β₁ → 0 by choice of the offset d,  β₂ = v/2.
 
-κ is then the ratio of the torques at rest, whatever low-pass filters lie between. One tone alone cannot separate κ from
-β₂; its interval is then wide.
+κ is then the ratio of constant torques, for any low-pass filters. A single frequency cannot separate κ from β₂; its
+interval is then wide.
 
-**Errors in both.** After removal of what a, x′, x″ and x‴ explain, κ is the slope of Deming's line. The ratio of both
-noises is estimated from the samples; since low-pass filters may hide it, the regressions that put all noise into one
-signal bound κ, and the distance to them is a rectangular error in the budget. Noise of R is in its derivatives as well,
-which matters where they are nearly proportional to it: one of the bounds takes it off the normal equations.
+**Errors in both.** After removal of the parts of a, x′, x″ and x‴, κ is the slope of Deming's line. The ratio of both
+noises is estimated from the samples. Low-pass filters may hide it, so the regressions with all noise in one signal
+bound κ; the distance to them is a rectangular error in the budget. Noise of R is also in its derivatives, which matters
+if these are nearly proportional to R: one of the bounds subtracts it from the normal equations.
 
 **Interval.** Residuals are correlated. The variance of κ is Σ_k c_x(k) γ(k)/c_x(0)², with the autocorrelation c_x of
-the torque and the autocovariance γ of the residuals: that of least squares with correlated errors. It is as large as
-with n_eff independent samples.
+the torque and the autocovariance γ of the residuals: that of least squares with correlated errors. It equals the
+variance for n_eff independent samples.
 """
 
 import math
@@ -44,30 +44,30 @@ LEAST_OVERLAP_S = 20.0
 LEAST_CORRELATION = 0.9
 """Smallest correlation of both averaged torques at the best time offset."""
 LEAST_SWING_COUNTS = 20.0
-"""Smallest swing of either torque, in its own noise of the average or its own count."""
+"""Smallest swing of either torque, as a multiple of its own noise in the average or of its own count."""
 ASSUMED_REFERENCE_REL_SD = 0.003
-"""Standard uncertainty of a sensor's scale, if it is not stated: accuracy class 0.5, rectangular (0.5 %/√3)."""
+"""Standard uncertainty of a sensor's scale if none is stated: accuracy class 0.5, rectangular (0.5 %/√3)."""
 LEAST_OWN_SHARE = 0.1
-"""Smallest share of the torque's variance that its derivatives do not explain; a tone has none, steps nearly all."""
-_COARSE_S = 0.25             # width of the average for the correlation
+"""Least share of the torque's variance that its derivatives do not explain. A tone has none, steps have nearly all."""
+_COARSE_S = 0.25             # s; width of the average for the correlation
 _PER_WIDTH = 2.0             # grid points for one width of the average
-_REACH = 4.0                 # of a Gaussian average, in its widths
+_REACH = 4.0                 # reach of a Gaussian average, in its widths
 _NARROWEST_S = 0.1
 _WIDER_THAN_FILTERS = 2.0    # width of the average over √|v|
 _WIDEST_SHARE = 0.02         # width of the average, of the overlap
 _ROUNDS, _CLOSE = 12, 1e-4
-_CLEARLY = 0.02              # of the correlation
-_TERMS = 4                   # beside κ: offset, and three derivatives
+_CLEARLY = 0.02              # difference of correlation that is significant
+_TERMS = 4                   # terms beside κ: offset, and three derivatives
 _LEAST_EFFECTIVE = 3.0 * _TERMS
 _ALIKE = (0.01, 100.0)       # bounds of the estimated ratio of the noise variances
-_SWING = (2.5, 97.5)         # percentiles
+_SWING = (2.5, 97.5)         # percentiles that define a swing
 _MOST_PLOTTED = 400
-_AT_ONCE = 1_000_000         # numbers in one piece of the average
+_AT_ONCE = 1_000_000         # numbers computed in one piece of the average
 
 
 @dataclass(frozen=True)
 class TorqueRecord:
-    """Torque over its own time, rising, of the drive or the sensor; ``count_nm``: its resolution, 0 if unknown."""
+    """Torque over its own rising time, of the drive or the sensor; ``count_nm``: its resolution, 0 if unknown."""
 
     time_s: FloatArray
     torque_nm: FloatArray
@@ -76,7 +76,7 @@ class TorqueRecord:
 
 @dataclass(frozen=True)
 class ReferenceSeries:
-    """Averaged torques (n,) with the residual of the fit, thinned for pictures; ``time_s`` of the drive's log."""
+    """Averaged torques (n,) with the residual of the fit, reduced for figures; ``time_s`` of the drive's log."""
 
     time_s: FloatArray
     reported_nm: FloatArray
@@ -86,11 +86,11 @@ class ReferenceSeries:
 
 @dataclass(frozen=True)
 class ReferenceFit:
-    """``factor`` κ and ``offset_nm`` a; None where ``refusal`` says that nothing can be known.
+    """Result: ``factor`` κ and ``offset_nm`` a; None if a ``refusal`` leaves them unknown.
 
     ``time_offset_s``: time in the sensor's record less time in the log. ``average_s``: width of the Gaussian average.
-    ``filter_s``: square root of the difference of the filters' variances, positive where the sensor is the slower.
-    ``effective_samples``: independent samples that κ rests on, of ``samples`` averages. ``swing_nm``: of the sensor.
+    ``filter_s``: square root of the difference of the filters' variances, positive if the sensor is slower.
+    ``effective_samples``: number of independent samples for κ, of ``samples`` averages. ``swing_nm``: of the sensor.
     """
 
     refusal: str = ""
@@ -113,10 +113,10 @@ def calibrate_reference(
     drive: TorqueRecord, sensor: TorqueRecord, *, reference_rel_sd: float = ASSUMED_REFERENCE_REL_SD,
     scale_rel_sd: float = 0.02, confidence: float = 0.95,
 ) -> ReferenceFit:
-    """κ from the drive's and a sensor's record of one run, or the reason why not.
+    """Return κ from the recordings of the drive and of a sensor in one run, or the reason of a refusal.
 
-    ``reference_rel_sd``: standard uncertainty of the sensor's scale; ``scale_rel_sd``: of the torque scale as it is
-    stated so far. Raises ValueError for a record that is not finite or whose time does not rise.
+    ``reference_rel_sd``: standard uncertainty of the sensor's scale; ``scale_rel_sd``: stated for the torque scale
+    before this calibration. Raises ValueError for a recording that is not finite or whose time does not rise.
     """
     for name, one in (("the drive's log", drive), ("the reference", sensor)):
         _check(name, one)
@@ -160,15 +160,15 @@ def _swing(torque: FloatArray) -> float:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The average of samples at their own times.
+# Average of samples at their own times.
 
 
 def _averaged(one: TorqueRecord, at_s: FloatArray, width_s: float) -> FloatArray:
-    """Gaussian average (n,) at rising times ``at_s``; NaN where samples are missing within its reach."""
+    """Return the Gaussian average (n,) at rising times ``at_s``; NaN if samples are missing within its reach."""
     time, torque = one.time_s, one.torque_nm
     spans = np.gradient(time)
     first, last = (np.searchsorted(time, at_s + sign * _REACH * width_s) for sign in (-1.0, 1.0))
-    gaps = np.concatenate([[0], np.cumsum(np.diff(time) > width_s)])        # before each sample
+    gaps = np.concatenate([[0], np.cumsum(np.diff(time) > width_s)])        # number of gaps before each sample
     whole = (at_s - _REACH * width_s >= time[0]) & (at_s + _REACH * width_s <= time[-1]) & (last - first > 1)
     whole &= gaps[np.maximum(last - 1, 0)] == gaps[np.clip(first - 1, 0, len(time) - 1)]
     found = np.full(len(at_s), np.nan)
@@ -190,7 +190,7 @@ def _grid(start_s: float, end_s: float, step_s: float) -> FloatArray:
 def _coarse_offset(drive: TorqueRecord, sensor: TorqueRecord) -> tuple[float, float]:
     """Return the time offset with the largest correlation, or with a clearly larger negative one, and that correlation.
 
-    Of every offset at which at least half of the shorter record overlaps, and `LEAST_OVERLAP_S`.
+    Searches every offset with an overlap of at least half of the shorter record and `LEAST_OVERLAP_S`.
     """
     width = max(_COARSE_S, 2.0 * _slowest(drive), 2.0 * _slowest(sensor))
     step = width / _PER_WIDTH
@@ -213,35 +213,35 @@ def _coarse_offset(drive: TorqueRecord, sensor: TorqueRecord) -> tuple[float, fl
     floor = 1e-9 * math.sqrt(float(np.sum(x * x)) * float(np.sum(y * y)))
     r = np.where(enough & (size > floor), xy / np.maximum(size, max(floor, 1e-300)), 0.0)
     best, opposite = int(np.argmax(r)), int(np.argmin(r))
-    if -r[opposite] > r[best] + _CLEARLY:       # a tone has both signs, half a period apart
+    if -r[opposite] > r[best] + _CLEARLY:       # a tone correlates with both signs, half a period apart
         best = opposite
     lag = best - (len(x) - 1)
     return float(sensor.time_s[0] - drive.time_s[0] + lag * step), float(r[best])
 
 
 def _correlated(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Σ_t a(t) b(t + lag) for lags from −(len(a) − 1) to len(b) − 1."""
+    """Return Σ_t a(t) b(t + lag) for lags from −(len(a) − 1) to len(b) − 1."""
     from scipy.signal import fftconvolve
 
     return np.asarray(fftconvolve(b, a[::-1]), dtype=np.float64)
 
 
 def _slowest(one: TorqueRecord) -> float:
-    """Return the usual interval between samples, s: nine of ten are no longer."""
+    """Return the usual interval between samples, s: nine of ten intervals are not longer."""
     return float(np.percentile(np.diff(one.time_s), 90.0))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The fit.
+# Fit of κ, offset and time offset.
 
 
 @dataclass(frozen=True)
 class _Fitted:
     slope: float
-    low: float                  # all noise in the sensor
-    high: float                 # all noise in the drive's report, its derivatives taken as exact
-    reported: float             # all noise in the drive's report and its derivatives
-    own_share: float            # of the torque's variance, what its derivatives do not explain
+    low: float                  # κ with all noise in the sensor
+    high: float                 # κ with all noise in the drive's report, its derivatives taken as exact
+    reported: float             # κ with all noise in the drive's report and its derivatives
+    own_share: float            # share of the torque's variance that its derivatives do not explain
     sd: float
     effective: float
     offset: float
@@ -256,7 +256,7 @@ class _Fitted:
 
 
 def _refined(drive: TorqueRecord, sensor: TorqueRecord, offset_s: float) -> _Fitted | None:
-    """The fit in the widest band that the sampling and the difference of the filters allow."""
+    """Return the fit in the widest band that the sampling and the difference of the filters allow."""
     narrowest = max(_NARROWEST_S, 2.0 * _slowest(drive), 2.0 * _slowest(sensor))
     width, found = max(narrowest, _COARSE_S), None
     for _ in range(_ROUNDS):
@@ -274,7 +274,7 @@ def _refined(drive: TorqueRecord, sensor: TorqueRecord, offset_s: float) -> _Fit
 
 
 def _fitted(drive: TorqueRecord, sensor: TorqueRecord, offset_s: float, width_s: float) -> _Fitted | None:
-    """The fit with one average, its time offset refined from ``offset_s``."""
+    """Return the fit with one average, its time offset refined from ``offset_s``."""
     from scipy.interpolate import make_interp_spline
 
     step = width_s / _PER_WIDTH
@@ -283,7 +283,7 @@ def _fitted(drive: TorqueRecord, sensor: TorqueRecord, offset_s: float, width_s:
     end = min(drive.time_s[-1], sensor.time_s[-1] - offset_s) - margin
     if end - start < LEAST_OVERLAP_S / 2.0:
         return None
-    # Four points a width: a spline of fifth degree through so smooth a signal has errors far below its noise.
+    # four points a width: a spline of degree 5 through such a smooth signal has errors far below its noise
     fine = _grid(start - 0.5 * margin, end + 0.5 * margin, 0.5 * step)
     reported = _averaged(drive, fine, width_s)
     referred = _averaged(sensor, fine + offset_s, width_s)
@@ -314,7 +314,7 @@ def _fitted(drive: TorqueRecord, sensor: TorqueRecord, offset_s: float, width_s:
 
 
 def _noise_ratio(drive: TorqueRecord, sensor: TorqueRecord) -> float:
-    """Variance of an average of the sensor over that of the drive, from the samples' second differences."""
+    """Return the variance of the sensor's average over that of the drive's, from second differences of the samples."""
     power = []
     for one in (sensor, drive):
         second = np.diff(one.torque_nm, 2)
@@ -327,7 +327,7 @@ def _noise_ratio(drive: TorqueRecord, sensor: TorqueRecord) -> float:
 def _line(
     points: FloatArray, x: FloatArray, y: FloatArray, others: FloatArray, ratio: float, delay_s: float, width_s: float
 ) -> _Fitted | None:
-    """Deming's line through what the other terms leave of x and y, with the variance of correlated residuals."""
+    """Return Deming's line through x and y without the other terms, with the variance of correlated residuals."""
     basis = np.linalg.qr(others)[0]
     u, v = x - basis @ (basis.T @ x), y - basis @ (basis.T @ y)
     uu, vv, uv = float(u @ u), float(v @ v), float(u @ v)
@@ -358,12 +358,13 @@ def _line(
 
 
 def _all_noise_reported(x: FloatArray, y: FloatArray, others: FloatArray, fit_noise: float, width_s: float) -> float:
-    """κ if all residuals were white noise of the reported torque, which is in its derivatives as well; inf if none is.
+    """Return κ if all residuals were white noise of the reported torque and so of its derivatives; inf if no κ fits.
 
-    Least squares with noisy regressors: the noise's expected part is taken off the normal equations. The derivatives a
-    and b of white noise of density S behind the average have the covariance ±S Γ((a + b + 1)/2)/(2π σ^(a + b + 1)).
+    Least squares with noisy regressors: the expected part of the noise is subtracted from the normal equations. The
+    derivatives a and b of white noise of density S behind the average have the covariance ±S Γ((a + b + 1)/2)/(2π σ^(a
+    + b + 1)).
     """
-    orders = (0, None, None, 2, None)      # the odd derivatives have another phase and take no part in κ
+    orders = (0, None, None, 2, None)      # the odd derivatives have another phase and do not affect κ
     noise = np.zeros((len(orders), len(orders)))
     for i, a in enumerate(orders):
         for j, b in enumerate(orders):
@@ -379,7 +380,7 @@ def _all_noise_reported(x: FloatArray, y: FloatArray, others: FloatArray, fit_no
 
 
 def _long_run(u: FloatArray, left: FloatArray, place: FloatArray) -> float:
-    """Return Σ_k c_u(k) γ(k): variance of Σ u·residual, with the residuals' autocovariance γ, gaps left out."""
+    """Return Σ_k c_u(k) γ(k), the variance of Σ u·residual; γ: autocovariance of the residuals, without gaps."""
     count = int(place[-1]) + 1
     full_u, full_r, there = np.zeros(count), np.zeros(count), np.zeros(count)
     full_u[place], full_r[place], there[place] = u, left, 1.0
@@ -391,7 +392,8 @@ def _long_run(u: FloatArray, left: FloatArray, place: FloatArray) -> float:
     pairs = np.maximum(autocorrelation(there), 1.0)
     gamma = autocorrelation(full_r) / pairs
     c = autocorrelation(full_u)
-    # The residuals' correlation ends where it first falls below its own scatter; twice as far, fading, is counted.
+    # the correlation of the residuals ends where it first falls below its scatter; lags up to twice that count, with
+    # decreasing weight
     negligible = np.flatnonzero(gamma < 2.0 / math.sqrt(len(left)) * gamma[0])
     ends = int(negligible[0]) if len(negligible) else count
     reach = min(max(2 * ends, 4 * int(_PER_WIDTH)), count // 4)
@@ -407,7 +409,7 @@ def _judged(
     drive: TorqueRecord, sensor: TorqueRecord, fit: _Fitted, correlation: float, reference_rel_sd: float,
     scale_rel_sd: float, confidence: float,
 ) -> ReferenceFit:
-    """The budget, the interval, and what is refused."""
+    """Return the result with budget, interval, and the refusal if there is one."""
     k = fit.slope
     if not math.isfinite(fit.reported):
         return ReferenceFit("the torque swings too little for its noise: its scale and the low-pass filters look alike",

@@ -1,12 +1,12 @@
 r"""Speed calibration: the reported speed against a known angle, from counted turns or from the drive's position.
 
-The drive reports Ω = ω/κ_ω, κ_ω the *calibration factor* of its speed. Over a time t the shaft turns through the angle
-θ = 2π N, and the integral of the reported speed is Θ, so that
+The drive reports Ω = ω/κ_ω, with the *calibration factor* κ_ω of its speed. Over a time t the shaft turns through the
+angle θ = 2π N, and the integral of the reported speed is Θ:
 
     κ_ω = θ/Θ,        with counted turns and a mean reported speed Ω̄:   κ_ω = 2π N/(Ω̄ t),
 
-and of independent errors remains (dκ/κ)² = (dN/N)² + (dt/t)² + (dΩ̄/Ω̄)². Uncertainties are propagated to first order
-(GUM 5.2). Bounds of an error are taken as rectangular distributions, half-width over √3 (GUM 4.3.7).
+and independent errors give (dκ/κ)² = (dN/N)² + (dt/t)² + (dΩ̄/Ω̄)². Uncertainties are propagated to first order (GUM
+5.2). Bounds of an error are taken as rectangular distributions, half-width over √3 (GUM 4.3.7).
 """
 
 import math
@@ -20,10 +20,10 @@ from tdhil.estimation.frequency_domain import student_quantile
 
 @dataclass(frozen=True)
 class CountedTurns:
-    """Turns of the motor shaft that an operator counted in ``seconds``, and the mean reported speed meanwhile.
+    """Turns of the motor shaft that an operator counted in ``seconds``, and the mean reported speed during this time.
 
-    Each with its standard uncertainty. ``speed_bound_rad_s``: bound of the error of the mean that the reports' lag and
-    rounding leave. The sign of ``turns`` does not matter: only that of the speed is known.
+    Each with its standard uncertainty. ``speed_bound_rad_s``: bound of the error of the mean due to lag and rounding of
+    the reports. The sign of ``turns`` does not matter: the direction of the speed is used.
     """
 
     turns: float
@@ -37,7 +37,7 @@ class CountedTurns:
 
 @dataclass(frozen=True)
 class SpeedBudgetLine:
-    """One input quantity: its standard uncertainty in its unit, and what it adds to κ_ω as a share (1 sd)."""
+    """Input quantity: its standard uncertainty in its own unit, and its relative contribution to κ_ω (1 sd)."""
 
     source: str
     standard_uncertainty: float
@@ -49,9 +49,9 @@ class SpeedBudgetLine:
 
 @dataclass(frozen=True)
 class SpeedCalibration:
-    """``factor`` κ_ω: true over reported speed; None where refused.
+    """Result: ``factor`` κ_ω, true over reported speed; None if refused.
 
-    ``least_turns``: turns that would be enough at this speed, where too few were counted; else None.
+    ``least_turns``: sufficient number of turns at this speed, if too few were counted; else None.
     """
 
     verdict: Verdict
@@ -64,7 +64,9 @@ class SpeedCalibration:
 
 
 def calibrate_by_turns(counted: CountedTurns, wanted: float, confidence: float = 0.95) -> SpeedCalibration:
-    """κ_ω from counted turns, to a half-width of ``wanted`` (a share) or better. Raises ValueError for no motion."""
+    """Return κ_ω from counted turns. Refused beyond a half-width of ``wanted`` (a share). Raises ValueError for no
+    motion.
+    """
     if not (counted.turns > 0.0 and counted.seconds > 0.0 and counted.speed_rad_s != 0.0):
         raise ValueError("no speed, no turns or no time")
     speed = abs(counted.speed_rad_s)
@@ -85,10 +87,10 @@ def calibrate_by_turns(counted: CountedTurns, wanted: float, confidence: float =
 def calibrate_by_position(
     stretches: Sequence[AngleRatio], wanted: float, confidence: float = 0.95
 ) -> SpeedCalibration:
-    """κ_ω from angle over integrated speed of stretches of one run. Raises ValueError without any.
+    """Return κ_ω from angle over integrated speed in stretches of one run. Raises ValueError without stretches.
 
-    Each stretch counts by 1/half-width². The bounds of all are taken to be of the same error: their mean counts, it is
-    not divided by the root of their number.
+    Each stretch has the weight 1/half-width². All bounds are taken as bounds of the same error: their mean is used,
+    without division by the root of their number.
     """
     if not stretches:
         raise ValueError("no stretch of the recording has a position and a speed")
@@ -117,7 +119,7 @@ def calibrate_by_position(
 
 
 _ALIKE = 0.02
-"""Largest difference of two ratios, as for two stages in `tdhil.estimation`: both are rounded."""
+"""Largest difference of two ratios, as for two stages in `tdhil.estimation`, because both are rounded."""
 
 
 def _concluded(
@@ -145,10 +147,11 @@ def _concluded(
 
 
 def _least_turns(counted: CountedTurns, wanted: float, confidence: float) -> int | None:
-    """Return the turns that reach ``wanted`` at this speed; None where the speed is not known well enough for any."""
+    """Return the turns that reach ``wanted`` at this speed; None if the uncertainty of the speed prevents it."""
     k = student_quantile(confidence, CERTAIN)
     fixed = (counted.speed_sd_rad_s / counted.speed_rad_s) ** 2
-    # The bound comes from the ends of the stretch and shrinks with its length; here it stays, as rounding does.
+    # the bound comes from the ends of the stretch and would shrink with its length; here it stays constant, as rounding
+    # does
     fixed += (counted.speed_bound_rad_s / counted.speed_rad_s) ** 2 / 3.0
     left = (wanted / k) ** 2 - fixed
     if left <= 0.0:

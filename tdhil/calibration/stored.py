@@ -1,4 +1,4 @@
-"""A torque calibration as it is kept and used: which drive it is of, since when, and a recording in its N·m."""
+"""Stored torque calibration: its drive and date, and its application to a recording."""
 
 import math
 from collections.abc import Mapping
@@ -11,23 +11,24 @@ from tdhil.recording import FloatArray, Recording
 
 KIND: Final = "torque_calibration"
 OWN_LOG: Final = "own_log"
-"""Key of a calibration that is applied to a log that it comes from."""
+"""Key of a calibration that is applied to a log from which it was made."""
 _NUMBERS: Final = ("value", "low", "high", "confidence")
 _LEAST, _MOST = 0.1, 10.0
-"""A factor beyond these is no calibration of a drive."""
+"""Range of a plausible factor. Beyond it, a document is not a calibration of a drive."""
 _ALIKE = 1e-6
 
 
 class CalibrationUnusable(ValueError):
-    """Raised for a document that is no calibration; the text says what is wrong."""
+    """Raised for a document that is not a calibration; the text states the fault."""
 
 
 @dataclass(frozen=True)
 class StoredCalibration:
     """``factor`` κ = true over reported torque, with its coverage interval. ``date`` in ISO 8601.
 
-    ``drive`` and ``settings``: identity of the drive, and what its unit of torque depends on. ``own_rel_sd``: standard
-    uncertainty of J of the calibration, as a share, for a log that the calibration comes from; else 0.
+    ``drive`` and ``settings``: identity of the drive, and the settings that its unit of torque depends on.
+    ``own_rel_sd``: relative standard uncertainty of the calibration's J, for a log from which the calibration was made;
+    else 0.
     """
 
     factor: float
@@ -42,7 +43,7 @@ class StoredCalibration:
 
     @classmethod
     def of(cls, document: Any) -> "StoredCalibration":
-        """Read the document of ``tdhil calibrate torque``. Raises CalibrationUnusable."""
+        """Return the calibration in a document of ``tdhil calibrate torque``. Raises CalibrationUnusable."""
         if not isinstance(document, Mapping) or document.get("kind") != KIND:
             raise CalibrationUnusable("is no calibration of tdhil calibrate torque")
         factor = document.get("calibration_factor")
@@ -67,15 +68,15 @@ class StoredCalibration:
 
     @property
     def day(self) -> str:
-        """``2026-11-23``."""
+        """Date as ``2026-11-23``."""
         return f"{datetime.fromisoformat(self.date):%Y-%m-%d}"
 
     @property
     def rel_sd(self) -> float:
-        """Standard deviation of a normal scale that has this interval, as a share.
+        """Relative standard deviation of a normal scale with this interval.
 
-        The noise of a log that the calibration comes from is in the factor too, and adds up instead of its squares. J
-        is then no better known than the calibration knows it.
+        The noise of a log from which the calibration was made is also in the factor, so both add linearly, not in
+        quadrature. J is then not more certain than in the calibration.
         """
         return max(self.own_rel_sd, 0.5 * (self.high - self.low) / self.factor / normal_quantile(self.confidence))
 
@@ -88,7 +89,7 @@ class StoredCalibration:
         return ""
 
     def too_old(self, started: str | None, valid_days: float) -> str:
-        """Return its age at the start of a run, in words, where that exceeds ``valid_days``; else ''."""
+        """Return the age of the calibration at the start of a run, in words, if it exceeds ``valid_days``; else ''."""
         try:
             age = datetime.fromisoformat(str(started)).astimezone() - datetime.fromisoformat(self.date).astimezone()
         except ValueError:
@@ -96,7 +97,7 @@ class StoredCalibration:
         return f"{age.days} days old, and valid for {valid_days:g}" if age > timedelta(days=valid_days) else ""
 
     def applied(self, recording: Recording) -> Recording:
-        """The recording with every torque in calibrated N·m."""
+        """Return the recording with every torque in calibrated N·m."""
         factor = self.factor
         limit = recording.torque_limit_nm
         return replace(

@@ -1,1 +1,1 @@
-"""The command line: `tdhil.cli.main` chooses a command; each puts the rooms together."""
+"""Command line: `tdhil.cli.main` selects a command, and each command combines the rooms that it needs."""

@@ -1,6 +1,6 @@
-"""Command line options that say which drive is meant and where it is: the same for every command that talks to one.
+"""Command line options for the drive and its address, the same for every command that uses a drive.
 
-None as a default means: rig.yaml, else the profile, else the built-in default (`tdhil.config.options`).
+A default of None means: rig.yaml, else the profile, else the built-in default (`tdhil.config.options`).
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ from tdhil.config import ASKED_AGAIN, OPTIONS, Option, Topic
 from tdhil.errors import MessageCode, UsageError
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Quantities as people type them on the command line: 1%, 0.01, 5min, 40rpm. `profiles.quantities` has the units.
+# Quantities as typed on the command line: 1%, 0.01, 5min, 40rpm. `profiles.quantities` has the units.
 
 
 def amount(unit: Unit) -> Callable[[str], float]:
-    """For argparse: a number in ``unit``, or with any unit of the same kind, in ``unit``."""
+    """Return a reader for argparse: a number in ``unit``, or a value with a unit of the same kind, converted to
+    ``unit``.
+    """
 
     def read(text: str) -> float:
         try:
@@ -34,11 +36,11 @@ def amount(unit: Unit) -> Callable[[str], float]:
 
 
 share = amount(SHARE)
-"""``1%`` or ``0.01``."""
+"""Reader of a share, ``1%`` or ``0.01``."""
 
 
 def meant(name: str, known: Iterable[str]) -> str:
-    """The question whether it is the one of ``known`` that is much like it, and a space; nothing where none is."""
+    """Return the suggestion "Did you mean 'NAME'? " for a similar known name, or an empty text."""
     close = difflib.get_close_matches(name[:40], list(known), n=1)
     return f"Did you mean '{close[0]}'? " if close else ""
 
@@ -46,16 +48,16 @@ def meant(name: str, known: Iterable[str]) -> str:
 # ---------------------------------------------------------------------------------------------------------------------
 
 _RARE: Final[WeakSet[argparse.Action]] = WeakSet()
-"""Options that ``--help`` leaves to ``--help-all``, of all parsers."""
+"""Options that only ``--help-all`` shows, of all parsers."""
 
 
 def rare_options(parser: argparse.ArgumentParser) -> list[argparse.Action]:
-    """Return the options of ``parser`` that ``--help`` leaves to ``--help-all``."""
+    """Return the options of ``parser`` that only ``--help-all`` shows."""
     return [action for action in parser._actions if action in _RARE]
 
 
 def add_option(group: argparse._ActionsContainer, option: Option, *, help: str = "") -> argparse.Action:
-    """A row of the table as an argument; ``help``: of a command for which it means something else."""
+    """Add a row of the table as an argument; ``help``: for a command in which the option has another meaning."""
     words: dict[str, Any] = {"dest": option.name, "help": (help or option.help_text).replace("%", "%%")}
     if option.kind is bool:
         words |= {"action": "store_const", "const": True}
@@ -69,7 +71,7 @@ def add_option(group: argparse._ActionsContainer, option: Option, *, help: str =
 
 
 def add_options(parser: argparse.ArgumentParser, *groups: Topic) -> dict[Topic, argparse._ArgumentGroup]:
-    """The rows of these groups, in a section each, for what a command has to add to it."""
+    """Add the rows of these groups, with a section for each. Return the sections, to which a command may add more."""
     sections = {group: parser.add_argument_group(group.value) for group in groups}
     for group, section in sections.items():
         for option in OPTIONS:
@@ -81,18 +83,18 @@ def add_options(parser: argparse.ArgumentParser, *groups: Topic) -> dict[Topic, 
 
 
 def hide_rare(*actions: argparse.Action) -> None:
-    """Leave these options of a command, which stand in no table, to ``--help-all``."""
+    """Show these options of a command, which are not in a table, only in ``--help-all``."""
     _RARE.update(actions)
 
 
 def add_settings(parser: argparse.ArgumentParser, whose: str) -> None:
-    """Options of identifying a log again; ``whose`` settings are the default, such as ``the run's``."""
+    """Add the options of identifying a log again; ``whose`` settings are the default, such as ``the run's``."""
     for option in ASKED_AGAIN:
         add_option(parser, option, help=f"{option.asked_again} (default: {whose}, or {option.default_text})")
 
 
 def settings_in(namespace: argparse.Namespace) -> dict[str, Any]:
-    """Return those that were given, by name. UsageError names an option whose value is out of its limits."""
+    """Return the given settings, by name. Raises UsageError with an option whose value exceeds its limits."""
     given: dict[str, Any] = {}
     for one in ASKED_AGAIN:
         if (value := getattr(namespace, one.name)) is None:
@@ -104,14 +106,14 @@ def settings_in(namespace: argparse.Namespace) -> dict[str, Any]:
 
 
 def add_drive_arguments(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
-    """Which drive; the group, for what a command has to add to it."""
+    """Add the options that select the drive. Return the group, to which a command may add more."""
     drive = add_options(parser, Topic.DRIVE)[Topic.DRIVE]
     drive.add_argument("--rig", type=Path, metavar="rig.yaml", help="the bench; needed to move anything real")
     return drive
 
 
 def add_line_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the address on any bus. python-can's own options are the most, and come last."""
+    """Add the options of the address on any bus. Those of python-can are the most, and come last."""
     from tdhil.buses import all_buses
 
     before = set(parser._actions)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of attend."""
+    """Add the options of attend."""
     parser.add_argument("--data", type=Path, metavar="DIR", default=Path("tdhil-data"),
                         help="the folder of tdhil serve (default: tdhil-data)")
     parser.set_defaults(run=run)

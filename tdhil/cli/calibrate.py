@@ -1,4 +1,4 @@
-"""`tdhil calibrate`: the scales of a drive's torque and speed from recordings and known quantities; nothing moves."""
+"""`tdhil calibrate`: calibration of a drive's torque and speed from recordings and known quantities; nothing moves."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 _EXAMPLE = "tdhil calibrate torque without.mcap with.mcap --added 55"
 _LARGEST = 1e9
-"""kg·m²; no body has more."""
+"""Largest inertia of a body, kg·m²."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The kinds of calibration, with their options."""
+    """Add the kinds of calibration, with their options."""
     kinds = parser.add_subparsers(dest="kind", metavar="torque|speed", required=True)
     torque = kinds.add_parser(
         "torque", allow_abbrev=False, help="by runs without and with a body of known inertia",
@@ -78,7 +78,7 @@ def _add_torque(parser: argparse.ArgumentParser) -> None:
 
 
 def run_torque(namespace: argparse.Namespace) -> int:
-    """Read, fit together, print; or plan."""
+    """Read the logs, fit them together, and print the result; or print a plan."""
     for flag, names in (("--columns", namespace.columns), ("--column", namespace.column)):
         if names and "=" not in names[-1]:
             raise UsageError("takes every word behind it", where=flag, next_step=f"Name the logs before {flag}")
@@ -125,7 +125,7 @@ def run_torque(namespace: argparse.Namespace) -> int:
 
 
 def calibrate_two(without: Path, with_body: Path, added: float, added_sd: float | None, save: Path) -> int:
-    """Calibrate by two logs, as the command does. Return the exit code."""
+    """Calibrate from two logs, as the command does. Return the exit code."""
     parser = argparse.ArgumentParser()
     _add_torque(parser)
     more = [] if added_sd is None else ["--added-sd", repr(added_sd)]
@@ -137,7 +137,7 @@ Wanted = list[tuple[Path, float, float | None]]
 
 
 def _wanted(namespace: argparse.Namespace) -> Wanted:
-    """(log, body, its standard uncertainty) of each run. UsageError for what can't be."""
+    """Return (log, body, its standard uncertainty) of each run. Raises UsageError for impossible values."""
     logs, added = namespace.logs, namespace.added
     _positive("--added", added)
     _positive("--added-sd", namespace.added_sd, zero=True)

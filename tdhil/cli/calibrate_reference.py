@@ -1,4 +1,6 @@
-"""`tdhil calibrate torque` without a body: by pairs of torque, a reference sensor's record, or a known pipe."""
+"""`tdhil calibrate torque` without a body: with pairs of torque, the recording of a reference sensor, or a known
+pipe.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ _EXAMPLES = {
 
 
 def run_without_body(namespace: argparse.Namespace, confidence: float) -> int:
-    """Read, fit, print, save. The kind is the one option of `WITHOUT_BODY` that was given."""
+    """Read, fit, print, save. The kind is the single given option of `WITHOUT_BODY`."""
     kind, *others = [name for name in WITHOUT_BODY if getattr(namespace, name) is not None]
     unwanted = [*others, *(name for name in _BODY if getattr(namespace, name)),
                 *(name for name, needed in _NEEDS.items() if needed != kind and getattr(namespace, name) is not None)]
@@ -47,7 +49,7 @@ def run_without_body(namespace: argparse.Namespace, confidence: float) -> int:
 
 
 def require_new(path: Path | None) -> None:
-    """Raise UsageError for a file that is there already."""
+    """Raise UsageError if the file exists already."""
     if path is not None and path.exists():
         raise UsageError("is there already, and is left as it is", where=f"--save {path}",
                          next_step="Name another file, or move that one away")

@@ -1,4 +1,6 @@
-"""`tdhil identify --calibrate`: a run without a body, the question for the body, a run with it, and the calibration."""
+"""`tdhil identify --calibrate`: a run without a body, a prompt to mount the body, a run with it, and the
+calibration.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from tdhil.errors import ExitCode, UsageError
 _EXAMPLE = "tdhil identify --calibrate --added 55"
 _LARGEST = 1e9
 Run = Callable[[argparse.Namespace, list[Path]], int]
-"""One run with its own confirmation: appends the path of its log, returns the exit code."""
+"""One run with its own confirmation: it appends the path of its log, and returns the exit code."""
 
 
 def add_calibrate_arguments(section: argparse._ActionsContainer) -> None:
@@ -48,10 +50,10 @@ def check_calibrate(namespace: argparse.Namespace) -> None:
 
 
 def run_calibration(namespace: argparse.Namespace, run: Run) -> int:
-    """Do both runs and the calibration. Return the exit code of the first of them that failed, or 0.
+    """Do both runs and the calibration. Return the exit code of the first failed step, or 0.
 
-    Nothing runs while the operator mounts the body: the drive is disabled and its bus is closed. Raises UsageError
-    before anything moves, and PreflightRefused where the body was not confirmed.
+    While the operator mounts the body, the drive is disabled and its bus is closed. Raises UsageError before any
+    motion, and PreflightRefused if the body was not confirmed.
     """
     from tdhil.cli.calibrate import calibrate_two
     from tdhil.report import stderr_console

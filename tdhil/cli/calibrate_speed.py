@@ -1,4 +1,4 @@
-"""`tdhil calibrate speed`: the scale of the reported speed from counted turns or from the drive's position."""
+"""`tdhil calibrate speed`: calibration of the reported speed from counted turns or from the drive's position."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OF_DISPLAY = ("speed", "speed_sd")
 
 
 def add_speed_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the speed calibration. None as a default: not given."""
+    """Add the options of the speed calibration. A default of None means: not given."""
     parser.add_argument("log", type=Path, nargs="?", metavar="run.mcap",
                         help="a log whose drive reports a position; or, with --turns, the log of the counted turns")
     parser.add_argument("--turns", type=float, metavar="N", help="turns of the shaft that were counted")
@@ -54,7 +54,7 @@ def add_speed_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_speed(namespace: argparse.Namespace) -> int:
-    """Read, compute, print, and keep the result."""
+    """Read, compute, print, and save the result."""
     from tdhil.report import PlainConsole, print_speed_calibration, speed_document, stderr_console
     from tdhil.session import (
         add_speed_calibration,
@@ -139,7 +139,7 @@ def _flag(name: str) -> str:
 def _found(
     namespace: argparse.Namespace, record: RunRecord | None
 ) -> tuple[SpeedCalibration, dict[str, object], tuple[str, ...]]:
-    """Return the result, what went in, and warnings."""
+    """Return the result, its inputs, and warnings."""
     from dataclasses import asdict
 
     from tdhil.session import SECONDS_SD, SPEED_REL_SD, TURNS_SD, TurnsCount, speed_by_position, speed_by_turns

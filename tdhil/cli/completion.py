@@ -1,4 +1,4 @@
-"""`tdhil completion`: a script with which a shell completes commands, options and choices."""
+"""`tdhil completion`: a shell script that completes commands, options and choices."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Print the script; UsageError if shtab is not installed."""
+    """Print the script. Raises UsageError if shtab is not installed."""
     try:
         import shtab
     except ImportError as error:

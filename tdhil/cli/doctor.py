@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The computer: versions, timer, scheduling, disk. Reads, and sleeps a tenth of a second.
+# Checks of the computer: versions, timer, scheduling, disk. They only read, and sleep for 0.1 s.
 
 
 WANTED_FREE_BYTES = 200_000_000
@@ -50,8 +50,8 @@ def host_findings(log: Path) -> Iterator[DoctorFinding]:
 
 
 def library_findings(version_of: Callable[[str], str | None]) -> Iterator[DoctorFinding]:
-    """Yield whether each library is installed, and new enough."""
-    pip = f"{shlex.quote(sys.executable or 'python')} -m pip"      # of this environment, whichever is active
+    """Yield for each library a finding: is it installed, and new enough?"""
+    pip = f"{shlex.quote(sys.executable or 'python')} -m pip"      # the pip of this environment
     for name, least in (one for bus in all_buses() for one in bus.libraries.items()):
         version = version_of(name)
         wanted = ".".join(map(str, least))
@@ -82,7 +82,7 @@ def jitter_finding(late_s: Sequence[float]) -> DoctorFinding:
 
 
 def priority_finding(why_no_priority: str, why_not_locked: str) -> DoctorFinding:
-    """Return whether the control loop may have real-time priority and locked memory."""
+    """Return a finding: may the control loop have real-time priority and locked memory?"""
     both = (("priority", why_no_priority), ("locked memory", why_not_locked))
     missing = [f"{name}: {why}" for name, why in both if why]
     if not missing:
@@ -92,7 +92,7 @@ def priority_finding(why_no_priority: str, why_not_locked: str) -> DoctorFinding
 
 
 def naps(now_s: Callable[[], float], sleep: Callable[[float], None]) -> list[float]:
-    """Return by how much each of some short sleeps was too long, s."""
+    """Return the excess durations of some short sleeps, s."""
     late = []
     for _ in range(NAPS):
         begun_s = now_s()
@@ -122,7 +122,7 @@ def _version(name: str) -> str | None:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """The leading whole numbers: 4.6.1rc2 → 4, 6, 1."""
+    """Return the leading whole numbers: 4.6.1rc2 → 4, 6, 1."""
     found = []
     for part in version.split("."):
         digits = part[: len(part) - len(part.lstrip("0123456789"))]
@@ -197,7 +197,7 @@ def findings(
 
 
 def _left(folder: Path) -> Iterator[DoctorFinding]:
-    """Yield settings that died runs have left in their drives."""
+    """Yield settings that runs left in their drives when they ended without restoring them."""
     from drivers.undo_journal import PREFIX, SUFFIX, read
 
     for path in sorted(folder.glob(f"{PREFIX}*{SUFFIX}")):

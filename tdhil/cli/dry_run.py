@@ -48,7 +48,7 @@ def dry_run(options: RunOptions, rig: Rig | None, simulated: bool, profile: Prof
 def dry_run_course(
     options: RunOptions, rig: Rig | None, case: EvaluationCase, simulated: bool, rate_hz: float
 ) -> int:
-    """Print a virtual string's speed program; exit code 0. Raises what a run would raise before motion."""
+    """Print a virtual string's speed program; exit code 0. Raises the errors that a run would raise before motion."""
     program, limits = plan_course(case, rig, simulated, rate_hz)
     ratio = case.rig.gear_ratio
     plain = {
@@ -87,7 +87,7 @@ def dry_run_course(
 def say_before(options: RunOptions, rig: Rig | None, profile: Profile, simulated: bool) -> str | None:
     """Return, before motion, that no interval is expected or that --tolerance can't be reached; else None.
 
-    It refers to the rig that rig.yaml expects, or to a typical one. The measured values of the run decide in the end.
+    It refers to the rig that rig.yaml expects, or to a typical one. The measured values of the run are decisive.
     """
     from drivers import PreflightRefused
 
@@ -96,7 +96,7 @@ def say_before(options: RunOptions, rig: Rig | None, profile: Profile, simulated
     try:
         planned, figures, _ = plan_dry(options, rig, simulated, profile)
     except PreflightRefused:
-        return None         # an assumed rig is no reason to refuse
+        return None         # an assumed rig is not a reason to refuse
     if math.isinf(planned.half_width):
         known = ", unless the drive reports its filters" if profile.filters else ""
         return (f"{_conclusions(planned)[0]}{known}. State the lags of the reports in rig.yaml (drive_data), or use"

@@ -1,4 +1,4 @@
-"""`tdhil evaluate`: a virtual drill string on a real drive, under a controller that `tune` made."""
+"""`tdhil evaluate`: a virtual drill string on a real drive, with a controller from `tune`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ CONTROLLERS = ("soft", "stiff", "compensated", "broadband")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of evaluate."""
+    """Add the options of evaluate."""
     from tdhil.cli.identify import add_peer_arguments
 
     what = parser.add_argument_group("evaluation")
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Read the three files, then run like every run."""
+    """Read the three files, then run as every run."""
     from tdhil.cli.identify import run_with
     from tdhil.cli.tune_inputs import read_result
     from tdhil.session import evaluation_case, load_tuning

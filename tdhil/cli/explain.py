@@ -1,4 +1,4 @@
-"""`tdhil explain`: the cause and the cure of a message, by its code."""
+"""`tdhil explain`: cause and cure of a message, by its code."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Print one entry or the list. UsageError names the nearest code of one that does not exist."""
+    """Print one entry or the list. Raises UsageError for an unknown code, with the nearest known one."""
     wanted = list(MessageCode) if namespace.code is None else [_entry(namespace.code)]
     if namespace.markdown:
         print(page(), end="")  # noqa: T201
@@ -78,7 +78,7 @@ def text(entry: MessageCode) -> str:
     rows = [f"{entry.code}  {entry.title}", ""]
     for name, sentences in (("cause", entry.cause), ("cure", entry.cure), ("exit code", f"{code} ({title.lower()})")):
         rows.append(textwrap.fill(sentences, 79, initial_indent=f"{name:<11}", subsequent_indent=" " * 11,
-                                  break_on_hyphens=False))      # an option stays whole
+                                  break_on_hyphens=False))      # options are not split
     return "\n".join(rows)
 
 

@@ -29,7 +29,7 @@ _LARGEST_STANDARD: Final = 0x7FF
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of export."""
+    """Add the options of export."""
     parser.add_argument("log", type=Path, metavar="run.mcap", help="the log of a run, whole or cut short")
     parser.add_argument("--to", required=True, choices=tuple(SUFFIXES), help="candump and asc: the raw CAN frames, as "
                         "can-utils and CANalyzer read them; csv and parquet: every sample with its command, SI units")
@@ -38,7 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Exit 0: all of it; 3: the log is not whole, and what there is was written; 10: nothing can be read."""
+    """Export. Exit 0: everything; 3: the log is not complete, and its readable part was written; 10: nothing is
+    readable.
+    """
     from tdhil.recording import read_run
     from tdhil.report import SIMULATED, stderr_console
 

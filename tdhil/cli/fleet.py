@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
     from tdhil.fleet import FleetRequest, FleetRow, FleetSummary
 
-_SHOWN = 10         # failures, changes: the table has all of them
+_SHOWN = 10         # failures and changes printed; the table has all of them
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of fleet."""
+    """Add the options of fleet."""
     parser.add_argument("logs", nargs="+", metavar="FOLDER|LOG",
                         help="folders with run.mcap files and traces (.csv with a .yaml of the same name), or files")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE",
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_watch_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of watch."""
+    """Add the options of watch."""
     parser.add_argument("folder", type=Path, metavar="DIR", help="folder that receives logs, with its subfolders")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the table (default: DIR/fleet.csv)")
     _add_settings(parser)
@@ -93,8 +93,8 @@ def run_watch(namespace: argparse.Namespace) -> int:
 
 
 class FolderWatch:
-    """The known logs, and the finished ones. A file that grows without a lock (a copy in progress) is left until it is
-    unchanged in two checks.
+    """Known logs, and finished ones. A file that grows without a lock (a copy in progress) is left until two checks
+    find it unchanged.
     """
 
     def __init__(self, request: FleetRequest) -> None:

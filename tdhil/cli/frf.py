@@ -1,4 +1,6 @@
-"""`tdhil frf`: the frequency response ω/T of a run, with intervals, noise and nonlinear distortion apart."""
+"""`tdhil frf`: the frequency response ω/T of a run, with intervals, and with noise and nonlinear distortion
+separated.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,8 @@ _PICTURES: Final = (".png", ".svg", ".pdf")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of frf."""
-    # Optional for argparse only: after --columns a file's name is taken as one more column.
+    """Add the options of frf."""
+    # optional for argparse only: after --columns it takes the name of a file as another column
     parser.add_argument("logs", type=Path, nargs="*", metavar="run.mcap|trace.csv",
                         help="logs of runs with a periodic excitation, or traces in CSV; several are drawn together")
     add_option(parser, OPTION["json"])
@@ -42,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Exit 0: every log has a response; 3: a log is not whole; 9: a log has no response."""
+    """Print the responses. Exit 0: every log has one; 3: a log is not complete; 9: a log has no response."""
     from tdhil.api import identify
     from tdhil.report import PlainConsole, print_responses, stderr_console
 
@@ -113,7 +115,7 @@ def _check_targets(namespace: argparse.Namespace, logs: Sequence[Path]) -> None:
 
 
 def _part(result: Result) -> dict[str, Any]:
-    """Return one log's response as plain data; without one, ``reason`` says why."""
+    """Return one log's response as plain data; without a response, ``reason`` states why."""
     document = result.document
     part = {name: document[name] for name in ("log", "simulated", "frequency_response")}
     return part | {"reason": None if part["frequency_response"] is not None else _reason(result.record, result)}
@@ -146,7 +148,7 @@ def _write_picture(responses: Sequence[dict[str, Any]], path: Path) -> None:
 
 
 def _write_table(found: Sequence[Result], path: Path) -> None:
-    """Write a row for each line of each log. A CSV has all digits, and an empty cell for a value that is not known."""
+    """Write a row for each line of each log. A CSV has all digits, and an empty cell for an unknown value."""
     from tdhil.estimation import response_columns
 
     rows: list[dict[str, Any]] = []

@@ -56,7 +56,9 @@ def show_settings(
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of identify. None as a default means: rig.yaml, else the built-in default (`tdhil.config.options`)."""
+    """Add the options of identify. A default of None means: rig.yaml, else the built-in default
+    (`tdhil.config.options`).
+    """
     sections = add_options(parser, Topic.MOTION, Topic.RESULT)
     sections[Topic.MOTION].add_argument("--dry-run", action="store_true",
                                         help="show the plan and the expected result; nothing moves")
@@ -85,11 +87,11 @@ def run(namespace: argparse.Namespace) -> int:
 def run_with(
     namespace: argparse.Namespace, evaluation: EvaluationCase | None = None, logs: list[Path] | None = None
 ) -> int:
-    """Run the command, with a virtual string in stage 5 if one is to be evaluated.
+    """Run the command, with a virtual string in stage 5 if ``evaluation`` is given.
 
-    ``logs``: the path of the run's log is appended to it, and the process goes on after the run.
+    ``logs``: receives the path of the run's log; the process then continues after the run.
 
-    Raises TdhilError before the drive is touched; afterwards everything ends in an exit code.
+    Raises TdhilError before the drive is accessed; after that every error becomes an exit code.
     """
     from tdhil.cli.dry_run import dry_run, dry_run_course, say_before
     from tdhil.report import stderr_console
@@ -152,7 +154,7 @@ def _run(request: RunRequest, console: Console, report: Path | None, logs: list[
     operator_interface = TerminalOperator(
         console, yes=options.yes, gear_ratio=1.0 if request.rig is None else request.rig.gear.ratio
     )
-    # The process does not end after a run of a calibration: signals must then work again, at the prompt and later.
+    # After a run of a calibration the process continues, so signals must work again, at the prompt and later.
     with Ending(own_process=entry.process.own and logs is None) as ending:
         session = RunSession(request, operator_interface, report=report is not None)
         code = ending.code(_finish(session, ending, options, console, report))
@@ -183,16 +185,16 @@ def _finish(
     try:
         if document is not None:
             print_result(document, options.json)
-    finally:            # the reader of stdout may be gone: log and report are still finished
+    finally:            # stdout may be closed: log and report are finished nevertheless
         try:
             session.close()
         except LogError as error:
-            # Stdout has its one document already. If the log ended the run, everything is reported.
+            # Stdout already has its one document. If the log ended the run, everything is reported.
             if not isinstance(outcome.cause, LogError):
                 console.print(f"tdhil: {error.coded}", style="bold red", markup=False, soft_wrap=True)
             code = code or int(exit_code(error))
         if document is not None:
-            # it names the log's SHA-256
+            # the report contains the log's SHA-256
             save_report(document, session.log.recording(complete=True), report, session.log.virtual_string)
     return code
 
@@ -218,7 +220,7 @@ def _failed(
         loud = not_confirmed(stop)
         console.print(f"tdhil: {loud.coded}", style="bold white on red", markup=False, soft_wrap=True)
         said = str(loud)
-        # In any case: a script that reads only the exit code must learn that the shaft may still turn.
+        # In any case: a script that reads only the exit code must know that the shaft may still turn.
         code = ExitCode.STOP_NOT_CONFIRMED
     if stop is None or stop.confirmed:
         console.print(f"tdhil: {said}", markup=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""The command line: which command, with which options. Imports what a command needs only once it is chosen."""
+"""Entry point of the command line: selects the command, and imports only what this command needs."""
 
 from __future__ import annotations
 
@@ -73,16 +73,18 @@ _GROUPS: Final = {
         "completion": "print a completion script for bash or zsh",
     },
 }
-"""The commands, in the groups of ``tdhil --help``, each with its one line."""
+"""Commands in the groups of ``tdhil --help``, each with its one line."""
 _COMMANDS: Final = {name: summary for commands in _GROUPS.values() for name, summary in commands.items()}
 
 
 process = SimpleNamespace(own=False)
-"""``own``: this process is the command's own, and nothing but its end follows; set by `console`."""
+"""Process of the command. ``own``: True if only the end of the process follows the command; `console` sets it."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; the exit code (`tdhil.errors.ExitCode`). No traceback for anything a user can cause."""
+    """Entry point. Return the exit code (`tdhil.errors.ExitCode`). An error that a user can cause shows no
+    traceback.
+    """
     namespace = argparse.Namespace()
     arguments = list(sys.argv[1:] if argv is None else argv)
     with sheltered():
@@ -94,15 +96,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"tdhil: {with_code('interrupted', MessageCode.INTERRUPTED.code)}", file=sys.stderr)  # noqa: T201
             return 130
         except BrokenPipeError:
-            return 141      # the reader of the output has gone
+            return 141      # the reader of the output has closed it
         except Exception as error:
-            # A syntax error leaves no namespace, but a caller with --json still expects a document.
+            # a syntax error gives no namespace, but a caller with --json still expects a document
             return _report(error, getattr(namespace, "json", None) is True or "--json" in arguments)
     return code
 
 
 def _main(arguments: list[str], namespace: argparse.Namespace) -> int:
-    # Libraries log what we report ourselves, with where and what next.
+    # libraries log errors that tdhil reports itself, with place and next step
     for library in (name for bus in BUSES.values() for name in bus.loggers):
         logging.getLogger(library).addHandler(logging.NullHandler())
         logging.getLogger(library).propagate = False
@@ -139,7 +141,7 @@ def _parser(chosen: Sequence[str]) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"tdhil {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=CommandParser)
     for name, summary in _COMMANDS.items():
-        # Options are written out in full: no `--y` may stand for --yes.
+        # options must be complete: --y must not mean --yes
         sub = commands.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".",
                                   allow_abbrev=False)
         if name in chosen:
@@ -166,7 +168,7 @@ _ELSEWHERE = {
     "compare": ("trend", "add_compare_arguments"),
     "rig": ("rig_new", "add_arguments"),
 }
-"""Commands that don't have a module of their own name, each with its module and what adds its options."""
+"""Commands without a module of their own name: module, and function that adds the options."""
 
 
 def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
@@ -176,7 +178,7 @@ def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
 
 
 def _report(error: Exception, as_json: bool) -> int:
-    """One message for an error of the tree; a traceback only for what is a mistake of ours."""
+    """Print one message for an error of the tree; a traceback only for an internal error of tdhil."""
     code = exit_code(error)
     if isinstance(error, TdhilError):
         error.spelling = {}
@@ -195,28 +197,28 @@ def _report(error: Exception, as_json: bool) -> int:
 
 
 def _hear_no_more() -> None:
-    """The process ends with its code, however often Ctrl-C is pressed meanwhile."""
+    """Ignore further Ctrl-C, so that the process ends with its exit code."""
     if process.own:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def leave(code: int) -> NoReturn:
-    """The end of the process, at once also where arithmetic that was left alone goes on in a thread."""
+    """End the process at once, even if an abandoned computation continues in a thread."""
     background = sys.modules.get("tdhil.runner.background")
     if background is not None and background.goes_on():
         for stream in (sys.stdout, sys.stderr):
-            with suppress(OSError, ValueError, AttributeError):     # full, closed, or none
+            with suppress(OSError, ValueError, AttributeError):     # full, closed, or missing
                 stream.flush()
         os._exit(code)
     sys.exit(code)
 
 
 def console() -> NoReturn:
-    """`tdhil` in a shell."""
+    """Run `tdhil` from a shell."""
     process.own = True
     try:
         code = main()
-    except KeyboardInterrupt:          # a second one, while the first was handled
+    except KeyboardInterrupt:          # a second one during the handling of the first
         code = int(ExitCode.INTERRUPTED)
     _hear_no_more()
     leave(code)

@@ -1,4 +1,4 @@
-"""The parser of the command line: errors of one line with the option that was meant, and help in two lengths."""
+"""Parser of the command line: errors of one line with the likely option, and help in two lengths."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from tdhil.errors import MessageCode, UsageError
 HELP_ALL: Final = "--help-all"
 _NAME_WIDTH: Final = 12
 _MANY_OPTIONS: Final = 12
-"""A command with more options than this has a short usage line."""
+"""Most options of a command with a complete usage line."""
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser for `tdhil` and each of its commands.
+    """Parser for `tdhil` and each of its commands.
 
-    Its errors are one line, as all others: a long usage above them would hide what is wrong. ``--help`` shows the
-    options that most runs need, and ``--help-all`` shows all of them.
+    Its errors are one line, like all others: a long usage above them would hide the error. ``--help`` shows the options
+    that most runs need, ``--help-all`` shows all of them.
     """
 
     def __init__(self, *args: Any, **words: Any) -> None:
         super().__init__(*args, **words)
         self._rare: list[argparse.Action] = []
         self.usual_action = ""
-        """Action of a command with several, for a command line that names none."""
+        """Default action of a command with several actions."""
 
     def set_rare(self, rare: list[argparse.Action]) -> None:
         """Hide these options from ``--help``, and add ``--help-all``."""
@@ -58,14 +58,18 @@ class CommandParser(argparse.ArgumentParser):
         raise self._refusal(message, entry)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """Refuse an unknown option where the options are known: argparse leaves it to the outermost parser."""
+        """Refuse an unknown option in the parser that knows the options: argparse would leave it to the outermost
+        parser.
+        """
         found, unknown = super().parse_known_args(self._with_action(args), namespace)
         if unknown:
             raise self._unknown(unknown)
         return found, unknown
 
     def _with_action(self, args: Any) -> Any:
-        """Return the words with the usual action before them, if the first word is no action and asks for no help."""
+        """Return the words with the default action before them, if the first word is neither an action nor a help
+        option.
+        """
         if not self.usual_action or args is None:
             return args
         actions = next(one for one in self._actions if isinstance(one, argparse._SubParsersAction))
@@ -88,7 +92,7 @@ class CommandParser(argparse.ArgumentParser):
 
 
 class _HelpAll(argparse._HelpAction):
-    """``--help-all``."""
+    """The option ``--help-all``."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
         assert isinstance(parser, CommandParser)
@@ -97,12 +101,12 @@ class _HelpAll(argparse._HelpAction):
 
 
 class FrontParser(CommandParser):
-    """The parser of `tdhil` itself; its help lists the commands in groups."""
+    """Parser of `tdhil` itself; its help lists the commands in groups."""
 
     groups: Mapping[str, Mapping[str, str]] = {}
 
     def format_help(self) -> str:
-        """Return the text of ``tdhil --help``: each group of commands, each command with one line."""
+        """Return the text of ``tdhil --help``: groups of commands, one line for each command."""
         rows = [f"usage: {self.prog} COMMAND [option ...]", "", self.description or ""]
         for title, commands in self.groups.items():
             rows += ["", f"{title}:", *(f"  {name:<{_NAME_WIDTH}}{summary}" for name, summary in commands.items())]

@@ -1,4 +1,4 @@
-"""`tdhil profiles`: the profiles in tdhil, their confidence, the settings that they need, and checks of a file."""
+"""`tdhil profiles`: profiles in tdhil, their confidence, their required settings, and checks of a file."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# `tdhil profiles show`: everything that is needed at the drive, on the terminal.
+# `tdhil profiles show`: all information needed at the drive, on the terminal.
 
 
-_NARROW = 72          # columns; a table of five would lose whole columns below
+_NARROW = 72          # columns; a narrower table of five would lose whole columns
 _SHOW = "tdhil profiles show NAME shows what to set at the drive and what to look up in its manual."
 
 
@@ -101,7 +101,7 @@ def _by_hand(profile: Profile, console: Console) -> None:
 
 
 def _advice(one: Any, untold: bool) -> str:
-    """Return what to do for a parameter. ``untold``: it can't be read over the bus."""
+    """Return the instruction for a parameter. ``untold``: it cannot be read over the bus."""
     stated = f"and state it in rig.yaml: drive_data.parameters.{one.name}" if untold else ""
     return "; ".join(part for part in (one.advice or "", stated) if part)
 

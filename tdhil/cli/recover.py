@@ -1,4 +1,4 @@
-"""`tdhil recover`: the readable content of a damaged log, in words, and a clean copy of it."""
+"""`tdhil recover`: the readable content of a damaged log as text, and a clean copy of it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of recover."""
+    """Add the options of recover."""
     parser.add_argument("log", type=Path, metavar="broken.mcap", help="the log of a run that was cut short or damaged")
     parser.add_argument("-o", "--output", type=Path, metavar="whole.mcap",
                         help="write what can be read as a finished log; the damaged one is never overwritten")
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Exit 0: nothing is missing; 3: some of it is; 10 (`NothingRecoverable`): nothing can be read."""
+    """Recover. Exit 0: nothing is missing; 3: a part is missing; 10 (`NothingRecoverable`): nothing is readable."""
     from tdhil.recording import examine, write_copy
     from tdhil.report import stderr_console
     from tdhil.session import check_log_path, make_room
@@ -55,7 +55,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def report(found: Salvage, path: Path, target: Path | None) -> dict[str, Any]:
-    """Return plain data. Times are control time in s; ``under_way``: the stage at the end of the log, or None."""
+    """Return plain data. Times are control time, s; ``under_way``: the stage at the end of the log, or None."""
     from tdhil.runner import STAGES
 
     run = found.run
@@ -130,5 +130,5 @@ def _finite(value: float) -> float | None:
 
 
 def _clean(text: str) -> str:
-    """Return a damaged file's text for a terminal: on one line, without control characters."""
+    """Return text of a damaged file for a terminal: on one line, without control characters."""
     return "".join(sign if sign.isprintable() else "·" for sign in text)

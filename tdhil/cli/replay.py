@@ -1,4 +1,4 @@
-"""`tdhil replay`: a tdhil log, or a trace exported from a drive's own tool, identified like a run."""
+"""`tdhil replay`: identification from a tdhil log, or from a trace of a drive's own tool, as in a run."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ _TRACE_ONLY = (
 )
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of replay. None as a default: not given."""
-    # Optional for argparse only: after --columns the file's name is taken as one more column (`_log`).
+    """Add the options of replay. A default of None means: not given."""
+    # optional for argparse only: after --columns it takes the name of the file as another column (`_log`)
     parser.add_argument("log", type=Path, nargs="?", metavar="run.mcap|trace.csv",
                         help="the log of a run, whole or cut short, or a trace in CSV; recognised by their content")
     add_option(parser, OPTION["json"])
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_trace_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of reading a trace in CSV. None as a default: not given."""
+    """Add the options for reading a trace in CSV. A default of None means: not given."""
     trace = parser.add_argument_group("a trace in CSV (a run.mcap contains all this)")
     trace.add_argument("--columns", nargs="+", metavar="QUANTITY=NAME:UNIT",
                        help="such as time=t_s speed=n_rpm:rpm torque=m_pct:%%; default: time_s speed_rad_s torque_nm")
@@ -85,7 +85,9 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def read_recorded(namespace: argparse.Namespace, path: Path) -> RunRecord:
-    """A log, or a trace by its options. UsageError where options of a trace are given for a log."""
+    """Return the content of a log, or of a trace by its options. Raises UsageError for options of a trace with a
+    log.
+    """
     trace: dict[str, Any] = {}
     if is_log(path):
         for name in _TRACE_ONLY:
@@ -129,7 +131,7 @@ def _evaluation(namespace: argparse.Namespace, recorded: RunRecord) -> int:
 
 
 def _identify(namespace: argparse.Namespace, recorded: RunRecord) -> int:
-    """Identify and print; return the exit code of the result, or the one for a result from a part of the run."""
+    """Identify and print. Return the exit code of the result, or the one for a result from a part of the run."""
     from tdhil.api import identify
     from tdhil.report import stderr_console
 
@@ -161,7 +163,7 @@ def _log(namespace: argparse.Namespace) -> Path:
 
 
 def _expecting(namespace: argparse.Namespace, recorded: RunRecord) -> RunRecord:
-    """Return the record with the expected values of the command line, each in place of that of the run."""
+    """Return the record with the expected values of the command line; each replaces that of the run."""
     if not namespace.expect:
         return recorded
     both = (*expectations_in(recorded.configuration), *expectations_of({}, namespace.expect))
@@ -185,7 +187,7 @@ def check_trace(namespace: argparse.Namespace) -> None:
           for lag in ("speed_lag", "speed_lag_sd", "torque_lag", "torque_lag_sd", "skew_sd")),
     ):
         value = getattr(namespace, name)
-        if value is not None and not low <= value < high:      # NaN neither
+        if value is not None and not low <= value < high:      # refuses NaN too
             raise UsageError(f"{value:g}: must be {wanted}", where=f"--{name.replace('_', '-')}",
                              entry=MessageCode.VALUE_NOT_ALLOWED)
     for lag in ("speed_lag", "torque_lag"):

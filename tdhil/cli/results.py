@@ -33,7 +33,7 @@ def save_report(
 
 
 def print_json(document: Mapping[str, Any]) -> None:
-    """Print one document on stdout; a number that JSON does not know is an internal error."""
+    """Print one document on stdout; a number that JSON does not have is an internal error."""
     json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
     sys.stdout.write("\n")
 

@@ -1,4 +1,4 @@
-"""`tdhil rig new`: a commented rig.yaml to fill in, with no drive at hand."""
+"""`tdhil rig new`: a commented rig.yaml to fill in, without a drive."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Write it, and report what must be filled in. Raises UsageError if it can't be written."""
+    """Write the file, and report the entries to fill in. Raises UsageError if it cannot be written."""
     from profiles import load_profile
     from tdhil.cli.scan import blank_rig, to_fill_in, write_new
 
@@ -45,7 +45,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def _asked() -> str | None:
-    """Ask for the rig's name at a terminal. None without an answer: the file then has a blank."""
+    """Ask for the rig's name at a terminal. Return None without an answer: the file then has a blank."""
     if sys.stdin is None or not sys.stdin.isatty():
         return None
     print("Name of this rig, such as bench 3: ", end="", file=sys.stderr, flush=True)  # noqa: T201

@@ -1,6 +1,6 @@
-"""`tdhil scan`: the drives on a bus or line, the profile of each, and a rig.yaml to start from.
+"""`tdhil scan`: the drives on a bus or line, the profile of each, and a first rig.yaml.
 
-It never writes to a drive. It requests data from every node of a bus: do not use it while another master is busy there.
+It never writes to a drive. It requests data from every node of a bus: do not use it while another master is active.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The rig.yaml to start from: where the drive was found, and blanks for the limits.
+# First rig.yaml: the place of the drive, and blanks for the limits.
 
 
 _PLAIN = re.compile(r"[A-Za-z_./][A-Za-z0-9_./-]*")
@@ -70,7 +70,7 @@ def starter(found: FoundDrive, line: Mapping[str, Any], profile: Profile | None)
 
 
 def blank_rig(profile: Profile, named: str, load: str, name: str | None = None) -> str:
-    """Return the file's text without a drive. ``named``: the profile as the operator names it."""
+    """Return the file's text without a drive. ``named``: profile as named by the operator."""
     parts = [
         "# Written by tdhil rig new. Torque and speed refer to the motor shaft. All keys: docs/reference/rig.md,",
         "# whose path tdhil docs prints.",
@@ -98,7 +98,7 @@ def blank_rig(profile: Profile, named: str, load: str, name: str | None = None) 
 
 
 def to_fill_in(profile: Profile, load: str, name: str | None = None) -> list[str]:
-    """Return what a run on a real drive needs besides."""
+    """Return the further entries that a run on a real drive needs."""
     found = [f"limits: {', '.join(_LIMITS)}", f"the drive's address: {bus_named(profile.bus).to_fill_in}"]
     if name is None:
         found.append("name: the rig's own name, such as bench 3")
@@ -161,7 +161,7 @@ def _doubts(profile: Profile | None) -> list[str]:
 
 
 def _untold(profile: Profile | None) -> list[str]:
-    """Return parameters that can't be read over the bus."""
+    """Return lines for the parameters that cannot be read over the bus."""
     blanks = [] if profile is None else [f"#    {one.name}:    # {_comment(one.title)}" for one in profile.untold]
     return ["#  parameters:", *blanks] if blanks else []
 
@@ -178,14 +178,14 @@ def _by_hand(profile: Profile | None) -> list[str]:
 
 
 def _comment(text: str) -> str:
-    """Return one line of printable text, also for a strange drive name."""
+    """Return one line of printable text, for any name that a drive reports."""
     return " ".join("".join(char if char.isprintable() else " " for char in text).split())
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of bus and line, as for identify; what to scan, and the path of a starter file."""
+    """Add the options of bus and line, as for identify; the scan's range, and the path of a first rig.yaml."""
     from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, add_option
     from tdhil.config import OPTION
 
@@ -259,7 +259,7 @@ def _there_already(path: Path) -> UsageError:
 
 
 def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, options: RunOptions) -> None:
-    """Write the starter file for the only drive, or for the requested one of several."""
+    """Write the first rig.yaml for the only drive, or for the requested one of several."""
     one = _chosen(found, connection, options)
     if options.given("profile"):
         one = replace(one, profile=options.profile, why=f"as given: {options.source('profile')}")

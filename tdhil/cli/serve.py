@@ -12,7 +12,7 @@ DATA = Path("tdhil-data")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of serve."""
+    """Add the options of serve."""
     from tdhil.service import HOST, PORT
 
     parser.add_argument("--rigs", type=Path, metavar="DIR",
@@ -81,7 +81,7 @@ def _add_accounts(kinds: argparse._SubParsersAction[argparse.ArgumentParser], ki
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Serve until Ctrl-C or SIGTERM, which stop all runs."""
+    """Serve until Ctrl-C or SIGTERM, which also stop all runs."""
     from tdhil.errors import UsageError
     from tdhil.service import Tls, check_idle, serve
 
@@ -105,7 +105,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def run_accounts(namespace: argparse.Namespace) -> int:
-    """Add, list, remove, or set a password; a running service applies it within a second."""
+    """Add, list or remove accounts, or set a password; a running service applies the change within a second."""
     from tdhil.errors import UsageError
     from tdhil.service import AccountsFile, require_folder
 

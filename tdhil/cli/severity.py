@@ -1,4 +1,4 @@
-"""`tdhil severity`: stick-slip and torsional oscillation in a record of ordinary drilling; nothing moves."""
+"""`tdhil severity`: stick-slip and torsional oscillation in a recording of normal drilling; nothing moves."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of severity."""
+    """Add the options of severity."""
     parser.add_argument("log", type=Path, metavar="run.mcap|trace.csv",
                         help="torque and speed of the top drive during rotation: a log, or a trace in CSV")
     parser.add_argument("--result", type=Path, required=True, metavar="result.json|run.mcap",
@@ -84,7 +84,7 @@ def _assess(
     path: Path, namespace: argparse.Namespace, result: Mapping[str, Any], string: DrillString, inertia: Interval,
     expected: tuple[TopDrive, SpeedController] | None, warnings: list[str],
 ) -> tuple[Severity, bool]:
-    """Return what one record says, and whether it is simulated; add warnings."""
+    """Return the result of one recording, and whether it is simulated; add warnings."""
     from tdhil.session import require_file
     from tdhil.soft_torque import severity
 

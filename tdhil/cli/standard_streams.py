@@ -1,4 +1,4 @@
-"""stdout and stderr in any state: closed, full, or unable to write '²'. No run and no result is lost by that."""
+"""Protection of stdout and stderr in any state: closed, full, or without '²'. No run and no result is lost by it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _HANDLER = "tdhil"
 
 
 class OutputLost(TdhilError):
-    """stdout can't be written: its disk is full, or the terminal is gone. The output went to stderr."""
+    """Raised if stdout cannot be written: its disk is full, or the terminal is gone. The output went to stderr."""
 
     entry = MessageCode.OUTPUT_LOST
 
@@ -31,7 +31,7 @@ class OutputLost(TdhilError):
 
 
 class WatchedStream:
-    """A stream that handles write errors: for stdout with `OutputLost`, for stderr silently."""
+    """Stream with handling of write errors: stdout raises `OutputLost`, stderr ignores them."""
 
     def __init__(self, stream: TextIO, *, needed: bool) -> None:
         self._stream = stream
@@ -73,8 +73,8 @@ class WatchedStream:
 def sheltered() -> Iterator[None]:
     """Protect the streams before anything is opened or printed.
 
-    A closed stdout or stderr would give its number to the next opened file, possibly the log. A character that a stream
-    can't encode is replaced by a similar one, in stdout and stderr.
+    Otherwise the next opened file, possibly the log, would get the number of a closed stdout or stderr. In stdout and
+    stderr, a character that the stream cannot encode is replaced by a similar one.
     """
     _fill_descriptors()
     codecs.register_error(_HANDLER, _resembling)
@@ -109,11 +109,11 @@ def _fill_descriptors() -> None:
             os.fstat(number)
         except OSError:
             with suppress(OSError):
-                os.open(os.devnull, os.O_RDWR)      # the lowest free one: this
+                os.open(os.devnull, os.O_RDWR)      # the lowest free number: that of this stream
 
 
 def _in_columns(text: str, encoding: str | None) -> str:
-    """Return ``text`` in characters that ``encoding`` has, with line widths kept where spaces allow it.
+    """Return ``text`` in characters of ``encoding``, with unchanged line widths if spaces allow it.
 
     '+-' for '±' would shift a table's right edge.
     """

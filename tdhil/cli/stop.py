@@ -1,4 +1,4 @@
-"""`tdhil stop`: a best-effort quick stop from outside of any run. It is no emergency stop."""
+"""`tdhil stop`: best-effort quick stop from outside of a run. It is not an emergency stop."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(namespace: argparse.Namespace) -> int:
     """Stop. Return 0 at standstill, else 8: still turning, no answer, or no connection to the drive.
 
-    Ctrl-C ends only the observation. The stop request stays in force.
+    Ctrl-C ends only the observation. The stop request remains active.
     """
     from drivers import MonotonicClock, bare_stop
     from tdhil.buses import examples
@@ -56,7 +56,7 @@ def run(namespace: argparse.Namespace) -> int:
     try:
         with connection.bus.open_target(options, connection, clock) as target:
             report = bare_stop(target, clock)
-    except Exception as error:         # no connection, or a lost one; an adapter's driver may raise anything
+    except Exception as error:         # no connection, or a lost one; the driver of an adapter may raise any error
         if exit_code(error) is ExitCode.USAGE:
             raise
         return _not_reached(error, as_json=namespace.json is True)
@@ -73,7 +73,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def _not_reached(error: Exception, *, as_json: bool) -> int:
-    """Report a stop that did not reach the drive: a connection error alone is not enough."""
+    """Report a stop that did not reach the drive; the connection error alone would not state this."""
     code = ExitCode.STOP_NOT_CONFIRMED
     if as_json:
         document = {"ended": "not reached", "error": str(error), "code": code_of(error), "remarks": [],
@@ -95,7 +95,7 @@ def _exit_code(report: BareStopReport) -> ExitCode:
 
 
 def said(report: BareStopReport) -> list[str]:
-    """Return the observations, a line each; the last one is the verdict."""
+    """Return the observations, one line each; the last one is the verdict."""
     from drivers import Ended
 
     lines = []

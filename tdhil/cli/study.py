@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The bench of the field studies: embedded simulator, virtual bus, driver, runner, guard and log; in stepped time.
+# Bench of the field studies: embedded simulator, virtual bus, driver, runner, guard and log; in stepped time.
 
 
 BEFORE_ACQUIRE_S = 32.0
@@ -35,9 +35,9 @@ BEFORE_ACQUIRE_S = 32.0
 
 
 class SimulatedFieldBench:
-    """Runs all five stages and the stop, like `tdhil identify --simulate`.
+    """Bench that runs all five stages and the stop, like `tdhil identify --simulate`.
 
-    Its log is written and dropped with the run. Ctrl-C stops the shaft, and raises `tdhil.errors.Interrupted`.
+    Its log is deleted after the run. Ctrl-C stops the shaft, and raises `tdhil.errors.Interrupted`.
     """
 
     def run(self, wish: FieldRun, progress: RunProgress) -> Recording:
@@ -134,7 +134,7 @@ def _raise_if_ended(outcome: RunOutcome) -> None:
 
 
 class _ProgressDisplay:
-    """A display that converts cycles to a share of the run."""
+    """Display that converts cycles to a share of the run."""
 
     def __init__(self, report: Callable[[float], None]) -> None:
         self._report = report
@@ -191,7 +191,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """List, or run the requested studies. A statement that does not hold is a finding, not a failure."""
+    """List, or run the requested studies. A statement that is not confirmed is a finding, not a failure."""
     studies = all_studies()
     if namespace.studies == [LIST]:
         return _list(studies, namespace.json)
@@ -283,7 +283,7 @@ def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, repo
         except TdhilError as error:
             if not report or isinstance(error, Interrupted):
                 raise
-            # in a report the other studies are still included
+            # with a report, the other studies continue
             told.print(f"tdhil: {study.name}: {error.coded}", style="bold red", markup=False, soft_wrap=True)
             code = code or int(exit_code(error))
             chapters.append(Chapter(study.name, None, None, str(error)))
@@ -314,7 +314,7 @@ def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, repo
 
 
 def _made(folder: Path) -> Path:
-    """Make the output folder before the computation."""
+    """Create the output folder before the computation."""
     from tdhil.errors import UsageError
 
     try:
@@ -326,7 +326,7 @@ def _made(folder: Path) -> Path:
 
 
 def _cost(outcome: StudyOutcome, took_s: float) -> str:
-    """Return wall time, and the time per simulated second: of the simulation alone if the study reports it."""
+    """Return wall time, and time per simulated second; of the simulation alone if the study reports it."""
     simulated_s = outcome.simulated_s
     if simulated_s <= 0.0:
         return f"{outcome.name}: {took_s:.1f} s"

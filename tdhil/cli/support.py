@@ -30,7 +30,7 @@ VARIABLES = (
     "LANG", "LC_ALL", "LC_CTYPE", "TERM", "PYTHONIOENCODING", "PYTHONUTF8", "OPENBLAS_CORETYPE",
     "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS",
 )
-"""The only environment variables that are included, beside those of the buses: others are private."""
+"""Environment variables that are included, beside those of the buses; all others are private."""
 
 _SECRET = re.compile(r"pass(word|wd|phrase)?|secret|token|api_?key|credential|authori[sz]ation|private", re.IGNORECASE)
 _PERSON = frozenset({"operator"})
@@ -43,7 +43,7 @@ _SHORTEST_NAME = 4
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of support."""
+    """Add the options of support."""
     parser.add_argument("log", type=Path, metavar="run.mcap", help="the log of the run")
     parser.add_argument("--rig", type=Path, metavar="rig.yaml", help="its rig.yaml, with comments")
     parser.add_argument("-o", "--output", type=Path, metavar="support.zip",
@@ -83,7 +83,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def about(log: Path) -> Iterable[tuple[str, str]]:
-    """Yield (name in the archive, text) of everything except the log and rig.yaml, not yet scrubbed."""
+    """Yield (name in the archive, text) of everything except the log and rig.yaml, before scrubbing."""
     from tdhil.cli.doctor import host_findings
 
     yield "versions.json", _json(versions())
@@ -148,9 +148,9 @@ class Scrub:
 
     @classmethod
     def of_this_computer(cls) -> Scrub:
-        """Return the scrubber for this computer. Names with another meaning in a log (root, user) stay."""
+        """Return the scrubber for this computer. Names with another meaning in a log (root, user) are kept."""
         names = []
-        with suppress(Exception):      # no entry for this user, no variables either
+        with suppress(Exception):      # no entry for this user, and no variables
             names.append(getpass.getuser())
         with suppress(OSError):
             names.append(socket.gethostname())

@@ -22,7 +22,7 @@ _COLOURS = ("#0b5cad", "#c2410c", "#15803d", "#7e22ce", "#525252", "#b45309", "#
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of trend."""
+    """Add the options of trend."""
     parser.add_argument("table", type=Path, metavar="FILE", help="a table that `tdhil fleet` wrote")
     parser.add_argument("--rig", metavar="NAME", help="name of the rig in rig.yaml (default: the only one)")
     _add_output(parser)
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of compare."""
+    """Add the options of compare."""
     parser.add_argument("logs", nargs="+", type=Path, metavar="run.mcap",
                         help="two or more; each is compared with the first")
     add_settings(parser, "each run's")
@@ -45,7 +45,7 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Read the table, report changes."""
+    """Read the table, and report changes."""
     from tdhil.fleet import read_table, trend_document
 
     _check_report(namespace.report, (namespace.table,))
@@ -90,7 +90,7 @@ def run_compare(namespace: argparse.Namespace) -> int:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# On the terminal
+# Output on the terminal
 
 
 def _print_trend(document: Mapping[str, Any]) -> None:
@@ -108,7 +108,7 @@ def _print_trend(document: Mapping[str, Any]) -> None:
 
 
 def _followed_text(one: Mapping[str, Any]) -> str:
-    """Return the trend of a quantity, after the least and the greatest of its values."""
+    """Return the trend of a quantity as text, after the least and the greatest of its values."""
     values = [point["value"] for point in one["points"]]
     seen = f", {min(values):.4g} to {max(values):.4g} {one['unit']}" if values else ""
     return f"{one['name']}{seen}: {one['text']}"
@@ -164,7 +164,7 @@ def _inertia_text(row: Mapping[str, Any]) -> str:
 
 
 def _by_line(document: Mapping[str, Any]) -> dict[float, list[float | None]]:
-    """Return the apparent inertia by frequency, a column per log; the mean over several mean speeds."""
+    """Return the apparent inertia by frequency, a column per log; the mean if there are several mean speeds."""
     found: dict[float, list[float | None]] = {}
     for number, lines in enumerate(document["apparent_inertia"]):
         by_hertz: dict[float, list[float]] = {}
@@ -178,7 +178,7 @@ def _by_line(document: Mapping[str, Any]) -> dict[float, list[float | None]]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# In one file, with a picture
+# Output in one file, with a figure
 
 
 def _check_report(path: Path | None, inputs: Sequence[Path]) -> None:
@@ -250,7 +250,7 @@ def _draw_curves(figure: FigureBase, document: Mapping[str, Any]) -> None:
             [line["hertz"] for line in known], [line["value"] for line in known],
             yerr=[[max(0.0, line["value"] - line["low"]) for line in known],
                   [max(0.0, line["high"] - line["value"]) for line in known]],
-            # concentric rings: equal runs do not hide each other
+            # concentric rings, so that equal runs do not hide each other
             fmt="o", ms=3 + 3 * number, mfc="none", lw=1, color=_COLOURS[number % len(_COLOURS)], label=heading)
     axis.set_xlabel("Hz")
     axis.set_ylabel("apparent inertia, kg·m²")

@@ -1,4 +1,6 @@
-"""`tdhil tune`: gains from a result's J, for the speed loop or against stick-slip; nothing moves or is written."""
+"""`tdhil tune`: gains from a result's J, for the speed loop or against stick-slip. Nothing moves, nothing is
+written.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +10,11 @@ from tdhil.cli import tune_soft_torque, tune_speed
 from tdhil.cli.parser import CommandParser
 
 SOFT_TORQUE = "soft-torque"
-"""Purpose of `tdhil tune result.json`, without a further word."""
+"""Purpose of `tdhil tune result.json` without a further word."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The two purposes, with their options."""
+    """Add the two purposes, with their options."""
     purposes = parser.add_subparsers(dest="purpose", metavar="speed|soft-torque", required=True)
     speed = purposes.add_parser(
         "speed", allow_abbrev=False, help="P, I and a notch for the drive's own speed loop",

@@ -1,4 +1,4 @@
-"""Inputs of both purposes of `tdhil tune`: a result, the drive's own impedance, and the options that both have."""
+"""Inputs of both purposes of `tdhil tune`: a result, the drive's own impedance, and the common options."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def require_result(path: Path) -> None:
-    """Raise UsageError if there is no such file."""
+    """Raise UsageError if the file does not exist."""
     if not path.is_file():
         raise UsageError("this file does not exist", where=str(path),
                          next_step="Name a result.json of tdhil identify --json, or a run.mcap",
@@ -25,7 +25,7 @@ def require_result(path: Path) -> None:
 
 
 def read_result(path: Path) -> Mapping[str, Any]:
-    """Return the result's document, from --json or identified again from the log."""
+    """Return the document of a result: read from --json, or identified again from the log."""
     from tdhil.session import is_log
 
     require_result(path)
@@ -72,7 +72,7 @@ def read_impedance(path: Path, result: Mapping[str, Any]) -> Mapping[str, Any]:
 def measured_lags(measured: Mapping[str, Any]) -> tuple[list[float], list[list[float]]]:
     """Return the lags of speed and torque, and the main axes of their 95 % coverage region.
 
-    Their sum is known better than each: its half-width gives their correlation.
+    Their sum is more certain than each lag: its half-width gives their correlation.
     """
     import numpy as np
 
@@ -89,7 +89,7 @@ def measured_lags(measured: Mapping[str, Any]) -> tuple[list[float], list[list[f
 
 
 def bounded_estimate(part: Any) -> tuple[float, float, float] | None:
-    """Return (low, value, high) of an estimate that is bounded and positive."""
+    """Return (low, value, high) of an estimate that is bounded and positive; else None."""
     if not isinstance(part, dict) or not all(is_number(part.get(key)) for key in ("low", "value", "high")):
         return None
     low, value, high = (float(part[key]) for key in ("low", "value", "high"))
@@ -97,7 +97,7 @@ def bounded_estimate(part: Any) -> tuple[float, float, float] | None:
 
 
 def ends_of(part: Mapping[str, Any], times: float = 1.0) -> tuple[float, float, float]:
-    """Return (low, value, high), none below 0; a missing end is the value."""
+    """Return (low, value, high), each at least 0; a missing end is replaced by the value."""
     value = max(0.0, float(part["value"]))
     low, high = (float(part[key]) if is_number(part.get(key)) else value for key in ("low", "high"))
     return times * max(0.0, min(low, value)), times * value, times * max(high, value)
@@ -131,14 +131,14 @@ def profile_for(namespace: argparse.Namespace, result: Mapping[str, Any]) -> Pro
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Options that both purposes have.
+# Options of both purposes.
 
 
 RATED: Final = (
     ("rated_torque", 1e-6, 1e9, "a positive number of N·m"),
     ("rated_speed", 1e-3, 1e6, "a positive number of rpm"),
 )
-"""Limits of the motor's ratings: attribute, least, greatest, both in words."""
+"""Limits of the motor's ratings: attribute, least, greatest, and both in words."""
 
 
 def check_limits(namespace: argparse.Namespace, limits: Iterable[tuple[str, float, float, str]]) -> None:

@@ -1,4 +1,4 @@
-"""`tdhil tune soft-torque`: a speed controller that damps the drill string, from a result's J; nothing moves."""
+"""`tdhil tune soft-torque`: a speed controller that damps the drill string, from a result's J. Nothing moves."""
 
 from __future__ import annotations
 
@@ -50,20 +50,20 @@ if TYPE_CHECKING:
 IDENTIFIED = ("inertia_kg_m2", "viscous_nm_s_rad", "coulomb_nm", "speed_lag_s", "torque_lag_s", "gear_ratio")
 """Keys of the result that `tdhil evaluate` needs."""
 CONTROL_PERIOD_S, DEAD_TIME_PERIODS = 0.002, 10.0
-"""Assumed control period of an inverter's speed loop, s; and the dead-time reserve in such periods."""
+"""Assumed control period of an inverter's speed loop, s; and the reserve of dead time, in such periods."""
 STATED_LAG_TOLERANCE, ASSUMED_LAG_TOLERANCE = 0.1, 0.5
 """Relative uncertainty of each lag that was not measured."""
 MOST_DEPTHS = 60
-"""Depths of one schedule: each takes some seconds."""
+"""Most depths of one schedule: each takes some seconds."""
 IDENTIFIED_DRAWS, IDENTIFIED_SEED = 20, 3
 MOST_IMPEDANCE_SPREAD = 0.15
-"""Relative half-width of ζ up to which an identified pipe counts as known."""
+"""Largest relative half-width of ζ for which an identified pipe counts as known."""
 ASSUMED_LAGS_S = (0.020, 0.010, 0.003)
 """Speed filter, torque loop and sampling of an inverter in vector control, s: typical, not measured."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of tune soft-torque."""
+    """Add the options of tune soft-torque."""
     parser.add_argument("result", type=Path, metavar="result.json|run.mcap",
                         help="result of tdhil identify --json, or the log of a run")
     parser.add_argument("--string", type=Path, metavar="string.yaml",
@@ -152,7 +152,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 @contextmanager
 def _progress(told: Console, text: str) -> Iterator[Callable[[str], None]]:
-    """Yield what tells each step, a line each; at a terminal the present step also has a moving sign."""
+    """Yield a function that prints each step, one line each; at a terminal the present step also has a moving sign."""
     def line(step: str) -> None:
         told.print(f"tune: {step} …", style="dim", markup=False)
 
@@ -186,7 +186,7 @@ def _check(namespace: argparse.Namespace) -> None:
 
 
 def _check_files(namespace: argparse.Namespace) -> None:
-    """Check every file that the command names before any of them is worked with. Raises UsageError, DataFileError."""
+    """Check every file of the command before any of them is used. Raises UsageError, DataFileError."""
     from tdhil.soft_torque import load_string
 
     require_result(namespace.result)
@@ -216,7 +216,7 @@ def depths(text: str) -> tuple[float, ...]:
 def _schedule(
     case: TuneCase, namespace: argparse.Namespace, ratio: float, profile: Profile | None, tell: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Return gains over depth: soft ones, which any drive takes, or compensated ones if --compensate asks for them."""
+    """Return gains over depth: soft ones, which any drive accepts, or compensated ones with --compensate."""
     from tdhil.report import schedule_document
     from tdhil.soft_torque import at_depth, drive_settings, schedule
 
@@ -294,7 +294,7 @@ def string_for(
 ) -> tuple[DrillString, tuple[Ends, ...], tuple[DrillString, ...]]:
     """Return the string, both ends of the interval of each of its values, and random draws of all of them.
 
-    The string comes from its file. Without one it is identified: a pipe if k, f and J_L together show one, else a
+    The string comes from its file. Without a file it is identified: a pipe if k, f and J_L together show one, else a
     spring with a mass.
     """
     from tdhil.soft_torque import Moved, identified_string, load_string, spring_and_mass
@@ -332,7 +332,7 @@ def string_for(
 
 
 def _drawn(values: Sequence[tuple[float, float, float]]) -> list[list[float]]:
-    """Draws of independent normal estimates: (low, value, high) of each is its 95 % interval."""
+    """Return random draws of independent normal estimates: (low, value, high) of each is its 95 % interval."""
     import numpy as np
 
     random = np.random.default_rng(IDENTIFIED_SEED)
@@ -387,7 +387,7 @@ def _lags(
     period: Any = (result.get("cycle") or {}).get("period_s")
     waiting = 1.5 * float(period) if is_number(period) else 0.0
     low, late, high = ends_of(reported)
-    # of a measured loop, the speed that the drive itself sees is no part of it
+    # the drive's own speed filter, the first of the inner lags, is not part of a loop over the bus
     rest = [sqrt(sum(axis[k] ** 2 for axis in axes)) for k in range(1, len(inner))] if axes else []
     others = [[0.0, 0.0, *(half if k == at else 0.0 for k in range(len(rest)))] for at, half in enumerate(rest)]
     return _moved_lags(

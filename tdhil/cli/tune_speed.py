@@ -1,4 +1,4 @@
-"""`tdhil tune speed`: P, I and a notch for the drive's own speed loop, from a result; numbers only, nothing moves."""
+"""`tdhil tune speed`: P, I and a notch for the drive's own speed loop, from a result. Numbers only, nothing moves."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ if TYPE_CHECKING:
 ASSUMED_LAGS_S = (0.020, 0.010)
 """Speed filter and torque loop of an inverter in vector control, s: typical, not measured."""
 ASSUMED_DEAD_TIME_S = 0.003
-"""One and a half control periods of 2 ms."""
+"""Assumed dead time, s: one and a half control periods of 2 ms."""
 STATED_TOLERANCE, ASSUMED_TOLERANCE = 0.1, 0.5
-"""Relative half-width of each lag's interval, as stated and as assumed."""
+"""Relative half-width of each lag's interval, for a stated and for an assumed lag."""
 _PICTURES = (".png", ".svg", ".pdf")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of tune speed."""
+    """Add the options of tune speed."""
     parser.add_argument("result", type=Path, metavar="result.json|run.mcap",
                         help="result of tdhil identify --json, or the log of a run")
     parser.add_argument("--bandwidth", type=amount(FREQUENCY), metavar="HZ",
@@ -165,7 +165,7 @@ def lags_in(
 
 
 def _lags_as_measured(measured: Mapping[str, Any]) -> tuple[Range, ...]:
-    """Return speed filter and torque lag. Their sum is known better than each, and it decides the margins."""
+    """Return speed filter and torque lag. Their sum is more certain than each, and determines the margins."""
     from tdhil.speed_loop import Range
 
     ends = [ends_of(measured[key]) for key in ("speed_filter_s", "torque_lag_s")]
@@ -180,7 +180,7 @@ def _lags_as_measured(measured: Mapping[str, Any]) -> tuple[Range, ...]:
 
 
 def plant_of(result: Mapping[str, Any], lags: tuple[Range, ...], dead_time: Range, path: Path) -> UncertainPlant:
-    """Return what the result knows of the loop, at the motor shaft. Raises LoopTuningRefused without J."""
+    """Return the loop as known from the result, at the motor shaft. Raises LoopTuningRefused without J."""
     from tdhil.speed_loop import LoopTuningRefused, Range, UncertainPlant
 
     positive_number(result, "gear_ratio", path)
@@ -212,7 +212,7 @@ def _has_value(part: Any) -> bool:
 
 
 def _range_or_none(part: Any) -> Range | None:
-    """Return an estimate, none of it below 0; None if the result does not have it."""
+    """Return an estimate with its ends, each at least 0; None if the result does not have it."""
     return _range(ends_of(part)) if isinstance(part, dict) and _has_value(part) else None
 
 

@@ -1,4 +1,4 @@
-"""The settings of a run: rig.yaml, and every option with the source of its value."""
+"""Settings of a run: rig.yaml, and every option with the source of its value."""
 
 from typing import TYPE_CHECKING
 

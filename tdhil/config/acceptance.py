@@ -15,7 +15,7 @@ from tdhil.errors import MessageCode, UsageError
 
 @dataclass(frozen=True)
 class AcceptedQuantity:
-    """A quantity that can be accepted: its unit, its label, and where the result document has it."""
+    """Quantity that can be accepted: its unit, its label, and its place in the result document."""
 
     unit: Unit
     label: str
@@ -33,7 +33,7 @@ ACCEPTED_QUANTITIES: Final[Mapping[str, AcceptedQuantity]] = MappingProxyType({
                                       ("impedance", "integral_nm_rad")),
     "torque-limit": AcceptedQuantity(TORQUE, "torque limit of the run", ("torque_limit_nm",)),
 })
-"""Quantities by the names that the operator writes."""
+"""Quantities by the names that an operator writes."""
 _PARTS: Final = re.compile(r"\s*(?P<value>[^±]+?)\s*(?:±|\+/?-)\s*(?P<tolerance>.+?)\s*")
 _EXAMPLE: Final = "104 ± 5 %"
 _FLAG: Final = OPTION["expect"].flag
@@ -41,7 +41,7 @@ _FLAG: Final = OPTION["expect"].flag
 
 @dataclass(frozen=True)
 class Expectation:
-    """Expected value of one quantity, and its tolerance to either side, in SI."""
+    """Expected value of one quantity, and its tolerance on either side, in SI."""
 
     name: str
     value: float
@@ -49,7 +49,7 @@ class Expectation:
 
     @staticmethod
     def of(name: str, text: str) -> Expectation:
-        """Read ``104 ± 5 %`` or ``0.4 s ± 50 ms``. Raises ValueError with words for the operator."""
+        """Read ``104 ± 5 %`` or ``0.4 s ± 50 ms``. Raises ValueError with a text for the operator."""
         quantity = ACCEPTED_QUANTITIES.get(name)
         if quantity is None:
             raise ValueError(f"no quantity is called {name!r:.40}: {', '.join(ACCEPTED_QUANTITIES)}")
@@ -65,7 +65,9 @@ class Expectation:
 
 
 def expectations_of(rig: Mapping[str, str], given: Sequence[str]) -> tuple[Expectation, ...]:
-    """Return those of rig.yaml, each replaced by that of the command line. Raises UsageError with the option."""
+    """Return the expectations of rig.yaml, each replaced by that of the command line. Raises UsageError with the
+    option.
+    """
     found = {name: Expectation.of(name, text) for name, text in rig.items()}
     for one in given:
         name, equals, text = one.partition("=")
@@ -80,7 +82,7 @@ def expectations_of(rig: Mapping[str, str], given: Sequence[str]) -> tuple[Expec
 
 
 def expectations_in(run: Mapping[str, Any]) -> tuple[Expectation, ...]:
-    """Return the expectations in the configuration of a log; a log may say anything."""
+    """Return the expectations in the configuration of a log. The content of a log is not trusted."""
     rows = run.get("acceptance")
     return tuple(
         Expectation(one["name"], float(one["value"]), float(one["tolerance"]))

@@ -34,7 +34,7 @@ def with_keywords(options: Collection[Option]) -> Callable[[_Function], _Functio
 
 
 def values_of(options: Collection[Option], given: Mapping[str, Any], function: str) -> dict[str, Any]:
-    """Return values by option name from keywords; None is not given. Raises UsageError for unknown keywords."""
+    """Return values by option name from keywords; None means not given. Raises UsageError for unknown keywords."""
     names = {one.keyword: one.name for one in options}
     if unknown := sorted(set(given) - set(names)):
         raise UsageError(f"unknown option: {', '.join(unknown)}", where=function,

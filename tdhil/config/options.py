@@ -1,9 +1,10 @@
-"""The table of a run's options. Each option is declared here once; everything that takes options is made from it.
+"""Table of a run's options. Each option is declared here once; everything that takes options is made from it.
 
 A row is a field of one of three dataclasses: `RunOptions` (also possible in rig.yaml), `Overrides` and `RunDetails`
 (for one run only). The field's annotation is the option's type, its default the option's default; `option` has the
-rest. From `OPTIONS` come the command line, the schema of rig.yaml, the keywords of `tdhil.run`, the service's API and
-its forms, and the rows of docs/reference/rig.md. Nothing heavy is imported here: ``--help`` reads this table.
+rest. The command line, the schema of rig.yaml, the keywords of `tdhil.run`, the service's API and forms, and the rows
+of docs/reference/rig.md are made from `OPTIONS`. No large library is imported here, because ``--help`` reads this
+table.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,11 +20,11 @@ from profiles.quantities import FREQUENCY, FRICTION, INERTIA, MINUTE, PERCENT, S
 from tdhil.config.registry import BUSES, DEFAULT_BUS, DEFAULT_EXCITATION, EXCITATIONS, MODELS, RegistryEntry
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A value, and its source.
+# Value of an option, and its source.
 
 
 class Origin(Enum):
-    """The kind of a setting's source. Decisions use it, never the words that name the source."""
+    """Kind of a setting's source. Decisions use it, and never the text that names the source."""
 
     COMMAND_LINE = "command line"
     RIG_FILE = "rig.yaml"
@@ -39,7 +40,7 @@ class _File(Protocol):
 
 @dataclass(frozen=True)
 class Setting:
-    """One option's value, its source in words (``--node``, ``rig.yaml:7``, ``default``), and the kind of source."""
+    """Value of one option, its source as text (``--node``, ``rig.yaml:7``, ``default``), and the kind of source."""
 
     value: Any
     source: str
@@ -56,7 +57,7 @@ class Setting:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The declaration of an option.
+# Declaration of an option.
 
 
 class Topic(Enum):
@@ -76,10 +77,10 @@ _LIMITS: Final = {"gt": ("greater than", gt), "ge": ("at least", ge), "lt": ("le
 
 @dataclass(frozen=True)
 class Form:
-    """A field of the service's forms. ``parts``: where it appears, of ``run``, ``simulated``,
-    ``real``, ``rehearsal`` and ``replay``.
+    """Field of the service's forms. ``parts``: its places among ``run``, ``simulated``, ``real``, ``rehearsal`` and
+    ``replay``.
 
-    ``unit``: the unit of a number without one. ``hint``: shown in the empty field in place of the default.
+    ``unit``: unit of a number that is entered without one. ``hint``: shown in the empty field instead of the default.
     """
 
     label: str
@@ -93,15 +94,14 @@ class Form:
 class Option:
     """One row of the table.
 
-    ``name`` in a parsed command line and in the API, ``keyword`` in Python, ``flag`` on the command line, ``at`` in
-    rig.yaml ('' if no file may state it). ``kind``: float, int, str, bool or tuple. ``limits``: gt, ge, lt, le or
+    Names: ``name`` in a parsed command line and in the API, ``keyword`` in Python, ``flag`` on the command line, ``at``
+    in rig.yaml ('' if no file may state it). ``kind``: float, int, str, bool or tuple. ``limits``: gt, ge, lt, le or
     min_length, as pydantic names them. ``help``: one sentence; ``{default}`` in it is the default. ``more``: the
-    sentences of the reference page, if those differ. ``unset``: the value that applies if nothing is given.
-    ``python``: True for a keyword of `tdhil.run` or `tdhil.simulate`. ``api``: True if HTTP accepts it. A text is the
-    reason for a refusal. ``asked_again``: its meaning in a replay, which may request another value; '' if it may not.
-    ``beside_rig``: a relative path in rig.yaml starts in the folder of rig.yaml. ``is_file``: a path that a run reads
-    or writes. ``longest``: most characters of a text over HTTP. ``common``: ``--help`` shows it; ``--help-all`` shows
-    the rest.
+    sentences of the reference page, if those differ. ``unset``: the value that applies if nothing is given. ``python``:
+    True for a keyword of `tdhil.run` or `tdhil.simulate`. ``api``: True if HTTP accepts it; a text is the reason for a
+    refusal. ``asked_again``: its meaning in a replay, which may use another value; '' if it may not. ``beside_rig``: a
+    relative path in rig.yaml starts in the folder of rig.yaml. ``is_file``: a path that a run reads or writes.
+    ``longest``: most characters of a text over HTTP. ``common``: ``--help`` shows it; ``--help-all`` shows the rest.
     """
 
     name: str
@@ -130,34 +130,34 @@ class Option:
 
     @property
     def joined(self) -> bool:
-        """Return whether it is a list: then the command line's entries are added to rig.yaml's."""
+        """True for a list: the entries of the command line are added to those of rig.yaml."""
         return self.kind is tuple
 
     @property
     def allowed(self) -> tuple[str, ...]:
-        """Return every choice that the registry holds now; empty if any value is possible."""
+        """Return every choice in the registry at present; empty if any value is possible."""
         return self.known or tuple(self.choices)
 
     @property
     def default_text(self) -> str:
-        """Return the default in words; '' for none."""
+        """Return the default as text; '' without one."""
         if self.default is None or self.joined:
             return self.unset
         return str(self.default).lower() if self.kind is bool else str(self.default)
 
     @property
     def help_text(self) -> str:
-        """Return the sentence of ``--help``."""
+        """Sentence of ``--help``."""
         return self.help.replace("{default}", self.default_text)
 
     def refusal(self, value: float) -> str:
-        """Return the limits, in words, that a number exceeds; '' if it is within them."""
+        """Return the limits, as text, that a number exceeds; '' if it is within them."""
         right = all(_LIMITS[name][1](value, limit) for name, limit in self.limits.items())
         return "" if right else " and ".join(f"{_LIMITS[name][0]} {limit:g}" for name, limit in self.limits.items())
 
     @property
     def form_hint(self) -> str:
-        """Return the text of an empty field: the value that applies."""
+        """Text of an empty field: the value that applies."""
         if self.form is None or self.form.hint or self.default is None or self.joined:
             return self.unset if self.form is None else self.form.hint or self.unset
         default = self.default if self.form.unit is None else f"{self.form.unit.of_si(self.default):g}"
@@ -171,7 +171,7 @@ def option(
     beside_rig: bool = False, is_file: bool = False, longest: int | None = None,
     common: bool = False, **limits: float,
 ) -> Any:
-    """Declare a row of the table as the field of a dataclass. The arguments: `Option`."""
+    """Declare a row of the table as the field of a dataclass. `Option` describes the arguments."""
     row = {name: value for name, value in locals().items() if name != "default"}
     return field(default=default, metadata={"row": row})
 
@@ -189,7 +189,7 @@ def _rows(table: type) -> Iterator[Option]:
 
 
 def _kind(annotation: Any) -> tuple[type, tuple[str, ...]]:
-    """Return the type of an option without its None, and the choices that a Literal names."""
+    """Return the type of an option without its None, and the choices of a Literal."""
     if get_origin(annotation) in (Union, UnionType):
         (annotation,) = (one for one in get_args(annotation) if one is not NoneType)
     if get_origin(annotation) is Literal:
@@ -198,12 +198,12 @@ def _kind(annotation: Any) -> tuple[type, tuple[str, ...]]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The table
+# Rows of the table
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Every option of a run that a file may state, with its value; ``settings`` holds the source of each.
+    """Every option of a run that a file may state, with its value; ``settings`` has the source of each.
 
     None as a value: the drive's profile or the plan of the run chooses it.
     """
@@ -383,7 +383,7 @@ class RunOptions:
         return RunOptions(**values, settings=MappingProxyType(dict(settings)))
 
     def source(self, name: str) -> str:
-        """Return the source of an option's value, in words."""
+        """Return the source of an option's value, as text."""
         return self.settings[name].source
 
     def given(self, name: str) -> bool:
@@ -391,7 +391,7 @@ class RunOptions:
         return self.settings[name].origin is not Origin.BUILT_IN
 
     def rows(self) -> Iterator[tuple[str, str, str]]:
-        """Yield (option, value, source) to print; '-' if the profile or the plan will choose."""
+        """Yield (option, value, source) for printing; '-' if the profile or the plan will choose."""
         for name, setting in self.settings.items():
             yield name, _shown(setting.value), setting.source
 
@@ -406,11 +406,11 @@ class RunOptions:
 
 
 class _Said:
-    """Options of one run that no file states."""
+    """Options of one run that a file cannot state."""
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:
-        """Build it from values by the options' names; None is not given."""
+        """Build it from values by the names of the options; None means not given."""
         given = {one.keyword: values.get(one.name) for one in _rows(cls)}
         return cls(**{name: tuple(value) if isinstance(value, list) else value
                       for name, value in given.items() if value is not None})
@@ -418,7 +418,7 @@ class _Said:
 
 @dataclass(frozen=True)
 class Overrides(_Said):
-    """Overrides by the operator, by name, for one run: rig.yaml states none of them."""
+    """Overrides by the operator, by name, for one run: rig.yaml cannot state them."""
 
     no_watchdog: bool = option(
         "--accept-no-watchdog", group=Topic.OVERRIDES, default=False,
@@ -450,7 +450,7 @@ class Overrides(_Said):
 
 @dataclass(frozen=True)
 class RunDetails(_Said):
-    """Details of one run: notes for its log, faults to rehearse, the priority of its control loop."""
+    """Details of one run: notes for its log, faults to rehearse, priority of its control loop."""
 
     operator: str | None = option(
         "--operator", group=Topic.OUTPUT, metavar="NAME", api=True, longest=500, form=Form("Operator"),
@@ -479,7 +479,7 @@ class RunDetails(_Said):
 RESOLVED: Final = tuple(_rows(RunOptions))
 """The options that `resolve` decides: those of `RunOptions`."""
 OPTIONS: Final = (*RESOLVED, *_rows(Overrides), *_rows(RunDetails))
-"""The whole table."""
+"""All rows of the table."""
 OPTION: Final = MappingProxyType({one.name: one for one in OPTIONS})
 ASKED_AGAIN: Final = tuple(sorted((one for one in OPTIONS if one.asked_again), key=lambda one: one.name))
 """Options that a replay, a comparison or a fleet may set differently from the run."""
@@ -490,7 +490,7 @@ CLOCKS: Final = ("real_time", "stepped")
 
 
 def is_name(flag: str, value: str) -> bool:
-    """Return whether ``value`` is the name of a profile that tdhil contains, not a file."""
+    """Return whether ``value`` is the name of a profile in tdhil, not a file."""
     return flag == OPTION["profile"].flag and not value.endswith((".yaml", ".yml"))
 
 

@@ -1,6 +1,6 @@
-"""Rows of docs/reference/rig.md that describe the options, made from their table.
+"""Rows on the options in docs/reference/rig.md, made from the table of options.
 
-``python -m tdhil.config.reference`` rewrites them in a clone; a test fails if they are stale.
+``python -m tdhil.config.reference`` rewrites them in a clone; a test fails if they are not up to date.
 """
 
 from collections.abc import Mapping
@@ -40,7 +40,7 @@ def _start(option: Option) -> str:
 
 
 def _section(option: Option) -> str:
-    """Return its section of rig.yaml; '' for the top, '-' for an option that no file states."""
+    """Return the section of rig.yaml; '' for the top level, '-' for an option that no file states."""
     return option.at.rpartition(".")[0] if option.at else "-"
 
 

@@ -1,8 +1,8 @@
 """Lists of choices: excitations, models of the shaft, buses.
 
-The command line, the schema of rig.yaml, `tdhil.api` and the code that acts read these lists. An entry has a name, the
-place of its object and a line of text. The object is imported at first use, so that ``--help`` loads none of them. The
-simulator is independent of tdhil and has its own list of plants: `sim_bus.plant.kinds`.
+The command line, the schema of rig.yaml, `tdhil.api` and the code that uses the choices read these lists. An entry has
+a name, the place of its object and a line of text. The object is imported at first use, so that ``--help`` loads none
+of them. The simulator is independent of tdhil and has its own list of plants: `sim_bus.plant.kinds`.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Any
 
 @dataclass(frozen=True)
 class RegistryEntry:
-    """``at``: ``module:attribute`` of the object; ``text``: its description.
+    """Entry. ``at``: ``module:attribute`` of the object; ``text``: its description.
 
-    Properties of an excitation for code that can't import it. ``periodic``: it has spectral lines and whole periods.
-    ``plateaus``: the speed is constant for a time within each period. There its noise is low, and a flat stretch is no
-    sign of clipping. ``before_echo``: it is for drill strings only, and J follows from the time before their echo.
+    Properties of an excitation, for code that cannot import it. ``periodic``: it has spectral lines and whole periods.
+    ``plateaus``: the speed is constant for a time within each period. Its noise is low there, and a flat stretch is not
+    a sign of clipping. ``before_echo``: it is for drill strings only, and J follows from the time before their echo.
     """
 
     at: str
@@ -31,7 +31,8 @@ class RegistryEntry:
 
 @dataclass(frozen=True)
 class BusEntry(RegistryEntry):
-    """``at``: a `tdhil.buses.Bus`. Its module imports no library of the bus: ``--help`` shows the options of every bus.
+    """Entry of a bus. ``at``: a `tdhil.buses.Bus`, whose module must not import a library of the bus, because
+    ``--help`` shows the options of every bus.
 
     ``loggers``: loggers of these libraries. tdhil reports their errors itself.
     """
@@ -51,7 +52,7 @@ EXCITATIONS: dict[str, RegistryEntry] = {
     "coast-down": RegistryEntry("tdhil.runner.excitation.pulses:COAST_DOWN",
                         "coasting down without torque, then driven back up; never with a string"),
 }
-"""Excitations of stage 5; each a `tdhil.runner.excitation.ExcitationKind`."""
+"""Excitations of stage 5. Each is a `tdhil.runner.excitation.ExcitationKind`."""
 
 DEFAULT_EXCITATION = "multisine"
 
@@ -70,13 +71,13 @@ BUSES: dict[str, BusEntry] = {
     "modbus": BusEntry("tdhil.buses.modbus:MODBUS", "Modbus TCP or RTU"),
     "ethercat": BusEntry("tdhil.buses.ethercat:ETHERCAT", "EtherCAT, CiA 402 (CoE)"),
 }
-"""Buses of a drive. The schema of the profiles of a bus is in the list of `profiles.library`, below all our lists."""
+"""Buses of a drive. `profiles.library`, which does not depend on tdhil, lists the schema of each bus's profiles."""
 
 DEFAULT_BUS = "canopen"
 
 
 def load(registry: Mapping[str, RegistryEntry], name: str) -> Any:
-    """Import the object of a name. Raises KeyError for an unknown name."""
+    """Return the object of a name. Raises KeyError for an unknown name."""
     return imported(registry[name].at)
 
 
@@ -87,7 +88,7 @@ def imported(at: str) -> Any:
 
 
 def names(registry: Mapping[str, RegistryEntry], *, periodic: bool = False) -> list[str]:
-    """Return the names in their order; with ``periodic`` only the periodic excitations."""
+    """Return the names in their order; with ``periodic``, only the periodic excitations."""
     return [name for name, entry in registry.items() if entry.periodic or not periodic]
 
 

@@ -1,4 +1,4 @@
-"""The value of an option, from the command line, else rig.yaml, else the default; and its source."""
+"""Resolution of an option: its value from the command line, else rig.yaml, else the default; and its source."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,14 +14,14 @@ from tdhil.errors import MessageCode, UsageError
 def resolve(cli_values: Mapping[str, Any], rig: Rig | None) -> RunOptions:
     """Return every option of `RunOptions`; None or absent in ``cli_values`` (keyed by option name) means not given.
 
-    A flag that is not given must be None or absent too, not False: rig.yaml could not set it otherwise.
-    Raises UsageError with every flag whose value rig.yaml would not accept either.
+    A flag that is not given must also be None or absent, not False, so that rig.yaml can set it. Raises UsageError with
+    every flag whose value rig.yaml would not accept.
     """
     given = {option.name: cli_values[option.name] for option in RESOLVED if cli_values.get(option.name) is not None}
     given |= {option.name: tuple(given[option.name]) for option in RESOLVED if option.joined and option.name in given}
     for one, other in (CLOCKS, CLOCKS[::-1]):
         if given.get(one) and other not in given:
-            given[other] = False           # a clock on the command line overrides rig.yaml's
+            given[other] = False           # a clock on the command line overrides that of rig.yaml
     _check(given)
     settings = {option.name: _setting(option, given, cli_values, rig) for option in RESOLVED}
     return RunOptions.of(settings)
@@ -66,7 +66,7 @@ def _check(given: Mapping[str, Any]) -> None:
 
 
 def wrong_values(given: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return every value that rig.yaml would not accept either, as name of the option and message."""
+    """Return every value that rig.yaml would not accept, as name of the option and message."""
     data, flags = _as_in_rig({name: tuple(one) if isinstance(one, list) else one for name, one in given.items()})
     name_of = {option.flag: option.name for option in RESOLVED}
     try:
@@ -77,7 +77,7 @@ def wrong_values(given: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _as_in_rig(given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[tuple[str | int, ...], str]]:
-    """Return the values at their places in rig.yaml, and the flag of each place."""
+    """Return the values at their places in rig.yaml, and the flag for each place."""
     data: dict[str, Any] = {}
     flags: dict[tuple[str | int, ...], str] = {}
     for option in RESOLVED:

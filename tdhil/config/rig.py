@@ -1,7 +1,7 @@
-"""One bench: drive, bus, gear, load, machine limits, and the usual options of a run.
+"""Bench: drive, bus, gear, load, machine limits, and the usual options of a run.
 
 `Rig` mirrors rig.yaml key by key. The names contain the units, all of them SI. Torque and speed refer to the motor
-shaft. It is frozen, and holds the file and line of each key::
+shaft. It is frozen, and has the file and line of each key::
 
     drive: canopen
     bus: {interface: socketcan, channel: can0, bitrate: 500000}
@@ -47,13 +47,13 @@ from tdhil.config.registry import BUSES, RegistryEntry, imported, names
 
 
 def _within(low: float, high: float, *, zero: bool = False) -> Any:
-    """Return a field with the range of real machines. A value beyond it is a typing error and could overflow."""
+    """Return a field with the range of real machines. A value outside is a typing error and could overflow."""
     return Field(ge=0.0 if zero else low, le=high)
 
 
 @dataclass(frozen=True, eq=False)
 class Registered:
-    """For pydantic: a name of a registry. Another name is refused with the list of all names, as for a Literal.
+    """Name in a registry, for pydantic. Another name is refused with the list of all names, as for a Literal.
 
     ``periodic``: only excitations with spectral lines.
     """
@@ -82,11 +82,11 @@ Inertia = Annotated[float, _within(1e-9, 1e9)]
 Ratio = Annotated[float, _within(1e-6, 1e6)]
 
 LONGEST_BRAKING_S = 90.0
-"""Longest braking from the highest speed, s. A stop is awaited for three times its ramp, at most five minutes."""
+"""Longest braking from the highest speed, s. The program waits for a stop for three times its ramp, at most 5 min."""
 
 
 class Limits(DataModel):
-    """The limits of the machine. The host watches them, and the drive where it can."""
+    """Limits of the machine. The host monitors them, and the drive too if possible."""
 
     speed_min_rad_s: Speed = Field(description="rad/s; lowest speed in torque mode")
     speed_max_rad_s: Annotated[float, _within(1e-6, 1e5)] = Field(description="rad/s; highest speed")
@@ -102,7 +102,7 @@ class Limits(DataModel):
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """Return an empty speed window, a probe torque above the limit, or a stop that takes too long."""
+        """Return errors: an empty speed window, a probe torque above the limit, or a stop that takes too long."""
         findings = []
         lowest, highest = values.get("speed_min_rad_s"), values.get("speed_max_rad_s")
         if lowest is not None and highest is not None and lowest >= highest:
@@ -118,12 +118,12 @@ class Limits(DataModel):
 
 
 def _load_of(value: Any) -> Any:
-    """Accept a single word as the kind."""
+    """Accept a single word as the kind of load."""
     return {"kind": value} if isinstance(value, str) else value
 
 
 class Load(DataModel):
-    """The load on the shaft. Given sizes of the pipe are used for the result; the kind alone is enough."""
+    """Load on the shaft. Stated sizes of the pipe are used for the result; the kind alone is enough."""
 
     kind: Literal["none", "string"] = Field(default="none", description="string: a drill string is on the shaft")
     length_m: Annotated[float, _within(1.0, 2e4)] | None = Field(
@@ -139,7 +139,7 @@ class Load(DataModel):
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """Return missing sizes, a pipe without a wall, or sizes without a string."""
+        """Return errors: missing sizes, a pipe without a wall, or sizes without a string."""
         sizes = ("length_m", "outer_diameter_m", "inner_diameter_m")
         given = [name for name in sizes if values.get(name) is not None]
         if values.get("kind") == "none" and given:
@@ -152,7 +152,7 @@ class Load(DataModel):
 
 
 class Gear(DataModel):
-    """The gear between motor and main shaft."""
+    """Gear between motor and main shaft."""
 
     ratio: Ratio = Field(default=1.0, description="i = ω_motor / ω_main; J at the main shaft is J·i²")
 
@@ -185,7 +185,7 @@ class DriveData(DataModel):
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """Return a standard deviation without its value."""
+        """Return errors: a standard deviation without its value."""
         return [
             (f"{name}_sd_s", f"needs {name}_s, the value that it is the deviation of")
             for name in ("speed_lag", "torque_lag")
@@ -217,12 +217,12 @@ _ONLY_THE_OPERATOR = dict(_only_the_operator())
 
 
 def attribute_of(key: str) -> str:
-    """Return the attribute of a key of rig.yaml. Pydantic has its own methods, such as ``json``."""
+    """Return the attribute of a key of rig.yaml; it differs if pydantic has a method of this name, such as ``json``."""
     return f"{key}_" if hasattr(BaseModel, key) else key
 
 
 def _with_options(section: str, base: type[DataModel]) -> Any:
-    """Return ``base`` with a field for each option of this section of rig.yaml; None: not given."""
+    """Return ``base`` with a field for each option of this section of rig.yaml; None means not given."""
     found: dict[str, Any] = {}
     for one in OPTIONS:
         at, _, key = one.at.rpartition(".")
@@ -245,13 +245,13 @@ def _annotation(one: Option) -> Any:
 
 
 class _RunSection(DataModel):
-    """The options of a run. None: the plan, or the default, applies."""
+    """Options of a run. None: the plan, or the default, applies."""
 
     never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """Return two clocks at once."""
+        """Return errors: two clocks at the same time."""
         first, second = CLOCKS
         both = values.get(first) and values.get(second)
         return [(second, f"and {first} exclude each other; keep one")] if both else []
@@ -266,7 +266,7 @@ else:
 
 
 class Service(DataModel):
-    """The rights of `tdhil serve` on this bench."""
+    """Rights of `tdhil serve` on this bench."""
 
     motion: Literal["never", "attended", "watched"] = Field(
         default="never",
@@ -275,7 +275,7 @@ class Service(DataModel):
 
 
 class Rig(_Options):
-    """The whole bench, without the sections of the buses (`rig_model`). Each key is optional until it is needed."""
+    """Bench, without the sections of the buses (`rig_model`). Each key is optional until it is needed."""
 
     never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
@@ -304,7 +304,7 @@ class Rig(_Options):
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """Return missing keys of a string, and limits that contradict other keys."""
+        """Return errors: missing keys of a string, and limits that contradict other keys."""
         asked = values.get("acceptance")
         wrong = list(_wrong_expectations(asked)) if isinstance(asked, Mapping) else []
         load = _load_of(values.get("load"))
@@ -326,17 +326,17 @@ class Rig(_Options):
         return findings + wrong
 
     def line(self, dotted: str) -> int:
-        """Return the line in rig.yaml of a key such as ``limits.torque_nm``; 0 if it is not there."""
+        """Return the line in rig.yaml of a key such as ``limits.torque_nm``; 0 if the key is missing."""
         return self._lines.get(tuple(dotted.split(".")), 0)
 
     def source(self, dotted: str) -> str:
-        """Return ``rig.yaml:7``, or '' if the key is not in the file."""
+        """Return the place of a key, such as ``rig.yaml:7``, or '' if the file does not have it."""
         line = self.line(dotted)
         return f"{Path(self._file).name}:{line}" if line else ""
 
     @property
     def conversions(self) -> tuple[tuple[str, str, str], ...]:
-        """Return (key, '100 rpm = 10.47 rad/s', 'rig.yaml:7') of every value that had a unit."""
+        """Conversions (key, '100 rpm = 10.47 rad/s', 'rig.yaml:7') of every value that had a unit."""
         keys = [".".join(map(str, one.path)) for one in self._conversions]
         return tuple((key, one.text, self.source(key)) for key, one in zip(keys, self._conversions, strict=True))
 
@@ -349,12 +349,12 @@ class Rig(_Options):
 
     @property
     def file(self) -> str:
-        """Return the file that it was read from; '' for none."""
+        """Path of the file; '' without one."""
         return self._file
 
     @property
     def folder(self) -> Path:
-        """Return the folder in which relative paths of rig.yaml start."""
+        """Folder in which relative paths of rig.yaml start."""
         return Path(self._file).parent
 
 
@@ -387,7 +387,7 @@ def load_rig(path: Path) -> Rig:
 
 
 def parse_rig(text: str, name: str) -> Rig:
-    """Return the bench of a text that is not in a file yet; ``name`` stands in the problems."""
+    """Return the bench of a text that is not in a file yet; problems state ``name`` as the file."""
     return _rig_of(parse_with_lines(text, name, rig_model(), convert=True))
 
 
@@ -434,7 +434,7 @@ _SIMULATED_TORQUE_SCALE_SD = 0.02
 
 
 def simulated_default_rig(rig: Rig | None = None) -> Rig:
-    """Return the bench of the simulated rig; ``rig`` overrides it. Raises DataFileError if they contradict."""
+    """Return the bench of the simulated rig, overridden by ``rig``. Raises DataFileError for a contradiction."""
     rig = rig or rig_model()()
     data = rig.model_dump(by_alias=True)
     data["limits"] = data["limits"] or _SIMULATED_LIMITS.model_dump()

@@ -1,4 +1,4 @@
-"""Recording in, Identification out; pure numpy and scipy, knows no drive and no file."""
+"""Identification of the inertia from a recording. Pure numpy and scipy; needs no drive and no file."""
 
 from tdhil.estimation.cross_checks import (
     AngleRatio as AngleRatio, angle_ratios as angle_ratios, mean_speed as mean_speed,

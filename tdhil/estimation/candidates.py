@@ -1,15 +1,16 @@
-"""The table of candidates: which models are tried for J, in which order, from what data, and what J's interval holds.
+"""The table of candidates: which models are tried for J, in which order, from what data, and what J's interval
+contains.
 
-The rule of selection stands in `walk`. A route goes through its rows in the order of the table. A row is tried where it
-applies to what stands so far, and its answer stands from then on. A row that ends the walk is the last. Each route
-gives its rows their two functions (`ModelTrial`); only the table knows the order.
+`walk` has the rule of selection. A route tries its rows in the order of the table. A row is tried if it applies to the
+result so far, and its result replaces that one. A row that ends the walk is the last. Each route gives its rows their
+two functions (`ModelTrial`); only the table knows the order.
 
-The rule of the interval: J's interval holds every value that some candidate allows which the data do not contradict.
-For one candidate these are the values over every structure of the reporting filters, joined with those of one-pole
-filters. ``interval`` states what a row adds. docs/decisions/0045 gives the reasons.
+The rule of the interval: J's interval contains every value of every candidate that the data do not contradict. For one
+candidate, these are the values for every structure of the reporting filters, and those for one-pole filters.
+``interval`` states what a row adds. docs/decisions/0045 gives the reasons.
 
 `python docs/made_pages.py` makes docs/reference/candidates.md from the table. `benchmarks/mutate_candidates.py` leaves
-out one row after another: the row's test must fail.
+out one row after another; the row's test must then fail.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,7 +20,9 @@ from typing import Generic, Protocol, TypeVar
 
 
 class FitRoute(StrEnum):
-    """The walks. ``LOAD`` is a walk within the row `LOAD_SWINGS` of ``LINES``, ``BAND`` within each of ``RECORD``."""
+    """Routes through the table. ``LOAD`` runs within the row `LOAD_SWINGS` of ``LINES``, ``BAND`` within each row of
+    ``RECORD``.
+    """
 
     LINES = "periodic excitation: spectral lines"
     LOAD = "a load that swings, from the same lines"
@@ -31,8 +34,8 @@ class FitRoute(StrEnum):
 class CandidateModel:
     """One row: ``model`` is fitted to ``data`` with the knowledge ``prior``.
 
-    ``tried``: where the row applies. ``stands``: when its answer replaces the one before. ``interval``: what J's
-    interval holds by this row. ``reason``: why the row exists. ``test``: the test that fails without the row.
+    ``tried``: when the row applies. ``stands``: when its answer replaces the previous result. ``interval``: what this
+    row adds to J's interval. ``reason``: why the row exists. ``test``: the test that fails without the row.
     """
 
     name: str
@@ -197,7 +200,9 @@ S = TypeVar("S", bound=WalkState)
 
 @dataclass(frozen=True)
 class ModelTrial(Generic[S]):
-    """The two functions of a row: whether it ``applies`` to what stands, and what stands after its ``fit``."""
+    """The two functions of a row: ``applies`` checks whether the row is tried, ``fit`` returns the state after its
+    fit.
+    """
 
     applies: Callable[[S], bool]
     fit: Callable[[S], S]
@@ -209,7 +214,7 @@ def rows(route: FitRoute) -> tuple[CandidateModel, ...]:
 
 
 def walk(route: FitRoute, trials: Mapping[str, ModelTrial[S]], standing: S) -> S:
-    """Return what stands after the rows of a route. Raises KeyError for a row without a trial."""
+    """Return the state after the rows of a route. Raises KeyError for a row without a trial."""
     for row in rows(route):
         trial = trials[row.name]
         if not standing.ended and trial.applies(standing):

@@ -1,4 +1,6 @@
-"""The case that identification works on, and the finding that a route brings back: what every verdict is made of."""
+"""The data that identification works on (`Case`), and the result of one route (`Finding`), from which the verdict is
+made.
+"""
 
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -32,10 +34,10 @@ def _no_samples() -> Samples:
 
 @dataclass(frozen=True)
 class Case:
-    """A recording, the options of its identification, and the results so far.
+    """Recording, options of its identification, and the results so far.
 
-    ``recording``: up to the ``aborted`` stage, if one was. ``levels``: of the excited segments; None without any.
-    ``sound``: the data passed their own checks, so a cross-check with them makes sense.
+    ``recording``: the data, up to the ``aborted`` stage if a stage was aborted. ``levels``: mean operating points of
+    the excited segments; None without any. ``sound``: the data passed their own checks, so cross-checks may use them.
     """
 
     recording: Recording
@@ -53,10 +55,10 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class PeriodicCase(Case):
-    """A case with periodic excitation: its whole periods, their lines, and B from the levels.
+    """Case with periodic excitation: its whole periods, their spectral lines, and B from the mean operating points.
 
-    ``every``: the lines pooled over the segments. ``lines``: those where both signals stand clear of the scatter;
-    ``usable``: where one of them does.
+    ``every``: the lines pooled over the segments. ``lines``: those where both signals are clear of the scatter;
+    ``usable``: those where at least one signal is.
     """
 
     levels: Levels
@@ -70,9 +72,10 @@ class PeriodicCase(Case):
 
 @dataclass(frozen=True)
 class ModelWords:
-    """A model in the reader's words, and what to do next: where the data contradict it, where its interval is wide.
+    """Words for a model, and the advice if the data contradict it or its interval is wide.
 
-    ``what`` ``explains`` the data; ``spread``: what is called too wide; ``digits``: of p where it is contradicted.
+    ``what`` and ``explains``: subject and verb of the sentence on the model. ``spread``: the quantity that is too wide.
+    ``digits``: digits of p in the message of a contradiction.
     """
 
     what: str = ""
@@ -95,16 +98,16 @@ _NONE, _WORDLESS = Refusal("", ""), ModelWords()
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one route for a case, in the same form for every route; `conclude` adds the verdict.
+    """Result of one route for a case, in the same form for every route. `conclude` adds the verdict.
 
-    ``inertia``: bounded estimate; None if the residuals contradict the model (which then gives nothing else), or if the
-    data do not determine it (``refusal``). ``conditions``: what J is conditional on besides the
-    torque scale. ``bent``: the model has friction that is no straight line over speed. ``samples_used``: None for the
-    case's own. ``preface`` and ``remark`` stand before and after the sentence on the model. ``reading_kg_m2``: by how
-    much more J may be off on either side for the moment at which torque is read; ``advice``: instead of the usual.
-    ``contradiction``: what else in the same run contradicts J beyond chance, so that J does not stand.
-    ``reject_p``: the p-value below which the residuals contradict the model. ``curve``: the model over frequency;
-    ``settled``: its lines without residual oscillation, () for the case's own.
+    ``inertia``: bounded estimate; None if the residuals contradict the model (no other value is then given), or if the
+    data do not determine J (``refusal``). ``conditions``: conditions of J besides the torque scale. ``bent``: the
+    friction of the model is nonlinear in speed. ``samples_used``: None for the number of the case. ``preface`` and
+    ``remark``: text before and after the sentence on the model. ``reading_kg_m2``: additional error of J, on either
+    side, due to the moment at which torque is read. ``advice``: replaces the usual advice. ``contradiction``: evidence
+    in the same run that contradicts J beyond chance; J is then not valid. ``reject_p``: the p-value below which the
+    residuals contradict the model. ``curve``: the model over frequency; ``settled``: lines without residual
+    oscillation; () for the lines of the case.
     """
 
     model: str = "none"
@@ -137,11 +140,13 @@ class Finding:
 
     @property
     def rejected(self) -> bool:
-        """Do the data contradict the model?"""
+        """True if the data contradict the model."""
         return rejects(self.residual, self.reject_p)
 
     def taken_back(self, contradiction: Refusal) -> "Finding":
-        """Return what is left where something else in the run contradicts J: no inertia, no figure that needs it."""
+        """Return the finding without an inertia, and without figures that need it, after another signal contradicted
+        J.
+        """
         return Finding(
             self.model, self.words, self.residual, lines=self.lines, samples_used=self.samples_used,
             warnings=self.warnings, contradiction=contradiction,
@@ -149,12 +154,12 @@ class Finding:
 
     @property
     def contradicted(self) -> str:
-        """The sentence on a model that the data contradict."""
+        """Sentence on a model that the data contradict."""
         p_value = "" if self.residual is None else f" (p = {self.residual.p_value:.{self.words.digits}g})"
         return f"the residuals contradict {self.words.what}{p_value}{self.remark}"
 
     @property
     def explained(self) -> str:
-        """The sentence on a model that stands."""
+        """Sentence on a model that the data do not contradict."""
         tested = ", untested" if self.residual is None else f" (p = {self.residual.p_value:.2g})"
         return f"{self.preface}{self.words.what} {self.words.explains}{tested}{self.remark}"

@@ -57,7 +57,9 @@ def conclude(case: Case, finding: Finding) -> Identification:
 
 
 def _inertia(case: Case, finding: Finding) -> InertiaEstimate | None:
-    """With the torque scale's uncertainty in quadrature, and what the reading of torque adds on either side."""
+    """Return the inertia with the torque scale's uncertainty in quadrature, and the uncertainty of the reading
+    moment added.
+    """
     if finding.inertia is None:
         return None
     conditions = ("torque scale exact", *finding.conditions)
@@ -77,7 +79,7 @@ def _inertia(case: Case, finding: Finding) -> InertiaEstimate | None:
 def _judged(
     options: Options, finding: Finding, inertia: InertiaEstimate | None
 ) -> tuple[Verdict, str, str, MessageCode]:
-    """The verdict, its reason and the advice, with their entry in the table of messages."""
+    """Return verdict, reason and advice, with their entry in the table of messages."""
     if finding.rejected:
         return Verdict.MODEL_REJECTED, finding.contradicted, finding.words.if_rejected, MessageCode.MODEL_REJECTED
     if finding.contradiction.reason:

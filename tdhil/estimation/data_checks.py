@@ -1,8 +1,8 @@
-"""Hopeless data, recognised before anything is fitted to them: each with what is wrong and what would mend it.
+"""Checks that refuse unusable data before any fit. Each refusal states the fault and the remedy.
 
-In the order of the questions: are these samples; can the excitation have been so, and was it sampled fast enough
-(`check_declared`); did anything move; did a limit shape it (`check_limited`)? What the lines help to tell (a wrong
-period, a wrong sign, a shaft that stood still) is asked later, in `excitation_checks`.
+The order: usable samples (`check_samples`); a possible excitation that was sampled fast enough (`check_declared`);
+motion; no limit that shaped the motion (`check_limited`). Checks that need the spectral lines (wrong period, wrong
+sign, standstill) follow in `excitation_checks`.
 """
 
 import math
@@ -17,29 +17,30 @@ from tdhil.estimation.samples import Samples, excited_window, usual_interval
 from tdhil.recording import Excitation, FloatArray, Recording, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Motion that a limit shaped: the drive's flag, the torque at its limit, and flat tops that no limit declares.
+# Motion shaped by a limit: the drive's flag, torque at its limit, and flat tops without a declared limit.
 #
-# A flat top is many samples at exactly the greatest (or least) value of a segment and few just below it. The crest of
-# a smooth wave, rounded to q, looks like that too. Of a sine of amplitude A, √(2q/A)/π is at the crest and 0.41 of it
-# one step below; of a crest as flat as x⁴, which a low-crest multisine may have, one step below is 0.19 of it, and a
-# tenth if the crest has a dip of just a step. Noise of the size of q thins the last step out to less than the one
-# before. So, where samples near the top wobble by noise, or leave it steeply, three times the share of the step below
-# is suspect; where they don't, twenty times. A top cut off by less than that is cut off by less than about a step, or
-# in the noise: it bends nothing. Nor does one that lasts for a sample or two each time: where there are few samples in
-# a period, at the same instants in each, the crest is as many times at one value as there are periods.
+# A flat top is many samples at exactly the greatest (or least) value of a segment, and few just below it. The crest of
+# a smooth wave, rounded to q, looks similar. For a sine of amplitude A, the share √(2q/A)/π is at the crest, and 0.41
+# of that one step below. For a crest as flat as x⁴, which a low-crest multisine may have, the ratio is 0.19. It is 0.1
+# if the crest has a dip of one step. Noise of the size of q makes the share at the extreme smaller than the share one
+# step below. Therefore two thresholds apply. If samples near the top scatter by noise, or leave the top steeply, three
+# times the share of the step below is suspect. Otherwise twenty times is suspect. A clipped top below these thresholds
+# loses less than about one step, or is within the noise, so its effect is negligible. The effect of a top that lasts
+# one or two samples each time is negligible too: with few samples in a period, at the same instants in each period, the
+# crest occurs at one value once a period.
 
 
-LIMIT_SHARE = 0.005       # of the excited samples that may be at a limit: they bend the line fit by about as much
-_AT_LIMIT = 0.98          # of the torque limit counts as at it
-_LEAST_FLAT = 5           # samples
+LIMIT_SHARE = 0.005       # largest share of excited samples at a limit; that share biases the line fit by about as much
+_AT_LIMIT = 0.98          # share of the torque limit that counts as at the limit
+_LEAST_FLAT = 5           # fewest samples of a flat top
 _NOISY_RATIO, _SMOOTH_RATIO = 3.0, 20.0
-_NOISY = 0.8              # steps of second difference on the mean, of the samples that are so many steps from the top:
-_NEAR = 4.5               # a slow crest's are a step or none
-_PILE = 0.01              # share at the extreme that is worth a look at all
-_LASTS = 3.0              # samples that it is there each time, on the mean, ...
-_APART = 5                # ... of times that lie more samples apart than these
-_STEP = 1.5               # steps below the extreme that are one step below
-_LOOKED_AT = 50_000       # of them at most
+_NOISY = 0.8              # steps; samples within _NEAR of the top are noisy if their mean second difference is larger
+_NEAR = 4.5               # steps from the top; on a slow crest the second difference is one step or none
+_PILE = 0.01              # share at the extreme below which nothing is checked
+_LASTS = 3.0              # least mean number of samples of one stay at the extreme
+_APART = 5                # samples; stays at the extreme with a larger distance are separate ones
+_STEP = 1.5               # steps below the extreme that count as one step below
+_LOOKED_AT = 50_000       # samples checked, at most
 _ADVICE = "use less amplitude, or more torque if the machine allows it"
 
 
@@ -82,7 +83,9 @@ def check_limited(
 
 
 def flat_share(signal: FloatArray, quantum: float) -> float | None:
-    """Share of the samples (N,) exactly at the greatest or least value, if a rounded wave can't explain it."""
+    """Return the share of the samples (N,) exactly at the greatest or least value; None if a rounded wave explains
+    it.
+    """
     if len(signal) < 8 * _LEAST_FLAT:
         return None
     found = [share for top in (float(np.max(signal)), float(np.min(signal)))
@@ -99,7 +102,7 @@ def _pile(signal: FloatArray, top: float, quantum: float) -> float | None:
     reach = float(np.ptp(signal))
     distance = np.abs(signal - top)
     rest = distance[distance > 1e-9 * reach]
-    # the step: declared, or as far as the next value that occurs; next to nothing for values that aren't rounded
+    # resolution: declared, or the distance to the next value that occurs (nearly 0 for values that are not rounded)
     step = max(quantum, float(np.min(rest)) if len(rest) else 0.0)
     below = int(np.count_nonzero(rest <= _STEP * step))
     near = np.flatnonzero((distance[1:-1] > 1e-9 * reach) & (distance[1:-1] <= _NEAR * step))[:_LOOKED_AT] + 1
@@ -109,21 +112,21 @@ def _pile(signal: FloatArray, top: float, quantum: float) -> float | None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What the excitation says of itself, held against the samples: can it have been so, and was it sampled fast enough?
+# Check of the declared excitation against the samples: is it possible, and was it sampled fast enough?
 #
-# The lines of a period are fitted side by side, so they must be different whole multiples of 1/period, and there must
-# be more samples in a period than there are unknowns. A line at or above half the sample rate is seen at another
-# frequency, and what is seen at a lower line may then be its image: nothing in such a record can be kept apart.
+# The lines of a period are fitted together. They must therefore be different whole multiples of 1/period, and a period
+# must have more samples than unknowns. A line at or above half the sample rate appears at another frequency (aliasing),
+# where it cannot be separated from a real line.
 
 
-_WHOLE = 2e-3             # of a line that it may be off a whole number of cycles a period
-_NYQUIST = 0.9            # of half the sample rate that lines may reach: the last tenth is too near to its image
-SAMPLED_SHARE = 0.5 * _NYQUIST    # of the sample rate: a line at or above it is refused
-_SECONDS_NOT = 100.0      # so much slower than the lines need: more likely the unit of time is wrong
+_WHOLE = 2e-3             # cycles a period by which a line may differ from a whole number
+_NYQUIST = 0.9            # line frequency over half the sample rate, at most: nearer to 1 a line is too near its image
+SAMPLED_SHARE = 0.5 * _NYQUIST    # line frequency / sample rate, from which a line is refused
+_SECONDS_NOT = 100.0      # sample interval over the need of the lines: beyond it a wrong unit of time is more likely
 
 
 def aliased(highest_hz: float, interval_s: float) -> bool:
-    """Return whether samples so far apart can't separate a spectral line from its image."""
+    """Return whether samples ``interval_s`` apart cannot separate a spectral line from its image."""
     return highest_hz * interval_s >= SAMPLED_SHARE
 
 
@@ -138,7 +141,9 @@ def too_few_a_period(lines: int, period_s: float, interval_s: float) -> bool:
 
 
 def check_declared(excitation: Excitation, samples: Samples) -> None:
-    """Raise Refused for segments that can't be, lie outside the record, or whose lines the sampling can't tell."""
+    """Raise Refused for impossible segments, segments outside the record, or lines that the sampling cannot
+    separate.
+    """
     for number, segment in enumerate(excitation.segments, start=1):
         _check_segment(segment, f"segment {number}")
     ordered = sorted(excitation.segments, key=lambda segment: segment.start_s)
@@ -205,12 +210,12 @@ def _check_rate(segment: Segment, part: Samples) -> None:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_LEAST_SAMPLES = 64       # fewer samples are no record
-_STALE_SHARE = 0.5        # of the samples that must bring something new
+_LEAST_SAMPLES = 64       # fewest samples of a record
+_STALE_SHARE = 0.5        # least share of fresh samples
 _LONGEST_S = 7.0 * 86400.0   # s; a week, the limit of a record
-_HUGE = 1e15            # rad/s or N·m: no machine; squares of it, and of its ratios, are still numbers
-_MOTIONLESS = 2.0       # steps of a signal within which it hasn't changed
-_TINY = 1e-12           # of a signal's size, or of its unit: below it is the arithmetic's own
+_HUGE = 1e15            # rad/s or N·m: no machine reaches it; squares of it, and of its ratios, can still be computed
+_MOTIONLESS = 2.0       # resolution steps within which a signal has not changed
+_TINY = 1e-12           # share of a signal's size, or of its unit, below which a change is rounding of the arithmetic
 
 
 def check_samples(recording: Recording) -> None:
@@ -261,7 +266,7 @@ def check_samples(recording: Recording) -> None:
 
 
 def _check_known(recording: Recording) -> None:
-    """Raise Refused for what the recording says besides its samples."""
+    """Raise Refused for invalid data of the recording other than its samples."""
     prior = recording.lag_prior
     lags = [lag for lag in (prior.speed_lag_s, prior.torque_lag_s) if lag is not None]
     sizes = (prior.speed_lag_sd_s, prior.torque_lag_sd_s, prior.skew_sd_s, recording.speed_resolution_rad_s,
@@ -275,7 +280,7 @@ def _check_known(recording: Recording) -> None:
 
 
 def check_motion(recording: Recording, excitation: Excitation, samples: Samples) -> None:
-    """Raise Refused for no motion, or motion that a limit shaped."""
+    """Raise Refused for no motion, or for motion that a limit shaped."""
     check_declared(excitation, samples)
     windows = [excited_window(segment) for segment in excitation.segments]
     parts = [(segment, part) for segment, window in zip(excitation.segments, windows, strict=True)
@@ -290,7 +295,7 @@ def check_motion(recording: Recording, excitation: Excitation, samples: Samples)
 
 
 def _moved(parts: list[FloatArray], quantum: float) -> bool:
-    """Did the signal leave the noise of its rounding, and of the arithmetic, within any one segment?"""
+    """Return whether a signal changed, within any one segment, by more than its rounding and that of the arithmetic."""
     for part in parts:
         high, low = float(np.max(part)), float(np.min(part))
         if high - low > max(_MOTIONLESS * quantum, _TINY * max(abs(high), abs(low), 1.0)):

@@ -1,6 +1,6 @@
-"""Checks of the spectral lines: a wrong period, a wrong sign, a shaft at rest, other motion than was declared.
+"""Checks of the spectral lines: wrong period, wrong sign, standstill, and motion that was not declared.
 
-The sign comes before the standstill: torque in the place of speed crosses zero too.
+The sign is checked before the standstill: if torque and speed are exchanged, the "speed" crosses zero too.
 """
 
 import numpy as np
@@ -14,22 +14,22 @@ from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine
 from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Signs and columns: does the torque do work on the shaft when it speeds up?
+# Signs and columns: does the torque do work on the shaft when the shaft accelerates?
 #
-# At a line T = G W, and a shaft with inertia has Im G > 0: torque leads speed. Lags turn G by less than a quarter
-# turn at the slow lines. Where Im G is negative at every clear line, the reported torque counts the other way round
-# (G is −G), or speed and torque stand in each other's place (G is 1/G). A drive's convention tells which: the mean
-# torque of a shaft that is driven against friction has the sign of its speed, if both were not exchanged. And where G
-# is the same real number at lines that are far apart, torque is a copy of speed: inertia and lags would have to
-# cancel exactly.
+# At a line T = G W, and a shaft with inertia has Im G > 0: torque leads speed. Lags turn G by less than a quarter turn
+# at the slow lines. If Im G is negative at every clear line, either the reported torque has the opposite sign (G is
+# −G), or speed and torque are exchanged (G is 1/G). The drive's convention distinguishes the two: the mean torque of a
+# shaft driven against friction has the sign of its speed, unless both signs were exchanged. If G is the same real
+# number at lines that are far apart, torque is a copy of speed: otherwise inertia and lags would have to cancel
+# exactly.
 
 
-_CLEAR_SIGN = 5.0      # sd by which Im(T W*) must be below zero at one line at least; at the others it must be below
-_COPY = 1e-3      # relative
+_CLEAR_SIGN = 5.0      # sd; Im(T W*) must be this far below zero at one line at least, and below zero at the others
+_COPY = 1e-3      # relative deviation below which T/W is the same at all lines
 
 
 def check_direction(lines: tuple[SpectralLine, ...], mean_speed: float, mean_torque: float) -> None:
-    """Raise Refused if at every one of the excited lines torque trails speed; means in rad/s and N·m."""
+    """Raise Refused if torque trails speed at every one of the excited lines; means in rad/s and N·m."""
     if not lines:
         return
     if _copied(lines):
@@ -40,7 +40,7 @@ def check_direction(lines: tuple[SpectralLine, ...], mean_speed: float, mean_tor
     clearest = 0.0
     for line in lines:
         cross = (line.torque * np.conj(line.speed)).imag
-        # what one period's scatter makes of it
+        # scatter of Im(T W*) over one period
         noise = np.sqrt((line.s_tt * np.abs(line.speed) ** 2 + line.s_ww * np.abs(line.torque) ** 2) / line.periods)
         if np.any(cross >= 0.0):
             return
@@ -70,20 +70,20 @@ def _copied(lines: tuple[SpectralLine, ...]) -> bool:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A shaft that stands still or turns back during the excitation: stick-slip, play, or a mean speed that is too low.
+# A shaft that stands still or reverses during the excitation: stick-slip, play, or a mean speed that is too low.
 #
-# At rest friction takes whatever value holds the shaft, and behind zero it changes its sign: neither is the straight
-# line that the levels and the lines are read with, and a jump of friction has lines of its own at the excited
+# At standstill friction takes whatever value holds the shaft, and it changes sign when the shaft reverses. Neither is
+# the straight line that the levels and the lines assume, and a jump of friction has lines of its own at the excited
 # frequencies.
 
 
-_NEAR_ZERO = 0.01       # of the speed's largest value counts as rest; at least so many of the signal's steps:
-_STEPS = 2.0              # quanta of the signal that count as near
-_LEAST_SHARE = 0.02     # of the samples
+_NEAR_ZERO = 0.01       # share of the largest speed that counts as standstill
+_STEPS = 2.0              # resolution steps that count as standstill, if these are more
+_LEAST_SHARE = 0.02     # least share of the samples at standstill for a refusal
 
 
 def check_standstill(parts: list[tuple[Segment, Samples]], quantum: float) -> None:
-    """Raise Refused if the speed was at zero, or behind it, for more than a share of a segment that turned."""
+    """Raise Refused if the speed was at or beyond zero for more than a share of a segment that turned."""
     for segment, part in parts:
         if len(part) == 0:
             continue
@@ -109,33 +109,32 @@ def check_standstill(parts: list[tuple[Segment, Samples]], quantum: float) -> No
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Does the motion repeat with the period that was declared?
+# Check of the period: does the motion repeat with the declared period?
 #
-# If the true period is longer by a share ε, a line of m cycles a period comes back late each time: its phase turns by
-# −2π m ε a period, at all lines and in all segments by the same ε. That is unlike noise, which turns nothing
-# steadily, and unlike a transient, which dies out. With R_k(ε) what is left of line k's scatter about its mean once
-# the turning has been taken out, on ν_k complex degrees of freedom and with the variance of every line unknown, twice
-# the log likelihood ratio
+# If the true period is longer by a share ε, a line of m cycles a period comes late in each period: its phase turns by
+# −2π m ε a period, with the same ε at all lines and in all segments. Noise does not turn steadily, and a transient dies
+# out. Let R_k(ε) be the scatter of line k about its mean after the turning is removed, with ν_k complex degrees of
+# freedom and an unknown variance of every line. Then twice the log likelihood ratio
 #
 #     Λ(ε) = Σ_k 2 ν_k ln(R_k(0)/R_k(ε))
 #
-# is about χ² of one degree for ε that isn't there. An inertia from lines at frequencies wrong by ε is wrong by ε, and
-# the turning counts as scatter besides.
+# is about χ² of one degree of freedom if the period is right. Frequencies wrong by ε make the inertia wrong by ε, and
+# the turning also counts as scatter.
 
 
-_CLEAR_TIMEBASE = 40.0           # of Λ
-_HARMLESS = 5e-4        # of the period: it makes J wrong by as much
+_CLEAR_TIMEBASE = 40.0           # least Λ for a refusal
+_HARMLESS = 5e-4        # share of the period: J is then wrong by the same share
 _WIDEST = 0.05            # largest ε that is searched
 _MOST_STEPS = 4001        # steps of this search, at most
-_STEPS_A_TURN = 32.0      # steps of ε for a turn of the fastest line over the segment
-_MOST_PERIODS = 64      # most periods used of a segment: enough to see a turning that matters
-_EQUAL = 1e-6           # of Λ: less is rounding
-_FLOOR = 1e-12          # relative: scatter that is the arithmetic's
-_CLEAR_LINE = 3.0       # a line that doesn't stand out of its turned scatter says nothing about turning
+_STEPS_A_TURN = 32.0      # steps of ε per turn of the fastest line over the segment
+_MOST_PERIODS = 64      # most periods used of a segment: enough to detect a relevant turning
+_EQUAL = 1e-6           # difference of Λ below which it is rounding
+_FLOOR = 1e-12          # relative scatter below which it is rounding of the arithmetic
+_CLEAR_LINE = 3.0       # power of the mean over that of the scatter, after turning: a weaker line is not used
 
 
 def check_period(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, ...]) -> None:
-    """Raise Refused, with the period that the data have, where it is another than was declared."""
+    """Raise Refused with the true period, if it differs from the declared one."""
     found = wrong_period(stretches, fits)
     if found is None or abs(found) <= _HARMLESS:
         return
@@ -149,7 +148,7 @@ def check_period(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, ...]) 
 
 
 def wrong_period(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, ...]) -> float | None:
-    """The share ε by which the true period is longer; None if the data don't show that it is."""
+    """Return the share ε by which the true period is longer; None if the data do not show one."""
     turning = []
     longest = 0.0
     for stretch, fit in zip(stretches, fits, strict=True):
@@ -162,12 +161,12 @@ def wrong_period(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, ...]) 
         longest = max(longest, float(np.ptp(number) * np.max(cycles)))
     if not turning:
         return None
-    # the likelihood's peak is as wide as half a turn over the whole segment: many steps to a turn
+    # the peak of the likelihood is as wide as half a turn over the whole segment, so a turn takes many steps
     step = max(1.0 / (_STEPS_A_TURN * longest), 2.0 * _WIDEST / (_MOST_STEPS - 1))
     reach = int(_WIDEST / step)
     trial: FloatArray = np.linspace(-reach * step, reach * step, 2 * reach + 1)
     coarse = _gain(turning, trial)
-    # An ε at which no line is clear gains nothing, and so does 0: of equals the smallest, whatever rounding makes of it
+    # Λ is the same at 0 and at every ε where no line is clear: of equal values take the smallest ε, despite rounding
     equal = trial[coarse >= np.max(coarse) - _EQUAL]
     best = float(equal[np.argmin(np.abs(equal))])
     fine: FloatArray = np.linspace(best - step, best + step, 81)
@@ -176,7 +175,7 @@ def wrong_period(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, ...]) 
 
 
 def _gain(turning: list[tuple[FloatArray, FloatArray, ComplexArray]], trial: FloatArray) -> FloatArray:
-    """Λ at every trial ε (E,); a line of the same frequency in two segments counts as two."""
+    """Return Λ at every trial ε (E,); a line of the same frequency in two segments counts twice."""
     gain = np.zeros(len(trial))
     for number, cycles, speeds in turning:
         for m, speed in zip(cycles, speeds.T, strict=True):
@@ -193,31 +192,31 @@ def _gain(turning: list[tuple[FloatArray, FloatArray, ComplexArray]], trial: Flo
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Undeclared motion: a strong line, in speed or torque, that is none of the excited ones.
+# Undeclared motion: a strong spectral line, in speed or torque, that is not an excited one.
 #
-# A limit cycle, a resonance that noise rings, ripple that sampling folds down, another machine, or other lines than
-# excitation.yaml says. It does not bias the declared lines by itself (within whole periods it is orthogonal to them,
-# or it turns from period to period and is scatter), but who reads the result should know, and a fold may lie
-# anywhere.
+# Causes: a limit cycle, a resonance that noise excites, aliased ripple, another machine, or lines that differ from
+# excitation.yaml. It does not bias the declared lines by itself: within whole periods it is orthogonal to them, or its
+# phase changes from period to period, so that it is scatter. The report states it nevertheless, because an aliased line
+# may be at any frequency.
 #
-# The signal is averaged in bins a twentieth of the fastest declared cycle long, less each period's mean and drift and
-# the segment's own mean lines; of the rest, the periodogram. Of noise, a bin is exponentially distributed about its
-# neighbourhood: forty times the median of the neighbours, at one in 10¹² bins.
+# The signal is averaged in bins of a twentieth of the fastest declared cycle, without each period's mean and drift and
+# without the segment's own mean lines. The rest gives the periodogram. For noise, a bin is exponentially distributed
+# about its neighbourhood, and exceeds forty times the median of the neighbours in one of 10¹² bins.
 
 
-_BINS_A_CYCLE = 20.0      # bins of a cycle of the fastest line
+_BINS_A_CYCLE = 20.0      # bins a cycle of the fastest line
 _MOST_BINS = 400_000      # bins in all, at most
-_NEIGHBOURS = 15          # to either side
-_FEWEST = 4               # of a side that count
-_CLEAR_UNDECLARED = 40.0             # times the neighbours' median
-_STRONG = 0.05            # of the strongest declared line's amplitude, above the declared lines
-_STRONG_AMONG = 0.15      # and among them, where the load wanders most
-_OWN = 2.0                # bins either side of a declared line that are its own
-_LOWEST = 1.0             # cycles a period: below it is wander
+_NEIGHBOURS = 15          # neighbours on either side
+_FEWEST = 4               # fewest neighbours of a side that count
+_CLEAR_UNDECLARED = 40.0             # power over the neighbours' median
+_STRONG = 0.05            # least amplitude over that of the strongest declared line, above the declared lines
+_STRONG_AMONG = 0.15      # the same ratio between the declared lines, where the load wanders most
+_OWN = 2.0                # bins on either side of a declared line that belong to that line
+_LOWEST = 1.0             # cycles a period: lower frequencies are wander
 
 
 def undeclared_warning(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, ...]) -> tuple[str, ...]:
-    """A sentence for each signal that has such a line, with the strongest of them."""
+    """Return a sentence for each signal that has an undeclared line, with the strongest of them."""
     said = []
     for name, unit in (("speed", "rad/s"), ("torque", "N·m")):
         found = [line for stretch, fit in zip(stretches, fits, strict=True)
@@ -234,7 +233,7 @@ def undeclared_warning(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, 
 
 
 def strongest_undeclared(stretch: Stretch, fit: PeriodLines, name: str) -> tuple[float, float, float] | None:
-    """Frequency in Hz, amplitude, and the strongest declared line's amplitude; None where nothing stands out."""
+    """Return frequency in Hz, amplitude, and amplitude of the strongest declared line; None if no line is clear."""
     if len(stretch.periods) < 2:
         return None
     lines = (fit.speed if name == "speed" else fit.torque).mean(axis=0)
@@ -273,7 +272,7 @@ def strongest_undeclared(stretch: Stretch, fit: PeriodLines, name: str) -> tuple
 
 
 def _bins(stretch: Stretch) -> int:
-    """A period's, no finer than the samples allow: two to a bin."""
+    """Return the number of bins of a period: at least two samples to a bin."""
     length = stretch.segment.period_s
     fewest = min(len(period) for period in stretch.periods)
     spans = max(stretch.index) - min(stretch.index) + 1
@@ -290,14 +289,16 @@ def _averaged(
     lines_hz: tuple[float, ...],
     lines: ComplexArray,
 ) -> tuple[FloatArray, BoolArray]:
-    """Means over the bins (bins,) less the lines there, 0 where there is no sample; and which bins have any."""
+    """Return the means over the bins (bins,) without the lines there, 0 for a bin without a sample; and which bins
+    have one.
+    """
     signal = period.speed_rad_s if name == "speed" else period.torque_nm
     edges = np.searchsorted(period.time_s, begin + width * np.arange(bins))
     counts = np.diff(np.append(edges, len(period)))
     full = counts > 0
     own = edges[full]
     value, when = np.zeros(bins), np.zeros(bins)
-    # whatever lies before the first edge (a sample a rounding early) belongs to the first bin
+    # samples before the first edge (a sample that is a rounding error early) belong to the first bin
     value[full] = np.add.reduceat(signal, own) / counts[full]
     when[full] = np.add.reduceat(period.time_s - start, own) / counts[full]
     turned = np.exp(2j * np.pi * np.multiply.outer(when[full], np.asarray(lines_hz)))
@@ -306,7 +307,9 @@ def _averaged(
 
 
 def _neighbourhood(power: FloatArray, at: int) -> float:
-    """Median of the bins on either side of one, its two nearest left out; the greater, for noise rises to low ones."""
+    """Return the median of the bins on one side of a bin, without its two nearest: the greater side, as noise rises
+    at low ones.
+    """
     low = power[max(at - 2 - _NEIGHBOURS, 1) : max(at - 2, 1)]
     high = power[at + 3 : at + 3 + _NEIGHBOURS]
     return max((float(np.median(side)) for side in (low, high) if len(side) >= _FEWEST), default=float("inf"))
@@ -315,7 +318,7 @@ def _neighbourhood(power: FloatArray, at: int) -> float:
 # ---------------------------------------------------------------------------------------------------------------------
 
 def check_lines(case: PeriodicCase) -> None:
-    """Raise Refused for what can't be so; of the pooled lines, those that stand clear tell the direction."""
+    """Raise Refused for impossible data. Of the pooled lines, the clear ones determine the direction."""
     check_period(case.stretches, case.fits)
     means = [(fit.speed_mean.mean(), fit.torque_mean.mean()) for fit in case.fits if len(fit.speed_mean)]
     if means:
@@ -328,5 +331,5 @@ def check_lines(case: PeriodicCase) -> None:
 def hints(
     recording: Recording, stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, ...], levels: Levels
 ) -> tuple[str, ...]:
-    """Warnings: what is wrong with the data but leaves a number that stands."""
+    """Return the warnings: faults of the data that do not invalidate the result."""
     return (*left_out_warnings(recording), *undeclared_warning(stretches, fits), *warming_warning(levels.warming))

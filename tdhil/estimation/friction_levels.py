@@ -1,16 +1,17 @@
-"""Friction from levels: mean torque at mean speeds, which no reporting lag can touch.
+"""Friction from mean torque at mean operating points (levels). Reporting lags do not change such means.
 
-Over any stretch of time, momentum balance says (means over the stretch, a = its net change of speed per second)
+Momentum balance over a stretch of time (means over the stretch, a = its net change of speed per second):
 
     T̄ = B ω̄ + T_c sgn ω̄ + J a − mean disturbance,
 
-whatever filters stand in the reports, since they pass a mean unchanged. With J a taken off, the error of one period is
-the mean disturbance in it, about independent from period to period; its scatter, pooled over the segments, gives every
-level's variance. B is then the slope of a weighted straight line, as a function of the J that is being sought:
-B(J) = slope − slope_per_inertia·J. The second term is small: the net change of speed nearly vanishes over a segment.
+This holds with any filters in the reports, because they do not change a mean. Without J a, the error of one period is
+its mean disturbance, nearly independent from period to period. Its scatter, pooled over the segments, gives the
+variance of every level. B is then the slope of a weighted straight line, as a function of the unknown J: B(J) = slope −
+slope_per_inertia·J. The second term is small: the net change of speed nearly vanishes over a segment.
 
-Levels are also times. Where the periods show that friction drifts at c N·m/s (`warming`), T̄ − c t̄ takes the place of T̄;
-a slope of the levels' times on their speeds, s, carries what is not known of c into B: var B += s² var c.
+The levels are measured at different times. If the periods show that friction drifts at c N·m/s (`warming`), T̄ − c t̄
+replaces T̄. With s, the slope of the levels' times over their speeds, the uncertainty of c adds to that of B: var B +=
+s² var c.
 """
 
 from collections.abc import Sequence
@@ -24,35 +25,37 @@ from tdhil.estimation.spectrum import PeriodLines
 from tdhil.recording import FloatArray, Level
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Friction that changes during the run: as bearings and oil warm up, or as the torque's zero wanders.
+# Friction that changes during the run, because bearings and oil warm up, or because the torque's zero drifts.
 #
-# The tie of B to the levels takes mean torque at two mean speeds for friction at two speeds. They are also torque at
-# two times: a friction that loses c N·m a second puts c D/Δω into B, with D the time between the levels, and from
-# there into J. Within a segment the speed stays the same on the mean, so that the trend of the periods' mean torque
-# tells c, free of every lag. With σ² the variance of one period's mean and t_p its time within the segment,
+# The constraint of B takes mean torque at two mean speeds as friction at two speeds. The torques are also measured at
+# two times. A friction that loses c N·m a second adds an error of c D/Δω to B, with D the time between the levels, and
+# from B to J. Within a segment the mean speed is constant, so the trend of the periods' mean torque gives c without any
+# effect of the lags. With σ² the variance of one period's mean and t_p its time within the segment,
 #
-#     ĉ = Σ (t_p − t̄) y_p / Σ (t_p − t̄)²,    sd(ĉ) = σ / √Σ (t_p − t̄)²,
-# with σ² from what is left once every segment has its own trend (a warming that slows down must not pass for scatter),
-# on Σ (P − 2) degrees of freedom.
+#     ĉ = Σ (t_p − t̄) y_p / Σ (t_p − t̄)²,    sd(ĉ) = σ / √Σ (t_p − t̄)².
 #
-# To allow for c always would make B two to three times less sure in runs that show no trend, to allow for it only
-# beyond a sharp limit would make it wrong just within. So a share w of ĉ is taken off, from none at 2 sd to all of it
-# at 4, and what a share leaves open goes into the variance: w² sd(ĉ)² + w (1 − w) ĉ², the mean square about w ĉ of a
-# mixture, of "no drift" and "ĉ ± sd". Below 2 sd nothing is changed: a drift that the run can't show is not allowed
-# for. Friction warms along an exponential: by the segments' own trends c_s it bends, and the straight line misses the
-# step between two segments by at most about a seventh of (c₁ − c₂) D for time constants down to half of D.
+# σ² is the scatter after each segment's own trend is removed, on Σ (P − 2) degrees of freedom: a warming that slows
+# down must not count as scatter.
+#
+# A correction in every run would make B two to three times less certain in runs without a trend. A correction only
+# beyond a sharp limit would make B wrong just below the limit. Therefore a share w of ĉ is subtracted: none at 2 sd,
+# all of it at 4 sd. The remaining uncertainty goes into the variance: w² sd(ĉ)² + w (1 − w) ĉ², the mean square about w
+# ĉ of a mixture of "no drift" and "ĉ ± sd". Below 2 sd nothing changes: a drift that the run cannot show is not
+# corrected. Friction warms along an exponential curve, so the segments' own trends c_s differ. For time constants down
+# to half of D, the straight line misses the step between two segments by at most about a seventh of (c₁ − c₂) D.
 
 
-_NONE, _ALL = 2.0, 4.0       # normal deviations of the trend at which none, and all, of it is believed
-_TOLD = 3.5                  # at which a warning is given
-_BEND = 0.15                 # of the trends' difference times the time between segments
+_NONE, _ALL = 2.0, 4.0       # normal deviations of the trend at which none, and all, of it is subtracted
+_TOLD = 3.5                  # normal deviations of the trend from which a warning is given
+_BEND = 0.15                 # error of the straight line over (difference of the trends × time between segments)
 
 
 @dataclass(frozen=True)
 class FrictionDrift:
-    """Trend of friction: ``rate`` (N·m/s) as believed, its ``variance``, ``own`` (S,) per segment as believed.
+    """Trend of friction: ``rate`` (N·m/s) as corrected, its ``variance``, ``own`` (S,) corrected rate of each segment.
 
-    ``bend`` (N·m/s): sd of what the segments' different trends leave open; ``clear``: worth a warning.
+    ``bend`` (N·m/s): sd due to the different trends of the segments. ``clear``: the trend is large enough for a
+    warning.
     """
 
     rate: float = 0.0
@@ -63,7 +66,9 @@ class FrictionDrift:
 
 
 def warming_of(times: list[FloatArray], torques: list[FloatArray]) -> FrictionDrift:
-    """Data of S segments' periods: middle (P,) in s and mean torque less J times its acceleration, (P,) N·m."""
+    """Return the drift. ``times``: middles of each segment's periods (P,), s. ``torques``: mean torque less J·dω/dt
+    (P,), N·m.
+    """
     none = FrictionDrift(own=(0.0,) * len(times))
     dof = sum(max(len(time) - 2, 0) for time in times)
     centred = [(time - time.mean(), torque - torque.mean()) for time, torque in zip(times, torques, strict=True)]
@@ -90,7 +95,7 @@ def warming_of(times: list[FloatArray], torques: list[FloatArray]) -> FrictionDr
 
 
 def warming_warning(warming: FrictionDrift) -> tuple[str, ...]:
-    """Return the warning about a trend; empty where there is no clear one."""
+    """Return the warning about a trend; empty without a clear one."""
     if not warming.clear:
         return ()
     how = "falls" if warming.rate < 0.0 else "rises"
@@ -102,7 +107,9 @@ def warming_warning(warming: FrictionDrift) -> tuple[str, ...]:
 
 
 def _deviations(trend: float, sd: float, dof: int) -> float:
-    """How many standard deviations of a normal distribution are as unlikely as this trend is by Student's t."""
+    """Return the standard deviations of a normal distribution with the same probability as this trend by Student's
+    t.
+    """
     from scipy.special import ndtri, stdtr
 
     if sd <= 0.0:
@@ -113,16 +120,16 @@ def _deviations(trend: float, sd: float, dof: int) -> float:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_LEAST_SPAN = 0.03    # mean speeds closer than this share of the speed tell no slope
+_LEAST_SPAN = 0.03    # least difference of mean speeds, as a share of the speed, for a slope
 
 
 @dataclass(frozen=True)
 class Levels:
     """N mean operating points: speed (rad/s), torque (N·m), net acceleration (rad/s²), duration (s); (N,) each.
 
-    ``density`` is the disturbance's mean square times duration, (N·m)²·s: the variance of a level is density/duration;
-    ``dof`` says how well the density is known. ``torque`` is as it would have been in the middle of the run, had
-    friction not drifted (``warming``); ``time`` (N,): the levels' middles, s.
+    ``density`` is the disturbance's mean square times duration, (N·m)²·s: the variance of a level is density/duration.
+    ``dof``: degrees of freedom of the density. ``torque`` is corrected for the drift of friction to the middle of the
+    run (``warming``); ``time`` (N,): the levels' middles, s.
     """
 
     speed: FloatArray
@@ -136,7 +143,7 @@ class Levels:
 
     @property
     def direction(self) -> float:
-        """Sign of rotation; Coulomb friction is taken as constant only where all levels share it."""
+        """Sign of rotation. Coulomb friction is constant only if all levels have the same sign."""
         return float(np.sign(np.mean(self.speed)))
 
     @property
@@ -161,7 +168,9 @@ def measure_levels(
     steady: tuple[Level, ...],
     rough_inertia: float,
 ) -> Levels:
-    """Levels of the segments; the protocol's steady stretches are added only if the segments share one mean speed."""
+    """Return the levels of the segments. The run's steady stretches are added only if the segments have one mean
+    speed.
+    """
     rows: list[tuple[float, ...]] = []
     errors: list[FloatArray] = []
     times: list[FloatArray] = []
@@ -182,7 +191,7 @@ def measure_levels(
     if warming.rate != 0.0:
         table[:, 1] -= warming.rate * (time - _mean(time, table[:, 3]))
     slope = _slope(table[:, 0], table[:, 1] - rough_inertia * table[:, 2], table[:, 3]) if _span_enough(rows) else 0.0
-    # a segment's own trend costs a degree of freedom where it is taken off its periods
+    # the trend of a segment costs one degree of freedom if it is subtracted from its periods
     costs = 1 + (warming.rate != 0.0)
     dof = float(sum(max(len(error) - costs, 0) for error in errors))
     scatter = 0.0
@@ -195,7 +204,7 @@ def measure_levels(
 
 
 def _warming(times: list[FloatArray], errors: list[FloatArray]) -> FrictionDrift:
-    """Return the drift of the segments that have periods; the others drift like the rest."""
+    """Return the drift from the segments that have periods; the other segments get the mean rate."""
     fixed = [number for number, error in enumerate(errors) if len(error)]
     found = warming_of([times[number] for number in fixed], [errors[number][:, 1] for number in fixed])
     own = dict(zip(fixed, found.own, strict=True))
@@ -222,7 +231,7 @@ def tie_viscous(levels: Levels) -> ViscousConstraint | None:
 
 
 def coulomb_level(levels: Levels, inertia: float, viscous: float, viscous_sd: float) -> tuple[float, float]:
-    """T_c (constant load included) along the rotation, N·m, and its standard deviation."""
+    """Return T_c along the rotation (constant load included) and its standard deviation, N·m."""
     weights = levels.weights
     speed = float(weights @ levels.speed)
     torque = float(weights @ (levels.torque - inertia * levels.drift))
@@ -231,12 +240,12 @@ def coulomb_level(levels: Levels, inertia: float, viscous: float, viscous_sd: fl
 
 
 def slope_over_speed(levels: Levels, values: FloatArray) -> float:
-    """Return the slope of ``values`` (N,) at the levels, weighted as their torques are for B."""
+    """Return the slope of ``values`` (N,) over the levels' speed, with the weights that B has for the torques."""
     return _slope(levels.speed, values, levels.duration)
 
 
 def _steady_row(samples: Samples) -> tuple[float, ...] | None:
-    """A level of the protocol: means, net acceleration, duration and middle of a stretch of steady speed."""
+    """Return a level from a stretch of steady speed: means, net acceleration, duration and middle."""
     if len(samples) < 16:
         return None
     time = samples.time_s

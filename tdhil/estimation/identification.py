@@ -1,8 +1,8 @@
-"""Recording in, Identification out: the order of the questions.
+"""Identification of a recording: the order of the checks and fits.
 
-1. Are these samples at all?  2. Was there motion that a limit did not shape?  3. Can these lines tell the inertia?
-4. Which inertia, with what interval?  5. Do the residuals allow the model?  The paper's method is computed wherever
-there are samples, and shown beside whatever comes out.
+1. Are the samples usable? 2. Was there motion, and did no limit shape it? 3. Do the lines determine the inertia? 4.
+Which inertia, with which interval? 5. Do the residuals allow the model? If there are samples, the result of the paper's
+method is reported too.
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ from tdhil.recording import Recording, aborted_stage, before_abort
 
 
 def identify(recording: Recording, options: Options | None = None) -> Identification:
-    """Identify the inertia. Pure: on one machine the same recording gives the same bits. Never raises: it refuses."""
+    """Identify the inertia. Never raises: it refuses. On one machine the same recording gives the same bits."""
     case = Case(before_abort(recording), options or Options(), aborted_stage(recording))
     try:
         case = torques_compared(_sampled(case))
@@ -40,7 +40,7 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
             case = recorded(case)
             finding = identify_record(case)
         else:
-            # a refusal shows what had been counted by then: so the case grows, step by step
+            # the case is built step by step, so that a refusal contains the counts so far
             case = periodic = measured(case, excitation)
             case = periodic = clear_lines(periodic)
             finding = identify_lines(periodic)
@@ -65,9 +65,10 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
 
 
 def _sampled(case: Case) -> Case:
-    """With samples, and what the paper's method makes of them: after settling, or of all where nothing was excited.
+    """Return the case with its samples and the result of the paper's method, after settling (all samples without
+    excitation).
 
-    Raises Refused for what are no samples.
+    Raises Refused for unusable samples.
     """
     check_samples(case.recording)
     samples = usable_samples(case.recording)

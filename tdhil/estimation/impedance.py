@@ -1,4 +1,4 @@
-"""The drive's own impedance, from a record in which its speed loop was moved by a known input.
+"""Impedance of the drive's own speed loop, from a recording in which a known input moved the loop.
 
 ::
 
@@ -6,24 +6,24 @@
                                                          E = H_t (P + I/s) G e^(−ds)   the speed reference u
     W = H_w ω      T = H_T (J s + B) ω e^(−ks)           reported speed and torque
 
-    H_t = 1/(1 + τ_t s) torque loop, F = 1/(1 + τ_f s) the speed that the loop sees, H_w and H_T the reports, G = 1 or
-    what is known of a reference filter; d how late a command acts, k torque read later than speed.
+H_t = 1/(1 + τ_t s): torque loop. F = 1/(1 + τ_f s): speed filter in the loop. H_w and H_T: filters of the reports. G:
+the known reference filter, 1 without one. d: delay of a command. k: time by which torque is read later than speed.
 
-**Why that is enough.** The string takes τ from a drive whose reference stands: −τ/ω = Z. A torque offset acts where
-the string does, but for H_t, so that Z comes out of W alone, whatever J is; T besides tells J s + B, and so how Z is
-made up. From the reference Z follows from the loop's own gains only, so that a smoothing of the reference
-would be taken for them: the fit looks for an undeclared filter, and refuses the result if it finds one.
+**Why these signals suffice.** The string loads a drive with constant reference by τ: −τ/ω = Z. A torque offset acts at
+the same place as the string, except for H_t. Z then follows from W alone, for any J. T also gives J s + B, and so the
+parts of Z. With an input at the reference, Z follows only from the gains of the loop, and smoothing of the reference
+would change them. The fit therefore searches for an undeclared filter, and refuses the result if it finds one.
 
-**Lines.** Under speed control what disturbs the shaft dies away, and the scatter from period to period is mostly what
-one period hands over to the next: it cancels in their mean, and would be counted as error. So all P counted periods are
-taken as one stretch. Excited lines stand at every P-th of its frequencies; those beside them, where nothing was
-commanded, have their noise: ν of them give its covariance.
+**Lines.** Under speed control a disturbance of the shaft decays. The scatter from period to period is mostly what one
+period passes to the next; it cancels in the mean, but would count as error. Therefore all P counted periods are one
+stretch. The excited lines are at every P-th of its frequencies. The lines beside them, where nothing was commanded,
+contain the same noise: ν of them give its covariance.
 
-**Likelihood.** The command is known exactly: it is rounded as it was sent, and held from sample to sample, which makes
-(1 − e^(−jωh))/(jωh) of its lines. Both reports' lines are Gaussian about the model. B is tied to the levels; stated
-lags, the skew and the delay d have priors. The weights being estimated, E S⁻¹ = ν/(ν − 2) Σ⁻¹, and an estimator
-weighted by them scatters more than the best by ν/(ν − 1): both are taken off the information, and Student's t has its
-degrees of freedom.
+**Likelihood.** The command is known exactly: it is rounded as it was sent, and held from sample to sample, which
+multiplies its lines by (1 − e^(−jωh))/(jωh). Both reports' lines are Gaussian about the model. B is tied to the levels;
+stated lags, the skew and the delay d have priors. The weights are estimates: E S⁻¹ = ν/(ν − 2) Σ⁻¹, and an estimator
+with these weights scatters more than the best one by ν/(ν − 1). The information is divided by both factors, and
+Student's t has its degrees of freedom.
 """
 
 from __future__ import annotations
@@ -53,23 +53,23 @@ REFERENCE: Final = "reference"
 _SIZE: Final = 11
 _LAG_BOUND_S, _INNER_BOUND_S, _DELAY_BOUND_S = 3.0, 0.5, 0.5
 _SIGNALS = 2                   # speed and torque
-_LEAST_PERIODS = 5             # in a row: the lines beside an excited one are then four at least
-_BESIDE = 5                    # of them on either side
+_LEAST_PERIODS = 5             # fewest periods in a row: an excited line then has at least four lines beside it
+_BESIDE = 5                    # most noise lines used on either side of an excited line
 _BLOCK = 8192                  # samples worked on at once
 _FLOOR = 1e-14                 # relative variance below which noise is rounding of the arithmetic
-_LEAST_LINES = 4          # lines that the fit needs
-_CLEAR = 9.0                   # |mean|² over its variance, of a line that answers
+_LEAST_LINES = 4          # fewest lines for the fit
+_CLEAR = 9.0                   # |mean|² over its variance, from which a line is clear
 _STARTS_S = ((0.40, 0.15), (0.05, 0.02), (0.1, 0.4))   # s; start values of the lags of speed and torque
 _OPEN = 0.5                    # relative half-width of P beyond which no value is given
-_AT_BOUND = 1e-6          # of a parameter's scale: nearer to its bound counts as on it
-_REFERENCE_GAIN = 10.83        # −2 ln L that a reference filter must be worth: one time in a thousand by chance
-_SMALL_FILTER_LOSS = 3.84      # −2 ln L by which the data contradict one of a given size: one time in twenty
+_AT_BOUND = 1e-6          # of a parameter's scale: a parameter nearer to its bound is at the bound
+_REFERENCE_GAIN = 10.83        # gain of −2 ln L from which a reference filter is real: probability 0.001 by chance
+_SMALL_FILTER_LOSS = 3.84      # rise of −2 ln L by which the data contradict a filter: probability 0.05 by chance
 _SMALL_FILTERS_S = tuple(0.01 * k for k in range(1, 16))
-_POINTS = 49                   # of the curve
+_POINTS = 49                   # points of the curve
 
 
 def measure_impedance(case: PeriodicCase) -> DriveImpedance:
-    """The finding. Never raises for what data can cause: it refuses."""
+    """Return the impedance. A problem in the data never raises an error; it gives a refusal."""
     asked = case.recording.impedance
     assert asked is not None
     problem = _problem(case, asked)
@@ -82,7 +82,7 @@ def measure_impedance(case: PeriodicCase) -> DriveImpedance:
 
 
 def refusal(asked: ImpedanceInput, reason: str, advice: str) -> DriveImpedance:
-    """Return a result without values, and the reason."""
+    """Return a result without values, with the reason."""
     return DriveImpedance(Verdict.NOT_IDENTIFIABLE, asked.by, reason, advice, asked.string_nm_s_rad)
 
 
@@ -90,28 +90,30 @@ _MORE: Final = "let it run for longer (--periods), or with more room in limits.t
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What was commanded: rounded as it was sent, line by line.
+# Spectral lines of the command (rounded as it was sent), and of the reports.
 
 
 @dataclass(frozen=True)
 class ImpedanceLine:
-    """One excited frequency: M segments' speed and torque, and the covariance of such a mean, of ``nu`` complex dof."""
+    """One excited line: speed and torque of M segments, and the covariance of one segment's mean with ``nu`` complex
+    dof.
+    """
 
     hertz: float
-    u: ComplexArray                # (M,) the command
+    u: ComplexArray                # (M,) command
     x: ComplexArray                # (M, 2)
     covariance: ComplexArray       # (2, 2)
     nu: float
 
     @property
     def answers(self) -> bool:
-        """Do speed and torque stand clear of their noise?"""
+        """True if speed and torque are both clear of their noise."""
         noise = np.diag(self.covariance).real
         return bool(np.all(np.abs(self.x) ** 2 > _CLEAR * noise[None, :]))
 
 
 def lines_of(case: PeriodicCase, asked: ImpedanceInput) -> tuple[ImpedanceLine, ...]:
-    """Return the lines of every segment's longest run of whole periods; () where one has too few."""
+    """Return the lines of the longest run of whole periods of every segment; () if a segment has too few periods."""
     pieces = []
     for stretch, fit_ in zip(case.stretches, case.fits, strict=True):
         run = _longest_run(stretch)
@@ -134,7 +136,7 @@ def lines_of(case: PeriodicCase, asked: ImpedanceInput) -> tuple[ImpedanceLine, 
 
 
 def _longest_run(stretch: Stretch) -> tuple[int, ...]:
-    """Numbers in ``stretch.periods`` of neighbours in time."""
+    """Return the positions in ``stretch.periods`` of the longest run of consecutive periods."""
     best: tuple[int, ...] = ()
     now: list[int] = []
     for number, index in enumerate(stretch.index):
@@ -149,9 +151,10 @@ def _longest_run(stretch: Stretch) -> tuple[int, ...]:
 def _spectrum(
     stretch: Stretch, run: tuple[int, ...], rounding: tuple[float, float]
 ) -> tuple[ComplexArray, tuple[ComplexArray, ...], FloatArray]:
-    """(K, 2) speed and torque of the excited lines; beside each of them (ν, 2); and what rounding repeats in either.
+    """Return speed and torque of the excited lines (K, 2), the lines beside each (ν, 2), and the repeating rounding
+    error.
 
-    By least squares on the actual time stamps, with a ramp, all lines side by side.
+    Least squares on the actual time stamps, for all lines and a ramp together.
     """
     segment = stretch.segment
     count = len(run)
@@ -189,7 +192,7 @@ def _spectrum(
 
 
 def commanded(stretch: Stretch, asked: ImpedanceInput) -> ComplexArray:
-    """(K,) lines of the command that stood in the first counted period, as the continuous signal that it was."""
+    """Return the lines (K,) of the command in the first counted period, as the held signal that was sent."""
     segment, period = stretch.segment, stretch.periods[0]
     time = period.time_s - segment.start_s
     omega = 2.0 * np.pi * np.asarray(segment.lines_hz)
@@ -222,7 +225,7 @@ class ImpedanceProblem:
     """K lines of M segments: ``x`` (K, M, 2) speed and torque, ``u`` (K, M) the command; ``white`` (K, 2, 2)."""
 
     by: str
-    declared_s: float              # of the reference filter
+    declared_s: float              # time constant of the reference filter
     s: ComplexArray
     u: ComplexArray
     x: ComplexArray
@@ -232,7 +235,7 @@ class ImpedanceProblem:
     priors: tuple[_Prior, ...]
 
     def model(self, theta: FloatArray) -> ComplexArray:
-        """(K, 2) speed and torque for one unit of the command."""
+        """Return speed and torque (K, 2) for one unit of the command."""
         s = self.s
         omega = excitation_of(self.by, theta, s, self.declared_s) / impedance_of(theta, s)
         speed = omega / (1.0 + theta[SPEED_REPORT] * s)
@@ -241,18 +244,18 @@ class ImpedanceProblem:
         return np.stack([speed, torque], axis=1)
 
     def errors(self, theta: FloatArray) -> ComplexArray:
-        """(K, M, 2) what the model leaves."""
+        """Return the residuals (K, M, 2) of speed and torque."""
         left: ComplexArray = self.x - self.model(theta)[:, None, :] * self.u[:, :, None]
         return left
 
     def residuals(self, theta: FloatArray) -> FloatArray:
-        """Return the residuals, of unit variance each: lines, then priors."""
+        """Return the residuals of the lines and then of the priors, each with unit variance."""
         whitened = math.sqrt(2.0) * np.einsum("kij,kmj->kmi", self.white, self.errors(theta))
         known = [(one.row @ theta - one.mean) / one.sd for one in self.priors]
         return np.concatenate([whitened.real.ravel(), whitened.imag.ravel(), np.asarray(known, dtype=np.float64)])
 
     def slopes(self, theta: FloatArray, scale: FloatArray) -> FloatArray:
-        """∂residuals/∂theta, by central differences."""
+        """Return ∂residuals/∂theta, by central differences."""
         return _slopes(self.residuals, theta, scale)
 
 
@@ -267,19 +270,19 @@ def _slopes(function: Callable[[FloatArray], FloatArray], theta: FloatArray, sca
 
 
 def control_law(theta: FloatArray, s: ComplexArray) -> ComplexArray:
-    """H_t (P + I/s)."""
+    """Return the control law H_t (P + I/s), N·m·s/rad."""
     found: ComplexArray = (theta[GAIN] + theta[INTEGRAL] / s) / (1.0 + theta[TORQUE_LAG] * s)
     return found
 
 
 def impedance_of(theta: FloatArray, s: ComplexArray) -> ComplexArray:
-    """Z."""
+    """Return the impedance Z, N·m·s/rad."""
     found: ComplexArray = theta[INERTIA] * s + theta[VISCOUS] + control_law(theta, s) / (1.0 + theta[SPEED_FILTER] * s)
     return found
 
 
 def excitation_of(by: str, theta: FloatArray, s: ComplexArray, declared_s: float) -> ComplexArray:
-    """E: the torque at the shaft for one unit of the command, were the shaft held."""
+    """Return E, the torque on a blocked shaft for one unit of the command."""
     late = np.exp(-theta[DELAY] * s)
     found: ComplexArray = late / (1.0 + theta[TORQUE_LAG] * s)
     if by == REFERENCE:
@@ -314,7 +317,9 @@ def _problem(case: PeriodicCase, asked: ImpedanceInput) -> ImpedanceProblem | Dr
 
 
 def _priors(case: PeriodicCase, asked: ImpedanceInput, period_s: float) -> tuple[_Prior, ...]:
-    """A command acts within a cycle or so of when its sample was taken; what else is known beforehand."""
+    """Return the prior knowledge: the delay of a command (about one cycle), the time offset, stated lags, and B from
+    levels.
+    """
     known = case.recording.lag_prior
     found = [_prior(DELAY, 0.25 * period_s, max(period_s, 1e-3)), _prior(SKEW, 0.0, max(known.skew_sd_s, 1e-4))]
     if known.speed_lag_s is not None:
@@ -337,12 +342,12 @@ def _prior(index: int, mean: float, sd: float) -> _Prior:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The fit: from some guesses at the reports' lags everything else follows by linear least squares.
+# Fit: for several start values of the reporting lags, the other start values follow by linear least squares.
 
 
 @dataclass(frozen=True)
 class FittedImpedance:
-    """The best theta, which parameters moved and came to rest inside their bounds, and −2 ln L up to a constant."""
+    """Best theta, the parameters that moved and ended inside their bounds, and −2 ln L up to a constant."""
 
     theta: FloatArray
     inside: BoolArray
@@ -351,7 +356,7 @@ class FittedImpedance:
 
 
 def fit(problem: ImpedanceProblem, *, with_filter: bool = False) -> FittedImpedance:
-    """``with_filter``: a first-order reference filter is fitted as well."""
+    """Return the best fit. ``with_filter``: also fit a first-order reference filter."""
     held = {REFERENCE_FILTER} if not with_filter or problem.by == OFFSET else set()
     stated = {int(np.argmax(one.row)): one.mean for one in problem.priors if np.count_nonzero(one.row) == 1}
     best: FittedImpedance | None = None
@@ -402,7 +407,7 @@ def _start(problem: ImpedanceProblem, speed_s: float, torque_s: float, delay_s: 
 
 
 def _real_fit(columns: Sequence[NDArray[np.complex128]], target: NDArray[np.complex128]) -> tuple[float, float]:
-    """Real a, b with a·first + b·second ≈ target, each equation relative to its size."""
+    """Return real a, b with a·first + b·second ≈ target, each equation relative to its size."""
     weight = 1.0 / np.maximum(np.abs(target), 1e-300).ravel()
     table = np.stack([(column.ravel() * weight) for column in columns], axis=1)
     right = target.ravel() * weight
@@ -412,13 +417,13 @@ def _real_fit(columns: Sequence[NDArray[np.complex128]], target: NDArray[np.comp
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Results: values with intervals by the quadratic approximation, and the residual test.
+# Results: values with intervals from the quadratic approximation, and the residual test.
 
 
 class _ThetaSpread:
-    """Covariance of theta, and the degrees of freedom of whatever is made of it.
+    """Covariance of theta, and the degrees of freedom of the values derived from it.
 
-    ``other``: a second fit that the data allow as well. Each interval then covers that of both.
+    ``other``: a second fit that the data also allow. Each interval then covers both.
     """
 
     def __init__(
@@ -442,7 +447,7 @@ class _ThetaSpread:
 
     def around(self, function: Callable[[FloatArray], FloatArray], extra_sd: FloatArray | None = None
                ) -> tuple[Estimate, ...]:
-        """Each of what ``function`` makes of theta, with its interval; ``extra_sd`` in quadrature."""
+        """Return each value of ``function`` of theta with its interval; ``extra_sd`` is added in quadrature."""
         value = function(self._fitted.theta)
         slopes = _slopes(function, self._fitted.theta, self._fitted.scale)[:, self._moved]
         found = []
@@ -464,7 +469,9 @@ class _ThetaSpread:
 
 
 def residual_test(problem: ImpedanceProblem, fitted: FittedImpedance) -> ResidualTest | None:
-    """Bartlett's form of Wilks' Λ line by line, (2ν + M − 2) ln det(1 + S⁻¹ Σ e eᴴ/ν) ~ χ²(4M), and the priors'."""
+    """Return Bartlett's form of Wilks' Λ, (2ν + M − 2) ln det(1 + S⁻¹ Σ e eᴴ/ν) ~ χ²(4M) a line, with the priors'
+    part.
+    """
     from scipy.special import chdtrc
 
     errors = problem.errors(fitted.theta)
@@ -539,9 +546,9 @@ def _not_below_zero(one: Estimate) -> Estimate:
 def _undeclared(
     problem: ImpedanceProblem, plain: FittedImpedance, confidence: float
 ) -> tuple[Estimate, bool] | None:
-    """Return the reference filter that the data want past chance, and whether it is in place of the declared one.
+    """Return the significant undeclared reference filter, and whether it replaces the declared one; None without one.
 
-    Else it is a further one. Of both the one that explains the data better is returned.
+    False: the filter is additional. Of the two alternatives, the one that explains the data better is returned.
     """
     found = []
     for instead in (False, True) if problem.declared_s > 0.0 else (False,):
@@ -557,9 +564,11 @@ def _undeclared(
 
 
 def _small_filter(problem: ImpedanceProblem, plain: FittedImpedance, confidence: float) -> _ThetaSpread | None:
-    """Return the fit with the largest undeclared reference filter that the data do not contradict; None: none.
+    """Return the fit with the largest undeclared reference filter that the data do not contradict; None if there is
+    none.
 
-    Such a filter moves P by more than P's own interval. By the torque offset no reference filter is in the way.
+    Such a filter changes P by more than P's own interval. With a torque offset as input, no reference filter has an
+    effect.
     """
     if problem.by == OFFSET:
         return None
@@ -576,7 +585,7 @@ def _small_filter(problem: ImpedanceProblem, plain: FittedImpedance, confidence:
 
 
 def _filter_words(declared_s: float, shows: Estimate, instead: bool) -> tuple[str, str]:
-    """(the filter that shows, the filter that was expected)."""
+    """Return the texts for the filter that the data show and for the expected one."""
     told = f"one of {shows.value:.3g} s ({shows.low:.3g} to {shows.high:.3g})"
     if declared_s <= 0.0:
         return told, "no reference filter"
@@ -617,13 +626,13 @@ def _points(
 
 
 def reflection(impedance: ComplexArray, string_nm_s_rad: float) -> FloatArray:
-    """|r| = |Z − ζ|/|Z + ζ|."""
+    """Return the reflection coefficient |r| = |Z − ζ|/|Z + ζ|."""
     found: FloatArray = np.abs((impedance - string_nm_s_rad) / (impedance + string_nm_s_rad))
     return found
 
 
 def _seen(problem: ImpedanceProblem, fitted: FittedImpedance) -> dict[float, tuple[float, float]]:
-    """Z that each line shows by itself: E u/ω, the reported speed without its lag."""
+    """Return Z (real, imaginary) from each line alone: E u/ω, with the lag of the reported speed removed."""
     theta, s = fitted.theta, problem.s
     driven = excitation_of(problem.by, theta, s, problem.declared_s) / (1.0 + theta[SPEED_REPORT] * s)
     speed = np.sum(problem.x[:, :, 0] * problem.u.conj(), axis=1)

@@ -1,13 +1,13 @@
 """The paper's method: T = J α + b by least squares (equations 7 and 16), in the form that reproduces its field slopes.
 
-α is the difference of the reported speed over 0.1 s, the torque is averaged over the same 0.1 s. With a sine of ω rad/s
-reported through lags τ_w and τ_T its slope tends to
+α is the difference of the reported speed over 0.1 s, the torque is averaged over the same 0.1 s. For a sine of ω rad/s,
+reported with the lags τ_w and τ_T, the slope tends to
 
     J (1 + ω² τ_w τ_T)/(1 + ω² τ_T²) + B (τ_w − τ_T)/(1 + ω² τ_T²),
 
-which is 107, 118, 137 and 186 kg·m² at 0.1, 0.3, 0.5 and 1 Hz for J = 104: it is shown, and never taken for J. At the
-raw rate (difference of neighbouring samples, torque of the later one) noise and rounding of the speed divide the slope
-by 1 + var(noise of α)/var(α): it depends on the sampling rate, and collapses.
+which is 107, 118, 137 and 186 kg·m² at 0.1, 0.3, 0.5 and 1 Hz for J = 104. The slope is reported, but is never used as
+J. At the raw rate (difference of neighbouring samples, torque of the later one) noise and rounding of the speed divide
+the slope by 1 + var(noise of α)/var(α): it depends on the sampling rate, and becomes far too small.
 """
 
 from collections.abc import Iterable, Iterator
@@ -19,7 +19,7 @@ from tdhil.estimation.samples import Samples
 from tdhil.recording import FloatArray
 
 STEP_S = 0.1              # s; interval of the acceleration (Xu 2026)
-_SHORTEST = 0.7     # of a step: a gap before the last sample may cut it
+_SHORTEST = 0.7     # shortest step, as a share of the interval: a gap before the last sample may shorten it
 _LONGEST = 1.5            # of this interval: a longer one has a gap
 _BLOCK = 65536      # samples worked on at once
 
@@ -27,13 +27,13 @@ Pairs = tuple[FloatArray, FloatArray]
 
 
 def paper_estimate(parts: tuple[Samples, ...]) -> PaperEstimate | None:
-    """Both fits over all parts together; None if the speed never changes or there are too few steps."""
+    """Return both fits over all parts together; None if the speed never changes or there are too few steps."""
     first, second = _fit_blocks(map(_steps, parts)), _fit_blocks(_raw(parts))
     return None if first is None or second is None else PaperEstimate(stepped=first, raw_rate=second)
 
 
 def _fit_blocks(blocks: Iterable[Pairs]) -> LineFit | None:
-    """`line_fit` over blocks of (α, torque), each seen once: moments about means, put together as Chan et al. do.
+    """Return `line_fit` over blocks of (α, torque), each read once. Moments about means are combined after Chan et al.
 
     With d the difference of two parts' means, the moments about the common one are those about their own plus
     d² n₁ n₂/(n₁ + n₂). R² is (Σ a t)²/(Σ a² Σ t²), which is 1 − Σ (t − slope a)²/Σ t² at the least-squares slope.
@@ -76,7 +76,9 @@ def line_fit(alpha: FloatArray, torque: FloatArray) -> LineFit | None:
 
 
 def _steps(part: Samples) -> Pairs:
-    """Adjoining steps of 0.1 s: from the sample nearest to each tenth to the next; trapezoidal mean of the torque."""
+    """Yield steps of 0.1 s, one after the other, from sample to nearest sample, with the trapezoidal mean of the
+    torque.
+    """
     time = part.time_s
     if len(time) < 3:
         return np.zeros(0), np.zeros(0)
@@ -92,7 +94,7 @@ def _steps(part: Samples) -> Pairs:
 
 
 def _impulse(part: Samples) -> FloatArray:
-    """Trapezoidal integral of the torque from the first sample to each, (N,), N·m·s; one array, nothing beside it."""
+    """Return the trapezoidal integral of the torque from the first sample to each, (N,), N·m·s, in a single array."""
     time, torque = part.time_s, part.torque_nm
     total = np.zeros(len(time))
     for first in range(0, len(time) - 1, _BLOCK):
@@ -103,7 +105,7 @@ def _impulse(part: Samples) -> FloatArray:
 
 
 def _raw(parts: tuple[Samples, ...]) -> Iterator[Pairs]:
-    """Backward difference of the speed, with the torque at the interval's end; a block at a time."""
+    """Yield, block by block, the backward difference of the speed with the torque at the end of the interval."""
     for part in parts:
         for first in range(0, len(part) - 1, _BLOCK):
             block = slice(first, first + _BLOCK + 1)

@@ -1,7 +1,7 @@
-"""Periodic excitation in, a finding out: the frequency domain's route.
+"""Route of the frequency domain: from periodic excitation to a finding.
 
-1. Which whole periods are there, with which lines, and what do the levels say of B?  2. Can they have been so, and do
-enough lines stand clear of the scatter?  3. Which candidate stands (`tdhil.estimation.candidates`)?
+1. Whole periods, their lines, and B from the mean operating points. 2. Checks of the lines: are they possible, and are
+enough of them clear of the scatter? 3. Selection of a candidate (`tdhil.estimation.candidates`).
 """
 
 import math
@@ -51,7 +51,7 @@ from tdhil.estimation.spectrum import PeriodLines, SpectralLine, period_lines, p
 from tdhil.recording import Excitation
 
 _ROUGH_REL_SD = 0.1       # relative standard uncertainty of the rough inertia as a prior
-_LEAST_NU = 2.0     # complex degrees of freedom of the weights; fewer and the interval means nothing
+_LEAST_NU = 2.0     # least complex degrees of freedom of the weights; with fewer the interval has no meaning
 _BEFORE_ECHO_HELPS = (
     "use --excitation prbs, which asks only for the time before an echo; or lift the bit off bottom, take weight off"
     " it, or excite with more amplitude or for longer"
@@ -63,7 +63,9 @@ _ONE_LINE = Refusal(
 
 
 def measured(case: Case, excitation: Excitation) -> PeriodicCase:
-    """The case with its whole periods, their lines, and B from the levels. Raises Refused without free motion."""
+    """Return the case with its whole periods, their lines, and B from the levels. Raises Refused without free
+    motion.
+    """
     recording, samples = case.recording, case.samples
     check_motion(recording, excitation, samples)
     cut = stretches(samples, excitation.segments)
@@ -91,7 +93,7 @@ def measured(case: Case, excitation: Excitation) -> PeriodicCase:
 
 
 def clear_lines(case: PeriodicCase) -> PeriodicCase:
-    """The case with the lines that stand clear of their scatter. Raises Refused where they can't tell the inertia."""
+    """Return the case with the lines clear of their scatter. Raises Refused if they do not determine the inertia."""
     if _before_echo(case):
         refuse_stick_slip(case)
     check_lines(case)
@@ -102,7 +104,7 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
             "let each mean speed run for four periods or more after settling",
             entry=MessageCode.TOO_FEW_PERIODS,
         )
-    if _before_echo(case):       # all or none, and the likelihood knows how sure each is
+    if _before_echo(case):       # before the echo all lines are used; the likelihood weights each by its uncertainty
         return replace(case, lines=every, usable=every, sound=True)
     lines = tuple(line for line in every if line.excited and line.nu >= _LEAST_NU)
     if not lines:
@@ -117,7 +119,9 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
 
 @dataclass(frozen=True)
 class _LineWalk:
-    """State of the walk over the rows of the lines. ``weak``: a line that is weak in one signal contradicted."""
+    """State of the walk over the rows of the lines. ``weak``: a line that is weak in one signal contradicted the
+    fit.
+    """
 
     case: PeriodicCase
     rigid: RigidResult | None = None
@@ -183,9 +187,10 @@ def _try_load(now: _LineWalk) -> _LineWalk:
 
 
 def _is_bent(now: _LineWalk) -> bool:
-    """Return whether straight friction is rejected, or hardly allowed.
+    """Return whether the data reject linear friction, or allow it only just.
 
-    A load that swings leaves residuals that a bend explains too, so in doubt it is tried only after the load.
+    An oscillating load leaves residuals that nonlinear friction explains too. In doubt, nonlinear friction is tried
+    only after the load.
     """
     finding = now.finding
     if not isinstance(finding, Finding) or now.rigid is None or not now.asked.lags:
@@ -208,20 +213,22 @@ _TRIALS: Mapping[str, ModelTrial[_LineWalk]] = {
 
 
 def _advised(finding: Finding | Refusal, case: PeriodicCase) -> Finding | Refusal:
-    """The finding; where a string drowned lines, a wide interval is answered with the motion before the echo."""
+    """Return the finding. If a string covered lines, the advice for a wide interval is the motion before the echo."""
     if isinstance(finding, Refusal) or not _drowned(case):
         return finding
     return replace(finding, words=replace(finding.words, if_wide=_BEFORE_ECHO_HELPS))
 
 
 def _before_echo(case: PeriodicCase) -> bool:
-    """Return whether the time before the echo is used; not where the requested shaft is no string."""
+    """Return whether the time before the echo is used; False if the requested shaft is not a string."""
     excitation = case.recording.excitation
     return excitation is not None and told_before_echo(excitation.kind) and shaft_model(case.options.model).piped
 
 
 def _too_few(case: PeriodicCase, what: str, advice: str) -> Refused:
-    """Return the refusal for too few clear lines; above a string with a known pipe it says what drowned the others."""
+    """Return the refusal for too few clear lines; with a string of known pipe it states the scatter due to the
+    string.
+    """
     if not _drowned(case):
         return Refused(what, advice, MessageCode.TOO_FEW_LINES)
     weak = [line for line in case.every if not line.excited]
@@ -235,12 +242,12 @@ def _too_few(case: PeriodicCase, what: str, advice: str) -> Refused:
 
 
 def _drowned(case: PeriodicCase) -> bool:
-    """Are there lines that a drill string drowned, whose pipe is known, so that another excitation would tell more?"""
+    """Return whether a string with a known pipe covers some lines, so that another excitation would determine more."""
     return case.recording.pipe is not None and any(not line.excited for line in case.every)
 
 
 def settled(case: PeriodicCase) -> PeriodicCase:
-    """The case without what a shaft that swings still does of its own (`transient`)."""
+    """Return the case without the residual oscillation of the shaft (`transient`)."""
     slope = case.constraint.slope if case.constraint is not None else 0.0
     every = settled_lines(case.fits, case.stretches, slope, case.levels.warming.own)
     usable = usable_lines(every, _LEAST_NU)
@@ -248,8 +255,8 @@ def settled(case: PeriodicCase) -> PeriodicCase:
 
 
 def _rigid(case: PeriodicCase, lines: tuple[SpectralLine, ...]) -> RigidResult | None:
-    """Fit a rigid shaft to the lines; None if the arithmetic breaks down, which only data can cause that passed
-    every test before. Raises Refused where the lines are too few.
+    """Return the rigid shaft fitted to the lines; None if the arithmetic fails, which data that passed every check
+    can still cause. Raises Refused for too few lines.
     """
     options, scale = case.options, case.recording.torque_scale_rel_sd
     priors, fixed = known_of(case.recording.lag_prior, len(lines), case.constraint)
@@ -266,7 +273,7 @@ def _rigid(case: PeriodicCase, lines: tuple[SpectralLine, ...]) -> RigidResult |
 
 
 def _tie(case: Case, levels: Levels, rough_inertia: float) -> ViscousConstraint | None:
-    """B from the levels; the less sure, the more the friction curve is bent: between two speeds it is a chord."""
+    """Return B from the levels. Curved friction makes it less certain, as a chord between two speeds."""
     constraint = tie_viscous(levels)
     if constraint is None:
         return None
@@ -276,7 +283,7 @@ def _tie(case: Case, levels: Levels, rough_inertia: float) -> ViscousConstraint 
 
 
 def _rough(fits: tuple[PeriodLines, ...]) -> float:
-    """|T|/(ω|W|) at the strongest line: the inertia's size, enough to correct the levels for drift."""
+    """Return |T|/(ω|W|) at the strongest line, kg·m²: a rough inertia, good enough to correct the levels for drift."""
     for fit in fits:
         if len(fit.speed):
             speed, torque = np.abs(fit.speed.mean(axis=0)), np.abs(fit.torque.mean(axis=0))
@@ -287,7 +294,7 @@ def _rough(fits: tuple[PeriodLines, ...]) -> float:
 
 
 def _warnings(cut: tuple[Stretch, ...]) -> tuple[str, ...]:
-    """Return warnings of missing periods, and of speeds where friction jumps."""
+    """Return warnings of missing periods, and of speeds at which friction jumps."""
     found = []
     for stretch in cut:
         segment = stretch.segment

@@ -1,4 +1,4 @@
-"""The conclusion of an identification: numbers with intervals, or the reason why there are none."""
+"""Result of an identification: numbers with intervals, or the reason why there are none."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ if TYPE_CHECKING:
 
 
 def normal_quantile(confidence: float) -> float:
-    """Half the width of the two-sided interval of a normal quantity with that confidence, in standard deviations."""
+    """Return the half-width of the two-sided interval of a normal quantity, in standard deviations."""
     return NormalDist().inv_cdf(0.5 + 0.5 * confidence)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What may be asked of identification.
+# Options of identification.
 
 
 @dataclass(frozen=True)
 class Options:
     """``confidence`` of every interval; ``tolerance``: relative half-width of J above which a result is `valid_wide`.
 
-    ``model``: rigid, two-mass and string take that shaft, with reporting lags; auto the simplest of these that the
-    data do not contradict; paper takes the paper's method at its word (no lags), and lets it stand only where the data
-    do not contradict that.
+    ``model``: rigid, two-mass and string select that shaft, with reporting lags. auto selects the simplest of these
+    that the data do not contradict. paper assumes no lags, as the paper's method does, and is valid only if the data do
+    not contradict this.
     """
 
     confidence: float = 0.95
     tolerance: float = 0.02
-    model: str = "auto"     # of `tdhil.config.registry.MODELS`
+    model: str = "auto"     # a name in `tdhil.config.registry.MODELS`
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.confidence < 1.0:
@@ -54,21 +54,21 @@ class Options:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_OPEN = 0.5     # half-width, of the value, beyond which an interval says nothing worth a number
+_OPEN = 0.5     # half-width over value, beyond which an interval is not reported as a number
 
 
 class Verdict(Enum):
     """Verdict on the inertia."""
 
-    VALID = "valid"                            # stands, within the tolerance
-    VALID_WIDE = "valid_wide"                  # stands, but the interval is wider than the tolerance
-    NOT_IDENTIFIABLE = "not_identifiable"      # the data can't tell; `reason` names what, `advice` the motion
+    VALID = "valid"                            # J stands, within the tolerance
+    VALID_WIDE = "valid_wide"                  # J stands, but the interval is wider than the tolerance
+    NOT_IDENTIFIABLE = "not_identifiable"      # the data do not determine J; `reason` and `advice` explain
     MODEL_REJECTED = "model_rejected"          # the data contradict every model tried
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its interval at the identification's confidence; infinite on a side that the data leave open."""
+    """Value with its interval at the confidence of the identification; infinite on a side that the data leave open."""
 
     value: float
     low: float
@@ -81,7 +81,7 @@ class Estimate:
 
     @property
     def bounded(self) -> bool:
-        """True if a positive value has an interval narrow enough to be reported."""
+        """True if the value is positive and its interval is narrow enough to be reported."""
         return self.finite and self.value > 0.0 and 0.5 * (self.high - self.low) <= _OPEN * self.value
 
 
@@ -104,7 +104,7 @@ class InertiaEstimate:
 
 @dataclass(frozen=True)
 class LineFit:
-    """T = inertia·α + intercept, by least squares (paper, equations 7 and 16)."""
+    """Line T = inertia·α + intercept, by least squares (paper, equations 7 and 16)."""
 
     inertia_kg_m2: float
     intercept_nm: float
@@ -113,7 +113,7 @@ class LineFit:
 
 @dataclass(frozen=True)
 class PaperEstimate:
-    """The paper's method: over 0.1 s steps, and at the raw rate."""
+    """Results of the paper's method: over 0.1 s steps, and at the raw rate."""
 
     stepped: LineFit
     raw_rate: LineFit
@@ -121,7 +121,7 @@ class PaperEstimate:
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """Weighted residual sum of squares against its expectation; ``p_value`` small = the model doesn't fit."""
+    """Weighted residual sum of squares against its expectation. A small ``p_value``: the model does not fit."""
 
     statistic: float
     degrees_of_freedom: float
@@ -133,20 +133,21 @@ DOUBT_P = 0.01
 
 
 def rejects(test: ResidualTest | None, least_p: float = REJECT_P) -> bool:
-    """Do the data contradict the model? Also where the statistic is no number."""
+    """Return whether the data contradict the model. True also if the statistic is not a number."""
     return test is not None and not test.p_value >= least_p
 
 
 def doubtful(test: ResidualTest | None) -> bool:
-    """Do the data only just allow the model, if at all?"""
+    """Return whether the data contradict the model, or allow it only just."""
     return rejects(test, DOUBT_P)
 
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """One source's share of J's uncertainty, kg·m²: the half-width that it alone leaves, at the result's confidence.
+    """Contribution of one source to the uncertainty of J, kg·m²: its half-width alone, at the result's confidence.
 
-    ``source``: noise, lag structure, lags, friction model, timing, torque scale. Lines add up in squares, about.
+    ``source``: noise, lag structure, lags, friction model, timing, torque scale. The contributions add in quadrature,
+    approximately.
     """
 
     source: str
@@ -156,11 +157,11 @@ class BudgetLine:
 
 @dataclass(frozen=True)
 class SecondOpinion:
-    """J by another route through the same run, with the interval that this route can vouch for.
+    """J from another route through the same run, with the interval of this route.
 
-    ``route``: speed change, coast-down, torque steps. ``agrees``: its interval and the result's overlap as two
-    independent ones of this confidence should; None where there is no result to agree with. ``least_scale_change``: the
-    least relative change of a signal's scale at stage 5 that would contradict J; None where that is not known.
+    ``route``: speed change, coast-down, torque steps. ``agrees``: its interval and that of the result overlap as two
+    independent intervals of this confidence should; None without a result to compare with. ``least_scale_change``:
+    smallest relative change of a signal's scale at stage 5 that would contradict J; None if unknown.
     """
 
     route: str
@@ -172,11 +173,10 @@ class SecondOpinion:
 
 @dataclass(frozen=True)
 class TorqueRatio:
-    """Reported torque over the ``reference``, commanded (in torque mode) or demanded torque (in speed mode).
+    """Ratio of reported torque to the ``reference``: commanded torque (torque mode) or demanded torque (speed mode).
 
-    ``surely``: half-width of the ratio's interval at a chance of 1 in 1000 to lie outside. Root mean squares are over
-    the samples that were compared. ``demanded_ratio``: demanded over commanded torque, where both are known and the
-    ratio is off; else None.
+    ``surely``: half-width of the ratio's 99.9 % interval. Root mean squares are over the compared samples.
+    ``demanded_ratio``: demanded over commanded torque if both are known and the ratio is wrong; else None.
     """
 
     reference: str
@@ -198,11 +198,11 @@ class FrictionPoint:
 
 @dataclass(frozen=True)
 class Compliant:
-    """A shaft that is not rigid: what turns behind the spring, kg·m², N·m/rad, N·m·s/rad, Hz.
+    """A shaft that is not rigid: the parameters behind the spring, kg·m², N·m/rad, N·m·s/rad, Hz.
 
-    ``total_inertia`` is J_r + J_L, known even if the data do not separate them, if only from one side: then it is as
-    wide as it is. A quantity that the data leave open is None. ``antiresonance_hz``: √(k/J_L)/2π, where the load swings
-    and torque hardly moves the motor; ``resonance_hz``: where little torque moves both much.
+    ``total_inertia`` is J_r + J_L. It is given even if the data do not separate the two, or bound it on one side only.
+    A quantity that the data leave open is None. ``antiresonance_hz``: √(k/J_L)/2π, where the load oscillates and torque
+    hardly moves the motor. ``resonance_hz``: where a small torque moves both strongly.
     """
 
     total_inertia: Estimate | None
@@ -215,10 +215,11 @@ class Compliant:
 
 @dataclass(frozen=True)
 class ImpedancePoint:
-    """The drive's impedance at one frequency, as its speed loop makes it: N·m·s/rad, real and imaginary part.
+    """Impedance of the drive with its speed loop at one frequency, N·m·s/rad, real and imaginary part.
 
-    ``reflection``: |r| = |Z − ζ|/|Z + ζ| if the torque scale is exact; ``reflection_total`` with what is open of that.
-    None where no ζ is known. ``measured``: what an excited line shows by itself, with the model's lags taken off.
+    ``reflection``: |r| = |Z − ζ|/|Z + ζ| if the torque scale is exact; ``reflection_total`` includes the uncertainty of
+    that scale. None if ζ is unknown. ``measured``: value from an excited line alone, with the lags of the model
+    removed.
     """
 
     hertz: float
@@ -233,35 +234,36 @@ class ImpedancePoint:
 class DriveImpedance:
     """Impedance of a drive's speed loop as seen by the load on its shaft, Z = J s + B + H(s)(P + I/s), at the motor.
 
-    H = 1/((1 + τ_t s)(1 + τ_f s)) are the lags inside the loop: of its torque, and of the speed that it sees;
-    ``inner_lag_s`` is their sum, which is known better than either. P and I are as the drive has them, in the scale of
-    its own torque. Estimates are None where the verdict is a refusal.
+    H = 1/((1 + τ_t s)(1 + τ_f s)) are the lags inside the loop: of its torque and of its speed feedback.
+    ``inner_lag_s`` is their sum, which is known better than either. P and I are those of the drive, in its own scale of
+    torque. Estimates are None if the verdict is a refusal.
     """
 
     verdict: Verdict
-    by: str                                    # offset, reference
+    by: str                                    # offset or reference
     reason: str
     advice: str
-    string_nm_s_rad: float                     # ζ at the motor; 0: none was known
+    string_nm_s_rad: float                     # ζ at the motor shaft; 0: unknown
     gain_nm_s_rad: Estimate | None = None      # P
     integral_nm_rad: Estimate | None = None    # I
     inner_lag_s: Estimate | None = None
     torque_lag_s: Estimate | None = None
     speed_filter_s: Estimate | None = None
-    inertia_kg_m2: Estimate | None = None      # as this measurement has it
+    inertia_kg_m2: Estimate | None = None      # from this measurement
     viscous_nm_s_rad: Estimate | None = None
-    reference_filter_s: Estimate | None = None     # of an undeclared reference filter, where one shows
+    reference_filter_s: Estimate | None = None     # time constant of an undeclared reference filter; None without one
     residual: ResidualTest | None = None
-    points: tuple[ImpedancePoint, ...] = ()    # rising frequency
+    points: tuple[ImpedancePoint, ...] = ()    # in order of frequency
     conditions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class LinePoint:
-    """One excited line: what torque over acceleration is at that frequency, and what the model makes of it.
+    """One excited line: apparent inertia and damping at that frequency, measured and by the model.
 
-    Apparent inertia is Im(T/ω)/2πf, the slope that a regression of torque on acceleration gives there, lags and all;
-    damping is Re(T/ω). ``residual_sd``: root mean square of what the model leaves, in standard deviations.
+    Apparent inertia is Im(T/ω)/2πf, the slope that a regression of torque on acceleration gives at this frequency, with
+    the effect of the lags. Damping is Re(T/ω). ``residual_sd``: root mean square of the residuals, in standard
+    deviations.
     """
 
     hertz: float
@@ -278,12 +280,13 @@ class LinePoint:
 
 @dataclass(frozen=True)
 class ResponseLine:
-    """One excited line. ``magnitude``: |ω/T|, rad/(s·N·m); ``phase_rad``: of ω/T, −π to π, its interval beyond.
+    """One excited line. ``magnitude``: |ω/T|, rad/(s·N·m). ``phase_rad``: phase of ω/T, −π to π; its interval may
+    exceed ±π.
 
     Apparent inertia is Im(T/ω)/2πf, kg·m². ``noise_rel`` and ``distortion_rel``: relative standard uncertainty of the
-    magnitude, and of the phase in rad, from either. The intervals contain the noise, and the distortion where it was
-    detected. ``fitted_magnitude`` and ``fitted_phase_rad``: of the model, None without one; ``residual_sd``: what the
-    model leaves, in standard deviations.
+    magnitude, and of the phase in rad, due to noise and to distortion. The intervals contain the noise, and the
+    distortion if it was detected. ``fitted_magnitude`` and ``fitted_phase_rad``: values of the model, None without one.
+    ``residual_sd``: residual of the model, in standard deviations.
     """
 
     hertz: float
@@ -301,10 +304,10 @@ class ResponseLine:
 
 @dataclass(frozen=True)
 class UnexcitedHarmonic:
-    """A harmonic that was not excited: the amplitude of T − Z W there, N·m, and the part of it that is noise.
+    """Harmonic that was not excited: amplitude of T − Z W there, N·m, and the part of it that is noise.
 
-    What an error of Z could explain is left out of the amplitude.
-    ``p_value``: how often noise alone would be as large.
+    The amplitude excludes the part that an error of Z can explain. ``p_value``: probability that noise alone is as
+    large.
     """
 
     hertz: float
@@ -318,9 +321,9 @@ class UnexcitedHarmonic:
 class DistortionTest:
     """Test for nonlinear distortion, ``detected`` at a p-value below 0.1 %.
 
-    ``p_value``: how often a linear shaft would show as much.
-    ``by_harmonics``, ``by_speed``: p-values of its two parts, None where that part was not possible; ``odd_share``: of
-    the distortion at unexcited harmonics, by power, None without any.
+    ``p_value``: probability of as much distortion with a linear shaft. ``by_harmonics``, ``by_speed``: p-values of its
+    two parts, None for a part that was not possible. ``odd_share``: share of odd harmonics in the power of the
+    distortion at unexcited harmonics, None without distortion.
     """
 
     detected: bool
@@ -333,7 +336,7 @@ class DistortionTest:
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """The fitted model at one frequency: |ω/T| and phase of ω/T, with its band."""
+    """Fitted model at one frequency: |ω/T| and phase of ω/T, with their band."""
 
     hertz: float
     magnitude: Estimate
@@ -343,9 +346,10 @@ class CurvePoint:
 
 @dataclass(frozen=True)
 class FrequencyResponse:
-    """G = ω/T at the excited lines, rising frequency, as speed and torque are reported, their lags included.
+    """Frequency response G = ω/T at the excited lines, in order of frequency, of the reported signals (lags included).
 
-    ``realisations``: of the phases, in this recording; ``mean_speeds_rad_s``: of its segments.
+    ``realisations``: number of different phase sets in this recording. ``mean_speeds_rad_s``: mean speeds of its
+    segments.
     """
 
     confidence: float
@@ -412,7 +416,7 @@ def unit_of(column: str) -> str:
 
 
 def response_columns(found: FrequencyResponse) -> dict[str, list[float]]:
-    """Return the lines as a table: column by name; a value that is not known is NaN."""
+    """Return the lines as a table: column by name; an unknown value is NaN."""
     rows = []
     for line, value in zip(found.lines, found.response.tolist(), strict=True):
         row: dict[str, Any] = {"hertz": line.hertz, "real_rad_s_nm": value.real, "imaginary_rad_s_nm": value.imag}
@@ -431,7 +435,7 @@ def response_columns(found: FrequencyResponse) -> dict[str, list[float]]:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why there can be no number, and what to do about it; a sentence each."""
+    """Reason why there is no number, and the advice; one sentence each."""
 
     reason: str
     advice: str
@@ -439,7 +443,7 @@ class Refusal:
 
 
 class Refused(Exception):
-    """Raised where an estimate can't be had. `identify` alone catches it, and makes it ``not_identifiable``."""
+    """Raised if a value cannot be estimated. Only `identify` catches it; the verdict is then ``not_identifiable``."""
 
     def __init__(self, reason: str, advice: str, entry: MessageCode = MessageCode.NOT_IDENTIFIABLE) -> None:
         super().__init__(reason)
@@ -448,12 +452,14 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Identification:
-    """The whole conclusion. Estimates are None where the verdict is a refusal or the quantity isn't in the model."""
+    """Result of an identification. Estimates are None if the verdict is a refusal or the model does not have the
+    quantity.
+    """
 
     verdict: Verdict
-    model: str                                  # paper, rigid+lags, two-mass, string, …; which one stands
+    model: str                                  # the selected model: paper, rigid+lags, two-mass, string,
     reason: str                                 # one sentence: why this verdict and this model
-    advice: str                                 # one sentence: what would make it better
+    advice: str                                 # one sentence: what would improve it
     inertia: InertiaEstimate | None
     viscous_nm_s_rad: Estimate | None
     coulomb_nm: Estimate | None                 # constant load included
@@ -467,10 +473,10 @@ class Identification:
     warnings: tuple[str, ...] = ()
     budget: tuple[BudgetLine, ...] = ()
     second_opinions: tuple[SecondOpinion, ...] = ()
-    friction_curve: tuple[FrictionPoint, ...] = ()      # rising speed; empty where fewer than three speeds were seen
-    compliant: Compliant | None = None                  # with the models two-mass and string; ``inertia`` is J_r then
-    impedance: DriveImpedance | None = None             # of a run that measured the drive's own
-    lines: tuple[LinePoint, ...] = ()                   # rising frequency; for the picture of the report
-    torque_ratios: tuple[TorqueRatio, ...] = ()         # of the signals of torque; empty where no setpoint is known
-    frequency_response: FrequencyResponse | None = None     # of a periodic excitation with two periods or more
+    friction_curve: tuple[FrictionPoint, ...] = ()      # in order of speed; empty with fewer than three speeds
+    compliant: Compliant | None = None                  # for the models two-mass and string; ``inertia`` is then J_r
+    impedance: DriveImpedance | None = None             # of a run that measured the drive's impedance
+    lines: tuple[LinePoint, ...] = ()                   # in order of frequency; for the figure of the report
+    torque_ratios: tuple[TorqueRatio, ...] = ()         # of each torque signal; empty without a known setpoint
+    frequency_response: FrequencyResponse | None = None     # of a periodic excitation with two or more periods
     entry: MessageCode = MessageCode.NOT_IDENTIFIABLE   # entry of verdict, reason and advice in the table of messages

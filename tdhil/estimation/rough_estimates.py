@@ -1,13 +1,13 @@
-"""A rough inertia from one change of speed, quick enough to be had while the shaft turns. It plans the excitation.
+"""Rough inertia from one change of speed, fast enough to plan the excitation while the shaft turns.
 
 Momentum balance from one steady level to the next, over the time between the levels' middles:
 
     J (ω_b − ω_a) = ∫ (T − T_c − B ω) dt.
 
-A reported signal that lags by τ has lost, in the integral from steady to steady, τ times its own change: T_rep loses
-τ_T (T_b − T_a) = τ_T B Δω, B ω_rep loses τ_w B Δω. So lags of any kind cost B (τ_w − τ_T) in J, some percent at the
-worst, where a regression of torque on acceleration would be wrong by their ratio. Noise averages out over the integral;
-what is left is the level's own scatter, which carries the friction through the ramp.
+In the integral from steady state to steady state, a reported signal with lag τ loses τ times its own change: T_rep
+loses τ_T (T_b − T_a) = τ_T B Δω, B ω_rep loses τ_w B Δω. Lags of any kind therefore change J by B (τ_w − τ_T), a few
+percent at most. A regression of torque on acceleration would be wrong by the ratio of the lags. Noise averages out in
+the integral. The remaining error is the scatter of the levels, which gives the friction during the ramp.
 """
 
 import math
@@ -18,24 +18,24 @@ import numpy as np
 
 from tdhil.recording import FloatArray, Level
 
-_LEAST_REL = 0.05       # unknown lags, friction that isn't a straight line
+_LEAST_REL = 0.05       # least relative uncertainty: unknown lags, nonlinear friction
 _MOST_REL = 0.9           # largest relative uncertainty: the inertia stays positive
-_BLOCK_S = 1.0          # means over a block are taken as independent
+_BLOCK_S = 1.0          # s; means over blocks of this length are taken as independent
 
 
 @dataclass(frozen=True)
 class RoughFriction:
-    """T = viscous·ω + coulomb at steady speed; the sd of a steady torque read off that line, N·m."""
+    """Friction T = viscous·ω + coulomb at steady speed, and the sd of a torque from this line, N·m."""
 
     viscous_nm_s_rad: float
     coulomb_nm: float
     level_sd_nm: float
 
     def opposing(self, speed_rad_s: float) -> "RoughFriction":
-        """The same torque at this speed, from parts that both oppose a forward rotation.
+        """Return friction with the same torque at this speed, whose two parts both oppose a forward rotation.
 
-        A line through friction that falls with speed, or through two levels that an oscillating string disturbs, has a
-        part that drives the shaft. Without it alone the other part would be too large.
+        A line through friction that falls with speed, or through two levels disturbed by an oscillating string, has a
+        part that drives the shaft. If only that part were removed, the other part would be too large.
         """
         torque_nm = max(0.0, self.coulomb_nm + self.viscous_nm_s_rad * speed_rad_s)
         if self.viscous_nm_s_rad < 0.0:
@@ -47,7 +47,7 @@ class RoughFriction:
 
 @dataclass(frozen=True)
 class RoughInertia:
-    """kg·m², with a generous relative uncertainty (about 2 sd), and the friction that it rests on."""
+    """Rough inertia, kg·m², with a generous relative uncertainty (about 2 sd), and the friction used for it."""
 
     inertia_kg_m2: float
     rel_error: float
@@ -57,7 +57,9 @@ class RoughInertia:
 def rough_friction(
     time_s: FloatArray, speed_rad_s: FloatArray, torque_nm: FloatArray, level_a: Level, level_b: Level
 ) -> RoughFriction | None:
-    """The line through two steady levels; through one (all Coulomb) if their speeds are alike. None without samples."""
+    """Return the line through two steady levels; Coulomb friction only if their speeds are similar. None without
+    samples.
+    """
     time = np.asarray(time_s, dtype=np.float64)
     means, deviations = [], []
     for level in (level_a, level_b):
@@ -82,11 +84,11 @@ def rough_inertia(
     friction: RoughFriction | None = None,
     swinging: bool = False,
 ) -> RoughInertia | None:
-    """Inertia from the change of speed between two levels, either way; (N,) arrays, time rising.
+    """Return the inertia from the change of speed between two levels, up or down; (N,) arrays, time rising.
 
-    ``friction`` from elsewhere (two levels of the speed stage) allows level_b to be not quite steady, as after a ramp
-    of torque; without it, it is taken from these two levels. ``swinging``: the levels' speeds are known by their means,
-    about which the shaft swings. None if there is no change of speed to go by.
+    With ``friction`` from two levels of the speed stage, level_b need not be quite steady, as after a ramp of torque.
+    Without ``friction``, it is computed from these two levels. ``swinging``: the shaft oscillates about the mean speeds
+    of the levels. Returns None without a change of speed.
     """
     own = friction or rough_friction(time_s, speed_rad_s, torque_nm, level_a, level_b)
     good = np.isfinite(speed_rad_s) & np.isfinite(torque_nm)
@@ -123,19 +125,19 @@ def rough_inertia(
     return RoughInertia(inertia, min(relative, _MOST_REL), own)
 
 
-_BEFORE_S = 1.0         # of a ramp: what flowed and turned
-_BEFORE_ECHO_ERROR = 0.3    # reports that lag by some 0.4 s, and what a ramp leaves to come
+_BEFORE_S = 1.0         # s; time before a ramp over which torque and speed are averaged
+_BEFORE_ECHO_ERROR = 0.3    # relative; reports with a lag of some 0.4 s, and the rest of the ramp
 
 
 def rough_inertia_before_echo(
     ramps: Sequence[tuple[FloatArray, FloatArray, FloatArray, float]], echo_s: float, impedance_nm_s_rad: float,
     friction: RoughFriction,
 ) -> RoughInertia | None:
-    """Estimate J of a motor above a drill string that is never at rest: from each ramp before its echo comes back.
+    """Estimate J of a motor above a drill string that is never at standstill, from each ramp before its echo returns.
 
-    ``ramps``: time, speed, torque, (N,) each, and when the ramp began. Until ``echo_s`` (2L/v) later the string is the
-    resistance ζ, ``impedance_nm_s_rad``, and J Δω = ∫ (T − T_0 − ζ (ω − ω_0)) dt. What the bit does adds noise, of
-    which the ramps' scatter tells. None without a ramp that tells anything.
+    ``ramps``: time, speed, torque, (N,) each, and the start of the ramp, s. Until ``echo_s`` (2L/v) later the string is
+    the resistance ζ, ``impedance_nm_s_rad``, and J Δω = ∫ (T − T_0 − ζ (ω − ω_0)) dt. The motion of the bit adds noise,
+    which the scatter of the ramps shows. None without a usable ramp.
     """
     found = []
     for time, speed, torque, start_s in ramps:
@@ -160,7 +162,9 @@ def rough_inertia_before_echo(
 
 
 def _sd_of_mean(time: FloatArray, torque: FloatArray) -> float:
-    """Return the standard deviation of a level's mean torque, from its block means (load disturbance is slow)."""
+    """Return the standard deviation of a level's mean torque, from its block means, because the load disturbance is
+    slow.
+    """
     blocks = int(min(8, max(2, (time[-1] - time[0]) // _BLOCK_S)))
     means = [float(np.mean(part)) for part in np.array_split(torque, blocks)]
     return float(np.std(means, ddof=1) / np.sqrt(blocks))

@@ -1,4 +1,4 @@
-"""The samples of a recording that identification may use, and the whole periods they make up."""
+"""Selection of the samples of a recording for identification, and their whole periods."""
 
 import math
 from dataclasses import dataclass
@@ -9,23 +9,23 @@ from profiles import CodedText, MessageCode
 from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Feedback that stuck while it was called fresh: the same value again and again where the motion says it must change.
+# Feedback that is frozen although it is marked as fresh: the same value repeats while the motion must change it.
 #
 # A smooth wave rounded to q rests on one value about its crests: x ≈ A − A ω² t²/2 stays within q for 2 √(2q/A)/ω. A
-# run of equal values several times as long as that, at the slowest line, and longer than a hole that a period may
-# have, is no wave. Two kinds of rest are other faults, reported elsewhere: at the extreme (clipped), and of the
-# speed at zero (the shaft stands still).
+# run of equal values is frozen if it is several times as long as that at the slowest line, and longer than a gap that a
+# period may have. Two kinds of constant value are other faults, reported elsewhere: at the extreme (clipped), and speed
+# at zero (standstill).
 
 
-_NATURAL = 3.0            # times as long as a rounded crest
-_SHARE_OF_CYCLE = 0.1     # of the fastest line's
+_NATURAL = 3.0            # times the duration of a rounded crest
+_SHARE_OF_CYCLE = 0.1     # share of the fastest line's cycle
 _LEAST_SAMPLES = 8
-_LOOKED_AT = 200_000      # samples, for the smallest step
+_LOOKED_AT = 200_000      # samples used to find the smallest step
 _PERIODIC = ("multisine", "sine")
 
 
 def frozen(recording: Recording) -> BoolArray | None:
-    """(N,) True where a sample repeats its stuck predecessor, within the excitation; None if there is none."""
+    """Return (N,) True where a sample repeats a frozen value within the excitation; None if there is none."""
     excitation = recording.excitation
     if excitation is None or excitation.kind not in _PERIODIC:
         return None
@@ -42,7 +42,7 @@ def frozen(recording: Recording) -> BoolArray | None:
 
 
 def _rests(recording: Recording, segment: Segment, first: int, last: int) -> list[tuple[int, int]]:
-    """Stretches [begin, end) of sample numbers in which a signal stands still for too long."""
+    """Return the stretches [begin, end) of sample numbers in which a signal is constant for too long."""
     time = recording.time_s[first:last]
     if last - first < 2 * _LEAST_SAMPLES:
         return []
@@ -70,7 +70,7 @@ def _rests(recording: Recording, segment: Segment, first: int, last: int) -> lis
 
 
 def _step(signal: FloatArray, quantum: float) -> float:
-    """The declared resolution, or the smallest step that occurs, whichever is coarser."""
+    """Return the declared resolution, or the smallest step in the data, whichever is coarser."""
     steps = np.abs(np.diff(signal[:_LOOKED_AT]))
     steps = steps[steps > 0.0]
     seen = float(np.min(steps)) if len(steps) else 0.0
@@ -78,7 +78,9 @@ def _step(signal: FloatArray, quantum: float) -> float:
 
 
 def _longest(signal: FloatArray, step: float, segment: Segment) -> float:
-    """How long this signal may rest on one value, s; infinite for one that has no amplitude to speak of."""
+    """Return the longest time that this signal may stay at one value, s; infinite if its amplitude is near its
+    resolution.
+    """
     amplitude = 0.5 * float(np.nanmax(signal) - np.nanmin(signal))
     if not (np.isfinite(amplitude) and amplitude > 2.0 * step):
         return float("inf")
@@ -87,8 +89,8 @@ def _longest(signal: FloatArray, step: float, segment: Segment) -> float:
 
 
 def _long_runs(time: FloatArray, signal: FloatArray, longest_s: float) -> list[tuple[int, int]]:
-    """Runs [begin, end) of equal values that last longer than ``longest_s`` and have some samples."""
-    ends = np.flatnonzero(signal[1:] != signal[:-1])      # the last sample of every run but the last
+    """Return the runs [begin, end) of equal values that last longer than ``longest_s`` and have enough samples."""
+    ends = np.flatnonzero(signal[1:] != signal[:-1])      # the last sample of every run except the last run
     first, last = (int(ends[0]), int(ends[-1])) if len(ends) else (len(signal) - 1, -1)
     between = [(int(ends[k]) + 1, int(ends[k + 1]) + 1) for k in np.flatnonzero(np.diff(ends) >= _LEAST_SAMPLES)]
     return [(begin, end) for begin, end in ((0, first + 1), *between, (last + 1, len(signal)))
@@ -96,21 +98,21 @@ def _long_runs(time: FloatArray, signal: FloatArray, longest_s: float) -> list[t
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Single samples that can't be: a value far from both its neighbours, on the same side. A bit that fell over, a frame
-# of another object, a pulse on the wire.
+# Spikes: single samples far from both neighbours, on the same side. Causes: a bit error, a frame of another object, an
+# impulse on the wire.
 #
-# The usual step from sample to sample is the mean |Δx|, noise and motion together. Of Gaussian noise a step of 25
-# times that doesn't occur, and motion doesn't go there and back within three samples.
+# The usual step from sample to sample is the mean |Δx|, of noise and motion together. Gaussian noise does not produce a
+# step of 25 times that, and motion does not go there and back within three samples.
 
 
-_FAR = 25.0       # usual steps
-_QUANTA = 6.0     # and at least so many of the signal's resolution: at rest the usual step may be next to nothing
-_MOST = 0.02      # of the samples: more are no spikes but another signal
+_FAR = 25.0       # times the usual step
+_QUANTA = 6.0     # times the resolution of the signal, at least: at standstill the usual step may be nearly 0
+_MOST = 0.02      # largest share of spikes: more of them are not spikes but another signal
 _BLOCK = 262144   # samples worked on at once
 
 
 def spikes(recording: Recording) -> BoolArray | None:
-    """(N,) True at a spike of speed or torque; None if there is none."""
+    """Return (N,) True at a spike of speed or torque; None if there is none."""
     found: BoolArray | None = None
     for signal, quantum in (
         (recording.speed_rad_s, recording.speed_resolution_rad_s),
@@ -129,7 +131,7 @@ def _of(signal: FloatArray, quantum: float) -> BoolArray | None:
     total, count = 0.0, 0
     for first in starts:
         part = np.asarray(signal[first : first + _BLOCK + 2], dtype=np.float64)
-        # of infinite neighbours the step is no number; they are left out, here as in the whole
+        # a step between infinite neighbours is not a number; both are left out, here and in the whole signal
         finite = np.isfinite(part)
         step = np.abs(np.diff(part[finite]))
         total, count = total + float(np.sum(step)), count + len(step)
@@ -154,11 +156,11 @@ def _of(signal: FloatArray, quantum: float) -> BoolArray | None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Samples that are no measurements although no flag says so, and the warnings about them.
+# Samples that are not measurements although no flag marks them, and the warnings about them.
 
 
 def good_samples(recording: Recording) -> BoolArray:
-    """(N,) True where a sample is fresh and finite, no spike, and doesn't repeat its stuck predecessor."""
+    """Return (N,) True where a sample is fresh, finite, not a spike and not frozen."""
     good: BoolArray = np.isfinite(recording.time_s)
     good &= recording.fresh
     good &= np.isfinite(recording.speed_rad_s)
@@ -181,7 +183,7 @@ def log_warnings(recording: Recording) -> tuple[str, ...]:
 
 
 def left_out_warnings(recording: Recording) -> tuple[str, ...]:
-    """A sentence for each kind of fault that samples were left out for; stale ones, which were flagged, apart."""
+    """Return a sentence for each kind of fault whose samples were left out, except stale ones, which have a flag."""
     said = []
     finite = np.isfinite(recording.speed_rad_s)
     finite &= np.isfinite(recording.torque_nm)
@@ -210,20 +212,20 @@ def _samples(count: int) -> str:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_LEAST_SHARE = 0.6        # of a period's samples that must be there
-_LONGEST_GAP = 0.1        # of the shortest cycle of the excitation
+_LEAST_SHARE = 0.6        # least share of a period's samples
+_LONGEST_GAP = 0.1        # longest gap, as a share of the shortest cycle of the excitation
 
 
 @dataclass(frozen=True)
 class Samples:
-    """N usable samples: fresh, finite; torque less its offset. (N,) each, time rising."""
+    """N usable samples: fresh and finite, torque without its offset; (N,) each, time rising."""
 
     time_s: FloatArray
     speed_rad_s: FloatArray
     torque_nm: FloatArray
 
     def between(self, start_s: float, end_s: float) -> "Samples":
-        """Samples with start ≤ time < end."""
+        """Return the samples with start ≤ time < end."""
         first, last = np.searchsorted(self.time_s, (start_s, end_s), side="left")
         return Samples(self.time_s[first:last], self.speed_rad_s[first:last], self.torque_nm[first:last])
 
@@ -233,7 +235,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Stretch:
-    """The usable whole periods of one segment, one Samples each; ``index`` (P,) counts from the segment's start."""
+    """Usable whole periods of one segment, one Samples each; ``index`` (P,) counts from the start of the segment."""
 
     segment: Segment
     periods: tuple[Samples, ...]
@@ -241,10 +243,9 @@ class Stretch:
 
 
 def usable_samples(recording: Recording) -> Samples:
-    """Drop what is stale, stuck, a spike or not a number, and subtract the torque that was reported at standstill.
+    """Return the samples without stale, frozen, spiked and non-finite ones, with torque less its offset at standstill.
 
-    Nothing is copied that need not be: where every sample is good, and no offset is known, these are the recording's
-    own arrays.
+    If every sample is good and no offset is known, these are the arrays of the recording, without a copy.
     """
     good = good_samples(recording)
     every = bool(np.all(good))
@@ -265,7 +266,7 @@ def excited_window(segment: Segment) -> tuple[float, float]:
 
 
 def stretches(samples: Samples, segments: tuple[Segment, ...]) -> tuple[Stretch, ...]:
-    """Cut every segment into whole periods; a period with holes in it is left out."""
+    """Return the whole periods of every segment; a period with gaps is left out."""
     found = []
     interval = usual_interval(samples.time_s)
     for segment in segments:
@@ -274,7 +275,7 @@ def stretches(samples: Samples, segments: tuple[Segment, ...]) -> tuple[Stretch,
         start, end = excited_window(segment)
         longest_gap = max(_LONGEST_GAP / max(segment.lines_hz), 3.0 * interval)
         last_time = float(samples.time_s[-1]) if len(samples) else start
-        # a record that ends a little early has a hole at its end, no longer than any other may be
+        # a recording may end a little early, by no more than the longest allowed gap
         end = min(end, last_time + longest_gap)
         whole = max(0, math.floor((end - start) / segment.period_s + 1e-6))
         kept, index = [], []
@@ -289,7 +290,7 @@ def stretches(samples: Samples, segments: tuple[Segment, ...]) -> tuple[Stretch,
 
 
 def usual_interval(time_s: FloatArray) -> float:
-    """Median time between samples (N,), s."""
+    """Return the median time between samples (N,), s."""
     return float(np.median(np.diff(time_s), overwrite_input=True)) if len(time_s) > 1 else math.inf
 
 
@@ -301,16 +302,16 @@ def _is_whole(period: Samples, begin_s: float, length_s: float, interval_s: floa
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A bit that sticks and slips: a swing that repeats, as large as the waves of a bit between rest and twice its speed.
+# Stick-slip of the bit: a repeating oscillation with a swing as large as that of a bit between 0 and twice its speed.
 
 
 STICK_SLIP_REGULAR = 0.6
-"""The least autocorrelation, after one period, of a swing that repeats."""
+"""Least autocorrelation, after one period, of a repeating oscillation."""
 
 STICK_SLIP_SHARE = 0.9
-"""Downhole swing over the mean speed, from which on a swing that repeats is stick-slip: a bit that stands still in each
-period swings by the mean speed or more. Simulated strings of 1,000 to 5,000 m with bit noise of 200 to 1,500 N·m: 1.04
-and more as computed here from 0.5 s means where the bit sticks. The rest is for the lag of the reported torque."""
+"""Downhole speed swing over mean speed, from which a repeating oscillation is stick-slip. A bit that stands still in
+each period swings by the mean speed or more. Simulated strings of 1,000 to 5,000 m with bit noise of 200 to 1,500
+N·m: 1.04 and more, computed from 0.5 s means, if the bit sticks. The margin is for the lag of the reported torque."""
 
 SHORTEST_SWING_S = 1.5    # s; shortest period of a string's oscillation
 
@@ -318,15 +319,17 @@ SHORTEST_SWING_S = 1.5    # s; shortest period of a string's oscillation
 def downhole_swing_rad_s(torque_swing_nm: float, impedance_nm_s_rad: float, delay_s: float, period_s: float) -> float:
     """Return the amplitude of the speed at the lower end of a pipe, from that of the torque at its upper end.
 
-    The upper end hardly moves. Then the wave that comes up and the one that was sent down add to
-    ω_b = −j sin(ΩT) τ/ζ at the lower end, T the pipe's travel time. Where ΩT is above π/2 the swing is not that of the
-    lowest mode, and its upper bound τ/ζ is returned.
+    The upper end hardly moves. The waves up and down then add to ω_b = −j sin(ΩT) τ/ζ at the lower end, T the pipe's
+    travel time. If ΩT is above π/2, the oscillation is not that of the lowest mode, and the upper bound τ/ζ is
+    returned.
     """
     return math.sin(min(2.0 * math.pi * delay_s / period_s, 0.5 * math.pi)) * torque_swing_nm / impedance_nm_s_rad
 
 
 def repeats(signal: FloatArray, step_s: float) -> tuple[float, float]:
-    """After what time it repeats, s, and how well: the first of the highest of the autocorrelation's peaks."""
+    """Return the time after which a signal repeats, s, and the autocorrelation there: the first of its highest
+    peaks.
+    """
     x = signal - signal.mean()
     count = len(x)
     alike = np.zeros(count // 2 + 1)

@@ -1,20 +1,21 @@
-r"""Torque that is sampled in step with a stepped setpoint, and what that may do to J.
+r"""Error of J if torque is sampled in step with a stepped setpoint.
 
-In speed mode the host's setpoint is a staircase, a step a cycle, and the drive answers each step with a surge of torque
-that dies away. Torque and speed are read once a cycle, always at the same moment after the step. What is read of the
-surges is then a sum where the shaft got the integral: for a steady acceleration, and so for any slow motion,
+In speed mode the setpoint of the host is a staircase with a step a cycle. The drive reacts to each step with a torque
+pulse that decays. Torque and speed are read once a cycle, always at the same moment after the step. The readings of the
+pulses then form a sum, while the shaft received the integral. For a steady acceleration, and for any slow motion,
 
     J_read/J = Σ_n T g(ε + n T),        ∫g dt = 1,
 
-T the cycle, ε the moment, g the answer of acceleration to a unit step of the setpoint (the impulse response of the
-speed's following H) as the torque report's lag leaves it. Nothing in the record tells: the reading is exactly that of a
-shaft with another inertia. It vanishes where a cycle is short beside the lags; at 10 Hz it is some percent. For J of
-stage 5 in speed mode ε is not known, so the worst one is taken, and the interval stretched by it.
+with the cycle T, the moment ε, and g, the response of acceleration to a unit step of the setpoint (the impulse response
+of the speed's following H), filtered by the lag of the torque report. Nothing in the recording shows this error: the
+readings are exactly those of a shaft with another inertia. It vanishes if a cycle is short compared with the lags; at
+10 Hz it is a few percent. For J of stage 5 in speed mode ε is unknown, so the interval is widened for the worst ε.
 
-In torque mode the shaft's answer to a step of torque is smooth, and what sampling does to torque is a delay, which is a
-parameter of the fit. A torque that stands for a cycle acts T/2 later in the mean than it was set; it is read ε after it
-was set. So the fit finds a skew of ε − T/2 (less the drive's own torque lag) between the reports, though both registers
-are of one moment. That skew tells ε, and with it what the ramps of the same run were read with in speed mode.
+In torque mode the response of the shaft to a step of torque is smooth. Sampling then acts as a delay of the torque,
+which is a parameter of the fit. A torque that is held for a cycle acts on average T/2 later than it was set; it is read
+ε after it was set. The fit therefore finds a time offset (skew) of ε − T/2, less the drive's own torque lag, between
+the reports, although both registers belong to one moment. This skew gives ε, and with it the error of the ramps of the
+same run in speed mode.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ from tdhil.estimation.case import Finding
 from tdhil.estimation.result import BudgetLine
 from tdhil.recording import FloatArray, Recording, SteppedSetpoint
 
-NEGLIGIBLE = 1e-3         # of J
-_FINE = 32                # steps of a cycle
+NEGLIGIBLE = 1e-3         # share of J
+_FINE = 32                # grid steps of a cycle
 _LONGEST_S = 40.0         # s; duration of the simulated response
-_MOST = 0.5               # of J: beyond it there is no number
+_MOST = 0.5               # share of J; a larger error gives no number
 
 
 def stretched(finding: Finding, recording: Recording) -> Finding:
-    """The finding with what stepping may do to J, where the recording says that the setpoint was stepped slowly."""
+    """Return the finding with the possible error of J, if the recording states a slowly stepped setpoint."""
     stepped, inertia = recording.stepped_setpoint, finding.inertia
     if stepped is None or inertia is None:
         return finding
@@ -62,27 +63,27 @@ def stretched(finding: Finding, recording: Recording) -> Finding:
 
 
 def worst_share(stepped: SteppedSetpoint, torque_lag_s: float) -> float:
-    """|J_read/J − 1| at the worst moment of reading, at most a half."""
+    """Return |J_read/J − 1| for the worst moment of reading, at most 0.5."""
     worst = float(np.max(np.abs(_shares(stepped, torque_lag_s))))
     return min(worst, _MOST) if math.isfinite(worst) else _MOST
 
 
 @lru_cache(maxsize=16)
 def _shares(stepped: SteppedSetpoint, torque_lag_s: float) -> FloatArray:
-    """(_FINE + 1,) J_read/J − 1 at the moments 0 to T after a step.
+    """Return J_read/J − 1 (_FINE + 1,) at the moments 0 to T after a step.
 
-    Kept: the momentum cross-check asks for the same loops several times.
+    The result is cached, because the momentum cross-check uses the same loops several times.
     """
     _, answer = _answer(stepped, torque_lag_s)
     sums = stepped.period_s * answer.reshape(-1, _FINE).sum(axis=0)
-    # Just before a step all is as at the step itself, but for the answer's own first moment.
+    # just before a step the sum is that at the step itself, without the first value of the response
     every: FloatArray = np.append(sums, sums[0] - stepped.period_s * answer[0]) - 1.0
     every.flags.writeable = False
     return every
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What reading in step adds to J, where the moment of reading is known by the skew.
+# Error of J from reading in step, if the skew shows the moment of reading.
 
 
 @dataclass(frozen=True)
@@ -96,12 +97,14 @@ class ReadingShare:
 EXACT_READING = ReadingShare(0.0, 0.0)
 
 _ONE_FRAME_SD_S = 0.002
-"""Registers of one reply are of one moment to within a task of the drive's: 1 to 4 ms in the profiles' manuals."""
+"""Standard deviation of the time between registers of one reply: one task of the drive, 1 to 4 ms in the profiles'
+manuals.
+"""
 
 
 @dataclass(frozen=True)
 class ReadMoment:
-    """Skew between the reports of torque and speed in torque mode, s, its standard deviation, and the torque's lag."""
+    """Skew between the reports of torque and speed in torque mode, its standard deviation, and the torque's lag; s."""
 
     skew_s: float
     skew_sd_s: float
@@ -111,10 +114,10 @@ class ReadMoment:
 def reading_share(
     loops: Sequence[SteppedSetpoint], moment: ReadMoment | None, torque_lag_s: float = 0.0
 ) -> ReadingShare:
-    """Over the moments of reading that the skew leaves open, and over ``loops``, which are alike likely.
+    """Return the share over the moments of reading that the skew allows, and over ``loops``, which are equally likely.
 
-    With no skew every moment of a cycle is alike likely: then the share is 0 in the mean. ``torque_lag_s``: of the
-    torque's report, where no ``moment`` has it.
+    Without a skew every moment of a cycle is equally likely, and the mean share is 0. ``torque_lag_s``: lag of the
+    torque report, used if ``moment`` is None.
     """
     lag_s = torque_lag_s if moment is None else moment.torque_lag_s
     shares, weights = [], []
@@ -131,9 +134,9 @@ def reading_share(
 
 
 def _likely(period_s: float, moment: ReadMoment) -> FloatArray:
-    """(_FINE,) How likely each part of a cycle is as the moment of reading. Their sum is 1.
+    """Return the probability (_FINE,) of each part of a cycle as the moment of reading. Their sum is 1.
 
-    A staircase that passes a lag τ and is read ε after its steps has the skew ε − T/2 − τ + T Σ e^(−(ε + nT)/τ), n ≥ 0.
+    A staircase with a lag τ, read ε after its steps, has the skew ε − T/2 − τ + T Σ e^(−(ε + nT)/τ), n ≥ 0.
     """
     at = (np.arange(_FINE) + 0.5) / _FINE * period_s
     skew = at - 0.5 * period_s
@@ -148,15 +151,15 @@ def _likely(period_s: float, moment: ReadMoment) -> FloatArray:
 
 
 _CROSSOVER_RAD_S = 5.0
-"""Bandwidth of a quick speed loop of a top drive, for a drive with an unknown loop: a quicker loop
-answers a step more sharply. Simulated drives of all profiles stay below half of what follows from it."""
+"""Bandwidth of a fast speed loop of a top drive, for a drive with an unknown loop. A faster loop reacts to a step
+more sharply. For simulated drives of all profiles the error is below half of the value from this bandwidth."""
 
 
-_SHARES_OF_CROSSOVER = (0.2, 0.4, 0.6, 0.8, 1.0)   # crossovers of the usual loops, from slow to quick
+_SHARES_OF_CROSSOVER = (0.2, 0.4, 0.6, 0.8, 1.0)   # crossovers of usual loops over the bandwidth, from slow to fast
 
 
 def usual_loops(period_s: float) -> tuple[SteppedSetpoint, ...]:
-    """PI loops with a double pole at half their crossover, from slow to quick, stepped once in ``period_s``."""
+    """Return PI loops with a double pole at half their crossover, from slow to fast, with one step per ``period_s``."""
     loops = []
     for share in _SHARES_OF_CROSSOVER:
         first_s = 4.0 / (share * _CROSSOVER_RAD_S)
@@ -165,11 +168,11 @@ def usual_loops(period_s: float) -> tuple[SteppedSetpoint, ...]:
 
 
 def _answer(stepped: SteppedSetpoint, lag_s: float) -> tuple[FloatArray, FloatArray]:
-    """Times (N,), _FINE a cycle, and g there, 1/s: (1 + b s)/((1 + a₁ s + a₂ s²)(1 + τ s)) by its poles."""
+    """Return the times (N,), _FINE a cycle, and g, 1/s: (1 + b s)/((1 + a₁ s + a₂ s²)(1 + τ s)), by its poles."""
     step = stepped.period_s / _FINE
     count = math.ceil(_LONGEST_S / stepped.period_s) * _FINE
     time = np.asarray(np.arange(count) * step, dtype=np.float64)
-    # A lag as short as a step of the grid is none, nor may two poles meet.
+    # a lag as short as a step of the grid counts as none, and two poles must not coincide
     poles = np.roots([stepped.second_s2, stepped.first_s, 1.0])
     if abs(poles[0] - poles[1]) < 1e-3 * abs(poles[0]):
         poles = poles * np.array([0.999, 1.001])

@@ -1,16 +1,17 @@
-r"""Several runs of one drive fitted together: the filters of its reports are shared, J and friction are each run's own.
+r"""Joint fit of several runs of one drive: the filters of its reports are shared, J and friction belong to each run.
 
-A run alone doesn't tell well how much of a line is the shaft's and how much the reports'. What it gets wrong of the
-filters it gets wrong of J, and two runs alone get that wrong each in its own way. With the filters shared,
+One run does not separate the shaft from the reports well. An error of the filters gives an error of J, different in
+each run. With shared filters,
 
     −2 ln L = Σ_i −2 ln L_i(J_i, B_i, φ),        φ the six parameters of the reports (`signal_filters`),
 
-the error that is left of φ is the same share of every J_i, nearly, and cancels in their ratio. What remains there is
-the scatter of the runs. The covariance is that of the joint information, (Σ over all lines)⁻¹, with degrees of freedom
-after Satterthwaite, as the weights of the lines are estimates.
+the remaining error of φ is nearly the same share of every J_i, and cancels in their ratio. The scatter of the runs
+remains. The covariance is that of the joint information, (Σ over all lines)⁻¹, with degrees of freedom after
+Satterthwaite, as the weights of the lines are estimates.
 
-Do they share? Fitted apart, the runs have 6 (n − 1) parameters more. By how much that lowers −2 ln L, less what the
-estimated weights add, is χ² with as many degrees of freedom at most: parameters at a bound are no parameters.
+Test of the shared filters: fitted separately, the runs have 6 (n − 1) parameters more. The decrease of −2 ln L, less
+the part due to the estimated weights, is χ² with at most that many degrees of freedom. A parameter at a bound does not
+count.
 """
 
 from __future__ import annotations
@@ -27,15 +28,16 @@ from tdhil.estimation.result import Options, Refused, ResidualTest
 from tdhil.estimation.samples import usable_samples
 from tdhil.recording import FloatArray, Recording
 
-_OWN = 2             # J and B stand before the six of the reports
+_OWN = 2             # J and B come before the six parameters of the reports
 
 
 @dataclass(frozen=True)
 class FittedTogether:
-    """``inertia_kg_m2`` (n,) as the drive's unit of torque has it, ``covariance`` (n, n) and its degrees of freedom.
+    """Result of a joint fit: ``inertia_kg_m2`` (n,) in the drive's unit of torque, ``covariance`` (n, n), its dof.
 
-    ``viscous_nm_s_rad`` (n,). ``sharing``: do the runs share the filters? None where nothing of them was free.
-    ``alone_kg_m2`` (n,): J of each run fitted alone. ``covariance_known_filters`` (n, n): with the filters known.
+    ``viscous_nm_s_rad`` (n,). ``sharing``: test whether the runs share the filters; None if no filter parameter was
+    free. ``alone_kg_m2`` (n,): J of each run, fitted alone. ``covariance_known_filters`` (n, n): covariance for known
+    filters.
     """
 
     inertia_kg_m2: FloatArray
@@ -48,9 +50,9 @@ class FittedTogether:
 
 
 def identify_together(recordings: Sequence[Recording]) -> FittedTogether:
-    """Fit a rigid shaft each, behind the same filters. Raises Refused where a recording has no lines that tell J.
+    """Fit a rigid shaft to each run, with common filters. Raises Refused if a recording has no lines that determine J.
 
-    For whole runs that `identify` found rigid; it doesn't ask again whether they are.
+    Only for complete runs that `identify` found rigid; this is not checked again.
     """
     fits = [_fitted(recording) for recording in recordings]
     problems = [one.problem for one in fits]
@@ -133,7 +135,7 @@ def _first(parts: list[FloatArray]) -> FloatArray:
 
 
 def _inverse(whole: FloatArray, free: list[int], wanted: list[int]) -> tuple[FloatArray, FloatArray]:
-    """The covariance (n, n) of the ``wanted`` parameters, and the rows (n, F) of the inverse that it is made of."""
+    """Return the covariance (n, n) of the ``wanted`` parameters, and the rows (n, F) of the inverse behind it."""
     chosen = whole[np.ix_(free, free)]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(chosen), 1e-300))
     inverse = np.linalg.pinv(chosen * np.outer(scale, scale), rcond=1e-13, hermitian=True) * np.outer(scale, scale)
@@ -142,7 +144,7 @@ def _inverse(whole: FloatArray, free: list[int], wanted: list[int]) -> tuple[Flo
 
 
 def _satterthwaite(columns: FloatArray, parts: list[tuple[FloatArray, FloatArray, float]], free: list[int]) -> float:
-    """Degrees of freedom of the difference of the first and the last J, which decides a calibration."""
+    """Return the degrees of freedom of the difference of the first and the last J, which decides a calibration."""
     row = columns[-1] - columns[0]
     at = {one: k for k, one in enumerate(free)}
     shares, uncertain = 0.0, 0.0
@@ -158,15 +160,16 @@ def _satterthwaite(columns: FloatArray, parts: list[tuple[FloatArray, FloatArray
 _LEANING = 2.0
 """Share of p/ν by which the covariance is too small, as in `filter_order.excess_rise`, where 4 is measured for one run.
 
-Measured on 55 drives of benchmarks/torque_calibration.py: with 4 and the median ν of both runs, κ missed in 13 % of
-those with a body that was large enough, mostly where one run had few periods.
+Measured on 55 drives of benchmarks/torque_calibration.py: with 4 and the median ν of both runs, the interval of κ
+missed the truth in 13 % of the drives with a large enough body, mostly if one run had few periods.
 """
 
 
 def _excess(fits: Sequence[FittedModel]) -> float:
-    """How much larger the covariance is than the information has it: 1 + p/(2ν), ν of the run with the fewest periods.
+    """Return the factor by which the covariance exceeds the inverse information: 1 + p/(2ν), ν of the run with fewest
+    periods.
 
-    p parameters lean on the lines whose scatter came out small by chance.
+    The p parameters follow the lines whose scatter is small by chance.
     """
     nu = min(float(np.median(one.problem.nu)) for one in fits)
     return 1.0 + fits[0].problem.model.size / (_LEANING * max(nu, 1.0))

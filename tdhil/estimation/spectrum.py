@@ -1,22 +1,22 @@
 """Spectral lines of samples: speed and torque at each excited frequency, with their scatter.
 
-Within each period, on the actual time stamps, least squares fits (tᶜ = time from the period's middle)
+Least squares on the actual time stamps of each period (tᶜ = time from the period's middle):
 
     x(t) = c + Σ_k (p_k cos ω_k t + q_k sin ω_k t),    X_k = p_k − j q_k,  so that x_k(t) = Re X_k e^(jω_k t).
 
-Speed drifts from period to period: a load disturbance of white torque makes it wander. Integrating J dω/dt over a
-period against e^(−jω_k t) leaves, besides jω_k J W_k, an end term from the net change of speed Δ = ω(end) − ω(start).
-Taking the ramp (Δ/P) tᶜ off the speed, and B (Δ/P) tᶜ off the torque, removes it exactly, so that T_k − G W_k is the
-disturbance's own line, independent from period to period. (A ramp fitted by least squares would not do: it follows the
-wander within the period, leaves errors that are smaller in one period but alike in neighbouring ones, and makes the
-scatter between periods too small by up to two at the lowest line.)
+Speed drifts from period to period: a load disturbance of white torque makes it wander. The integral of J dω/dt over a
+period against e^(−jω_k t) is jω_k J W_k and an end term from the net change of speed Δ = ω(end) − ω(start). The ramp
+(Δ/P) tᶜ is subtracted from the speed, and B (Δ/P) tᶜ from the torque. This removes the end term exactly, so that T_k −
+G W_k is the line of the disturbance alone, independent from period to period. (A ramp fitted by least squares is not
+suitable: it follows the wander within the period. Its errors are smaller in one period but alike in neighbouring ones,
+which makes the scatter between periods too small, by up to a factor of two at the lowest line.)
 
-Periods of one segment repeat but for what disturbs them; with x = (W, T) of period p, segment s,
+Periods of one segment are equal except for disturbances. With x = (W, T) of period p, segment s,
 
     S_k = Σ_s Σ_p (x_sp − x̄_s)(x_sp − x̄_s)ᴴ / ν_k,   ν_k = Σ_s (P_s − 1),
 
-is the covariance of one period (complex: E|·|² per period), the speed-torque cross term included. In closed loop,
-and in torque mode, a disturbance is in both signals; only the cross term makes the variance of T − G W right.
+is the covariance of one period (complex: E|·|² per period), the speed-torque cross term included. In closed loop, and
+in torque mode, a disturbance is in both signals; the variance of T − G W is correct only with the cross term.
 """
 
 from dataclasses import dataclass
@@ -29,15 +29,15 @@ from tdhil.estimation.samples import Samples, Stretch
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The speed at the two ends of a period, from which its net change follows (why that is needed: `spectrum`).
+# Speed at the two ends of a period, which gives its net change. `spectrum` explains why it is needed.
 
 
-_EDGE_S = 0.1             # either side of a period's end, averaged to read the speed there
-_EDGE_SAMPLES = 4         # samples at one instant, at least
+_EDGE_S = 0.1             # s; samples on either side of a period's end whose mean is the speed there
+_EDGE_SAMPLES = 4         # fewest samples for the speed at one instant
 
 
 class Edge:
-    """Speed at an instant, less the periodic motion: the mean of the samples within 0.1 s, or of the nearest few."""
+    """Speed at an instant without the periodic motion: mean of the samples within 0.1 s, or of the nearest few."""
 
     def __init__(
         self, samples: Samples, start_s: float, lines_hz: tuple[float, ...], wave: NDArray[np.complex128]
@@ -46,12 +46,12 @@ class Edge:
         self.omega = 2.0 * np.pi * np.asarray(lines_hz)
 
     def drift(self, begin_s: float, length_s: float) -> float:
-        """Net change of speed per second over a period."""
+        """Return the net change of speed per second over a period, rad/s²."""
         (begin, speed_begin), (end, speed_end) = self.speed(begin_s), self.speed(begin_s + length_s)
         return (speed_end - speed_begin) / (end - begin)
 
     def speed(self, at_s: float) -> tuple[float, float]:
-        """The mean time of the samples taken, s, and their mean speed."""
+        """Return the mean time of the samples used, s, and their mean speed, rad/s."""
         time = self.samples.time_s
         first, last = (int(i) for i in np.searchsorted(time, (at_s - _EDGE_S, at_s + _EDGE_S)))
         while last - first < min(_EDGE_SAMPLES, len(time)):
@@ -62,35 +62,37 @@ class Edge:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Rounding that repeats with the motion isn't in the scatter between periods, and no number of periods averages it.
+# Rounding error that repeats with the motion. The scatter between periods does not contain it, and more periods do not
+# average it out.
 #
-# A signal rounded to q is off by q²/12 in square. Of N samples with errors of their own, a line's is 4 q²/(12 N)
-# (complex: E|·|²). Where the signal takes many samples for one step these have one error together: it changes sign
-# twice on a step, so N is at most twice the steps of a period, and the error's lines reach up to half of that.
+# A signal rounded to q has a mean square error of q²/12. With N samples with independent errors, the error of a line is
+# 4 q²/(12 N) (complex: E|·|²). If the signal takes many samples for one step, these have one error together. It changes
+# sign twice on a step, so N is at most twice the steps of a period, and the error has lines up to half of that.
 #
-# How much of it comes again depends on where the samples lie on the wave: in every period at the same instants, in
-# every second one, or elsewhere in each. It is seen at the harmonics h that are not excited. Of P periods' lines there
+# The share that repeats depends on where the samples lie on the wave: at the same instants in every period, in every
+# second period, or elsewhere in each. It is measured at the harmonics h that are not excited. There, the lines of P
+# periods have
 #
-#     E|mean|² = σ_h²/P + what comes again,      σ_h² their scatter,
+#     E|mean|² = σ_h²/P + repeating part,      σ_h² their scatter,
 #
-# and the error of rounding is as large at one line as at the next. What else comes again (friction's own harmonics) is
-# bounded by the whole. Where noise of deviation σ goes before the rounding, it can't be more than the sawtooth of
-# rounding smoothed by it, Σ_k e^(−4π²k²σ²/q²) q²/(2π²k²): a thousandth for σ = 0.4 q, which settles it where the
-# residuals are mostly noise.
+# and the rounding error is equally large at all lines. Other repeating parts (harmonics of friction) are included in
+# this bound. If noise of standard deviation σ is added before the rounding, the bound is the sawtooth of rounding
+# smoothed by the noise, Σ_k e^(−4π²k²σ²/q²) q²/(2π²k²): a thousandth for σ = 0.4 q. This decides if the residuals are
+# mostly noise.
 
 
 _HARMONICS = np.arange(1.0, 9.0)
-_SURE = 1.25            # of q²/12: so much of the residuals' square may be rounding
-_LOOKED_AT = 40_000     # samples, in whole periods
-_LOOKED_FOR = 32        # harmonics that are not excited
-_FEWEST = 3             # of them; fewer tell nothing
-_UNDETECTED = 0.01      # of the scatter of a segment's mean: less isn't looked at further
+_SURE = 1.25            # times q²/12: largest part of the residuals' square that may be rounding
+_LOOKED_AT = 40_000     # samples examined, in whole periods
+_LOOKED_FOR = 32        # harmonics examined that are not excited
+_FEWEST = 3             # fewest of these harmonics; with fewer there is no estimate
+_UNDETECTED = 0.01      # share of the scatter of a segment's mean below which rounding is not examined further
 
 
 class PeriodInstants:
     """Instants of the first periods of a segment, and the unit waves there.
 
-    Speed and torque are sampled at the same instants, so that each wave is computed once for both.
+    Speed and torque are sampled at the same instants, so each wave is computed once for both.
     """
 
     def __init__(
@@ -104,11 +106,11 @@ class PeriodInstants:
 
     @cached_property
     def at_lines(self) -> list[NDArray[np.complex128]]:
-        """e^(jω_k t) of each period, (N, K)."""
+        """Return e^(jω_k t) of each period, (N, K)."""
         return [np.exp(1j * np.multiply.outer(angle, self.lines_hz)) for angle in self._angles]
 
     def at_harmonics(self, harmonics: FloatArray) -> list[NDArray[np.complex128]]:
-        """2 e^(−jω_h t) of each period, (H, N), for H harmonics of the period."""
+        """Return 2 e^(−jω_h t) of each period, (H, N), for H harmonics of the period."""
         if not np.array_equal(harmonics, self._harmonics):
             self._harmonics = harmonics
             self._at_harmonics = [
@@ -122,9 +124,10 @@ def repeating_rounding(
     periods: tuple[FloatArray, ...], instants: PeriodInstants, wave: NDArray[np.complex128], scatter: float,
     quantum: float,
 ) -> float:
-    """E|·|² of what rounding to ``quantum`` leaves in the mean of a line, over periods' samples and their instants.
+    """Return E|·|² of the error that rounding to ``quantum`` leaves in the mean of a line over ``periods``.
 
-    ``wave`` (K,): the mean lines, from the segment's start on; ``scatter``: the least variance of a period's.
+    ``wave`` (K,): the mean lines, with phase from the segment's start. ``scatter``: least variance of a line of one
+    period.
     """
     if not quantum > 0.0:
         return 0.0
@@ -143,7 +146,7 @@ def repeating_rounding(
     first, last = round(instants.period_s * max(instants.lines_hz)) + 1.0, 0.5 * count
     if last < first + _FEWEST:
         return most
-    harmonics = np.unique(np.round(np.geomspace(first, last, _LOOKED_FOR)))    # most of them near the lines
+    harmonics = np.unique(np.round(np.geomspace(first, last, _LOOKED_FOR)))    # most of them are near the lines
     unexcited = np.array([turned @ rest / len(rest)
                           for rest, turned in zip(rests, instants.at_harmonics(harmonics), strict=True)])
     again = np.abs(unexcited.mean(axis=0)) ** 2 - np.var(unexcited, axis=0, ddof=1) / len(unexcited)
@@ -157,16 +160,16 @@ ComplexArray = NDArray[np.complex128]
 _SIGNIFICANT = 25.0       # |mean|² over its variance: a line less clear than 5 sd is not excited
 _BLOCK = 8192             # samples worked on at once
 _FLOOR = 1e-14            # relative variance below which scatter is rounding of the arithmetic
-_BLOCKS_A_CYCLE = 20      # of the fastest line, at least
-_SAME = 4.0 * float(np.finfo(np.float64).eps)      # of a frequency: a sum of two that is the third
+_BLOCKS_A_CYCLE = 20      # blocks per cycle of the fastest line, at least
+_SAME = 4.0 * float(np.finfo(np.float64).eps)      # relative; closer frequencies count as equal
 
 
 @dataclass(frozen=True)
 class PeriodLines:
-    """One stretch of P periods: ``speed``, ``torque``, ``ramp`` (P, K) complex lines, the rest (P,).
+    """Lines of one stretch of P periods: ``speed``, ``torque``, ``ramp`` (P, K) complex, the rest (P,).
 
-    ``drift`` is the net change of speed per second; it is taken off ``speed``, not yet off ``torque``. ``ramp`` are the
-    lines of tᶜ itself, s. ``rounding``: E|·|² of what rounding leaves in the means of speed's and torque's lines.
+    ``drift`` is the net change of speed per second; it is subtracted from ``speed``, not yet from ``torque``. ``ramp``:
+    the lines of tᶜ itself, s. ``rounding``: E|·|² of the rounding error in the mean lines of speed and torque.
     """
 
     lines_hz: tuple[float, ...]
@@ -181,7 +184,7 @@ class PeriodLines:
 
 @dataclass(frozen=True)
 class SpectralLine:
-    """One frequency: M segment means and the pooled covariance of a single period.
+    """One spectral line: M segment means and the pooled covariance of a single period.
 
     ``speed``, ``torque`` (M,) complex; ``periods`` (M,) whole numbers; ``nu`` complex degrees of freedom.
     """
@@ -197,16 +200,17 @@ class SpectralLine:
 
     @property
     def excited(self) -> bool:
-        """Both signals stand clear of their scatter, in every segment."""
+        """True if both signals are clear of their scatter in every segment."""
         speed_clear = np.abs(self.speed) ** 2 * self.periods > _SIGNIFICANT * self.s_ww
         torque_clear = np.abs(self.torque) ** 2 * self.periods > _SIGNIFICANT * self.s_tt
         return bool(np.all(speed_clear & torque_clear))
 
 
 def period_lines(stretch: Stretch, samples: Samples, quanta: tuple[float, float] = (0.0, 0.0)) -> PeriodLines:
-    """The least-squares lines of every period of a stretch; ``samples``: all there are, to look across theirs.
+    """Return the least-squares lines of every period of a stretch. ``samples``: all samples, for the speed at period
+    ends.
 
-    ``quanta``: what speed and torque are rounded to, rad/s and N·m.
+    ``quanta``: resolution of speed and torque, rad/s and N·m.
     """
     segment = stretch.segment
     lines = segment.lines_hz
@@ -215,7 +219,7 @@ def period_lines(stretch: Stretch, samples: Samples, quanta: tuple[float, float]
     table: ComplexArray = np.array([fit[1] for fit in fits]).reshape(-1, 3, count)
     means = np.array([fit[0] for fit in fits]).reshape(-1, 3)
     wave = table[:, 0].mean(axis=0) if fits else np.zeros(count, dtype=np.complex128)
-    # only within the segment: across its ends the motion is another one
+    # only within the segment: beyond its ends the motion differs
     edge = Edge(samples.between(segment.start_s - 1e-9, segment.end_s - 1e-9), segment.start_s, lines, wave)
     begins = [segment.start_s + number * segment.period_s for number in stretch.index]
     drift = np.array([edge.drift(begin, segment.period_s) for begin in begins])
@@ -243,10 +247,10 @@ def period_lines(stretch: Stretch, samples: Samples, quanta: tuple[float, float]
 
 
 def unexcited_lines(stretch: Stretch, fit: PeriodLines, harmonics: tuple[int, ...]) -> PeriodLines:
-    """Return lines at harmonics of the period that are not excited; ``fit``: those of the excited ones.
+    """Return lines at harmonics of the period that are not excited. ``fit``: lines of the excited ones.
 
-    Means over short blocks stand for the samples, so that a long record costs little. They lower a line by less than
-    1 %, and do not mix lines.
+    Means over short blocks replace the samples, so that a long recording takes little time. They reduce a line by less
+    than 1 %, and do not mix lines.
     """
     segment = stretch.segment
     lines = tuple(harmonic / segment.period_s for harmonic in harmonics)
@@ -268,7 +272,7 @@ def unexcited_lines(stretch: Stretch, fit: PeriodLines, harmonics: tuple[int, ..
 
 
 def _thinned(period: Samples, blocks: int) -> Samples:
-    """Return means over blocks of equally many samples; the samples themselves where these are few."""
+    """Return means over blocks of equally many samples; the samples themselves if there are few."""
     size = len(period) // blocks
     if size < 2:
         return period
@@ -279,17 +283,17 @@ def _thinned(period: Samples, blocks: int) -> Samples:
 
 
 def _least(lines: ComplexArray) -> float:
-    """The smallest scatter of a line's periods (P, K)."""
+    """Return the smallest scatter of a line's periods (P, K)."""
     return float(np.min(np.sum(np.abs(lines - lines.mean(axis=0)) ** 2, axis=0))) / max(len(lines) - 1, 1)
 
 
 def _fit(period: Samples, start_s: float, lines_hz: tuple[float, ...]) -> tuple[FloatArray, ComplexArray]:
-    """Means (3,) and lines (3, K) of speed, torque and tᶜ in one period; phases count from ``start_s``."""
+    """Return the means (3,) and lines (3, K) of speed, torque and tᶜ in one period; phases count from ``start_s``."""
     count = len(lines_hz)
     time = period.time_s
     middle = 0.5 * (time[0] + time[-1])
-    # normal equations: the columns are nearly orthogonal, so nothing is lost and much time is won; in blocks, so that
-    # a long period never stands in memory as a whole table
+    # normal equations are accurate and fast here, because the columns are nearly orthogonal; blocks keep the table of a
+    # long period out of memory
     normal, right = np.zeros((1 + 2 * count, 1 + 2 * count)), np.zeros((1 + 2 * count, 3))
     for first in range(0, len(time), _BLOCK):
         block = slice(first, first + _BLOCK)
@@ -306,7 +310,9 @@ def _fit(period: Samples, start_s: float, lines_hz: tuple[float, ...]) -> tuple[
 
 
 def _turned(time_s: FloatArray, lines_hz: tuple[float, ...]) -> ComplexArray:
-    """e^(jωt) of every line, (K, N). A line at the sum of two before it is their product, ten times as quick."""
+    """Return e^(jωt) of every line, (K, N). A line at the sum of two earlier ones is their product (ten times
+    faster).
+    """
     found: ComplexArray = np.empty((len(lines_hz), len(time_s)), dtype=np.complex128)
     for k, hertz in enumerate(lines_hz):
         pair = next(((a, b) for a in range(k) for b in range(a, k)
@@ -323,10 +329,10 @@ def _turned(time_s: FloatArray, lines_hz: tuple[float, ...]) -> ComplexArray:
 def pooled_lines(
     fits: tuple[PeriodLines, ...], viscous: float, warming_nm_s: tuple[float, ...] = ()
 ) -> tuple[SpectralLine, ...]:
-    """Lines in rising frequency, pooled over the segments that have them; only those with a scatter to go by.
+    """Return the lines in order of frequency, pooled over the segments that have them; only lines with a known scatter.
 
-    ``viscous``: B as the levels tell it (0 if they don't), for the ramp of torque that a ramp of speed needs.
-    ``warming_nm_s``: the ramp of friction in each of the segments; none of it if left out.
+    ``viscous``: B from the levels (0 if unknown), for the torque that a ramp of speed requires. ``warming_nm_s``: ramp
+    of friction in each segment; 0 if left out.
     """
     rates = warming_nm_s or (0.0,) * len(fits)
     frequencies = sorted({round(hertz, 9) for fit in fits for hertz in fit.lines_hz})
@@ -347,7 +353,7 @@ def pooled_lines(
 
 
 def torque_lines(fit: PeriodLines, viscous: float, warming_nm_s: float) -> ComplexArray:
-    """(P, K), less the ramp of torque that the ramp of speed needs, and that of a friction that changes as it warms."""
+    """Return the torque lines (P, K) without the ramps due to the ramp of speed and to the warming of friction."""
     torque: ComplexArray = fit.torque - (viscous * fit.drift + warming_nm_s)[:, None] * fit.ramp
     return torque
 
@@ -355,7 +361,9 @@ def torque_lines(fit: PeriodLines, viscous: float, warming_nm_s: float) -> Compl
 def _pool(
     hertz: float, speeds: list[ComplexArray], torques: list[ComplexArray], rounding: list[FloatArray]
 ) -> SpectralLine | None:
-    """``rounding``: of each segment, as large as if it came anew in every period."""
+    """Return the pooled line; None without a known scatter. ``rounding``: rounding error of each segment, as for new
+    in each period.
+    """
     nu = float(sum(len(speed) - 1 for speed in speeds))
     if nu < 1.0:
         return None

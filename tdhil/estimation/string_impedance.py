@@ -1,8 +1,8 @@
 """Characteristic impedance of a drill string from a run, in the drive's own unit of torque.
 
-A string of known travel time hangs on the shaft. Everything else of it is free: the motor's inertia, the string's
-impedance ζ, what turns at its end, all friction, and the filters of the reports. What is measured is z = ζ T^(−e), with
-the travel time T. The exponent e says how the length and the waves' speed are used: −1 gives the string's inertia.
+A string of known travel time T hangs on the shaft. All other parameters are free: the inertia of the motor, the
+impedance ζ of the string, the inertia at its end, all friction, and the filters of the reports. The measured value is z
+= ζ T^(−e). The exponent e states how the length and the wave speed are used: −1 gives the inertia of the string.
 """
 
 from __future__ import annotations
@@ -33,17 +33,23 @@ from tdhil.estimation.spectrum import SpectralLine
 from tdhil.recording import Pipe, Recording
 
 _ANY_IMPEDANCE = 1.0
-"""Relative standard deviation of ζ beforehand: the data decide."""
+"""Relative standard deviation of the prior of ζ: so wide that the data decide."""
 _WIDER = 3.0
-"""Factor on the stated uncertainty of the travel time: it chooses among the string's swings, and measures nothing."""
+"""Factor on the stated uncertainty of the travel time. The prior selects among the oscillations of the string, and
+measures nothing.
+"""
 _LEAST_LINES = 5
-"""Ten equations, for as many unknowns of a string with known travel time behind first-order lags."""
+"""Least number of lines: ten equations, for as many unknowns of a string with known travel time and first-order
+lags.
+"""
 _ADVICE = "repeat the run off bottom with the default motion, and check the string's sections and length"
 
 
 @dataclass(frozen=True)
 class MeasuredString:
-    """``value``: z, in the drive's unit of torque; ``impedance_nm_s_rad`` and ``delay_s`` of the best fit."""
+    """Result of the measurement. ``value``: z, in the drive's unit of torque; ``impedance_nm_s_rad``, ``delay_s``:
+    of the best fit.
+    """
 
     value: Estimate
     impedance_nm_s_rad: float
@@ -54,7 +60,7 @@ class MeasuredString:
 def measure_string(
     recording: Recording, pipe: Pipe, delay_rel_sd: float, exponent: float, confidence: float = 0.95
 ) -> MeasuredString:
-    """Measure z of the string from a periodic motion. Raises Refused where the lines do not determine it."""
+    """Measure z of the string from a periodic motion. Raises Refused if the lines do not determine it."""
     excitation = recording.excitation
     if excitation is None or not excitation.segments:
         raise Refused("there is no periodic excitation in it", "identify with a multisine")

@@ -1,4 +1,4 @@
-"""A Recording as it grows: used by the live run and by the reader, so that both give the same one, bit for bit."""
+"""Builder of a Recording, used by the live run and by the reader, so that both results are equal bit for bit."""
 
 import math
 from array import array
@@ -16,18 +16,18 @@ from tdhil.recording.recording import BoolArray, Excitation, FloatArray, IntArra
 # ---------------------------------------------------------------------------------------------------------------------
 # Dataclasses from plain values: from JSON's lists and dictionaries, or from a protobuf message.
 #
-# The live run sends its facts through here too, so that a NumPy scalar or an int in place of a float can't make
-# the live recording differ from the replayed one.
+# The live run converts its facts in the same way, so that a NumPy scalar or an int instead of a float does not make the
+# live recording differ from the replayed one.
 
 
 hints_of = cache(get_type_hints)
 
 
 def structure(hint: Any, value: Any) -> Any:
-    """``value`` as an object of type ``hint``: a dataclass, tuple[X, ...], X | None, float, int, bool or str.
+    """Return ``value`` as an object of type ``hint``: a dataclass, tuple[X, ...], X | None, float, int, bool or str.
 
-    Members that the type doesn't know are left out, members that are absent take their defaults.
-    Raises TypeError or ValueError where the value doesn't fit the type.
+    Unknown members are left out; missing members take their defaults. Raises TypeError or ValueError if the value does
+    not fit the type.
     """
     if get_origin(hint) is UnionType:
         inner = next(one for one in get_args(hint) if one is not NoneType)
@@ -44,7 +44,7 @@ def structure(hint: Any, value: Any) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """The way back, for JSON: dataclasses as dictionaries, everything else as it is."""
+    """Return plain data for JSON: dataclasses as dictionaries, everything else unchanged."""
     return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
 
 
@@ -76,17 +76,17 @@ _COLLECTED: Final = frozenset({
     "excitation", "levels", "ramps", "stages", "complete",
 })
 FACTS: Final = frozenset(field.name for field in fields(Recording)) - _COLLECTED
-"""The members of a Recording that are known once and written into the configuration: gear ratio, lag prior, …"""
+"""Members of a Recording that are known once and written into the configuration: gear ratio, lag prior,"""
 
 
 class RecordingBuilder:
-    """Collects; pure. `add` costs a microsecond and 41 bytes a sample, and 16 more where a sample has a position."""
+    """Collection of samples and facts. Pure. `add` takes 1 µs and 41 bytes a sample, 16 bytes more with a position."""
 
     def __init__(self) -> None:
         self._values = array("d")              # time, speed, torque, time, speed, torque, …
-        self._setpoints = array("d")           # commanded and demanded torque, NaN where there is none, …
+        self._setpoints = array("d")           # commanded and demanded torque, NaN without a value,
         self._flags = bytearray()              # 1 fresh, 2 limited
-        self._positions_at = array("q")        # the samples that brought one, counted from 0
+        self._positions_at = array("q")        # numbers of the samples with a position, counted from 0
         self._positions = array("d")
         self._facts: dict[str, Any] = {}
         self._excitation: Excitation | None = None
@@ -99,11 +99,11 @@ class RecordingBuilder:
 
     @property
     def first_time_s(self) -> float:
-        """Control time of the first sample; there must be one."""
+        """Control time of the first sample, s. Requires at least one sample."""
         return self._values[0]
 
     def add(self, sample: Sample, command: Command | None = None) -> None:
-        """One cycle's feedback, and the command that it answers, where one is known."""
+        """Add the feedback of one cycle, and the command to which it responds, if known."""
         (time_s, _, _, fresh, speed_rad_s, torque_nm, demanded_nm, mode, state, _, limited, _, position_rad) = sample
         enabled, commanded_nm = state is PowerState.ENABLED, math.nan
         if enabled and mode is Mode.TORQUE and command is not None and command[0] is Mode.TORQUE:
@@ -118,7 +118,7 @@ class RecordingBuilder:
         self, time_s: float, speed_rad_s: float, torque_nm: float, fresh: bool, limited: bool,
         commanded_nm: float = math.nan, demanded_nm: float = math.nan, position_rad: float | None = None,
     ) -> None:
-        """The same, from what a Recording keeps of it."""
+        """Add one sample from the values that a Recording stores."""
         if position_rad is not None:
             self._positions_at.append(len(self._flags))
             self._positions.append(position_rad)
@@ -130,10 +130,10 @@ class RecordingBuilder:
         self, values: FloatArray, fresh: BoolArray, limited: BoolArray, setpoints: FloatArray | None = None,
         positions_at: IntArray | None = None, position_rad: FloatArray | None = None,
     ) -> None:
-        """The same of many cycles: ``values`` (n, 3) are time in s, speed in rad/s and torque in N·m.
+        """Add the samples of many cycles: ``values`` (n, 3) are time in s, speed in rad/s and torque in N·m.
 
-        ``setpoints`` (n, 2) are commanded and demanded torque, N·m, NaN where there is none. ``position_rad``: of the
-        cycles ``positions_at``, which count from the block's first.
+        ``setpoints`` (n, 2) are commanded and demanded torque, N·m, NaN without a value. ``position_rad``: of the
+        cycles ``positions_at``, counted from the block's first.
         """
         if positions_at is not None and position_rad is not None:
             self._positions_at.frombytes((positions_at + len(self._flags)).astype(np.int64).tobytes())
@@ -145,19 +145,19 @@ class RecordingBuilder:
         self._flags += (fresh.astype(np.uint8) | limited.astype(np.uint8) << 1).tobytes()
 
     def stage(self, stage: Stage) -> None:
-        """A stage that has ended."""
+        """Add a stage that has ended."""
         self._stages.append(structure(Stage, asdict(stage)))
 
     def excitation(
         self, excitation: Excitation | None, levels: Sequence[Level] = (), ramps: Sequence[Ramp] = ()
     ) -> None:
-        """Everything known so far of the motion; a later call replaces it."""
+        """Set everything known so far of the motion; a later call replaces it."""
         self._excitation = None if excitation is None else structure(Excitation, asdict(excitation))
         self._levels = tuple(structure(Level, asdict(level)) for level in levels)
         self._ramps = tuple(structure(Ramp, asdict(ramp)) for ramp in ramps)
 
     def learn(self, **facts: Any) -> None:
-        """Facts by their names in Recording (`FACTS`). Raises TypeError for another name or an unfit value."""
+        """Set facts by their names in Recording (`FACTS`). Raises TypeError for another name or an unfit value."""
         unknown = sorted(set(facts) - FACTS)
         if unknown:
             raise TypeError(f"a recording has no {', '.join(unknown)}")
@@ -166,11 +166,11 @@ class RecordingBuilder:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Return the findings of the run so far, for `RunWriter.configuration`."""
+        """Return the facts of the run so far, for `RunWriter.configuration`."""
         return dict(self._facts)
 
     def recording(self, *, complete: bool = True) -> Recording:
-        """The Recording so far; a copy, so collecting may go on."""
+        """Return the Recording so far, as a copy; collecting may continue."""
         values = np.array(self._values, dtype=np.float64).reshape(-1, 3)
         flags = np.frombuffer(bytes(self._flags), dtype=np.uint8)
         setpoints = np.array(self._setpoints, dtype=np.float64).reshape(-1, 2)
@@ -199,5 +199,5 @@ class RecordingBuilder:
 
 
 def _where_known(signal: FloatArray) -> FloatArray | None:
-    """The signal, or None if it has no value at all."""
+    """Return the signal, or None if it has no value at all."""
     return None if bool(np.all(np.isnan(signal))) else np.ascontiguousarray(signal)

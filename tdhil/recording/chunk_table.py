@@ -1,9 +1,9 @@
-"""Many chunks at once: where their records stand, and what their samples hold, by numpy.
+"""Fast reading of many chunks by numpy: the places of their records and the values of their samples.
 
-A log of ours has a chunk each 0.2 s of control time, some 150 records in it; walking from record to record in Python
-is most of what reading costs. Here all chunks of a batch are walked in step: the k-th records of all of them together.
-What isn't laid out exactly as our own writer lays it out is not decided here: the caller then goes message by message.
-Pure, over bytes that may be hostile; nothing is taken on trust from indexes.
+A log of tdhil has a chunk each 0.2 s of control time, with some 150 records. Reading them record by record in Python
+takes most of the time. Here all chunks of a batch are read in parallel: the k-th records of all of them together. This
+module only reads the exact layout of tdhil's writer; for any other layout the caller reads message by message. Pure;
+the bytes may be hostile, and no index is trusted.
 """
 
 import math
@@ -29,7 +29,7 @@ from tdhil.recording.log_messages import (
 
 _HEAD: Final = Struct("<BQ")           # opcode:1  length:8
 _MESSAGE_HEAD: Final = 22              # channel:2  sequence:4  log time:8  publish time:8
-_FEW: Final = 12                       # chunks; below, a loop in Python is quicker than numpy's calls
+_FEW: Final = 12                       # chunks; for fewer, a loop in Python is faster than numpy
 _MESSAGE: Final = 0x05
 _DECLARING: Final = (0x03, 0x04)       # schema, channel
 
@@ -41,7 +41,7 @@ _SAMPLE_ROW: Final = np.dtype([
     ("tag7", "u1"), ("limit_active", "u1"), ("tag8", "u1"), ("standstill", "u1"), ("tag9", "u1"), ("state", "u1"),
     ("tag10", "u1"), ("mode", "u1"), ("tag11", "u1"), ("status", "<u4"),
 ])
-"""`log_messages.pack_sample`, byte by byte; torque demand and position may follow, each behind its tag."""
+"""Layout of `log_messages.pack_sample`, byte by byte; torque demand and position may follow, each with its tag."""
 _TAGS: Final = tuple(
     zip((f"tag{k}" for k in range(1, 12)), (0x09, 0x11, 0x19, 0x21, 0x29, 0x30, 0x38, 0x40, 0x48, 0x50, 0x5D),
         strict=True))
@@ -50,7 +50,7 @@ _COMMAND_ROW: Final = np.dtype([
     ("tag1", "u1"), ("time_s", "<f8"), ("tag2", "u1"), ("speed_rad_s", "<f8"), ("tag3", "u1"), ("torque_nm", "<f8"),
     ("tag4", "u1"), ("mode", "u1"),
 ])
-"""`log_messages.pack_command`, byte by byte; the torque offset may follow, behind its tag."""
+"""Layout of `log_messages.pack_command`, byte by byte; the torque offset may follow, with its tag."""
 _COMMAND_TAGS: Final = tuple(zip((f"tag{k}" for k in range(1, 5)), (0x09, 0x11, 0x19, 0x20), strict=True))
 _MORE_ROW: Final = np.dtype([("tag", "u1"), ("value", "<f8")])
 
@@ -58,7 +58,7 @@ Offsets = NDArray[np.int64]
 
 
 class TorqueCommand(NamedTuple):
-    """The time of a command, s, and its torque setpoint, N·m; NaN where it asked for another mode than torque."""
+    """Time of a command, s, and its torque setpoint, N·m; NaN if it requested another mode than torque."""
 
     time_s: float
     torque_nm: float
@@ -71,8 +71,8 @@ NO_COMMAND: Final = TorqueCommand(math.nan, math.nan)
 class SampleBlock:
     """Samples in their order: ``values`` (n, 3) time in s, speed in rad/s, torque in N·m; fresh and limited, (n,).
 
-    ``setpoints`` (n, 2): commanded and demanded torque, N·m, as `RecordingBuilder.add` takes them. ``position_rad``
-    stands in the samples ``positions_at``, which count from the block's first.
+    ``setpoints`` (n, 2): commanded and demanded torque, N·m, as `RecordingBuilder.add` takes them. ``position_rad``: of
+    the samples ``positions_at``, counted from the block's first.
     """
 
     values: NDArray[np.float64]
@@ -86,16 +86,16 @@ class SampleBlock:
 
 @dataclass(frozen=True)
 class RawMessage:
-    """One message as it stands in its chunk, not decoded yet."""
+    """One message of a chunk, not decoded yet."""
 
     number: int
     payload: bytes
 
 
 class ChunkTable:
-    """The records of several chunks, one behind the other.
+    """Records of several chunks, one after the other.
 
-    ``plain`` tells of each chunk whether it holds messages alone, each of them whole.
+    ``plain``: for each chunk, True if it contains only complete messages.
     """
 
     def __init__(self, chunks: Sequence[bytes]) -> None:
@@ -115,12 +115,12 @@ class ChunkTable:
         self, first: int, last: int, numbers: Mapping[int, int], samples: int, commands: int, skipped: frozenset[int],
         before: TorqueCommand,
     ) -> tuple[SampleBlock | None, TorqueCommand, list[RawMessage], bool] | None:
-        """The samples of the plain chunks from ``first`` to before ``last``, the last command, the other messages, and
-        was any of ours?
+        """Return the samples of the plain chunks from ``first`` to before ``last``, the last command, the other
+        messages, and whether any message is tdhil's.
 
-        ``numbers``: which channel of the file is which of ours; ``samples``, ``commands``: those of the samples and the
-        commands; ``skipped``: those not wanted; ``before``: the last command before these chunks. None where a sample
-        or a command isn't laid out exactly as our writer does it.
+        ``numbers``: tdhil's channel number by the file's; ``samples``, ``commands``: numbers of these channels;
+        ``skipped``: channels to leave out; ``before``: the last command before these chunks. Returns None if a sample
+        or a command does not have the exact layout of tdhil's writer.
         """
         rows = slice(self._rows[first], self._rows[last])
         at, length = self._at[rows], self._length[rows]
@@ -135,7 +135,8 @@ class ChunkTable:
             return None
         block = None
         if is_sample.any():
-            # row 0 is the command before these chunks, so the count of commands before a sample is its command's row
+            # row 0 is the command before these chunks, so the number of commands before a sample is the row of its
+            # command
             answered = commanded[np.cumsum(is_command)[is_sample]]
             block = self._samples(
                 at[is_sample], length[is_sample], answered, int(head["log_time_ns"][np.argmax(is_sample)]))
@@ -148,7 +149,7 @@ class ChunkTable:
         return block, TorqueCommand(*commanded[-1].tolist()), found, bool(number_of.any())
 
     def _commands(self, at: Offsets, length: Offsets, before: TorqueCommand) -> NDArray[np.float64] | None:
-        """(1 + n, 2) time and torque setpoint (NaN: not in torque mode) of ``before`` and of n commands."""
+        """Return (1 + n, 2) time and torque setpoint (NaN: not in torque mode) of ``before`` and of n commands."""
         size = length - _MESSAGE_HEAD
         more = size == COMMAND_SIZE + MORE_SIZE
         if not np.all(more | (size == COMMAND_SIZE)):
@@ -205,10 +206,10 @@ class ChunkTable:
 
 
 def _taken(data: bytes, at: Offsets, row: np.dtype[np.void]) -> NDArray[np.void]:
-    """A copy of the rows that begin at these bytes; each must lie within ``data``."""
+    """Return a copy of the rows that begin at these bytes; each must lie within ``data``."""
     if not len(at):
         return np.empty(0, row)
-    # As plain bytes, which are copied in one go, where fields would be copied one by one.
+    # as plain bytes, which are copied in one step; fields would be copied one by one
     everywhere: NDArray[np.void] = np.ndarray((len(data) - row.itemsize + 1,), f"V{row.itemsize}", data, strides=(1,))
     return everywhere[at].view(row)
 
@@ -220,7 +221,7 @@ def _records(
     whole = np.ones(len(starts), np.bool_)
     places, opcodes, lengths = [], [], []
     chunk = np.flatnonzero(starts < ends)
-    at, last = starts[chunk], ends[chunk] - _HEAD.size          # where a record's head may stand at the latest
+    at, last = starts[chunk], ends[chunk] - _HEAD.size          # last possible place of a record's head
     while len(chunk) >= _FEW:
         room = last - at
         if room.min() < 0:
@@ -254,7 +255,9 @@ def _records(
 
 
 def _walk(data: bytes, at: int, end: int) -> "tuple[array[int], bool]":
-    """The same of one chunk, record by record: place, opcode, length, place, …"""
+    """Return place, opcode, length, place, … of one chunk's records, read one by one; and whether the chunk is
+    whole.
+    """
     found = array("q")
     unpack, head = _HEAD.unpack_from, _HEAD.size
     while at < end:

@@ -37,21 +37,21 @@ from tdhil.recording.builder import hints_of
 from tdhil.recording.recording import Excitation, Level, Ramp, Segment, Stage
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Something that happened in a run and is worth a line: an error, a warning, a drop, a key press.
+# Event: something in a run that deserves a line, such as an error, a warning, a lost sample, or a key press.
 
 
 RECOVERED: Final = "recovered"
-"""Kind of the event in a salvaged copy: the copy is whole, the run that it shows is not."""
+"""Kind of the event in a recovered copy: the file is complete, but the run in it is not."""
 
 
 FAILURE: Final = "failure"
 INTERRUPTED: Final = "interrupted"
-"""Kinds of the event that ended a run: what went wrong, or who asked for it."""
+"""Kinds of the event that ended a run: the fault, or the source of the request."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """``time_s`` is control time; ``kind`` is one lower-case word; ``traceback`` is empty where there was none."""
+    """Event. ``time_s``: control time; ``kind``: one lower-case word; ``traceback``: '' without one."""
 
     time_s: float
     kind: str
@@ -60,9 +60,9 @@ class Event:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Events once more as `foxglove.Log`, which viewers of MCAP show as a log (docs.foxglove.dev, schema Log).
+# The same events as `foxglove.Log`, which viewers of MCAP show as a log (docs.foxglove.dev, schema Log).
 #
-# Our own Event stays the one that is read back; this one is for viewers, and tdhil does not read it.
+# tdhil reads only its own Event; this copy is for viewers.
 
 
 _LEVELS: Final = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
@@ -101,7 +101,7 @@ LOG_CLASS: Final = _log_class()
 
 
 def log_payload(kind: str, text: str, log_time_ns: int) -> bytes:
-    """A `foxglove.Log` message of an event; its level is by the event's kind."""
+    """Return a `foxglove.Log` message of an event, with a level that follows from its kind."""
     level = _ERROR if kind == FAILURE else _WARNING if kind in _WARNINGS else _INFO
     message = LOG_CLASS(level=level, message=f"{kind}: {text}", name=_NAME)
     message.timestamp.seconds, message.timestamp.nanos = divmod(log_time_ns, 10**9)
@@ -112,9 +112,9 @@ def log_payload(kind: str, text: str, log_time_ns: int) -> bytes:
 # ---------------------------------------------------------------------------------------------------------------------
 # Protobuf message classes from a compact table: no compiler, no generated code, any protobuf runtime from 5 on.
 #
-# A message is a dictionary from field name to type; the field's number is its place, counted from 1. So fields
-# are added at the end and never moved. A type is a scalar of protobuf, an enum or a message of the same table,
-# with ``?`` for an optional one (absent is not zero) and ``*`` for a repeated one.
+# A message is a dictionary from field name to type; the field's number is its place, counted from 1. Fields must
+# therefore be added at the end and never be moved. A type is a scalar of protobuf, an enum or a message of the same
+# table, with ``?`` for an optional one (absent is not zero) and ``*`` for a repeated one.
 
 
 Table = Mapping[str, Mapping[str, str]]
@@ -131,13 +131,13 @@ _OF_PYTHON = {float: "double", int: "int64", bool: "bool", str: "string"}
 
 
 def fields_of(kind: Any) -> dict[str, str]:
-    """The table row of a dataclass, from its annotations."""
+    """Return the row of the table for a dataclass, from its annotations."""
     hints = hints_of(kind)
     return {field.name: _type_of(hints[field.name]) for field in fields(kind)}
 
 
 def message_classes(package: str, enums: Mapping[str, tuple[str, ...]], messages: Table) -> dict[str, Any]:
-    """A class for each message of the table; the values of an enum count from 0."""
+    """Return a class for each message of the table; the values of an enum count from 0."""
     file = FileDescriptorProto(name=f"{package}.proto", package=package, syntax="proto3")
     for name, values in enums.items():
         enum = file.enum_type.add(name=name)
@@ -162,7 +162,7 @@ def _describe(message: DescriptorProto, row: Mapping[str, str], package: str, en
             field.type = FieldDescriptorProto.TYPE_ENUM if bare in enums else FieldDescriptorProto.TYPE_MESSAGE
             field.type_name = f".{package}.{bare}"
         if wanted.endswith("?") and field.type != FieldDescriptorProto.TYPE_MESSAGE:
-            field.proto3_optional = True           # proto3 wants a oneof of one for it
+            field.proto3_optional = True           # proto3 requires a oneof with this single field
             field.oneof_index = len(message.oneof_decl)
             message.oneof_decl.add(name=f"_{name}")
 
@@ -197,13 +197,13 @@ VIRTUAL_COLUMNS: Final = (
     "time_s", "phase", "set_rad_s", "top_rad_s", "innovation_rad_s", "string_nm", "drive_nm", "share", "bit_rad_s",
     "unknown_nm", "put_in_j", "clamped",
 )
-"""Values of a `VirtualString`, all doubles: the content of `tdhil.soft_torque.HostLoop.row`."""
+"""Values of a `VirtualString`, all doubles: those of `tdhil.soft_torque.HostLoop.row`."""
 
 FRF_COLUMNS: Final = (
     "hertz", "magnitude", "magnitude_low", "magnitude_high", "phase_rad", "phase_rad_low", "phase_rad_high",
     "apparent_inertia_kg_m2", "noise_rel", "distortion_rel", "coherence",
 )
-"""Arrays of a `Response`, a value for each excited line: ω/T in rad/(s·N·m)."""
+"""Arrays of a `Response`, one value for each excited line: ω/T in rad/(s·N·m)."""
 
 CHANNELS: Final = {
     SAMPLE: ("/sample", "Sample"),
@@ -221,7 +221,7 @@ CHANNELS: Final = {
     FRF: ("/frf", "Response"),
 }
 FRAME_CHANNELS: Final = {topic: number for number, (topic, message) in CHANNELS.items() if message == "Frames"}
-"""The channels of raw frames by topic. A log has messages on one of them."""
+"""Channels of raw frames by topic. A log has messages on only one of them."""
 RAW_FRAMES: Final = frozenset(FRAME_CHANNELS.values())
 
 MODES: Final = {None: 0, Mode.SPEED: 1, Mode.TORQUE: 2}
@@ -276,6 +276,6 @@ CLASSES: Final[dict[str, Any]] = message_classes(PACKAGE, ENUMS, MESSAGES) | {"L
 
 
 def schema_name(message: str) -> str:
-    """A message's full name, such as ``tdhil.Sample``."""
+    """Return the full name of a message, such as ``tdhil.Sample``."""
     name: str = CLASSES[message].DESCRIPTOR.full_name
     return name

@@ -1,7 +1,6 @@
-"""The rare messages, through the protobuf classes, laid out where they are handed in.
+"""Encoding of the rare messages through the protobuf classes, in the caller's thread.
 
-So a value that has no place in the log is refused in the caller's own stack, and what the caller changes
-afterwards isn't logged by mistake.
+An invalid value is therefore refused in the caller's own stack, and later changes by the caller do not reach the log.
 """
 
 import json
@@ -33,7 +32,7 @@ from tdhil.recording.log_format import (
 from tdhil.recording.recording import Excitation, Level, Ramp, Stage
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The three messages of every cycle, laid out by hand: protobuf's wire format at the price of one `struct.pack`.
+# The three messages of every cycle, encoded without protobuf's classes: its wire format by one `struct.pack`.
 #
 # A tag is (field number << 3) | wire type: 0 varint, 1 eight bytes, 2 length and bytes, 5 four bytes. Little-endian.
 #
@@ -48,15 +47,15 @@ from tdhil.recording.recording import Excitation, Level, Ramp, Stage
 #     Frames   09 time_s:8  { 12 length  Frame } …
 #     Frame    09 time_s:8  10 outgoing:1  1D identifier:4  22 length  data
 #
-# Zeros are written out, where protobuf would leave them away: both read the same, and the layout stays constant.
-# Field numbers and types are those of `log_format.MESSAGES`. Raises struct.error for an integer out of its range.
+# Zeros are written, although protobuf would leave them out: both read the same, and the layout stays constant. Field
+# numbers and types are those of `log_format.MESSAGES`. Raises struct.error for an integer out of its range.
 
 
 _SAMPLE = Struct("<BdBdBdBdBd B?B?B?BBBB BI".replace(" ", ""))
 _MORE = Struct("<Bd")
 _COMMAND = Struct("<BdBdBdBB")
-SAMPLE_SIZE: Final = _SAMPLE.size      # bytes without torque demand and position, which take `MORE_SIZE` more each
-COMMAND_SIZE: Final = _COMMAND.size    # bytes without the torque offset, which takes `MORE_SIZE` more
+SAMPLE_SIZE: Final = _SAMPLE.size      # bytes without torque demand and position, which take `MORE_SIZE` each
+COMMAND_SIZE: Final = _COMMAND.size    # bytes without the torque offset, which takes `MORE_SIZE`
 MORE_SIZE: Final = _MORE.size
 DEMAND_TAG: Final = 0x61
 POSITION_TAG: Final = 0x69
@@ -66,7 +65,7 @@ ENABLED_STATE: Final = STATES[PowerState.ENABLED]
 
 
 def pack_sample(sample: Sample) -> bytes:
-    """A `Sample` message."""
+    """Return a `Sample` message."""
     (time_s, age_s, half_width_s, fresh, speed_rad_s, torque_nm, demand_nm,
      mode, state, standstill, limit_active, status, position_rad) = sample
     fixed = _SAMPLE.pack(
@@ -79,14 +78,14 @@ def pack_sample(sample: Sample) -> bytes:
 
 
 def pack_command(time_s: float, command: Command) -> bytes:
-    """A `Command` message; ``time_s`` is control time."""
+    """Return a `Command` message; ``time_s`` is control time."""
     mode, speed_rad_s, torque_nm, offset_nm = command
     fixed = _COMMAND.pack(0x09, time_s, 0x11, speed_rad_s, 0x19, torque_nm, 0x20, MODES[mode])
     return fixed if offset_nm == 0.0 else fixed + _MORE.pack(OFFSET_TAG, offset_nm)
 
 
 def pack_frames(frames: list[RawFrame]) -> bytes:
-    """A `Frames` message of at least one frame; its time is the first one's."""
+    """Return a `Frames` message of at least one frame; its time is that of the first frame."""
     parts = [_MORE.pack(0x09, frames[0][0])]
     for time_s, outgoing, identifier, data in frames:
         layout, head, tail = _frame_layout(len(data))
@@ -96,7 +95,7 @@ def pack_frames(frames: list[RawFrame]) -> bytes:
 
 @lru_cache(maxsize=512)
 def _frame_layout(length: int) -> tuple[Struct, bytes, bytes]:
-    """For ``length`` bytes of data: the layout, what stands before time_s, and what stands before the data."""
+    """Return the layout for ``length`` bytes of data, the bytes before time_s, and the bytes before the data."""
     tail = b"\x22" + _varint(length)
     head = b"\x12" + _varint(1 + 8 + 2 + 5 + len(tail) + length) + b"\x09"
     return Struct(f"<{len(head)}sdB?BI{len(tail)}s{length}s"), head, tail
@@ -118,7 +117,9 @@ _EVENT_LIMIT: Final = 2**16
 
 
 class Cold(NamedTuple):
-    """``time_s`` is control time, None for that of the record before; ``flush`` closes the chunk after it."""
+    """Encoded rare message. ``time_s``: control time, None for that of the record before; ``flush``: close the chunk
+    after it.
+    """
 
     channel: int
     time_s: float | None
@@ -127,12 +128,12 @@ class Cold(NamedTuple):
 
 
 def stage_message(stage: Stage) -> Cold:
-    """A `Stage`, at its end."""
+    """Return a `Stage` message, at its end."""
     return Cold(STAGE, stage.end_s, _bytes("Stage", asdict(stage)), flush=True)
 
 
 def excitation_message(excitation: Excitation | None, levels: Sequence[Level], ramps: Sequence[Ramp]) -> Cold:
-    """A `Motion`."""
+    """Return a `Motion` message."""
     content = {
         "excitation": None if excitation is None else asdict(excitation),
         "levels": [asdict(level) for level in levels],
@@ -153,27 +154,27 @@ def event_message(event: Event) -> Cold:
 
 
 _VIRTUAL = Struct("<" + "Bd" * len(VIRTUAL_COLUMNS))
-_VIRTUAL_TAGS = [number << 3 | 1 for number in range(1, len(VIRTUAL_COLUMNS) + 1)]      # below 16, so one byte each
+_VIRTUAL_TAGS = [number << 3 | 1 for number in range(1, len(VIRTUAL_COLUMNS) + 1)]      # below 16: one byte each
 
 
 def virtual_message(row: Sequence[float]) -> Cold:
-    """A `VirtualString`, laid out by hand: there is one a cycle."""
+    """Return a `VirtualString` message, encoded by struct because there is one a cycle."""
     fields = [part for pair in zip(_VIRTUAL_TAGS, row, strict=True) for part in pair]
     return Cold(VIRTUAL_STRING, row[0], _VIRTUAL.pack(*fields), flush=False)
 
 
 def configuration_message(run: Mapping[str, Any], facts: Mapping[str, Any]) -> Cold:
-    """The run's configuration and the facts that a Recording needs, as one JSON text."""
+    """Return the run's configuration and the facts of a Recording, as one JSON text."""
     return _text(CONFIGURATION, {"run": run, "recording": {name: plain(value) for name, value in facts.items()}})
 
 
 def result_message(result: Mapping[str, Any]) -> Cold:
-    """The result as a JSON text."""
+    """Return the result as a JSON text."""
     return _text(RESULT, result)
 
 
 def response_message(found: Mapping[str, Any]) -> Cold:
-    """The frequency response of a result document as arrays, which a viewer can plot; an open side is NaN."""
+    """Return the frequency response of a result document as arrays for a viewer's plot; an open side is NaN."""
     def value(line: Mapping[str, Any], name: str) -> float:
         key, _, side = name.rpartition("_") if name.endswith(("_low", "_high")) else (name, "", "value")
         one = line[key]
@@ -203,5 +204,5 @@ def _bytes(message: str, content: Mapping[str, Any]) -> bytes:
 
 
 def _clean(text: str) -> str:
-    """A surrogate (a file name that isn't UTF-8) has no place in protobuf."""
+    """Return the text without surrogates (from a file name that is not UTF-8), which protobuf does not accept."""
     return text[:_EVENT_LIMIT].encode(errors="replace").decode()

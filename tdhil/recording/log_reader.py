@@ -1,4 +1,4 @@
-"""run.mcap back into a Recording, from a file that may be whole, cut, damaged or hostile."""
+"""Reading of run.mcap as a Recording, from a file that may be complete, cut, damaged or hostile."""
 
 import json
 import math
@@ -25,24 +25,24 @@ from tdhil.recording.mcap_recovery import Contents, Damage, Library, Whole, walk
 from tdhil.recording.recording import Excitation, FloatArray, Level, Ramp, Recording, Stage
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The records inside a chunk that passed its CRC: pure, over bytes that may still be hostile.
+# Records inside a chunk with a valid CRC. Pure; the bytes may still be hostile.
 
 
 _RECORD = Struct("<BQ")
 _MESSAGE = Struct("<HIQQ")
 SCHEMA, CHANNEL, MESSAGE = 0x03, 0x04, 0x05
-_LONGEST = 128                         # characters of a name: ours are shorter
+_LONGEST = 128                         # characters of a name; those of tdhil are shorter
 
 
 class Schema(NamedTuple):
-    """``identifier:2  n:4 name  …``: the fields themselves are known here."""
+    """Schema record, ``identifier:2  n:4 name  …``; its fields are not read, because they are known."""
 
     identifier: int
     name: str
 
 
 class Channel(NamedTuple):
-    """``identifier:2  schema:2  n:4 topic  …``."""
+    """Channel record, ``identifier:2  schema:2  n:4 topic  …``."""
 
     identifier: int
     schema: int
@@ -50,7 +50,7 @@ class Channel(NamedTuple):
 
 
 class Message(NamedTuple):
-    """``channel:2  sequence:4  log time:8  publish time:8  payload``."""
+    """Message record, ``channel:2  sequence:4  log time:8  publish time:8  payload``."""
 
     channel: int
     log_time_ns: int
@@ -58,7 +58,7 @@ class Message(NamedTuple):
 
 
 def records(chunk: bytes) -> Iterator[Schema | Channel | Message]:
-    """The records in order; others are stepped over. Raises ValueError where a record leaves the chunk."""
+    """Yield the records in order; other kinds are skipped. Raises ValueError for a record that exceeds the chunk."""
     offset, size = 0, len(chunk)
     while offset < size:
         if offset + _RECORD.size > size:
@@ -89,16 +89,16 @@ def _string(chunk: bytes, start: int, end: int) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The messages of our channels in a file that may be anything.
+# Messages of tdhil's channels in any file.
 
 
 _NUMBER: Final = {(topic, schema_name(message)): number for number, (topic, message) in CHANNELS.items()}
 _OTHER: Final = "Give a run.mcap of this tool"
-_BUFFER: Final = 2**17                 # bytes; most of reading is small reads, one behind the other
+_BUFFER: Final = 2**17                 # bytes; reading consists mostly of small sequential reads
 
 
 class Ours(NamedTuple):
-    """One message on one of our channels, not decoded yet; ``number`` is the channel's in `CHANNELS`."""
+    """One message on one of tdhil's channels, not decoded yet; ``number`` is the channel's in `CHANNELS`."""
 
     number: int
     payload: bytes
@@ -106,10 +106,10 @@ class Ours(NamedTuple):
 
 
 def messages(path: Path, *, salvage: bool = False) -> Iterator[Ours | Damage | Whole]:
-    """Messages of ours, what was stepped over, and at the end `Whole` if the file was closed.
+    """Yield tdhil's messages, damaged places, and at the end `Whole` if the file was closed.
 
-    Raises `LogError` where the file can't be opened, is empty, is not MCAP, or (at the end) holds nothing of ours.
-    ``salvage``: a file that doesn't begin like MCAP is searched all the same, since its head may be what was hit.
+    Raises `LogError` for a file that cannot be opened, is empty, is not MCAP, or (at the end) has no message of tdhil.
+    ``salvage``: a file that does not begin like MCAP is searched too, because its head may be damaged.
     """
     declared = _Declared()
     for found in _batches(path, declared, salvage, 0):
@@ -123,9 +123,10 @@ def messages(path: Path, *, salvage: bool = False) -> Iterator[Ours | Damage | W
 def _batches(
     path: Path, declared: "_Declared", salvage: bool, size_limit: int
 ) -> Iterator[list[Contents] | Damage | Whole]:
-    """Yield the same with good chunks in batches of up to so many bytes; the caller uses their content.
+    """Yield the good chunks in batches of up to ``size_limit`` bytes, and the damaged places; the caller decodes the
+    chunks.
 
-    A damage or a header in between changes ``declared`` only after the chunks before it were used.
+    A damaged place or a header between chunks changes ``declared`` only after the earlier chunks were used.
     """
     batch: list[Contents] = []
     waiting = 0
@@ -153,7 +154,7 @@ def _batches(
                     declared.library(found.name)
                 elif not isinstance(found, Contents):
                     if salvage and isinstance(found, Damage):
-                        declared.assume_undeclared()       # it may have been what declares the channels
+                        declared.assume_undeclared()       # the damaged part may have declared the channels
                     yield found
     except OSError as error:
         raise LogError(f"the log can't be read: {error.strerror or error}", where=str(path),
@@ -166,7 +167,7 @@ def _batches(
 
 
 class _Declared:
-    """Which channel of the file is which of ours, by topic and schema."""
+    """Assignment of the file's channels to those of tdhil, by topic and schema."""
 
     def __init__(self) -> None:
         self.ours = False
@@ -174,23 +175,23 @@ class _Declared:
         self._numbers: dict[int, int] = {}
 
     def library(self, name: str) -> None:
-        """Our own files: the channels are known even if the chunk that declares them is lost."""
+        """Use tdhil's channel numbers for a file of tdhil, even if the chunk with the declarations is lost."""
         if name.split(" ", maxsplit=1)[0] == PACKAGE:
             self.ours = True
             self._numbers = {number: number for number in CHANNELS} | self._numbers
 
     def assume(self) -> None:
-        """Nothing is known of who wrote it: what can't be one of our files' chunks must show by itself."""
+        """Use tdhil's channel numbers if the writer is unknown; chunks that do not fit show an error themselves."""
         self._numbers = {number: number for number in CHANNELS}
 
     def assume_undeclared(self) -> None:
-        """Assume our own channel numbers if none were declared so far."""
+        """Use tdhil's channel numbers if none were declared so far."""
         if not self._schemas:
             self._numbers = {number: number for number in CHANNELS} | self._numbers
 
     @property
     def numbers(self) -> Mapping[int, int]:
-        """Which channel of the file is which of ours, so far."""
+        """Number of tdhil's channel by the number in the file, so far."""
         return self._numbers
 
     def messages(self, contents: Contents) -> Iterator[Ours | Damage]:
@@ -218,22 +219,22 @@ class _Declared:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-SAMPLES: Final = 8_000_000             # 41 bytes each, 57 with a position; two hours at 1 kHz
+SAMPLES: Final = 8_000_000             # samples of 41 bytes each, 57 with a position; two hours at 1 kHz
 _CENTURY_NS: Final = 946_684_800 * 10**9       # 2000-01-01
-RARE: Final = 20_000                   # stages, events, problems
-RARE_BYTES: Final = 64 * 2**20         # of everything but samples, commands and frames
-BATCH: Final = 2 * 2**20               # bytes of chunks that are read at once; a longer one is read message by message
+RARE: Final = 20_000                   # most stages, events and problems
+RARE_BYTES: Final = 64 * 2**20         # bytes of everything except samples, commands and frames
+BATCH: Final = 2 * 2**20               # bytes of chunks read at once; a longer chunk is read message by message
 _UNREAD: Final = frozenset({log_format.FRF, log_format.LOG}) | log_format.RAW_FRAMES
 _EVERY_CYCLE: Final = frozenset({log_format.SAMPLE, log_format.COMMAND})
 
 
 @dataclass(frozen=True)
 class LoggedRun:
-    """A run as the log has it. ``complete`` is False where the file wasn't closed or some of it is lost.
+    """Run as read from the log. ``complete`` is False if the file was not closed or a part of it is lost.
 
-    ``problems`` says what was stepped over, a line each; ``result`` is None where the run got none. ``epoch_ns`` is the
-    wall clock at control time zero, 0 where the log doesn't tell; ``virtual_string``: a row a cycle, with the columns
-    of `log_format.VIRTUAL_COLUMNS`.
+    ``problems``: damaged places, one line each. ``result``: None if the run has none. ``epoch_ns``: wall clock at
+    control time zero, 0 if unknown. ``virtual_string``: a row a cycle, with the columns of
+    `log_format.VIRTUAL_COLUMNS`.
     """
 
     recording: Recording
@@ -248,24 +249,24 @@ class LoggedRun:
 
 
 def read_run(path: Path, *, salvage: bool = False, batch: int = BATCH) -> LoggedRun:
-    """Everything but the raw frames and the speed setpoints. Raises `LogError` if there is nothing of ours in the file.
+    """Return everything except the raw frames and the speed setpoints. Raises `LogError` without a message of tdhil.
 
-    ``salvage``: also where the file's head is damaged. ``batch``: bytes of chunks that are read at once; 0 is
-    message by message, which gives the same to the bit and takes five times as long.
+    ``salvage``: also read a file with a damaged head. ``batch``: bytes of chunks read at once; 0 means message by
+    message, which gives the same result bit for bit and takes five times as long.
     """
     return _Reading(batch).run(path, salvage)
 
 
 def read_samples(path: Path) -> Iterator[Sample]:
-    """The samples as they were logged, damaged stretches left out. Raises `LogError` like `read_run`."""
+    """Yield the samples of the log, without damaged stretches. Raises `LogError` like `read_run`."""
     for _, message in _messages(path, log_format.SAMPLE):
         yield _sample_of(message)
 
 
 def read_frames(path: Path) -> Iterator[RawFrame]:
-    """The raw frames as they stood on the bus, damaged stretches left out. Raises `LogError` like `read_run`.
+    """Yield the raw frames of the bus, without damaged stretches. Raises `LogError` like `read_run`.
 
-    Of a Modbus line they are requests and replies, the unit for an identifier.
+    On Modbus they are requests and replies, with the unit as identifier.
     """
     for _, message in _messages(path, *log_format.RAW_FRAMES):
         for frame in message.frames:
@@ -273,7 +274,9 @@ def read_frames(path: Path) -> Iterator[RawFrame]:
 
 
 def read_cycles(path: Path) -> Iterator[tuple[Command | None, Sample]]:
-    """Every sample with the command that it answers, None before the first. Raises `LogError` like `read_run`."""
+    """Yield every sample with the command before it, None before the first command. Raises `LogError` like
+    `read_run`.
+    """
     command: Command | None = None
     for number, message in _messages(path, log_format.COMMAND, log_format.SAMPLE):
         if number == log_format.SAMPLE:
@@ -299,7 +302,7 @@ def _messages(path: Path, *wanted: int) -> Iterator[tuple[int, Any]]:
 
 
 class _Reading:
-    """One reading of one file; ``batch``: bytes of chunks that are read at once, 0 for message by message."""
+    """One reading of one file; ``batch``: bytes of chunks read at once, 0 for message by message."""
 
     def __init__(self, batch: int) -> None:
         self._batch = batch
@@ -350,7 +353,9 @@ class _Reading:
         )
 
     def _chunks(self, batch: list[Contents], declared: _Declared) -> bool:
-        """Take what they hold, by numpy where they are laid out as our own writer does it; False: enough is read."""
+        """Read the content of a batch, by numpy if it has the layout of tdhil's writer. Returns False to end the
+        reading.
+        """
         if not self._batch or any(len(one.data) > self._batch for one in batch):
             return all(self._one_by_one(one, declared) for one in batch)
         table = ChunkTable([one.data for one in batch])
@@ -367,7 +372,9 @@ class _Reading:
         return True
 
     def _block(self, table: ChunkTable, first: int, last: int, declared: _Declared) -> bool:
-        """The same of chunks without declarations; False: nothing was taken, they must be read one by one."""
+        """Read chunks without declarations by numpy. Returns False if nothing was read; they must be read one by
+        one.
+        """
         taken = table.messages(
             first, last, declared.numbers, log_format.SAMPLE, log_format.COMMAND, _UNREAD, self._command)
         if taken is None:
@@ -389,7 +396,7 @@ class _Reading:
         return True
 
     def _one_by_one(self, contents: Contents, declared: _Declared) -> bool:
-        """One chunk, message by message, whatever is in it; False: enough is read."""
+        """Read one chunk with any content, message by message. Returns False to end the reading."""
         for found in declared.messages(contents):
             if isinstance(found, Damage):
                 self._problem(str(found))
@@ -402,7 +409,7 @@ class _Reading:
         return True
 
     def _epoch_of(self, log_time_ns: int) -> int:
-        """Return the epoch from the first sample; a time before this century is the zero of a stepped log."""
+        """Return the epoch from the first sample; a time before the year 2000 is the zero of a stepped log."""
         time_s = self._builder.first_time_s
         epoch_ns = log_time_ns - round(time_s * 1e9) if abs(time_s) < 1e9 else 0
         return epoch_ns if epoch_ns > _CENTURY_NS else 0

@@ -1,7 +1,7 @@
-"""Reads a run.mcap that another process is still writing: each time what has come since the last time.
+"""Reading of a run.mcap that another process still writes: each call returns the data since the last call.
 
-The writer hands over whole chunks, so the end of the file may lie in the middle of one: it is left for the next time.
-Only our own files are read so, whose channels are known.
+The end of the file may be inside a chunk that is not complete yet; it is left for the next call. Only files of tdhil
+are read in this way, because their channels are known.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _NUMBERS: Final = {number: number for number in CHANNELS}
 _SKIPPED: Final = log_format.RAW_FRAMES | {
     log_format.COMMAND, log_format.FRF, log_format.LOG, log_format.VIRTUAL_STRING}
 MOST: Final = 2**20
-"""Approximate bytes read at a time: a viewer that joins a long run late must not delay the others."""
+"""Approximate bytes read at a time, so that a viewer that joins a long run late does not delay the others."""
 
 
 def _nothing() -> FloatArray:
@@ -42,7 +42,7 @@ def _nothing() -> FloatArray:
 
 @dataclass(frozen=True)
 class LogNews:
-    """News of a log. ``samples`` (n, 3): control time in s, speed in rad/s, torque in N·m, in order.
+    """New data of a log. ``samples`` (n, 3): control time in s, speed in rad/s, torque in N·m, in order.
 
     ``configuration`` and ``result``: the latest new ones, or None. ``epoch_ns``: wall clock at control time zero, 0
     without a sample. ``more``: more can be read at once. ``closed``: the log is complete.
@@ -60,7 +60,7 @@ class LogNews:
 
 @dataclass(frozen=True)
 class LogChunks:
-    """New whole chunks, decompressed. ``more`` and ``closed`` as in LogNews."""
+    """New complete chunks, decompressed. ``more`` and ``closed`` as in LogNews."""
 
     chunks: tuple[bytes, ...] = ()
     more: bool = False
@@ -69,7 +69,7 @@ class LogChunks:
 
 @dataclass(frozen=True)
 class LoggedMessage:
-    """A message as it stands in the log: its channel's number, its time (wall clock, ns) and its bytes."""
+    """Message as in the log: number of its channel, its time (wall clock, ns) and its bytes."""
 
     number: int
     log_time_ns: int
@@ -77,7 +77,7 @@ class LoggedMessage:
 
 
 def messages_in(chunk: bytes) -> Iterator[LoggedMessage]:
-    """The messages of a chunk in their order; what isn't one of our channels' is left out."""
+    """Yield the messages of a chunk in order, without those of other programs' channels."""
     at = 0
     while at + _RECORD.size <= len(chunk):
         opcode, length = _RECORD.unpack_from(chunk, at)
@@ -92,7 +92,7 @@ def messages_in(chunk: bytes) -> Iterator[LoggedMessage]:
 
 
 class LogTail:
-    """One reader of one file. Costs next to nothing where nothing has come. ``offset``: how far it has read."""
+    """Reader of one file. A call without new data takes nearly no time. ``offset``: bytes read so far."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -101,7 +101,7 @@ class LogTail:
         self.closed = False
 
     def read(self) -> LogNews:
-        """Return the news since the last call; none if the file is missing, or can't be read now."""
+        """Return the data since the last call; none if the file is missing, or cannot be read now."""
         came = self.read_chunks()
         decoded = [self._decoded(one) for one in came.chunks]
         samples = [one.samples for one in decoded if len(one.samples)]
@@ -117,7 +117,7 @@ class LogTail:
         )
 
     def read_chunks(self) -> LogChunks:
-        """The same, byte for byte."""
+        """Return the new complete chunks since the last call."""
         begin, found = self.offset, list[bytes]()
         with suppress(OSError):
             size = self._path.stat().st_size
@@ -130,7 +130,7 @@ class LogTail:
         return LogChunks(tuple(found), self.offset - begin > MOST, self.closed)
 
     def _contents(self, file: BinaryIO, size: int) -> Iterator[bytes]:
-        """Whole chunks; the offset is behind each when it comes. Damage is stepped over where its length is known."""
+        """Yield complete chunks and set the offset after each. Damage is skipped if its length is known."""
         if self.offset == 0:
             if size < len(MAGIC):
                 return
@@ -156,7 +156,7 @@ class LogTail:
         table = ChunkTable((chunk,))
         found = table.messages(0, 1, _NUMBERS, log_format.SAMPLE, log_format.COMMAND, _SKIPPED, NO_COMMAND)
         if found is None:
-            return LogNews()           # samples of another layout: none of our writer's
+            return LogNews()           # samples with another layout are not from tdhil's writer
         block, _, messages, _ = found
         events: list[Event] = []
         stages: list[Stage] = []

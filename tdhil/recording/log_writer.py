@@ -1,10 +1,10 @@
-"""The log of a run as it is written: a cheap front for the control loop, a thread behind it for all the rest.
+"""Writing of a run's log: fast calls for the control loop, and a thread for all other work.
 
-The front appends to a bounded queue and does nothing else. The thread (`Pump`) empties the queue every 50 ms, lays
-out the messages, and closes a chunk after 0.25 s of wall time or 0.2 s of control time, whichever comes first:
-a kill costs less than half a second. In stepped time, where control time runs ahead of the wall, the front wakes
-the thread as soon as 256 records wait, and itself waits where the file is 0.4 s of control time behind. A third
-thread (`Syncer`) has the disk take what was written, against a loss of power.
+The calls of the control loop only append to a bounded queue. The thread (`Pump`) empties the queue every 50 ms, encodes
+the messages, and closes a chunk after 0.25 s of wall time or 0.2 s of control time, whichever is first: a killed
+process loses less than half a second. In stepped time, in which control time is faster than the wall clock, the control
+loop wakes the thread when 256 records wait, and waits if the file is 0.4 s of control time behind. A third thread
+(`Syncer`) requests the operating system to store the data on the disk, against a loss of power.
 """
 
 import errno
@@ -28,52 +28,52 @@ from tdhil.recording.mcap_container import Container, LogGone, RawFile
 from tdhil.recording.recording import Excitation, Level, Ramp, Stage
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The bounded queue between the control loop and the log's thread.
+# Bounded queue between the control loop and the thread of the log.
 
 
 NUDGE: Final = 256
 WAKE_S: Final = 0.2
-LAG_S: Final = 0.4                     # of control time: what a kill may cost in stepped time, plus a cycle
+LAG_S: Final = 0.4                     # s of control time that a killed process may lose in stepped time, plus a cycle
 SPARE: Final = 1024
 
 
 class Backlog:
-    """First in, first out. `put` belongs to the run, everything else to the log's thread.
+    """First-in, first-out queue. `put` belongs to the run, all other methods to the thread of the log.
 
-    A deque, since its append and popleft are atomic: no lock on the way in. ``block`` says what a full queue does:
-    make the caller wait (stepped time, where nothing is lost by waiting) or drop the record and count it (real
-    time, where the shaft turns on).
+    It is a deque, whose append and popleft are atomic, so `put` needs no lock. ``block`` selects the effect of a full
+    queue: the caller waits (stepped time, in which waiting does no harm), or the record is dropped and counted (real
+    time, in which the shaft continues to turn).
     """
 
     def __init__(self, limit: int, *, block: bool) -> None:
         self.items: deque[Any] = deque()
-        self.wake = Flag()                 # there is enough to do, or the end has come
-        self.room = Flag()                 # something was taken out
+        self.wake = Flag()                 # set if there is work, or at the end
+        self.room = Flag()                 # set if a record was removed
         self.dropped = 0
         self.ended = False
-        self.hurry = False                 # a caller waits until all data is in the file
-        self.written = Flag()              # that is done
-        self.saved_s = 0.0                 # control time up to which the file holds everything
+        self.hurry = False                 # True if a caller waits until all data are in the file
+        self.written = Flag()              # set when all data are in the file
+        self.saved_s = 0.0                 # control time, s, up to which the file is complete
         self._limit = limit
         self._block = block
         self._alert = min(NUDGE, limit)
 
     def put(self, item: Any) -> bool:
-        """Takes ``item``; False if the queue is full (it is dropped and counted) or the log has ended."""
+        """Add ``item``. Returns False if the queue is full (the item is dropped and counted) or the log has ended."""
         if len(self.items) >= self._alert and not self._crowded(self._limit):
             return False
         self.items.append(item)
         return True
 
     def put_rare(self, item: Any) -> bool:
-        """Takes an item that is too precious to be dropped with the cyclic ones: some spare places are kept."""
+        """Add an item that must not be dropped with the cyclic ones: some places are reserved for such items."""
         if len(self.items) >= self._alert and not self._crowded(self._limit + SPARE):
             return False
         self.items.append(item)
         return True
 
     def keep_up(self, time_s: float) -> None:
-        """Stepped time, after the cycle of control time ``time_s``: waits while the file is `LAG_S` behind it."""
+        """In stepped time, after the cycle of control time ``time_s``: wait while the file is `LAG_S` behind it."""
         behind_s = time_s - self.saved_s
         if behind_s < WAKE_S:
             return
@@ -85,7 +85,7 @@ class Backlog:
         self.hurry = True
         self.wake.set()
         while not self.ended and not self.written.wait(0.05):
-            pass                           # the time-out covers an end that came in between
+            pass                           # the time-out covers an end that happened in between
 
     def end(self) -> None:
         """Accept no more data, and release callers that wait for room."""
@@ -109,19 +109,19 @@ class Backlog:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Asks the operating system to put the log on the disk, beside the thread that writes it.
+# Request to the operating system to store the log on the disk, beside the thread that writes it.
 #
-# What was written survives a killed process by itself; only a loss of power takes what the disk hasn't got yet. A disk
-# may take a second for that, and neither the control loop nor the thread that closes the chunks waits for it.
+# Written data survive a killed process; only a loss of power loses data that are not on the disk yet. A disk may take a
+# second for this. Neither the control loop nor the thread that closes the chunks waits for it.
 
 
-EVERY_S: Final = 0.25                  # least interval, wall time
+EVERY_S: Final = 0.25                  # s; least interval, wall time
 _CANNOT: Final = frozenset({errno.EINVAL, errno.ENOTSUP, errno.EROFS, errno.ENOSYS})
 _data_to_disk = getattr(os, "fdatasync", os.fsync)
 
 
 class Syncer:
-    """One file's. ``failure`` is what the disk said when it couldn't."""
+    """Disk synchronisation of one file. ``failure``: the error of the disk, if there was one."""
 
     def __init__(self, file: RawFile) -> None:
         self.failure: OSError | None = None
@@ -139,7 +139,7 @@ class Syncer:
             self._wake.set()
 
     def finish(self) -> None:
-        """Everything written is on the disk. Raises OSError if it can't be known to be."""
+        """Wait until all written data are on the disk. Raises OSError if this cannot be confirmed."""
         self._end.set()
         self._wake.set()
         self._thread.join()
@@ -155,13 +155,13 @@ class Syncer:
             try:
                 _data_to_disk(self._file.fileno())
             except OSError as error:
-                # Pipes and devices have no disk behind them.
+                # pipes and devices have no disk
                 self.failure = None if error.errno in _CANNOT else error
             self._end.wait(EVERY_S)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The log's thread: takes what waits, lays it out, closes chunks in time.
+# Thread of the log: empties the queue, encodes the messages, closes chunks in time.
 
 
 POLL_S: Final = 0.05
@@ -172,9 +172,9 @@ FRAMES: Final = 64
 
 
 class Pump:
-    """Runs until the backlog has ended and is empty, or until something fails; then finishes the file.
+    """Thread that runs until the queue has ended and is empty, or until a failure; then it finishes the file.
 
-    ``failure`` is the first exception, whatever came after it.
+    ``failure``: the first exception.
     """
 
     def __init__(
@@ -185,15 +185,15 @@ class Pump:
         self._container = container
         self._syncer = syncer
         self._epoch_ns = epoch_ns
-        self._channel = frames                 # of raw frames
-        self._time_s = 0.0                     # of the latest record, control time
-        self._frames: list[RawFrame] = []      # of the cycle that is under way
+        self._channel = frames                 # channel of raw frames
+        self._time_s = 0.0                     # control time of the latest record
+        self._frames: list[RawFrame] = []      # frames of the present cycle
         self._chunk_ns: int | None = None      # log time of the open chunk's first sample
         self._opened_s: float | None = None    # when the open chunk was first seen, wall time
-        self._told = 0                         # drops that have been logged
+        self._told = 0                         # number of dropped records that have been logged
 
     def run(self) -> None:
-        """Run the thread; no exception leaves it. At its end no caller is left waiting."""
+        """Run the thread. No exception leaves it. At its end no caller is left waiting."""
         try:
             self._guarded(self._work)
         finally:
@@ -207,7 +207,7 @@ class Pump:
     def _guarded(self, step: Callable[[], None]) -> None:
         try:
             step()
-        except BaseException as error:         # kept for the run, which raises it in its own thread
+        except BaseException as error:         # stored for the run, which raises it in its own thread
             self.failure = self.failure or error
 
     def _work(self) -> None:
@@ -274,7 +274,7 @@ class Pump:
             self._close_chunk()
 
     def _put_log(self, log_ns: int, payload: bytes) -> None:
-        """An event again, as viewers know it."""
+        """Add an event for viewers."""
         event = CLASSES["Event"].FromString(payload)
         self._container.add(LOG, log_ns, log_payload(event.kind, event.text, log_ns))
 
@@ -295,7 +295,9 @@ class Pump:
         self._syncer.poke()
 
     def _log_ns(self, time_s: float) -> int:
-        """Log time of a control time; NaN counts as the time of the record before, an impossible one as the epoch."""
+        """Return the log time of a control time; NaN counts as the time of the record before, an impossible one as
+        the epoch.
+        """
         try:
             log_ns = self._epoch_ns + round(time_s * 1e9)
         except (ValueError, OverflowError):
@@ -308,27 +310,26 @@ class Pump:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-STEPPED_QUEUE: Final = 1024            # records; small, since in stepped time it can hold much control time
-REAL_TIME_QUEUE: Final = 16384         # some seconds at 250 Hz: what a slow disk may take before records are lost
-ALIVE_EVERY_S: Final = 1.0             # of control time: whether there still is a thread that writes
+STEPPED_QUEUE: Final = 1024            # records; few, because in stepped time they can contain much control time
+REAL_TIME_QUEUE: Final = 16384         # records; some seconds at 250 Hz, in case of a slow disk
+ALIVE_EVERY_S: Final = 1.0             # s of control time between two checks that the thread is alive
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 
 
 class RunWriter:
-    """One run.mcap. ``epoch_ns`` is the wall clock at control time zero.
+    """Writer of one run.mcap. ``epoch_ns`` is the wall clock at control time zero.
 
-    ``frames``: the channel of the raw frames; each kind of bus has its own topic.
+    ``frames``: channel of the raw frames; each kind of bus has its own topic.
 
-    ``queue_size`` counts records; None takes the default of stepped or real time.
-    ``block``: a full queue makes the caller wait (stepped time); otherwise the record is dropped, counted in
-    ``dropped``, and the drop is logged as an event (real time).
+    ``queue_size``: number of records; None: the default of stepped or real time. ``block``: a full queue makes the
+    caller wait (stepped time); otherwise the record is dropped, counted in ``dropped``, and the drop is logged as an
+    event (real time).
 
-    Raises `LogUnopened` and, where less than ``min_free_bytes`` are free, `LogRefused`.
+    Raises `LogUnopened` and, if less than ``min_free_bytes`` are free, `LogRefused`.
 
-    When the thread fails (disk full, file removed or cut short), the next call raises `LogBroken`, once;
-    after that records are discarded, so that the stop sequence isn't disturbed by a log that is gone, and `close`
-    raises it again.
-    `frame` never raises: it is called from inside the drive's own input and output.
+    If the thread fails (disk full, file removed or truncated), the next call raises `LogBroken`, once. After that
+    records are discarded, so that a lost log does not disturb the stop sequence, and `close` raises the error again.
+    `frame` never raises, because the input and output of the drive calls it.
     """
 
     def __init__(
@@ -365,17 +366,17 @@ class RunWriter:
 
     @property
     def dropped(self) -> int:
-        """Records that did not make it into the log so far."""
+        """Number of records lost so far."""
         return self._backlog.dropped
 
     @property
     def failure(self) -> LogError | None:
-        """The error that ended the log too early, or None."""
+        """Error that ended the log too early, or None."""
         cause = self._pump.failure
         return None if cause is None else self._error(LogBroken, "the log can't be written any more", cause)
 
     def sample(self, sample: Sample) -> None:
-        """One cycle's feedback; call it after the cycle's command and frames."""
+        """Log the feedback of one cycle. Call it after the cycle's command and frames."""
         if abs(sample[0] - self._checked_s) >= ALIVE_EVERY_S:
             self._checked_s = sample[0]
             if not (self._closing or self._thread.is_alive()):
@@ -387,45 +388,45 @@ class RunWriter:
             self._backlog.keep_up(sample[0])
 
     def command(self, time_s: float, command: Command) -> None:
-        """One cycle's command; ``time_s`` is control time."""
+        """Log the command of one cycle; ``time_s`` is control time."""
         if not self._backlog.put((time_s, command)):
             self._refused()
 
     def frame(self, frame: RawFrame) -> None:
-        """One frame from the bus; a `FrameTap`, may be called from any thread."""
+        """Log one frame from the bus. This is a `FrameTap`; any thread may call it."""
         self._backlog.put(frame)
 
     def virtual(self, row: Sequence[float]) -> None:
-        """One cycle of a virtual string (`log_format.VIRTUAL_COLUMNS`)."""
+        """Log one cycle of a virtual string (`log_format.VIRTUAL_COLUMNS`)."""
         if not self._backlog.put(log_messages.virtual_message(row)):
             self._refused()
 
     def stage(self, stage: Stage) -> None:
-        """A stage that has ended."""
+        """Log a stage that has ended."""
         self._rare(log_messages.stage_message(stage))
 
     def excitation(
         self, excitation: Excitation | None, levels: Sequence[Level] = (), ramps: Sequence[Ramp] = ()
     ) -> None:
-        """Everything known so far of the motion; may be called again, the last call counts."""
+        """Log everything known so far of the motion; the last call counts."""
         self._rare(log_messages.excitation_message(excitation, levels, ramps))
 
     def event(self, event: Event) -> None:
-        """Something that happened."""
+        """Log an event."""
         self._rare(log_messages.event_message(event))
 
     def configuration(self, run: Mapping[str, Any], facts: Mapping[str, Any]) -> None:
-        """The run's configuration and `RecordingBuilder.facts`; may be called again, the last call counts."""
+        """Log the run's configuration and `RecordingBuilder.facts`; the last call counts."""
         self._rare(log_messages.configuration_message(run, facts))
 
     def result(self, result: Mapping[str, Any]) -> None:
-        """The result document; may be called again, the last call counts."""
+        """Log the result document; the last call counts."""
         self._rare(log_messages.result_message(result))
         if (response := result.get("frequency_response")) is not None:
             self._rare(log_messages.response_message(response))
 
     def close(self, timeout_s: float = 30.0) -> None:
-        """Writes what waits and finishes the file; idempotent. Raises `LogBroken` if the log isn't whole."""
+        """Write all waiting records and finish the file; idempotent. Raises `LogBroken` if the log is not complete."""
         self._closing = True
         self._backlog.end()
         self._backlog.wake.set()
@@ -445,7 +446,7 @@ class RunWriter:
         try:
             self.close()
         except LogError:
-            if error is None:                  # an exception under way is the first cause and stays it
+            if error is None:                  # an exception already in progress is the first cause, and is raised
                 raise
 
     def _rare(self, message: log_messages.Cold) -> None:

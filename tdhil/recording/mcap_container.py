@@ -1,14 +1,14 @@
-"""The MCAP container, from records to chunks to the file.
+"""Writer of the MCAP container: records to chunks to the file.
 
-mcap's own writer costs some 7 µs a message and cannot take back a chunk that the disk refused; its
-record classes are used for everything that is written once a chunk or less. A message stands in its chunk as
+The writer of the mcap package takes some 7 µs a message and cannot withdraw a chunk that the disk refused. Its record
+classes are used for everything that is written once a chunk or less often. A message in its chunk:
 
 ::
 
     05  length:8  channel:2  sequence:4  log time:8  publish time:8  payload          (little-endian)
 
-Schemas and channels stand in the first chunk, where the CRC covers them. Each chunk goes to the operating
-system in one piece with its indexes, so what a kill leaves is whole chunks and at most one cut one.
+Schemas and channels are in the first chunk, where the CRC covers them. Each chunk is written in one piece with its
+indexes, so a killed process leaves complete chunks and at most one cut chunk.
 """
 
 import errno
@@ -35,11 +35,11 @@ _MESSAGE: Final = Struct("<BQHIQQ")
 _INDEX: Final = Struct("<BQHI")
 _FOOTER_HEAD: Final = Struct("<BQQQ")
 _TAIL: Final = 16
-"""Bytes that are compared with what was written: a time and an offset of the last index, never all zero."""
+"""Bytes compared with the last write: a time and an offset of the last index, which are never all zero."""
 
 
 class RawFile(Protocol):
-    """Interface of the file: an unbuffered binary one fits."""
+    """Interface of the file; an unbuffered binary file fits."""
 
     def write(self, data: memoryview, /) -> int | None: ...
 
@@ -53,26 +53,25 @@ class RawFile(Protocol):
 
 
 class LogGone(OSError):
-    """The file was removed or cut short by another program while it was being written."""
+    """Another program removed or truncated the file during writing."""
 
 
 class Container:
-    """One file being written. Every method but `add` may raise OSError; the file then ends with its last chunk.
+    """One file during writing. Every method except `add` may raise OSError; the file then ends with its last chunk.
 
-    Before each write it is looked whether the file is still there: one that was removed takes all that is written to it
-    without a word, and so does one that was cut short.
+    Each write first checks that the file still exists: a write to a removed or truncated file gives no error.
     """
 
     def __init__(self, file: RawFile) -> None:
         self._file = file
         self._offset = 0
-        self._tail = b""                                # of what was written last
-        self._seam: tuple[int, bytes] = (0, b"")        # where that begins, and what stands before it
+        self._tail = b""                                # last bytes written
+        self._seam: tuple[int, bytes] = (0, b"")        # their position, and the bytes before them
         self._watched = _is_named(file)
         self._compress = zstandard.ZstdCompressor(level=1).compress
         self._parts: list[bytes] = []
         self._size = 0
-        self._index: dict[int, list[int]] = {}          # channel: log time, offset, log time, offset, …
+        self._index: dict[int, list[int]] = {}          # by channel: log time, offset, log time, offset,
         self._chunks: list[ChunkIndex] = []
         self._counts: dict[int, int] = dict.fromkeys(CHANNELS, 0)
         self._declarations = _declarations()
@@ -84,7 +83,7 @@ class Container:
         return self._size
 
     def add(self, channel: int, log_time_ns: int, payload: bytes) -> None:
-        """Puts a message into the open chunk."""
+        """Put a message into the open chunk."""
         if not self._parts and not self._chunks:
             first = b"".join(record for group in self._declarations for record in group)
             self._parts.append(first)
@@ -96,7 +95,7 @@ class Container:
         self._size += 31 + length
 
     def close_chunk(self) -> None:
-        """Compresses the open chunk, if it holds anything, and hands it to the operating system."""
+        """Compress the open chunk, if it is not empty, and pass it to the operating system."""
         if not self._parts:
             return
         raw, index = b"".join(self._parts), self._index
@@ -122,7 +121,7 @@ class Container:
             message_index_length=end - start - len(chunk), uncompressed_size=len(raw)))
 
     def finish(self) -> None:
-        """Writes the summary; the file is then a whole MCAP. An open chunk is not part of it."""
+        """Write the summary; the file is then a complete MCAP. An open chunk is not part of it."""
         end = _record(DataEnd(0))
         start = self._offset + len(end)
         schemas, channels = self._declarations
@@ -146,7 +145,7 @@ class Container:
         self._file.close()
 
     def _put(self, data: bytes) -> None:
-        """Writes all of ``data``, or leaves the file as it was before and raises OSError; LogGone where it is gone."""
+        """Write all of ``data``, or restore the file and raise OSError; LogGone if the file is gone."""
         if self._watched:
             self._require_whole()
         left = memoryview(data)
@@ -173,13 +172,13 @@ class Container:
             raise LogGone(
                 errno.EIO, f"the file was cut to {found.st_size} of {self._offset} bytes while it was being written"
             )
-        # Cut between the last look and the last write: the write has made it long again, with a hole before it.
+        # If the file was truncated between check and write, the write made it long again, with a hole before it.
         start, before = self._seam
-        if sys.platform == "win32":    # no pread; no other program can cut an open file
+        if sys.platform == "win32":    # no pread; on Windows no other program can truncate an open file
             return
         try:
             stands = os.pread(self._file.fileno(), len(before), start)
-        except OSError:                # a file that can't be read, too: nothing to compare
+        except OSError:                # also a file that cannot be read: nothing to compare
             return
         if stands != before:
             raise LogGone(
@@ -198,7 +197,7 @@ class Container:
 
 
 def _is_named(file: RawFile) -> bool:
-    """Return whether it is a plain file with a count of names. Pipes, devices and some file systems have none."""
+    """Return whether this is a regular file with a count of names. Pipes, devices and some file systems have none."""
     try:
         found = os.fstat(file.fileno())
     except (OSError, ValueError):
@@ -207,7 +206,7 @@ def _is_named(file: RawFile) -> bool:
 
 
 def _declarations() -> tuple[list[bytes], list[bytes]]:
-    """The schema and channel records; a channel and its schema bear the same number."""
+    """Return the schema and channel records; a channel and its schema have the same number."""
     schemas, channels = [], []
     for number, (topic, message) in CHANNELS.items():
         schemas.append(_record(
@@ -218,7 +217,7 @@ def _declarations() -> tuple[list[bytes], list[bytes]]:
 
 
 def schema_of(message: str) -> bytes:
-    """A message's schema as the log has it: a FileDescriptorSet of protobuf."""
+    """Return the schema of a message for the log: a FileDescriptorSet of protobuf."""
     described, files = CLASSES[message].DESCRIPTOR.file, FileDescriptorSet()
     for file in (*described.dependencies, described):
         file.CopyToProto(files.file.add())

@@ -1,12 +1,12 @@
-"""Walks through an MCAP file that may be whole, cut, damaged or hostile, and gives what can be trusted.
+"""Reading of an MCAP file that may be complete, cut, damaged or hostile: yields the content that can be trusted.
 
 ::
 
     magic  { 06 length:8  Chunk   { 07 length:8  MessageIndex } … } …  0F DataEnd  summary  02 Footer  magic
 
-Only what stands in chunks counts, since only that has a CRC; indexes and summary are stepped over. Where the
-records make no sense any more, the next chunk is looked for by the name of its compression and its consistent
-lengths. Nothing is decompressed beyond the limit of a chunk (`contents`), nor in sum beyond `TOTAL_LIMIT`.
+Only the content of chunks is used, because only chunks have a CRC; indexes and summary are skipped. After invalid
+records, the next chunk is searched by the name of its compression and its consistent lengths. At most the limit of a
+chunk (`contents`) is decompressed, and `TOTAL_LIMIT` in all.
 """
 
 import re
@@ -22,14 +22,14 @@ import zstandard
 from tdhil.recording.mcap_container import MAGIC
 
 # ---------------------------------------------------------------------------------------------------------------------
-# One chunk of an MCAP file, decompressed within limits that hold whatever it declares.
+# One chunk of an MCAP file, decompressed within limits that do not depend on its declarations.
 #
 # ::
 #
 #     06 length:8  start time:8  end time:8  uncompressed size:8  CRC:4  n:4 compression  size:8 data
 
 
-CHUNK_LIMIT: Final = 16 * 2**20        # bytes, uncompressed; a power of two, as zstd's window wants it
+CHUNK_LIMIT: Final = 16 * 2**20        # bytes, uncompressed; a power of two, as the window of zstd requires
 CHUNK: Final = 0x06
 CHUNK_HEAD: Final = Struct("<QQQII")
 _RECORD_HEAD: Final = Struct("<BQ")
@@ -37,7 +37,7 @@ _RECORD_HEAD: Final = Struct("<BQ")
 
 @dataclass(frozen=True)
 class Damage:
-    """Something that was stepped over; ``offset`` is its place in the file."""
+    """Damaged place that was skipped; ``offset`` is its position in the file."""
 
     offset: int
     text: str
@@ -48,7 +48,7 @@ class Damage:
 
 @dataclass(frozen=True)
 class Contents:
-    """Content of one good chunk, uncompressed; ``offset`` is the chunk's place in the file."""
+    """Content of one good chunk, uncompressed; ``offset`` is the chunk's position in the file."""
 
     offset: int
     data: bytes
@@ -66,7 +66,7 @@ class ChunkHead:
 
 
 def chunk_head(file: BinaryIO, offset: int, size: int) -> ChunkHead | None:
-    """The chunk record at ``offset``, if there is one whose lengths agree with each other and with the file."""
+    """Return the chunk record at ``offset``, if its lengths agree with each other and with the file; else None."""
     head = read_at(file, offset, _RECORD_HEAD.size + CHUNK_HEAD.size + 24)
     if len(head) < _RECORD_HEAD.size + CHUNK_HEAD.size or head[0] != CHUNK:
         return None
@@ -83,7 +83,7 @@ def chunk_head(file: BinaryIO, offset: int, size: int) -> ChunkHead | None:
 
 
 def contents(file: BinaryIO, offset: int, chunk: ChunkHead, zstd: zstandard.ZstdDecompressor) -> Contents | Damage:
-    """The chunk whose head was read at ``offset``, decompressed and checked. ``zstd`` bounds the window."""
+    """Return the chunk with the head read at ``offset``, decompressed and checked. ``zstd`` limits the window."""
     if chunk.uncompressed_size > CHUNK_LIMIT or chunk.length > CHUNK_LIMIT:
         return Damage(offset, f"a chunk of {max(chunk.uncompressed_size, chunk.length)} bytes is refused "
                                f"(limit {CHUNK_LIMIT})")
@@ -100,7 +100,7 @@ def contents(file: BinaryIO, offset: int, chunk: ChunkHead, zstd: zstandard.Zstd
 
 
 def _decompress(zstd: zstandard.ZstdDecompressor, compression: str, data: bytes, limit: int) -> bytes:
-    """Return at most ``limit`` bytes of it, and never use more memory than that."""
+    """Return at most ``limit`` decompressed bytes, and never use more memory than that."""
     if compression == "zstd":
         if 0 <= zstandard.frame_content_size(data) < limit:     # memory is reserved for the stated size only
             return zstd.decompress(data)
@@ -114,7 +114,7 @@ def _decompress(zstd: zstandard.ZstdDecompressor, compression: str, data: bytes,
 
 
 def read_at(file: BinaryIO, offset: int, length: int) -> bytes:
-    """Up to ``length`` bytes from ``offset`` on; fewer at the end of the file."""
+    """Return up to ``length`` bytes from ``offset`` on; fewer at the end of the file."""
     file.seek(max(0, offset))
     return file.read(length)
 
@@ -139,16 +139,16 @@ class Library:
 
 
 class Whole:
-    """The last thing from a file that was closed as it should be."""
+    """Sign of a file that was closed properly, at its end."""
 
 
 Found = Contents | Damage | Library | Whole
 
 
 def walk(file: BinaryIO, size: int) -> Iterator[Found]:
-    """The contents of every good chunk, and what was met on the way.
+    """Yield the content of every good chunk, damaged places, the library, and the end of a closed file.
 
-    ``size`` is the length of the file. The magic at its start is the caller's to check.
+    ``size`` is the length of the file. The caller checks the magic at its start.
     """
     offset, total = len(MAGIC), 0
     zstd = zstandard.ZstdDecompressor(max_window_size=CHUNK_LIMIT)
@@ -157,7 +157,7 @@ def walk(file: BinaryIO, size: int) -> Iterator[Found]:
         opcode, length = _RECORD.unpack_from(head) if len(head) >= _RECORD.size else (0, 0)
         end = offset + _RECORD.size + length
         if opcode == MESSAGE_INDEX and end <= size and _is_index(head, length):
-            offset = end                    # most of all records
+            offset = end                    # most records are of this kind
             continue
         if not head:
             yield Damage(offset, "the file ends in mid-run: it was not closed")
@@ -193,9 +193,9 @@ def _is_index(head: bytes, length: int) -> bool:
 
 def _next_chunk(file: BinaryIO, offset: int, size: int) -> int | None:
     """Return the start of the next consistent chunk; None if there is none."""
-    before = _RECORD.size + CHUNK_HEAD.size - 4           # from the chunk's first byte to its compression's name
+    before = _RECORD.size + CHUNK_HEAD.size - 4           # bytes from the chunk's start to the compression's name
     while offset < size:
-        block = read_at(file, offset, _STEP + before + 8)  # blocks overlap by what a chunk's head takes
+        block = read_at(file, offset, _STEP + before + 8)  # blocks overlap by the size of a chunk's head
         for match in _NAMES.finditer(block, before):
             if chunk_head(file, offset + match.start() - before, size):
                 return offset + match.start() - before
@@ -209,7 +209,7 @@ def _is_closed(file: BinaryIO, size: int) -> bool:
 
 
 def _library(body: bytes) -> str:
-    """``n:4 profile  n:4 library``."""
+    """Return the library from a header record, ``n:4 profile  n:4 library``."""
     start = 4 + int.from_bytes(body[:4], "little")
     length = int.from_bytes(body[start:start + 4], "little")
     return body[start + 4:start + 4 + length].decode("utf-8", "replace")

@@ -1,6 +1,7 @@
-"""A recording as an npz: what a cache keeps, read in milliseconds. It is no log: it has no frames, commands or events.
+"""Recording as an npz file for a cache, read in milliseconds. It is not a log: it has no frames, commands or events.
 
-The arrays stand in it as they are, everything else as one JSON text; what is read back is equal to the last bit.
+The arrays are stored unchanged, everything else as one JSON text. The recording that is read back is equal to the last
+bit.
 """
 
 import json
@@ -18,14 +19,14 @@ from tdhil.recording.recording import Recording
 
 _ARRAYS: Final = ("time_s", "speed_rad_s", "torque_nm", "fresh", "limited")
 _SOME: Final = ("commanded_torque_nm", "demanded_torque_nm", "position_rad")
-"""Arrays that a recording may be without."""
+"""Optional arrays of a recording."""
 _FLAGS: Final = ("fresh", "limited")
 _REST: Final = tuple(field.name for field in fields(Recording) if field.name not in (*_ARRAYS, *_SOME))
 _TEXT: Final = "json"
 
 
 def pack_recording(recording: Recording, beside: Mapping[str, Any]) -> bytes:
-    """The file's bytes. ``beside``: what else is to be kept, as plain data for JSON. Raises TypeError or ValueError."""
+    """Return the bytes of the file. ``beside``: additional plain data for JSON. Raises TypeError or ValueError."""
     whole = asdict(recording)
     text = json.dumps({"recording": {name: whole[name] for name in _REST}, "beside": dict(beside)})
     file = BytesIO()
@@ -37,7 +38,7 @@ def pack_recording(recording: Recording, beside: Mapping[str, Any]) -> bytes:
 
 
 def unpack_recording(path: Path) -> tuple[Recording, dict[str, Any]] | None:
-    """The recording and what was kept beside it; None for a file that is missing, damaged, or something else."""
+    """Return the recording and the additional data; None for a missing or damaged file, or one of another kind."""
     try:
         with np.load(path, allow_pickle=False) as found:
             arrays = {name: found[name] for name in (*_ARRAYS, *_SOME) if name not in _SOME or name in found.files}

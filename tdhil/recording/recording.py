@@ -1,8 +1,8 @@
-"""A recording: all that identification may see, and nothing else.
+"""Recording: all data that identification may use.
 
-Pure data. `tdhil replay` builds it from run.mcap, a live run from its own samples; both must be equal to
-the last bit, and so must what is identified from them on the same machine. On another processor, whose linear algebra
-sums in another order (or on another number of cores), what is identified is the same to 1e-9.
+Pure data. `tdhil replay` builds it from run.mcap, a live run from its own samples. Both must be equal to the last bit,
+and so must their results on the same machine. On another processor or number of cores, whose linear algebra sums in
+another order, the results are equal to 1e-9.
 """
 
 import math
@@ -17,22 +17,22 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
 ABORTED: Final = "aborted"
-"""Outcome of a stage that did not come to its end."""
+"""Outcome of a stage that did not reach its end."""
 
 MARGIN_S: Final = 1.0
-"""Time before an abort that is left out too, s: the fault is in the signals before it is detected."""
+"""Time before an abort that is also left out, s, because a fault is in the signals before it is detected."""
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A stretch of periodic excitation about one mean speed.
+    """Stretch of periodic excitation about one mean speed.
 
-    The reference was ``offset_rad_s + sum(a * cos(2π f (t - start_s) + φ))`` over the lines; every line is a
-    whole multiple of ``1 / period_s``. ``end_s`` is where the last whole period ended (earlier if aborted);
-    the first ``settle_periods`` periods are transient and not for identification.
+    The reference was ``offset_rad_s + sum(a * cos(2π f (t - start_s) + φ))`` over the lines; every line is a whole
+    multiple of ``1 / period_s``. ``end_s`` is the end of the last whole period (earlier if aborted); the first
+    ``settle_periods`` periods are transient and not for identification.
 
-    With ``torque_amplitudes_nm`` it was a torque offset that had these lines and phases, about zero, while the speed
-    reference stood at ``offset_rad_s``; ``amplitudes_rad_s`` are then what the speed was expected to do.
+    With ``torque_amplitudes_nm`` the excitation was a torque offset with these lines and phases, about zero, with a
+    constant speed reference ``offset_rad_s``; ``amplitudes_rad_s`` are then the expected amplitudes of the speed.
     """
 
     start_s: float
@@ -57,7 +57,7 @@ class Excitation:
 
 @dataclass(frozen=True)
 class Level:
-    """A stretch of steady speed: its mean torque is friction, free of every lag."""
+    """Stretch of steady speed: its mean torque is friction, without an effect of the lags."""
 
     start_s: float
     end_s: float
@@ -65,7 +65,7 @@ class Level:
 
 @dataclass(frozen=True)
 class Ramp:
-    """A stretch in which torque or speed was ramped: a rough inertia can be had from it."""
+    """Stretch with a ramp of torque or speed, which gives a rough inertia."""
 
     start_s: float
     end_s: float
@@ -73,19 +73,19 @@ class Ramp:
 
 @dataclass(frozen=True)
 class LagPrior:
-    """A reporting lag as the drive or the rig states it, with a standard deviation; None = nothing known."""
+    """Reporting lag as stated by the drive or the rig, with a standard deviation; None: unknown."""
 
     speed_lag_s: float | None = None
     speed_lag_sd_s: float = 0.0
     torque_lag_s: float | None = None
     torque_lag_sd_s: float = 0.0
     source: str = ""
-    skew_sd_s: float = 0.01    # torque and speed are of one frame to within this; used only if the lines can't tell
+    skew_sd_s: float = 0.01    # sd of the time offset of torque and speed in one frame; used if the lines leave it open
 
 
 @dataclass(frozen=True)
 class Pipe:
-    """A drill string's uniform pipe as its sizes have it, at the motor's shaft; ``rel_sd`` of either."""
+    """Uniform pipe of a drill string by its sizes, at the motor shaft; ``rel_sd`` of inertia and of stiffness."""
 
     inertia_kg_m2: float               # J_s = ρ I L
     stiffness_nm_rad: float            # k = G I/L, from end to end
@@ -94,18 +94,18 @@ class Pipe:
 
     @property
     def impedance_nm_s_rad(self) -> float:
-        """ζ = √(J_s k), what waves feel."""
+        """Characteristic impedance ζ = √(J_s k) of the pipe."""
         return math.sqrt(self.inertia_kg_m2 * self.stiffness_nm_rad)
 
     @property
     def delay_s(self) -> float:
-        """√(J_s/k), from one end to the other."""
+        """Travel time √(J_s/k) from one end to the other, s."""
         return math.sqrt(self.inertia_kg_m2 / self.stiffness_nm_rad)
 
 
 @dataclass(frozen=True)
 class SteppedSetpoint:
-    """A speed setpoint that was stepped once in ``period_s``, and how the drive made the shaft follow it:
+    """Speed setpoint with one step per ``period_s``, and the response of the shaft's speed:
 
     H(s) = (1 + zero·s)/(1 + first·s + second·s²) from setpoint to the shaft's speed.
     """
@@ -118,9 +118,7 @@ class SteppedSetpoint:
 
 @dataclass(frozen=True)
 class TorqueAnswer:
-    """How the reported torque followed the commanded one: 1/(1 + lag·s + shape·(lag·s)²), and a delay, which is left
-    out.
-    """
+    """Response of the reported torque to the commanded one: 1/(1 + lag·s + shape·(lag·s)²), without its delay."""
 
     lag_s: float
     shape: float
@@ -128,14 +126,14 @@ class TorqueAnswer:
 
 @dataclass(frozen=True)
 class ImpedanceInput:
-    """Command that measured the drive's own impedance: a torque offset or the speed reference.
+    """Command for the measurement of the drive's impedance: a torque offset or the speed reference.
 
-    ``count`` is one count of it, N·m or rad/s; commands are rounded to it (0: no rounding). A command holds from one
-    sample to the next. ``reference_filter_s``: known first-order filter of the drive's speed reference, s.
+    ``count``: resolution of the command, N·m or rad/s; commands are rounded to it (0: no rounding). A command is held
+    from one sample to the next. ``reference_filter_s``: known first-order filter of the drive's speed reference, s.
     ``string_nm_s_rad``: impedance ζ of the string for |r|, at the motor; 0: unknown.
     """
 
-    by: str                            # offset, reference
+    by: str                            # offset or reference
     count: float = 0.0
     reference_filter_s: float = 0.0
     string_nm_s_rad: float = 0.0
@@ -143,7 +141,7 @@ class ImpedanceInput:
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage of the protocol as it went. ``outcome``: ok, degraded, aborted."""
+    """Completed or aborted stage. ``outcome``: ok, degraded, aborted."""
 
     name: str
     start_s: float
@@ -154,15 +152,15 @@ class Stage:
 
 @dataclass(frozen=True)
 class Recording:
-    """N samples of one run, SI at the motor shaft, and what must be known to read them.
+    """N samples of one run, SI at the motor shaft, and the data needed to use them.
 
     ``time_s`` (N,) is the SYNC's control time, rising; ``speed_rad_s`` and ``torque_nm`` (N,) are as reported;
-    ``fresh`` (N,) is False where a cycle brought no new feedback (such samples are not for identification);
-    ``limited`` (N,) is True where the drive said that an internal limit was active. Three arrays (N,) are None where
-    the log has nothing of them, and NaN at samples without a value: ``commanded_torque_nm``, the torque setpoint, N·m,
-    only of samples with the drive enabled and in torque mode; ``demanded_torque_nm``, the drive's own torque demand
-    (6074h), N·m, only of samples with the drive enabled; ``position_rad``, the motor shaft's angle since the first
-    reading, counted apart from the speed, unwrapped.
+    ``fresh`` (N,) is False for a cycle without new feedback (such samples are not for identification); ``limited`` (N,)
+    is True while the drive reported an active internal limit. Three arrays (N,) are None if the log does not have them,
+    and NaN at samples without a value: ``commanded_torque_nm``, the torque setpoint, N·m, only of samples with the
+    drive enabled and in torque mode; ``demanded_torque_nm``, the drive's own torque demand (6074h), N·m, only of
+    samples with the drive enabled; ``position_rad``, the angle of the motor shaft since the first reading, measured
+    independently of the speed, unwrapped.
     """
 
     time_s: FloatArray
@@ -181,37 +179,37 @@ class Recording:
     torque_offset_nm: float = 0.0          # reported at standstill, de-energised; subtracted by identification
     torque_scale_rel_sd: float = 0.0       # 1 sd of the drive's torque scale, as a share of the reading
     gear_ratio: float = 1.0                # i = ω_motor / ω_main
-    timing_half_width_s: float = 0.0       # usual half-width of a transaction: when in it a sample was taken is open
-    stepped_setpoint: SteppedSetpoint | None = None     # in speed mode
-    impedance: ImpedanceInput | None = None             # where the drive's own impedance was measured
-    torque_answer: TorqueAnswer | None = None           # in torque mode, if it was checked
-    winds_up: bool = False                 # a load that winds up hangs on the shaft, as rig.yaml says (load: string)
-    pipe: Pipe | None = None               # of the drill string that hangs on the shaft, where its sizes are known
+    timing_half_width_s: float = 0.0       # usual half-width of a transaction, within which a sample was taken
+    stepped_setpoint: SteppedSetpoint | None = None     # of speed mode
+    impedance: ImpedanceInput | None = None             # if the drive's impedance was measured
+    torque_answer: TorqueAnswer | None = None           # of torque mode, if it was checked
+    winds_up: bool = False                 # a load that winds up hangs on the shaft, as rig.yaml states (load: string)
+    pipe: Pipe | None = None               # of the drill string on the shaft, if its sizes are known
     simulated: bool = False
     complete: bool = True                  # False: the log ended before the run did
     commanded_torque_nm: FloatArray | None = None
     demanded_torque_nm: FloatArray | None = None
     position_rad: FloatArray | None = None
-    position_gap_s: float | None = None    # over a longer gap in position_rad the turns are not known; None: over any
-    speed_unit_accepted: bool = False      # though the position contradicted it (--accept-speed-unit)
+    position_gap_s: float | None = None    # longest gap in position_rad without a lost turn, s; None: any gap
+    speed_unit_accepted: bool = False      # with --accept-speed-unit, although the position contradicted the speed
 
 
 def aborted_stage(recording: Recording) -> Stage | None:
-    """The first stage that did not come to its end."""
+    """Return the first stage that did not reach its end, or None."""
     return next((stage for stage in recording.stages if stage.outcome == ABORTED), None)
 
 
 def before_abort(recording: Recording) -> Recording:
-    """Return the part for the identification: all until a moment before the first aborted stage ended, or everything.
+    """Return the part for the identification: up to a moment before the first aborted stage ended, or everything.
 
-    An aborted run is stopped in the same record: samples of braking and of standstill follow those of the planned
+    The recording of an aborted run includes the stop: samples of braking and of standstill follow those of the planned
     motion. Segments end with their last whole period.
     """
     stage = aborted_stage(recording)
     if stage is None or not math.isfinite(stage.end_s):
         return recording
     end_s = stage.end_s - MARGIN_S
-    # Times that don't rise are refused later, by those who look at samples: nothing is sorted or searched here.
+    # times that do not rise are refused later, by the checks of samples; nothing is sorted or searched here
     kept = recording.time_s < end_s
     excitation = recording.excitation
     return replace(
@@ -244,5 +242,5 @@ def _whole(segment: Segment, end_s: float) -> Segment:
     if not segment.end_s > end_s or not segment.period_s > 0.0:
         return segment
     periods = math.floor((end_s - segment.start_s) / segment.period_s)
-    # A segment without a whole period keeps a part of one, which counts for nothing.
+    # a segment without a whole period keeps a part of one, which is not used
     return replace(segment, end_s=segment.start_s + periods * segment.period_s if periods else end_s)

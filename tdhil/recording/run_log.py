@@ -1,4 +1,4 @@
-"""Log of a run as it happens: to the file, and to the Recording for the identification afterwards."""
+"""Log of a run during the run: data go to the file, and to the Recording for the identification."""
 
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.recording import Excitation, FloatArray, Level, Ramp, Recording, Stage
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What ended a run before its time: written into its log as typed fields, and found there again, in older logs too.
+# Cause that ended a run early: written into its log as typed fields, and read back from it, also from older logs.
 
 
 @dataclass(frozen=True)
 class RunEnd:
-    """``kind`` is the error's class, such as DriveFault; ``time_s`` is control time; ``exit_code`` is the run's."""
+    """Cause of an early end. ``kind``: class of the error, such as DriveFault; ``time_s``: control time;
+    ``exit_code``: of the run.
+    """
 
     kind: str
     what: str
@@ -33,16 +35,16 @@ class RunEnd:
     next_step: str
     exit_code: int
     time_s: float
-    code: str = ""      # in the table of messages; a log of an older version has none
+    code: str = ""      # code in the table of messages; '' in a log of an older version
 
     @property
     def message(self) -> str:
-        """Text of the event, and its place."""
+        """Text of the event, with its place."""
         return f"{self.where}: {self.what}" if self.where else self.what
 
 
 def ended_by(error: BaseException, time_s: float) -> dict[str, Any]:
-    """For the log's configuration, under `ended`."""
+    """Return the cause for the log's configuration, under `ended`."""
     what, where, next_step = str(error), "", ""
     if isinstance(error, TdhilError):
         what, where, next_step = error.what, error.where, error.next_step
@@ -53,7 +55,7 @@ def ended_by(error: BaseException, time_s: float) -> dict[str, Any]:
 def find_ended(configuration: Mapping[str, Any], events: tuple[Event, ...]) -> RunEnd | None:
     """Return the cause that ended the run of this log; None if the run was complete, or the log ends first.
 
-    Logs older than 0.2 have it as text in an event only.
+    Logs older than 0.2 have the cause only as text in an event.
     """
     found = configuration.get("ended")
     if isinstance(found, Mapping):
@@ -92,7 +94,7 @@ def _number(value: object) -> float:
 # ---------------------------------------------------------------------------------------------------------------------
 
 class RunLog:
-    """One run's memory. What the builder gets, the file gets, so that a replay sees what the live run saw."""
+    """Memory of one run. Builder and file receive the same data, so that a replay uses the data of the live run."""
 
     def __init__(self, writer: RunWriter, run: Mapping[str, Any]) -> None:
         self._writer = writer
@@ -102,16 +104,16 @@ class RunLog:
         self._virtual = array("d")
         self._commanded = array("d")
         self.frame: FrameTap = writer.frame
-        """One raw frame, as it passes on the bus."""
+        """Log one raw frame as it passes on the bus."""
         writer.configuration(self._run, {})
 
     @property
     def run(self) -> dict[str, Any]:
-        """The run's configuration so far."""
+        """Return the configuration of the run so far."""
         return dict(self._run)
 
     def cycle(self, command: Command, sample: Sample) -> None:
-        """One exchange."""
+        """Log one exchange."""
         self._builder.add(sample, command)
         self._commanded.append(command.torque_nm)
         self._writer.command(sample.time_s, command)
@@ -119,21 +121,21 @@ class RunLog:
 
     @property
     def commanded_nm(self) -> FloatArray:
-        """The torque that was commanded in each cycle, (N,), N·m."""
+        """Return the commanded torque of each cycle, (N,), N·m."""
         return np.array(self._commanded)
 
     def virtual(self, row: Sequence[float]) -> None:
-        """One cycle of a virtual string (`log_format.VIRTUAL_COLUMNS`)."""
+        """Log one cycle of a virtual string (`log_format.VIRTUAL_COLUMNS`)."""
         self._virtual.extend(row)
         self._writer.virtual(row)
 
     @property
     def virtual_string(self) -> FloatArray:
-        """(cycles, columns) of it."""
+        """Return the cycles of a virtual string, (cycles, columns)."""
         return np.array(self._virtual).reshape(-1, len(VIRTUAL_COLUMNS))
 
     def event(self, time_s: float, kind: str, text: str) -> None:
-        """Something worth a line."""
+        """Log an event."""
         self._writer.event(Event(time_s, kind, text))
 
     def failure(self, time_s: float, error: BaseException) -> None:
@@ -146,7 +148,7 @@ class RunLog:
         self._writer.event(Event(time_s, FAILURE, f"{type(error).__name__}: {error}", trace))
 
     def stage(self, stage: Stage) -> Stage:
-        """A stage that has ended; as it stands in the log: degraded where the log could not take all of it."""
+        """Log a stage that has ended. Return it as logged: degraded if the log is not complete."""
         dropped = self._writer.dropped - self._dropped
         if dropped:
             self._dropped += dropped
@@ -158,26 +160,26 @@ class RunLog:
         return stage
 
     def motion(self, excitation: Excitation | None, levels: Sequence[Level] = (), ramps: Sequence[Ramp] = ()) -> None:
-        """Everything known so far of what the shaft was made to do; the last call counts."""
+        """Log everything known so far of the motion; the last call counts."""
         self._builder.excitation(excitation, levels, ramps)
         self._writer.excitation(excitation, levels, ramps)
 
     def learn(self, **facts: Any) -> None:
-        """Facts of the Recording, by their names there."""
+        """Log facts of the Recording, by their names there."""
         self._builder.learn(**facts)
         self._writer.configuration(self._run, self._builder.facts)
 
     def configure(self, **run: Any) -> None:
-        """More of the run's configuration."""
+        """Add to the configuration of the run."""
         self._run |= run
         self._writer.configuration(self._run, self._builder.facts)
 
     def result(self, document: Mapping[str, Any]) -> None:
-        """The result document."""
+        """Log the result document."""
         self._writer.result(document)
 
     def recording(self, *, complete: bool) -> Recording:
-        """The Recording so far."""
+        """Return the Recording so far."""
         return self._builder.recording(complete=complete)
 
     def close(self) -> None:

@@ -26,7 +26,7 @@ _GAP_PERIODS: Final = 20.0
 
 @dataclass(frozen=True)
 class Gap:
-    """A stretch without samples between two that are there; control time."""
+    """Stretch without samples between two samples; control time."""
 
     start_s: float
     end_s: float
@@ -34,7 +34,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class Salvage:
-    """Readable content. ``gaps``: holes longer than a single missed cycle; ``lost``: text, one line each."""
+    """Readable content of a log. ``gaps``: longer than a single missed cycle; ``lost``: one line of text each."""
 
     run: LoggedRun
     gaps: tuple[Gap, ...]
@@ -46,7 +46,7 @@ class Salvage:
 
 
 def examine(path: Path) -> Salvage:
-    """Read what can be read. Raises `NothingRecoverable`."""
+    """Read all readable content. Raises `NothingRecoverable`."""
     try:
         run = read_run(path, salvage=True)
     except LogError as error:
@@ -65,9 +65,9 @@ def examine(path: Path) -> Salvage:
 
 
 def find_gaps(run: LoggedRun) -> tuple[Gap, ...]:
-    """Return gaps between samples: more than 20 periods, a period being the median step."""
+    """Return gaps between samples: more than 20 periods, with the median step as period."""
     time_s = run.recording.time_s
-    with np.errstate(invalid="ignore", over="ignore"):        # a hostile file's times may be anything
+    with np.errstate(invalid="ignore", over="ignore"):        # times in a hostile file may have any value
         steps = np.diff(time_s)
     rising = steps[steps > 0.0]
     if run.complete or len(rising) == 0:
@@ -77,13 +77,13 @@ def find_gaps(run: LoggedRun) -> tuple[Gap, ...]:
 
 
 Edit = Callable[[int, bytes], bytes]
-"""(channel, payload) → the payload to be written instead."""
+"""Function (channel, payload) → the payload to be written instead."""
 
 
 def write_copy(source: Path, target: Path, found: Salvage, edit: Edit | None = None) -> int:
-    """All that can be read of ``source`` as a finished log at ``target``; the number of messages in it.
+    """Write all readable content of ``source`` as a finished log to ``target``. Return the number of its messages.
 
-    Nothing stands at ``target`` before all of it does. Raises `LogError`.
+    ``target`` appears only when it is complete. Raises `LogError`.
     """
     part = target.with_name(target.name + ".part")
     try:
@@ -94,7 +94,7 @@ def write_copy(source: Path, target: Path, found: Salvage, edit: Edit | None = N
     try:
         with file:
             count = _copy(source, Container(file), found, edit)
-            with suppress(OSError):            # not every file has a disk behind it
+            with suppress(OSError):            # not every file has a disk
                 os.fsync(file.fileno())
         part.replace(target)
     except OSError as error:
@@ -132,5 +132,5 @@ def _reads(one: Ours) -> bool:
         message = CLASSES[CHANNELS[one.number][1]].FromString(one.payload)
     except DecodeError:
         return False
-    # A copy of a copy says once what was lost.
+    # a copy of a copy states the lost parts only once
     return not (one.number == EVENT and message.kind == RECOVERED)

@@ -1,4 +1,4 @@
-"""Findings to terminal, JSON, HTML and PDF."""
+"""Output of results: terminal, JSON, HTML and PDF."""
 
 from typing import TYPE_CHECKING
 

@@ -1,7 +1,7 @@
-"""Acceptance: each expected value against the identified one, judged by the interval. Pure: it reads the document.
+"""Acceptance: comparison of expected and identified values, judged by the interval. Pure: it reads the document.
 
 A quantity passes if its whole interval lies within the tolerance, and fails if its interval and the tolerance have no
-value in common. Otherwise the data cannot tell.
+value in common. Otherwise the data do not decide.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tdhil.config import ACCEPTED_QUANTITIES, Expectation
 
 Part = Mapping[str, Any]
 _WITH_TORQUE: Final = ("inertia", "viscous", "coulomb")
-"""Quantities that a wrong torque scale multiplies by one factor."""
+"""Quantities that are proportional to the torque scale."""
 
 
 class AcceptanceVerdict(StrEnum):
@@ -30,7 +30,7 @@ class AcceptanceVerdict(StrEnum):
 
 @dataclass(frozen=True)
 class Accepted:
-    """One expected value, and what was identified; None where it was not."""
+    """One expected value, and the identified one; None if it was not identified."""
 
     name: str
     label: str
@@ -58,7 +58,7 @@ def acceptance_of(expected: Sequence[Expectation], document: Part) -> dict[str, 
 
 
 def acceptance_rows(acceptance: Part | None) -> list[tuple[str, str]]:
-    """Return it as names and texts."""
+    """Return the acceptance as names and texts."""
     if acceptance is None:
         return []
     return [("acceptance", acceptance["verdict"]), *((one["label"], one["text"]) for one in acceptance["quantities"]),
@@ -95,7 +95,7 @@ def _identified(name: str, at: Iterable[str], document: Part) -> tuple[float | N
 
 
 def _causes(rows: Sequence[Accepted]) -> Iterable[str]:
-    """Yield what is off, in words. One factor in all quantities with torque is one cause: the torque scale."""
+    """Yield the deviations in words. One common factor of all quantities with torque is one cause: the torque scale."""
     failed = [one for one in rows if one.verdict is AcceptanceVerdict.FAIL and one.value is not None]
     named = {one.name for one in failed}
     ratios = {one.name: _ratio(one) for one in rows if one.name in _WITH_TORQUE and one.value is not None}
@@ -130,6 +130,6 @@ def _ratio(one: Accepted) -> tuple[float, float]:
 
 
 def _one_factor(ratios: Sequence[tuple[float, float]]) -> bool:
-    """Return whether all ratios are the same within their intervals; a ratio that says nothing is no proof."""
+    """Return whether all ratios are equal within their intervals; a ratio with a very wide interval is no proof."""
     (first, half), *others = ratios
     return all(abs(one - first) <= sqrt(width**2 + half**2) and width < abs(one - 1.0) + half for one, width in others)

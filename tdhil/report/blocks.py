@@ -1,6 +1,7 @@
 """Content of a report, in order, for any output: HTML and PDF show the same blocks.
 
-Everything comes from the result document and the recording; lengths of pictures are in inches of a page 7 inches wide.
+All content comes from the result document and the recording. Lengths of figures are in inches, for a page 7 inches
+wide.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _VERDICTS = {
 
 @dataclass(frozen=True)
 class AnswerBox:
-    """The box at the top; ``colour`` green, yellow or red."""
+    """Box at the top; ``colour`` green, yellow or red."""
 
     colour: str
     value: str
@@ -54,14 +55,14 @@ class Text:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Names and what they are."""
+    """Names with their texts."""
 
     rows: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True)
 class Column:
-    """``share`` of the table's width; numbers stand on the right."""
+    """Column of a table. ``share`` of the table's width; numbers are aligned on the right."""
 
     title: str
     share: float
@@ -78,7 +79,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """``draw`` fills a figure of 7 by ``height_in`` inches; ``names_left``: long words stand beside its axis."""
+    """Figure. ``draw`` fills a figure of 7 by ``height_in`` inches; ``names_left``: long words stand beside its
+    axis.
+    """
 
     draw: Callable[[FigureBase], None]
     height_in: float
@@ -99,7 +102,7 @@ class ReportSection:
 
 @dataclass(frozen=True)
 class Report:
-    """All of it. ``simulated`` is '' for what really turned."""
+    """Complete report. ``simulated`` is '' for a real drive."""
 
     title: str
     subtitle: str
@@ -119,7 +122,7 @@ def _simulated(document: Part) -> str:
 
 
 def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
-    """The report of a result; ``sha256`` is that of the log it comes from."""
+    """Return the report of a result; ``sha256`` is that of its log."""
     rig = document["rig"] or {}
     facts = [name for name in (rig.get("name"), shown_date(document["date"])) if name]
     return Report(
@@ -134,7 +137,7 @@ def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
 
 
 def shown_date(text: str | None) -> str:
-    """Return a time as every page and report shows it: ``2026-11-22 05:17:03 UTC+01:00``; '' for none."""
+    """Return a time as shown on every page and report: ``2026-11-22 05:17:03 UTC+01:00``; '' for none."""
     if not text:
         return ""
     try:
@@ -221,7 +224,7 @@ def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Rep
     yield ReportSection("Basis of the result", (Pairs(tuple(_grounds(document, recording, sha256))),))
 
 
-# -- what the run was ----------------------------------------------------------------------------------------
+# -- data of the run ---------------------------------------------------------------------------------------------
 
 
 def _run_rows(document: Part, recording: Recording) -> Iterator[tuple[str, str]]:
@@ -282,7 +285,7 @@ _QUANTITIES = (Column("quantity", 0.52), Column("value", 0.12, True), Column("fr
 
 
 def _numbers(document: Part) -> Iterator[Block]:
-    """Every estimate, the interval to quote first."""
+    """Yield every estimate, beginning with the interval to quote."""
     rows: list[tuple[str, ...]] = []
 
     def add(title: str, part: Part | None, unit: str, kind: str = "") -> None:
@@ -307,7 +310,7 @@ def _numbers(document: Part) -> Iterator[Block]:
 
 
 def _response(found: Part) -> Iterator[Block]:
-    """Yield the picture of the frequency response, and what it shows."""
+    """Yield the figure of the frequency response, and sentences on it."""
     from tdhil.report.frequency_response import draw_bode, response_sentences
 
     yield Picture(
@@ -317,7 +320,7 @@ def _response(found: Part) -> Iterator[Block]:
 
 
 def _impedance(found: Part) -> Iterator[Block]:
-    """Yield the picture, the numbers of the loop and their conditions, or the refusal."""
+    """Yield the figure, the numbers of the loop and their conditions, or the refusal."""
     from tdhil.report.plots import draw_impedance
 
     if found["points"]:

@@ -1,4 +1,4 @@
-"""Parts that every torque calibration shows in the same way, on the card and on the laboratory's page."""
+"""Common parts of all torque calibrations, on the card and on the laboratory's page."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Part = Mapping[str, Any]
 VERDICT_STYLE = {"valid": "bold green", "not_identifiable": "bold red", "model_rejected": "bold red"}
 VERDICT_COLOUR = {"valid": "green", "not_identifiable": "red", "model_rejected": "red"}
 MANY = 1e4
-"""More degrees of freedom are shown as infinitely many."""
+"""Degrees of freedom above which the page shows ∞."""
 
 
 def quantity(one: MeasuredValue | None, confidence: float) -> dict[str, Any] | None:
@@ -28,12 +28,12 @@ def quantity(one: MeasuredValue | None, confidence: float) -> dict[str, Any] | N
 
 
 def run_name(run: Part) -> str:
-    """Return the short name of a run's log; a file of an earlier version has its path only."""
+    """Return the short name of a run's log; a file of an earlier version has only its path."""
     return str(run.get("name") or Path(run["log"]).name)
 
 
 def with_share(part: Part, unit: str) -> str:
-    """Return a quantity with its interval, and half of that as a share."""
+    """Return a quantity with its interval, and with half of the interval in percent."""
     share = 50.0 * (part["high"] - part["low"]) / part["value"]
     return f"{with_interval(part['value'], part['low'], part['high'], unit).rstrip()}  ±{share:#.2g} %"
 
@@ -45,7 +45,7 @@ def scale_error(factor: Part) -> str:
 
 
 def shown_degrees(dof: float) -> str:
-    """``50``, or ``∞``."""
+    """Return ``50``, or ``∞``."""
     return "∞" if dof > MANY else f"{dof:.0f}"
 
 
@@ -54,7 +54,7 @@ _IN_HEX = ("vendor", "product", "revision")
 
 
 def calibrated_item(document: Part) -> ReportSection:
-    """Identity and settings of the drive; without blocks where neither is known."""
+    """Return identity and settings of the drive; without blocks if neither is known."""
     drive = document["drive"] or {}
     identity = [(name, f"{drive[name]:X}h" if name in _IN_HEX and isinstance(drive[name], int) else str(drive[name]))
                 for name in ("name", *_IN_HEX, "serial") if name in drive]
@@ -68,20 +68,20 @@ _SETTINGS = {"rated_torque_nm": "rated torque, N·m", "torque_count_nm": "one co
 
 
 def recordings(document: Part) -> ReportSection:
-    """Logs of the calibration with date and hash; without blocks where there is none."""
+    """Return logs of the calibration with date and hash; without blocks if there is none."""
     rows = tuple((run_name(run), f"{shown_date(run['date'])}, SHA-256 {run['sha256']}") for run in document["runs"])
     return ReportSection("Recordings", (Pairs(rows),) if rows else ())
 
 
 def date_and_signature(document: Part) -> ReportSection:
-    """The end of the page."""
+    """Return the last section of the page."""
     return ReportSection("Date and signature", (Pairs((
         ("date of calibration", shown_date(document["date"])), ("conditions", "temperature, warm-up: ____________"),
         ("signature", "______________________"))),))
 
 
 def result_rows(quantities: Iterable[tuple[str, Part, str]]) -> Table:
-    """(name, measured value, unit) each, with the columns of a certificate."""
+    """Return a table of (name, measured value, unit), with the columns of a certificate."""
     rows = tuple((name, unit, f"{part['value']:.5g}", f"{part['standard_uncertainty']:.3g}",
                   shown_degrees(part["degrees_of_freedom"]), f"{part['coverage_factor']:.2f}",
                   f"{0.5 * (part['high'] - part['low']):.3g}") for name, part, unit in quantities)
@@ -91,7 +91,7 @@ def result_rows(quantities: Iterable[tuple[str, Part, str]]) -> Table:
 
 
 def laboratory_page(document: Part, lines: Iterable[str], sections: Iterable[ReportSection]) -> Report:
-    """Return the page of a torque calibration as a laboratory lays it out; ``lines``: below κ in the answer."""
+    """Return the page of a torque calibration in the layout of a laboratory; ``lines``: below κ in the answer."""
     factor = document["calibration_factor"]
     return Report(
         title="Calibration of a drive's torque",

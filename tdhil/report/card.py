@@ -1,4 +1,4 @@
-"""The result card: what a field engineer reads first, in 80 columns."""
+"""Result card: the most important values for a field engineer, in 80 columns."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal
 from tdhil.report.labels import ACCELERATION_REGRESSION, ESTIMATES, MOMENTUM_CROSS_CHECK, UNCERTAINTY_BUDGET
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Numbers with as many digits as their interval justifies.
+# Numbers with the digits that their interval justifies.
 
 
 _NOTHING = 1e-9
-"""Below it a quantity in SI is the arithmetic's own: 8.8e-12 s is no lag."""
+"""SI value below which a quantity is rounding of the arithmetic: 8.8e-12 s is no lag."""
 
 
 def plain_number(number: float, digits: int = 4) -> str:
-    """Return the number to some significant digits, without an exponent from 1e-4 to 1e9; below 1e-9 it is 0."""
+    """Return the number with some significant digits, without an exponent from 1e-4 to 1e9; below 1e-9 it is 0."""
     if abs(number) < _NOTHING:
         return "0"
     return f"{float(f'{number:.{digits}g}'):.{9}g}"
 
 
 def with_interval(value: float, low: float, high: float, unit: str) -> str:
-    """``103.9 (103.1 to 104.8) kg·m²``: two significant digits of the half-width decide the decimals."""
+    """Return ``103.9 (103.1 to 104.8) kg·m²``: two significant digits of the half-width set the decimals."""
     half = 0.5 * (high - low)
     if not all(math.isfinite(number) for number in (value, low, high)) or half <= 0.0:
         return f"{plain_number(value, 5)} {unit}"
@@ -42,7 +42,7 @@ def with_interval(value: float, low: float, high: float, unit: str) -> str:
 
 
 def rounded(value: float | None, low: float | None, high: float | None) -> tuple[str, str, str]:
-    """The three as texts, with decimals as in `with_interval`; None, an open side, is ``open``."""
+    """Return the three values as texts, with decimals as in `with_interval`; None, an open side, is ``open``."""
     ends = [number for number in (low, high) if number is not None]
     half = 0.5 * (ends[1] - ends[0]) if len(ends) == 2 else 0.0
 
@@ -55,20 +55,20 @@ def rounded(value: float | None, low: float | None, high: float | None) -> tuple
 
 
 def plus_minus(value: float, half_width: float) -> str:
-    """``83.9 ± 3.0``, decimals as in `with_interval`."""
+    """Return ``83.9 ± 3.0``, with decimals as in `with_interval`."""
     if not (math.isfinite(value) and math.isfinite(half_width)) or half_width <= 0.0:
         return plain_number(value)
     return f"{_digits(value, half_width)} ± {_digits(half_width, half_width)}"
 
 
 def _digits(number: float, half_width: float) -> str:
-    """To the second significant digit of the half-width, tens and hundreds included."""
+    """Round to the second significant digit of the half-width, tens and hundreds included."""
     decimals = 1 - math.floor(math.log10(half_width))
-    return f"{round(number, decimals) + 0.0:.{max(0, decimals)}f}"          # no minus zero
+    return f"{round(number, decimals) + 0.0:.{max(0, decimals)}f}"          # avoids −0
 
 
 def percent(half_width: float, value: float) -> str:
-    """``±0.80 %`` of the value: two significant digits."""
+    """Return ``±0.80 %`` of the value: two significant digits."""
     if not value or not math.isfinite(half_width):
         return "±?"
     share = 100.0 * half_width / abs(value)
@@ -76,18 +76,18 @@ def percent(half_width: float, value: float) -> str:
 
 
 def minutes(seconds: float) -> str:
-    """``4:07``, or ``12 s`` under a minute."""
+    """Return ``4:07``, or ``12 s`` under a minute."""
     whole = max(0, round(seconds))
     return f"{whole // 60}:{whole % 60:02d}" if whole >= 60 else f"{whole} s"
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The small tables of the result card: uncertainty budget, cross-checks, friction over speed, a compliant shaft.
+# Small tables of the result card: uncertainty budget, cross-checks, friction over speed, a compliant shaft.
 
 
 _AGREES = {True: ("agrees", "green"), False: ("DOES NOT AGREE", "bold red"), None: ("nothing to compare with", "dim")}
 
-_NOTHING = 1e-5           # of J: a source of less than that is none
+_NOTHING = 1e-5           # of J: a smaller contribution is left out
 
 Row = tuple[str, Text | str]
 
@@ -108,7 +108,7 @@ def compliant_rows(document: Mapping[str, Any]) -> Iterator[Row]:
     if shaft is None:
         return
     yield "shaft", "compliant: J above is the motor's side, J_r"
-    if all(shaft[key] is None for _, key, _ in COMPLIANT):      # nothing below the motor was measured
+    if all(shaft[key] is None for _, key, _ in COMPLIANT):      # no quantity below the motor was measured
         return
     for title, key, unit in COMPLIANT:
         part = shaft[key]
@@ -153,7 +153,7 @@ def opinion_rows(document: Mapping[str, Any]) -> Iterator[Row]:
 
 
 def friction_rows(document: Mapping[str, Any], to_a_line: int = 2) -> Iterator[Row]:
-    """Friction torque at every steady speed of the run."""
+    """Yield the friction torque at every steady speed of the run."""
     points = [f"{p['speed_rad_s']:.2f} rad/s: {_plus_minus(p['torque_nm'])}" for p in document["friction_curve"]]
     if points:
         width = max(len(point) for point in points)
@@ -182,7 +182,7 @@ def budget_table(budget: Sequence[Mapping[str, Any]], value: float, notes: bool 
 
 
 def estimate_text(part: Mapping[str, Any], unit: str) -> str:
-    """An estimate of the document with its interval; an open side is named. At a bound of zero: "at most"."""
+    """Return an estimate of the document with its interval; an open side is named. At a bound of zero: "at most"."""
     if part["low"] is None or part["high"] is None:
         sides = "both sides" if part["low"] == part["high"] else "one side"
         return f"{plain_number(part['value'])} {unit}, open on {sides}"
@@ -193,7 +193,7 @@ def estimate_text(part: Mapping[str, Any], unit: str) -> str:
 
 
 def inertia_text(part: Mapping[str, Any], kind: str = "") -> str:
-    """J with the interval that includes the torque scale (``_total``), or that of the repeatability."""
+    """Return J with the interval that includes the torque scale (``_total``), or with that of the repeatability."""
     value, low, high = part["value"], part["low" + kind], part["high" + kind]
     return f"{with_interval(value, low, high, 'kg·m²')}  {percent(0.5 * (high - low), value)}"
 
@@ -204,7 +204,7 @@ def _plus_minus(part: Mapping[str, Any]) -> str:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_NARROW = 72          # columns; below, tables keep their numbers and lose their notes
+_NARROW = 72          # columns; in a narrower terminal, tables keep their numbers and lose their notes
 
 _VERDICT_STYLE = {
     "valid": "bold green",
@@ -218,7 +218,7 @@ _TEST_STYLE = {"pass": "bold green", "fail": "bold red", "inconclusive": "yellow
 
 
 def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
-    """A panel of the result document; ``width``: columns that there are."""
+    """Return a panel of the result document; ``width``: available columns."""
     narrow = width < _NARROW
     rows = names_and_texts(())
     verdict = document["verdict"]
@@ -277,17 +277,17 @@ def _paper_text(paper: Mapping[str, Any], inertia: Mapping[str, Any] | None) -> 
 
 
 def sentence(text: str) -> str:
-    """With a capital and a full stop; nothing where there is nothing."""
+    """Return the text with a capital and a full stop; '' for an empty text."""
     return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".") if text else ""
 
 
 def print_card(document: Mapping[str, Any], console: Console) -> None:
-    """The card, on a console."""
+    """Print the card on a console."""
     console.print(result_card(document, console.width))
 
 
 def card_text(document: Mapping[str, Any], width: int = 80) -> str:
-    """The card as plain text."""
+    """Return the card as plain text."""
     console = PlainConsole(io.StringIO())
     console.width = width
     console.print(result_card(document, console.width))
@@ -295,7 +295,7 @@ def card_text(document: Mapping[str, Any], width: int = 80) -> str:
 
 
 def card_html(document: Mapping[str, Any], width: int = 100) -> str:
-    """The card as a piece of HTML that brings its own colours: what a notebook shows."""
+    """Return the card as a piece of HTML with its own colours, for a notebook."""
     console = PlainConsole(io.StringIO(), record=True)
     console.width = width
     console.print(result_card(document, console.width))

@@ -1,4 +1,4 @@
-"""Console for all output to the operator: foreign text stays text, whatever it contains."""
+"""Console for all output to the operator: text from outside is printed as plain text, for any content."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class PlainConsole(Console):
                 yield segment
 
     def on_broken_pipe(self) -> None:
-        """Leave a broken pipe to the caller: rich would end the process with 1, the code of an internal error."""
+        """Raise the error for the caller: rich would end the process with 1, the exit code of an internal error."""
         raise  # noqa: PLE0704 (rich calls this where it has caught the BrokenPipeError)
 
 
@@ -37,7 +37,7 @@ def stderr_console() -> Console:
 
 
 def names_and_texts(rows: Iterable[tuple[str, RenderableType]], *, quiet: bool = False) -> Table:
-    """Return names, dim, each with its text, folded at the console's width; ``quiet``: the text is dim too."""
+    """Return dimmed names, each with its text, folded at the console's width; ``quiet``: the texts are dimmed too."""
     grid = Table.grid(padding=(0, 2))
     grid.add_column(style="dim", no_wrap=True)
     grid.add_column(style="dim" if quiet else None, overflow="fold")

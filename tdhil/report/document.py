@@ -1,4 +1,4 @@
-"""The result as one JSON document: the same from a live run and from its replay."""
+"""Result as one JSON document, equal for a live run and for its replay."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tdhil.version import __version__
 
 SIMULATED = "SIMULATED"
 REHEARSAL = "FAULT REHEARSAL"
-"""Mark of a run of the simulated drive with scripted faults (`--fault`). Its result is no history of the rig."""
+"""Mark of a run of the simulated drive with scripted faults (`--fault`). Its result does not count for the rig."""
 
 
 def rehearsed_faults(run: Mapping[str, Any]) -> list[str]:
@@ -27,7 +27,7 @@ def rehearsed_faults(run: Mapping[str, Any]) -> list[str]:
 
 
 def rehearsal_of(run: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the verdict on the rehearsed faults in the log's configuration; None if it has none that can be read."""
+    """Return the verdict on the rehearsed faults in the log's configuration; None without a readable one."""
     found = run.get("rehearsal")
     if not isinstance(found, Mapping) or not isinstance(found.get("faults"), list | tuple):
         return None
@@ -55,7 +55,7 @@ def rehearsal_rows(rehearsal: Mapping[str, Any] | None) -> list[tuple[str, str]]
 
 
 def marks(document: Mapping[str, Any]) -> str:
-    """Return what a title adds for a run in which nothing real turned: simulated, and a fault rehearsed."""
+    """Return the suffix of a title for a run without a real drive: simulated, and rehearsal of a fault."""
     if not document["simulated"]:
         return ""
     return f"{SIMULATED} · {REHEARSAL}" if document.get("rehearsed_faults") else SIMULATED
@@ -64,9 +64,9 @@ def marks(document: Mapping[str, Any]) -> str:
 def result_document(
     identification: Identification, recording: Recording, run: Mapping[str, Any], log: str
 ) -> dict[str, Any]:
-    """Plain data for `json.dumps`. ``run`` is the log's configuration; everything else is SI at the motor shaft.
+    """Return plain data for `json.dumps`. ``run`` is the log's configuration; everything else is SI at the motor shaft.
 
-    Numbers that aren't finite become null: JSON knows no NaN.
+    Numbers that are not finite become null, because JSON has no NaN.
     """
     found = identification
     document: dict[str, Any] = {
@@ -127,7 +127,7 @@ def result_document(
 
 
 def _calibration(stored: Any) -> dict[str, Any] | None:
-    """Return factor and date of the torque calibration in the log; None without one."""
+    """Return factor and date of the torque calibration in the log; None without a calibration."""
     if stored is None:
         return None
     try:
@@ -138,20 +138,20 @@ def _calibration(stored: Any) -> dict[str, Any] | None:
 
 
 def coded_reason(reason: str, document: Mapping[str, Any]) -> str:
-    """Return the reason of a verdict with its code; without one for a valid result, which has nothing to look up."""
+    """Return the reason of a verdict with its code; a valid result has no code to look up."""
     code = str(document.get("code", ""))
     return with_code(reason, "" if code == MessageCode.VALID.code else code)
 
 
 def coded_warnings(document: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the warnings of a result as a person sees them, with their codes; a document of before 0.3 has none."""
+    """Return the warnings of a result for display, with their codes; a document from before 0.3 has no codes."""
     codes = [str(code) for code in document.get("warning_codes", ())]
     warnings = [str(one) for one in document["warnings"]]
     return tuple(map(with_code, warnings, codes + [""] * (len(warnings) - len(codes))))
 
 
 def provenance(run: Mapping[str, Any]) -> dict[str, Any]:
-    """When, where, by whom and on which drive; None for what the log doesn't say. A log may say anything."""
+    """Return date, place, operator and drive of the run; None for data that the log lacks. A log is not trusted."""
     bench, drive, profile = (_mapping(run.get(name)) or {} for name in ("bench", "identity", "profile"))
     limits = _mapping(bench.get("limits")) or {}
     numbers = ("vendor", "product", "revision", "serial")
@@ -175,7 +175,7 @@ def provenance(run: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _connection(run: Mapping[str, Any]) -> str | None:
-    """``canopen, interface socketcan, channel can0``: what says where the drive was reached."""
+    """Return the connection to the drive: ``canopen, interface socketcan, channel can0``."""
     found = [text for text in (text_of(run.get("drive")),) if text]
     for name, row in (_mapping(run.get("bus")) or {}).items():
         value = row.get("value") if isinstance(row, Mapping) else None
@@ -185,7 +185,7 @@ def _connection(run: Mapping[str, Any]) -> str | None:
 
 
 def text_of(value: object) -> str | None:
-    """A text of a log or a drive as it may be shown: one line that can be printed."""
+    """Return a text of a log or a drive for display: one line of printable characters."""
     if not isinstance(value, str) or not value.strip():
         return None
     return " ".join("".join(sign if sign.isprintable() else " " for sign in value).split())[:500]
@@ -200,7 +200,7 @@ def _count(value: object) -> int:
 
 
 def _inertia(inertia: InertiaEstimate | None) -> dict[str, Any] | None:
-    """The interval to quote goes first, the torque scale included; then the repeatability on this drive."""
+    """Return the interval to quote first (torque scale included), then the repeatability on this drive."""
     if inertia is None:
         return None
     found = asdict(inertia)
@@ -211,7 +211,7 @@ def _inertia(inertia: InertiaEstimate | None) -> dict[str, Any] | None:
 
 
 def _at_main_shaft(inertia: InertiaEstimate | None, gear_ratio: float) -> dict[str, float] | None:
-    """J·i² with i = ω_motor/ω_main."""
+    """Return J·i² with i = ω_motor/ω_main."""
     if inertia is None:
         return None
     squared = gear_ratio * gear_ratio
@@ -220,7 +220,7 @@ def _at_main_shaft(inertia: InertiaEstimate | None, gear_ratio: float) -> dict[s
 
 
 def _compliant(found: Identification) -> dict[str, Any] | None:
-    """The shaft behind the spring; ``motor_inertia_kg_m2`` is the result's own inertia, J_r."""
+    """Return the shaft behind the spring; ``motor_inertia_kg_m2`` is the result's own inertia, J_r."""
     shaft = found.compliant
     if shaft is None:
         return None
@@ -243,7 +243,7 @@ def _estimate(estimate: Any) -> dict[str, float] | None:
 
 
 def only_finite(value: Any) -> Any:
-    """Return plain data with null for each number that JSON does not know."""
+    """Return plain data with null for each number that JSON cannot represent."""
     if isinstance(value, dict):
         return {key: only_finite(part) for key, part in value.items()}
     if isinstance(value, list | tuple):

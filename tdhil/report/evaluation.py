@@ -1,4 +1,4 @@
-"""Result of a virtual string on a drive: as a document for machines, on a terminal, and as a page with pictures."""
+"""Result of a virtual string on a drive: as a JSON document, on a terminal, and as a page with figures."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _STYLES = {"as_predicted": "bold green", "differs": "bold yellow"}
 def evaluation_document(
     found: Evaluation, case: EvaluationCase, recording: Recording, run: Mapping[str, Any], log: str
 ) -> dict[str, Any]:
-    """Plain data for `json.dumps`; speeds and torques at the main shaft of the machine that is meant."""
+    """Return plain data for `json.dumps`; speeds and torques at the main shaft of the represented machine."""
     prediction, bit = case.prediction, case.string.bit
     return {
         "kind": "evaluation",
@@ -80,7 +80,7 @@ def evaluation_document(
 
 
 def print_evaluation(document: Mapping[str, Any], console: PlainConsole) -> None:
-    """Measured beside predicted. 80 columns do."""
+    """Print measured beside predicted values, in 80 columns."""
     simulated = f" · {SIMULATED}" if document["simulated"] else ""
     name = document["string"] or "a virtual string"
     where = "in the drive's own loop, " if document["controller"]["own_loop"] else ""
@@ -91,7 +91,7 @@ def print_evaluation(document: Mapping[str, Any], console: PlainConsole) -> None
 
 
 def _damping(part: Part) -> str:
-    """With its 95 % interval; a document from before there was one has none."""
+    """Return the damping with its 95 % interval; an old document has none."""
     if part.get("low") is None or part.get("high") is None:
         return f"{part['value']:.3f}"
     return f"{part['value']:.3f} ({part['low']:.3f} to {part['high']:.3f})"
@@ -123,7 +123,7 @@ def _rows(document: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# As a page.
+# Page of the evaluation.
 
 _COLOURS = {"as_predicted": "green", "differs": "yellow"}
 _VERDICTS = {
@@ -137,19 +137,19 @@ _CLOSE = (
     (Phase.HOLD, 5.0, "At the first set speed the bit must stick and slip."),
     (Phase.RELEASED, 35.0, "The bit turns; it is lifted off bottom, and what swings decays."),
 )
-"""Phases shown by themselves, for `_CLOSE_S`, from so many seconds before."""
+"""Phases shown in detail, for `_CLOSE_S`, from so many seconds before."""
 
 
 def write_evaluation_report(document: Part, rows: FloatArray, path: Path) -> Path:
-    """The page, HTML or PDF by its name; where it went. ``rows``: of `COLUMNS`, a cycle each, as the log has them.
+    """Write the page, HTML or PDF by its name, and return its path. ``rows``: of `COLUMNS`, one per cycle of the log.
 
-    Raises UsageError where it can't be written.
+    Raises UsageError if it cannot be written.
     """
     return write_blocks(evaluation_report(document, rows, sha256_of(Path(document["log"]))), path)
 
 
 def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Report:
-    """The blocks of the page."""
+    """Return the blocks of the page."""
     facts = [document["string"] or "a virtual string", shown_date(document["date"])]
     sections = [ReportSection("Measured, and as tune says", (
         Table((Column("", 0.34), Column("measured", 0.33, number=True), Column("by tune", 0.33, number=True)),
@@ -197,7 +197,7 @@ def _answer(document: Part) -> AnswerBox:
 
 
 def _beside(document: Part) -> Iterator[tuple[str, str, str]]:
-    """(what, measured, predicted)."""
+    """Yield (quantity, measured, predicted)."""
     critical, cure = document["critical_rpm"], document["predicted_critical_rpm"]
     yield ("critical speed, rpm",
            "not found" if critical is None else f"{critical['value']:.1f}, above {critical['low']:.1f}",
@@ -250,7 +250,7 @@ def _columns(rows: FloatArray) -> dict[str, FloatArray]:
 
 
 def draw_close(figure: FigureBase, rows: FloatArray, phase: Phase, before_s: float) -> None:
-    """A minute about the begin of a phase."""
+    """Draw a minute around the beginning of a phase."""
     of = _columns(rows)
     time, axes = of["time_s"], figure.subplots()
     begin = max(time[0], time[of["phase"] == phase][0] - before_s)
@@ -268,7 +268,7 @@ _SPEEDS = {"bit_rad_s": ("bit", OURS, "-"), "top_rad_s": ("top drive", QUIET, "-
 
 
 def draw_course(figure: FigureBase, rows: FloatArray) -> None:
-    """All of it: every column spans all that was in its time."""
+    """Draw the whole run: every column spans all values of its time."""
     of = _columns(rows)
     time = of["time_s"] - of["time_s"][0]
     above, below = figure.subplots(2, 1, sharex=True)

@@ -1,4 +1,4 @@
-"""A torque calibration without a body: by pairs of torque or by the record of a reference sensor.
+"""Torque calibration without a body: with pairs of torque, a reference sensor, or a known pipe.
 
 The document is that of `tdhil calibrate torque` with a calibration factor and its budget. It has no moment of inertia.
 """
@@ -54,7 +54,7 @@ def pairs_document(
     found: PairsFit, pairs: TorquePairs, source: str, drive: Part, settings: Part, *, date: str, confidence: float,
     simulated: bool, runs: Sequence[Part] = (),
 ) -> dict[str, Any]:
-    """Plain data for `json.dumps`; ``source``: the file of the pairs, ``drive``: as a log names it."""
+    """Return plain data for `json.dumps`; ``source``: file of the pairs; ``drive``: as in a log."""
     return {
         **_begun(PAIRS, "model_rejected" if found.refusal else "valid",
                  found.refusal or f"{len(pairs.direction)} pairs give κ to ±{found.factor.half_width_share:.2%}", ""),
@@ -81,7 +81,7 @@ def reference_document(
     found: ReferenceFit, source: Part, runs: Sequence[Part], drive: Part, settings: Part, *, date: str,
     confidence: float, simulated: bool, warnings: Sequence[str],
 ) -> dict[str, Any]:
-    """Plain data for `json.dumps`; ``source``: file and hash of the sensor's record, and the shaft that it is of."""
+    """Return plain data for `json.dumps`; ``source``: file, hash and shaft of the sensor's recording."""
     factor = found.factor
     reason = found.refusal
     if not reason and factor is not None:
@@ -108,9 +108,9 @@ def known_pipe_document(
     found: KnownPipeFit | None, measured: MeasuredString | None, known: KnownPipe, refusal: tuple[str, str],
     source: Part, runs: Sequence[Part], drive: Part, settings: Part, *, date: str, confidence: float, simulated: bool,
 ) -> dict[str, Any]:
-    """Plain data for `json.dumps`; ``refusal``: reason and advice where nothing was measured.
+    """Return plain data for `json.dumps`; ``refusal``: reason and advice if nothing was measured.
 
-    ``measured_factor`` is there also where it is too wide to be used; ``calibration_factor`` is then None.
+    ``measured_factor`` is present even if its interval is too wide for use; ``calibration_factor`` is then None.
     """
     reason, advice = refusal if found is None else (found.refusal, found.advice)
     verdict = "not_identifiable" if reason else "valid"
@@ -157,11 +157,11 @@ def _number(value: float) -> float | None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The card
+# Card of a calibration without a body
 
 
 def print_factor(document: Part, console: PlainConsole) -> None:
-    """The card of a calibration without a body, on a console."""
+    """Print the card of a calibration without a body on a console."""
     rows = names_and_texts(())
     verdict, factor = document["verdict"], document["calibration_factor"]
     rows.add_row("verdict", Words(verdict, style=VERDICT_STYLE.get(verdict, "bold")))
@@ -256,16 +256,16 @@ _CARD_ROWS = {PAIRS: _pairs_rows, REFERENCE: _reference_rows, KNOWN_PIPE: _known
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The page
+# Page of a calibration without a body
 
 
 def write_factor_report(document: Part, path: Path) -> Path:
-    """The page, as PDF where the name ends so; and where it went. Raises UsageError where it can't be written."""
+    """Write the page, HTML or PDF by its name, and return its path. Raises UsageError if it cannot be written."""
     return write_blocks(factor_report(document), path)
 
 
 def factor_report(document: Part) -> Report:
-    """Laid out as a calibration laboratory does, as `calibration_report` is."""
+    """Return the report in the layout of a calibration laboratory, as `calibration_report`."""
     factor = document["calibration_factor"]
     lines = () if factor is None else (f"The drive reports {scale_error(factor)}",)
     return laboratory_page(document, lines, _sections(document))
@@ -371,11 +371,13 @@ _DATA = {PAIRS: _pairs_data, REFERENCE: _reference_data, KNOWN_PIPE: _known_pipe
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Pictures
+# Figures
 
 
 def draw_pairs(figure: FigureBase, document: Part) -> None:
-    """Above: the pairs, the line and its 95 % band; dotted: an exact torque scale. Below: residuals by direction."""
+    """Draw, above, the pairs, the line and its 95 % band (dotted: an exact torque scale); below, residuals by
+    direction.
+    """
     pairs, line = document["pairs"], document["line"]
     x, y, x_sd, y_sd, left = (np.array([pair[name] for pair in pairs]) for name in (
         "reported_nm", "reference_nm", "reported_sd_nm", "reference_sd_nm", "residual_nm"))
@@ -395,7 +397,7 @@ def draw_pairs(figure: FigureBase, document: Part) -> None:
         if not chosen.any():
             continue
         top.plot(x[chosen], y[chosen], marker, color=DARK, ms=5, label=name)
-        beside = x[chosen] + (0.1 if marker == "^" else -0.1) * margin      # so that error bars stand apart
+        beside = x[chosen] + (0.1 if marker == "^" else -0.1) * margin      # so that error bars do not overlap
         below.errorbar(beside, left[chosen], 1.96 * spread[chosen], fmt=marker, color=DARK, ms=4, capsize=3, lw=1.0)
     top.set_ylabel("reference torque, N·m")
     top.legend(fontsize="small", loc="best")
@@ -404,7 +406,7 @@ def draw_pairs(figure: FigureBase, document: Part) -> None:
 
 
 def draw_reference(figure: FigureBase, document: Part) -> None:
-    """Above: both torques over time. Below: residuals over time."""
+    """Draw, above, both torques over time; below, residuals over time."""
     series = {name: np.array(values) for name, values in document["series"].items()}
     line = document["line"]
     top, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
@@ -420,7 +422,7 @@ def draw_reference(figure: FigureBase, document: Part) -> None:
 
 
 def draw_linearity(figure: FigureBase, document: Part) -> None:
-    """Residuals over reported torque."""
+    """Draw residuals over reported torque."""
     series = document["series"]
     axes = figure.subplots()
     axes.plot(series["reported_nm"], series["residual_nm"], ".", color=OURS, ms=3)

@@ -1,4 +1,4 @@
-"""The frequency response of a result: its pictures, the text below them, and the table on a terminal."""
+"""Frequency response of a result: its figures, the text below them, and the table on a terminal."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
 
 Part = Mapping[str, Any]
 
-_ODD, _EVEN = 0.7, 0.3      # share of odd harmonics from which, and up to which, one kind is named
+_ODD, _EVEN = 0.7, 0.3      # share of odd harmonics: above the first "odd", below the second "even" is named
 _COLOURS = (DARK, OURS, PAPER, "#1a7f37", "#7c3aed", "#0e7490")
 _PNG_DPI = 150              # dots per inch of a PNG
-_SIZE_IN = (7.0, 8.6)       # inches, of a picture with all panels
-_CAPTION_SIGNS = 105        # in a line below it
+_SIZE_IN = (7.0, 8.6)       # inches, of a figure with all panels
+_CAPTION_SIGNS = 105        # characters in a line of the caption
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Words
+# Sentences
 
 
 def response_sentences(found: Part) -> tuple[str, ...]:
-    """Return what the response shows: its uncertainty, and noise against distortion, a sentence each."""
+    """Return sentences on the response: its uncertainty, and noise compared with distortion."""
     lines, distortion = found["lines"], found["distortion"]
     halves = [_half_rel(line) for line in lines]
     known = [half for half in halves if half is not None]
@@ -82,7 +82,7 @@ def _half_rel(line: Part) -> float | None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Pictures
+# Figures
 
 
 def draw_bode(figure: FigureBase, found: Part) -> None:
@@ -95,7 +95,7 @@ def draw_bode(figure: FigureBase, found: Part) -> None:
 
 
 def save_responses(parts: Sequence[tuple[str, Part]], path: Path) -> None:
-    """Write one picture of several responses: |ω/T|, phase, apparent inertia, residuals. Raises OSError."""
+    """Write one figure of several responses: |ω/T|, phase, apparent inertia, residuals. Raises OSError."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -107,7 +107,7 @@ def save_responses(parts: Sequence[tuple[str, Part]], path: Path) -> None:
 
 
 def draw_faults(figure: FigureBase, found: Part) -> None:
-    """Draw the two panels in which faults show: |ω/T| with noise and distortion, and the apparent inertia."""
+    """Draw the two panels that show faults: |ω/T| with noise and distortion, and the apparent inertia."""
     axes = figure.subplots(2, 1, sharex=True)
     _magnitude(axes[0], found, "each line by itself", DARK)
     _inertia(axes[1], found, DARK)
@@ -116,7 +116,9 @@ def draw_faults(figure: FigureBase, found: Part) -> None:
 
 
 def draw_responses(figure: FigureBase, parts: Sequence[tuple[str, Part]]) -> None:
-    """Draw |ω/T|, phase, apparent inertia and residuals of each response, with a name; of one, what it shows."""
+    """Draw |ω/T|, phase, apparent inertia and residuals of each named response; a single response also gets its
+    sentences.
+    """
     axes = figure.subplots(4, 1, sharex=True, height_ratios=(3, 2, 3, 1))
     for number, (name, found) in enumerate(parts):
         colour = _COLOURS[number % len(_COLOURS)]
@@ -145,7 +147,7 @@ def _finish(every: Sequence[Axes]) -> None:
 
 
 def _plain_number(value: float, _: object = None) -> str:
-    """``0.2``: the label of a logarithmic axis; '' for 7 and 9, which would touch their neighbours."""
+    """Return ``0.2``, the label of a logarithmic axis; '' for 7 and 9, which would touch their neighbours."""
     return "" if f"{value:.0e}"[0] in "79" else f"{value:g}"
 
 
@@ -196,7 +198,7 @@ def _inertia(axes: Axes, found: Part, colour: str) -> None:
 
 
 def _errors(axes: Axes, lines: Sequence[Part], key: str, colour: str, name: str | None) -> None:
-    """Draw values with bars; a line whose interval is open has a hollow mark and no bar."""
+    """Draw values with bars; a line with an open interval has a hollow mark and no bar."""
     for whole, face in ((True, colour), (False, "none")):
         shown = [line for line in lines if (line[key]["high"] is not None) is whole]
         if not shown:
@@ -224,11 +226,11 @@ def _unwrapped(phases_rad: Sequence[float]) -> list[float]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The table on a terminal, in 80 columns
+# Table on a terminal, in 80 columns
 
 
 def print_responses(responses: Sequence[Part], console: Console) -> None:
-    """Print each log's response as a table, and what it shows; the reason where a log has none."""
+    """Print each log's response as a table with sentences; if a log has no response, print the reason."""
     for number, one in enumerate(responses):
         if number:
             console.print()

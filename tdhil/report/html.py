@@ -1,4 +1,4 @@
-"""The result as one file that needs nothing beside it, HTML or PDF by its name: verdict, pictures, every number."""
+"""Result as one self-contained file, HTML or PDF by its name: verdict, figures, all numbers."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _PARTS = re.compile(
     r"<h2>(?P<heading>[^<]*)</h2>|<figure>(?P<svg><svg.*?</svg>)\s*<figcaption>(?P<caption>[^<]*)<", re.DOTALL)
 _TEMPLATE, _STYLE = (files("tdhil.report").joinpath(name).read_text("utf-8")
                      for name in ("report.html.j2", "report.css"))
-"""Read when this is imported: at the end of a run there may be no descriptor left to open them with."""
+"""Template and style, read at import: at the end of a run there may be no file descriptor left."""
 
 
 def check_report_path(path: Path, log: Path, where: str = "--report") -> None:
-    """Before anything moves: can a report be made, and put there? Never over an older file. Raises UsageError."""
+    """Check before motion that a report can be written, and replaces no older file. Raises UsageError."""
     require_extra(where)
     if path.resolve() == log.resolve():
         raise UsageError("is the log itself", where=f"{where} {path}", next_step="Such as report.html or report.pdf",
@@ -38,7 +38,7 @@ def check_report_path(path: Path, log: Path, where: str = "--report") -> None:
         raise UsageError("is there already, and is left as it is", where=f"{where} {path}",
                          next_step=f"Name another file, such as {fresh(path).name}, or move that one away",
                          entry=MessageCode.FILE_EXISTS)
-    if path.suffix.lower() not in _SUFFIXES and not path.exists():      # what exists here is a device
+    if path.suffix.lower() not in _SUFFIXES and not path.exists():      # an existing path here is a device
         raise UsageError("ends neither in .html nor in .pdf", where=f"{where} {path}",
                          next_step="Name the file report.html or report.pdf",
                          entry=MessageCode.VALUE_NOT_ALLOWED)
@@ -48,7 +48,7 @@ def check_report_path(path: Path, log: Path, where: str = "--report") -> None:
 
 
 def fresh(path: Path) -> Path:
-    """``path``, or the first of report-2.html, report-3.html … that isn't there."""
+    """Return ``path``, or the first of report-2.html, report-3.html … that does not exist."""
     number, found = 1, path
     while found.exists():
         number += 1
@@ -57,13 +57,13 @@ def fresh(path: Path) -> Path:
 
 
 def write_report(document: Mapping[str, Any], recording: Recording, path: Path) -> Path:
-    """Write a report of a finished log, as PDF where the name ends so; and where it went.
+    """Write a report of a finished log, HTML or PDF by its name, and return its path.
 
-    That is beside a file that has come there meanwhile. Raises UsageError where it can't be written.
+    The path differs if such a file was created meanwhile. Raises UsageError if the report cannot be written.
     """
     try:
         return _put(report_of(document, recording, sha256_of(Path(document["log"]))), path)
-    except OSError as error:      # of the file; or of a module or a font, with no descriptor left to read it by
+    except OSError as error:      # of the file, or of a module or a font that cannot be read without a file descriptor
         raise UsageError(
             f"can't be written ({error.strerror or error})",
             where=f"--report {path}",
@@ -73,7 +73,7 @@ def write_report(document: Mapping[str, Any], recording: Recording, path: Path) 
 
 
 def write_blocks(report: Report, path: Path) -> Path:
-    """Any report, as PDF where the name ends so; and where it went. Raises UsageError where it can't be written."""
+    """Write any report, HTML or PDF by its name, and return its path. Raises UsageError if it cannot be written."""
     try:
         return _put(report, path)
     except OSError as error:
@@ -106,7 +106,7 @@ def sha256_of(path: Path) -> str:
 
 @dataclass(frozen=True)
 class ShownPicture:
-    """A picture of a page, as an SVG of its own, with the heading above it and the words below."""
+    """Figure of a page, as a separate SVG, with the heading above and the text below it."""
 
     heading: str
     caption: str
@@ -114,7 +114,7 @@ class ShownPicture:
 
 
 def pictures_in(page: str) -> tuple[ShownPicture, ...]:
-    """The pictures of a page that `report_page` made, in their order."""
+    """Return the figures of a page from `report_page`, in order."""
     found, heading = [], ""
     for part in _PARTS.finditer(page):
         if part["heading"] is not None:
@@ -125,13 +125,13 @@ def pictures_in(page: str) -> tuple[ShownPicture, ...]:
 
 
 def report_page(report: Report) -> str:
-    """The page; the same report gives the same text."""
+    """Return the page; the same report gives the same text."""
     from jinja2 import Environment
     from markupsafe import Markup
 
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
 
-    def picture(block: Picture) -> Markup:                      # our own SVG
+    def picture(block: Picture) -> Markup:                      # SVG made by tdhil
         return Markup(inline_svg(block.draw, (WIDTH_IN, block.height_in), names_left=block.names_left))
 
     return environment.from_string(_TEMPLATE).render(

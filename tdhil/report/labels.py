@@ -11,7 +11,7 @@ from typing import Final
 
 @dataclass(frozen=True)
 class Label:
-    """Name and unit of one estimate. ``on_card``: the name where a column of 20 characters is all the space."""
+    """Name and unit of one estimate. ``on_card``: name for a column of only 20 characters."""
 
     key: str
     name: str

@@ -1,4 +1,6 @@
-"""A run as it goes: the five stages with live speed, torque and time left. On stderr, which is not for results."""
+"""Display of a run in progress: the five stages with live speed, torque and remaining time. On stderr, not on
+stdout.
+"""
 
 from __future__ import annotations
 
@@ -24,10 +26,10 @@ from tdhil.report.card import minutes
 from tdhil.report.document import SIMULATED
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Output in a thread of its own, so that a blocked terminal (Ctrl-S, a pty without reader) blocks no other thread.
+# Output in its own thread, so that a blocked terminal (Ctrl-S, a pty without reader) blocks no other thread.
 #
-# A caller only leaves a note and goes on: lines are kept in order, up to a number of them, and of pictures the
-# latest only. The thread is a daemon: it may be stuck in a write for ever, and the process still ends.
+# A caller only queues a job and continues. Lines are kept in order, up to a limit; of pictures only the latest is kept.
+# The thread is a daemon: it may be blocked in a write forever, and the process still ends.
 
 
 Job = Callable[[], None]
@@ -38,7 +40,9 @@ MOST_LINES = 500
 
 
 class Painter:
-    """Every method but `flush` returns at once. What fails in a job, if not the terminal itself, a later one raises."""
+    """Output thread. Every method except `flush` returns at once. An error in a job, except of the terminal, is
+    raised later.
+    """
 
     def __init__(self) -> None:
         self._lines: deque[Job] = deque(maxlen=MOST_LINES)
@@ -47,7 +51,7 @@ class Painter:
         self._waiting: deque[threading.Event] = deque()
         self._thread: threading.Thread | None = None
         self._failure: Exception | None = None
-        self._gone = False             # the terminal
+        self._gone = False             # True if the terminal is gone
         self._ending = False
 
     def line(self, job: Job) -> None:
@@ -57,7 +61,7 @@ class Painter:
         self._begin()
 
     def picture(self, job: Job) -> None:
-        """Do this once all lines are done, unless a newer picture comes. Raises what failed earlier."""
+        """Do this job after all lines, unless a newer picture is queued. Raises an error of an earlier job."""
         self._check()
         self._picture = job
         self._begin()
@@ -70,7 +74,7 @@ class Painter:
         self.line(job)
 
     def flush(self, timeout_s: float) -> bool:
-        """Wait until all is done, so long at most; whether it is."""
+        """Wait until all jobs are done, at most ``timeout_s``. Return whether they are done."""
         if self._thread is None:
             return True
         done = threading.Event()
@@ -99,7 +103,7 @@ class Painter:
         while True:
             self._wake.wait()
             self._wake.clear()
-            # Taken first: their predecessors were queued before them.
+            # taken first, because they were queued before these lines
             waiting = [self._waiting.popleft() for _ in range(len(self._waiting))]
             while self._lines or self._picture is not None:
                 while self._lines:
@@ -118,7 +122,7 @@ class Painter:
             return
         try:
             job()
-        except (OSError, ValueError):  # closed, hung up: a run goes on without its display
+        except (OSError, ValueError):  # terminal closed or disconnected: a run continues without its display
             self._gone = True
         except Exception as error:
             self._failure = error
@@ -160,22 +164,22 @@ _SWITCH_S = 0.0005
 
 @dataclass(frozen=True)
 class LiveView:
-    """Displayed content at one moment; never changed, only replaced."""
+    """Displayed content at one moment; it is never changed, only replaced."""
 
     expected_s: Mapping[str, float]
     ended: Mapping[str, Stage] = field(default_factory=dict)
     current: str | None = None
-    elapsed_s: float = 0.0             # of the current stage, control time
+    elapsed_s: float = 0.0             # of the current stage, s of control time
     last: tuple[Command, Sample] | None = None
     simulated: bool = False
-    taken: bool = False                # the terminal, by a cycle since the last pause
+    taken: bool = False                # True if a cycle has taken the terminal since the last pause
     end: str = ""
 
 
 class LiveDisplay:
-    """Drawn in place on a terminal; elsewhere a line a stage. Costs a clock reading a cycle.
+    """Display that is redrawn in place on a terminal; elsewhere one line a stage. Needs one clock reading a cycle.
 
-    Nothing here writes: a thread does (`Painter`), from a view that no longer changes once it is handed over.
+    This class does not write. The thread of `Painter` does, from a view that does not change after it was passed.
     """
 
     def __init__(self, console: Console, show_preflight: bool) -> None:
@@ -185,11 +189,11 @@ class LiveDisplay:
         self._view = LiveView(expected_s=dict(_EXPECTED_S))
         self._started_s: float | None = None
         self._next_s = 0.0
-        self._live: Live | None = None         # the painter's own
+        self._live: Live | None = None         # used by the painter only
         self._usual_s = sys.getswitchinterval()
 
     def __enter__(self) -> LiveDisplay:
-        # The control loop must get the interpreter back soon while a picture is being drawn.
+        # the control loop must get the interpreter back soon while a picture is drawn
         self._usual_s = sys.getswitchinterval()
         sys.setswitchinterval(min(self._usual_s, _SWITCH_S))
         return self
@@ -202,19 +206,19 @@ class LiveDisplay:
     def pause(self) -> None:
         """Release the terminal for a prompt; the next stage or cycle takes it back.
 
-        Waits until all is written, with a limit.
+        Waits until everything is written, up to a time limit.
         """
         view = self._view = replace(self._view, taken=False)
-        # A picture that came behind would take the terminal back, and what is printed next stand on its last line.
+        # a later picture would take the terminal back, and the next output would overwrite its last line
         self._painter.line_after_picture(lambda: self._release_picture(view))
         self._painter.flush(_LONGEST_FLUSH_S)
 
     def say(self, text: str) -> None:
-        """One line."""
+        """Print one line."""
         self._print(text, style="dim")
 
     def preflight(self, preflight: Preflight) -> None:
-        """The preflight table, on a real peer or where something was refused."""
+        """Print the preflight table for a real drive, or if a check refused."""
         self._view = replace(self._view, simulated=preflight.identity.simulated)
         if self._show_preflight or preflight.refused or not preflight.identity.simulated:
             view = self._view
@@ -230,7 +234,7 @@ class LiveDisplay:
             self._print(f"{self._prefix()}stage {name} …")
 
     def planned(self, plan: PlannedMotion) -> None:
-        """The plan of stage 5, as soon as there is one."""
+        """Show the plan of stage 5 as soon as it exists."""
         self._view = replace(self._view, expected_s={**self._view.expected_s, "acquire": plan.duration_s + 5.0})
         text = (
             f"plan: {plan.kind} in {plan.mode} mode, {minutes(plan.duration_s)}, speed {plan.speed_min_rad_s:.2f} to "
@@ -239,7 +243,7 @@ class LiveDisplay:
         self._print(self._prefix() + text, style="dim")
 
     def cycle(self, command: Command, sample: Sample) -> None:
-        """Called in every cycle."""
+        """Update the view in every cycle."""
         now_s = time.monotonic()
         if now_s < self._next_s:
             return
@@ -253,7 +257,7 @@ class LiveDisplay:
     def stage_ended(self, stage: Stage) -> None:
         self._view = replace(self._view, ended={**self._view.ended, stage.name: stage})
         if not self._console.is_terminal:
-            # An aborted stage begins its detail with the class of the error, which is for the log only.
+            # the detail of an aborted stage begins with the class of the error, which is only for the log
             detail = f": {re.sub(_ERROR_CLASS, '', stage.detail)}" if stage.detail else ""
             took = minutes(stage.end_s - stage.start_s)
             self._print(f"{self._prefix()}stage {stage.name} {stage.outcome}, {took}{detail}")
@@ -261,7 +265,7 @@ class LiveDisplay:
             self._show()
 
     def stopped(self, confirmed: bool) -> None:
-        """The stop sequence has ended."""
+        """Show the end of the stop sequence."""
         end = "shaft at rest, drive disabled" if confirmed else "STOP NOT CONFIRMED"
         self._view = replace(self._view, end=end)
         if not self._console.is_terminal:
@@ -302,7 +306,7 @@ class LiveDisplay:
 
 
 def picture(view: LiveView) -> RenderableType:
-    """Stages, bars, speed and torque."""
+    """Return stages, bars, speed and torque."""
     table = Table.grid(padding=(0, 1))
     table.add_column(width=1)
     table.add_column(width=8)
@@ -337,7 +341,7 @@ def picture(view: LiveView) -> RenderableType:
 
 
 def preflight_table(preflight: Preflight) -> Table:
-    """Every check with what was wanted and what was found."""
+    """Return every check with the required and the found value."""
     who = preflight.identity
     title = Text(f"preflight: {visible(who.name)}" + (f" · {SIMULATED}" if who.simulated else ""), "table.title")
     table = Table(title=title, title_justify="left", expand=False)

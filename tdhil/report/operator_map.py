@@ -1,4 +1,4 @@
-"""The operator's map of a tuning: set speed × bit torque, for the document and the page."""
+"""Operator's map of a tuning: set speed × bit torque, for the document and the page."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _COLOURS = {"stable": "#7fbf7f", "at risk": "#f2d16b", "stick-slip": "#d9695f"}
 
 
 def map_document(found: OperatorMap) -> dict[str, Any]:
-    """Return the map as plain data; a row a bit torque, a cell a set speed."""
+    """Return the map as plain data: a row for each bit torque, a cell for each set speed."""
     return {"speeds_rpm": list(found.speeds_rpm), "bit_torques_nm": list(found.bit_torques_nm),
             "states": {kind: [list(row) for row in rows] for kind, rows in found.states.items()},
             "how_to_read": HOW_TO_READ}
 
 
 def map_section(document: Part, bit: str) -> ReportSection:
-    """Return picture and table of the map."""
+    """Return figure and table of the map."""
     kinds = list(document["states"])
     width = 0.8 / len(kinds)
     rows = tuple(
@@ -46,7 +46,7 @@ def map_section(document: Part, bit: str) -> ReportSection:
 
 
 def _row_words(states: Sequence[str], speeds_rpm: Sequence[float]) -> str:
-    """Say from which speed on the row is stable, and up to which speed the bit sticks."""
+    """Return a text: the speed from which the row is stable, and the speed up to which the bit sticks."""
     stable = next((speed for k, speed in enumerate(speeds_rpm) if all(one == "stable" for one in states[k:])), None)
     words = f"not stable up to {speeds_rpm[-1]:.0f} rpm" if stable is None else f"stable from {stable:.0f} rpm"
     sticking = [speed for speed, one in zip(speeds_rpm, states, strict=True) if one == "stick-slip"]
@@ -63,7 +63,7 @@ def draw_map(figure: FigureBase, document: Part) -> None:
         for torque, row in zip(torques, document["states"][kind], strict=True):
             for speed, state in zip(speeds, row, strict=True):
                 axes.bar(speed, rise, step, torque - 0.5 * rise, color=_COLOURS[state], edgecolor="white", lw=0.4)
-        # Below the axes: a report's figure has no room for a title above them.
+        # below the axes, because a report's figure has no room for a title above them
         axes.set(xlabel=f"{kind}: set speed, rpm", xlim=(speeds[0] - 0.5 * step, speeds[-1] + 0.5 * step),
                  ylim=(torques[0] - 0.5 * rise, torques[-1] + 0.5 * rise))
     every[0].set_ylabel("bit torque, kN·m")

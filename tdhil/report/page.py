@@ -1,4 +1,4 @@
-"""Common parts of every HTML page: style, pictures as SVG, and the message on missing packages."""
+"""Common parts of every HTML page: style, figures as SVG, and the message on missing packages."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def install_command() -> str:
     """Return the command that installs the extra `report` here: into this environment, from the clone, or by package
     names.
 
-    This package is in no index, so its own name would not be found.
+    tdhil is not in a package index, so its own name would not be found.
     """
     python = shlex.quote(sys.executable or "python")
     clone = Path(version.__file__).resolve().parent.parent
@@ -57,12 +57,12 @@ def install_command() -> str:
 
 
 def has_extra() -> bool:
-    """Are the packages for reports there?"""
+    """Return whether the packages for reports are installed."""
     return all(find_spec(name) is not None for name in NEEDED)
 
 
 def require_extra(where: str) -> None:
-    """Raises UsageError, in one line, where the optional packages for a report are missing."""
+    """Raise UsageError, in one line, if optional packages for a report are missing."""
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
         raise UsageError(
@@ -74,7 +74,7 @@ def require_extra(where: str) -> None:
 
 @contextmanager
 def repeatable_figures() -> Iterator[None]:
-    """Matplotlib set so that the same data give the same file: salted ids, no style of the user's."""
+    """Configure matplotlib so that the same data give the same file: salted ids, and no style of the user."""
     from matplotlib import rc_context
 
     with rc_context({"svg.hashsalt": "tdhil", "font.size": 10.0, "figure.facecolor": "white"}):
@@ -82,7 +82,7 @@ def repeatable_figures() -> Iterator[None]:
 
 
 def lay_out(figure: FigureBase, wide_in: float, high_in: float, *, names_left: bool = False) -> None:
-    """Margins in inches, the same for every picture of a page, so that their axes stand below each other."""
+    """Set margins in inches, equal for every figure of a page, so that their axes are aligned."""
     left = 1.75 if names_left else 0.72
     every: Any = figure.axes
     above = not names_left and any(axes.texts for axes in every)
@@ -92,7 +92,7 @@ def lay_out(figure: FigureBase, wide_in: float, high_in: float, *, names_left: b
 
 
 def inline_svg(draw: Draw, size_in: tuple[float, float], *, names_left: bool = False) -> str:
-    """A picture as an <svg> element for the page itself: no date, no second file, text as text."""
+    """Return a figure as an <svg> element for the page: without a date or a second file, and with text as text."""
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure

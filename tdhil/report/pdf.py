@@ -1,8 +1,8 @@
-"""The report as PDF on A4: pictures and letters as vectors, by matplotlib alone (docs/decisions/0009).
+"""Report as PDF on A4: figures and letters as vectors, by matplotlib alone (docs/decisions/0009).
 
-A sheet is filled from the top. A heading stays with what follows it, and a picture with its caption. A table stays on
-one sheet if that leaves at most a quarter of the sheet before it empty. Otherwise it is split between rows, and its
-head is repeated. All lengths are in points.
+A sheet is filled from the top. A heading stays with the next block, and a figure with its caption. A table stays on one
+sheet if that leaves at most a quarter of the sheet before it empty. Otherwise it is split between rows, and its head is
+repeated. All lengths are in points.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _COLOURS = {"green": "#1a7f37", "yellow": "#8a6100", "red": "#b42318"}
 _DARK, _QUIET, _RULE = "#222222", "#666666", "#cccccc"
 
 Draw = Callable[["_Sheets", float], None]
-"""Draws a piece at a height from the sheet's top."""
+"""Function that draws a piece at a distance from the sheet's top."""
 
 
 def pdf_bytes(report: Report) -> bytes:
-    """The whole file; the same report gives the same bytes."""
+    """Return the whole file; the same report gives the same bytes."""
     from matplotlib.backends.backend_pdf import PdfPages
 
     data = BytesIO()
@@ -43,7 +43,7 @@ def pdf_bytes(report: Report) -> bytes:
 
 
 def sheets_of(report: Report) -> list[Figure]:
-    """The sheets as figures of A4, with their feet."""
+    """Return the sheets as figures of A4, with their feet."""
     with _fonts():
         sheets = _Sheets(report.simulated)
         _write(sheets, report)
@@ -67,7 +67,7 @@ def _metadata(report: Report) -> dict[str, Any]:
 
 
 class _Sheets:
-    """The sheets so far; ``at`` is where the last one is filled to."""
+    """Sheets so far; ``at`` is the position up to which the last one is filled."""
 
     def __init__(self, banner: str) -> None:
         self.figures: list[Figure] = []
@@ -76,7 +76,7 @@ class _Sheets:
         self._top = TOP
 
     def place(self, height: float, draw: Draw, space: float = 0.0) -> None:
-        """Draw a piece so high that stays together, below a space (none at the top of a sheet)."""
+        """Draw a piece of this height that stays together, below a space (none at the top of a sheet)."""
         if not self.figures or (self.at + space + height > BOTTOM and not self.fresh):
             self.new()
         if self.fresh:
@@ -110,7 +110,7 @@ class _Sheets:
         return bool(self.figures) and self.at == self._top
 
     def foot(self, figure: Figure, left: str, right: str) -> None:
-        """Below everything on a sheet."""
+        """Draw the foot of a sheet."""
         at = HIGH - 26.0
         for text, x, side in ((left, LEFT, "left"), (right, WIDE - LEFT, "right")):
             figure.text(x / WIDE, 1.0 - at / HIGH, text, fontsize=6.8, color=_QUIET, ha=side, va="baseline",
@@ -120,24 +120,24 @@ class _Sheets:
 
     def line(self, x: float, y: float, text: str, size: float, *, color: str = _DARK, weight: str = "normal",
              style: str = "normal", side: str = "left") -> None:
-        """One line of text with its baseline at ``y``."""
+        """Draw one line of text with its baseline at ``y``."""
         self.figures[-1].text(x / WIDE, 1.0 - y / HIGH, text, fontsize=size, color=color, fontweight=weight,
                               fontstyle=style, ha=side, va="baseline", parse_math=False)
 
     def lines(self, x: float, y: float, texts: Sequence[str], size: float, **how: Any) -> None:
-        """Lines below each other; ``y`` is where the first begins."""
+        """Draw lines below each other; ``y`` is the top of the first."""
         for number, text in enumerate(texts):
             self.line(x, y + (number + 0.78) * size * _LEADING, text, size, **how)
 
     def rule(self, y: float, color: str = _RULE, width: float = 0.5) -> None:
-        """A line across the page."""
+        """Draw a line across the page."""
         from matplotlib.lines import Line2D
 
         figure = self.figures[-1]
         figure.add_artist(Line2D((LEFT / WIDE, (LEFT + INNER) / WIDE), (1.0 - y / HIGH,) * 2, lw=width, color=color))
 
     def box(self, y: float, height: float, x: float, width: float, color: str) -> None:
-        """A filled rectangle, from its top."""
+        """Draw a filled rectangle, from its top."""
         from matplotlib.patches import Rectangle
 
         figure = self.figures[-1]
@@ -145,7 +145,7 @@ class _Sheets:
                                     facecolor=color, transform=figure.transFigure))
 
     def picture(self, y: float, picture: Picture, height: float) -> None:
-        """A figure within the sheet's."""
+        """Draw a figure within the figure of the sheet."""
         figure = self.figures[-1]
         grid = figure.add_gridspec(3, 3, width_ratios=(LEFT, INNER, WIDE - LEFT - INNER),
                                    height_ratios=(y, height, HIGH - y - height))
@@ -206,11 +206,11 @@ def _warning(sheets: _Sheets, warning: str) -> None:
     sheets.place(height, draw, 5.0)
 
 
-_HEADING = 21.0         # with the rule below it
+_HEADING = 21.0         # points, with the rule below it
 
 
 def _section(sheets: _Sheets, section: ReportSection) -> None:
-    """The heading goes with the first block, or with the first rows of a table that is longer than a sheet."""
+    """Draw a section. The heading stays with the first block, or with the first rows of a table longer than a sheet."""
     heading: str | None = section.heading
     for block in section.blocks:
         if isinstance(block, Table | Pairs):
@@ -276,7 +276,7 @@ def _table(sheets: _Sheets, heading: str | None, block: Table | Pairs) -> None:
             used += rows[fit].height
             fit += 1
         if fit < len(rows):
-            fit = min(fit, len(rows) - _LEAST_ROWS)      # no sheet begins or ends with a row or two of a table
+            fit = min(fit, len(rows) - _LEAST_ROWS)      # no sheet begins or ends with only one or two rows of a table
         if fit < _LEAST_ROWS and not sheets.fresh and fit < len(rows):
             sheets.new()
             continue
@@ -324,7 +324,7 @@ def _draw_rows(on: _Sheets, y: float, head: _TableRow | None, rows: Sequence[_Ta
 
 
 def wrapped(text: str, size: float, width: float, weight: str = "normal", style: str = "normal") -> list[str]:
-    """Lines no wider than ``width``; what has no spaces is cut where it must be."""
+    """Return lines no wider than ``width``; a word without spaces is cut if necessary."""
     lines: list[str] = []
     for paragraph in text.splitlines() or [""]:
         line = ""
@@ -348,7 +348,7 @@ def wrapped(text: str, size: float, width: float, weight: str = "normal", style:
 
 @lru_cache(maxsize=4096)
 def _measured(text: str, weight: str, style: str) -> float:
-    """Width of a line in letters of one point."""
+    """Return the width of a line in letters of one point."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import text_to_path
 

@@ -1,4 +1,4 @@
-"""The pictures of a result: lines over frequency, the budget, friction over speed, all inertias side by side."""
+"""Figures of a result: lines over frequency, budget, friction over speed, all estimates of the inertia."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The picture of a run: speed and torque over time, its stages and the excited segments shaded.
+# Figure of a run: speed and torque over time, with its stages and the excited segments shaded.
 
 
-_COLUMNS = 1200           # as many as a screen can show: each is a line from the least to the greatest value in it
+_COLUMNS = 1200           # columns, as many as a screen can show; each spans the values of its time
 _SHADES = ("#f2f2f2", "#ffffff")
 _SEGMENT = "#1f5fa8"
 
 
 def draw_run(figure: FigureBase, recording: Recording) -> None:
-    """Nothing is smoothed: every column spans all that was reported in its time."""
+    """Draw the run without smoothing: every column spans all reported values of its time."""
     speed_axes, torque_axes = figure.subplots(2, 1, sharex=True)
     for axes, signal, label in (
         (speed_axes, recording.speed_rad_s, "speed, rad/s"),
@@ -47,7 +47,7 @@ def draw_run(figure: FigureBase, recording: Recording) -> None:
         for number, stage in enumerate(recording.stages):
             middle = 0.5 * (stage.start_s + stage.end_s)
             if stage.end_s > stage.start_s:
-                # short stages stand side by side: their names go up and down in turn
+                # short stages are close together: their names alternate in height
                 height = 1.02 if stage.end_s - stage.start_s > 0.1 * length or number % 2 == 0 else 1.10
                 speed_axes.text(middle, height, stage.name, transform=speed_axes.get_xaxis_transform(), ha="center",
                                 va="bottom", fontsize="small")
@@ -68,14 +68,14 @@ def _shade(axes: Axes, recording: Recording) -> None:
 
 
 def envelope(time_s: FloatArray, signal: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Least and greatest value in each of at most 1200 stretches of equally many samples; only what is a number."""
+    """Return least and greatest value in each of at most 1200 stretches of equally many finite samples."""
     good = np.isfinite(time_s) & np.isfinite(signal)
     time, values = time_s[good], signal[good]
     if len(time) == 0:
         empty = np.zeros(0)
         return empty, empty, empty
     starts = np.unique(np.linspace(0, len(time), min(_COLUMNS, len(time)), endpoint=False).astype(np.intp))
-    # each stretch takes the next one's first value along, so that the picture has no seams
+    # each stretch includes the first value of the next one, so that the figure has no gaps
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     following = values[np.append(starts[1:], len(values) - 1)]
     return time[starts], np.minimum(low, following), np.maximum(high, following)
@@ -88,7 +88,7 @@ Part = Mapping[str, Any]
 
 
 def draw_lines(figure: FigureBase, document: Part) -> None:
-    """Above: what every line shows by itself, the model through it, and J. Below: what the model leaves."""
+    """Draw, above, apparent inertia of every line, the model and J; below, the residuals."""
     points = document["lines"]
     hertz = [point["hertz"] for point in points]
     top, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
@@ -112,7 +112,7 @@ def draw_lines(figure: FigureBase, document: Part) -> None:
 
 
 def draw_impedance(figure: FigureBase, found: Part) -> None:
-    """|Z| over frequency, lines by themselves and the loop that explains them; |r| below, where a string is known."""
+    """Draw |Z| over frequency, of the lines and of the fitted loop; |r| below, if a string is known."""
     points, zeta = found["points"], found["string_nm_s_rad"]
     hertz = [point["hertz"] for point in points]
     real, imaginary = (np.array([point[key]["value"] for point in points])
@@ -138,7 +138,7 @@ def draw_impedance(figure: FigureBase, found: Part) -> None:
 
 
 def draw_budget(figure: FigureBase, document: Part) -> None:
-    """One bar for each source, largest on top."""
+    """Draw one bar for each source, the largest on top."""
     lines = sorted((line for line in document["budget"] if line["half_width_kg_m2"] is not None),
                    key=lambda line: float(line["half_width_kg_m2"]))
     axes = figure.subplots()
@@ -152,7 +152,7 @@ def draw_budget(figure: FigureBase, document: Part) -> None:
 
 
 def draw_friction(figure: FigureBase, document: Part) -> None:
-    """The points, and the straight line of T_c and B through them."""
+    """Draw the points, and the straight line of T_c and B through them."""
     points = document["friction_curve"]
     speeds = [point["speed_rad_s"] for point in points]
     torques = [point["torque_nm"] for point in points]
@@ -198,7 +198,7 @@ def draw_opinions(figure: FigureBase, document: Part) -> None:
 
 
 def _bars(estimates: Sequence[Part]) -> list[list[float]]:
-    """Distances down and up, as errorbar wants them; an open side has no bar."""
+    """Return distances down and up for errorbar; an open side has no bar."""
     down = [0.0 if e["low"] is None else max(0.0, e["value"] - e["low"]) for e in estimates]
     up = [0.0 if e["high"] is None else max(0.0, e["high"] - e["value"]) for e in estimates]
     return [down, up]

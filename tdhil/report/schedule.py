@@ -1,4 +1,4 @@
-"""Gains over depth, for the document, the terminal and the page; and how a speed or a gain is written."""
+"""Gains over depth, for the document, the terminal and the page; and the format of a speed or a gain."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ Part = Mapping[str, Any]
 
 
 def spread_document(spread: DrawnValues, resolution_share: float) -> dict[str, float | None]:
-    """Median of the sampled truths and 95 % interval; None: above the highest that was tried."""
+    """Return median of the sampled true values and 95 % interval; None: above the highest speed tried."""
     median = spread.median
     low, high = spread.interval(resolution_share * (median or 0.0))
     return {"value": median, "low": low, "high": high}
 
 
 def finite(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values with None for what is infinite."""
+    """Return the values, with None for infinite ones."""
     return {name: value if not isinstance(value, float) or math.isfinite(value) else None
             for name, value in values.items()}
 
 
 def gain_words(value: float) -> str:
-    """Four digits, and no power of ten."""
+    """Return the gain with four digits, without a power of ten."""
     return f"{value:.0f}" if value >= 1e3 else f"{value:.4g}"
 
 
@@ -91,7 +91,7 @@ def _speeds(drawn: DrawnValues) -> dict[str, float | None]:
 
 
 def _worst_between(found: DepthSchedule) -> str:
-    """Say how far linear interpolation between the rows falls short, at its worst."""
+    """Return a text on the worst loss by linear interpolation between the rows."""
     if not found.between:
         return "No two neighbouring depths have gains: nothing can be interpolated."
     margins = [(one.worst.phase_deg, one.depth_m) for one in found.between if one.worst is not None]
@@ -132,7 +132,7 @@ def print_schedule(document: Part, console: PlainConsole) -> None:
 
 
 def schedule_section(document: Part) -> ReportSection:
-    """Return table and picture of the schedule."""
+    """Return table and figure of the schedule."""
     headings = _headings(document)
     rows = tuple(tuple(cell.replace("!", "⚠ ") for cell in cells) for cells in _table(document))
     parameters = tuple(_parameter_rows(document))
@@ -188,7 +188,7 @@ def _parameter_rows(document: Part) -> Iterator[tuple[str, ...]]:
 
 
 def draw_schedule(figure: FigureBase, document: Part) -> None:
-    """P and I over depth, and below the critical speed of these gains and of those they are compared with."""
+    """Draw P and I over depth; below, the critical speed of these gains and of those for comparison."""
     rows, between = _with_gains(document), document["between"]
     noisy = any(one["critical_under_noise_rpm"] for one in rows)
     every = figure.subplots(2 if noisy else 1, 1, sharex=True, squeeze=False)[:, 0]

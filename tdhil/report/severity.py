@@ -1,4 +1,4 @@
-"""Severity of torsional oscillation: as a document for machines, on a terminal, and as a page with pictures."""
+"""Severity of torsional oscillation: as a JSON document, on a terminal, and as a page with figures."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ Part = Mapping[str, Any]
 _STYLES = {"stick-slip": "bold red", "at risk": "bold yellow", "smooth": "bold green"}
 _COLOURS = {"stick-slip": "red", "at risk": "yellow", "smooth": "green"}
 MOST_EPISODES = 200
-"""Episodes that the document names."""
+"""Most episodes in the document."""
 SHOWN_EPISODES = 3
 SHOWN_PERIODS = 12.0
-"""Length of the detail picture, in periods."""
+"""Length of the detail figure, in periods."""
 _EXPLAINED = {
     "severity index": "half of peak to peak of the downhole speed over the mean speed, in windows of one period of the "
                       f"string's lowest mode; {STICK_SLIP_INDEX:g} and more with a bit that nearly stops is "
@@ -49,7 +49,7 @@ def severity_document(
     found: Sequence[tuple[Severity, str]], string: DrillString, inertia: Interval, *, simulated: bool,
     warnings: tuple[str, ...],
 ) -> dict[str, Any]:
-    """Return plain data for `json.dumps`; one record, or two of which the second is later. At the main shaft."""
+    """Return plain data for `json.dumps`, at the main shaft; one record, or two, the second of which is later."""
     records = [_record(one, name) for one, name in found]
     return {
         "kind": "severity", "records": records, "sentence": _sentence(records), "simulated": simulated,
@@ -78,7 +78,7 @@ def _record(one: Severity, name: str) -> dict[str, Any]:
 
 
 def _sentence(records: Sequence[Part]) -> str:
-    """Return the finding in a sentence; of two records, what changed."""
+    """Return the finding in a sentence; for two records, the change."""
     first, last = records[0], records[-1]
     if len(records) == 1:
         if first["level"] == "stick-slip":
@@ -95,7 +95,7 @@ def _sentence(records: Sequence[Part]) -> str:
 
 
 def print_severity(document: Part, console: PlainConsole) -> None:
-    """Print sentence, figures and what they mean. 80 columns do."""
+    """Print sentence, figures and their meaning, in 80 columns."""
     records = document["records"]
     console.print(Words(document["sentence"], style=_STYLES[records[-1]["level"]]))
     console.print()
@@ -161,11 +161,11 @@ def _reflection(one: Part) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# As a page.
+# Page of the severity.
 
 
 def write_severity_report(document: Part, found: Sequence[Severity], path: Path) -> Path:
-    """Write the page, HTML or PDF by its name; return where it went. Raises UsageError where it can't be written."""
+    """Write the page, HTML or PDF by its name, and return its path. Raises UsageError if it cannot be written."""
     return write_blocks(severity_report(document, found), path)
 
 

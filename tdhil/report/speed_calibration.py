@@ -1,4 +1,4 @@
-"""A speed calibration as a document for machines, and on a terminal."""
+"""Speed calibration as a JSON document, and on a terminal."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def speed_document(
     found: SpeedCalibration, inputs: Part, drive: Part, settings: Part, *, log: Part | None, date: str,
     confidence: float, simulated: bool, warnings: tuple[str, ...],
 ) -> dict[str, Any]:
-    """Plain data for `json.dumps`. ``inputs``: of a count; ``log``: its name, hash and date."""
+    """Return plain data for `json.dumps`. ``inputs``: of a count; ``log``: its name, hash and date."""
     return {
         "kind": "speed_calibration",
         "method": found.method,
@@ -51,7 +51,7 @@ def speed_document(
 
 
 def print_speed_calibration(document: Part, console: PlainConsole) -> None:
-    """The card of a speed calibration, on a console."""
+    """Print the card of a speed calibration on a console."""
     factor, verdict = document["calibration_factor"], document["verdict"]
     rows = names_and_texts([("verdict", Text(verdict, style="bold green" if verdict == "valid" else "bold red"))])
     if factor is not None:

@@ -1,4 +1,4 @@
-"""`tdhil tune speed`'s findings: as a document for machines, on a terminal, as a picture and as a page."""
+"""Result of `tdhil tune speed`: as a JSON document, on a terminal, as a figure and as a page."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ _COLOURS = {"present": "0.35", "tuned": "#1f5fa8"}
 _PNG_DPI = 150
 """Dots per inch of a PNG."""
 _SIZE_IN = (7.0, 8.4)
-"""Inches, of a picture with all panels."""
+"""Size of a figure with all panels, inches."""
 _STEP_POINTS = 300
 """Points of a step response in the document."""
 _UNLIKE = 3.0
-"""Half-widths by which a line may differ from the shaft that was tuned for."""
+"""Half-widths by which a measured line may differ from the shaft used for the tuning."""
 _UNLIKE_REL = 0.1
-"""Relative difference below which no line is named."""
+"""Relative difference below which no line is named in a warning."""
 _BEYOND_LINES = 1.0
-"""Bandwidth over the highest excited frequency from which a warning follows."""
+"""Bandwidth over the highest excited frequency, from which a warning follows."""
 _EXPLAINED = {
     "P, I": "gains at the motor shaft, N·m·s/rad and N·m/rad",
     "margins": "of the open loop: as believed, and the least over all corners of the intervals",
@@ -68,7 +68,7 @@ class LoopTunedFor:
     """Source of the numbers."""
 
     source: str
-    """The result or log."""
+    """Path of the result or log."""
     simulated: bool
     model: str
     profile: str | None
@@ -80,7 +80,7 @@ class LoopTunedFor:
 
 
 def loop_document(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: LoopTunedFor) -> dict[str, Any]:
-    """Plain data for `json.dumps`, at the motor shaft; null in place of an infinite value."""
+    """Return plain data for `json.dumps`, at the motor shaft; null for an infinite value."""
     case, plant = design.case, design.case.plant
     lowest_hz = None if shaft is None else float(shaft.hertz.min())
     warnings = [*tuned_for.warnings, *_warnings(design, shaft, tuned_for)]
@@ -129,7 +129,7 @@ def _controller(row: LoopRow, design: LoopDesign, settings: tuple[DriveSetting, 
 
 
 def _failed(row: LoopRow, design: LoopDesign) -> Iterator[str]:
-    """Yield each margin that is thinner than required in the worst case."""
+    """Yield each margin that is below the required one in the worst case."""
     worst, case = row.worst, design.case
     if not worst.stable:
         yield "unstable in the worst case"
@@ -200,7 +200,7 @@ def _points(loop: np.ndarray[Any, np.dtype[np.complex128]]) -> dict[str, list[fl
 
 
 def _step(row: LoopRow) -> dict[str, list[float]]:
-    """Return the response until twice the settling time, in so many points."""
+    """Return the response until twice the settling time, as `_STEP_POINTS` points."""
     settled = row.settling_s.high
     end = len(row.time_s) if not math.isfinite(settled) else int(np.searchsorted(row.time_s, 2.0 * settled)) + 1
     every = max(1, end // _STEP_POINTS)
@@ -209,11 +209,11 @@ def _step(row: LoopRow) -> dict[str, list[float]]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# On a terminal
+# Output on a terminal
 
 
 def print_loop_tuning(document: Part, console: PlainConsole) -> None:
-    """Print gains, margins and step response, and what they rest on. 80 columns do."""
+    """Print gains, margins, step response and their conditions, in 80 columns."""
     simulated = f" · {SIMULATED}" if document["tuned_for"]["simulated"] else ""
     console.print(Words(document["sentence"], style="bold green"))
     console.print()
@@ -274,7 +274,7 @@ def _with_ends(part: Part, unit: str) -> str:
 
 
 def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
-    """Yield the name of each figure and its values, one for each controller; "!" before a thin margin."""
+    """Yield the name of each figure and its values, one for each controller; "!" before an insufficient margin."""
     every = document["controllers"]
     yield "P, N·m·s/rad", [gain_words(one["gain_nm_s_rad"]) for one in every]
     yield "I, N·m/rad", [gain_words(one["integral_nm_rad"]) for one in every]
@@ -310,25 +310,25 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def _ends(part: Part, times: float = 1.0) -> str:
-    """``2.31 (2.22–2.42)``."""
+    """Return ``2.31 (2.22–2.42)``."""
     if part["value"] is None or part["high"] is None:
         return "–"
     return f"{times * part['value']:.3g} ({times * part['low']:.3g}–{times * part['high']:.3g})"
 
 
 def _setting_rows(document: Part) -> Iterator[tuple[str, str, str]]:
-    """Yield (parameter, what to type, how sure), of the tuned gains."""
+    """Yield (parameter, value to enter, confidence), of the tuned gains."""
     for one in document["controllers"][-1]["drive_parameters"]:
         value = one["why"] if one["value"] is None else f"{gain_words(one['value'])} {one['unit']}"
         yield one["title"], value, one["confidence"]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Pictures and the page
+# Figures and the page
 
 
 def check_picture_path(path: Path, source: Path) -> None:
-    """Check before the work that a picture can be made and put there. Raises UsageError."""
+    """Check, before the computation, that a figure can be written to this path. Raises UsageError."""
     require_extra("--plot")
     where = f"--plot {path}"
     if path.resolve() == source.resolve():
@@ -343,7 +343,7 @@ def check_picture_path(path: Path, source: Path) -> None:
 
 
 def save_loop_picture(document: Part, path: Path) -> None:
-    """Write loop, sensitivity and step response as one picture. Raises UsageError if it can't be written."""
+    """Write loop, sensitivity and step response as one figure. Raises UsageError if it cannot be written."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -425,7 +425,7 @@ def draw_step(figure: FigureBase, document: Part) -> None:
 
 
 def write_loop_report(document: Part, path: Path) -> Path:
-    """Write the page, HTML or PDF by its name; return where it went. Raises UsageError if it can't be written."""
+    """Write the page, HTML or PDF by its name, and return its path. Raises UsageError if it cannot be written."""
     return write_blocks(loop_report(document), path)
 
 

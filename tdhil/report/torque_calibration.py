@@ -1,4 +1,4 @@
-"""A torque calibration as a document for machines, on a terminal, and as a calibration laboratory writes it."""
+"""Torque calibration as a JSON document, on a terminal, and in the layout of a calibration laboratory."""
 
 from __future__ import annotations
 
@@ -48,9 +48,10 @@ def calibration_document(
     found: TorqueCalibration, runs: tuple[Part, ...], drive: Part, settings: Part, *, date: str, at: str,
     confidence: float, simulated: bool, warnings: tuple[str, ...],
 ) -> dict[str, Any]:
-    """Plain data for `json.dumps`. ``runs``: log, its hash, its date, the body; in the order of the points.
+    """Return plain data for `json.dumps`. ``runs``: log, its hash, its date, the body; in the order of the points.
 
-    ``at``: the shaft that the bodies were given at; every inertia is at the motor shaft. ``date``: of the calibration.
+    ``at``: the shaft for which the bodies were stated; every inertia is at the motor shaft. ``date``: of the
+    calibration.
     """
     told = [{**run, **asdict(point)} for run, point in zip(runs, found.points, strict=True)] if found.points else [
         dict(run) for run in runs]
@@ -82,11 +83,11 @@ def calibration_document(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The card
+# Card of a torque calibration
 
 
 def print_calibration(document: Part, console: PlainConsole) -> None:
-    """The card of a torque calibration, on a console."""
+    """Print the card of a torque calibration on a console."""
     rows = names_and_texts(())
     verdict = document["verdict"]
     rows.add_row("verdict", Words(verdict, style=VERDICT_STYLE.get(verdict, "bold")))
@@ -116,7 +117,7 @@ def print_calibration(document: Part, console: PlainConsole) -> None:
 
 
 def _budget(document: Part) -> Grid:
-    """Each input quantity's share of κ and of J, at the coverage factor of the result."""
+    """Return each input quantity's contribution to κ and to J, at the coverage factor of the result."""
     k_factor, k_inertia = (document[key]["coverage_factor"] for key in ("calibration_factor", "inertia_kg_m2"))
     table = Grid.grid(padding=(0, 2))
     table.add_column(style="dim")
@@ -131,16 +132,16 @@ def _budget(document: Part) -> Grid:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The page
+# Page of a torque calibration
 
 
 def write_calibration_report(document: Part, path: Path) -> Path:
-    """The page, as PDF where the name ends so; and where it went. Raises UsageError where it can't be written."""
+    """Write the page, HTML or PDF by its name, and return its path. Raises UsageError if it cannot be written."""
     return write_blocks(calibration_report(document), path)
 
 
 def calibration_report(document: Part) -> Report:
-    """Laid out as a calibration laboratory does: item, conditions, result, budget, data, date and signature."""
+    """Return the report in the layout of a laboratory: item, conditions, result, budget, data, date and signature."""
     factor, inertia = document["calibration_factor"], document["inertia_kg_m2"]
     lines = []
     if factor is not None and inertia is not None:
@@ -211,7 +212,7 @@ def _data(document: Part) -> Table:
 
 
 def _residual(run: Part) -> float:
-    """Return the residual; 0 where it is rounding only, as with two runs."""
+    """Return the residual; 0 if it is rounding only, as with two runs."""
     left = float(run["residual_kg_m2"])
     return left if abs(left) > _ROUNDING * abs(run["reported_kg_m2"]) else 0.0
 
@@ -226,7 +227,7 @@ def _picture(document: Part) -> Block:
 
 
 def draw_calibration(figure: FigureBase, document: Part) -> None:
-    """Above: the runs, the line and its 95 % band; dotted: an exact torque scale. Below: residuals."""
+    """Draw, above, the runs, the line and its 95 % band (dotted: an exact torque scale); below, residuals."""
     runs, line = document["runs"], document["line"]
     added = np.array([run["added_kg_m2"] for run in runs])
     seen = np.array([run["reported_kg_m2"] for run in runs])

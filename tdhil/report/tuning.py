@@ -1,4 +1,4 @@
-"""`tdhil tune`'s findings: as a document for machines, on a terminal, and as a page with pictures."""
+"""Result of `tdhil tune`: as a JSON document, on a terminal, and as a page with figures."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ _WHAT = {
     "broadband": "near ζ over more than one mode, as far as lags and J's interval allow",
 }
 SIMULATION_ERROR_RPM, SIMULATION_ERROR_SHARE = 0.5, 0.015
-"""Error of a simulated critical speed, rpm and share: half of the search's step, and the effect of the tick and of the
-simulation's length (stiff loop of the reference case: 182 for 183; collars as sections: 1.5 %)."""
+"""Error of a simulated critical speed, rpm and share: half of the search's step, and the effects of the time step
+and of the simulation's length (stiff loop of the reference case: 182 instead of 183; collars as sections: 1.5 %)."""
 _COLOURS = {"present": "0.25", "stiff": "#c2410c", "soft": "#1f5fa8", "compensated": "#1a7f37", "broadband": "#7c3aed"}
 _IN_BRACKETS = "95 % interval over J, string, lags and bit drawn together; ψ: over J alone, the string as stated"
 _MEANT = {
@@ -85,7 +85,7 @@ class TunedFor:
     """Source of the numbers."""
 
     source: str
-    """The result or log."""
+    """Path of the result or log."""
     simulated: bool
     profile: str | None
     gear_ratio: float
@@ -96,11 +96,11 @@ class TunedFor:
     """Settings in the drive's own parameters, by the controller's kind."""
     warnings: tuple[str, ...] = ()
     identified: Mapping[str, Any] = field(default_factory=dict)
-    """Figures of the result at the motor shaft that a virtual string on the same rig needs."""
+    """Values of the result at the motor shaft that a virtual string on the same rig needs."""
 
 
 def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
-    """Plain data for `json.dumps`: torques, inertias and gains at the shaft that is named; nothing is infinite."""
+    """Return plain data for `json.dumps`: torques, inertias and gains at the named shaft; no infinite values."""
     import numpy as np
 
     case, string = tuning.case, tuning.case.string
@@ -158,14 +158,16 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
 
 
 def _whole_lag(case: TuneCase) -> Interval:
-    """Στ, with what is open of it."""
+    """Return Στ with its interval."""
     value = case.drive.total_lag_s
     moved = [[end.drive.total_lag_s for end in pair] for pair in case.moves(present=False)]
     return in_squares(Interval(value, value, value), moved)
 
 
 def _sends_back_more(tuning: Tuning) -> Iterator[str]:
-    """Yield a warning for |r| > 1: the loop is stable there only by the string's own losses, which are not measured."""
+    """Yield a warning for |r| > 1: there the loop is stable only by the losses of the string, which are not
+    measured.
+    """
     import numpy as np
 
     hertz = np.geomspace(0.02, 5.0, 300)
@@ -213,7 +215,7 @@ def _controller(one: Tuned, ratio: float, settings: Sequence[DriveSetting]) -> d
 
 
 def _quiet_part(one: Tuned) -> dict[str, float | None]:
-    """Value, and ends over all that has an interval; None: not found below the highest speed tried.
+    """Return value and ends over all intervals; None: not found below the highest speed tried.
 
     The ends include the search's resolution and the error of the simulation's grid.
     """
@@ -230,7 +232,7 @@ def _quiet_part(one: Tuned) -> dict[str, float | None]:
 
 
 def _advice(tuning: Tuning) -> dict[str, Any]:
-    """The advice, in one sentence and as data."""
+    """Return the advice, as one sentence and as data."""
     advice = tuning.advice
     base = tuning.by_kind(advice.compared_with)
     best = None if advice.kind is None else tuning.by_kind(advice.kind)
@@ -290,11 +292,11 @@ def _number(value: float | None) -> float | None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# On a terminal.
+# Output on a terminal.
 
 
 def print_tuning(document: Part, console: PlainConsole) -> None:
-    """Gains, what they do, what they rest on. 80 columns do."""
+    """Print gains, their effects and their conditions, in 80 columns."""
     simulated = f" · {SIMULATED}" if document["tuned_for"]["simulated"] else ""
     advice = document["advice"]
     console.print(Words(advice["sentence"], style="bold yellow" if advice["keep"] else "bold green"))
@@ -356,7 +358,7 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
 
 
 def _legend(document: Part) -> Iterator[tuple[str, str]]:
-    """Return a few words about each line of the table."""
+    """Yield a short explanation of each line of the table."""
     yield "in brackets", _IN_BRACKETS
     left_out = () if document["critical_speeds"] is not None else _OF_SPEEDS
     yield from ((name, words) for name, words in _EXPLAINED.items() if name not in left_out)
@@ -401,7 +403,7 @@ _LIMIT_OF = {"phase_deg": "phase margin", "gain_db": "gain margin", "dead_time_s
 
 
 def _margin(one: Part, key: str, form: str, times: float = 1.0) -> str:
-    """The least over the sampled truths; "!" before one that is thin."""
+    """Return the least margin over the sampled true values; "!" before an insufficient one."""
     if one["margins"] is None:
         return "–"
     worst = one["margins"]["worst"]
@@ -428,7 +430,7 @@ def _wrong(part: Part) -> str:
 
 
 def _setting_rows(document: Part) -> Iterator[tuple[str, str, str]]:
-    """(parameter, what to type for each controller, how sure), a row a parameter."""
+    """Yield (parameter, value to enter for each controller, confidence), one row for each parameter."""
     taken = [one for one in document["controllers"] if one.get("drive_parameters")]
     for k in range(len(taken[0]["drive_parameters"]) if taken else 0):
         own = [one["drive_parameters"][k] for one in taken]
@@ -440,12 +442,12 @@ def _setting_rows(document: Part) -> Iterator[tuple[str, str, str]]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# As a page.
+# Page of the tuning.
 
 
 @dataclass(frozen=True)
 class Showcase:
-    """Stick-slip with and without: bit and top at one set speed, under the stiff loop and a tuned one."""
+    """Stick-slip under the stiff loop and none under a tuned one: bit and top at one set speed."""
 
     set_rpm: float
     kinds: tuple[str, ...]
@@ -453,7 +455,7 @@ class Showcase:
 
 
 def showcase_of(tuning: Tuning, seconds: float = 60.0) -> Showcase | None:
-    """Return the motion at a set speed at which only the stiff loop leaves the bit stuck; None without such a speed."""
+    """Return the motion at a set speed at which the bit sticks only under the stiff loop; None without such a speed."""
     import numpy as np
 
     found = {one.kind: one for one in tuning.tuned if one.controller is not None and one.quiet_cures}
@@ -476,12 +478,12 @@ def showcase_of(tuning: Tuning, seconds: float = 60.0) -> Showcase | None:
 
 
 def write_tuning_report(document: Part, showcase: Showcase | None, path: Path) -> Path:
-    """The page, HTML or PDF by its name; where it went. Raises UsageError where it can't be written."""
+    """Write the page, HTML or PDF by its name, and return its path. Raises UsageError if it cannot be written."""
     return write_blocks(tuning_report(document, showcase), path)
 
 
 def tuning_report(document: Part, showcase: Showcase | None) -> Report:
-    """The blocks of the page."""
+    """Return the blocks of the page."""
     taken = [one for one in document["controllers"] if not one["refused"]]
     best = next((one for one in taken if one["kind"] == document["advice"]["kind"]), None)
     sections = [
@@ -556,7 +558,7 @@ def _answer(best: Part | None, document: Part) -> AnswerBox:
 
 
 def draw_reflection(figure: FigureBase, document: Part) -> None:
-    """|r(f)| of every controller."""
+    """Draw |r(f)| of every controller."""
     axes = figure.subplots()
     curves = document["reflection"]
     for hertz in document["string"]["modes_hz"]:
@@ -573,7 +575,7 @@ def draw_reflection(figure: FigureBase, document: Part) -> None:
 
 
 def draw_modes(figure: FigureBase, document: Part) -> None:
-    """Damping over frequency."""
+    """Draw damping over frequency."""
     axes = figure.subplots()
     for one in document["controllers"]:
         if not one["refused"]:
@@ -586,7 +588,7 @@ def draw_modes(figure: FigureBase, document: Part) -> None:
 
 
 def draw_showcase(figure: FigureBase, showcase: Showcase) -> None:
-    """Bit and top over time, a picture a controller."""
+    """Draw bit and top over time, one panel for each controller."""
     every = figure.subplots(len(showcase.kinds), 1, sharex=True, squeeze=False)
     for row, kind in enumerate(showcase.kinds):
         axes = every[row][0]

@@ -1,4 +1,6 @@
-"""The paper's simulated and field experiments, and ours, as commands: published figures beside what comes out here."""
+"""The paper's simulated and field experiments, and tdhil's own, as commands: published figures beside those of
+tdhil.
+"""
 
 from typing import TYPE_CHECKING
 

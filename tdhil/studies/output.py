@@ -1,6 +1,6 @@
-"""A study's outcome as files: one CSV a table, a PNG and an SVG, the settings it was run with; and as a document.
+"""Outcome of a study as files (one CSV a table, a PNG and an SVG, the settings) and as a document.
 
-Without matplotlib everything but the picture is written.
+Without matplotlib everything except the plot is written.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from tdhil.report import STYLE, install_command, repeatable_figures
 from tdhil.studies.study import Cell, Progress, ResultTable, Statement, Study, StudyOutcome
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Numbers of a table as people read them: one column, one number of decimals.
+# Numbers of a table for display: one number of decimals for each column.
 
 
-_DIGITS = 5          # of a column's largest number
+_DIGITS = 5          # digits of a column's largest number
 _MOST_DECIMALS = 5
-_WIDE = 1e3          # a column whose numbers differ more than that gets its digits one by one
+_WIDE = 1e3          # ratio of a column's numbers beyond which each number has its own decimals
 
 
 def shown(value: Cell) -> str:
-    """Alone: six digits at most; '-' for nothing."""
+    """Return a single value with six digits at most; '-' for None."""
     if value is None:
         return "-"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def column_texts(values: Sequence[Cell]) -> list[str]:
-    """A column, its numbers with as many decimals as its largest bears; whole numbers as they are."""
+    """Return the texts of a column, with as many decimals as its largest number has; whole numbers are unchanged."""
     sizes = [abs(value) for value in values if isinstance(value, float) and math.isfinite(value) and value != 0.0]
     whole = all(size == int(size) for size in sizes)
     if not sizes or whole or max(sizes) > _WIDE * min(sizes) or max(sizes) < 1e-3:
@@ -57,14 +57,16 @@ def column_texts(values: Sequence[Cell]) -> list[str]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How far the studies are: on stderr, which is not for results.
+# Progress of the studies, on stderr, because stdout is for results.
 
 
 LINE_EVERY_S = 60.0
 
 
 class StudyBar:
-    """A bar over all studies on a terminal, gone while something else is printed; else a line a study and minute."""
+    """Progress bar over all studies on a terminal, hidden during other output; elsewhere a line per study and
+    minute.
+    """
 
     def __init__(self, console: Console, count: int) -> None:
         self._console = console
@@ -78,7 +80,7 @@ class StudyBar:
 
     @contextmanager
     def of(self, index: int, name: str) -> Iterator[Progress]:
-        """While study ``index`` runs."""
+        """Show progress while study ``index`` runs."""
         if not self._console.is_terminal:
             self._console.print(f"study {name} …", markup=False)
         self._bar.update(self._task, completed=float(index), name=name, description="")
@@ -101,7 +103,7 @@ DPI = 120
 
 @dataclass(frozen=True)
 class Written:
-    """Paths of the files. ``picture``: None if none was drawn; ``without_matplotlib``: whether that is the reason."""
+    """Paths of the files. ``picture``: None without a plot; ``without_matplotlib``: True if that is the reason."""
 
     folder: Path
     tables: tuple[Path, ...]
@@ -132,7 +134,9 @@ def write_study(outcome: StudyOutcome, settings: BaseModel, folder: Path) -> Wri
 
 
 def document(outcome: StudyOutcome, settings: BaseModel, written: Written) -> dict[str, Any]:
-    """Plain data for `json.dumps`: what the study says of itself, its tables and its statements. Not finite is null."""
+    """Return plain data for `json.dumps`: the study's description, tables and statements. Non-finite values are
+    null.
+    """
     whole = {
         "study": outcome.name,
         "title": outcome.title,
@@ -161,14 +165,14 @@ def _csv(table: ResultTable, folder: Path) -> Path:
 
 
 def _cell(value: Cell) -> str:
-    """Every digit of a number, so that it reads back as the same; nothing for None."""
+    """Return every digit of a number, so that it reads back unchanged; '' for None."""
     if value is None:
         return ""
     return repr(float(value)) if isinstance(value, float) else cell_of(value) if isinstance(value, str) else str(value)
 
 
 def _settings(name: str, settings: BaseModel, folder: Path) -> Path:
-    """A study file: copy it, change it, run it with --study."""
+    """Write a study file, for the user to copy, change and run with --study."""
     import yaml
 
     path = folder / "study.yaml"
@@ -190,12 +194,12 @@ def _pictures(outcome: StudyOutcome, folder: Path) -> tuple[Path, Path]:
         FigureCanvasAgg(figure)
         outcome.draw(figure)
         figure.savefig(png, dpi=DPI)
-        figure.savefig(svg, metadata={"Date": None})     # the same outcome gives the same file
+        figure.savefig(svg, metadata={"Date": None})     # so that the same outcome gives the same file
     return png, svg
 
 
 def _plain(value: Any) -> Any:
-    """Lists, maps and numbers of Python's own: numpy's are turned into them."""
+    """Return lists, maps and numbers of Python instead of those of numpy."""
     if isinstance(value, Mapping):
         return {str(key): _plain(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
@@ -208,7 +212,7 @@ def _plain(value: Any) -> Any:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A study's outcome on a terminal of 80 columns: tables, then what holds and what doesn't.
+# Outcome of a study on a terminal of 80 columns: tables, then statements.
 
 
 MARKS: dict[bool | None, tuple[str, str, str]] = {
@@ -217,11 +221,11 @@ MARKS: dict[bool | None, tuple[str, str, str]] = {
     None: ("~", "open: the paper contradicts itself or leaves out what decides", "yellow"),
 }
 SIMULATED = "SIMULATED"
-_GAP = 2          # between columns
+_GAP = 2          # characters between columns
 
 
 def print_outcome(outcome: StudyOutcome, written: Written, console: Console) -> None:
-    """Everything, and where the files are."""
+    """Print the whole outcome, and the paths of the files."""
     console.print(Text.assemble((f"{outcome.name}  {outcome.title}", "bold"), (f"  {SIMULATED}", "magenta")))
     for table in outcome.tables:
         console.print(Text(table.name.replace("_", " "), style="italic"))
@@ -234,7 +238,7 @@ def print_outcome(outcome: StudyOutcome, written: Written, console: Console) -> 
 
 
 def print_list(studies: Iterable[Study], console: Console) -> None:
-    """Names and titles."""
+    """Print names and titles of the studies."""
     grid = Table.grid(padding=(0, 2))
     grid.add_column(no_wrap=True)
     grid.add_column(overflow="fold")
@@ -244,7 +248,7 @@ def print_list(studies: Iterable[Study], console: Console) -> None:
 
 
 def statements(all_of_them: Iterable[Statement]) -> RenderableType:
-    """Each with its mark, what was published and what came out here."""
+    """Return each statement with its mark, the published value and that of tdhil."""
     parts: list[RenderableType] = []
     for statement in all_of_them:
         mark, word, style = MARKS[statement.holds]
@@ -259,7 +263,7 @@ def statements(all_of_them: Iterable[Statement]) -> RenderableType:
 
 
 def _tables(table: ResultTable, width: int) -> Iterator[Table]:
-    """The table in parts that fit beside the margin, its first column before each: no number is ever folded."""
+    """Yield the table in parts that fit the width, each with the first column, so that no number is wrapped."""
     cells = [column_texts([row[index] for row in table.rows]) for index in range(len(table.columns))]
     widths = [
         max([len(word) for word in name.split("_")] + [len(text) for text in texts])
@@ -287,12 +291,12 @@ def _part(table: ResultTable, cells: list[list[str]], widths: list[int], columns
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# One page over all studies of a run: index.html with jinja2, index.md without.
+# Page over all studies of a run: index.html with jinja2, index.md without.
 
 
 @dataclass(frozen=True)
 class Chapter:
-    """One study in the report; ``failure`` says why there is no outcome."""
+    """One study in the report; ``failure``: reason for a missing outcome."""
 
     name: str
     outcome: StudyOutcome | None
@@ -301,7 +305,7 @@ class Chapter:
 
 
 def write_report(chapters: Sequence[Chapter], folder: Path) -> Path:
-    """The index of everything in ``folder``; the other kind of an earlier run is removed."""
+    """Write the index of all outcomes in ``folder``; an index of the other kind from an earlier run is removed."""
     folder.mkdir(parents=True, exist_ok=True)
     try:
         text, path = _html(chapters, folder), folder / "index.html"
@@ -317,7 +321,7 @@ def write_report(chapters: Sequence[Chapter], folder: Path) -> Path:
 
 
 def tally(chapters: Sequence[Chapter]) -> str:
-    """How many statements hold, don't, or are open."""
+    """Return how many statements hold, do not hold, or are open."""
     counted = Counter(s.holds for chapter in chapters if chapter.outcome for s in chapter.outcome.statements)
     return f"{counted[True]} statements hold, {counted[False]} do not, {counted[None]} are open"
 

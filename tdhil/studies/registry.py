@@ -1,4 +1,4 @@
-"""The simulated studies by name, in the paper's order."""
+"""Registry of the simulated studies by name, in the paper's order."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tdhil.studies.study import Study
 
 
 def simulated_studies() -> tuple[Study, ...]:
-    """All that need no bench."""
+    """Return all studies that need no bench."""
     return (
         DesignStudy("table6", "Table 6: L16 over the system parameters", Table6Settings),
         DesignStudy("table7", "Table 7: L9 over friction and noise", Table7Settings),

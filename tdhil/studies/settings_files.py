@@ -1,4 +1,4 @@
-"""Settings from a file and from `--set`: the study's defaults, then the file, then each assignment.
+"""Settings of a study from a file and from `--set`: the defaults, then the file, then each assignment.
 
 ::
 
@@ -34,7 +34,7 @@ class _Envelope(DataModel):
 
 
 def load_study_file(path: Path, studies: Mapping[str, Study]) -> tuple[Study, Any]:
-    """The study that a file names, and its settings; DataFileError with each problem and its line."""
+    """Return the study named in a file, and its settings. Raises DataFileError with each problem and its line."""
     envelope = load_with_lines(path, _Envelope)
     name = envelope.value.study
     if name not in studies:
@@ -49,9 +49,9 @@ def load_study_file(path: Path, studies: Mapping[str, Study]) -> tuple[Study, An
 
 
 def with_assignments(settings: M, assignments: Iterable[str]) -> M:
-    """``settings`` with every ``name=value`` applied, all checked together; UsageError in one line.
+    """Return ``settings`` with every ``name=value`` applied, all checked together. Raises UsageError in one line.
 
-    A name is a field, its symbol (`Kp`), or a field of a section (`rig.inertia_kg_m2`); a value is written as in YAML
+    A name is a field, its symbol (`Kp`), or a field of a section (`rig.inertia_kg_m2`); a value has the form of YAML
     (`3000`, `[0.1, 0.5]`).
     """
     data = settings.model_dump(mode="json")
@@ -87,7 +87,7 @@ def with_assignments(settings: M, assignments: Iterable[str]) -> M:
 
 
 def _field(name: str, settings: BaseModel) -> str:
-    """The field that is meant; a name that is none stays as it is, and is refused by the model in its own words."""
+    """Return the field for a name; an unknown name is returned unchanged, and the model refuses it."""
     fields = type(settings).model_fields
     return next((one for one in (name, full_name(name), name.lower()) if one in fields), name)
 

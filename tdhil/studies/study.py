@@ -1,4 +1,4 @@
-"""The result of every study: tables, statements that hold or don't, a document for machines, and a picture."""
+"""Result of any study: tables, statements that hold or do not, a JSON document, and a plot."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ Cell = str | int | float | None
 
 @dataclass(frozen=True)
 class ResultTable:
-    """Written as one CSV and printed as one table. Units stand in the column names (``inertia_kg_m2``)."""
+    """Table, written as one CSV and printed. Units are in the column names (``inertia_kg_m2``)."""
 
-    name: str                                  # file stem, and heading when printed
+    name: str                                  # file stem, and heading in print
     columns: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
 
 
 @dataclass(frozen=True)
 class Statement:
-    """One thing that was published, whether it holds here, and by how much.
+    """Published statement, whether tdhil confirms it, and by how much.
 
-    ``holds`` is None where the paper contradicts itself or leaves a setting open: then ``ours`` says so, and no
-    parameter is bent to make it true.
+    ``holds`` is None if the paper contradicts itself or does not state a setting. ``ours`` then states this, and no
+    parameter is adjusted to make the statement true.
     """
 
     text: str
@@ -37,26 +37,26 @@ class Statement:
 
 @dataclass(frozen=True)
 class StudyOutcome:
-    """``draw`` draws on an empty matplotlib figure; it is not called where there is no matplotlib."""
+    """Outcome. ``draw`` draws on an empty matplotlib figure; it is not called without matplotlib."""
 
     name: str
     title: str
     tables: tuple[ResultTable, ...]
     statements: tuple[Statement, ...] = ()
-    document: Mapping[str, Any] = field(default_factory=dict)      # for --json, beside tables and statements
-    simulated_s: float = 0.0                                       # plant time, all runs added up
-    simulation_wall_s: float = 0.0                                 # what simulating that took; not in the document
+    document: Mapping[str, Any] = field(default_factory=dict)      # for --json, besides tables and statements
+    simulated_s: float = 0.0                                       # plant time of all runs together
+    simulation_wall_s: float = 0.0                                 # wall time of the simulation; not in the document
     draw: Callable[[Figure], None] | None = None
     figure_size_in: tuple[float, float] = (8.0, 5.0)
-    interrupted: bool = False                                      # by Ctrl-C: the figures are of what was done by then
+    interrupted: bool = False                                      # by Ctrl-C: the figures are of the completed runs
 
 
 Progress = Callable[[float, str], None]
-"""Share done (0 to 1) and what is being done."""
+"""Function that receives the completed share (0 to 1) and the present step."""
 
 
 class Study(Protocol):
-    """One experiment. ``settings`` is its pydantic model (frozen, units in field names), made from file and --set."""
+    """One experiment. ``settings``: its pydantic model (frozen, units in field names), filled from file and --set."""
 
     name: str
     title: str

@@ -1,4 +1,4 @@
-"""Checks beside a result: J by other routes through the same run, and the friction curve."""
+"""Cross-checks of a result: J by other routes through the same run, and the friction curve."""
 
 from tdhil.estimation.cross_checks.angle_agreement import (
     AngleRatio as AngleRatio, angle_checked as angle_checked, angle_ratios as angle_ratios,

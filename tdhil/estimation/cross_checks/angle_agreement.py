@@ -1,12 +1,12 @@
-"""The reported speed held against the shaft's angle, stage by stage.
+"""Check of the reported speed against the angle of the shaft, stage by stage.
 
-Over a stretch the angle moves as far as the integral of the true speed. A reported speed that lags by τ, whatever its
-filter, is late by the same way at both ends,
+Over a stretch the angle changes by the integral of the true speed. A reported speed with lag τ, for any filter, is late
+by τ at both ends:
 
     ∫ω_rep dt = Δθ/k − τ Δω_rep,
 
-so that a stretch whose ends are equally fast gives the ratio k of true to reported speed without any knowledge of τ.
-For other stretches the longest plausible lag bounds the error.
+A stretch with equal speed at both ends gives the ratio k of true to reported speed without knowledge of τ. For other
+stretches the longest plausible lag bounds the error.
 """
 
 import math
@@ -21,17 +21,19 @@ from tdhil.estimation.result import Refusal
 from tdhil.estimation.samples import Samples, excited_window, usable_samples
 from tdhil.recording import Recording
 
-_LAG_S = 0.5              # the longest lag of a reported speed that is plausible
-_END_S = 0.5              # at either end of a stretch, over which its speed is averaged
-_LEAST_S = 2.0            # of a stretch
-_LEAST_READINGS = 8       # of the angle in a stretch
-_LONGEST_GAP_S = 0.3      # without a sample of the speed: over it the way is not known
-_ALIKE = 0.02             # of the ratio of a stage, by which that of another may differ: both are rounded
+_LAG_S = 0.5              # s; longest plausible lag of a reported speed
+_END_S = 0.5              # s; time at either end of a stretch over which its speed is averaged
+_LEAST_S = 2.0            # s; least duration of a stretch
+_LEAST_READINGS = 8       # fewest readings of the angle in a stretch
+_LONGEST_GAP_S = 0.3      # s; longest gap in the speed: over a longer one the travel is unknown
+_ALIKE = 0.02             # largest relative difference between the ratios of two stages, as both are rounded
 
 
 @dataclass(frozen=True)
 class AngleRatio:
-    """Angle over the integral of the reported speed in one stretch, with what bounds its error on either side."""
+    """Ratio of the angle to the integral of the reported speed in one stretch, with the bound of its error on either
+    side.
+    """
 
     where: str
     value: float
@@ -39,7 +41,9 @@ class AngleRatio:
 
 
 def angle_ratio(recording: Recording, samples: Samples, where: str, start_s: float, end_s: float) -> AngleRatio | None:
-    """Between the first and the last angle of a stretch; None where there are too few, or the speed has a hole."""
+    """Return the ratio between the first and the last angle of a stretch; None for too few angles or a gap in the
+    speed.
+    """
     angle = recording.position_rad
     if angle is None:
         return None
@@ -52,7 +56,7 @@ def angle_ratio(recording: Recording, samples: Samples, where: str, start_s: flo
     if len(inside) < _LEAST_READINGS or float(np.max(np.diff(inside.time_s), initial=0.0)) > _LONGEST_GAP_S:
         return None
     way = float(np.trapezoid(inside.speed_rad_s, inside.time_s))
-    # a sample may be missing at either end; there the speed is carried on
+    # a sample may be missing at either end; the speed is taken as constant there
     way += float(inside.speed_rad_s[0]) * (float(inside.time_s[0]) - begin)
     way += float(inside.speed_rad_s[-1]) * (end - float(inside.time_s[-1]))
     ends = [samples.between(at, at + _END_S).speed_rad_s for at in (begin, end - _END_S)]
@@ -62,16 +66,16 @@ def angle_ratio(recording: Recording, samples: Samples, where: str, start_s: flo
         return None
     change = abs(float(np.mean(ends[1])) - float(np.mean(ends[0])))
     ratio = float(turned[-1] - turned[0]) / way
-    # an angle that turns without steps has a smallest change that is no count; the median one bounds both
+    # for an angle without steps the smallest change is not its resolution; the median change bounds both
     open_rad = 2.0 * min(count, float(np.median(steps))) + _LAG_S * change * abs(ratio)
     open_rad += 0.5 * recording.speed_resolution_rad_s * (end - begin)
     return AngleRatio(where, ratio, open_rad / abs(way))
 
 
 def mean_speed(recording: Recording, start_s: float, end_s: float) -> tuple[float, float] | None:
-    """Return the mean reported speed between two times, and a bound of its error, rad/s; None where it has a hole.
+    """Return the mean reported speed between two times, and a bound of its error, rad/s; None if the speed has a gap.
 
-    The bound covers the longest plausible lag of the reports, their rounding, and samples that miss at the ends.
+    The bound covers the longest plausible lag of the reports, their rounding, and missing samples at the ends.
     """
     inside = usable_samples(recording).between(start_s, end_s)
     if len(inside) < _LEAST_READINGS:
@@ -87,7 +91,7 @@ def mean_speed(recording: Recording, start_s: float, end_s: float) -> tuple[floa
 
 
 def _unbroken(recording: Recording, where: str, start_s: float, end_s: float) -> list[tuple[str, float, float]]:
-    """The parts of a stretch in which no turn of the shaft is lost: none has a longer gap than the angle allows."""
+    """Return the parts of a stretch without a lost turn of the shaft: no gap is longer than the angle allows."""
     angle, gap_s = recording.position_rad, recording.position_gap_s
     if angle is None or gap_s is None:
         return [(where, start_s, end_s)]
@@ -98,7 +102,9 @@ def _unbroken(recording: Recording, where: str, start_s: float, end_s: float) ->
 
 
 def angle_ratios(recording: Recording) -> tuple[tuple[AngleRatio, ...], tuple[AngleRatio, ...]]:
-    """Return the time spans of the steady levels and of stage 5: its segments, or all of it if it has none."""
+    """Return the ratios of the steady levels, and those of stage 5: its segments, or the whole stage without
+    segments.
+    """
     if recording.position_rad is None:
         return (), ()
     samples = usable_samples(recording)
@@ -116,7 +122,7 @@ def angle_ratios(recording: Recording) -> tuple[tuple[AngleRatio, ...], tuple[An
 
 
 def angle_contradiction(recording: Recording) -> Refusal | None:
-    """Return how the angle contradicts the speed that J rests on; None if not, or without an angle."""
+    """Return the contradiction between the angle and the speed used for J; None without one, or without an angle."""
     steady, excited = angle_ratios(recording)
     for one in excited:
         if not recording.speed_unit_accepted and abs(one.value - 1.0) > SPEED_UNIT_TOLERANCE + one.half_width:
@@ -140,7 +146,7 @@ def angle_contradiction(recording: Recording) -> Refusal | None:
 
 
 def angle_checked(finding: Finding, case: Case) -> Finding:
-    """The finding, taken back where the angle contradicts the speed that it rests on. Never raises."""
+    """Return the finding, without its inertia if the angle contradicts the speed. Never raises."""
     if finding.inertia is None or case.recording.position_rad is None:
         return finding
     contradiction = angle_contradiction(case.recording)

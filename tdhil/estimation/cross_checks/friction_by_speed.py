@@ -1,17 +1,18 @@
-"""Friction over speed, at every steady speed that the run saw, and whether it is the straight line that B takes it for.
+"""Friction over speed, at every steady speed of the run, and the test whether it is the straight line that B assumes.
 
-Over a stretch with weight w(t) (`momentum.BalanceRow`) the balance of momentum gives friction free of lags,
+Over a stretch with weight w(t) (`momentum.BalanceRow`), the momentum balance gives friction without an effect of the
+lags:
 
     T_f = (∫w T − J (Δω + δ Δα)) / ∫w     at     ω = ∫w ω / ∫w,     variance D ∫w² / (∫w)²,
 
-D the disturbance's density, and what the uncertainty of J and δ makes of a drift. Stretches are those of steady or
-slowly drifting speed between the motions, and the excited segments after settling.
-About a segment's mean speed the shaft swings: the mean torque of a straight line is its value at the mean speed, but
-that of a parabola c ω² is more by c var ω. So the swung points serve the test for a straight line, and are shown only
-where there are too few others: then as unsure as c is, which all points tell together.
+D is the density of the disturbance. The uncertainty of J and δ adds to the variance if the speed drifts. The stretches
+are those of steady or slowly drifting speed between the motions, and the excited segments after settling. In an excited
+segment the speed oscillates about its mean. The mean torque of a straight line is its value at the mean speed, but that
+of a parabola c ω² is larger by c var ω. Points of excited segments are therefore used to test for a straight line. They
+are shown only if there are too few others, with the uncertainty of c, which all points determine together.
 
-If friction bends (Stribeck), B between two mean speeds ω₁, ω₂ is a chord, and at either end the slope differs by
-c (ω₂ − ω₁) from it: `viscous_spread_nm_s_rad`, which belongs in quadrature to the deviation of what ties B to
+If friction is nonlinear (Stribeck), B between two mean speeds ω₁, ω₂ is the slope of a chord. At either end the slope
+differs from it by c (ω₂ − ω₁): `viscous_spread_nm_s_rad`, which adds in quadrature to the standard deviation of B from
 the levels.
 """
 
@@ -39,17 +40,17 @@ from tdhil.estimation.samples import Samples, excited_window
 from tdhil.recording import FloatArray, Recording
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The points of a friction curve: friction torque over each stretch of steady or slowly drifting speed.
+# Points of a friction curve: friction torque over each stretch of steady or slowly drifting speed.
 #
-# How a point is made of a balance of momentum stands in `tdhil.estimation.cross_checks.friction_by_speed`.
+# `tdhil.estimation.cross_checks.friction_by_speed` explains how a momentum balance gives a point.
 
 
-_ALIKE = 0.01             # of the fastest: speeds closer than that are one
+_ALIKE = 0.01             # share of the highest speed: closer speeds are merged
 
 
 @dataclass(frozen=True)
 class Inertia:
-    """The known J, kg·m², rough or final, with its standard deviation; and the delay between the reports."""
+    """Known J, kg·m², rough or final, with its standard deviation, and the delay between the reports."""
 
     value: float
     sd: float
@@ -63,11 +64,11 @@ class FrictionStretch:
     speed: float
     torque: float
     variance: float           # (N·m)²
-    swing: float              # var ω, (rad/s)²
+    swing: float              # var ω of the excitation, (rad/s)²
 
 
 def steady_points(recording: Recording, samples: Samples, inertia: Inertia, density: float) -> list[FrictionStretch]:
-    """One for each stretch, in order of kind and time; ``density``: the disturbance's, (N·m)²·s."""
+    """Return one point for each stretch, in order of kind and time; ``density`` of the disturbance, (N·m)²·s."""
     blocks = block_means(samples)
     if blocks is None:
         return []
@@ -99,7 +100,9 @@ def _point(row: BalanceRow, inertia: Inertia, density: float, swing: float) -> F
 
 
 def merged(points: list[FrictionStretch]) -> list[FrictionStretch]:
-    """Sort points by rising speed and merge neighbours of one speed, both calm or both swung, by their weights."""
+    """Return the points in order of speed, with neighbours of one speed merged by weight, if both are steady or both
+    excited.
+    """
     ordered = sorted(points, key=lambda point: point.speed)
     fastest = max((abs(point.speed) for point in ordered), default=0.0)
     found: list[FrictionStretch] = []
@@ -124,16 +127,16 @@ def merged(points: list[FrictionStretch]) -> list[FrictionStretch]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 _BENT_P = 0.01            # p-value of a straight line over speed, below which friction counts as nonlinear
-_LEAST_SPEEDS = 3         # two speeds fit any straight line
-_LEAST_DOF = 4.0          # degrees of freedom of a scatter that counts
+_LEAST_SPEEDS = 3         # fewest speeds for a test: two speeds fit any straight line
+_LEAST_DOF = 4.0          # least degrees of freedom of a scatter that is used
 
 
 @dataclass(frozen=True)
 class FrictionCurve:
-    """``points``: () where fewer than three speeds were seen. ``p_value``: of a straight line; None if untested.
+    """Friction curve. ``points``: () for fewer than three speeds. ``p_value``: of a straight line; None if untested.
 
-    ``viscous_spread_nm_s_rad``: one standard deviation by which the slope at the excited mean speeds may differ from
-    the levels' B; 0 unless the curve is bent.
+    ``viscous_spread_nm_s_rad``: standard deviation of the difference between the slope at the excited mean speeds and B
+    of the levels; 0 if the curve is straight.
     """
 
     points: tuple[FrictionPoint, ...]
@@ -157,9 +160,9 @@ _NOTHING = FrictionCurve((), None, False, 0.0)
 def friction_curve(
     recording: Recording, samples: Samples, levels: Levels, inertia: Inertia, options: Options
 ) -> FrictionCurve:
-    """Points in rising speed. A rough inertia is enough: at slow drift there is little to take off. Never raises.
+    """Return the friction curve. A rough inertia is enough: at slow drift its term is small. Never raises.
 
-    ``levels``: of the excited segments, for the density of the disturbance.
+    ``levels``: mean operating points of the excited segments, for the density of the disturbance.
     """
     try:
         density = _density(recording, samples, levels, inertia.delay)
@@ -187,7 +190,9 @@ def friction_curve(
 
 
 def _density(recording: Recording, samples: Samples, levels: Levels, delay: Delay) -> Density | None:
-    """Friction of the excited periods; where they are too few, also of what balances of momentum leave."""
+    """Return the density from the friction of the excited periods; with too few, also from residuals of momentum
+    balances.
+    """
     own = Density(levels.density, levels.dof)
     if own.dof < _LEAST_DOF:
         found = balances(recording, samples)
@@ -198,9 +203,9 @@ def _density(recording: Recording, samples: Samples, levels: Levels, delay: Dela
 
 
 def _columns(points: list[FrictionStretch]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Per point (K,): speed and its square, the swing's part included, (K, 2); torque; 1/σ.
+    """Return for each point (K,): speed and its square (including the oscillation), (K, 2); torque; 1/σ.
 
-    With them come one column for each direction of rotation: Coulomb friction differs.
+    One more column for each direction of rotation has its Coulomb friction.
     """
     speed = np.array([point.speed for point in points])
     square = speed**2 + np.array([point.swing for point in points])
@@ -211,7 +216,7 @@ def _columns(points: list[FrictionStretch]) -> tuple[FloatArray, FloatArray, Flo
 
 
 def _straight(points: list[FrictionStretch], density: Density) -> float:
-    """The p-value of a straight line: F test of what it leaves against the disturbance's density."""
+    """Return the p-value of a straight line: F test of its residuals against the density of the disturbance."""
     design, torque, weight = _columns(points)
     design = np.delete(design, 1, axis=1)
     left = len(points) - design.shape[1]
@@ -223,7 +228,7 @@ def _straight(points: list[FrictionStretch], density: Density) -> float:
 
 
 def _bend(points: list[FrictionStretch]) -> tuple[float, float]:
-    """Coefficient c of ω², N·m·s²/rad², and its standard deviation; 0 and 0 where the points are too few to tell."""
+    """Return the coefficient c of ω², N·m·s²/rad², and its standard deviation; 0 and 0 for too few points."""
     design, torque, weight = _columns(points)
     if len(points) < design.shape[1]:
         return 0.0, 0.0
@@ -235,5 +240,7 @@ def _bend(points: list[FrictionStretch]) -> tuple[float, float]:
 
 
 def _mean_speeds(points: list[FrictionStretch], levels: Levels) -> FloatArray:
-    """The levels' mean speeds, between which B is a chord; without two of them, the whole curve's."""
+    """Return the mean speeds of the levels, between which B is a chord; with fewer than two levels, those of the
+    curve.
+    """
     return levels.speed if len(levels.speed) > 1 else np.array([point.speed for point in points])

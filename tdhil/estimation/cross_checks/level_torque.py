@@ -1,13 +1,14 @@
-"""The mean torque of stage 5 against the torque that the steady levels of stage 2 account for, at the same mean speed.
+"""Check of the mean torque of stage 5 against the torque of the steady levels of stage 2 at the same mean speed.
 
-The mean torque over whole periods is the load at the mean speed, free of every lag. Where the torque's scale changes
-between the stages, in every report alike, the mean torque changes by the same factor as J does. Above a drill string
-nothing else shows it: the ramps of stage 2 give J there to a factor of two at best.
+The mean torque over whole periods is the load at the mean speed, without an effect of the lags. If the torque scale
+changes between the stages, equally in every report, the mean torque changes by the same factor as J. Above a drill
+string no other check shows this: the ramps of stage 2 give J only to a factor of two there.
 
-A load may change by itself. Friction falls while oil and bearings warm up, so a smaller torque shows less than a larger
-one. The bounds are wide for that reason: they find a torque scale that halves or doubles, and no small change. Levels
-of one speed are not compared with each other: on sound rigs with a slowly changing load one had 2.4 times the torque
-of the other (three of 68 runs of `benchmarks/healthy_runs.py` above 1.7), and neither shows how well it is known.
+A load may also change by itself. Friction falls while oil and bearings warm up, so a smaller torque is weaker evidence
+than a larger one. The bounds are therefore wide: they detect a torque scale that halves or doubles, but no small
+change. Levels of one speed are not compared with each other. On sound rigs with a slowly changing load, one level had
+2.4 times the torque of the other (three of 68 runs of `benchmarks/healthy_runs.py` above 1.7), and neither shows its
+own uncertainty.
 """
 
 import math
@@ -25,18 +26,20 @@ LEAST, MOST = 0.55, 1.7
 """Bounds of the ratio of mean torques; 0.79 to 1.19 over 30 random healthy rigs (`benchmarks/healthy_runs.py`)."""
 
 _BEYOND = 0.25
-"""How far the mean speed may lie beyond the levels, as a share of their distance: further out a line says little."""
+"""Largest distance of the mean speed from the levels, as a share of their own distance: further out the line is
+uncertain.
+"""
 
 _CLEAR_SDS = 5.0
-"""Standard deviations of the torque's block means by which the torque must differ."""
+"""Least difference of the torques, in standard deviations of the torque's block means."""
 
-_BLOCK_S = 2.0            # of a level; a segment's blocks are its periods
-_FEWEST = 20              # samples of a stretch
+_BLOCK_S = 2.0            # s; block of a level. The blocks of a segment are its periods
+_FEWEST = 20              # fewest samples of a stretch
 
 
 @dataclass(frozen=True)
 class LevelTorque:
-    """Mean torque of an excited segment, and the torque that the levels account for at its mean speed, N·m."""
+    """Mean torque of an excited segment, and the torque by the levels at its mean speed, N·m."""
 
     speed_rad_s: float
     torque_nm: float
@@ -45,12 +48,12 @@ class LevelTorque:
 
     @property
     def ratio(self) -> float:
-        """Return the mean torque as a multiple of what the levels account for."""
+        """Return the mean torque over the torque by the levels."""
         return self.torque_nm / self.by_levels_nm if self.by_levels_nm != 0.0 else math.inf
 
 
 def level_torques(recording: Recording, samples: Samples) -> tuple[LevelTorque, ...]:
-    """Compare each excited segment whose mean speed lies among the levels; () without two levels of unlike speed."""
+    """Compare each excited segment with a mean speed near the levels; () without two levels of different speed."""
     if recording.excitation is None:
         return ()
     steady = (_mean(samples.between(level.start_s, level.end_s), _BLOCK_S) for level in recording.levels)
@@ -75,7 +78,7 @@ def level_torques(recording: Recording, samples: Samples) -> tuple[LevelTorque, 
 
 
 def level_contradiction(recording: Recording, samples: Samples) -> Refusal | None:
-    """Return what is wrong where the mean torque is far from what the levels account for; else None."""
+    """Return the contradiction if the mean torque is far from the torque by the levels; else None."""
     for one in level_torques(recording, samples):
         apart = abs(one.torque_nm - one.by_levels_nm)
         if LEAST <= one.ratio <= MOST or apart <= _CLEAR_SDS * one.sd_nm:
@@ -92,7 +95,7 @@ def level_contradiction(recording: Recording, samples: Samples) -> Refusal | Non
 
 
 def level_checked(finding: Finding, case: Case) -> Finding:
-    """Return the finding, taken back where the mean torque contradicts the levels. Never raises."""
+    """Return the finding, without its inertia if the mean torque contradicts the levels. Never raises."""
     if finding.inertia is None or not case.sound:
         return finding
     contradiction = level_contradiction(case.recording, case.samples)
@@ -102,7 +105,7 @@ def level_checked(finding: Finding, case: Case) -> Finding:
 
 
 def _mean(samples: Samples, block_s: float) -> tuple[float, float, float] | None:
-    """Return mean speed, mean torque and the standard deviation of the latter; None for less than two blocks."""
+    """Return mean speed, mean torque and the standard deviation of the mean torque; None for less than two blocks."""
     if len(samples) < _FEWEST:
         return None
     blocks = np.floor((samples.time_s - samples.time_s[0]) / block_s + 1e-9)

@@ -1,4 +1,4 @@
-"""The balances of a run: knots where it turned calmly, swung or coasted, and a row from each to the next."""
+"""Momentum balances of a run: knots at steady, periodic or coasting motion, and a row from each knot to the next."""
 
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -11,22 +11,22 @@ from tdhil.estimation.samples import Samples
 from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Where a run stood calm, and where it coasted: read off half-second means of the reports, whichever host ran it.
+# Steady and coasting stretches of a run, found from half-second means of the reports, for any recording host.
 #
-# Calm is what every reporting lag agrees on: while speed hardly changes, reported and true speed and torque are the
-# same, whatever filters stand between. Between two calm stretches a momentum balance needs no model of the reports
-# (`balance`). Coasting is motion without torque: there the torque's lag has nothing to act on.
+# At steady speed reported and true speed and torque are the same, for any reporting lag. Between two steady stretches a
+# momentum balance needs no model of the reports (`balance`). Coasting is motion without torque, so the lag of the
+# torque has no effect.
 
 
 BLOCK_S = 0.5             # s; length of a block
 _MOST_BLOCKS = 1_000_000   # blocks of a record, at most
-_CALM_PER_S = 0.02        # of the range of speed per second: costs a lag of 0.5 s some 1 % of a full change of speed
-_DRIFT_PER_S = 0.05       # slow enough to take J times the acceleration off and keep the friction
-_POINT_WIDTH = 0.15       # of the fastest: how far the speed may go within one point of a friction curve
-_TURNING = 0.05           # of the greatest speed: slower is standstill or creep
-_LEAST_CALM = 5           # blocks, the first of which is left to the lags
-_LEAST_COAST = 4          # blocks in a row that make a coasting
-_COAST_TORQUE = 0.03      # of the torque that steady turning takes
+_CALM_PER_S = 0.02        # of the range of speed per second: a lag of 0.5 s then adds an error of 1 % of the range
+_DRIFT_PER_S = 0.05       # the same for slow drift: J times the acceleration can be subtracted, and friction remains
+_POINT_WIDTH = 0.15       # of the highest speed: largest change of speed within one point of a friction curve
+_TURNING = 0.05           # of the highest speed: slower is standstill or creep
+_LEAST_CALM = 5           # blocks of a steady stretch; the first is left out because of the lags
+_LEAST_COAST = 4          # least number of consecutive blocks of a coasting
+_COAST_TORQUE = 0.03      # largest torque of a coasting, over the torque of steady turning
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Blocks:
-    """M means over half a second each, empty ones left out: time of the middle (s), speed, torque, acceleration."""
+    """Means over half a second, M of them, without empty blocks: middle time (s), speed, torque, acceleration."""
 
     time_s: FloatArray
     speed_rad_s: FloatArray
@@ -51,14 +51,14 @@ class Blocks:
     acceleration_rad_s2: FloatArray
 
     def extremes(self, start_s: float, end_s: float) -> tuple[float, float]:
-        """Least and greatest speed of the blocks that lie within; (inf, -inf) if none does."""
+        """Return the least and greatest speed of the blocks within the span; (inf, -inf) without a block."""
         half = 0.5 * BLOCK_S
         inside = self.speed_rad_s[(self.time_s >= start_s + half) & (self.time_s <= end_s - half)]
         return (float(inside.min()), float(inside.max())) if len(inside) else (np.inf, -np.inf)
 
 
 def block_means(samples: Samples) -> Blocks | None:
-    """Return None for too few samples, or for times that make no sense as a record."""
+    """Return the block means; None for too few samples, or for times that cannot be a recording."""
     if len(samples) < 16:
         return None
     start, length = float(samples.time_s[0]), float(samples.time_s[-1] - samples.time_s[0])
@@ -78,15 +78,17 @@ def block_means(samples: Samples) -> Blocks | None:
 
 
 def calm_spans(blocks: Blocks, excluded: tuple[Segment, ...]) -> tuple[Span, ...]:
-    """Stretches of 2 s or more at a steady speed other than zero, outside of the excited segments.
+    """Return stretches of 2 s or more at a steady speed other than zero, outside of the excited segments.
 
-    The first half second is left out: there a lag still brings something of what was before.
+    The first half second is left out, because lagging reports still contain the motion before it.
     """
     return _slower_than(_CALM_PER_S, blocks, excluded)
 
 
 def drifting_spans(blocks: Blocks, excluded: tuple[Segment, ...]) -> tuple[Span, ...]:
-    """Calm ones, and others of 2 s or more in which speed drifts slowly, cut where it goes too far for one point."""
+    """Return steady stretches, and those of 2 s or more with slow drift, cut where the speed changes too far for one
+    point.
+    """
     fastest = float(np.max(np.abs(blocks.speed_rad_s)))
     found = []
     for span in _slower_than(_DRIFT_PER_S, blocks, excluded):
@@ -102,7 +104,9 @@ def drifting_spans(blocks: Blocks, excluded: tuple[Segment, ...]) -> tuple[Span,
 
 
 def _slower_than(rate_per_s: float, blocks: Blocks, excluded: tuple[Segment, ...]) -> tuple[Span, ...]:
-    """Runs of blocks in which the speed changes by less than a share of its range per second, from the second on."""
+    """Return runs of blocks, without their first one, in which the speed changes by less than this share of its
+    range per s.
+    """
     speed = np.abs(blocks.speed_rad_s)
     fastest, reach = float(np.max(speed)), float(np.ptp(blocks.speed_rad_s))
     calm = (np.abs(blocks.acceleration_rad_s2) <= rate_per_s * reach) & (speed > _TURNING * fastest)
@@ -112,7 +116,7 @@ def _slower_than(rate_per_s: float, blocks: Blocks, excluded: tuple[Segment, ...
 
 
 def coasting_spans(blocks: Blocks, calm: tuple[Span, ...], torque_resolution_nm: float) -> tuple[Span, ...]:
-    """Stretches of 2 s or more in which the shaft slows down and the drive gives no torque."""
+    """Return stretches of 2 s or more in which the shaft slows down and the drive gives no torque."""
     level = np.zeros(len(blocks.time_s), dtype=np.bool_)
     for span in calm:
         level |= (blocks.time_s >= span.start_s) & (blocks.time_s <= span.end_s)
@@ -126,7 +130,7 @@ def coasting_spans(blocks: Blocks, calm: tuple[Span, ...], torque_resolution_nm:
 
 
 def _runs(chosen: BoolArray, time_s: FloatArray, least: int) -> tuple[Span, ...]:
-    """Unbroken runs of chosen blocks, as stretches of time."""
+    """Return the unbroken runs of chosen blocks as stretches of time."""
     padded = np.concatenate(([False], chosen, [False])).astype(np.int8)
     begins, ends = np.flatnonzero(np.diff(padded) == 1), np.flatnonzero(np.diff(padded) == -1)
     found = []
@@ -138,9 +142,9 @@ def _runs(chosen: BoolArray, time_s: FloatArray, least: int) -> tuple[Span, ...]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# One balance of momentum, between two instants at which no reporting lag matters.
+# Momentum balance between two instants at which reporting lags have no effect.
 #
-# A knot is a short window in which speed is read; a row is what happened between one knot and the next. With w(t)
+# A knot is a short window in which speed is read; a row is the balance from one knot to the next. With w(t)
 # rising from 0 to 1 over the first knot and falling back over the second, J ω̇ = T − B ω − T_c sgn ω − d integrates
 # by parts to
 #
@@ -161,11 +165,11 @@ def _runs(chosen: BoolArray, time_s: FloatArray, least: int) -> tuple[Span, ...]
 
 
 _LONGEST_GAP_S = 0.3      # s; longest time without a sample
-_CHUNK = 65_536           # samples worked on at once: a long row never stands in memory as a whole
+_CHUNK = 65_536           # samples worked on at once, to limit the memory for a long row
 
 
 class BalanceKind(Enum):
-    """The purpose of a row."""
+    """Purpose of a row."""
 
     TURNING = "turning"       # steady or changing speed under torque
     COASTING = "coasting"
@@ -173,7 +177,7 @@ class BalanceKind(Enum):
 
 @dataclass(frozen=True)
 class Knot:
-    """A window in which speed is read; ``periodic``: one whole period of an excitation."""
+    """Window in which speed is read; ``periodic``: one whole period of an excitation."""
 
     start_s: float
     end_s: float
@@ -187,9 +191,9 @@ class Knot:
 
 @dataclass(frozen=True)
 class BalanceRow:
-    """One balance: integrals over w(t). Speeds rad/s, times s, torque impulse N·m·s; ``energy_s`` is ∫w².
+    """One momentum balance: integrals over w(t). Speeds rad/s, times s, torque impulse N·m·s; ``energy_s`` is ∫w².
 
-    ``stepped_rad_s``: the part of ``change_rad_s`` in which a speed setpoint moved the shaft, a step a cycle.
+    ``stepped_rad_s``: the part of ``change_rad_s`` that a speed setpoint with one step a cycle caused.
     """
 
     first: Knot
@@ -205,7 +209,7 @@ class BalanceRow:
 
 
 def balance(samples: Samples, first: Knot, second: Knot) -> BalanceRow | None:
-    """The row from one knot to the next; None where samples are missing."""
+    """Return the row from one knot to the next; None if samples are missing."""
     begin, end = (int(i) for i in np.searchsorted(samples.time_s, (first.start_s - 1e-9, second.end_s - 1e-9)))
     if end - begin < 8:
         return None
@@ -239,7 +243,7 @@ def balance(samples: Samples, first: Knot, second: Knot) -> BalanceRow | None:
 
 
 def _cells(time_s: FloatArray, part: slice) -> tuple[FloatArray, FloatArray, float]:
-    """Times of some samples, how long each stands for (half of the way to either neighbour), and the widest gap."""
+    """Return the times of some samples, their durations (half the distance to either neighbour), and the widest gap."""
     low, high = max(part.start - 1, 0), min(part.stop + 1, len(time_s))
     gaps = np.diff(time_s[low:high])
     before = gaps[: part.stop - part.start] if low < part.start else np.append(0.0, gaps)[: part.stop - part.start]
@@ -249,7 +253,9 @@ def _cells(time_s: FloatArray, part: slice) -> tuple[FloatArray, FloatArray, flo
 
 
 def _reading(samples: Samples, knot: Knot) -> tuple[float, float] | None:
-    """Mean speed and mean acceleration within a knot; a whole period of a periodic motion has no acceleration."""
+    """Return mean speed and mean acceleration within a knot; a whole period of a periodic motion has no
+    acceleration.
+    """
     begin, end = (int(i) for i in np.searchsorted(samples.time_s, (knot.start_s - 1e-9, knot.end_s - 1e-9)))
     if end - begin < 2:
         return None
@@ -266,13 +272,13 @@ def _reading(samples: Samples, knot: Knot) -> tuple[float, float] | None:
 
 
 def overlap_s(earlier: BalanceRow, later: BalanceRow) -> float:
-    """∫w_i w_{i+1} of two neighbouring rows, s."""
+    """Return ∫w_i w_{i+1} of two neighbouring rows, s."""
     return earlier.second.length_s / 6.0 if earlier.second == later.first else 0.0
 
 
 def through(samples: Samples, start_s: float, end_s: float, knot_s: float, *,
             periodic: bool = False) -> BalanceRow | None:
-    """The balance over one stretch, from a knot at its start to one at its end; None where samples are missing."""
+    """Return the balance over one stretch, from a knot at its start to one at its end; None if samples are missing."""
     return balance(samples, Knot(start_s, start_s + knot_s, periodic), Knot(end_s - knot_s, end_s, periodic))
 
 
@@ -280,18 +286,18 @@ def through(samples: Samples, start_s: float, end_s: float, knot_s: float, *,
 
 KNOT_S = 1.0              # s; length of a knot
 _COAST_KNOT_S = 0.5       # s; length of a knot at either end of a coasting
-_SETTLED = ("speed", "hold")      # stages that end at a speed
-_SETTLING_PER_S = 0.05    # of the range of speed per second: a delay that is known to 0.02 s costs 0.1 % of the range
-_APART_S = 5.0            # at least, between knots of one calm stretch
-_CLOSER_S = 2.5           # the same where the rows alone must tell the scatter: more of them, if less independent
-_COAST_ENTRY_S = 1.5      # until the reports have forgotten the torque that was there before
-_SWITCH_S = 0.25          # either side of a change of mode, where its speed is read
-_BEYOND = 0.8             # friction is taken as known down to this share of the least speed that it was seen at
+_SETTLED = ("speed", "hold")      # stages that end at a steady speed
+_SETTLING_PER_S = 0.05    # of the range of speed per second: a delay known to 0.02 s is an error of 0.1 % of the range
+_APART_S = 5.0            # s; least distance between knots of one steady stretch
+_CLOSER_S = 2.5           # s; least distance if only the rows give the scatter: more rows, though less independent
+_COAST_ENTRY_S = 1.5      # s; time until the reports no longer contain the earlier torque
+_SWITCH_S = 0.25          # s; time on either side of a change of mode, over which the speed is read
+_BEYOND = 0.8             # share of the least speed of known friction, down to which friction is taken as known
 
 
 @dataclass(frozen=True)
 class Balances:
-    """All rows of a run, in order of time, turning in ``direction`` (±1); ``calm`` is where speed was steady."""
+    """All rows of a run, in order of time, for rotation in ``direction`` (±1). ``calm``: the steady stretches."""
 
     rows: tuple[BalanceRow, ...]
     direction: float
@@ -299,7 +305,9 @@ class Balances:
 
 
 def balances(recording: Recording, samples: Samples, *, alone: bool = False) -> Balances | None:
-    """Every balance that a run allows; None if it never turned steadily. ``alone``: nothing else tells the scatter."""
+    """Return every possible balance of a run; None if it never turned steadily. ``alone``: only the rows give the
+    scatter.
+    """
     blocks = block_means(samples)
     if blocks is None:
         return None
@@ -327,8 +335,8 @@ def balances(recording: Recording, samples: Samples, *, alone: bool = False) -> 
 
 
 def _stepped_rad_s(recording: Recording, samples: Samples, row: BalanceRow) -> float:
-    """Change of speed in the parts of a row that a run of ours spent in speed mode. 0 for a trace of another tool: its
-    setpoint is not known.
+    """Return the change of speed in the parts of a row in which this program ran speed mode; 0 for a trace of
+    another tool, because its setpoint is unknown.
     """
     if row.kind is BalanceKind.COASTING or not recording.stages:
         return 0.0
@@ -347,7 +355,7 @@ def _stepped_rad_s(recording: Recording, samples: Samples, row: BalanceRow) -> f
 
 
 def periodic_segments(recording: Recording) -> tuple[Segment, ...]:
-    """Segments taken by whole periods; the plateaus of a square wave are calm enough to be knots themselves."""
+    """Return the segments used by whole periods. Plateaus of a square wave are steady enough to be knots themselves."""
     excitation = recording.excitation
     if excitation is None or has_plateaus(excitation.kind):
         return ()
@@ -355,7 +363,7 @@ def periodic_segments(recording: Recording) -> tuple[Segment, ...]:
 
 
 def _seen(blocks: Blocks, knots: list[Knot], direction: float) -> tuple[float, float]:
-    """Speeds along the rotation between which friction was seen, a little widened; never through zero."""
+    """Return the speeds along the rotation between which friction is known, slightly widened; never through zero."""
     edges = np.array([[v * direction for v in blocks.extremes(knot.start_s - 0.25, knot.end_s + 0.25)]
                       for knot in knots])
     edges = edges[np.all(np.isfinite(edges), axis=1)]
@@ -366,7 +374,9 @@ def _seen(blocks: Blocks, knots: list[Knot], direction: float) -> tuple[float, f
 
 
 def _calm_knots(span: Span, apart_s: float) -> list[Knot]:
-    """Place cuts at both ends of a calm stretch and every few seconds between; one in the middle of a short one."""
+    """Return knots at both ends of a steady stretch and every few seconds between; one in the middle of a short
+    stretch.
+    """
     count = 1 + int((span.duration_s - KNOT_S) / apart_s)
     if count == 1:
         middle = 0.5 * (span.start_s + span.end_s)
@@ -376,9 +386,9 @@ def _calm_knots(span: Span, apart_s: float) -> list[Knot]:
 
 
 def _stage_knots(recording: Recording, samples: Samples, blocks: Blocks, others: list[Knot]) -> list[Knot]:
-    """The last moment of stages 2 and 4, where the shaft has been brought to a speed but not held there for long.
+    """Return knots at the end of stages 2 and 4, where the shaft reached a speed but did not stay there for long.
 
-    What is left of a change of speed is in the row: the known delay takes its acceleration to the true speed.
+    The row contains the rest of the change of speed: the acceleration and the known delay correct the reported speed.
     """
     found = []
     for stage in recording.stages:
@@ -393,14 +403,14 @@ def _stage_knots(recording: Recording, samples: Samples, blocks: Blocks, others:
 
 
 def _period_knots(segment: Segment) -> list[Knot]:
-    """The first and the last whole period of a segment."""
+    """Return the first and the last whole period of a segment as knots."""
     period = segment.period_s
     last = segment.start_s + (int((segment.end_s - segment.start_s) / period + 1e-6) - 1) * period
     return [Knot(start, start + period, periodic=True) for start in (segment.start_s, last)]
 
 
 def _coast_knots(span: Span, blocks: Blocks, direction: float, low: float) -> list[Knot]:
-    """Return the span from settled reports to the point where friction is unknown, or the coasting ends."""
+    """Return knots from settled reports to the speed where friction is unknown, or to the end of the coasting."""
     inside = (blocks.time_s > span.start_s) & (blocks.time_s < span.end_s) & (blocks.speed_rad_s * direction >= low)
     start = span.start_s + _COAST_ENTRY_S
     end = float(blocks.time_s[inside][-1]) if np.any(inside) else start

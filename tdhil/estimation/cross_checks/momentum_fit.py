@@ -1,9 +1,9 @@
-"""Inertia and friction from balances of momentum: generalised least squares with a disturbance of unknown density.
+"""Inertia and friction from momentum balances: generalised least squares with a disturbance of unknown density.
 
-Rows y = A x + e, x = (J, B, T_c), cov e = D C (`momentum.BalanceRow`: C is tridiagonal). D is known twice:
-from the scatter of the excited periods' mean torque (`friction_levels.Levels.density`), and from the residuals of the
-rows themselves. They are pooled, unless the rows scatter more than the periods allow (F test, 1 %): then friction or
-load behave otherwise in the changes of speed, and the rows' own scatter is what the interval must be built on.
+Rows y = A x + e, x = (J, B, T_c), cov e = D C (`momentum.BalanceRow`: C is tridiagonal). D has two sources: the scatter
+of the excited periods' mean torque (`friction_levels.Levels.density`), and the residuals of the rows. They are pooled,
+unless the rows scatter more than the periods allow (F test, 1 %). In that case friction or load differ during the
+changes of speed, and the interval uses the scatter of the rows.
 """
 
 import math
@@ -19,15 +19,15 @@ from tdhil.estimation.setpoint_sampling import EXACT_READING, ReadingShare
 from tdhil.recording import FloatArray
 
 _ROWS_DIFFER_P = 0.01     # p-value below which the rows scatter more than the operating points
-_LEAST_DOF = 3.0          # degrees of freedom of a scatter that counts
-_BEND_SHOWS = 6.6         # of the density: what a bend must explain to be seen, χ² of one degree at 1 %
-_UNSEEN_BEND = 0.03       # of J: friction that bends unseen moves a balance by so much, one standard deviation
-_LEAST_CHANGE = 0.1       # of the greatest speed: rows that change it by less say nothing of J worth a number
+_LEAST_DOF = 3.0          # least degrees of freedom of a scatter that is used
+_BEND_SHOWS = 6.6         # of the density: decrease that shows nonlinear friction, χ² of one degree at 1 %
+_UNSEEN_BEND = 0.03       # of J: standard deviation of the effect of undetected nonlinear friction on a balance
+_LEAST_CHANGE = 0.1       # of the highest speed: rows with a smaller change of speed determine J too poorly
 
 
 @dataclass(frozen=True)
 class Density:
-    """Mean square of the disturbance times duration, (N·m)²·s, and the degrees of freedom behind it."""
+    """Mean square of the disturbance times duration, (N·m)²·s, and its degrees of freedom."""
 
     value: float
     dof: float
@@ -35,7 +35,7 @@ class Density:
 
 @dataclass(frozen=True)
 class Delay:
-    """δ = τ_w − τ_T, delay of the reported speed behind the reported torque, s; ``known``: fitted or stated."""
+    """Delay of the reported speed behind the reported torque, δ = τ_w − τ_T, s; ``known``: fitted or stated."""
 
     seconds: float
     sd_s: float
@@ -48,7 +48,7 @@ UNKNOWN_DELAY = Delay(0.0, 0.25, False)
 
 @dataclass(frozen=True)
 class Resolution:
-    """Standard deviation of what rounding leaves in a mean: of speed, rad/s, and of torque, N·m."""
+    """Standard deviation of a mean due to rounding: of speed, rad/s, and of torque, N·m."""
 
     speed_rad_s: float
     torque_nm: float
@@ -56,10 +56,10 @@ class Resolution:
 
 @dataclass(frozen=True)
 class MomentumFit:
-    """J kg·m², its half-width at the confidence asked for, and the delay's part in it (kg·m², one standard deviation).
+    """J, kg·m², its half-width at the requested confidence, and the delay's part in it (kg·m², one standard deviation).
 
-    ``rows`` is how many changes of speed it rests on; ``density`` is pooled. ``bend``: by how much J changes, kg·m²,
-    if friction has a part that grows with the square of the speed.
+    ``rows`` number of changes of speed used; ``density`` is pooled. ``bend``: change of J, kg·m², if friction has a
+    part proportional to the square of the speed.
     """
 
     inertia: float
@@ -75,10 +75,11 @@ def fit_momentum(
     found: Balances, kind: BalanceKind, levels: Density, delay: Delay, resolution: Resolution, confidence: float,
     reading: ReadingShare = EXACT_READING,
 ) -> MomentumFit | None:
-    """J from the rows of one kind; the others serve for friction where their speed hardly changes. None if they can't.
+    """Return J from the rows of one kind. Other rows with nearly constant speed give friction. None if J is not
+    determined.
 
-    ``reading``: what sampling in step with a speed setpoint adds to the impulse of the rows that the setpoint moved, as
-    a share of J (`tdhil.estimation.setpoint_sampling`). Raises LinAlgError where the rows make no system.
+    ``reading``: error of the impulse from sampling in step with a speed setpoint, as a share of J, for rows moved by
+    the setpoint (`tdhil.estimation.setpoint_sampling`). Raises LinAlgError for a singular system.
     """
     fastest = max(abs(row.travel_rad) / row.time_s for row in found.rows)
 
@@ -94,7 +95,9 @@ def fit_momentum(
     impulse = inverse @ np.array([row.impulse_nm_s for row in rows])
 
     def solve(delay_s: float, *more: FloatArray, prior: float = 0.0) -> tuple[FloatArray, FloatArray, float]:
-        """``more``: columns beside J, B and T_c; ``prior``: the inverse deviation of the last one, in rows' units."""
+        """Solve with further columns ``more`` beside J, B and T_c. ``prior``: inverse deviation of the last, in
+        rows' units.
+        """
         columns = np.column_stack([_design(rows, delay_s, found.direction, reading.value), *more])
         design = inverse @ columns
         if prior > 0.0:
@@ -127,9 +130,9 @@ def fit_momentum(
     design = inverse @ np.column_stack([_design(rows, delay.seconds, found.direction, reading.value), *further])
     gain = (spread @ design.T @ inverse)[0]                       # ∂J/∂(impulse of each row)
     edges = gain * float(x[0])
-    # a rounded speed is wrong at a knot: by the same amount, with opposite sign, in the two rows that share it
+    # an error of speed from rounding at a knot has opposite signs in the two rows that share the knot
     knots = np.append(edges, 0.0) - np.append(0.0, edges)
-    # and its slope there, which the delay multiplies, by as much as a sawtooth over the knot
+    # the slope at the knot, multiplied by the delay, also has a rounding error, that of a sawtooth over the knot
     read = resolution.speed_rad_s * math.hypot(1.0, math.sqrt(12.0) * delay.seconds / KNOT_S)
     rounding = math.hypot(
         read * float(np.linalg.norm(knots)),
@@ -148,9 +151,9 @@ def _bent(
     solve: Callable[..., tuple[FloatArray, FloatArray, float]], rows: list[BalanceRow], delay_s: float, inertia: float,
     further: tuple[FloatArray, ...], prior: float, rest: float, density: float,
 ) -> float:
-    """Return the change of J, kg·m², with friction that has a part ∝ ω|ω|: all of it where the rows show that part.
+    """Return the change of J, kg·m², due to friction with a part ∝ ω|ω|: the full change if the rows show that part.
 
-    Where they do not, what they leave open of it is mostly noise, and counts up to a share of J.
+    Otherwise the estimate of this part is mostly noise, and the change is limited to a share of J.
     """
     square = np.array([row.travel_rad * abs(row.travel_rad) / row.time_s for row in rows])
     try:
@@ -169,7 +172,9 @@ def _covariance(rows: list[BalanceRow]) -> FloatArray:
 
 
 def _design(rows: list[BalanceRow], delay_s: float, direction: float, share: float) -> FloatArray:
-    """(rows, 3): columns J, B, T_c; ``share`` of J is read too much where a setpoint moved the shaft."""
+    """Return the design matrix (rows, 3) for J, B, T_c. ``share``: relative excess of J where a setpoint moved the
+    shaft.
+    """
     table = []
     for row in rows:
         delay = 0.0 if row.kind is BalanceKind.COASTING else delay_s

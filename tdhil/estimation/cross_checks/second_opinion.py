@@ -1,13 +1,13 @@
-"""J by another route through the same run: a balance of momentum instead of lines, and whether the two agree.
+"""Momentum cross-check: J by momentum balances of the same run instead of spectral lines, and whether the two agree.
 
-The lines tell J by how torque and speed swing together, and need the reports' lags for it. The balances tell it by what
-torque it took to get from one steady speed to another (the ramps of stages 2 and 3, the way to stage 5, the change
-between its mean speeds, the plateaus of a square wave), or how fast the shaft slows down by friction alone; they hardly
-know a lag. The two share the friction and the torque's scale, and otherwise use different stretches of the run, so
-their errors are about independent.
+The lines give J from the oscillation of torque and speed, and need the lags of the reports. The balances give J from
+the torque of a change between two steady speeds (ramps of stages 2 and 3, the change to stage 5 and between its mean
+speeds, plateaus of a square wave), or from the deceleration by friction alone. Lags have little effect on them. Both
+routes share the friction and the torque scale, but use different stretches of the run, so their errors are nearly
+independent.
 
-Error model: the disturbance's density over the time that a change takes, friction from all steady stretches, rounding,
-and B·δ of the reports' delays: fitted or stated, else anything up to half a second either way (two deviations).
+Error model: density of the disturbance over the time of a change, friction from all steady stretches, rounding, and B·δ
+of the reports' delays. δ is fitted or stated, else unknown within ±0.5 s (two standard deviations).
 """
 
 import math
@@ -35,25 +35,25 @@ from tdhil.estimation.samples import Samples, usual_interval
 from tdhil.estimation.setpoint_sampling import ReadingShare, ReadMoment, reading_share, usual_loops
 from tdhil.recording import FloatArray, Recording, SteppedSetpoint
 
-_LEAST_DOF = 3.0          # degrees of freedom of a scatter that counts
-_OPEN = 0.5               # a half-width beyond this share of J is no opinion
-_FALSE_ALARM = 0.01       # of the runs; a warning that comes in every twentieth sound one is soon read past
+_LEAST_DOF = 3.0          # least degrees of freedom of a scatter that is used
+_OPEN = 0.5               # half-width over J, beyond which there is no cross-check
+_FALSE_ALARM = 0.01       # share of sound runs with a false warning; more frequent warnings would be ignored
 _WORTH_A_FIT = 0.005
-"""Share of J that reading in step may add with a usual speed loop, from which on the drive's own loop is fitted."""
+"""Least share of J that reading in step may add with a usual speed loop, for a fit of the drive's own loop."""
 
 Fitted = tuple[tuple[SecondOpinion, MomentumFit], ...]
-_ACQUISITION = "acquire"  # the stage that J comes from
+_ACQUISITION = "acquire"  # the stage that gives J
 _CONTRADICTION = 1e-3
-"""Share of runs: the chance that a sound result is taken back, for noise and friction that bends unseen."""
+"""Probability of withdrawing a sound result, given noise and undetected nonlinear friction."""
 
 _ALIKE = 0.05
-"""Share of J: a smaller difference is none. Friction drifts between stages by some percent of J's torque."""
+"""Share of J: a smaller difference does not count. Friction drifts between stages by a few percent of J's torque."""
 
 
 def cross_checked(finding: Finding, case: Case) -> Finding:
     """Return the finding with cross-checks and friction curve. Never raises. The curve needs excited segments.
 
-    Refused data get no cross-check, because it would give a number from them (`Case.sound`).
+    Refused data get no cross-check, because a cross-check would give a number from them (`Case.sound`).
     """
     fitted = _fitted_opinions(case, finding)
     opinions = tuple(opinion for opinion, _ in fitted)
@@ -64,19 +64,21 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
     inertia = _inertia(case, finding, opinions)
     contradiction = _contradiction(against, finding, case.options.confidence)
     if contradiction.reason:
-        # a J that does not stand gets no further figures, as where the residuals contradict the model
+        # a withdrawn J gets no further figures, as for residuals that contradict the model
         finding = Finding(finding.model, finding.words, finding.residual, lines=finding.lines, bent=finding.bent,
                           samples_used=finding.samples_used, contradiction=contradiction)
     if inertia is None or case.levels is None:
         return replace(finding, second_opinions=opinions, warnings=warnings)
     curve = friction_curve(case.recording, case.samples, case.levels, inertia, case.options)
-    # where the bend is part of the model, J knows of it
+    # if nonlinear friction is part of the model, J accounts for it
     warnings = (*warnings, *(() if finding.bent else curve.warnings))
     return replace(finding, second_opinions=opinions, friction_curve=curve.points, warnings=warnings)
 
 
 def _inertia(case: Case, finding: Finding, opinions: tuple[SecondOpinion, ...]) -> Inertia | None:
-    """Return J of everything that turns, with its standard deviation: the finding's, else a momentum cross-check's."""
+    """Return J of everything that turns, with its standard deviation: from the finding, else from a momentum
+    cross-check.
+    """
     known = reference_inertia(finding)
     if known is None and opinions:
         known = opinions[0].inertia_kg_m2
@@ -88,8 +90,8 @@ def _inertia(case: Case, finding: Finding, opinions: tuple[SecondOpinion, ...]) 
 
 
 def second_opinions(case: Case, finding: Finding) -> tuple[SecondOpinion, ...]:
-    """J by every route that the run has; () where there is none. The finding's own J and lags count, where it
-    has them. Never raises.
+    """Return J by every route of the run; () without one. Uses the J and lags of the finding, if it has them. Never
+    raises.
     """
     return tuple(opinion for opinion, _ in _fitted_opinions(case, finding))
 
@@ -109,10 +111,10 @@ def _fitted_opinions(case: Case, finding: Finding, *, alone: bool = False) -> Fi
 
 
 def _before_acquisition(case: Case, finding: Finding) -> Fitted:
-    """The same from what was recorded before stage 5 alone.
+    """Return the cross-checks from the recording before stage 5 only.
 
-    Where a signal changes its scale during the run, the balances of the whole run contradict one another, and their
-    interval becomes so wide that J agrees with it. Those of before do not.
+    If a signal changes its scale during the run, the balances of the whole run contradict one another, and their
+    interval becomes so wide that J agrees with it. The balances before stage 5 do not have this problem.
     """
     begun = next((stage.start_s for stage in case.recording.stages if stage.name == _ACQUISITION), None)
     if begun is None:
@@ -124,9 +126,10 @@ def _before_acquisition(case: Case, finding: Finding) -> Fitted:
 
 
 def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Refusal:
-    """Return the contradiction of J beyond chance and the effect of nonlinear friction on a balance; else nothing.
+    """Return the contradiction of J beyond chance and beyond the effect of nonlinear friction on a balance; else
+    nothing.
 
-    The torque's scale is shared by both and cancels.
+    Both values have the same torque scale, which cancels.
     """
     reference = reference_inertia(finding)
     for opinion, fit in opinions:
@@ -149,7 +152,7 @@ def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Ref
 
 
 def _bent_by(own: Estimate, fit: MomentumFit, confidence: float) -> Estimate:
-    """The interval of a balance, as wide as friction that bends may make it."""
+    """Return the interval of a balance, widened for the possible effect of nonlinear friction."""
     half = math.hypot(own.high - own.value, normal_quantile(confidence) * fit.bend)
     return Estimate(own.value, own.value - half, own.value + half)
 
@@ -157,7 +160,7 @@ def _bent_by(own: Estimate, fit: MomentumFit, confidence: float) -> Estimate:
 def _with_least_change(
     opinions: tuple[SecondOpinion, ...], before: Fitted, compared: int, finding: Finding, confidence: float
 ) -> tuple[SecondOpinion, ...]:
-    """The first one's note with the least change of a signal's scale at stage 5 that would contradict J."""
+    """Add to the first cross-check the least change of a signal's scale at stage 5 that would contradict J."""
     reference = reference_inertia(finding)
     if not opinions or not before or reference is None or not reference.finite or not reference.value > 0.0:
         return opinions
@@ -206,11 +209,11 @@ def _opinions(case: Case, found: Balances, finding: Finding) -> Fitted:
 
 
 def _reading(case: Case, finding: Finding) -> ReadingShare:
-    """Share that reading in step with a speed setpoint adds to J of the ramps, beyond what it adds to J of stage 5.
+    """Return the share that reading in step with a speed setpoint adds to J of the ramps, relative to J of stage 5.
 
-    In torque mode stage 5 has none of it, and its skew tells the moment of reading. Stage 5 in speed mode is read like
-    the ramps. But a ramp generator in the drive smooths a ramp's large steps more than the small ones of stage 5, so
-    that anything from none to all of it may be left between the two.
+    In torque mode stage 5 does not have this error, and its skew gives the moment of reading. Stage 5 in speed mode is
+    read like the ramps. However, a ramp generator in the drive smooths the large steps of a ramp more than the small
+    steps of stage 5, so the difference may be any part of the error.
     """
     recording = case.recording
     if recording.stepped_setpoint is None:
@@ -220,7 +223,7 @@ def _reading(case: Case, finding: Finding) -> ReadingShare:
 
 
 def _least_lag_s(case: Case, finding: Finding) -> float:
-    """The shortest lag of the torque's report that the data or the drive's documents allow, s."""
+    """Return the shortest lag of the torque report that the data or the drive's documents allow, s."""
     if finding.torque_lag_s is not None:
         return max(finding.torque_lag_s.low, 0.0)
     prior = case.recording.lag_prior
@@ -235,7 +238,7 @@ def _moment(finding: Finding) -> ReadMoment | None:
 
 
 def _loops(case: Case, finding: Finding) -> tuple[SteppedSetpoint, ...]:
-    """How the drive may have followed the setpoint of the ramps: as the ramp of stage 2 shows, else as is usual."""
+    """Return possible speed loops during the ramps: from the ramp of stage 2, else the usual loops."""
     period_s = usual_interval(case.samples.time_s)
     loops = usual_loops(period_s)
     reference, lag = reference_inertia(finding), finding.speed_lag_s
@@ -255,7 +258,7 @@ def _loops(case: Case, finding: Finding) -> tuple[SteppedSetpoint, ...]:
 
 
 def known_delay(recording: Recording, finding: Finding) -> Delay:
-    """δ = τ_w − τ_T − skew: fitted, else stated, else unknown."""
+    """Return the delay δ = τ_w − τ_T − skew: fitted, else stated, else unknown."""
     speed, torque, skew = finding.speed_lag_s, finding.torque_lag_s, finding.skew_s
     if speed is not None and torque is not None and skew is not None:
         value = speed.value - torque.value - skew.value
@@ -273,8 +276,8 @@ def known_delay(recording: Recording, finding: Finding) -> Delay:
 def _resolution(recording: Recording, samples: Samples, found: Balances) -> Resolution:
     """Return the error of a mean from rounding to a quantum q, by the scatter σ of the signal at steady speed.
 
-    Noise of deviation σ before the rounding dithers it: the mean's error is at most (q/π) e^(−2π²σ²/q²), and
-    uniform of deviation q/√12 without noise.
+    Noise of standard deviation σ before the rounding acts as dither: the error of the mean is at most (q/π)
+    e^(−2π²σ²/q²). Without noise it is uniform, with standard deviation q/√12.
     """
     return Resolution(
         _rounding(recording.speed_resolution_rad_s, [s.speed_rad_s for s in _calm_samples(samples, found)]),
@@ -295,12 +298,12 @@ def _rounding(quantum: float, parts: list[FloatArray]) -> float:
 
 
 def reference_inertia(finding: Finding) -> Estimate | None:
-    """Return the inertia to compare with a momentum balance: all that turns, also behind a compliant shaft."""
+    """Return the inertia to compare with a momentum balance: everything that turns, also behind a compliant shaft."""
     return finding.inertia if finding.compliant is None else finding.compliant.total_inertia
 
 
 def _agrees(own: Estimate, finding: Finding, confidence: float, miss_share: float) -> bool | None:
-    """Return whether the difference is within two independent intervals. ``miss_share``: chance of a wrong no."""
+    """Return whether the difference is within two independent intervals. ``miss_share``: probability of a false no."""
     reference = reference_inertia(finding)
     if reference is None or not reference.finite:
         return None

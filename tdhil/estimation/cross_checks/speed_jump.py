@@ -1,16 +1,16 @@
-"""A reported speed that changes faster than the identified inertia allows, above a drill string.
+"""Check for a reported speed that changes faster than the identified inertia allows, above a drill string.
 
-A reported speed is an average of true speeds with weights that are not negative, so no lag makes its slope steeper
-than the greatest acceleration of the shaft:
+A reported speed is an average of true speeds with weights ≥ 0. A lag therefore cannot make its slope steeper than the
+greatest acceleration of the shaft:
 
     |dz/dt| ≤ (T_max − T_load,min)/J_low
 
-`tdhil.runner.observer` tests this in every cycle. Above a string it knows J to a factor of two at best by then, and a
-sensor whose scale changes passes. Here J is the result's own, so a jump shows that the result does not stand: where the
-scale changed during the run, J is wrong by as much.
+`tdhil.runner.observer` tests this in every cycle. Above a string the observer has J only to a factor of two at that
+time, and does not detect a change of a sensor's scale. Here J is that of the result, so a jump shows that the result is
+wrong: if the scale changed during the run, J is wrong by the same factor.
 
-The torques are those of torque mode, commanded and reported, within the longest time that a report remembers. The load
-of a string is T − Jα over the time before; it stays within its own range beyond either end.
+The torques are those of torque mode, commanded and reported, within the longest memory of a report. The load of a
+string is T − Jα over the time before. It may leave the range of that time by the width of the range, on either side.
 """
 
 import math
@@ -23,16 +23,18 @@ from tdhil.estimation.result import Refusal
 from tdhil.recording import FloatArray, Recording
 
 POINT_S = 0.04
-"""Samples are averaged over so long, s; a slow line has one sample for each point."""
+"""Time over which samples are averaged to a point, s; a slow line has one sample for each point."""
 
 SLOPE_S = 0.12
 """Time over which a slope of the reported speed is taken, s."""
 
 MEMORY_S = 3.0
-"""A reported slope remembers the torque of so long, s: six of the longest plausible lags (0.5 s)."""
+"""Time during which an earlier torque affects the reported slope, s: six of the longest plausible lags (0.5 s)."""
 
 LOAD_BEFORE_S, LOAD_RANGE = 10.0, 1.0
-"""The torque of a string stays within this multiple of its range, about the middle, over so long before, s."""
+"""Assumed bound of a string's load: range of the torque over the time before (s), and the multiple of it about the
+middle.
+"""
 
 NOISE_SDS = 6.0
 """Standard deviations that count as the noise of a point's speed."""
@@ -41,14 +43,14 @@ NORMAL_MEDIAN = 1.4826
 """Standard deviation of normal noise as a multiple of its median magnitude."""
 
 MOST = 0.9
-"""Slope as a share of the bound: 0.69 at most in healthy runs above a string (`benchmarks/healthy_runs.py`); 1.01 where
-a sensor doubled in stage 5, 1.4 where it lost a tenth in stage 4 (`benchmarks/lying_reports.py`)."""
+"""Slope as a share of the bound: 0.69 at most in healthy runs above a string (`benchmarks/healthy_runs.py`); 1.01 if
+the scale of a sensor doubled in stage 5, 1.4 if it lost a tenth in stage 4 (`benchmarks/lying_reports.py`)."""
 
-_IN_A_ROW = 2             # points beyond the bound: a single false report is no change of scale
+_IN_A_ROW = 2             # points in a row beyond the bound: a single false report is not a change of scale
 
 
 def jump_checked(finding: Finding, case: Case) -> Finding:
-    """Return the finding, taken back where the speed jumps. Never raises."""
+    """Return the finding, without its inertia if the speed jumps. Never raises."""
     inertia = finding.inertia
     if inertia is None or not case.sound or not case.recording.winds_up or not inertia.low > 0.0:
         return finding
@@ -59,7 +61,7 @@ def jump_checked(finding: Finding, case: Case) -> Finding:
 
 
 def jump_contradiction(recording: Recording, inertia_low_kg_m2: float, inertia_kg_m2: float) -> Refusal | None:
-    """Return what is wrong where the speed jumps in torque mode; else None."""
+    """Return the contradiction if the speed jumps in torque mode; else None."""
     if recording.commanded_torque_nm is None or len(recording.time_s) < 2:
         return None
     period_s = float(np.median(np.diff(recording.time_s)))
@@ -76,10 +78,10 @@ def jump_contradiction(recording: Recording, inertia_low_kg_m2: float, inertia_k
     back = max(1, round(SLOPE_S / point_s))
     slope = np.full(count, np.nan)
     took_s = time_s[back:, 0] - time_s[:-back, 0]
-    whole = took_s < 1.5 * back * point_s                    # not across a gap
+    whole = took_s < 1.5 * back * point_s                    # no slope across a gap
     slope[back:] = np.where(whole, (speed[back:] - speed[:-back]) / took_s, np.nan)
     load = np.mean(torque, axis=1) - inertia_kg_m2 * slope
-    # Not the jump's own: the load of the time before it.
+    # the load before the slope, without the jump itself
     before = _delayed(load, math.ceil((SLOPE_S + 0.25) / point_s))
     load_high = _past(before, LOAD_BEFORE_S / point_s)
     load_low = -_past(-before, LOAD_BEFORE_S / point_s)
@@ -89,7 +91,7 @@ def jump_contradiction(recording: Recording, inertia_low_kg_m2: float, inertia_k
     faster = np.maximum(0.0, highest - (middle - half)) / inertia_low_kg_m2 + blur
     slower = np.maximum(0.0, (middle + half) - lowest) / inertia_low_kg_m2 + blur
     bound = np.where(slope > 0.0, faster, slower)
-    beyond = np.abs(slope) > MOST * bound                    # never where one of them is not known
+    beyond = np.abs(slope) > MOST * bound                    # False if one of them is unknown
     for shift in range(1, _IN_A_ROW):
         beyond[shift:] &= beyond[:-shift]
     if not np.any(beyond):
@@ -104,7 +106,7 @@ def jump_contradiction(recording: Recording, inertia_low_kg_m2: float, inertia_k
 
 
 def _past(values: FloatArray, points: float) -> FloatArray:
-    """Return the greatest of this point and those before it, over so many points; NaN where one of them is NaN."""
+    """Return the greatest of each point and the ``points`` before it; NaN if one of them is NaN."""
     width = min(len(values), 1 + math.ceil(points))
     padded = np.concatenate([np.full(width - 1, np.nan), values])
     greatest: FloatArray = np.max(np.lib.stride_tricks.sliding_window_view(padded, width), axis=1)
@@ -112,16 +114,17 @@ def _past(values: FloatArray, points: float) -> FloatArray:
 
 
 def _delayed(values: FloatArray, points: int) -> FloatArray:
-    """Return the values of so many points before; NaN where there are none."""
+    """Return the values shifted later by ``points``; NaN at the beginning."""
     late = np.full(len(values), np.nan)
     late[points:] = values[: len(values) - points]
     return late
 
 
 def _noise_rad_s(speed: FloatArray) -> float:
-    """Return the standard deviation of a point's noise, by the median of its third differences: 20 times its variance.
+    """Return the standard deviation of a point's noise, from the median of the third differences (20 times its
+    variance).
 
-    The motion itself hardly shows in them, even at 10 Hz.
+    The motion itself has little effect on third differences, even at 10 Hz.
     """
     rough = np.abs(np.diff(speed, 3))
     rough = rough[np.isfinite(rough)]

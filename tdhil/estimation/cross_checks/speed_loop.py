@@ -1,13 +1,14 @@
-"""Gains of the drive's speed loop, read off the ramp of the setpoint between the levels of stage 2.
+"""Gains of the drive's speed loop, from the ramp of the setpoint between the levels of stage 2.
 
-The setpoint r is known but for its end: it stands at the lower level, rises by the same step in every cycle, and stands
-at the upper level. A PI loop gives the torque
+The setpoint r is known except for its end: it stays at the lower level, rises by the same step in every cycle, and
+stays at the upper level. A PI loop gives the torque
 
     T = T_0 + K_p (r − ω) + K_i ∫(r − ω) dt,
 
-linear in T_0, K_p and K_i for a given number of steps, and the number with the least residual is taken. Where the
-report of speed has a lag τ, r and T are put through the same lag, which leaves the equation as it is. A drive with
-another law (a filter of the setpoint, a ramp generator) leaves more residual than its levels scatter, and is not read.
+which is linear in T_0, K_p and K_i for a given number of steps. The number of steps with the least residual is used. If
+the speed report has a lag τ, r and T are filtered with the same lag, which keeps the equation valid. A drive with
+another law (a filter of the setpoint, a ramp generator) has residuals larger than the scatter of the levels, and gives
+no gains.
 """
 
 import math
@@ -19,19 +20,19 @@ import numpy as np
 from tdhil.estimation.samples import Samples, usual_interval
 from tdhil.recording import FloatArray, Level, Recording
 
-_SAME_TIME_S = 1e-6       # s; times closer than this are one: they are rounded in the log
-_FEWEST = 20              # samples of either level, and of the way between
-_LAW_HOLDS = 2.0          # times the levels' own scatter, of the residual: beyond it is no PI loop
-_VALLEY_S = 0.05          # a ramp that is longer or shorter by 0.07 s leaves ten times the scatter
+_SAME_TIME_S = 1e-6       # s; closer times count as equal, because the log rounds them
+_FEWEST = 20              # fewest samples of either level, and of the ramp between
+_LAW_HOLDS = 2.0          # residual over the scatter of the levels: with a larger one the loop is not a PI loop
+_VALLEY_S = 0.05          # s; a ramp that is longer or shorter by 0.07 s has ten times the scatter
 _SEEN_SHARE = 0.1
-"""Least relative standard deviation of a gain. On the simulated drives the gains are 4 % low in the mean with a scatter
-of 5 % (rounding of speed to 1 rpm, speed filters of 20 ms)."""
-_CLEAR_SHARE = 0.3        # beyond it the gain was not seen
+"""Least relative standard deviation of a gain. On the simulated drives the gains are 4 % low on average, with a
+scatter of 5 % (rounding of speed to 1 rpm, speed filters of 20 ms)."""
+_CLEAR_SHARE = 0.3        # relative standard deviation beyond which a gain is not determined
 
 
 @dataclass(frozen=True)
 class SpeedLoop:
-    """K_p, N·m·s/rad, and its standard deviation; K_i, N·m/rad."""
+    """Gains of a speed loop: K_p, N·m·s/rad, and its standard deviation; K_i, N·m/rad."""
 
     gain_nm_s_rad: float
     gain_sd_nm_s_rad: float
@@ -39,7 +40,7 @@ class SpeedLoop:
 
 
 def speed_loop(recording: Recording, samples: Samples, speed_lag_s: float) -> SpeedLoop | None:
-    """The loop that followed the ramp of stage 2; None where no such ramp is recorded, or the law does not fit."""
+    """Return the loop that followed the ramp of stage 2; None without such a ramp, or if a PI loop does not fit."""
     ends = _ends(recording)
     if ends is None:
         return None
@@ -57,7 +58,9 @@ def speed_loop(recording: Recording, samples: Samples, speed_lag_s: float) -> Sp
     rising = _lagged(np.maximum(number, 0.0), interval_s, speed_lag_s)
 
     def fitted(steps: int) -> tuple[float, FloatArray, FloatArray]:
-        """Residual, T_0 and gains, design: the setpoint rises in so many steps, which is one rise less a later one."""
+        """Return residual, (T_0, gains) and design for a setpoint that rises in ``steps`` steps: one rise less a
+        later one.
+        """
         later = np.append(np.zeros(steps), rising[:-steps])
         error = start + (end - start) * (rising - later) / steps - part.speed_rad_s
         integral = np.append(0.0, np.cumsum(0.5 * (error[1:] + error[:-1]) * widths))
@@ -86,7 +89,7 @@ def _least(of: Callable[[int], float], first: int, last: int, stride: int) -> in
 
 
 def _ends(recording: Recording) -> tuple[Level, Level] | None:
-    """The levels at both ends of the first ramp."""
+    """Return the levels at both ends of the first ramp."""
     if not recording.ramps or not recording.stages:
         return None
     ramp = recording.ramps[0]
@@ -96,7 +99,7 @@ def _ends(recording: Recording) -> tuple[Level, Level] | None:
 
 
 def _lagged(signal: FloatArray, interval_s: float, lag_s: float) -> FloatArray:
-    """Through a first-order lag, from sample to sample; its delay is the lag's."""
+    """Return the signal behind a first-order lag, from sample to sample; its delay is that of the lag."""
     if not lag_s > 0.0:
         return signal
     keep = math.exp(-interval_s / lag_s)

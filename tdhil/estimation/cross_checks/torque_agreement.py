@@ -1,16 +1,16 @@
-"""Commanded, demanded and reported torque held against each other: do they fit within the drive's torque scale?
+"""Comparison of commanded, demanded and reported torque: do they agree within the drive's torque scale?
 
-A reported torque with a wrong scale gives an inertia that is wrong by the same factor, and no residual shows it. But
-the host knows the torque that it commands, and many drives report their own torque demand. In torque mode the reported
-torque y follows the commanded torque x through the drive's torque loop and its reporting filter,
+A reported torque with a wrong scale gives an inertia that is wrong by the same factor, and no residual shows it.
+However, the host knows the torque that it commands, and many drives report their own torque demand. In torque mode the
+reported torque y follows the commanded torque x through the drive's torque loop and its reporting filter,
 
     A(d/dt) y = k x + c,     A = 1 + a₁ d/dt + a₂ d²/dt² + a₃ d³/dt³,
 
-k the ratio of both scales and c an offset. A is the inverse of whatever lags lie between, at low frequencies: a₁ is
-their sum, and of one pole, two poles, a moving average or a dead time a₂ is between 0 and a₁²/2, a₃ between 0 and
-a₁³/6. Seen through smooth windows (`tdhil.estimation.time_domain`) this is linear in k, c and the a. So k needs no
-model of the lags, no steady torque, and no part of the record in which a limit acted. In speed mode x is the drive's
-torque demand.
+with the ratio k of both scales and an offset c. At low frequencies A is the inverse of the lags between x and y: a₁ is
+their sum. For one pole, two poles, a moving average or a dead time, a₂ is between 0 and a₁²/2, and a₃ between 0 and
+a₁³/6. Through smooth windows (`tdhil.estimation.time_domain`) the equation is linear in k, c and the a. Therefore k
+needs no model of the lags and no steady torque, and parts of the recording with an active limit are left out. In speed
+mode x is the drive's torque demand.
 """
 
 import math
@@ -38,27 +38,27 @@ from tdhil.estimation.time_domain import (
 from tdhil.recording import BoolArray, FloatArray, Recording
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The ratio of two torques in one part of a record.
+# Ratio of two torques in one part of a recording.
 
 
-_RATE_HZ = 50.0           # of the averages that are compared: both signals pass the same average, so it cancels
-_GAP_STEPS, _GAP_S = 4.5, 0.05     # a longer hole begins a new stretch
-_LEAST_S = 4.0            # of a stretch; a shorter one says nothing at the frequencies below the lags
-_LEAST_BINS = 8           # frequencies that a fit needs
-_ROUNDS = 4               # of weighting again
-_CLEAR = 20.0             # power of what the reference explains over the residual's
-_NARROW = 0.05            # of the frequency: over so much the explained power is averaged
-_PHASE_RAD = 0.9          # of the lags, up to which a cubic stands for their inverse
-_LEAST_LAG_S = 0.02       # a lag is taken as no shorter than this where its square and cube are bounded
+_RATE_HZ = 50.0           # Hz; rate of the compared averages. Both signals have the same average, so its effect cancels
+_GAP_STEPS, _GAP_S = 4.5, 0.05     # missing samples, s; a longer gap begins a new stretch
+_LEAST_S = 4.0            # s; least duration of a stretch; a shorter one has no frequencies below those of the lags
+_LEAST_BINS = 8           # fewest frequencies for a fit
+_ROUNDS = 4               # rounds of reweighting
+_CLEAR = 20.0             # least power that the reference explains, over that of the residual
+_NARROW = 0.05            # of the frequency: width over which the explained power is averaged
+_PHASE_RAD = 0.9          # rad; phase of the lags up to which a cubic is their inverse
+_LEAST_LAG_S = 0.02       # s; least lag used for the bounds of its square and cube
 _SQUARE, _SQUARE_SD = 0.25, 0.2        # a₂/a₁²: one pole 0, two poles up to 1/4, moving average 1/3, dead time 1/2
 _CUBE, _CUBE_SD = 0.05, 0.06           # a₃/a₁³: one and two poles 0, dead time 1/6
-_LEAST_DOF = 3.0          # degrees of freedom, at least, for the quantile
+_LEAST_DOF = 3.0          # least degrees of freedom for the quantile
 _RATIO, _OFFSET, _FIRST, _SECOND, _THIRD = range(5)
 
 
 @dataclass(frozen=True)
 class _RatioFit:
-    """Ratio k with its standard deviation, its degrees of freedom, and how far noise in the reference may draw it."""
+    """Ratio k with its standard deviation and degrees of freedom, and the possible bias from noise in the reference."""
 
     ratio: float
     sd: float
@@ -66,12 +66,12 @@ class _RatioFit:
     lean: float
 
     def half_width(self, confidence: float) -> float:
-        """Probability of the coverage interval."""
+        """Return the half-width of the coverage interval with probability ``confidence``."""
         return student_quantile(confidence, self.dof) * self.sd + self.lean
 
 
 def _ratio(time_s: FloatArray, reference_nm: FloatArray, torque_nm: FloatArray) -> _RatioFit | None:
-    """K of ``torque_nm`` over ``reference_nm`` (N,) each; None where the reference moves too little to show it."""
+    """Return k of ``torque_nm`` over ``reference_nm``, (N,) each; None if the reference moves too little."""
     bins = joined([
         measure(window) for window in place_windows(tuple(_stretches(Samples(time_s, reference_nm, torque_nm))))
     ])
@@ -106,7 +106,7 @@ def _ratio(time_s: FloatArray, reference_nm: FloatArray, torque_nm: FloatArray) 
 
 
 def _stretches(samples: Samples) -> Iterator[OneWayStretch]:
-    """Parts without holes, in averages at some fifty a second."""
+    """Yield the parts without gaps, averaged to some fifty samples a second."""
     if len(samples) < 2:
         return
     longest = max(_GAP_STEPS * usual_interval(samples.time_s), _GAP_S)
@@ -118,14 +118,14 @@ def _stretches(samples: Samples) -> Iterator[OneWayStretch]:
 
 
 def _operators(bins: Bins) -> list[FloatArray]:
-    """d/dt, its square and its cube of the torque, in every bin (M,)."""
+    """Return d/dt, d²/dt² and d³/dt³ of the torque in every bin (M,)."""
     return [
         np.einsum("mn,mn->m", polynomial(bins.s, *(0.0,) * power, 1.0), bins.torque) for power in range(1, 4)
     ]
 
 
 def _left(bins: Bins, x: FloatArray) -> FloatArray:
-    """Return the residual of the equation in every bin (M,), as torque: the inverse of the lags taken off again."""
+    """Return the residual of the equation in every bin (M,), as torque: divided by the inverse of the lags."""
     first, second, third = _operators(bins)
     left = bins.torque[:, 0] + x[_FIRST] * first + x[_SECOND] * second + x[_THIRD] * third
     left = left - x[_RATIO] * bins.speed[:, 0] - x[_OFFSET] * bins.level[:, 0]
@@ -136,14 +136,14 @@ def _left(bins: Bins, x: FloatArray) -> FloatArray:
 def _solved(
     bins: Bins, variance: FloatArray, lag_s: float, *, bounded: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """k, c and the a (5,), their covariance (5, 5), and each bin's leverage (M,).
+    """Return k, c and the a (5,), their covariance (5, 5), and the leverage of each bin (M,).
 
-    ``bounded``: a₂ and a₃ are held near what filters with a lag of ``lag_s`` in all have.
+    ``bounded``: a₂ and a₃ are kept near the values of filters with a total lag of ``lag_s``.
     """
     first, second, third = _operators(bins)
     s = bins.s
     lag = max(lag_s, _LEAST_LAG_S)
-    # the noise lies in the reported torque, and A acts on it as well
+    # the noise is in the reported torque, and A acts on it too
     by_lag = 1.0 + lag * s if bounded else np.ones(len(s))
     weight = np.sqrt(np.where(bins.hertz > 0.0, 2.0, 1.0) / variance) / np.abs(by_lag)
     columns = np.column_stack([bins.speed[:, 0], bins.level[:, 0], -first, -second, -third]) * weight[:, None]
@@ -172,18 +172,20 @@ def _solved(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Which parts of a record are compared, and what follows.
+# Selection of the compared parts of a recording, and the consequences of the comparison.
 
 
 COMMANDED, DEMANDED = "commanded", "demanded"
 _FALSE_ALARM = 1e-3
-"""Chance that sound signals are called contradicting, for the ratio's own noise; the scale's allowance comes on top."""
+"""Probability that the noise of the ratio alone makes sound signals contradict; the allowance for the scale is
+added.
+"""
 
 _NEGLIGIBLE = 0.01
-"""Share of one: a ratio that differs by less is one. Setpoints are rounded, and a torque loop keeps a small error."""
+"""Difference of the ratio from 1 that counts as none. Setpoints are rounded, and a torque loop keeps a small error."""
 
 _FITS = 0.2
-"""Share of the ratio's deviation: two signals that differ by less fit each other."""
+"""Share of the ratio's difference from 1: two signals with a smaller difference agree with each other."""
 
 _ADVICE = (
     "check the units of torque in the profile (per_lsb of setpoint and reported torque) and the rated torque; or "
@@ -192,10 +194,10 @@ _ADVICE = (
 
 
 def torque_ratios(recording: Recording, confidence: float) -> tuple[TorqueRatio, ...]:
-    """Reported over commanded torque in torque mode, and reported over demanded torque in speed mode.
+    """Return reported over commanded torque in torque mode, and reported over demanded torque in speed mode.
 
-    Of the excited segments where there are some, else of the whole record. () where no setpoint is known, or where it
-    moves too little. Never raises.
+    Uses the excited segments, or the whole recording without segments. Returns () without a known setpoint, or if the
+    setpoint moves too little. Never raises.
     """
     commanded, demanded = recording.commanded_torque_nm, recording.demanded_torque_nm
     if commanded is None and demanded is None:
@@ -212,7 +214,7 @@ def torque_ratios(recording: Recording, confidence: float) -> tuple[TorqueRatio,
 
 
 def _within(recording: Recording) -> BoolArray:
-    """(N,) True in the excited segments after settling; everywhere if there are none."""
+    """Return (N,) True in the excited segments after settling; True everywhere without segments."""
     time = recording.time_s
     segments = () if recording.excitation is None else recording.excitation.segments
     inside = np.full(len(time), not segments)
@@ -253,14 +255,14 @@ def _rms(signal: FloatArray) -> float:
 
 
 def torques_compared(case: Case) -> Case:
-    """The case with the ratios of its torque signals."""
+    """Return the case with the ratios of its torque signals."""
     return replace(case, torque_ratios=torque_ratios(case.recording, case.options.confidence))
 
 
 def torques_judged(case: Case) -> Case:
-    """The case; with a wider torque scale where a ratio differs from 1 by less than that scale allows.
+    """Return the case, with a wider torque scale if a ratio differs from 1 by less than that scale allows.
 
-    Raises Refused where one differs by more: J would be wrong by that factor, and nothing tells which torque is true.
+    Raises Refused if a ratio differs by more: J would be wrong by that factor, and the true torque is unknown.
     """
     scale = case.recording.torque_scale_rel_sd
     refusal = torque_contradiction(case.torque_ratios, scale)
@@ -280,7 +282,7 @@ def torques_judged(case: Case) -> Case:
 
 
 def torque_contradiction(found: tuple[TorqueRatio, ...], scale_rel_sd: float) -> Refusal | None:
-    """Return the contradiction where a ratio differs from 1 by more than the torque scale allows; None where none does.
+    """Return the contradiction if a ratio differs from 1 by more than the torque scale allows; else None.
 
     ``scale_rel_sd``: standard uncertainty of the torque scale, as a share.
     """
@@ -291,7 +293,7 @@ def torque_contradiction(found: tuple[TorqueRatio, ...], scale_rel_sd: float) ->
 
 
 def _worst(found: tuple[TorqueRatio, ...]) -> TorqueRatio | None:
-    """The ratio that differs most from 1; None where none differs by more than chance and rounding explain."""
+    """Return the ratio that differs most from 1; None if none differs by more than chance and rounding explain."""
     off = [one for one in found if abs(one.ratio.value - 1.0) > max(one.surely, _NEGLIGIBLE)]
     return max(off, key=lambda one: abs(one.ratio.value - 1.0), default=None)
 
@@ -315,7 +317,7 @@ def _contradiction(found: TorqueRatio, allowed: float) -> str:
 
 
 def _which(found: TorqueRatio) -> str:
-    """Which signal stands alone, where three are known."""
+    """Return which signal differs from the other two, if three are known."""
     if found.demanded_ratio is None:
         return ""
     share = found.ratio.value / found.demanded_ratio

@@ -1,4 +1,6 @@
-"""Periodic excitation: lines to a model's likelihood, likelihood to values and intervals."""
+"""Route of periodic excitation: from spectral lines to the likelihood of a model, and from there to values and
+intervals.
+"""
 
 from tdhil.estimation.frequency_domain.before_echo import (
     identify_before_echo as identify_before_echo, refuse_stick_slip as refuse_stick_slip,

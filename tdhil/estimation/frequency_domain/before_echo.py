@@ -1,21 +1,21 @@
-"""A drill string on bottom: the motor's inertia from what its shaft does before an echo comes back.
+"""Inertia of a motor above a drill string on bottom, from the motion before an echo returns.
 
-Whatever the motor does runs down the string as a wave, and for the time 2L/v until anything of it returns the string is
-nothing but the resistance ζ = √(J_s k). What comes back later is the bit's: a mass, collars, new rock, a bit that cuts.
-With the waves at the top, down a = τ + ζω and up b = ζω − τ (τ the torque that the string takes), and the bottom taken
-for anything that answers linearly, b(t) = ∫ r(x) a(t − x) dx,
+The motion of the motor runs down the string as a wave. For the round-trip time 2L/v the string acts only as the
+resistance ζ = √(J_s k). The later echo depends on the bit: a mass, collars, new rock, a bit that cuts. The waves at the
+top are a = τ + ζω down and b = ζω − τ up (τ: torque that the string takes). For any bottom with a linear response, b(t)
+= ∫ r(x) a(t − x) dx,
 
     Z = J s + B + ζ (1 − Γ)/(1 + Γ),       Γ(s) = Σ_n r_n e^(−s t_n).
 
-r is not the string's whole echo but what the bottom makes of *one* wave: what runs up and down again and again passes
-the top, whose motion is measured, and is in a. So r is short, whatever the string's damping. It is unknown: next to
-nothing until 0.97 · 2L/v (`_UNEVEN`: pipes are worn, and mud drags along them), and from there anything of the size of
-a full reflection, dying away within 16 s. A dense line spectrum, 1/P apart, sees it over a whole period P. How
-the bit answers is fitted with the rest, and what it scatters by is noise like any other. A bit in stick-slip
-does not answer in this way; its torsional oscillation shows it.
+r is not the whole echo of the string, but the response of the bottom to *one* wave: repeated echoes pass the top, whose
+motion is measured, and are part of a. Therefore r is short, for any damping of the string. It is unknown: nearly 0
+until 0.97 · 2L/v (`_UNEVEN`: pipes are worn, and mud drags along them), and from there up to a full reflection,
+decaying within 16 s. A dense line spectrum, with spacing 1/P, covers a whole period P. The response of the bit is
+fitted too, and its scatter is noise. A bit in stick-slip does not respond linearly; its torsional oscillation shows
+this.
 
-The interval is that of the profile likelihood, over all bottoms and reports. Scatter from period to period counts what
-the string swings on from one period to the next as if it came anew each time (`unleaked`).
+The interval is that of the profile likelihood, over all bottoms and reports. The scatter from period to period would
+count an oscillation that continues from one period to the next as new in each; `unleaked` corrects it.
 """
 
 from __future__ import annotations
@@ -46,23 +46,23 @@ from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine, p
 from tdhil.recording import FloatArray, LagPrior, Pipe, Recording, TorqueAnswer
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The shaft.
+# Shaft of a motor above a string.
 
 
-RESISTANCE, ECHO = 2, 3     # in m: ζ, and the first of r
-_FASTER = 0.97              # of 2L/v: waves may be a little faster than in a smooth pipe of nominal steel
-_FINER, _LATE_FINER = 4.0, 1.4     # instants of r per half a cycle of the fastest line; from _LATE_S on
-_FULL = 1.0                 # of r over half a cycle, about a full reflection at first
-_DIES_S = 5.0               # to 1/e
+RESISTANCE, ECHO = 2, 3     # positions in m of ζ and of the first value of r
+_FASTER = 0.97              # share of 2L/v: waves may be slightly faster than in a smooth pipe of nominal steel
+_FINER, _LATE_FINER = 4.0, 1.4     # instants of r per half a cycle of the fastest line; the second from _LATE_S on
+_FULL = 1.0                 # sd of r over half a cycle at first: about a full reflection
+_DIES_S = 5.0               # s; time constant of the decay of r
 _LATE_S = 3.0             # s after the echo; from then on the instants are farther apart
-_LASTS_S = 16.0           # s after the echo, for which its response is followed
-_UNEVEN = 0.01              # of r before the echo
-_TOP_SHARE = 0.05           # of ζ: the top's own friction
+_LASTS_S = 16.0           # s after the echo; duration of its response
+_UNEVEN = 0.01              # sd of r before the echo
+_TOP_SHARE = 0.05           # sd of the friction at the top, as a share of ζ
 _MOST = 5.0
 
 
 class EchoShaft:
-    """J (kg·m²), B, ζ (N·m·s/rad), r_1 … r_N. Known of it are ζ, to the pipe's tolerance, and how large r may be."""
+    """J (kg·m²), B, ζ (N·m·s/rad), r_1 … r_N. The priors are ζ, to the pipe's tolerance, and the size of r."""
 
     def __init__(self, pipe: Pipe, fastest_hz: float) -> None:
         half_s = 0.5 / fastest_hz
@@ -89,7 +89,7 @@ class EchoShaft:
         return z
 
     def jacobian(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
-        """∂(1 − Γ)/(1 + Γ)/∂Γ = −2/(1 + Γ)²."""
+        """Return the slopes by m; uses ∂(1 − Γ)/(1 + Γ)/∂Γ = −2/(1 + Γ)²."""
         delays = self._delays(s)
         gamma = delays @ m[ECHO:]
         by_gamma = -2.0 * m[RESISTANCE] / (1.0 + gamma) ** 2
@@ -109,7 +109,7 @@ class EchoShaft:
         return self._beliefs @ m - self._believed, self._beliefs
 
     def start(self, inertia: float) -> FloatArray:
-        """(M,): above a bit that is a mass of the string's own weight."""
+        """Return start values (M,) for a bit that is a mass of the string's own weight."""
         zeta, at = self.pipe.impedance_nm_s_rad, self.at_s
         first = int(np.argmin(np.abs(at - 2.0 * self.pipe.delay_s)))
         slow_s = self.pipe.inertia_kg_m2 / zeta
@@ -125,21 +125,22 @@ class EchoShaft:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Scatter of a shaft that swings on.
+# Scatter of a shaft that continues to oscillate.
 #
-# A string keeps swinging from one period into the next, so the error T − G W of a line in one period has the swing at
-# its beginning and at its end in it: a smooth function of frequency, which the next period takes back. In the mean of
-# N periods next to nothing is left of it, in their scatter all. With lines as dense as they can be, 1/P apart, what a
-# Hann window keeps of the scatter, e_k − (e_(k−1) + e_(k+1))/2, is free of what is smooth over k, and for the rest 3/2
-# times as large. Variances of neighbours are averaged: noise changes slowly with frequency, and each has few periods.
+# A string continues to oscillate from one period into the next. The error T − G W of a line in one period then contains
+# the oscillation at its beginning and at its end: a smooth function of frequency, which the next period compensates.
+# The mean of N periods contains nearly nothing of it, their scatter all. With the densest possible lines, spacing 1/P,
+# the part of the scatter that a Hann window keeps, e_k − (e_(k−1) + e_(k+1))/2, has no part that is smooth over k, and
+# is 3/2 times as large for the rest. Variances of neighbours are averaged, because noise changes slowly with frequency
+# and each line has few periods.
 
 
 _NEIGHBOURS = 2           # lines on either side over which a scatter is smoothed
-_SURER = 3.0        # times the degrees of freedom of one line's scatter, so averaged
+_SURER = 3.0        # factor of this averaging on the degrees of freedom of one line's scatter
 
 
 def unleaked(lines: tuple[SpectralLine, ...], fits: tuple[PeriodLines, ...]) -> tuple[SpectralLine, ...]:
-    """The pooled lines of ``fits`` with the scatter that their means have; themselves where they aren't dense."""
+    """Return the pooled lines of ``fits`` with the scatter of their means; unchanged if the lines are not dense."""
     if len(lines) < 2 * _NEIGHBOURS + 1 or any(len(fit.lines_hz) != len(lines) for fit in fits):
         return lines
     steps = np.diff([line.hertz for line in lines])
@@ -163,7 +164,7 @@ def unleaked(lines: tuple[SpectralLine, ...], fits: tuple[PeriodLines, ...]) -> 
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_LAGS_S = ((0.40, 0.15), (0.05, 0.05), (0.15, 0.40))       # to begin with
+_LAGS_S = ((0.40, 0.15), (0.05, 0.05), (0.15, 0.40))       # s; start values of the lags of speed and torque
 _WORDS = ModelWords(
     "a string whose echo may be anything",
     "is the pipe as rig.yaml has it, from the top down to where its section changes?",
@@ -172,8 +173,8 @@ _WORDS = ModelWords(
 
 
 def identify_before_echo(case: PeriodicCase) -> Finding:
-    """J of the motor alone. Raises Refused where the pipe is not known, or the lines don't see the time before the
-    echo.
+    """Return J of the motor alone. Raises Refused for an unknown pipe, or lines that do not resolve the time before
+    the echo.
     """
     pipe, confidence = case.recording.pipe, case.options.confidence
     if pipe is None:
@@ -225,9 +226,9 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
 def problem_of(
     lines: tuple[SpectralLine, ...], pipe: Pipe, prior: LagPrior, answer: TorqueAnswer | None = None
 ) -> Likelihood:
-    """``answer``: the response of the torque, where no lag of it is stated.
+    """Return the likelihood. ``answer``: the response of the torque, used if no lag of it is stated.
 
-    Raises Refused where the lines are too few or too far apart to see an echo apart from what was before it.
+    Raises Refused if the lines are too few, or too far apart to separate an echo from the time before it.
     """
     hertz = [line.hertz for line in lines]
     apart = float(np.max(np.diff(hertz))) if len(hertz) > 1 else math.inf
@@ -258,27 +259,27 @@ def problem_of(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What the torque's report does, from the torque that was commanded.
+# Filter of the torque report, from the commanded torque.
 #
-# Before an echo comes back, J follows from lines at which the reports' filters matter as much as it does: long lags on
-# both reports and a lighter motor look alike, and with nothing known of the filters the interval reaches down to half
-# of J. But what reports the torque can be seen apart from all mechanics. In torque mode the torque is commanded, and a
-# drive's torque loop follows within some milliseconds: how much later and smoother the reported torque is than the
-# commanded one is the report's filter, and the little that drive and bus take (`_OWN_LAG_S`). Its delay says nothing:
-# the bus's is in it.
+# Before an echo returns, J follows from lines at which the filters of the reports matter as much as J. Long lags on
+# both reports look like a lighter motor; with unknown filters the interval reaches down to half of J. The filter of the
+# torque report, however, can be measured without the mechanics. In torque mode the torque is commanded, and a drive's
+# torque loop follows within some milliseconds. The delay and the smoothing of the reported torque relative to the
+# commanded one are then those of the report's filter, with a small part of drive and bus (`_OWN_LAG_S`). The delay
+# itself is not used, because it contains that of the bus.
 
 
-_OWN_LAG_S, _OWN_LAG_SD_S = 0.01, 0.015      # of the torque behind its setpoint: from none to some 40 ms
+_OWN_LAG_S, _OWN_LAG_SD_S = 0.01, 0.015      # s; lag of the torque behind its setpoint: 0 to some 40 ms
 _SHAPE_SD = 0.1
-_ANSWER_MISFIT = 0.01       # of the lines, rms: above it the response is no filter of two poles, and stays unknown
-_LEAST_ANSWER = 0.1         # of the strongest line
+_ANSWER_MISFIT = 0.01       # of the lines, rms: above it the response is not a filter of two poles, and stays unknown
+_LEAST_ANSWER = 0.1         # of the strongest line: weaker lines are not used
 _FOLLOWS = "the drive's torque follows its setpoint within some 40 ms: what its report is late by beyond is its filter"
 
 
 def torque_answer(recording: Recording, commanded_nm: FloatArray) -> TorqueAnswer | None:
     """Return the response of a motion for `identify_before_echo`; ``commanded_nm`` (N,). None if not of two poles.
 
-    A command stood from its cycle on, and a report answers it a cycle later or so: all of that is delay.
+    A command acts from its cycle on, and a report follows about one cycle later; all of this is delay.
     """
     from scipy.optimize import least_squares
 
@@ -311,13 +312,13 @@ def torque_answer(recording: Recording, commanded_nm: FloatArray) -> TorqueAnswe
 # ---------------------------------------------------------------------------------------------------------------------
 
 def echo_shaft(problem: Likelihood) -> EchoShaft:
-    """The shaft of a problem of `problem_of`."""
+    """Return the shaft of a problem from `problem_of`."""
     assert isinstance(problem.model.shaft, EchoShaft)
     return problem.model.shaft
 
 
 def fit_before_echo(problem: Likelihood, prior: LagPrior) -> FittedModel:
-    """Raises Refused where the arithmetic breaks down."""
+    """Return the fit. Raises Refused if the arithmetic fails."""
     model, shaft = problem.model, echo_shaft(problem)
     moved = model.mechanical - Model().mechanical
     fixed = {index + moved: value for index, value in known_structure(prior).items()}
@@ -336,13 +337,13 @@ def fit_before_echo(problem: Likelihood, prior: LagPrior) -> FittedModel:
 
 
 def _apparent_inertia(lines: tuple[SpectralLine, ...]) -> float:
-    """|T/(ω W)| where the motor turns all but alone: of the faster half of the lines."""
+    """Return the median |T/(ω W)| of the faster half of the lines, at which the string has little effect; kg·m²."""
     upper = lines[len(lines) // 2 :]
     return float(np.median([abs(np.mean(line.torque / line.speed)) / (2.0 * np.pi * line.hertz) for line in upper]))
 
 
 def residual_of(fitted: FittedModel) -> ResidualTest | None:
-    """Return the test of the lines alone, less the fitted parameters: a prior on the echo is no measurement."""
+    """Return the test of the lines alone, less the fitted parameters: a prior on the echo is not a measurement."""
     from scipy.special import chdtrc
 
     problem, theta = fitted.problem, fitted.whole.theta
@@ -356,14 +357,14 @@ def residual_of(fitted: FittedModel) -> ResidualTest | None:
     return ResidualTest(statistic, left, float(chdtrc(left, statistic))) if left >= 1.0 else None
 
 
-_GRID_S = 0.25            # s; step of the search for a period in the rest
+_GRID_S = 0.25            # s; step of the search for a period in the residual torque
 _LOOKED_AT_S = 300.0      # s; longest part of a segment in this search
 
 
 def refuse_stick_slip(case: PeriodicCase) -> None:
-    """Raise Refused, with period and size, where the motor swings besides as above a bit that sticks and slips.
+    """Raise Refused, with period and size, if the motor also oscillates as above a bit in stick-slip.
 
-    The torque that is left over turns it, J ω. What stick-slip adds to the lines makes their J too small, if anything.
+    The residual torque moves it, by J ω. Stick-slip makes the J of the lines too small, if it has an effect.
     """
     pipe = case.recording.pipe
     if pipe is None or not case.every:

@@ -1,4 +1,4 @@
-"""The verdict on a shaft that is not rigid: what stands, why, and what the run could not tell."""
+"""Verdict on a shaft that is not rigid: the selected model, the reason, and what the run could not determine."""
 
 import math
 from collections.abc import Mapping
@@ -66,39 +66,42 @@ from tdhil.estimation.spectrum import SpectralLine
 from tdhil.recording import Pipe
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Two masses, or the string? The simplest that the residuals allow stands; models that fit alike widen the interval.
+# Selection between two masses and a string: the simplest model that the residuals allow; equal fits widen the interval.
 #
-# Two masses are a string that weighs nothing. A light string is, to first order in its weight, two masses with other
-# shares of the same total: a third of it seems to turn with the motor. Only its second swing, near one half of the
-# wave's frequency 1/T, tells. So where two masses explain the data, J_r and J_L are theirs, but their intervals hold
-# whatever string the data do not contradict (`result_of`; one whose lowest swing the lines can see, `too_slow`);
-# J_r + J_L is the same in both. Only who says ``--model two-mass`` takes the spring's weight for nothing.
+# Two masses are a string without weight. A light string is, to first order in its weight, two masses with different
+# shares of the same total: a third of it seems to turn with the motor. Only its second oscillation, near half of the
+# wave's frequency 1/T, distinguishes them. If two masses explain the data, J_r and J_L are theirs, but their intervals
+# also contain every string that the data do not contradict (`result_of`; for one whose lowest oscillation the lines can
+# resolve, `too_slow`). J_r + J_L is the same in both. Only with ``--model two-mass`` the weight of the spring is
+# assumed to be 0.
 #
-# So little is lost by holding on to two masses too long, and J_r moves by the weight of the string if they are given up
-# too early: the string must gain what would be as unlikely by chance as residuals that reject a model (χ²(1); half of
-# that at the bound η = 0), each model with the structure of lags that it does best with.
+# The error is small if two masses are kept too long. If they are given up too early, J_r changes by the weight of the
+# string. The gain of the string must therefore be as improbable by chance as residuals that reject a model (χ²(1); half
+# of that at the bound η = 0). Each model has the structure of lags that fits it best.
 
 
-_DOUBT = 0.3                 # of the residual test's p, above which a rigid shaft isn't doubted
-_MUCH = 9.0                  # of −2 ln L, for one parameter more than the rigid shaft's lags have
-_REPORTS = 3                 # unknown besides the shaft: two lags and the skew
-_BY_PIPE = 2                 # known where the pipe is: its inertia and its stiffness
-_SIGNIFICANT = 25.0          # |mean|² over its variance, as `SpectralLine.excited`
-_LEAST_LOAD = 0.01           # of the total: less hangs on one line's error
-_ANY_IMPEDANCE = 1.0         # relative sd of ζ that leaves it to the data
+_DOUBT = 0.3                 # p of the residual test above which a rigid shaft is not in doubt
+_MUCH = 9.0                  # gain of −2 ln L, for one parameter more than the lags of the rigid shaft have
+_REPORTS = 3                 # unknowns besides the shaft: two lags and the skew
+_BY_PIPE = 2                 # parameters known with a known pipe: its inertia and its stiffness
+_SIGNIFICANT = 25.0          # |mean|² over its variance, as in `SpectralLine.excited`
+_LEAST_LOAD = 0.01           # of the total: a smaller load depends on the error of one line
+_ANY_IMPEDANCE = 1.0         # relative sd of ζ, so wide that the data decide
 _PIPE_RATIOS = (0.75, 1.33)
-"""Allowed ratios of ζ to that of the pipe, if the waves have the pipe's travel time. G of 61 instead of 79 GPa gives
-0.88; worn pipe and the torque scale change it by a tenth. A ratio beyond means a wrong scale or a wrong section."""
-_NEAR = (SLOWEST_SEEN, 2.0)  # where a swing can be seen, of the lowest and the highest line
+"""Allowed ratios of ζ to that of the pipe, for waves with the pipe's travel time. G of 61 instead of 79 GPa gives
+0.88; worn pipe and the torque scale change the ratio by a tenth. A ratio outside means a wrong scale or a wrong
+section."""
+_NEAR = (SLOWEST_SEEN, 2.0)  # visible oscillations: multiples of the lowest and the highest line
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """``fit`` stands, or was the last to be tried if ``rejected``; ``beside``: the string, where two masses stand.
+    """Selected model. ``fit``: selected, or the last one tried if ``rejected``; ``beside``: the string beside two
+    masses.
 
-    ``pipe``: the fit takes the pipe for what its sizes say; ``other_pipe``: it doesn't, since the data contradict them.
-    ``unlike_hz``: of lines that the mean speeds differ at, and that count by that difference.
-    ``impedance_ratio``: of the string to the pipe, where that alone is what contradicts the pipe.
+    ``pipe``: the fit uses the stated sizes of the pipe; ``other_pipe``: it does not, because the data contradict them.
+    ``unlike_hz``: lines that differ between the mean speeds, weighted by that difference. ``impedance_ratio``: of the
+    string to the pipe, if only this ratio contradicts the pipe.
     """
 
     fit: CompliantFit
@@ -111,9 +114,9 @@ class Chosen:
 
 
 def usable_lines(every: tuple[SpectralLine, ...], least_nu: float) -> tuple[SpectralLine, ...]:
-    """Lines where speed or torque stands clear of its scatter: at a resonance one of them all but vanishes.
+    """Return the lines with speed or torque clear of its scatter: at a resonance one of the two nearly vanishes.
 
-    The likelihood treats both alike, so either will do.
+    The likelihood treats both in the same way, so one is enough.
     """
     return tuple(line for line in every if line.nu >= least_nu and _clear(line))
 
@@ -128,8 +131,8 @@ def _clear(line: SpectralLine) -> bool:
 class _LoadWalk:
     """State of the walk over the rows of the load.
 
-    ``near``: two masses fitted beside a pipe that is ``contradicted``; ``two``: two masses, where they are tried;
-    ``counted``: by the difference of the mean speeds already.
+    ``near``: two masses fitted beside a pipe that is ``contradicted``. ``two``: two masses, if they are tried.
+    ``counted``: lines are already weighted by the difference of the mean speeds.
     """
 
     asked: str
@@ -150,14 +153,14 @@ class _LoadWalk:
         return shaft_model(self.asked)
 
     def countable(self, model: ShaftModel, known: int = 0) -> bool:
-        """Do the lines give as many equations as this shaft has unknowns?"""
+        """Return whether the lines give as many equations as this shaft has unknowns."""
         return _refuse_count(model, self.lines, self.constraint, self.priors, known) is None
 
     def fitted(self, shaft: Shaft, near: CompliantFit | None = None) -> CompliantFit:
         return fit_compliant(shaft, self.lines, self.constraint, self.priors, self.fixed, near)
 
     def with_pipe(self, pipe: Pipe | None) -> "_LoadWalk":
-        """Return the walk with this pipe; it has ended if the lines are too few for the simplest shaft then."""
+        """Return the walk with this pipe; it has ended if the lines are then too few for the simplest shaft."""
         simplest = self.model if self.model.compliant is not None else (
             STRING if self.is_string and pipe is None else TWO_MASS)
         refusal = _refuse_count(simplest, self.lines, self.constraint, self.priors)
@@ -169,9 +172,9 @@ def choose(
     priors: tuple[GaussianPrior, ...],
     fixed: Fixed, pipe: Pipe | None = None, is_string: bool = False
 ) -> Chosen | Refusal:
-    """Walk the rows of the load (`tdhil.estimation.candidates`). ``asked``: the name of the requested model; ``priors``
-    and ``fixed`` as with a rigid shaft. ``is_string``: rig.yaml declares a string, so two masses never stand without
-    the string beside them.
+    """Walk the rows of the load (`tdhil.estimation.candidates`). ``asked``: the name of the requested model;
+    ``priors`` and ``fixed`` as with a rigid shaft. ``is_string``: rig.yaml declares a string, so two masses never
+    stand without the string beside them.
     """
     return _chosen_of(_LoadWalk(asked, lines, constraint, priors, fixed, pipe, is_string))
 
@@ -183,7 +186,7 @@ def _chosen_of(begin: _LoadWalk) -> Chosen | Refusal:
 
 
 def _try_pipe(standing: _LoadWalk) -> _LoadWalk:
-    """Hold the string to the known pipe. If the data contradict it, the other rows are tried without it."""
+    """Fit the string with the known pipe. If the data contradict it, the other rows are tried without it."""
     assert standing.pipe is not None
     near = standing.fitted(TwoMassShaft())
     known = standing.fitted(KnownStringShaft(standing.pipe), near)
@@ -200,7 +203,7 @@ def _try_requested(standing: _LoadWalk) -> _LoadWalk:
 
 def _try_two_masses(standing: _LoadWalk) -> _LoadWalk:
     two = standing.fitted(TwoMassShaft())
-    if two.residual is None:      # a shaft taken in place of one that was contradicted must be one that could be, too
+    if two.residual is None:      # a shaft that replaces a contradicted one must be testable too
         refusal = Refusal(
             f"{len(standing.lines)} excited lines leave nothing to test two masses on a spring with",
             "excite more lines about two mean speeds, from well below the resonance to well above it",
@@ -211,7 +214,7 @@ def _try_two_masses(standing: _LoadWalk) -> _LoadWalk:
 
 
 def _try_string(standing: _LoadWalk) -> _LoadWalk:
-    """Fit the string; it stands beside two masses that the data allow and that it does not outdo."""
+    """Fit the string; it stands beside two masses that the data allow and that it does not clearly exceed."""
     two = standing.chosen.fit if isinstance(standing.chosen, Chosen) else None
     string = standing.fitted(StringShaft(), two)
     if two is not None and not rejects(two.residual) and not _outdoes(string, two):
@@ -220,7 +223,7 @@ def _try_string(standing: _LoadWalk) -> _LoadWalk:
 
 
 def _try_scaled_pipe(standing: _LoadWalk) -> _LoadWalk:
-    """Compare the impedance of a string that has the travel time of the contradicted pipe with that of the pipe."""
+    """Compare the impedance of a string with the travel time of the contradicted pipe to that of the pipe."""
     assert standing.pipe is not None and isinstance(standing.chosen, Chosen)
     scaled = KnownStringShaft(standing.pipe, _ANY_IMPEDANCE)
     fit = standing.fitted(scaled, standing.near)
@@ -231,21 +234,21 @@ def _try_scaled_pipe(standing: _LoadWalk) -> _LoadWalk:
         standing, chosen=replace(standing.chosen, other_pipe=True, impedance_ratio=ratio if found else None))
 
 
-# Where the motor all but stands still the load swings widest, faster than the mean speed it may be. Its dry friction
-# then changes sign twice a period at the slower mean speed and never at the faster one: 30 N·m of it at the end of a
-# string made T/ω of that line differ by 15 %, and of its harmonics by less, and a sound shaft was rejected for it. Such
-# a line hardly tells J_r (it is the motor that stands still), but where the swing lies. So where no shaft that swings
-# is allowed, and the line by the swing differs from one mean speed to another beyond its scatter, lines that differ
-# count by their difference instead, which with two mean speeds is a variance on one complex degree of freedom. All
-# others, half of the lines at least, must fit as ever.
+# Near the antiresonance the motor nearly stands still and the load oscillates most, possibly faster than the mean
+# speed. Its dry friction then changes sign twice a period at the slower mean speed, but never at the faster one. In one
+# case 30 N·m of it at the end of a string changed T/ω of that line by 15 %, and that of its harmonics by less, and a
+# correct shaft was rejected. Such a line has little information about J_r (the motor stands still), but shows the
+# frequency of the oscillation. Therefore, if no oscillating shaft is allowed, and this line differs between mean speeds
+# beyond its scatter, the lines that differ are weighted by their difference, which with two mean speeds is a variance
+# on one complex degree of freedom. All others, at least half of the lines, must fit as usual.
 
 
-_BY_THE_SWING = 0.1          # of its frequency
-_LEAST_NU = 2.0              # complex degrees of freedom of a difference, at least: the likelihood's tails need them
+_BY_THE_SWING = 0.1          # of its frequency: distance of the line from the oscillation
+_LEAST_NU = 2.0              # least complex degrees of freedom of a difference: the tails of the likelihood need them
 
 
 def _try_by_difference(standing: _LoadWalk) -> _LoadWalk:
-    """Choose again, with lines that count by how the mean speeds differ."""
+    """Select again, with lines weighted by the difference between the mean speeds."""
     assert isinstance(standing.chosen, Chosen)
     lines = standing.lines
     swing_hz = float(standing.chosen.fit.mechanical[SWING]) / (2.0 * math.pi)
@@ -276,7 +279,7 @@ _TRIALS: Mapping[str, ModelTrial[_LoadWalk]] = {
 
 
 def _by_difference(line: SpectralLine) -> SpectralLine:
-    """With the scatter that the segments' T/ω have between them, where that is beyond the scatter of their periods."""
+    """Return the line with the scatter of T/ω between the segments, if it exceeds the scatter between their periods."""
     weight = line.periods * np.abs(line.speed) ** 2
     g = complex(np.sum(line.periods * line.torque * line.speed.conj()) / np.sum(weight))
     apart = float(np.sum(line.periods * np.abs(line.torque - g * line.speed) ** 2))
@@ -292,16 +295,18 @@ def _by_difference(line: SpectralLine) -> SpectralLine:
 
 
 def _outdoes(string: CompliantFit, two: CompliantFit) -> bool:
-    """Return whether the string gains more on two masses than chance gives a parameter.
+    """Return whether the gain of the string over two masses is more than one parameter gains by chance.
 
-    Each with the structure of lags that it needs: two masses may bend filters of two poles and averages into what a
-    string does behind plain lags, and those parameters are counted.
+    Each model has the structure of lags that it needs: with filters of two poles and averages, two masses may imitate a
+    string with first-order lags. These parameters are counted.
     """
     return _likeliest(two) - _likeliest(string) > chance_gain()
 
 
 def _likeliest(fit: CompliantFit) -> float:
-    """−2 ln L of first-order lags, or of the whole family with Schwarz's price for its structure (`filter_order`)."""
+    """Return −2 ln L with first-order lags, or of the whole family plus Schwarz's penalty for its structure
+    (`filter_order`).
+    """
     fitted = fit.fitted
     price = len([index for index in fitted.problem.model.structure if index not in fitted.fixed])
     rise = excess_rise(fitted.problem, len(fitted.free))
@@ -310,12 +315,12 @@ def _likeliest(fit: CompliantFit) -> float:
 
 
 def may_swing(rigid: RigidResult) -> bool:
-    """Should another shaft be tried? Where the rigid one is rejected; and where a load that swings behind first-order
-    lags explains the data much better than the lags of a rigid shaft do, whatever their structure.
+    """Return whether another shaft is tried: if the rigid one is rejected, or if an oscillating load with first-order
+    lags explains the data much better than a rigid shaft with any lags.
 
-    A resonance just above the band bends the lines as filters of two poles would, and may pass the residual test, at
-    the price of an inertia far too low. Looked into only where first-order lags don't do and the test is in doubt:
-    a rigid shaft with plain lags pays nothing for it.
+    A resonance just above the band changes the lines as filters of two poles would, and may pass the residual test with
+    an inertia far too low. This is checked only if first-order lags do not suffice and the test is in doubt; a rigid
+    shaft with first-order lags is not affected.
     """
     fitted, problem = rigid.fitted, rigid.fitted.problem
     if rejects(rigid.residual):
@@ -332,22 +337,23 @@ def may_swing(rigid: RigidResult) -> bool:
 
 
 def plausible(fit: CompliantFit) -> bool:
-    """Return whether the lines see a swing, rather than one bad line explained by a load of its own."""
+    """Return whether the lines show an oscillation, and not just one bad line explained by a load."""
     omega = np.abs(fit.fitted.problem.s)
     m = fit.mechanical
     near = _NEAR[0] * float(np.min(omega)) <= m[SWING] <= _NEAR[1] * float(np.max(omega))
     return bool(near and m[LOAD] >= _LEAST_LOAD * (m[INERTIA] + m[LOAD]))
 
 
-# Where rig.yaml declares a string, a string hangs on the shaft whatever the residuals allow. Filters of two poles and
-# averages that no manual states let a rigid shaft explain what a string does to few lines: of 58 random strings and
-# two-mass shafts, identified with four lines, 14 intervals held neither the motor's inertia nor, some of them, that of
-# all that turns. So a rigid shaft stands only where there are lines enough to test a string, first-order lags explain
-# them, and no string that swings in sight tells the motor's inertia: then all turns as one, and the result says so.
+# If rig.yaml declares a string, a string hangs on the shaft for any residuals. With undocumented filters of two poles
+# and averages, a rigid shaft can explain the effect of a string on few lines. Of 58 random strings and two-mass shafts,
+# identified with four lines, 14 intervals contained neither the motor's inertia nor, for some, the total inertia. A
+# rigid shaft is therefore accepted only if there are enough lines to test a string, first-order lags explain them, and
+# no string with a visible oscillation gives the motor's inertia. Then everything turns as one, and the result states
+# this.
 
 
 def _turns_as_one(fit: CompliantFit) -> bool:
-    """Return whether the load in the fit is negligible, or swings too fast for the lines."""
+    """Return whether the load in the fit is negligible, or oscillates too fast for the lines."""
     m = fit.mechanical
     light = m[LOAD] < _LEAST_LOAD * (m[INERTIA] + m[LOAD])
     return bool(light or m[SWING] > _NEAR[1] * float(np.max(np.abs(fit.fitted.problem.s))))
@@ -360,7 +366,9 @@ def _refuse_count(
     priors: tuple[GaussianPrior, ...],
     known: int = 0,
 ) -> Refusal | None:
-    """Equations and unknowns, as `rigid.refuse_count` has them for a rigid shaft; ``known`` of the load."""
+    """Return the refusal if equations are fewer than unknowns, as `rigid.refuse_count`; ``known``: known values of
+    the load.
+    """
     assert model.compliant is not None
     equations = 2 * len(lines) + (constraint is not None) + len(priors) + known
     unknowns = len(model.compliant().names) + _REPORTS
@@ -376,14 +384,15 @@ def _refuse_count(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a compliant shaft's fit says in the end: J_r, J_L, k and the rest, with intervals; their budget.
+# Results of a compliant shaft's fit: J_r, J_L, k and the other parameters, with intervals and their budget.
 
 
 @dataclass(frozen=True)
 class CompliantResult:
-    """``inertia``: J_r, infinite on a side that the data leave open. ``viscous``, ``coulomb``: of both ends.
+    """Result of a compliant shaft. ``inertia``: J_r, infinite on a side that the data leave open. ``viscous``,
+    ``coulomb``: of both ends.
 
-    ``by_model``: nothing widens it more than a string that isn't excluded beside two masses.
+    ``by_model``: the largest contribution to the interval is a string that the data do not exclude beside two masses.
     """
 
     inertia: Estimate
@@ -398,7 +407,7 @@ class CompliantResult:
 
 
 def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_rel_sd: float) -> CompliantResult:
-    """Return the intervals of the model that stands; those of two masses also hold the values of a string."""
+    """Return the intervals of the selected model; those of two masses also contain the values of a string."""
     alone = intervals(chosen.fit, confidence)
     fixed = alone if chosen.beside is None else _united(alone, inertias(chosen.beside, confidence))
     speed_lag, torque_lag, skew = lags_of(chosen.fit.fitted, confidence)
@@ -429,7 +438,7 @@ def _unless_open(one: Estimate) -> Estimate | None:
 
 
 def _united(one: CompliantIntervals, others: dict[str, Estimate]) -> CompliantIntervals:
-    """The values of ``one``, and all that either holds."""
+    """Return the values of ``one``, with intervals that cover ``one`` and ``others``."""
     fixed = {}
     for name, other in others.items():
         own: Estimate = getattr(one, name)
@@ -438,7 +447,7 @@ def _united(one: CompliantIntervals, others: dict[str, Estimate]) -> CompliantIn
 
 
 def _coulomb(levels: Levels, fit: CompliantFit, fixed: CompliantIntervals, confidence: float) -> Estimate | None:
-    """Dry friction of both ends, from the levels: it is in the mean torque only."""
+    """Return the Coulomb friction of both ends, from the levels: it is in the mean torque only."""
     if len(levels.speed) == 0 or levels.dof < 1.0 or levels.direction == 0.0:
         return None
     fitted = fit.fitted
@@ -450,8 +459,8 @@ def _coulomb(levels: Levels, fit: CompliantFit, fixed: CompliantIntervals, confi
 
 
 def _budget(fit: CompliantFit, alone: Estimate, fixed: Estimate, confidence: float) -> tuple[BudgetLine, ...]:
-    """Return the budget as `budget_of` does for a rigid shaft: one group after another is set free, each with its share
-    in squares; the shaft's model is the last.
+    """Return the budget, as `budget_of` for a rigid shaft: one group after another is freed, and adds in quadrature;
+    the model of the shaft is the last.
     """
     at = fit.fitted.problem.model.at
     lags, timing = (at(signal_filters.SPEED_LAG), at(signal_filters.TORQUE_LAG)), (at(signal_filters.SKEW),)
@@ -495,9 +504,9 @@ _WHICH = (
 def identify_compliant(
     case: PeriodicCase, rigid: Finding | Refusal | None = None, plain_lags: bool = False
 ) -> Finding | Refusal:
-    """Two masses or the string. ``rigid``: what was found of a rigid shaft that the data contradict or throw doubt on,
-    or whose load is declared a string, under auto; it stands where no other shaft does better. ``plain_lags``: behind
-    first-order lags it explains the data.
+    """Identify two masses or the string. ``rigid``: finding of a rigid shaft that the data contradict or doubt, or
+    whose load is declared a string, under auto; it is kept if no other shaft is better. ``plain_lags``: it explains
+    the data with first-order lags.
     """
     told = None
     contradicted = rigid if isinstance(rigid, Finding) and rigid.rejected else None
@@ -527,7 +536,7 @@ def identify_compliant(
         return _stands(chosen, told, case, rigid)
     if is_string:
         return (rigid if plain_lags else None) or _UNSEEN
-    # a rigid shaft that is only doubted gives a number, which would be wrong: see `may_swing`
+    # a rigid shaft that is only in doubt gives a number, which would be wrong: see `may_swing`
     return rigid if isinstance(rigid, Refusal) else contradicted or _OPEN
 
 
@@ -540,7 +549,7 @@ def _chosen(case: PeriodicCase) -> Chosen | Refusal:
 
 
 def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Finding | Refusal | None) -> Finding:
-    """Return the finding of a shaft that stands; without J where only the sum of both inertias is known."""
+    """Return the finding of a selected shaft, without J if only the sum of both inertias is known."""
     fit = chosen.fit
     name = name_of(fit, case.options.model)
     finding = Finding(
@@ -563,7 +572,7 @@ def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Fi
     elif rigid is not None and not case.recording.winds_up:
         finding = replace(finding, remark=", much better than the lags of a rigid shaft do")
     if chosen.impedance_ratio is not None:
-        # a J that does not stand gets no further figures, as where the residuals contradict the model
+        # a J that does not stand gets no further figures, as for residuals that contradict the model
         return Finding(name, finding.words, fit.residual, lines=finding.lines, curve=finding.curve,
                        contradiction=_pipe_contradiction(chosen.impedance_ratio))
     if told.inertia.bounded:
@@ -599,7 +608,7 @@ def _together(total: Estimate | None) -> str:
 
 
 def name_of(fit: CompliantFit, asked: str) -> str:
-    """Return the name as in ``--model``: the requested model, or the one of the two candidates that stands."""
+    """Return the name as in ``--model``: the requested model, or the one of the two candidates that was selected."""
     if shaft_model(asked).compliant is not None:
         return asked
     return "string" if fit.is_string else "two-mass"

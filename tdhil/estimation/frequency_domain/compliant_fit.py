@@ -1,4 +1,4 @@
-"""A compliant shaft fitted to lines, and the intervals of what is asked of it."""
+"""Fit of a compliant shaft to spectral lines, and the intervals of the requested quantities."""
 
 import math
 from collections.abc import Callable
@@ -30,33 +30,34 @@ from tdhil.estimation.spectrum import ComplexArray, SpectralLine
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Where the descents of a compliant shaft begin: linear least squares over a grid of resonances.
+# Start values for a compliant shaft: linear least squares over a grid of resonances.
 #
-# Given how the load swings, what hangs below the motor is J_L H(s) with a known H, and behind first-order lags and a
-# skew d the equation of a line, Z = J_r s + B + J_L H, is linear: with T' = T e^(ds),
+# For a given oscillation of the load, the shaft below the motor is J_L H(s) with a known H. With first-order lags and a
+# skew d, the equation of a line, Z = J_r s + B + J_L H, is linear: with T' = T e^(ds),
 #
 #     T' = (J_r τ_w) s² W + (J_r + B τ_w) s W + B W + (J_L τ_w) s H W + J_L H W − τ_T s T',
 #
-# six real unknowns. τ_w is then the ratio of the quadratic terms to the linear ones. The swing lies on a grid over
-# the band and around it, with little damping and with much; the string's share of the load on another.
+# with six real unknowns. τ_w is then the ratio of the quadratic terms to the linear ones. The oscillation lies on a
+# grid over the band and around it, with little and with much damping. The string's share of the load lies on another
+# grid.
 #
-# No line may count for more than the grid's coarseness allows: with errors as small as they are, a resonance off by
-# some per cent is as wrong as none. So the lines are first taken for less exact than they are; the best of the grid
-# are brought down there, where the valleys are wide, and the best of those is where the real descents begin.
+# No line may have more weight than the coarse grid allows: with errors as small as they are, a resonance that is wrong
+# by some per cent fits as badly as none. Therefore the lines first get larger errors. The best starts of the grid are
+# minimised with these, where the valleys are wide, and the best results are the starts of the real descents.
 
 
 _PER_OCTAVE = 24
-_BEYOND = (0.6, 2.0)                     # the grid's ends, of the lowest and highest line
-_RATIOS = (0.01, 0.1)                    # damping, of critical
+_BEYOND = (0.6, 2.0)                     # ends of the grid, as multiples of the lowest and highest line
+_RATIOS = (0.01, 0.1)                    # damping ratios of the grid, of critical damping
 _SHARES = (0.08, 0.15, 0.22, 0.3, 0.38, 0.46, 0.55, 0.65, 0.8, 1.0)
 _SKEWS = (-0.05, 0.0, 0.05)
-_BLUR = 0.08                             # relative error that every line is given
-_ALIKE = (0.15, 0.12)                    # octaves of swing, share of the string
+_BLUR = 0.08                             # relative error that is assumed for every line
+_ALIKE = (0.15, 0.12)                    # octaves of the oscillation, share of the string: closer starts are equal
 _TRIED, _KEPT = 24, 5
 
 
 def compliant_starts(problem: Likelihood, fixed: Fixed) -> list[FloatArray]:
-    """The most promising theta, (P,) each; for `TwoMassShaft` and `StringShaft`."""
+    """Return the most promising theta, (P,) each; for `TwoMassShaft` and `StringShaft`."""
     lines = tuple(
         replace(line, s_tt=line.s_tt + _BLUR**2 * float(np.mean(np.abs(line.torque) ** 2 * line.periods)))
         for line in problem.lines
@@ -69,7 +70,7 @@ def compliant_starts(problem: Likelihood, fixed: Fixed) -> list[FloatArray]:
 
 
 def _proposals(problem: Likelihood) -> list[FloatArray]:
-    """Return the best of every neighbourhood of the grid, in rising misfit."""
+    """Return the best point of every neighbourhood of the grid, in order of misfit."""
     shapes = _shapes(problem)
     hung = np.array([problem.model.shaft.impedance(shape, problem.s) for shape in shapes])[:, problem.owner]
     solved = [_solved(problem, hung, skew) for skew in _SKEWS]
@@ -90,7 +91,7 @@ def _proposals(problem: Likelihood) -> list[FloatArray]:
 
 
 def _shapes(problem: Likelihood) -> list[FloatArray]:
-    """Mechanical parameters of nothing but a load of 1 kg·m², swinging in every way of the grid."""
+    """Return mechanical parameters with only a load of 1 kg·m², for every oscillation of the grid."""
     omega = np.abs(problem.s)
     low, high = _BEYOND[0] * float(np.min(omega)), _BEYOND[1] * float(np.max(omega))
     swings = np.geomspace(low, high, max(2, round(_PER_OCTAVE * np.log2(high / low))))
@@ -112,7 +113,9 @@ def _alike(one: FloatArray, other: FloatArray) -> bool:
 
 
 def _solved(problem: Likelihood, hung: ComplexArray, skew: float) -> tuple[FloatArray, FloatArray]:
-    """Misfit (H,) and unknowns (H, 6) for every shape; ``hung`` (H, N): its H(s) at every observation."""
+    """Return misfit (H,) and unknowns (H, 6) for every shape; ``hung`` (H, N): H(s) of each shape at every
+    observation.
+    """
     w, s = problem.speed, problem.s[problem.owner]
     lines = len(problem.s)
     ratio = problem.torque / w
@@ -132,7 +135,7 @@ def _solved(problem: Likelihood, hung: ComplexArray, skew: float) -> tuple[Float
 
 
 def _theta(problem: Likelihood, shape: FloatArray, x: FloatArray, skew: float) -> FloatArray | None:
-    """The unknowns as parameters; None where an inertia comes out negative."""
+    """Return the unknowns as parameters; None if an inertia is negative."""
     quadratic, linear, viscous, torque_lag, load_late, load = (float(value) for value in x)
     size = linear**2 + load**2
     speed_lag = (quadratic * linear + load_late * load) / size if size > 0.0 else 0.0
@@ -154,16 +157,18 @@ def _theta(problem: Likelihood, shape: FloatArray, x: FloatArray, skew: float) -
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The same shaft with one of its parameters replaced by a derived quantity: the total inertia, the stiffness, a
-# resonance. Its interval is then a profile like any other (`inference.estimate`), bounds and curved valleys included.
+# The same shaft with one parameter replaced by a derived quantity: total inertia, stiffness, or a resonance. Its
+# interval is then a profile like any other (`inference.estimate`), with bounds and curved valleys.
 #
-# The parameter m_i gives way to u with m_i = h(u, the others); the rest keep their places. By the chain rule
-# ∂Z/∂u = ∂Z/∂m_i ∂h/∂u, and every other slope gains ∂Z/∂m_i ∂h/∂m_j.
+# The parameter m_i is replaced by u, with m_i = h(u, the others); the others keep their places. By the chain rule ∂Z/∂u
+# = ∂Z/∂m_i ∂h/∂u, and every other slope gets the additional term ∂Z/∂m_i ∂h/∂m_j.
 
 
 @dataclass(frozen=True)
 class ParameterView:
-    """``of`` m: what takes the place of m[index]; ``back`` from m with it there: (m[index], its gradient (M,))."""
+    """Replacement of one parameter. ``of`` m: the quantity in place of m[index]; ``back``: (m[index], its gradient
+    (M,)).
+    """
 
     index: int
     of: Callable[[FloatArray], float]
@@ -171,7 +176,7 @@ class ParameterView:
 
 
 def _light(m: FloatArray) -> float:
-    """1 − 2η/3, the share of the load that swings (`shafts.py`); 1 of two lumps."""
+    """Return 1 − 2η/3, the share of the load that oscillates (`shafts.py`); 1 for two lumps."""
     return 1.0 - 2.0 / 3.0 * float(m[STRING_SHARE]) if len(m) > STRING_SHARE else 1.0
 
 
@@ -182,7 +187,7 @@ def _total_back(m: FloatArray) -> tuple[float, FloatArray]:
 
 
 def _stiffness_back(m: FloatArray) -> tuple[float, FloatArray]:
-    """ω_a = √(k/(J_L (1 − 2η/3)))."""
+    """Return ω_a = √(k/(J_L (1 − 2η/3))), rad/s, and its gradient."""
     swing = math.sqrt(max(float(m[SWING]), 1e-300) / (float(m[LOAD]) * _light(m)))
     slope = np.zeros(len(m))
     slope[SWING], slope[LOAD] = 0.5 * swing / max(float(m[SWING]), 1e-300), -0.5 * swing / float(m[LOAD])
@@ -192,7 +197,7 @@ def _stiffness_back(m: FloatArray) -> tuple[float, FloatArray]:
 
 
 def _resonance_back(m: FloatArray) -> tuple[float, FloatArray]:
-    """ω_a = Ω/√(1 + J_L/J_r)."""
+    """Return ω_a = Ω/√(1 + J_L/J_r), rad/s, and its gradient."""
     motor, load = float(m[INERTIA]), float(m[LOAD])
     swing = float(m[SWING]) / math.sqrt(1.0 + load / motor)
     slope = np.zeros(len(m))
@@ -203,13 +208,14 @@ def _resonance_back(m: FloatArray) -> tuple[float, FloatArray]:
 
 
 def string_view(exponent: float) -> ParameterView:
-    """View of a string's z = ζ T^(−exponent), with ζ = √(J_s k) and the travel time T = √(J_s/k), in place of J_L.
+    """Return the view with a string's z = ζ T^(−exponent) in place of J_L; ζ = √(J_s k), travel time T = √(J_s/k).
 
-    −1 is J_s, 0 is ζ, 1 is k. With J_s = η J_L and k = ω_a² J_L (1 − 2η/3), z is J_L times a factor of ω_a and η.
+    An exponent of −1 gives J_s, 0 gives ζ, 1 gives k. With J_s = η J_L and k = ω_a² J_L (1 − 2η/3), z is J_L times a
+    factor of ω_a and η.
     """
 
     def factor(m: FloatArray) -> tuple[float, float, float]:
-        """(z/J_L, ∂ln/∂ω_a, ∂ln/∂η)."""
+        """Return (z/J_L, ∂ln/∂ω_a, ∂ln/∂η)."""
         share, swing, light = max(float(m[STRING_SHARE]), _LIGHTEST), float(m[SWING]), _light(m)
         value = swing ** (1.0 + exponent) * math.sqrt(share * light) * (share / light) ** (-0.5 * exponent)
         of_light = -2.0 / 3.0 / light
@@ -225,14 +231,14 @@ def string_view(exponent: float) -> ParameterView:
     return ParameterView(LOAD, lambda m: float(m[LOAD]) * factor(m)[0], back)
 
 
-_LIGHTEST = 1e-6     # η of a string that weighs nothing
+_LIGHTEST = 1e-6     # η of a string with negligible weight
 TOTAL = ParameterView(INERTIA, lambda m: float(m[INERTIA] + m[LOAD]), _total_back)
 STIFFNESS = ParameterView(SWING, lambda m: float(m[SWING] ** 2 * m[LOAD] * _light(m)), _stiffness_back)
 RESONANCE = ParameterView(SWING, lambda m: float(m[SWING] * math.sqrt(1.0 + m[LOAD] / m[INERTIA])), _resonance_back)
 
 
 class ViewedShaft:
-    """A compliant shaft through a view."""
+    """Compliant shaft with one parameter replaced by a view."""
 
     def __init__(self, inner: Shaft, view: ParameterView) -> None:
         self.inner, self.view = inner, view
@@ -266,7 +272,7 @@ class ViewedShaft:
         return scales
 
     def beliefs(self, m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the prior residuals of the inner shaft; empty where it has none."""
+        """Return the prior residuals of the inner shaft; empty without a prior."""
         if not isinstance(self.inner, Believing):
             return np.zeros(0), np.zeros((0, len(m)))
         inside, slope = self._inside(m)
@@ -282,7 +288,7 @@ class ViewedShaft:
 
 
 def viewed(fitted: FittedModel, view: ParameterView) -> FittedModel:
-    """The same fits in the view's parameters; `view.index` is the index of the interval."""
+    """Return the same fits in the parameters of the view; `view.index` is the index of the interval."""
     old = fitted.problem
     problem = Likelihood(old.lines, Model(ViewedShaft(old.model.shaft, view)), old.constraint, old.priors)
     size = old.model.mechanical
@@ -299,7 +305,7 @@ def viewed(fitted: FittedModel, view: ParameterView) -> FittedModel:
 
 
 def _through(row: FloatArray, index: int, slope: FloatArray) -> FloatArray:
-    """A linear combination of m, in the view's parameters."""
+    """Return a linear combination of m in the parameters of the view."""
     kept = row.copy()
     kept[index] = 0.0
     kept += row[index] * slope
@@ -308,14 +314,14 @@ def _through(row: FloatArray, index: int, slope: FloatArray) -> FloatArray:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-SLOWEST_SEEN = 0.5        # of the lowest line: a slower swing is not seen
+SLOWEST_SEEN = 0.5        # of the lowest line: a slower oscillation is not visible
 _RIGID = len(RigidShaft.names)
-_HEAVIER = (0.02, 0.2, 0.4, 0.7)      # shares of the load from which a string's descents begin; the first: two masses
+_HEAVIER = (0.02, 0.2, 0.4, 0.7)      # shares of the load at the start of a string's descents; the first: two masses
 
 
 @dataclass(frozen=True)
 class CompliantFit:
-    """Two lumps or the string, fitted; with the test of its residuals."""
+    """Fit of two lumps or the string, with the test of its residuals."""
 
     fitted: FittedModel
     residual: ResidualTest | None
@@ -326,7 +332,7 @@ class CompliantFit:
 
     @property
     def mechanical(self) -> FloatArray:
-        """The shaft's m of the likelier structure of lags, (M,)."""
+        """Return the shaft's m (M,) of the likelier structure of lags."""
         return self.fitted.likelier.theta[: self.fitted.problem.model.mechanical]
 
 
@@ -352,9 +358,9 @@ def fit_compliant(
     fixed: Fixed,
     near: CompliantFit | None = None,
 ) -> CompliantFit:
-    """Fit and test. ``priors`` and ``fixed`` count as with a rigid shaft, and are moved to where this one has them.
+    """Fit and test. ``priors`` and ``fixed`` have the indices of a rigid shaft, and are moved to those of this shaft.
 
-    ``near``: two lumps already fitted, from which a string's descents begin too.
+    ``near``: two lumps already fitted, which give additional starts for a string.
     """
     model = Model(shaft)
     moved = model.mechanical - _RIGID
@@ -369,9 +375,10 @@ def fit_compliant(
 
 
 def _heavier(two: FloatArray, share: float) -> FloatArray:
-    """Two masses with a spring that weighs this share of what hangs on it: a third of it seemed to turn with the motor.
+    """Return two masses with a spring of this share of the load's inertia, a third of which seemed to turn with the
+    motor.
 
-    So J_L (1 − η/3) and J_r + η J_L/3 are what two masses took for J_L and J_r.
+    Two masses fit J_L (1 − η/3) as J_L, and J_r + η J_L/3 as J_r.
     """
     theta = np.insert(two, STRING_SHARE, [share, 0.5])
     theta[LOAD] = two[LOAD] / (1.0 - share / 3.0)
@@ -380,11 +387,11 @@ def _heavier(two: FloatArray, share: float) -> FloatArray:
 
 
 def too_slow(problem: Likelihood) -> Apart:
-    """A shaft whose lowest swing the lines can't see stands where it explains more than chance does, not by a hair.
+    """Return the condition for a shaft with a lowest oscillation below the lines: it must gain more than chance does.
 
-    A string always has such a double: at multiples of a frequency f, tan ωT is the same with T + 1/(2f), a wave that
-    takes longer by half a period (10 s at 0.05 Hz: 32 km of pipe). What it gains on its double is scatter, and whether
-    a descent finds it hangs on rounding.
+    A string always has such an alternative: at multiples of a frequency f, tan ωT is the same for T + 1/(2f), a wave
+    that takes longer by half a period (10 s at 0.05 Hz: 32 km of pipe). The difference between the two is scatter, and
+    rounding decides whether a descent finds the alternative.
     """
     slowest = SLOWEST_SEEN * float(np.min(np.abs(problem.s)))
     size = problem.model.mechanical
@@ -403,7 +410,7 @@ def chance_gain() -> float:
 
 
 def inertias(fit: CompliantFit, confidence: float) -> dict[str, Estimate]:
-    """Return the quantities that a string's weight changes most, named as in `CompliantIntervals`."""
+    """Return the quantities that the string's weight changes most, named as in `CompliantIntervals`."""
     fitted = fit.fitted
     return {
         "inertia": estimate(fitted, INERTIA, confidence),
@@ -414,7 +421,7 @@ def inertias(fit: CompliantFit, confidence: float) -> dict[str, Estimate]:
 
 
 def intervals(fit: CompliantFit, confidence: float) -> CompliantIntervals:
-    """Each by its own profile, whatever the others may be."""
+    """Return each interval by its own profile, for any values of the others."""
     fitted = fit.fitted
     swing = estimate(fitted, SWING, confidence)
     free = estimate(viewed(fitted, RESONANCE), SWING, confidence)
@@ -431,7 +438,7 @@ def intervals(fit: CompliantFit, confidence: float) -> CompliantIntervals:
 def _hertz(fit: CompliantFit) -> tuple[float, float]:
     """Return the factors for the two frequencies of the parametrisation: exact for two lumps.
 
-    The string's own lie a few per cent away, by a factor that hardly depends on what is uncertain.
+    Those of a string differ by a few per cent, by a factor that hardly depends on the uncertain parameters.
     """
     turn = 0.5 / math.pi
     if not fit.is_string:

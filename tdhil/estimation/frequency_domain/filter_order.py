@@ -1,17 +1,17 @@
-"""First-order lags or not: both answers fitted, and how much each weighs.
+"""Fits with first-order lags and with the whole family of filters, and the weight of each.
 
-The reports' family (signal_filters.py) is fitted twice: with first-order lags alone, and whole. The first is the
-sharper where it is true and biased where it isn't; the second is right in both cases and less sharp. Its three
-parameters more must lower −2 ln L by more than Schwarz's 3 ln n, n real numbers fitted, to be preferred; about there,
-both count:
+The family of report filters (signal_filters.py) is fitted twice: with first-order lags only, and complete. The first
+fit is more precise if it is true, and biased if not. The second is right in both cases, and less precise. It is
+preferred if its three additional parameters lower −2 ln L by more than Schwarz's 3 ln n, with n real numbers fitted.
+Near this limit both count:
 
     weight of the first-order fit = 1/(1 + e^((D/r − 3 ln n)/2)),    D = −2 ln L_first + 2 ln L_whole ≥ 0,
 
-and r the share by which −2 ln L rises and falls too much, since its weights are estimates themselves (`excess_rise`).
-That is for the value. An interval rests on the whole family always, whatever the weight.
+with r, the factor by which −2 ln L changes too much, because its weights are estimates (`excess_rise`). This weight is
+for the value. An interval always uses the whole family.
 
-The descents of the whole family begin near the first-order fit. Lower minima far from it exist now and then, in corners
-where filters of the two reports all but cancel; they are noise fitted, and following them costs both scatter and
+The descents of the whole family begin near the first-order fit. Lower minima far from it occur sometimes, in corners
+where the filters of the two reports nearly cancel. They are fits to noise, and using them increases scatter and reduces
 coverage (tried on the plants of the coverage study).
 """
 
@@ -35,21 +35,21 @@ from tdhil.estimation.frequency_domain.optimiser import (
 from tdhil.estimation.frequency_domain.signal_filters import AVERAGE, SPEED_SHAPE, TORQUE_SHAPE
 from tdhil.recording import FloatArray
 
-# where the whole family's descents begin, besides the first-order fit itself
+# start values of the whole family, besides the first-order fit
 _SHAPES = ((SPEED_SHAPE, 0.25), (TORQUE_SHAPE, 0.25), (AVERAGE, 0.1), (AVERAGE, -0.1))
 
 
 @dataclass(frozen=True)
 class FittedModel:
-    """A model's two fits. ``fixed``: parameters that are known for certain, whatever the structure."""
+    """Two fits of one model. ``fixed``: parameters that are known exactly, for any structure."""
 
     problem: Likelihood
     limits: Box
     fixed: Fixed
-    simple: Fit             # first-order lags
-    whole: Fit              # the whole family
-    simple_weight: float    # of the first-order fit, 0 to 1
-    rivals: tuple[Fit, ...] = ()     # other answers of the whole family, elsewhere
+    simple: Fit             # fit with first-order lags
+    whole: Fit              # fit with the whole family
+    simple_weight: float    # weight of the first-order fit, 0 to 1
+    rivals: tuple[Fit, ...] = ()     # other minima of the whole family
 
     @property
     def simple_held(self) -> Fixed:
@@ -58,21 +58,21 @@ class FittedModel:
 
     @property
     def free(self) -> list[int]:
-        """Parameters of the whole family that are free."""
+        """Return the free parameters of the whole family."""
         return [index for index in range(self.problem.model.size) if index not in self.fixed]
 
     @property
     def first_order(self) -> bool:
-        """Are first-order lags the likelier answer?"""
+        """True if the first-order fit is the likelier one."""
         return self.simple_weight >= 0.5
 
     @property
     def likelier(self) -> Fit:
-        """The likelier of the two answers."""
+        """Return the likelier of the two fits."""
         return self.simple if self.first_order else self.whole
 
     def value(self, row: FloatArray) -> float:
-        """The estimate of a linear combination of theta, row (P,)."""
+        """Return the estimate of a linear combination of theta, row (P,)."""
         share = self.simple_weight
         return float(share * (row @ self.simple.theta) + (1.0 - share) * (row @ self.whole.theta))
 
@@ -84,9 +84,9 @@ def fit_model(
     rivals_of: Callable[[FloatArray], list[FloatArray]] | None = None,
     apart: Apart | None = None,
 ) -> FittedModel:
-    """Fit ``problem`` from several ``starts`` (P,) each; ``rivals_of`` an answer: where another may be.
+    """Fit ``problem`` from several ``starts`` (P,) each; ``rivals_of``: start values of other possible minima.
 
-    ``apart``: answers that stand only where they gain more on the others than they must.
+    ``apart``: solutions that are accepted only with more gain than a stated minimum.
     """
     model = problem.model
     limits = box(problem, rough_inertia_of(problem))
@@ -108,23 +108,25 @@ def fit_model(
 
 
 def simple_weight(gain: float, more: int, numbers: int) -> float:
-    """Return the weight of the answer with ``more`` fewer parameters; ``gain``: the drop of −2 ln L by them."""
+    """Return the weight of the fit with ``more`` fewer parameters; ``gain``: decrease of −2 ln L by these
+    parameters.
+    """
     return 1.0 / (1.0 + math.exp(min(0.5 * (gain - more * math.log(numbers)), 700.0)))
 
 
 def excess_rise(problem: Likelihood, fitted: int) -> float:
-    """How much more than by χ² −2 ln L changes: 1 + p/(4ν), p parameters ``fitted``, ν complex d.o.f. of a weight.
+    """Return the excess change of −2 ln L over χ²: 1 + p/(4ν), p parameters ``fitted``, ν complex d.o.f. of a weight.
 
-    Parameters that are fitted lean on those lines whose scatter came out small by chance. The factor was measured, on
-    first-order and on other plants alike: without it 7 to 8 % of the intervals miss instead of 5 %. (What is held by
-    beliefs leans on those.)
+    Fitted parameters follow those lines whose scatter is small by chance. The factor was measured, on first-order and
+    on other plants: without it 7 to 8 % of the intervals miss instead of 5 %. (Parameters held by priors are not
+    counted.)
     """
     nu = float(np.median(problem.nu))
     return 1.0 + (fitted - problem.held) / (4.0 * max(nu, 1.0))
 
 
 def unit(fitted: FittedModel, index: int) -> FloatArray:
-    """The row (P,) that picks one parameter."""
+    """Return the row (P,) that selects one parameter."""
     row = np.zeros(fitted.problem.model.size)
     row[index] = 1.0
     return row

@@ -1,14 +1,14 @@
-"""Frequency response of the shaft as the drive reports it: G = ω/T at every excited line, noise and distortion apart.
+"""Frequency response of the shaft as the drive reports it: G = ω/T at every excited line, with noise and distortion.
 
-Of a line, with segment means W̄_s, T̄_s over P_s periods and the one-period covariance (`spectrum`),
+For a line with segment means W̄_s, T̄_s over P_s periods and the one-period covariance (`spectrum`),
 
     Z = T/ω = Σ P T̄ W̄* / Σ P |W̄|²,      var Z = v/Σ P |W̄|²,      v = S_TT + |Z|² S_WW − 2 Re(Z* S_TW),
 
-where speed stands clearer of its scatter than torque. Where torque does (at an antiresonance the motor hardly turns),
-G is estimated so, and Z = 1/G. The error is circular: relative magnitude and phase have the same uncertainty.
+if speed is clearer of its scatter than torque. Otherwise (at an antiresonance the motor hardly turns) G is estimated in
+the same way, and Z = 1/G. The error is circular: relative magnitude and phase have the same uncertainty.
 
-Three kinds of scatter separate noise from nonlinear distortion (the robust method of Pintelon and Schoukens, with what
-one recording has):
+Three kinds of scatter separate noise from nonlinear distortion (the robust method of Pintelon and Schoukens, adapted to
+one recording):
 
 - From period to period, the motion repeats. What differs is noise.
 - At harmonics that are not excited, a linear shaft has T = Z W, whatever the torque is. A mean of D = T − Z W over the
@@ -44,14 +44,14 @@ from tdhil.estimation.spectrum import ComplexArray, SpectralLine, torque_lines, 
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The fitted model, drawn through the lines
+# Fitted model, drawn through the lines
 
 
 @dataclass(frozen=True)
 class ModelCurve:
     """A fitted model over frequency, with its band in the quadratic approximation.
 
-    Where the residuals exceed their expectation, the band grows with them.
+    If the residuals exceed their expectation, the band grows with them.
     """
 
     fitted: FittedModel
@@ -86,7 +86,7 @@ class ModelCurve:
 
 @dataclass(frozen=True)
 class _StraightLine:
-    """B + J s through the lines, where no model was fitted; known to a half."""
+    """Line B + J s through the spectral lines, if no model was fitted; uncertain by a half."""
 
     inertia_kg_m2: float
     viscous_nm_s_rad: float
@@ -101,16 +101,16 @@ class _StraightLine:
 # From lines to the response
 
 DETECTED_P = 0.001
-"""p-value of the test for distortion below which it counts as detected. 0.1 % of linear shafts are below it."""
+"""p-value of the test for distortion below which it is detected. 0.1 % of linear shafts are below it."""
 
-_MOST_HARMONICS = 12     # unexcited ones that are tested
-_BEYOND = 3              # times the highest excited harmonic: distortion of third order ends there
-_SAMPLES_A_CYCLE = 8     # at least, of an unexcited harmonic
-_NEIGHBOURS = 4          # unexcited harmonics that stand for an excited line
-_CURVE_POINTS = 31       # at least; more where the curve turns
-_CURVE_TURN = 0.35       # rad, or of ln |Z|, between two points
-_CURVE_PASSES = 3        # in which intervals are halved
-_CURVE_SPAN = 1.25       # beyond the lowest and the highest line
+_MOST_HARMONICS = 12     # most unexcited harmonics tested
+_BEYOND = 3              # times the highest excited harmonic: end of third-order distortion
+_SAMPLES_A_CYCLE = 8     # fewest samples per cycle of an unexcited harmonic
+_NEIGHBOURS = 4          # unexcited harmonics used for an excited line
+_CURVE_POINTS = 31       # fewest points of the curve; more where the curve turns
+_CURVE_TURN = 0.35       # rad, or of ln |Z|, between two points, at most
+_CURVE_PASSES = 3        # passes in which intervals are halved
+_CURVE_SPAN = 1.25       # factor by which the curve extends beyond the lowest and the highest line
 
 
 @dataclass(frozen=True)
@@ -127,9 +127,9 @@ class _PooledLine:
 def measure_response(
     case: PeriodicCase, curve: ResponseCurve | None, settled: tuple[SpectralLine, ...], model: str
 ) -> FrequencyResponse | None:
-    """Return the response at all excited lines; None if no line has two periods to know its scatter by.
+    """Return the response at all excited lines; None if no line has two periods for its scatter.
 
-    ``settled``: the lines without residual oscillation, () for the case's own.
+    ``settled``: the lines without residual oscillation, () for the lines of the case.
     """
     pooled = [one for line in settled or case.every if (one := _pooled(line)) is not None]
     if not pooled:
@@ -173,7 +173,7 @@ def _pooled(line: SpectralLine) -> _PooledLine | None:
     cross = complex(np.sum(line.periods * line.torque * line.speed.conj()))
     if not (weight_w > 0.0 and weight_t > 0.0 and abs(cross) > 0.0 and math.isfinite(weight_w + weight_t)):
         return None
-    by_speed = weight_w * line.s_tt >= weight_t * line.s_ww      # speed is the clearer of the two
+    by_speed = weight_w * line.s_tt >= weight_t * line.s_ww      # True if speed is the clearer of the two
     z = cross / weight_w if by_speed else weight_t / cross.conjugate()
     alone = line.s_tt + abs(z) ** 2 * line.s_ww
     variance = max(alone - 2.0 * (z.conjugate() * line.s_tw).real, 1e-12 * alone)
@@ -252,13 +252,13 @@ def _drawn(curve: ResponseCurve, hertz: FloatArray) -> tuple[CurvePoint, ...]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The tests for distortion. Of M means with weights estimated on ν complex degrees of freedom, Bartlett's form
-# (2ν + M − 1) ln(1 + q/ν) ~ χ²(2M), as for the residuals (`inference`). Many small distortions show in the sum, one
-# large one in the least p-value: both count, at half the level each.
+# Tests for distortion. For M means with weights estimated on ν complex degrees of freedom, Bartlett's form (2ν + M − 1)
+# ln(1 + q/ν) ~ χ²(2M), as for the residuals (`inference`). Many small distortions show in the sum, one large distortion
+# in the least p-value. Both count, at half the level each.
 
 
 def _combined(p_values: list[float]) -> float | None:
-    """Return the least p-value, for as many as were tried (Bonferroni); None without any."""
+    """Return the least p-value times the number of p-values (Bonferroni); None without any."""
     return min(1.0, len(p_values) * min(p_values)) if p_values else None
 
 
@@ -267,7 +267,7 @@ def _unexcited(
 ) -> tuple[tuple[UnexcitedHarmonic, ...], float | None]:
     """Return the unexcited harmonics, and the p-value of all together; None without any.
 
-    What an error of Z could explain is left out of the test: ``misfit``, relative, and the band of the curve.
+    The test leaves out the part that an error of Z can explain: ``misfit``, relative, and the band of the curve.
     """
     from scipy.special import chdtrc
 
@@ -311,7 +311,7 @@ def _unexcited(
 
 
 def _harmonics(lines_hz: tuple[float, ...], period_s: float, samples: int) -> tuple[int, ...]:
-    """Return harmonics of the period that are not excited; ``samples``: in a period."""
+    """Return harmonics of the period that are not excited; ``samples``: number in a period."""
     excited = {round(hertz * period_s) for hertz in lines_hz}
     highest = min(_BEYOND * max(excited), samples // _SAMPLES_A_CYCLE)
     return tuple(h for h in range(1, highest + 1) if h not in excited)[:_MOST_HARMONICS]
@@ -335,7 +335,7 @@ def _between_speeds(lines: list[_PooledLine]) -> float | None:
 
 
 def _excess_between_speeds(one: _PooledLine) -> float:
-    """Return E|·|² of the torque by which the mean speeds differ, beyond noise, (N·m)²."""
+    """Return E|·|² of the torque difference between the mean speeds, beyond noise, (N·m)²."""
     more = len(one.line.speed) - 1
     if more < 1:
         return 0.0

@@ -1,11 +1,12 @@
-"""Intervals from the profile likelihood: all values that the data, with everything else refitted, don't contradict.
+"""Intervals from the profile likelihood: all values that the data do not contradict, with all other parameters
+refitted.
 
-The quadratic approximation fails where lags are matched, or at a bound: there the likelihood is flat along a curved
-valley. The profile P(x) = min over the other parameters of −2 ln L follows the valley, and needs no derivative at a
-bound. The interval is {x: P(x) ≤ P_min + t²}, t Student's quantile: chi-square would take the weights for known.
+The quadratic approximation fails for equal lags, or at a bound: there the likelihood is flat along a curved valley. The
+profile P(x) = min over the other parameters of −2 ln L follows the valley, and needs no derivative at a bound. The
+interval is {x: P(x) ≤ P_min + t²}, with Student's quantile t: chi-square would assume known weights.
 
-The valley forks where a second pole sets in: the fit with one, refitted along the profile, stands at ρ = 0, and another
-with two lies beyond a ridge, lower further out. An edge is one only where no such other fit lies lower.
+The valley forks where a second pole begins: the fit with one pole, refitted along the profile, stays at ρ = 0. A fit
+with two poles lies beyond a ridge, and is lower further out. An edge is valid only if no such other fit is lower.
 """
 
 import math
@@ -23,25 +24,25 @@ from tdhil.estimation.spectrum import SpectralLine
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Do the residuals look like the scatter between periods? If not, the model is wrong, and so would its number be.
+# Test of the residuals against the scatter between periods. If it fails, the model is wrong, and J would be too.
 #
-# Of M segment means with weights estimated on ν complex degrees of freedom, q/M follows F(2M, 2ν). Bartlett's form of
+# For M segment means with weights estimated on ν complex degrees of freedom, q/M follows F(2M, 2ν). Bartlett's form of
 # its logarithm,
 #
 #     (2ν + M − 1) ln(1 + q/ν)  ~  χ²(2M),
 #
-# holds far into the tail, where sums of F itself do not; the tie of B to the levels, t(n), adds (n − ½) ln(1 + z²/n)
-# ~ χ²(1), and what is known of the lags χ²(1) each. Their sum at the best parameters has lost one degree of freedom
-# to each parameter that was free to follow the data: those at a bound were not.
+# is valid far into the tail, where sums of F are not. The constraint of B by the levels, t(n), adds (n − ½) ln(1 +
+# z²/n) ~ χ²(1), and each prior on the lags adds χ²(1). Their sum at the best parameters has one degree of freedom less
+# for each free parameter, except for parameters at a bound.
 
 
-_AT_BOUND = 1e-6      # of the natural scale
+_AT_BOUND = 1e-6      # of the natural scale: nearer to a bound counts as at the bound
 
 
 def residual_of(fitted: FittedModel, chosen: int = 0) -> ResidualTest | None:
-    """Return the test of the whole family's fit; counted as fitted are the free parameters inside their bounds.
+    """Return the test of the whole family's fit; free parameters inside their bounds count as fitted.
 
-    ``chosen``: how many more were, by a choice among models.
+    ``chosen``: number of parameters fitted in addition, by a choice among models.
     """
     theta, limits = fitted.whole.theta, fitted.limits
     near = _AT_BOUND * limits.scale
@@ -50,10 +51,11 @@ def residual_of(fitted: FittedModel, chosen: int = 0) -> ResidualTest | None:
 
 
 def contradicted(problem: Likelihood, theta: FloatArray, others: tuple[SpectralLine, ...]) -> bool:
-    """Do lines that were not fitted contradict theta (P,)? For lines that were too weak in one signal.
+    """Return whether lines that were not fitted contradict theta (P,). For lines that were too weak in one signal.
 
-    A shaft that swings stands still at its antiresonance while the torque goes on: that line has no speed to speak of,
-    and says most. Each by itself, by Bartlett's form as above; theta is all but exact for lines as weak as these.
+    At its antiresonance an oscillating shaft stands still while the torque continues: that line has nearly no speed,
+    and the most information. Each line is tested alone, by Bartlett's form; theta is nearly exact for lines as weak as
+    these.
     """
     from scipy.special import chdtrc
 
@@ -67,7 +69,9 @@ def contradicted(problem: Likelihood, theta: FloatArray, others: tuple[SpectralL
 
 
 def residual_test(problem: Likelihood, theta: FloatArray, fitted: int) -> ResidualTest | None:
-    """The sum against its expectation; None where as much was fitted as was measured."""
+    """Return the sum against its expectation; None if the number of fitted parameters reaches that of the
+    measurements.
+    """
     _, q = problem.weighted(theta)
     m, nu = problem.segments, problem.nu
     measured = 2.0 * float(np.sum(m)) + len(problem.priors)
@@ -90,21 +94,21 @@ def residual_test(problem: Likelihood, theta: FloatArray, fitted: int) -> Residu
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-# Tails and quantiles are scipy.special's: scipy.stats gives the same bits, and takes a second to load.
+# Tails and quantiles are from scipy.special: scipy.stats gives the same bits, but takes a second to load.
 
 _TRIES = 14               # trial values of one bound of the interval
-_CLOSE = 5e-3     # of t: how well the edge is found
+_CLOSE = 5e-3     # of t: tolerance of the interval's edge
 
 
 def student_quantile(confidence: float, dof: float) -> float:
-    """Two-sided quantile of Student's t."""
+    """Return the two-sided quantile of Student's t."""
     from scipy.special import stdtrit
 
     return float(stdtrit(dof, 0.5 + 0.5 * confidence))
 
 
 def fisher_tail(ratio: float, dof_above: float, dof_below: float) -> float:
-    """How often Fisher's F exceeds ``ratio`` by chance."""
+    """Return the probability that Fisher's F exceeds ``ratio`` by chance."""
     from scipy.special import fdtrc
 
     return float(fdtrc(dof_above, dof_below, ratio)) if not ratio <= 0.0 else 1.0
@@ -113,7 +117,7 @@ def fisher_tail(ratio: float, dof_above: float, dof_below: float) -> float:
 def standard_deviation(problem: Likelihood, theta: FloatArray, index: int, free: list[int]) -> tuple[float, float]:
     """Return the sd of theta[index], quadratic, and its degrees of freedom (Satterthwaite).
 
-    var = cᵀ F c with c = F⁻¹ e_i = Σ over the parts of F, each as uncertain as the weight it was built on.
+    var = cᵀ F c with c = F⁻¹ e_i: a sum over the parts of F, each as uncertain as the weight used for it.
     """
     whole, parts = problem.information(theta)
     chosen = np.ix_(free, free)
@@ -128,18 +132,19 @@ def standard_deviation(problem: Likelihood, theta: FloatArray, index: int, free:
 
 
 Refit = Callable[[FloatArray, float], Fit]
-"""The best fit with the parameter held at a value, from a start (P,) nearby."""
+"""Function that returns the best fit with the parameter held at a value, from a start (P,) nearby."""
 
 Others = Callable[[Fit, float], Iterable[Fit]]
-"""Other fits with the parameter held at a value, which may lie lower than one that was found there."""
+"""Function that returns other fits with the parameter held at a value, which may be lower than the first one found."""
 
 
 def profile_edge(
     refit: Refit, limits: Box, best: Fit, index: int, step: float, rise: float, others: Others
 ) -> float:
-    """Return where the profile has risen by ``rise`` on the side of ``step``'s sign; a bound or ±inf if it never does.
+    """Return the value at which the profile has risen by ``rise`` in the direction of ``step``; a bound or ±inf without
+    it.
 
-    The root of √(P − P_best) is sought, which is a straight line for a quadratic likelihood.
+    Searches the root of √(P − P_best) − √rise, a straight line for a quadratic likelihood.
     """
     target = math.sqrt(max(rise, 0.0))
     if target == 0.0:
@@ -162,7 +167,7 @@ def profile_edge(
             root = root_of(fit)
             if root >= (1.0 - _CLOSE) * target:
                 return x
-            outside = None           # that was of the higher valley
+            outside = None           # that point belongs to the higher valley
         if root < target:
             if x == bound:
                 return bound
@@ -179,23 +184,23 @@ def profile_edge(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The interval of one parameter of a fitted model: its profile over the whole family of lag structures.
+# Interval of one parameter of a fitted model: its profile over the whole family of lag structures.
 #
-# While first-order lags are the likelier answer, their interval is part of it. What both reports share of their lags is
-# held against a prior (`signal_filters.shared_lag`), and of two answers that the data hardly tell apart it takes the
-# one in which a report has no lag at all, only delay and an average: the whole family's fit sits there in one run of
-# ten of the field rig's, and its profile excludes the truth that is the other. With the whole family alone 7.2 % of 249
-# intervals of that rig missed, with the first-order ones beside it 3.6 %, for 5 % of width; on the fifteen plants of
-# the coverage study whose lags are first order (750 runs) 3.2 % instead of 4.3, for 2 %. An average of the two was
-# tried in its place, and misses where a second pole is just not to be seen (docs/explanation/accuracy.md).
+# If first-order lags are the likelier solution, their interval is joined. A prior limits the common lag of both reports
+# (`signal_filters.shared_lag`). Of two solutions that the data hardly distinguish, this prior prefers the one in which
+# a report has no lag, only delay and an average. The fit of the whole family is there in one of ten runs of the field
+# rig, and its profile excludes the other solution, which is the truth. With the whole family alone, 7.2 % of 249
+# intervals of that rig missed; with the first-order ones joined, 3.6 %, for 5 % more width. On the fifteen plants of
+# the coverage study with first-order lags (750 runs) it was 3.2 % instead of 4.3 %, for 2 % more width. An average of
+# the two was tried instead; it misses if a second pole is just not visible (docs/explanation/accuracy.md).
 
 
 def quantile_of(fitted: FittedModel, index: int, confidence: float) -> float:
-    """The root of how far −2 ln L may rise: Student's quantile, enlarged for what is fitted besides.
+    """Return the root of the allowed rise of −2 ln L: Student's quantile, enlarged for the fitted parameters.
 
-    Its degrees of freedom are those of the first-order fit (the whole family's would be spread over directions that the
-    data hardly speak of). Student's quantile allows for the weights' own uncertainty if nothing else is fitted; what is
-    refitted all along the profile is allowed for by `excess_rise`.
+    Its degrees of freedom are those of the first-order fit, because those of the whole family would include directions
+    with little information in the data. Student's quantile accounts for the uncertainty of the weights if nothing else
+    is fitted; `excess_rise` accounts for the parameters that are refitted along the profile.
     """
     free = [i for i in range(fitted.problem.model.size) if i not in fitted.simple_held]
     if index not in free:
@@ -205,9 +210,9 @@ def quantile_of(fitted: FittedModel, index: int, confidence: float) -> float:
 
 
 def estimate(fitted: FittedModel, index: int, confidence: float, behind: float = 0.0) -> Estimate:
-    """Value and interval of theta[index]; infinite on a side that the data leave open. Fixed: no width.
+    """Return value and interval of theta[index]; infinite on a side that the data leave open. A fixed one has no width.
 
-    ``behind``: by how much −2 ln L lies above that of another model's fit, to which this one is a rival.
+    ``behind``: amount by which −2 ln L exceeds that of another model's fit.
     """
     value = fitted.value(unit(fitted, index))
     if index in fitted.fixed:
@@ -226,9 +231,9 @@ def estimate(fitted: FittedModel, index: int, confidence: float, behind: float =
 
 
 def first_order_estimate(fitted: FittedModel, index: int, confidence: float) -> Estimate:
-    """Value and interval of theta[index] if the lags are first order: for the lags themselves, whose meaning it is.
+    """Return value and interval of theta[index] for first-order lags: used for the lags themselves.
 
-    (Over the whole family a lag is open above, since what both reports share can't be seen.)
+    (In the whole family a lag has no upper limit, because the common part of both reports is not visible.)
     """
     value = float(fitted.simple.theta[index])
     if index in fitted.simple_held:
@@ -260,7 +265,9 @@ def _edges(
 
 
 def half_width_first_order(fitted: FittedModel, index: int, confidence: float, known: tuple[int, ...] = ()) -> float:
-    """Half-width in the quadratic approximation, with first-order lags and the parameters ``known`` at their values."""
+    """Return the half-width by the quadratic approximation, with first-order lags and with the parameters ``known``
+    fixed.
+    """
     free = [i for i in range(fitted.problem.model.size) if i not in fitted.simple_held and i not in known]
     if index not in free:
         return 0.0
@@ -269,21 +276,21 @@ def half_width_first_order(fitted: FittedModel, index: int, confidence: float, k
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The drive's torque scale, to which J is proportional: what it adds to an interval, and its line of the budget.
+# Torque scale of the drive, to which J is proportional: its effect on an interval, and its line of the budget.
 
 
-_CERTAIN = 1e6      # degrees of freedom: what a data sheet states is taken for normally distributed
+_CERTAIN = 1e6      # degrees of freedom: a data sheet's value is assumed to be normally distributed
 
 
 def scale_half_width(value: float, rel_sd: float, confidence: float) -> float:
-    """Half-width of a quantity in proportion to the scale, from the scale alone."""
+    """Return the half-width, from the torque scale alone, of a quantity proportional to the scale."""
     return student_quantile(confidence, _CERTAIN) * rel_sd * abs(value)
 
 
 def with_total(
     one: Estimate, rel_sd: float, confidence: float, conditional_on: tuple[str, ...]
 ) -> InertiaEstimate:
-    """J with both intervals: as the data have it, and with the scale's uncertainty in quadrature."""
+    """Return J with both intervals: from the data, and with the uncertainty of the scale in quadrature."""
     scale = scale_half_width(one.value, rel_sd, confidence)
     return InertiaEstimate(
         value=one.value,
@@ -297,30 +304,30 @@ def with_total(
 
 
 def torque_scale_line(value: float, rel_sd: float, confidence: float) -> BudgetLine:
-    """The last line of a budget."""
+    """Return the line of the torque scale, the last line of a budget."""
     half = scale_half_width(value, rel_sd, confidence)
     return BudgetLine("torque scale", half, "of the drive; not in the repeatability")
 
 
 def widened_most_by_scale(inertia: InertiaEstimate) -> bool:
-    """Return whether the torque scale adds more to the total interval than all else together."""
+    """Return whether the torque scale adds more to the total interval than all other sources together."""
     repeatable, total = inertia.high - inertia.low, inertia.high_total - inertia.low_total
     return total > 0.0 and total * total > 2.0 * repeatable * repeatable
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The error budget of J: what each thing that isn't known adds to the half-width, line by line.
+# Uncertainty budget of J: contribution of each unknown to the half-width, line by line.
 #
-# Unknowns are set free one group after another: J alone (noise), then the skew (timing), the lags, the friction, and
-# last the structure of the lags; a line is what its group adds, in squares: √(h_n² − h_(n−1)²); they add up to the
-# interval. Friction comes behind the lags since without them a line tells J and B apart by itself (imaginary and real
-# part); it is lags that mix the two.
+# Unknowns are freed one group after another: J alone (noise), then the skew (timing), the lags, the friction, and last
+# the structure of the lags. A line is the contribution of its group in quadrature: √(h_n² − h_(n−1)²); together they
+# give the interval. Friction comes after the lags, because without lags a line separates J and B by itself (imaginary
+# and real part); only lags mix the two.
 
 
 def budget_of(
     fitted: FittedModel, inertia: Estimate, confidence: float, torque_scale_rel_sd: float
 ) -> tuple[BudgetLine, ...]:
-    """The lines, in the order of the derivation above; the torque scale last, which is in no interval but the total."""
+    """Return the lines in the order of the groups. The torque scale is last: it is only in the total interval."""
     model = fitted.problem.model
     lags = (model.at(signal_filters.SPEED_LAG), model.at(signal_filters.TORQUE_LAG))
     timing = (model.at(signal_filters.SKEW),)
@@ -341,9 +348,9 @@ def budget_of(
 
 
 def grown_lines(grown: Iterable[tuple[str, float, str]], half: float) -> tuple[BudgetLine, ...]:
-    """Return the part that each step adds in squares.
+    """Return the contribution of each step in quadrature.
 
-    ``grown`` are (source, half-width reached with it free, note), ``half`` the last of them.
+    ``grown``: (source, half-width with it free, note); ``half``: the last half-width.
     """
     found, before = [], 0.0
     for source, reached, note in grown:

@@ -1,17 +1,16 @@
-"""How well a set of parameters explains the lines: errors in both signals, weights known only by estimate.
+"""Likelihood of parameters given the lines: errors in both signals, and weights that are estimates.
 
 For line k with segment means W̄_s, T̄_s over P_s periods and the one-period covariance S on ν complex degrees of
 freedom, the equation error r_s = T̄_s − G W̄_s has the variance v/P_s, v = S_TT + |G|² S_WW − 2 Re(G* S_TW). With the
-true lines and the true covariance concentrated out of the Gaussian likelihood
-(det(νS + rank one) = det(νS)(1 + q/ν)),
+true lines and the true covariance concentrated out of the Gaussian likelihood (det(νS + rank one) = det(νS)(1 + q/ν)),
 
     −2 ln L = Σ_k 2 (ν_k + M_k) ln(1 + q_k/ν_k) + priors,    q_k = Σ_s P_s |r_s|² / v_k,
 
-M segments. This is a complex t-distribution: what the weights don't know is in its tails, and for ν → ∞ it is Σ 2q,
-a χ². It is a sum of squares of φ(q)·r/√v with φ² = 2(ν + M) ln(1 + q/ν)/q, smooth at q = 0, for least squares.
-What acts on the shaft besides and doesn't go with the speed at the line, c N_s of a bent friction (`TorqueLoad`), is
-taken off T̄_s first. The tie of B to the levels is a real t-distribution, (n + 1) ln(1 + z²/n); what is known of the
-lags is Gaussian.
+with M segments. This is a complex t-distribution: its tails contain the uncertainty of the weights, and for ν → ∞ it is
+Σ 2q, a χ². For least squares it is a sum of squares of φ(q)·r/√v with φ² = 2(ν + M) ln(1 + q/ν)/q, smooth at q = 0. A
+torque that is not proportional to the speed at the line, c N_s of nonlinear friction (`TorqueLoad`), is first
+subtracted from T̄_s. The constraint of B by the levels is a real t-distribution, (n + 1) ln(1 + z²/n). Priors on the
+lags are Gaussian.
 """
 
 import math
@@ -28,19 +27,19 @@ from tdhil.estimation.friction_levels import ViscousConstraint
 from tdhil.estimation.spectrum import ComplexArray, SpectralLine
 from tdhil.recording import FloatArray
 
-_SERIES = 1e-4          # of q/ν
+_SERIES = 1e-4          # q/ν below which a series is used
 
 
 @dataclass(frozen=True)
 class TorqueLoad:
-    """Torque in proportion to theta[index]: N·m per its unit in every segment mean of every line, in their order."""
+    """Torque proportional to theta[index]: N·m per unit of it, in every segment mean of every line, in their order."""
 
     index: int
     lines: ComplexArray
 
 
 class Likelihood:
-    """−2 ln L of a model's theta (P,), a sum of squares."""
+    """−2 ln L of a model's theta (P,), as a sum of squares."""
 
     def __init__(
         self,
@@ -82,17 +81,17 @@ class Likelihood:
 
     @property
     def numbers(self) -> int:
-        """n: how many real numbers are fitted."""
+        """Return n, the number of fitted real numbers."""
         beliefs = len(self.beliefs(np.ones(self.model.size))[0])
         return 2 * len(self.owner) + len(self.priors) + (self.constraint is not None) + beliefs
 
     @property
     def held(self) -> int:
-        """How many parameters what is known beforehand holds, rather than the lines."""
+        """Return the number of parameters held by prior knowledge rather than by the lines."""
         return 0 if self._believing is None else self._believing.held
 
     def beliefs(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """How far theta is from what is known of the shaft beforehand, in sd, (R,), and the slopes, (R, P)."""
+        """Return the deviation of theta from the prior knowledge of the shaft, in sd, (R,), and the slopes, (R, P)."""
         if self._believing is None:
             return np.zeros(0), np.zeros((0, self.model.size))
         off, slopes = self._believing.beliefs(theta[: self.model.mechanical])
@@ -101,7 +100,7 @@ class Likelihood:
         return off, wide
 
     def unloaded(self, theta: FloatArray) -> tuple[SpectralLine, ...]:
-        """The lines without the torque of the load."""
+        """Return the lines without the torque of the load."""
         if self._load is None:
             return self.lines
         torque = self._unloaded(theta)
@@ -111,18 +110,18 @@ class Likelihood:
         return self.torque if self._load is None else self.torque - theta[self._load.index] * self._load.lines
 
     def variance(self, g: ComplexArray) -> FloatArray:
-        """v_k of one period's equation error, (K,); floored where the cross term cancels all but rounding."""
+        """Return v_k of one period's equation error, (K,), with a floor where only rounding remains."""
         alone = self.s_tt + (g.real * g.real + g.imag * g.imag) * self.s_ww
         v: FloatArray = np.maximum(alone - (g.real * self._twice_tw.real + g.imag * self._twice_tw.imag), 1e-9 * alone)
         return v
 
     def weighted(self, theta: FloatArray) -> tuple[ComplexArray, FloatArray]:
-        """√P r/√v of every segment and line, and q (K,)."""
+        """Return √P r/√v of every segment and line, and q (K,)."""
         g = self.model.impedance(theta, self.s)
         return self._weighted(theta, g, self._gain(self.variance(g)))
 
     def _gain(self, v: FloatArray) -> FloatArray:
-        """√P/√v of every segment and line."""
+        """Return √P/√v of every segment and line."""
         gain: FloatArray = self.root_periods / np.sqrt(v)[self.owner]
         return gain
 
@@ -133,24 +132,24 @@ class Likelihood:
         return e, q
 
     def residuals(self, theta: FloatArray) -> FloatArray:
-        """A real vector whose sum of squares is −2 ln L."""
+        """Return a real vector whose sum of squares is −2 ln L."""
         return self.at(theta)[0]
 
     def linearised(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The residuals (R,) and ∂residuals/∂theta (R, P)."""
+        """Return the residuals (R,) and ∂residuals/∂theta (R, P)."""
         residuals, slopes = self.at(theta)
         return residuals, slopes()
 
     def at(self, theta: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]]:
-        """The residuals (R,), and a function that gives ∂residuals/∂theta (R, P) on demand.
+        """Return the residuals (R,), and a function that gives ∂residuals/∂theta (R, P) on demand.
 
-        With u = √P r/√v: ∂u = −√P ∂(G W + c N)/√v − u Re(h ∂G), h = (G* S_WW − S_TW*)/v, since ∂v = 2 v Re(h ∂G);
-        ∂q = 2 Σ Re(u* ∂u), and ∂(φ u) = φ ∂u + φ' ∂q u. All but W, N and u is one number for a line, whose sums go
-        before the product with ∂G:
+        With u = √P r/√v: ∂u = −√P ∂(G W + c N)/√v − u Re(h ∂G), h = (G* S_WW − S_TW*)/v, since ∂v = 2 v Re(h ∂G); ∂q =
+        2 Σ Re(u* ∂u), and ∂(φ u) = φ ∂u + φ' ∂q u. Except W, N and u, all factors are one number for a line. They are
+        summed before the product with ∂G:
 
             ∂(φ u) = −φ √P ∂(G W + c N)/√v − u Re[(φ h + 2 φ' (q h + Σ u* √P W/√v)) ∂G] − 2 φ' u Re Σ u* √P N ∂c/√v.
 
-        A descent tries more places than it goes to.
+        The slopes are on demand, because a descent does not need them at every point that it tries.
         """
         g, g_slopes = self.model.seen(theta, self.s)
         v = self.variance(g)
@@ -181,23 +180,23 @@ class Likelihood:
         return residuals, slopes
 
     def _summed(self, each: ComplexArray) -> ComplexArray:
-        """Over the segments of every line."""
+        """Return the sums over the segments of every line."""
         found = np.empty(len(self.s), dtype=np.complex128)
         found.real, found.imag = self._of_line.dot(each.real), self._of_line.dot(each.imag)
         return found
 
     def _by(self, slopes: ComplexArray) -> ComplexArray:
-        """∂(G W̄ + c N)/∂theta of every segment and line, from ∂G/∂theta (K, P)."""
+        """Return ∂(G W̄ + c N)/∂theta of every segment and line, from ∂G/∂theta (K, P)."""
         found: ComplexArray = self.speed[:, None] * slopes[self.owner]
         if self._load is not None:
             found[:, self._load.index] += self._load.lines
         return found
 
     def _phi(self, q: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]]:
-        """φ(q) = √(2 (ν + M) ln(1 + q/ν)/q), (K,), and what gives dφ/dq; by series where q/ν is small."""
+        """Return φ(q) = √(2 (ν + M) ln(1 + q/ν)/q), (K,), and a function for dφ/dq; by a series if q/ν is small."""
         x = q / self.nu
         small = x < _SERIES
-        few = True in small.tolist()     # hardly ever
+        few = True in small.tolist()     # rarely the case
         safe = np.where(small, 1.0, x) if few else x
         plain = np.log1p(safe) / safe
         phi: FloatArray = np.sqrt(self._scale * (np.where(small, 1.0 - x / 2.0 + x * x / 3.0, plain) if few else plain))
@@ -212,13 +211,13 @@ class Likelihood:
         return phi, slope
 
     def objective(self, theta: FloatArray) -> float:
-        """−2 ln L."""
+        """Return −2 ln L."""
         return float(np.sum(self.residuals(theta) ** 2))
 
     def _known(self, theta: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]]:
-        """The residuals of what is known besides the lines, and what gives their slopes (P, R).
+        """Return the residuals of the prior knowledge besides the lines, and a function for their slopes (P, R).
 
-        In their order: priors, beliefs, the lag that the reports share, the tie.
+        The order: priors, beliefs, the common lag of the reports, the constraint of B.
         """
         tie = self.constraint
         off = self._prior_rows.dot(theta) - self._prior_offset
@@ -256,24 +255,25 @@ class Likelihood:
         return signal_filters.shared_lag(float(theta[speed]), float(theta[torque]), self._unseen_s)
 
     def _shared_lag_row(self, theta: FloatArray) -> FloatArray:
-        """The slopes (P,) of `_shared_lag`."""
+        """Return the slopes (P,) of `_shared_lag`."""
         assert self._lags is not None
         row = np.zeros(self.model.size)
         _, *row[list(self._lags)] = self._shared_lag(theta)
         return row
 
     def tie_error(self, theta: FloatArray) -> float:
-        """How far the friction is from what the levels say, in standard deviations.
+        """Return the deviation of the friction from that of the levels, in standard deviations.
 
-        The combination of theta that they speak of is the friction slope plus its slope per inertia.
+        The levels determine a combination of theta: the friction slope plus its slope per inertia times J.
         """
         assert self.constraint is not None
         return (float(self._tie_row.dot(theta)) - self.constraint.slope) / self.constraint.sd
 
     def information(self, theta: FloatArray) -> tuple[FloatArray, list[tuple[FloatArray, float]]]:
-        """Fisher information (P, P), and its parts with the degrees of freedom of each part's weight.
+        """Return the Fisher information (P, P), and its parts with the degrees of freedom of each part's weight.
 
-        Of a line: 2 Re Σ P ∂(G W̄)ᴴ∂(G W̄) / v · (ν − 1)/ν, since E 1/v̂ = ν/((ν − 1) v). Of the tie and priors: 1/sd².
+        A line has 2 Re Σ P ∂(G W̄)ᴴ∂(G W̄) / v · (ν − 1)/ν, since E 1/v̂ = ν/((ν − 1) v). The constraint and the priors
+        have 1/sd².
         """
         g, slopes = self.model.impedance_jacobian(theta, self.s)
         by = self._by(slopes) * self.root_periods[:, None]

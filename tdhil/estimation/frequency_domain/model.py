@@ -1,4 +1,4 @@
-"""A shaft seen through a drive's reports: G(s) = Z(s; m) · exp(ln F_T/F_w(s; phi)), theta = (m, phi)."""
+"""Shaft with the filters of a drive's reports: G(s) = Z(s; m) · exp(ln F_T/F_w(s; phi)), theta = (m, phi)."""
 
 from collections.abc import Callable, Set
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from tdhil.recording import FloatArray
 
 @dataclass(frozen=True)
 class GaussianPrior:
-    """A parameter (its index in theta) known beforehand."""
+    """Gaussian prior of one parameter, given by its index in theta."""
 
     index: int
     mean: float
@@ -22,18 +22,18 @@ class GaussianPrior:
 
 @dataclass(frozen=True)
 class Model:
-    """theta (P,): the shaft's M parameters, then the six of the reports."""
+    """Model with theta (P,): the M parameters of the shaft, then the six of the reports."""
 
     shaft: Shaft = field(default_factory=RigidShaft)
 
     @property
     def mechanical(self) -> int:
-        """M."""
+        """Return M, the number of parameters of the shaft."""
         return len(self.shaft.names)
 
     @property
     def size(self) -> int:
-        """P."""
+        """Return P, the number of parameters."""
         return self.mechanical + signal_filters.COUNT
 
     @property
@@ -47,7 +47,7 @@ class Model:
 
     @property
     def structure(self) -> tuple[int, ...]:
-        """Parameters that are zero for first-order lags."""
+        """Return the parameters that are zero for first-order lags."""
         return tuple(self.at(index) for index in signal_filters.STRUCTURE)
 
     def plausible(self, stated: Set[int]) -> tuple[GaussianPrior, ...]:
@@ -57,25 +57,25 @@ class Model:
 
     @property
     def inertia_row(self) -> FloatArray:
-        """(P,): the inertia that turns with mean speed."""
+        """Return the row (P,) of the inertia that turns with mean speed."""
         return np.concatenate([self.shaft.inertia_row, np.zeros(signal_filters.COUNT)])
 
     @property
     def viscous_row(self) -> FloatArray:
-        """(P,): the friction slope that levels show."""
+        """Return the row (P,) of the friction slope that levels show."""
         return np.concatenate([self.shaft.viscous_row, np.zeros(signal_filters.COUNT)])
 
     def impedance(self, theta: FloatArray, s: ComplexArray) -> ComplexArray:
-        """G, N·m·s/rad, (K,)."""
+        """Return G, N·m·s/rad, (K,)."""
         return self.seen(theta, s)[0]
 
     def impedance_jacobian(self, theta: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """G (K,) and ∂G/∂theta (K, P)."""
+        """Return G (K,) and ∂G/∂theta (K, P)."""
         g, slopes = self.seen(theta, s)
         return g, slopes().T
 
     def seen(self, theta: FloatArray, s: ComplexArray) -> tuple[ComplexArray, Callable[[], ComplexArray]]:
-        """G (K,), and a function that gives ∂G/∂theta (P, K) on demand."""
+        """Return G (K,), and a function that gives ∂G/∂theta (P, K) on demand."""
         mechanical = len(theta) - signal_filters.COUNT
         m = theta[:mechanical]
         reports = signal_filters.FilterRatio(theta[mechanical:], s)
@@ -90,11 +90,11 @@ class Model:
         return g, slopes
 
     def bounds(self, rough_inertia: float, s: ComplexArray) -> tuple[FloatArray, FloatArray]:
-        """Least and greatest theta, (P,) each."""
+        """Return the least and greatest theta, (P,) each."""
         low_m, high_m = self.shaft.bounds(rough_inertia, s)
         low, high = signal_filters.bounds(s)
         return np.concatenate([low_m, low]), np.concatenate([high_m, high])
 
     def scales(self, rough_inertia: float, s: ComplexArray) -> FloatArray:
-        """The natural size of each of theta, (P,)."""
+        """Return the natural size of each parameter, (P,)."""
         return np.concatenate([self.shaft.scales(rough_inertia, s), signal_filters.scales()])

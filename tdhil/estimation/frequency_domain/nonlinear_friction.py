@@ -1,7 +1,7 @@
-"""The verdict on a shaft whose friction bends over speed.
+"""Verdict on a shaft with nonlinear friction over speed.
 
-Its two parameters more, c and the bell's width, must lower −2 ln L by more than Schwarz's 2 ln n, as with the lags
-(`filter_order`): a rigid shaft that is rejected, or doubted, by chance doesn't bend.
+Its two additional parameters, c and the width of the bell, must lower −2 ln L by more than Schwarz's 2 ln n, as for the
+lags (`filter_order`). A rigid shaft that is rejected, or in doubt, only by chance does not become nonlinear by this.
 """
 
 import math
@@ -33,27 +33,27 @@ from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine
 from tdhil.recording import FloatArray, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The shapes that friction over speed may have besides its straight line.
+# Shapes of friction over speed besides a straight line.
 #
 #     T_f(ω) = T_c sgn ω + B ω + c g(ω)
 #
-# g is Stribeck's bell, exp(−(ω/ω_s)²), whose ω_s runs over a grid, or the parabola ω |ω| of a fan and of churned oil,
-# which wide bells come near. One shape with either sign of c, not a sum of them: over the speeds of one run two of
-# them could hardly be kept apart.
+# g is Stribeck's bell, exp(−(ω/ω_s)²), with ω_s on a grid, or the parabola ω |ω| of a fan and of churned oil, which
+# wide bells resemble. One shape with either sign of c is used, not a sum: the speeds of one run can hardly separate
+# two.
 
 
-_WIDTHS = 9               # widths of the bend that are tried
-_NARROWEST, _WIDEST = 0.35, 1.0     # of the slowest and of the fastest speed: outside, a bell is not to be seen
+_WIDTHS = 9               # number of widths tried
+_NARROWEST, _WIDEST = 0.35, 1.0     # of the slowest and of the fastest speed: a narrower or wider bell is not visible
 
 
 @dataclass(frozen=True)
 class Bend:
-    """One shape; ``width_rad_s`` None: the parabola."""
+    """Shape of nonlinear friction; ``width_rad_s`` None: the parabola."""
 
     width_rad_s: float | None
 
     def over(self, speed: FloatArray) -> FloatArray:
-        """The shape g at speeds (rad/s)."""
+        """Return the shape g at speeds, rad/s."""
         if self.width_rad_s is None:
             parabola: FloatArray = speed * np.abs(speed)
             return parabola
@@ -62,24 +62,24 @@ class Bend:
 
 
 def bends(slowest_rad_s: float, fastest_rad_s: float) -> tuple[Bend, ...]:
-    """All that is tried for a run between two speeds of one direction, both in magnitude."""
+    """Return all shapes to try for a run between two speeds of one direction, both in magnitude."""
     widths = np.geomspace(_NARROWEST * slowest_rad_s, _WIDEST * fastest_rad_s, _WIDTHS)
     return (*(Bend(float(width)) for width in widths), Bend(None))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A rigid shaft whose friction has a third parameter, c, of a shape that is given.
+# Rigid shaft whose friction has a third parameter, c, of a given shape.
 
 
-BEND = 2                  # place of the bend among the parameters
+BEND = 2                  # position of c in the parameters
 
 
 @dataclass(frozen=True)
 class BentShaft:
-    """m = J, B, c.
+    """Rigid shaft with nonlinear friction, m = J, B, c.
 
-    ``chord``: how much the levels' slope of friction over speed rises with c; ``typical``: c of a bend as large as B ω
-    is, over B. c is not in the impedance: what it adds at a line does not go with the speed there
+    ``chord``: rise of the levels' slope of friction over speed with c. ``typical``: c of a nonlinear part as large as B
+    ω, over B. c is not in the impedance, because its torque at a line is not proportional to the speed there
     (`likelihood.TorqueLoad`).
     """
 
@@ -110,26 +110,26 @@ class BentShaft:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a bend of friction does at the lines: the speed's true wave over a period, through the bend, and its lines.
+# Effect of nonlinear friction at the lines: the true speed over a period, its friction, and the lines of that friction.
 #
-# The lines of the reported speed, W_k, divided by its report's filter, are those of the shaft's speed,
+# The lines of the reported speed, W_k, divided by the filter of the report, are those of the shaft's speed,
 #
 #     ω(t) = ω̄ + Re Σ_k W_k/F_w(s_k) e^(jω_k t),
 #
-# which keeps repeating with the segment's period. Friction follows it at once, so that c g(ω(t)) has the lines
+# which repeats with the segment's period. Friction follows it at once, so c g(ω(t)) has the lines
 #
 #     G_k = 2/N Σ_n g(ω(t_n)) e^(−jω_k t_n)    and the mean    ḡ,
 #
-# and the drive reports them through the torque's filter: T_k = F_T (J s + B) W_k/F_w + c F_T G_k. Only F_T/F_w can be
-# seen in the first term; the second is a correction, for which the filters that fit are good enough.
+# and the drive reports them through the torque's filter: T_k = F_T (J s + B) W_k/F_w + c F_T G_k. The first term shows
+# only F_T/F_w. The second term is a correction, for which the fitted filters are accurate enough.
 
 
-_POINTS = 16      # to a cycle of the fastest line
+_POINTS = 16      # points per cycle of the fastest line
 
 
 @dataclass(frozen=True)
 class SegmentWave:
-    """One segment: ``lines_hz`` (K,) rising or not, ``speed`` (K,) complex as reported, its mean, and its period."""
+    """One segment: ``lines_hz`` (K,) in any order, ``speed`` (K,) complex as reported, its mean, and its period."""
 
     lines_hz: tuple[float, ...]
     speed: ComplexArray
@@ -138,48 +138,48 @@ class SegmentWave:
 
     @cached_property
     def _s(self) -> ComplexArray:
-        """(K,)."""
+        """Return s = jω of the lines, (K,)."""
         return 2j * math.pi * np.asarray(self.lines_hz)
 
     @cached_property
     def _turned(self) -> ComplexArray:
-        """e^(jω_k t_n), (N, K): each line makes a whole number of turns in a period."""
+        """Return e^(jω_k t_n), (N, K): each line makes a whole number of turns in a period."""
         turns = np.round(np.asarray(self.lines_hz) * self.period_s)
         count = _POINTS * int(max(turns.max(), 1.0))
         turned: ComplexArray = np.exp(2j * math.pi / count * np.multiply.outer(np.arange(count), turns))
         return turned
 
     def over_period(self, phi: FloatArray) -> FloatArray:
-        """The shaft's own speed behind the report ``phi`` (6,) (`signal_filters`), (N,) rad/s."""
+        """Return the speed of the shaft behind the report ``phi`` (6,) (`signal_filters`), (N,) rad/s."""
         found: FloatArray = self.mean + (self._turned @ (self.speed / signal_filters.filters(phi, self._s)[0])).real
         return found
 
     def through(self, bend: Bend, phi: FloatArray) -> tuple[ComplexArray, float]:
-        """F_T G (K,) and ḡ."""
+        """Return F_T G (K,) and ḡ."""
         torque = bend.over(self.over_period(phi))
         lines = torque @ self._turned.conj() * (2.0 / len(torque))
         return signal_filters.filters(phi, self._s)[1] * lines, float(torque.mean())
 
 
 def wave_of(fit: PeriodLines, segment: Segment) -> SegmentWave:
-    """Mean over all its periods together."""
+    """Return the mean wave over all periods."""
     return SegmentWave(fit.lines_hz, fit.speed.mean(axis=0), float(fit.speed_mean.mean()), segment.period_s)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A rigid shaft with bent friction, fitted: every shape in turn, the filters of its wave found on the way.
+# Fit of a rigid shaft with nonlinear friction: every shape in turn, with the filters of its wave.
 #
-# The bend's lines depend on the filters, and these on the fit: a few rounds settle that. The shape that explains the
-# data best stands; in the interval counts every shape that the data do not contradict, from where its own −2 ln L
-# lies.
+# The lines of the friction depend on the filters, and these on the fit; a few rounds make them consistent. The shape
+# with the best fit is selected. The interval contains every shape that the data do not contradict, relative to its own
+# −2 ln L.
 
 
-_ROUNDS = 3               # of weighting again
+_ROUNDS = 3               # rounds of reweighting
 _RIGID = len(RigidShaft.names)
-_HOPELESS = 40.0    # of −2 ln L behind the best with first-order lags: looked at no further
-_FINE = 0.0005       # of a bell's width
-_SHORT_S = 0.02     # of a lag in common: it hardly changes the wave
-_SLOWEST = 0.1      # of the mean speed: what comes nearer to rest than that is another kind of friction
+_HOPELESS = 40.0    # of −2 ln L behind the best with first-order lags: such a shape is dropped
+_FINE = 0.0005       # of a bell's width: tolerance of its search
+_SHORT_S = 0.02     # s; a shorter common lag hardly changes the wave
+_SLOWEST = 0.1      # of the mean speed: nearer to standstill friction is of another kind
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ class ShaftMotion:
 
 @dataclass(frozen=True)
 class BentFit:
-    """One shape, fitted."""
+    """Fit of one shape."""
 
     bend: Bend
     fitted: FittedModel
@@ -207,8 +207,10 @@ class BentFit:
 
 def fit_bends(motion: ShaftMotion, priors: tuple[GaussianPrior, ...], fixed: Fixed,
               rigid: RigidResult) -> list[BentFit]:
-    """Every shape, the best first; none where the shaft comes too near to rest. ``priors``, ``fixed``: as rigid."""
-    # with first-order lags: a whole family of filters, made to explain a bend, ends in corners
+    """Return the fits of every shape, the best first; none if the shaft comes too near to standstill. ``priors``,
+    ``fixed``: as for rigid.
+    """
+    # with first-order lags only: the whole family of filters, made to explain nonlinear friction, ends in corners
     starts = starts_of(motion, rigid.fitted.simple.theta)
     if not starts or len({float(np.sign(wave.mean)) for wave in motion.waves}) != 1:
         return []
@@ -234,24 +236,26 @@ def fit_bends(motion: ShaftMotion, priors: tuple[GaussianPrior, ...], fixed: Fix
 
 
 def starts_of(motion: ShaftMotion, straight: FloatArray) -> list[FloatArray]:
-    """Yield the starts of the descents: the straight fit, and the same without the lag that both reports share.
+    """Return the start values: the straight fit, and the same without the common lag of both reports.
 
-    A straight fit bends long lags that all but cancel to the friction's shape. They change its ratio little, but the
-    wave that is made of the reported one by taking such a lag off it swings far too wide. Only those count by whose
-    wave the shaft keeps turning.
+    A straight fit may use long, nearly cancelling lags to imitate the shape of the friction. They change the ratio of
+    the filters little, but the wave after removal of such a lag is far too large. Only starts whose wave keeps the
+    shaft turning are used.
     """
     apart = _apart(straight, _RIGID)
     return [theta for theta in (straight, apart) if theta is not None and _keeps_turning(motion, theta[_RIGID:])]
 
 
 def _keeps_turning(motion: ShaftMotion, phi: FloatArray) -> bool:
-    """Return whether the shaft behind the reports ``phi`` (6,) stays away from rest."""
+    """Return whether the shaft behind the reports ``phi`` (6,) stays away from standstill."""
     least = _SLOWEST * min(abs(wave.mean) for wave in motion.waves)
     return all(np.min(wave.over_period(phi) * np.sign(wave.mean)) > least for wave in motion.waves)
 
 
 def inertia_of(found: Sequence[BentFit], best: Estimate, confidence: float) -> Estimate:
-    """``best``, the best shape's, with an interval that holds whatever the others leave open. ``found``: it first."""
+    """Return ``best``, of the best shape, with an interval that covers the other shapes. ``found``: the best shape
+    first.
+    """
     rise = quantile_of(found[0].fitted, INERTIA, confidence) ** 2
     low, high = [best.low], [best.high]
     for one in found[1:]:
@@ -267,7 +271,7 @@ _Near = tuple[Bend, Likelihood, Fit]
 
 
 def _between(tried: list[_Near], near: Callable[[Bend, FloatArray], _Near]) -> list[_Near]:
-    """The best bell between the neighbours of the grid's best; each from where the best so far ended."""
+    """Return the best bell between the neighbours of the grid's best, each started from the best result so far."""
     bells = [(bend.width_rad_s, fit) for bend, _, fit in tried if bend.width_rad_s is not None]
     best = min(range(len(bells)), key=lambda number: bells[number][1].objective)
     around = (math.log(bells[max(best - 1, 0)][0]), math.log(bells[min(best + 1, len(bells) - 1)][0]))
@@ -290,7 +294,7 @@ def _between(tried: list[_Near], near: Callable[[Bend, FloatArray], _Near]) -> l
 def _near(
     bend: Bend, motion: ShaftMotion, priors: tuple[GaussianPrior, ...], fixed: Fixed, theta: FloatArray
 ) -> _Near:
-    """With first-order lags, one descent in each round, from where the last one ended."""
+    """Return the fit with first-order lags, one descent in each round, from the end of the last one."""
     for _ in range(_ROUNDS):
         problem = _problem(bend, motion, priors, theta[BEND + 1 :])
         first_order = {**dict.fromkeys(problem.model.structure, 0.0), **fixed}
@@ -300,7 +304,7 @@ def _near(
 
 
 def _apart(theta: FloatArray, mechanical: int) -> FloatArray | None:
-    """Theta without the lag that both reports have in common; None where that is hardly any."""
+    """Return theta without the common lag of both reports; None if that lag is very short."""
     lags = [mechanical + signal_filters.SPEED_LAG, mechanical + signal_filters.TORQUE_LAG]
     shared = float(np.min(theta[lags]))
     if shared < _SHORT_S:
@@ -311,7 +315,7 @@ def _apart(theta: FloatArray, mechanical: int) -> FloatArray | None:
 
 
 def _problem(bend: Bend, motion: ShaftMotion, priors: tuple[GaussianPrior, ...], phi: FloatArray) -> Likelihood:
-    """With the bend's lines as the filters ``phi`` (6,) have them."""
+    """Return the problem with the lines of the friction for the filters ``phi`` (6,)."""
     seen = [wave.through(bend, phi) for wave in motion.waves]
     by_hertz = [
         {round(hertz, 9): line for hertz, line in zip(wave.lines_hz, lines, strict=True)}
@@ -328,13 +332,14 @@ def _problem(bend: Bend, motion: ShaftMotion, priors: tuple[GaussianPrior, ...],
 # ---------------------------------------------------------------------------------------------------------------------
 
 MODEL = f"{RIGID}, bent friction"
-_MORE = 2      # parameters than with straight friction
+_MORE = 2      # additional parameters compared with straight friction
 
 
 def identify_bent(case: PeriodicCase, rigid: RigidResult) -> Finding | None:
-    """``rigid``: the rigid shaft with straight friction, which the data contradict or hardly allow.
+    """Return the finding with nonlinear friction. ``rigid``: the rigid shaft with straight friction, rejected or in
+    doubt.
 
-    None where this one does no better, or leaves the inertia open.
+    None if this fit is not better, or leaves the inertia open.
     """
     constraint = tie_viscous(case.levels)
     if constraint is None or rigid_rivals(rigid.fitted.simple.theta):
@@ -394,7 +399,7 @@ def _result(
 def _budget(
     best: BentFit, own: Estimate, inertia: Estimate, confidence: float, torque_scale_rel_sd: float
 ) -> tuple[BudgetLine, ...]:
-    """Return the budget of the best shape's ``own`` interval, with one more line: the share of other shapes."""
+    """Return the budget of the best shape's ``own`` interval, and one more line: the contribution of other shapes."""
     *lines, scale = budget_of(best.fitted, own, confidence, torque_scale_rel_sd)
     grown = math.sqrt(max((inertia.high - inertia.low) ** 2 - (own.high - own.low) ** 2, 0.0))
     return (*lines, BudgetLine("friction's shape", 0.5 * grown, "other shapes that the data allow"), scale)

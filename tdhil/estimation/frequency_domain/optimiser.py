@@ -1,12 +1,14 @@
-"""Least squares by Levenberg and Marquardt's damped Gauss-Newton steps, within bounds, some parameters held.
+"""Least squares by Levenberg and Marquardt's damped Gauss-Newton steps, within bounds, with some parameters held.
 
-Written out because the profile of an interval asks for hundreds of small descents, each from a good start: a general
-solver's set-up costs more than the few steps that they take. `scipy.optimize.least_squares` is the oracle in the tests.
+This is an own implementation, because the profile of an interval needs hundreds of small descents, each from a good
+start: the set-up of a general solver takes longer than their few steps. The tests compare with
+`scipy.optimize.least_squares`.
 
-A step solves (AᵀA + λ diag AᵀA) δ = −Aᵀ r for the parameters that are free and do not push against a bound. What it
-would take beyond a bound goes to the bound, and the rest is solved again (cut alone, the rest would go where they only
-belong if the one went on: λ rises until the step is short of the bound, and the next one is no better). λ falls with
-every success and rises with every failure; a start that is no minimum moves, one that is stays bit for bit.
+A step solves (AᵀA + λ diag AᵀA) δ = −Aᵀ r for the parameters that are free and do not push against a bound. A parameter
+that would leave its bounds is set to the bound, and the others are solved again. (If it were only cut, the others would
+fit the step without the cut: λ would rise until the step ends before the bound, and the next step would be no better.)
+λ falls with every success and rises with every failure. A start that is a minimum stays unchanged bit for bit; any
+other start moves.
 """
 
 import math
@@ -21,19 +23,19 @@ from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
 from tdhil.recording import BoolArray, FloatArray
 
 At = Callable[[FloatArray], tuple[FloatArray, Callable[[], FloatArray]]]
-"""A function from parameters to residuals r, and to a function that gives their slopes A."""
+"""Function from parameters to residuals r, and to a function for their slopes A."""
 
 _MOST_STEPS = 200         # steps of a fit, at most
 _MOST_TRIES = 12          # damping values of a step, at most
-_SMALL_GAIN = 1e-6        # of −2 ln L, absolute: an interval's edge is where it has risen by about 4
+_SMALL_GAIN = 1e-6        # of −2 ln L, absolute; at the edge of an interval −2 ln L has risen by about 4
 _SMALL_STEP = 1e-9        # of the natural scale
-_CREEPING, _LOOKED_BACK = 0.01, 20         # of −2 ln L, gained in so many steps: along the floor of a flat valley
-_FAR, _LOOKS_TO_TELL = 5.0, 4              # above the goal, after twice as many: it won't reach it; looks for a trend
+_CREEPING, _LOOKED_BACK = 0.01, 20         # of −2 ln L, gained in so many steps: less is the floor of a flat valley
+_FAR, _LOOKS_TO_TELL = 5.0, 4              # of −2 ln L above the goal after twice as many steps; checks for a trend
 
 
 @dataclass(frozen=True)
 class Fit:
-    """The parameters and the sum of squares there."""
+    """Parameters, and the sum of squares there."""
 
     theta: FloatArray
     objective: float
@@ -51,7 +53,7 @@ class Box:
 def descend(at: At, start: FloatArray, free: BoolArray, box: Box, goal: float = math.inf) -> Fit:
     """Descend from ``start`` (P,); only ``free`` (P,) parameters move. Arithmetic that overflows ends the descent.
 
-    ``goal``: what it is to beat; where that is far off after a while, it is left.
+    ``goal``: value to go below; if it stays far off, the descent ends.
     """
     theta = np.where(free, np.clip(start, box.low, box.high), start)
     r, slopes = at(theta)
@@ -104,9 +106,9 @@ def descend(at: At, start: FloatArray, free: BoolArray, box: Box, goal: float = 
 
 
 def _leads_nowhere(course: Sequence[float], goal: float) -> bool:
-    """Return whether a descent, seen now and then, is at its end, or will end above ``goal``.
+    """Return whether a descent has ended, or will end above ``goal``. ``course``: its values at regular checks.
 
-    Along the floor of a flat valley what is gained falls by the same share from look to look; the first is left out.
+    Along the floor of a flat valley the gain falls by the same share from check to check; the first check is left out.
     """
     if course[-2] - course[-1] < _CREEPING:
         return True
@@ -119,7 +121,7 @@ def _leads_nowhere(course: Sequence[float], goal: float) -> bool:
 def _within(
     least: FloatArray, most: FloatArray, here: FloatArray, scale: FloatArray, matrix: FloatArray, right: FloatArray
 ) -> FloatArray:
-    """``here`` plus the step x of matrix x = right, in units of ``scale``; what would leave the bounds stops there."""
+    """Return ``here`` plus the step x of matrix x = right, in units of ``scale``; parameters stop at their bounds."""
     there = here + _solved(matrix, right) * scale
     held = outside = (there < least) | (there > most)
     while True in outside.tolist():
@@ -144,31 +146,31 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Where to begin: rough sizes, and linear least squares for shafts behind first-order lags; then the best of many.
+# Start values: rough sizes, and linear least squares for shafts with first-order lags; then the best of many descents.
 
 
-# τ_w, τ_T, d to start from besides what linear least squares proposes: the field rig's, and its mirror image
+# τ_w, τ_T, d as start values besides those of linear least squares: the field rig's, and its mirror image
 _STARTS = ((0.40, 0.15, 0.0), (0.15, 0.40, 0.0))   # s; lags of speed and torque, and time offset
 _SKEWS = (-0.2, -0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1, 0.2)   # s; start values of the time offset
 _PROPOSALS = 3            # best start values of the search that are fitted
-_NO_LAG, _SOME_LAG = 0.1, 0.6      # radians at the fastest line
-_EQUAL_POLES, _NEAR_EQUAL = 0.25, 0.1      # of ρ
-_FOR_ONE_POLE = 4.0 ** (1.0 / 3.0)         # of its delay, that of two equal poles in its place
-_BY_AVERAGE = 12.0 * (0.5 * _FOR_ONE_POLE**2 - 1.0) / (_FOR_ONE_POLE**2 - 1.0)    # u, of what the delay's square gains
+_NO_LAG, _SOME_LAG = 0.1, 0.6      # rad at the fastest line
+_EQUAL_POLES, _NEAR_EQUAL = 0.25, 0.1      # ρ of two equal poles, and the distance that counts as equal
+_FOR_ONE_POLE = 4.0 ** (1.0 / 3.0)         # delay of two equal poles that replace one pole, over the delay of that pole
+_BY_AVERAGE = 12.0 * (0.5 * _FOR_ONE_POLE**2 - 1.0) / (_FOR_ONE_POLE**2 - 1.0)    # u over the rise of delay²
 
 Fixed = dict[int, float]
 
 
 @dataclass(frozen=True)
 class Apart:
-    """Answers (P,) that stand apart, and by how much they must lower −2 ln L to be preferred."""
+    """Condition for separate solutions (P,): the least decrease of −2 ln L for which they are preferred."""
 
     stands: Callable[[FloatArray], bool]
     gain: float
 
 
 def box(problem: Likelihood, rough_inertia: float) -> Box:
-    """Bounds of theta; wider where a prior says so."""
+    """Return the bounds of theta; wider if a prior requires it."""
     low, high = problem.model.bounds(rough_inertia, problem.s)
     for prior in problem.priors:
         high[prior.index] = max(high[prior.index], prior.mean + 6.0 * prior.sd)
@@ -176,7 +178,7 @@ def box(problem: Likelihood, rough_inertia: float) -> Box:
 
 
 def rough_inertia_of(problem: Likelihood) -> float:
-    """|T|/(ω|W|) of the lowest line: the right size, whatever the lags."""
+    """Return |T|/(ω|W|) of the lowest line: the right size of J, for any lags."""
     first = problem.owner == 0
     ratio = np.abs(problem.torque[first]) / np.maximum(np.abs(problem.speed[first] * problem.s[0]), 1e-300)
     return float(np.median(ratio))
@@ -185,10 +187,10 @@ def rough_inertia_of(problem: Likelihood) -> float:
 def minimise(
     problem: Likelihood, limits: Box, start: FloatArray, fixed: Fixed, goal: float = math.inf
 ) -> Fit:
-    """A descent, and another from beside a lag of zero; the parameters in ``fixed`` keep the value that stands there.
+    """Descend from the start, and again from beside a lag of zero; the parameters in ``fixed`` keep these values.
 
-    At no lag at all descents stand still, a minimum or not: a short lag whose delay the skew takes back is felt through
-    its square only, ln F = −ln(1 + τ s) + τ s = τ² s²/2 − …, and the slope of that is zero at τ = 0.
+    At a lag of zero a descent stops, even without a minimum: a short lag whose delay the skew compensates acts only by
+    its square, ln F = −ln(1 + τ s) + τ s = τ² s²/2 − …, and its slope is zero at τ = 0.
     """
     fit = _descent(problem, limits, start, fixed, goal)
     for begin in _beside_no_lag(problem, fit.theta, fixed):
@@ -208,7 +210,7 @@ def _descent(
 
 
 def _beside_no_lag(problem: Likelihood, theta: FloatArray, fixed: Fixed) -> Iterator[FloatArray]:
-    """Starts with a lag of some size instead of hardly any, and the skew that makes up for its delay."""
+    """Yield start values with a moderate lag instead of nearly none, and the skew that compensates its delay."""
     at, fastest = problem.model.at, float(np.max(np.abs(problem.s)))
     if at(signal_filters.SKEW) in fixed:
         return
@@ -226,11 +228,13 @@ def _beside_no_lag(problem: Likelihood, theta: FloatArray, fixed: Fixed) -> Iter
 
 
 def other_poles(problem: Likelihood, theta: FloatArray, fixed: Fixed) -> Iterator[FloatArray]:
-    """Starts with two equal poles in one report that has one, or two unlike ones; and with one where it has two.
+    """Yield starts with two equal poles in one report that has one pole or two different ones, and with one pole
+    instead of two.
 
-    In the logarithm's series one pole's third term is 2 τ³, of two equal ones τ³/2: these stand for it where their
-    delay is 4^(1/3) of its. What the second term differs by then, τ² to τ²/2, an average may make up for (u/12), and
-    the skew for the delay; between the two lies a ridge, which no descent crosses that sets out from the old delay.
+    In the series of the logarithm the third term of one pole is 2 τ³, that of two equal poles τ³/2. Two poles are
+    therefore equivalent if their delay is 4^(1/3) times that of the one. An average (u/12) compensates the difference
+    of the second terms, τ² to τ²/2, and the skew that of the delay. Between the two lies a ridge, which a descent from
+    the old delay does not cross.
     """
     at, fastest = problem.model.at, float(np.max(np.abs(problem.s)))
     for lag, shape, sign in (
@@ -255,7 +259,9 @@ def best_fit(
     problem: Likelihood, limits: Box, fixed: Fixed, starts: Iterable[FloatArray], apart: Apart | None = None,
     known: Sequence[Fit] = (),
 ) -> Fit:
-    """The `lowest` of several descents, of those beside no lag from the lowest of them, and of what is ``known``."""
+    """Return the `lowest` of several descents, of those beside no lag from the lowest of them, and of the ``known``
+    fits.
+    """
     fits = [*known, *(_descent(problem, limits, start, fixed) for start in starts)]
     best = min(fits, key=lambda fit: fit.objective)
     fits += [_descent(problem, limits, start, fixed) for start in _beside_no_lag(problem, best.theta, fixed)]
@@ -263,7 +269,7 @@ def best_fit(
 
 
 def lowest(fits: Sequence[Fit], apart: Apart | None = None) -> Fit:
-    """The first of equals, so that the same data give the same bits; what stands ``apart`` must gain more."""
+    """Return the first of the lowest fits, so that the same data give the same bits; fits ``apart`` must gain more."""
     best = min(fits, key=lambda fit: fit.objective)
     if apart is None or not apart.stands(best.theta):
         return best
@@ -273,16 +279,16 @@ def lowest(fits: Sequence[Fit], apart: Apart | None = None) -> Fit:
 
 
 def rigid_starts(problem: Likelihood) -> list[FloatArray]:
-    """The most promising of the linear proposals, and two guesses."""
+    """Return the most promising of the linear proposals, and two guesses."""
     proposals = sorted(_proposals(problem), key=problem.objective)
     return proposals[:_PROPOSALS] + [_start(problem, lags) for lags in _STARTS]
 
 
 def rigid_rivals(theta: FloatArray) -> list[FloatArray]:
-    """Starts at which a rigid shaft's lag and the lag of its speed's report have changed places.
+    """Return starts at which the lag of a rigid shaft and the lag of its speed report are exchanged.
 
     (J s + B)(1 + τ_w s) = (B τ_w s + B)(1 + (J/B) s): shaft and report cannot be separated if both J/B and τ_w are
-    plausible lags of a report. An answer has this rival, and so has an interval.
+    plausible lags of a report. A fit has this alternative, and so has an interval.
     """
     inertia, viscous, lag = theta[INERTIA], theta[VISCOUS], theta[2 + signal_filters.SPEED_LAG]
     if viscous <= 0.0 or inertia > 1.2 * signal_filters.LAG_BOUND_S * viscous:
@@ -293,7 +299,7 @@ def rigid_rivals(theta: FloatArray) -> list[FloatArray]:
 
 
 def _start(problem: Likelihood, lags: tuple[float, float, float]) -> FloatArray:
-    """With the lags given, J and B follow from the lines by linear least squares: G/filters = J s + B."""
+    """Return J and B for given lags by linear least squares: G/filters = J s + B."""
     phi = np.zeros(signal_filters.COUNT)
     phi[[signal_filters.SPEED_LAG, signal_filters.TORQUE_LAG, signal_filters.SKEW]] = lags
     seen = problem.torque / (signal_filters.FilterRatio(phi, problem.s).value[problem.owner] * problem.speed)
@@ -309,7 +315,7 @@ def _start(problem: Likelihood, lags: tuple[float, float, float]) -> FloatArray:
 
 
 def _proposals(problem: Likelihood) -> list[FloatArray]:
-    """Starts by linear least squares: for a given skew, first-order lags make the equation linear.
+    """Return start values by linear least squares: for a given skew, first-order lags make the equation linear.
 
     With T' = T e^(ds):  T' = (J τ_w) s² W + (J + B τ_w) s W + B W − τ_T s T', four real unknowns, each equation divided
     by its standard deviation. J and τ_w follow from a = J τ_w and b = J + B τ_w, hence B τ_w² − b τ_w + a = 0, smaller

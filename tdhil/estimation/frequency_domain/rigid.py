@@ -1,4 +1,4 @@
-"""The rigid model fitted to the lines of a recording: values, intervals, what they rest on, and what to say of it."""
+"""Rigid model fitted to the lines of a recording: values, intervals, conditions and texts."""
 
 import math
 from dataclasses import dataclass, replace
@@ -36,19 +36,19 @@ from tdhil.estimation.spectrum import ComplexArray, SpectralLine
 from tdhil.recording import LagPrior
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Can these lines tell the inertia at all? Count equations and unknowns before fitting.
+# Count of equations and unknowns before the fit: can these lines determine the inertia?
 #
-# Each distinct excited frequency is two equations (real and imaginary part of T/ω); two mean speeds add one (B), each
-# lag stated by the drive or the rig one. Unknown are five: J, B, the two lags, and the skew. (The structure of the
-# lags is unknown too; where the lines cannot tell it, the interval is wide or open, but is one.) At a second mean
-# speed the same frequency says the same again: it helps the scatter, not the count.
+# Each distinct excited frequency gives two equations (real and imaginary part of T/ω). Two mean speeds add one (B), and
+# each lag stated by the drive or the rig one. There are five unknowns: J, B, the two lags, and the skew. (The structure
+# of the lags is unknown too; if the lines do not determine it, the interval is wide or open, but still valid.) At a
+# second mean speed the same frequency gives the same equations: it reduces the scatter, but does not count.
 #
 # The parameters are those of the rigid model.
 
 
 UNKNOWNS = 5              # J, B, two lags and the time offset
 _AT = Model().at
-_LEAST_SD_S = 1e-4     # a lag "known exactly" is known to a tenth of a millisecond at best
+_LEAST_SD_S = 1e-4     # s; a lag "known exactly" is known to 0.1 ms at best
 
 
 def lag_priors(
@@ -64,7 +64,7 @@ def lag_priors(
 
 
 def known_structure(prior: LagPrior) -> dict[int, float]:
-    """A stated lag is a first-order one. What the manual states of both reports leaves no room for an average."""
+    """Return the fixed parameters. A stated lag is first-order; if the manual states both lags, there is no average."""
     fixed = {}
     if prior.speed_lag_s is not None:
         fixed[_AT(SPEED_SHAPE)] = 0.0
@@ -83,7 +83,9 @@ def unfiltered() -> dict[int, float]:
 def with_skew(
     priors: tuple[GaussianPrior, ...], lines: int, constraint: ViscousConstraint | None, sd_s: float
 ) -> tuple[GaussianPrior, ...]:
-    """If only the skew is missing from the count, and both lags are known: torque and speed come in one frame."""
+    """Add the stated skew if only the skew is missing from the count: both lags are known, both signals in one
+    frame.
+    """
     known = len(priors) + (constraint is not None) + 2 * lines
     if known < UNKNOWNS and len(priors) == 2:
         return (*priors, GaussianPrior(_AT(SKEW), 0.0, max(sd_s, _LEAST_SD_S)))
@@ -98,7 +100,7 @@ def known_of(
 
 
 def refuse_count(lines: int, constraint: ViscousConstraint | None, priors: tuple[GaussianPrior, ...]) -> Refusal | None:
-    """A refusal that names equations, unknowns and the motion that would do."""
+    """Return a refusal with the equations, the unknowns and the motion that would suffice; None if they suffice."""
     equations = 2 * lines + (constraint is not None) + len(priors)
     if equations >= UNKNOWNS:
         return None
@@ -117,22 +119,21 @@ def refuse_count(lines: int, constraint: ViscousConstraint | None, priors: tuple
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Lines as a reader sees them: the inertia that each frequency shows by itself, beside what the model makes of it.
+# Spectral lines for the report: the inertia that each frequency shows by itself, beside that of the model.
 #
-#     G = T/ω,    apparent inertia Im G/ω_k (what regressing torque on acceleration gives at that line),    damping Re G
+#     G = T/ω,    apparent inertia Im G/ω_k (the slope of torque over acceleration at that line),    damping Re G
 #
-# pooled over the segments, G = Σ P T W* / Σ P |W|², of variance v / Σ P |W|² (`likelihood`), half of it in either
-# part.
+# pooled over the segments, G = Σ P T W* / Σ P |W|², with variance v / Σ P |W|² (`likelihood`), half of it in each part.
 
 
 def fitted_points(fitted: FittedModel, confidence: float) -> tuple[LinePoint, ...]:
-    """The lines of a fit beside the likelier of its two answers."""
+    """Return the lines of a fit beside the likelier of its two solutions."""
     problem, theta = fitted.problem, fitted.likelier.theta
     return line_points(problem.unloaded(theta), problem.model.impedance(theta, problem.s), confidence)
 
 
 def line_points(lines: tuple[SpectralLine, ...], fitted: ComplexArray, confidence: float) -> tuple[LinePoint, ...]:
-    """One for each line, in their order; ``fitted`` (K,) is the model's T/ω at them, N·m·s/rad."""
+    """Return one point for each line, in their order; ``fitted`` (K,) is the model's T/ω at them, N·m·s/rad."""
     found = []
     for line, model in zip(lines, fitted, strict=True):
         g = complex(model)
@@ -173,7 +174,7 @@ _OPEN = Refusal(
 
 @dataclass(frozen=True)
 class RigidResult:
-    """``inertia`` is infinite on a side that the data leave open."""
+    """Result of a rigid shaft; ``inertia`` is infinite on a side that the data leave open."""
 
     inertia: Estimate
     viscous: Estimate
@@ -183,7 +184,7 @@ class RigidResult:
     skew_s: Estimate
     residual: ResidualTest | None
     budget: tuple[BudgetLine, ...]
-    first_order: bool          # first-order lags are the likelier answer
+    first_order: bool          # True if first-order lags are the likelier solution
     fitted: FittedModel
 
 
@@ -223,11 +224,11 @@ def fit_inertia(
     fixed: Fixed,
     confidence: float,
 ) -> tuple[Estimate, ResidualTest | None, FittedModel]:
-    """`fit_rigid` as far as J goes, which is a third of it; J without width where the data reject the model."""
+    """Return J only, as `fit_rigid`, in a third of the time; J has no width if the data reject the model."""
     problem = Likelihood(lines, Model(), constraint, priors)
     fitted = fit_model(problem, fixed, rigid_starts(problem), rigid_rivals)
     residual = residual_of(fitted)
-    if rejects(residual):            # then no interval will be shown, and none is sought
+    if rejects(residual):            # then no interval is reported, and none is computed
         value = float(fitted.whole.theta[INERTIA])
         return Estimate(value, value, value), residual, fitted
     return estimate(fitted, INERTIA, confidence), residual, fitted
@@ -245,10 +246,10 @@ def _bare(fitted: FittedModel, residual: ResidualTest | None) -> RigidResult:
 
 
 def lags_of(fitted: FittedModel, confidence: float) -> tuple[Estimate, Estimate, Estimate]:
-    """Delay of slow motion in either report, and what torque is late besides.
+    """Return the delay of slow motion in either report, and the additional delay of torque.
 
-    Where first-order lags are the answer, their intervals are those of first-order lags. The whole family counts half
-    of a moving average among the delays, whichever report it stands in; where one was found it is given back.
+    If first-order lags are the likelier solution, the intervals are those of first-order lags. In the whole family,
+    half of a moving average counts as delay, in either report; if an average was found, it is added back.
     """
     at = fitted.problem.model.at
     chosen = (signal_filters.SPEED_LAG, signal_filters.TORQUE_LAG, signal_filters.SKEW)
@@ -281,7 +282,7 @@ def _coulomb(levels: Levels, fitted: FittedModel, confidence: float) -> Estimate
 def rigid_finding(
     result: RigidResult | None, case: Case, what: str = "a rigid shaft with reporting lags"
 ) -> Finding | Refusal:
-    """Return the finding of a rigid shaft; a refusal where its inertia stays open. ``what``: its name in messages."""
+    """Return the finding of a rigid shaft; a refusal if its inertia stays open. ``what``: its name in messages."""
     if result is None or not (rejects(result.residual) or result.inertia.bounded):
         return _OPEN
     as_paper = not shaft_model(case.options.model).lags
@@ -302,7 +303,7 @@ def rigid_finding(
 
 
 def _turned(estimate: Estimate, value: float) -> Estimate:
-    """The same interval stretched to hold another value too."""
+    """Return the interval, extended to contain another value."""
     return replace(estimate, value=value, low=min(estimate.low, value), high=max(estimate.high, value))
 
 
@@ -324,7 +325,7 @@ def _conditions(result: RigidResult, case: Case) -> tuple[str, ...]:
 
 
 def simultaneous(priors: tuple[GaussianPrior, ...], skew: int) -> tuple[str, ...]:
-    """Return the condition on an inertia where the skew, of this index, was taken as known."""
+    """Return the condition on an inertia for which the skew, of this index, was assumed to be known."""
     return tuple(f"speed and torque simultaneous to {p.sd * 1e3:.3g} ms (1 sd)" for p in priors if p.index == skew)
 
 

@@ -1,6 +1,6 @@
-"""The mechanics behind a line: T/ω of the shaft itself, before the drive's reports have changed either.
+"""Mechanics of the shaft: T/ω before the filters of the drive's reports.
 
-About a mean speed that keeps its sign Coulomb friction is constant, and the shaft is linear: T = Z(s) ω, s = jω.
+If the speed does not change its sign, Coulomb friction is constant, and the shaft is linear: T = Z(s) ω, s = jω.
 """
 
 import math
@@ -15,38 +15,38 @@ from tdhil.estimation.spectrum import ComplexArray
 from tdhil.recording import FloatArray, Pipe
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Two masses on a torsion spring, seen from the motor (the paper's figure 7, which it draws and then drops).
+# Two masses on a torsion spring, seen from the motor (figure 7 of the paper, which does not use it further).
 #
 #     J_r dω_r/dt = T − B_r ω_r − τ      J_L dω_L/dt = τ − B_L ω_L      dτ/dt = k (ω_r − ω_L) + c d(ω_r − ω_L)/dt
 #
-# At s = jω the spring says ω_r − ω_L = a τ with the compliance a = s/(k + c s), the load τ = Z_L ω_L, Z_L = J_L s +
-# B_L. So ω_r = (1/Z_L + a) τ: speeds add up, as voltages do in a row,
+# At s = jω the spring gives ω_r − ω_L = a τ with the compliance a = s/(k + c s), and the load τ = Z_L ω_L with Z_L =
+# J_L s + B_L. Therefore ω_r = (1/Z_L + a) τ: speeds add, as voltages in series do,
 #
 #     Z = T/ω_r = J_r s + B_r + Z_L/(1 + a Z_L) = J_r s + B_r + (J_L s + B_L)(k + c s)/(J_L s² + (B_L + c) s + k).
 #
-# Dry friction at either end is a constant torque while both keep turning one way: it is in the mean, not in the
+# Dry friction at either end is a constant torque while both ends turn in one direction: it is in the mean, not in the
 # lines.
 #
-# Where Z is large, the load swings by itself at √(k/J_L) and holds the motor still (antiresonance of the motor's
-# speed). Where Z is small, above it, the ends swing against each other at √(k (1/J_r + 1/J_L)) and little torque
-# moves much (resonance).
+# Where Z is large, the load oscillates at √(k/J_L) and the motor stands still (antiresonance of the motor's speed). At
+# a higher frequency Z is small: the ends oscillate against each other at √(k (1/J_r + 1/J_L)), and a small torque gives
+# a large motion (resonance).
 #
-# Below both, Z → (J_r + J_L) s + B_r + B_L: what turns with mean speed, and what the levels show. Parameters, chosen
-# so that lines speak of them one by one:
+# Below both, Z → (J_r + J_L) s + B_r + B_L: the total inertia, and the friction that the levels show. The parameters
+# are chosen so that the lines determine them nearly independently:
 #
 #     m = J_r, B = B_r + B_L, J_L, ω_a = √(k/J_L), c, B_L            k = ω_a² J_L.
 #
-# c and B_L damp alike and can hardly be kept apart.
+# c and B_L damp in the same way and can hardly be separated.
 
 
-LOAD, SWING, DAMPING, LOAD_VISCOUS = range(2, 6)    # in m, after shaft.py's INERTIA and VISCOUS
+LOAD, SWING, DAMPING, LOAD_VISCOUS = range(2, 6)    # positions in m, after shaft.py's INERTIA and VISCOUS
 
-_SLOWEST, _FASTEST = 0.2, 10.0     # swing, of the lowest and of the highest line
-_SMALL_LOSS = 0.03                 # damping's natural size, of J ω
+_SLOWEST, _FASTEST = 0.2, 10.0     # bounds of the oscillation, as multiples of the lowest and of the highest line
+_SMALL_LOSS = 0.03                 # natural size of the damping, over J ω
 
 
 class TwoMassShaft:
-    """J_r, B, J_L, ω_a (rad/s), c, B_L."""
+    """Two masses; m = J_r, B, J_L, ω_a (rad/s), c, B_L."""
 
     names: tuple[str, ...] = ("inertia", "viscous", "load_inertia", "swing_rad_s", "damping", "load_viscous")
     inertia_row = np.array([1.0, 0.0, 1.0, 0.0, 0.0, 0.0])
@@ -60,7 +60,9 @@ class TwoMassShaft:
         return z
 
     def jacobian(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
-        """With D = 1 + a Z_L: ∂(Z_L/D)/∂Z_L = 1/D², ∂(Z_L/D)/∂a = −Z_L²/D², ∂a/∂k = −a²/s, ∂a/∂c = −a²."""
+        """Return the slopes by m: D = 1 + a Z_L, ∂(Z_L/D)/∂Z_L = 1/D², ∂(Z_L/D)/∂a = −Z_L²/D², ∂a/∂k = −a²/s, ∂a/∂c
+        = −a².
+        """
         _, _, load, swing, damping, load_viscous = m
         a = s / (swing**2 * load + damping * s)
         hung = load * s + load_viscous
@@ -87,19 +89,19 @@ class TwoMassShaft:
 
 
 def stiffness(m: FloatArray) -> float:
-    """k, N·m/rad, of two lumps."""
+    """Return k of two lumps, N·m/rad."""
     return float(m[SWING] ** 2 * m[LOAD])
 
 
 def resonances(m: FloatArray) -> tuple[float, float]:
-    """(antiresonance, resonance) of the motor's speed without damping, rad/s."""
+    """Return (antiresonance, resonance) of the motor's speed without damping, rad/s."""
     return float(m[SWING]), float(m[SWING] * np.sqrt(1.0 + m[LOAD] / m[0]))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 
 class Shaft(Protocol):
-    """A mechanical impedance Z(s; m), m (M,).
+    """Mechanical impedance Z(s; m), m (M,).
 
     ``inertia_row`` and ``viscous_row`` (M,): the inertia that turns with mean speed, and the friction slope that
     levels of mean torque show, as linear combinations of m.
@@ -112,27 +114,27 @@ class Shaft(Protocol):
     @property
     def viscous_row(self) -> FloatArray: ...
     def impedance(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
-        """Z, N·m·s/rad, (K,)."""
+        """Return Z, N·m·s/rad, (K,)."""
         ...
 
     def jacobian(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
-        """∂Z/∂m, (K, M)."""
+        """Return ∂Z/∂m, (K, M)."""
         ...
 
     def bounds(self, rough_inertia: float, s: ComplexArray) -> tuple[FloatArray, FloatArray]:
-        """Least and greatest m, (M,) each."""
+        """Return the least and greatest m, (M,) each."""
         ...
 
     def scales(self, rough_inertia: float, s: ComplexArray) -> FloatArray:
-        """The natural size of each of m, (M,)."""
+        """Return the natural size of each parameter of m, (M,)."""
         ...
 
 
-INERTIA, VISCOUS = range(2)     # of every shaft: the motor's own inertia first, a viscous friction second
+INERTIA, VISCOUS = range(2)     # positions in m of every shaft: inertia of the motor, viscous friction
 
 
 class RigidShaft:
-    """J dω/dt + B ω + T_c sgn ω = T: Z = J s + B."""
+    """Rigid shaft J dω/dt + B ω + T_c sgn ω = T: Z = J s + B."""
 
     names = ("inertia", "viscous")
     inertia_row = np.array([1.0, 0.0])
@@ -155,7 +157,7 @@ class RigidShaft:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A drill string: torsional waves between the motor and what turns at the bottom; two masses are its limit.
+# Drill string: torsional waves between the motor and the inertia at the bottom; two masses are its limit.
 #
 # Along the string, per length, the wave equation of a bar with drag and inner friction (d'Alembert; Chen and Géradin
 # 1995), s = jω, is −∂τ/∂x = (b/L) ω, −∂ω/∂x = (a/L) τ, with the totals
@@ -163,29 +165,29 @@ class RigidShaft:
 #     b = J_s s + D       inertia J_s = ρ I L and drag of the string
 #     a = s/(k + c s)     compliance, k = G I/L its static stiffness.
 #
-# The solution is waves e^(±√(ab) x/L); with the end's impedance Z_e = J_e s + B_e at the bottom, the top sees
+# The solution is waves e^(±√(ab) x/L). With the impedance Z_e = J_e s + B_e at the bottom, the impedance at the top is
 #
 #     Z_s = (Z_e + √(b/a) tanh √(ab)) / (1 + Z_e √(a/b) tanh √(ab)) = (Z_e + b q)/(1 + Z_e a q)
 #     q = tanh √x / √x,    x = a b,
 #
-# and the motor Z = J_r s + B_r + Z_s. Without drag √(b/a) is the characteristic impedance I √(Gρ) = √(J_s k), √(ab) =
-# s T with the delay T = L √(ρ/G) = √(J_s/k). A string that weighs nothing (b = 0, q = 1) leaves two masses, and that
-# is how it is parametrised: with the load J_L = J_s + J_e and the string's share of it, η = J_s/J_L,
+# and the motor Z = J_r s + B_r + Z_s. Without drag √(b/a) is the characteristic impedance I √(Gρ) = √(J_s k), √(ab) = s
+# T with the delay T = L √(ρ/G) = √(J_s/k). A string without weight (b = 0, q = 1) gives two masses. The parameters
+# follow this: the load J_L = J_s + J_e and the string's share of it, η = J_s/J_L,
 #
 #     m = J_r, B, J_L, ω_a, c, B_L, η, δ     k = ω_a² J_L (1 − 2η/3),    J_s = η J_L,    J_e = (1 − η) J_L,
 #
-# η = 0 two masses, η = 1 a free bottom. J_e + J_s/3 is what a string's swing weighs by Rayleigh, so that ω_a stays
-# near the lowest antiresonance (10 % off at worst) whatever η. Of the friction below, B_L, the string's drag is D = δ
-# B_L: at the swing the bottom moves most, so that a loss there shows more than the same loss along the string, of
-# which the levels show the sum alone.
+# η = 0 means two masses, η = 1 a free bottom. By Rayleigh the effective inertia of the oscillation is J_e + J_s/3, so
+# ω_a is near the lowest antiresonance (10 % off at worst) for any η. The string's drag is a part D = δ B_L of the
+# friction B_L below the motor. In the oscillation the bottom moves most, so a loss there has more effect than the same
+# loss along the string; the levels show only the sum of both.
 
 
-STRING_SHARE, DRAG_SHARE = 6, 7         # in m
+STRING_SHARE, DRAG_SHARE = 6, 7         # positions in m
 _RAYLEIGH = 2.0 / 3.0
 
 
 class StringShaft:
-    """J_r, B, J_L, ω_a (rad/s), c, B_L, η, δ."""
+    """Drill string; m = J_r, B, J_L, ω_a (rad/s), c, B_L, η, δ."""
 
     names: tuple[str, ...] = (*TwoMassShaft.names, "string_share", "drag_share")
     inertia_row = np.append(TwoMassShaft.inertia_row, [0.0, 0.0])
@@ -199,7 +201,9 @@ class StringShaft:
         return z
 
     def jacobian(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
-        """Chain rule through Z_e, a, b: of Z_s = N/D, N = Z_e + b q, D = 1 + Z_e a q; ∂a/∂k = −a²/s, ∂a/∂c = −a²."""
+        """Return the slopes by m, with the chain rule through Z_e, a, b: Z_s = N/D, N = Z_e + b q, D = 1 + Z_e a q;
+        ∂a/∂k = −a²/s, ∂a/∂c = −a².
+        """
         load, swing, share, drag_share = m[LOAD], m[SWING], m[STRING_SHARE], m[DRAG_SHARE]
         light = 1.0 - _RAYLEIGH * share
         a = s / (string_stiffness(m) + m[DAMPING] * s)
@@ -232,35 +236,38 @@ class StringShaft:
 
 @runtime_checkable
 class Believing(Protocol):
-    """A shaft of which something is known beforehand; ``held`` of its parameters by that more than by the lines."""
+    """Shaft with prior knowledge; ``held``: number of its parameters held by this knowledge more than by the lines."""
 
     @property
     def held(self) -> int: ...
     def beliefs(self, m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """How far m is from that, in standard deviations, (R,), and the slopes of it, (R, M)."""
+        """Return the deviation of m from the prior knowledge, in standard deviations, (R,), and its slopes, (R, M)."""
         ...
 
 
 class KnownStringShaft(StringShaft):
-    """A string whose pipe is known: ζ = √(J_s k) to its tolerance, and √(J_s/k), the waves' way, to a third of that.
+    """String with a known pipe: ζ = √(J_s k) to its tolerance, and the travel time √(J_s/k) to a third of that.
 
-    What the pipe's section is wrong by is in J_s and in k alike, and leaves the waves' speed alone: steel's.
+    An error of the pipe's section changes J_s and k equally, and does not change the wave speed, which is that of
+    steel.
     """
 
     held = 0
 
     def __init__(self, pipe: Pipe, impedance_rel_sd: float | None = None) -> None:
-        """``impedance_rel_sd``: of ζ, in place of the pipe's own; the waves' way stays as sure as the pipe has it."""
+        """Set the pipe. ``impedance_rel_sd``: of ζ, instead of the pipe's; the travel time keeps the pipe's
+        uncertainty.
+        """
         self.pipe = pipe
         self.impedance_rel_sd = pipe.rel_sd if impedance_rel_sd is None else impedance_rel_sd
 
     def impedance_ratio(self, m: FloatArray) -> float:
-        """Return ζ of the fit as a multiple of the pipe's."""
+        """Return ζ of the fit over that of the pipe."""
         inertia = float(m[STRING_SHARE] * m[LOAD])
         return math.sqrt(inertia * string_stiffness(m)) / self.pipe.impedance_nm_s_rad
 
     def beliefs(self, m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """With ln J_s = ln η + ln J_L, ln k = 2 ln ω_a + ln J_L + ln(1 − 2η/3)."""
+        """Return the deviations and slopes, from ln J_s = ln η + ln J_L, ln k = 2 ln ω_a + ln J_L + ln(1 − 2η/3)."""
         share, load, swing = max(float(m[STRING_SHARE]), 1e-6), float(m[LOAD]), float(m[SWING])
         light = 1.0 - _RAYLEIGH * share
         inertia = math.log(share * load / self.pipe.inertia_kg_m2)
@@ -278,7 +285,7 @@ DELAY_SURER = 3.0
 
 
 def _end_and_string(m: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Z_e and b."""
+    """Return Z_e and b."""
     share, drag_share = m[STRING_SHARE], m[DRAG_SHARE]
     end: ComplexArray = (1.0 - share) * m[LOAD] * s + (1.0 - drag_share) * m[LOAD_VISCOUS]
     string: ComplexArray = share * m[LOAD] * s + drag_share * m[LOAD_VISCOUS]
@@ -286,15 +293,16 @@ def _end_and_string(m: FloatArray, s: ComplexArray) -> tuple[ComplexArray, Compl
 
 
 def string_stiffness(m: FloatArray) -> float:
-    """k, N·m/rad, from the motor to the bottom."""
+    """Return k from the motor to the bottom, N·m/rad."""
     return float(m[SWING] ** 2 * m[LOAD] * (1.0 - _RAYLEIGH * m[STRING_SHARE]))
 
 
 def string_resonances(m: FloatArray) -> tuple[float, float]:
-    """Lowest (antiresonance, resonance) of the motor's speed without damping, rad/s.
+    """Return the lowest (antiresonance, resonance) of the motor's speed without damping, rad/s.
 
-    With x = √(J_s/k) ω and β = J_e/J_s, the string carries Z_s/s = J_s g, g = (β + tan x/x)/(1 − β x tan x): its pole,
-    then the first x beyond it where J_r + J_s g = 0, each the one root of a monotonic function in its interval.
+    With x = √(J_s/k) ω and β = J_e/J_s, the string has Z_s/s = J_s g, g = (β + tan x/x)/(1 − β x tan x). The
+    antiresonance is its pole, the resonance the first x beyond it with J_r + J_s g = 0. Each is the only root of a
+    monotonic function in its interval.
     """
     from scipy.optimize import brentq
 
@@ -313,15 +321,15 @@ def string_resonances(m: FloatArray) -> tuple[float, float]:
         return motor * pole(x) + beta * math.cos(x) + math.sin(x) / x
 
     fixed = float(brentq(pole, 1e-12, 0.5 * math.pi + 1e-12))
-    # just above the pole Z_s/s is −∞; it has risen through −J_r before it is 0, at or before π
+    # just above the pole Z_s/s is −∞; it passes −J_r before it reaches 0, at or before π
     free = float(brentq(zero, fixed, math.pi))
     return fixed / delay, free / delay
 
 
 def _q(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """The even function tanh √x/√x and its derivative, (1 − x q² − q)/(2x); by series where x is small."""
+    """Return the even function tanh √x/√x and its derivative, (1 − x q² − q)/(2x); by a series for small x."""
     small = np.abs(x) < 1e-3
-    few = True in small.tolist()     # hardly ever
+    few = True in small.tolist()     # rarely the case
     safe: ComplexArray = np.where(small, 1.0, x) if few else x
     root: ComplexArray = np.sqrt(safe)
     q = np.tanh(root) / root
@@ -339,10 +347,10 @@ def _q(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
 class ShaftModel:
     """A model of the shaft, by name in `tdhil.config.registry.MODELS`.
 
-    ``compliant``: makes the shaft whose swing is fitted, whose m begins as that of two masses does; None: a rigid one.
-    ``text``: of a compliant shaft, what it is, for the reader; ``explain``: what it does with the data, if so;
-    ``have``: what has the unknowns of its fit. ``lags``: are the reports taken to lag? ``widened``: where a rigid
-    shaft is contradicted or in doubt, are others tried? ``piped``: is a pipe made use of whose sizes are known?
+    ``compliant``: makes a shaft with an oscillating load, whose m begins like that of two masses; None: rigid.
+    ``text``: name of a compliant shaft in messages; ``explain``: verb if it explains the data; ``have``: subject and
+    verb for the unknowns of its fit. ``lags``: the reports have lags. ``widened``: other shafts are tried if a rigid
+    one is rejected or in doubt. ``piped``: a pipe of known sizes is used.
     """
 
     compliant: Callable[[], Shaft] | None = None
@@ -366,6 +374,6 @@ PAPER = ShaftModel(lags=False)
 
 
 def shaft_model(name: str) -> ShaftModel:
-    """The model of that name. KeyError where there is none."""
+    """Return the model with this name. Raises KeyError for an unknown name."""
     found: ShaftModel = load(MODELS, name)
     return found

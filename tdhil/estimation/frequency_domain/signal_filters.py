@@ -1,7 +1,7 @@
-"""The ratio of the filters on the two signals that a drive reports: only what the reports do not share can be seen.
+"""Ratio of the filters on the two signals that a drive reports. The common part of both filters is not visible.
 
-Torque and speed are reported through filters and delays of their own, T_rep = T·F_T, ω_rep = ω·F_w, and a line of the
-excitation shows T_rep/ω_rep = (T/ω)·F_T/F_w. With s = jω,
+Torque and speed are reported with their own filters and delays, T_rep = T·F_T, ω_rep = ω·F_w. A line of the excitation
+shows T_rep/ω_rep = (T/ω)·F_T/F_w. With s = jω,
 
     ln F_T/F_w = ln P(s; τ_w, ρ_w) − ln P(s; τ_T, ρ_T) + a(s; u) − d s,
 
@@ -11,17 +11,17 @@ excitation shows T_rep/ω_rep = (T/ω)·F_T/F_w. With s = jω,
                                   (−) for u < 0. Averages on both show as their difference,
     d                             all delay of torque beyond speed's: dead times, halves of averages, the frame's skew.
 
-Every structure that drives are known to have is a point of this family, and it is smooth there: u passes through zero,
-ρ = 0 is a plain bound. First order on both is ρ_w = ρ_T = u = 0. So the structure is not chosen before the fit; what
-the data leave open of it goes into the interval like any other unknown (see inference.py).
+Every known structure of a drive is a point of this family, and the family is smooth there: u passes through zero, and ρ
+= 0 is a simple bound. First order on both is ρ_w = ρ_T = u = 0. The structure is therefore not chosen before the fit.
+Its uncertainty is part of the interval, like that of any other unknown (see inference.py).
 
-What is plausible of a drive enters softly, as Gaussians about zero: lags of about a second at most, averages of about a
-second (`PLAUSIBLE`). Data overrule that easily where they speak; where they don't, it keeps the fit out of corners in
-which long filters of both reports all but cancel, and where the descents would lose their way.
+Plausible values of a drive are Gaussian priors about zero: lags of about a second at most, averages of about a second
+(`PLAUSIBLE`). Informative data easily override them. Without such data, the priors keep the fit out of corners in which
+long filters of both reports nearly cancel, and in which descents do not converge.
 
-Why this many and no more: in the logarithm's series −κ₁ s + κ₂ s²/2 − κ₃ s³/6 + κ₄ s⁴/24 …, κ being differences of the
-filters' cumulants, (d, τ_w, τ_T) already carry any κ₁, κ₂, κ₃. A wrong structure first shows in κ₄, which ρ_w, ρ_T and
-u carry from three sides. What lies beyond is below (ωτ)⁵ at the lines.
+The number of parameters follows from the series of the logarithm, −κ₁ s + κ₂ s²/2 − κ₃ s³/6 + κ₄ s⁴/24 …, in which κ
+are differences of the filters' cumulants: (d, τ_w, τ_T) already give any κ₁, κ₂, κ₃. A wrong structure first shows in
+κ₄, which ρ_w, ρ_T and u adjust in three ways. The remaining terms are below (ωτ)⁵ at the lines.
 """
 
 import math
@@ -34,20 +34,20 @@ from tdhil.recording import FloatArray
 
 SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE, AVERAGE, SKEW = range(6)
 COUNT: Final = 6
-STRUCTURE: Final = (SPEED_SHAPE, TORQUE_SHAPE, AVERAGE)   # all zero: first-order lags
+STRUCTURE: Final = (SPEED_SHAPE, TORQUE_SHAPE, AVERAGE)   # all are zero for first-order lags
 
 LAG_BOUND_S: Final = 2.0
-SKEW_BOUND_S: Final = 1.0      # half an average of 1.4 s, and what the frame's own skew may add
+SKEW_BOUND_S: Final = 1.0      # s; half an average of 1.4 s, and the skew of the frame itself
 SHAPE_BOUND: Final = 0.5
 PLAUSIBLE: Final = ((SPEED_LAG, 1.0), (TORQUE_LAG, 1.0), (AVERAGE, 1.0))     # standard deviations about zero: s, s, s²
-_AVERAGE_CYCLES = 0.8          # an average of w has a zero at 1/w: lines must stay below it
+_AVERAGE_CYCLES = 0.8          # cycles: an average of w has a zero at 1/w, and lines must be below it
 
-_SIGNS: Final = np.array([[1.0], [-1.0]])      # of ln P in the ratio: of speed, of torque
-_SERIES: Final = 1e-3                          # of y², below which a is its series
+_SIGNS: Final = np.array([[1.0], [-1.0]])      # signs of ln P in the ratio: speed, torque
+_SERIES: Final = 1e-3                          # y² below which a is computed by its series
 
 
 class FilterRatio:
-    """F_T/F_w at some lines and its slopes, by Horner's rule and without logarithms: thousands are needed for a result.
+    """F_T/F_w at some lines and its slopes, by Horner's rule and without logarithms, because a result needs thousands.
 
     ``phi`` (6,) = τ_w (s), ρ_w, τ_T (s), ρ_T, u (s²), d (s); ``s`` (K,). ``value`` (K,).
     """
@@ -66,7 +66,7 @@ class FilterRatio:
         self.value = value
 
     def log_slopes(self) -> ComplexArray:
-        """∂ ln F_T/F_w / ∂phi, (6, K).
+        """Return ∂ ln F_T/F_w / ∂phi, (6, K).
 
         With y = ω √|u|/2: ∂a/∂u = (y cot y − 1)/(2|u|), which is −ω²/24 at u = 0.
         """
@@ -88,7 +88,7 @@ class FilterRatio:
 
 
 def filters(phi: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """F_w and F_T, (K,) each, as far as ``phi`` (6,) tells them apart; their ratio is `FilterRatio`'s."""
+    """Return F_w and F_T, (K,) each, as far as ``phi`` (6,) separates them; their ratio is that of `FilterRatio`."""
     x, y = phi[SPEED_LAG] * s, phi[TORQUE_LAG] * s
     speed = 1.0 / (1.0 + x + phi[SPEED_SHAPE] * x * x)
     torque = np.exp(-phi[SKEW] * s) / (1.0 + y + phi[TORQUE_SHAPE] * y * y)
@@ -98,38 +98,38 @@ def filters(phi: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArra
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What both reports share of their lags can hardly be seen; how plausible is it then?
+# Prior on the common lag of both reports, which the lines hardly show.
 #
-# With equal lags on both, F_T/F_w = 1 however long they are; with τ_w = c + δ, τ_T = c and the delay δ taken back,
+# With equal lags on both, F_T/F_w = 1 for any length of them. With τ_w = c + δ, τ_T = c and the delay δ compensated,
 #
 #     ln F_T/F_w = ln(1 + δ s/(1 + c s)) − δ s  ≈  −δ c s²/(1 + c s),
 #
-# a product: lines tell δ c, and c only as far as δ c (ω c)² stands out of the noise. Where nothing stands out, c runs
-# up to whatever bound there is, noise at the slowest lines picks δ/c there, and J follows, since far above 1/c the
-# ratio is the number 1 + δ/c. A flat prior calls that likely: of all lags up to a second, most are long. But a lag is a
-# scale, of which no size is likelier than another in the logarithm (the reference prior 1/c), where the lines can see
-# such a lag; below that it is flat. So
+# which is a product: lines determine δ c, and c only if δ c (ω c)² is clear of the noise. Otherwise c rises to any
+# bound, noise at the slowest lines determines δ/c there, and J follows, because far above 1/c the ratio is the number 1
+# + δ/c. A flat prior makes this likely: of all lags up to a second, most are long. However, a lag is a scale: if the
+# lines can show such a lag, no size is likelier than another in the logarithm (reference prior 1/c). Below that the
+# prior is flat. Therefore
 #
 #     −2 ln p = ln(1 + (c/c₀)²),    c = √2 τ_w τ_T/√(τ_w² + τ_T²),    c₀ = 0.2/ω of the fastest line,
 #
-# goes with the likelihood: c is the shorter lag where they differ much, and either where they are alike. One long lag
-# costs nothing. Two long lags cost five or so, which their difference must explain: where it stands out of the lines'
-# noise it explains hundreds, and c moves by a fifth of its standard deviation. Where it doesn't, there is nothing that
-# tells them from none, and where they are equal, nothing to tell. In between, at lags that are long and unlike by less
-# than a few percent, the interval is as wide as it may be without them.
+# is added to the likelihood. c is the shorter lag if they differ much, and either of them if they are equal. One long
+# lag has no penalty. Two long lags have a penalty of about five, which their difference must explain: if it is clear of
+# the noise, it explains hundreds, and c changes by a fifth of its standard deviation. If it is not, the data do not
+# distinguish them from no lags. In between, at long lags that differ by less than a few percent, the interval may be as
+# wide as without this prior.
 
 
 _UNSEEN = 0.2          # rad at the fastest line
-_ROUND = 0.1           # of c₀: c is made smooth about zero
+_ROUND = 0.1           # of c₀: c is made smooth about zero over this width
 
 
 def unseen_lag(fastest_rad_s: float) -> float:
-    """c₀, s."""
+    """Return c₀, s."""
     return _UNSEEN / fastest_rad_s
 
 
 def shared_lag(speed_lag_s: float, torque_lag_s: float, unseen_s: float) -> tuple[float, float, float]:
-    """The residual whose square is −2 ln p of two lags, and its slopes over either of them."""
+    """Return the residual whose square is −2 ln p of two lags, and its slopes by each of them."""
     a, b = speed_lag_s, torque_lag_s
     square = a * a + b * b + (_ROUND * unseen_s) ** 2
     root = math.sqrt(square)
@@ -145,7 +145,7 @@ def shared_lag(speed_lag_s: float, torque_lag_s: float, unseen_s: float) -> tupl
 
 
 def bounds(s: ComplexArray) -> tuple[FloatArray, FloatArray]:
-    """Least and greatest phi, (6,) each."""
+    """Return the least and greatest phi, (6,) each."""
     window = _AVERAGE_CYCLES * 2.0 * np.pi / float(np.max(np.abs(s)))
     widest = min(window, 2.0 * LAG_BOUND_S) ** 2
     low = np.array([0.0, 0.0, 0.0, 0.0, -widest, -SKEW_BOUND_S])
@@ -154,5 +154,5 @@ def bounds(s: ComplexArray) -> tuple[FloatArray, FloatArray]:
 
 
 def scales() -> FloatArray:
-    """The natural size of each of phi, (6,)."""
+    """Return the natural size of each parameter of phi, (6,)."""
     return np.array([0.1, 0.1, 0.1, 0.1, 0.05, 0.05])

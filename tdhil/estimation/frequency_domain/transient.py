@@ -1,19 +1,19 @@
-"""Residual oscillation of a shaft during the counted periods, taken off their lines.
+"""Residual oscillation of a shaft during the counted periods, subtracted from their lines.
 
-A string that an excitation sets swinging takes minutes to repeat itself: damped by little but the host's slow control,
-the lines of its tenth period still differ from those of its first by more than all noise. Left in, this is a bias that
-is the same in every line's mean, and a scatter that makes everything unsure.
+An excited string takes minutes to reach periodic motion. Damped by little more than the host's slow control, its lines
+in the tenth period still differ from those in the first by more than all noise. Without correction this is a common
+bias in the mean of every line, and a scatter that makes all values uncertain.
 
-But it is no noise. What is left of a linear system's beginning dies away in its own modes, x(t) = Re a e^(σt), with σ
-shared by both signals and all segments, and a of each its own. A period that begins at t = pP has, in its line at
-ω = 2π n/P,
+However, it is not noise. The transient of a linear system decays in its own modes, x(t) = Re a e^(σt), with σ common to
+both signals and all segments, and a different a for each. A period that begins at t = pP has, in its line at ω = 2π
+n/P,
 
     X = (2/P) ∫ x e^(−jωt) dt = (1/P) {a e^(σpP) (e^(σP) − 1)/(σ − jω) + the same of σ*, a*},
 
-and its net change, which is taken off the lines of speed as a ramp (`spectrum`), takes j/ω (1/P) {a e^(σpP) (e^(σP) −
-1) + …} off them, and B times that off those of torque. So all lines together tell the few a, also where a line lies so
-near a mode that it alone could not be separated. Given σ, lines and a are linear (variable projection). Modes are
-added one by one, as long as they gain more than Schwarz's ln n for each of their parameters.
+and its net change, which is subtracted from the lines of speed as a ramp (`spectrum`), reduces them by j/ω (1/P) {a
+e^(σpP) (e^(σP) − 1) + …}, and those of torque by B times that. All lines together therefore determine the few a, also
+if a line is too near a mode to be separated alone. For a given σ, lines and a are linear (variable projection). Modes
+are added one by one while each gains more than Schwarz's ln n for each of its parameters.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine, p
 from tdhil.recording import FloatArray
 
 MOST_MODES = 3            # decaying modes, at most
-_LEAST_PERIODS = 5        # periods that a transient needs
-_OF_A_MODE = 4               # real numbers in a segment: the a of speed and that of torque
+_LEAST_PERIODS = 5        # fewest periods for a transient
+_OF_A_MODE = 4               # real numbers of a mode in a segment: the a of speed and that of torque
 _PER_OCTAVE = 12          # frequencies tried per octave
-_BEYOND = (0.3, 1.3)         # where modes are looked for, of the lowest and the highest line
+_BEYOND = (0.3, 1.3)         # search range of the modes, as multiples of the lowest and the highest line
 _DECAYS = (0.05, 0.15, 0.4, 1.0, 2.0)   # decays tried, per period
-_LEAST_DECAY = 0.02          # of ln x over a period: what dies away slower is drift, which ends of periods correct for
-_STEPS = (0.2, 0.03)         # of the logarithm of a decay, of a frequency over the lowest line's: a descent's first
+_LEAST_DECAY = 0.02          # of ln x over a period: a slower decay is drift, which the ends of the periods correct
+_STEPS = (0.2, 0.03)         # first steps of a descent: of ln(decay), of frequency over the lowest line's
 _ROUNDING = 1e-12         # least relative variance: below it is rounding
 
 
 @dataclass(frozen=True)
 class _ModeShare:
-    """The modes' share of a segment: ``left`` of the signals, (2, P, K), and how the lines' means depend on it.
+    """Contribution of the modes to a segment: ``left`` of the signals, (2, P, K), and its effect on the lines' means.
 
-    ``mean`` (2, K): of the signals without it. ``uncertain`` (2, K): by how much the variance of a mean is larger for
-    it, in variances of one period; ``fitted`` (2, K): complex degrees of freedom that it takes.
+    ``mean`` (2, K): mean of the signals without the modes. ``uncertain`` (2, K): increase of the variance of a mean, in
+    variances of one period. ``fitted`` (2, K): complex degrees of freedom used.
     """
 
     left: ComplexArray
@@ -59,7 +59,7 @@ class _ScaledSegment:
 
     signals: ComplexArray
     scatter: FloatArray
-    begin_s: FloatArray      # of its periods, (P,)
+    begin_s: FloatArray      # start of its periods, (P,)
     period_s: float
     omega: FloatArray        # (K,)
     viscous: float
@@ -71,11 +71,11 @@ class _ScaledSegment:
 
     @cached_property
     def _about_mean(self) -> ComplexArray:
-        """The signals about their means over the periods, (2, P, K)."""
+        """Return the signals about their means over the periods, (2, P, K)."""
         return _centred(self.signals)
 
     def keep(self, modes: Sequence[complex]) -> None:
-        """Compute the columns of these modes once: the search of the next one needs them with each of its trials."""
+        """Compute the columns of these modes once: the search for the next mode needs them in each trial."""
         for mode in modes:
             if mode not in self.kept:
                 self.kept[mode] = self._columns(mode)
@@ -94,7 +94,7 @@ class _ScaledSegment:
         return _ModeShare(left, self.signals.mean(axis=1) - means @ amplitudes, uncertain / variance, fitted)
 
     def _fitted(self, modes: Sequence[complex]) -> tuple[ComplexArray, FloatArray, FloatArray, ComplexArray]:
-        """Return the residual, (2, P, K); amplitudes (M,), the inverse of their normal matrix, and their columns."""
+        """Return the residual (2, P, K), amplitudes (M,), the inverse of their normal matrix, and their columns."""
         kept = self.kept
         columns = np.concatenate([kept[mode] if mode in kept else self._columns(mode) for mode in modes], axis=-1)
         about, signals = _centred(columns), self._about_mean
@@ -107,7 +107,7 @@ class _ScaledSegment:
         return signals - about @ amplitudes, amplitudes, inverse, columns
 
     def _columns(self, mode: complex) -> ComplexArray:
-        """(2, P, K, 4): the lines of a mode of speed with a = 1 and a = j, then of torque."""
+        """Return (2, P, K, 4): the lines of a mode of speed with a = 1 and a = j, then of torque."""
         of_speed, of_torque, of_both = [], [], []
         for sigma in (mode, mode.conjugate()):
             change = np.exp(sigma * self.begin_s)[:, None] * (np.exp(sigma * self.period_s) - 1.0) / self.period_s
@@ -123,7 +123,7 @@ class _ScaledSegment:
 
 
 def _centred(values: ComplexArray) -> ComplexArray:
-    """About the mean over the periods."""
+    """Return the values about their mean over the periods."""
     about: ComplexArray = values - values.mean(axis=1, keepdims=True)
     return about
 
@@ -131,7 +131,7 @@ def _centred(values: ComplexArray) -> ComplexArray:
 def settled_lines(
     fits: tuple[PeriodLines, ...], cut: tuple[Stretch, ...], viscous: float, warming_nm_s: tuple[float, ...] = ()
 ) -> tuple[SpectralLine, ...]:
-    """Return `pooled_lines` without decaying oscillation; the same lines where there is none."""
+    """Return `pooled_lines` without decaying oscillation; the same lines if there is none."""
     plain = pooled_lines(fits, viscous, warming_nm_s)
     rates = warming_nm_s or (0.0,) * len(fits)
     if not fits or len({fit.lines_hz for fit in fits}) != 1 or min(len(fit.speed) for fit in fits) < _LEAST_PERIODS:
@@ -159,7 +159,7 @@ def _segment(fit: PeriodLines, torque: ComplexArray, stretch: Stretch, viscous: 
 
 
 def _modes(segments: Sequence[_ScaledSegment]) -> tuple[complex, ...]:
-    """Those that are worth their parameters."""
+    """Return the modes that gain more than their parameters cost."""
     found: tuple[complex, ...] = ()
     now = _misfit(segments, found)
     numbers = 2.0 * sum(segment.signals.size for segment in segments)
@@ -177,7 +177,7 @@ def _modes(segments: Sequence[_ScaledSegment]) -> tuple[complex, ...]:
 
 
 def _misfit(segments: Sequence[_ScaledSegment], modes: Sequence[complex]) -> float:
-    """−2 ln L with every line's variance concentrated out, but for a constant."""
+    """Return −2 ln L with every line's variance concentrated out, up to a constant."""
     total = 0.0
     for segment in segments:
         left = segment.without(modes)
@@ -229,7 +229,7 @@ def _line(
         means.append(swing.mean[:, column] * size)
         counts.append(1.0 / (1.0 / periods + float(np.max(swing.uncertain[:, column]))))
         nu += periods - 1.0 - float(np.max(swing.fitted[:, column]))
-    # σ is fitted as well: two real numbers a mode, shared by all lines and both signals.
+    # σ is fitted as well: two real numbers a mode, common to all lines and both signals.
     nu = max(1.0, nu - modes / (2.0 * len(segments[0].omega)))
     speed, torque = np.array(means).T
     covariance = scatter / nu

@@ -1,4 +1,4 @@
-"""Identification of any record, periodic or not: the time domain's route."""
+"""Route of the time domain: identification of any recording, periodic or not."""
 
 from tdhil.estimation.time_domain.fit import smoothed as smoothed
 from tdhil.estimation.time_domain.identify import identify_record as identify_record, recorded as recorded

@@ -1,17 +1,17 @@
-r"""The shaft in every bin: what is left of torque when speed has explained its share.
+r"""Equation of the shaft in every bin: the torque that the speed does not explain.
 
-With ω = Q_w(s) ω_rep and T = Q_T(s) e^(ds) T_rep the shaft's equation is, friction constant in each direction,
+With ω = Q_w(s) ω_rep, T = Q_T(s) e^(ds) T_rep, and constant friction in each direction, the equation of the shaft is
 
     A T_rep = C ω_rep + c,      A = Q_T e^(ds),   C = (J s + B) Q_w,   Q = 1 + τ s + κ τ² s²,
 
-d the delay of the torque report beyond the speed report's. Of the structure of a filter only its low frequencies count:
-κ = 0 is one pole, up to ¼ two poles, ⅓ a moving average, ½ a delay. κ is a nuisance within [0, ½].
+with the delay d of the torque report relative to the speed report. Only the low frequencies of a filter matter: κ = 0
+is one pole, up to ¼ two poles, ⅓ a moving average, ½ a delay. κ is a nuisance parameter within [0, ½].
 
-Where friction has a part c₂ ω|ω|, C ω_rep gains c₂ Q_w ω_rep|ω_rep|: the shaft's speed is ahead of the reported one,
-and so is its square, ω² = ω_rep² + τ_w d(ω_rep²)/dt + …, but for (τ_w dω_rep/dt)². Of the reported speed as it is, it
-would make J wrong by τ_w times friction's slope there, 2 c₂ ω.
+If friction has a part c₂ ω|ω|, the term c₂ Q_w ω_rep|ω_rep| is added to C ω_rep. The speed of the shaft is ahead of the
+reported speed, and so is its square: ω² = ω_rep² + τ_w d(ω_rep²)/dt + …, except for (τ_w dω_rep/dt)². Without Q_w, J
+would be wrong by τ_w times the slope of friction, 2 c₂ ω.
 
-The residual of a bin is e = (A T − C W − c Φ)/A, N·m·s: T_rep less what the model makes of ω_rep.
+The residual of a bin is e = (A T − C W − c Φ)/A, N·m·s: T_rep less the torque of the model for ω_rep.
 """
 
 from dataclasses import dataclass
@@ -23,13 +23,13 @@ from tdhil.estimation.time_domain.windows import Bins
 from tdhil.recording import FloatArray
 
 INERTIA, VISCOUS, SPEED_LAG, TORQUE_LAG, SKEW, SPEED_SHAPE, TORQUE_SHAPE, FORWARD, BACK, BEND = range(10)
-PARAMETERS = 10           # of the equation
+PARAMETERS = 10           # number of parameters of the equation
 MOST_SHAPE = 0.5
 
 
 @dataclass(frozen=True)
 class Evaluated:
-    """``error`` (M,), its slopes (M, 10), and G = C/A (M,)."""
+    """Residuals ``error`` (M,), their slopes (M, 10), and G = C/A (M,)."""
 
     error: ComplexArray
     slopes: ComplexArray
@@ -37,7 +37,7 @@ class Evaluated:
 
 
 def evaluate(theta: FloatArray, bins: Bins) -> Evaluated:
-    """The residual of every bin and how it changes with theta."""
+    """Return the residual of every bin and its derivatives by theta."""
     inertia, viscous, lag_w, lag_t, skew, shape_w, shape_t = (float(value) for value in theta[:7])
     s = bins.s
     shaft, report = polynomial(s, viscous, inertia), polynomial(s, 1.0, lag_w, shape_w * lag_w**2)

@@ -1,7 +1,7 @@
 """Weighted least squares over the bins: −2 ln L for a given noise, within bounds, with priors.
 
-A bin's residual is a circular complex number of variance v: it adds 2|e|²/v; at frequency zero it is real and adds
-e²/v.
+The residual of a bin is a circular complex number of variance v, and adds 2|e|²/v. At frequency zero it is real, and
+adds e²/v.
 """
 
 import math
@@ -38,30 +38,32 @@ from tdhil.estimation.time_domain.windows import Bins
 from tdhil.recording import BoolArray, FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How loud the noise is at each frequency, from what the fit leaves over.
+# Noise at each frequency, from the residuals of the fit.
 #
-# Load disturbance, torque noise and speed noise behind the inverse filters add up to a residual whose power per bin
-# is energy·S(f), S smooth. S is the mean of |e|²/energy over neighbouring frequencies, each residual scaled up by
-# what the fit has taken from it, 1/(1 − leverage): a fit of few equations always leaves less than the noise.
+# Load disturbance, torque noise and speed noise behind the inverse filters add up to a residual whose power per bin is
+# energy·S(f), with a smooth S. S is the mean of |e|²/energy over neighbouring frequencies. Each residual is scaled by
+# 1/(1 − leverage), because a fit of few equations leaves less than the noise.
 
 
-_WIDTH = 0.35         # of the frequency, either way
-_NEIGHBOURS = 8       # either way, at least
-_TOP_SHARE = 0.2      # of the bins, the highest: where a record moves least
+_WIDTH = 0.35         # of the frequency: width of the mean, on either side
+_NEIGHBOURS = 8       # fewest neighbours on either side
+_TOP_SHARE = 0.2      # share of the bins, the highest frequencies: there a recording moves least
 
 
 @dataclass(frozen=True)
 class BinNoise:
-    """``variance`` (M,) of every bin's residual, and ``count`` (M,): over how many bins it was averaged."""
+    """Noise of the bins: ``variance`` (M,) of every residual, and ``count`` (M,), the number of bins averaged for
+    it.
+    """
 
     variance: FloatArray
     count: FloatArray
 
 
 def smoothed(hertz: FloatArray, power: FloatArray, width: float = _WIDTH) -> tuple[FloatArray, FloatArray]:
-    """Mean of ``power`` over neighbouring frequencies, and over how many; (M,) each, any order.
+    """Return the mean of ``power`` over neighbouring frequencies, and the number averaged; (M,) each, any order.
 
-    ``width``: how far neighbours reach, of the frequency; for what is as smooth as noise, unless told otherwise.
+    ``width``: distance of the farthest neighbours, as a share of the frequency; the default suits noise.
     """
     order = np.argsort(hertz, kind="stable")
     f = hertz[order]
@@ -77,7 +79,7 @@ def smoothed(hertz: FloatArray, power: FloatArray, width: float = _WIDTH) -> tup
 
 
 def from_residuals(bins: Bins, error: ComplexArray, leverage: FloatArray) -> BinNoise:
-    """The noise that residuals with these leverages speak of."""
+    """Return the noise estimated from residuals with these leverages."""
     power = np.abs(error) ** 2 / (bins.energy * np.maximum(1.0 - leverage, 0.05))
     mean, count = smoothed(bins.hertz, power)
     floor = 1e-12 * float(np.max(np.abs(bins.torque[:, 0]) ** 2 / bins.energy)) if len(bins) else 0.0
@@ -85,7 +87,9 @@ def from_residuals(bins: Bins, error: ComplexArray, leverage: FloatArray) -> Bin
 
 
 def guessed(bins: Bins, inertia: float) -> BinNoise:
-    """Before any fit: white noise in both signals as at the highest frequencies, and 3 % of the torque."""
+    """Return the noise before any fit: white noise in both signals as at the highest frequencies, and 3 % of the
+    torque.
+    """
     top = bins.hertz >= (1.0 - _TOP_SHARE) * float(np.max(bins.hertz))
     floors = [float(np.median(np.abs(x[top, 0]) ** 2 / bins.energy[top])) for x in (bins.torque, bins.speed)]
     share, count = smoothed(bins.hertz, (0.03 * np.abs(bins.torque[:, 0])) ** 2 / bins.energy)
@@ -95,20 +99,20 @@ def guessed(bins: Bins, inertia: float) -> BinNoise:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-# Plausible values of unstated lags: about a second at most, as in the frequency domain; and what both share
-# is held against `shared_lag`'s prior, at a quarter of it, beyond what the middle of the frequencies can see. A record
-# without a plan sees far less of lags than a multisine does, and two long ones that are unlike by a few percent
-# must still be covered.
+# Plausible values of unstated lags: about a second at most, as in the frequency domain. `shared_lag` limits the common
+# lag of both reports by a quarter of its prior, beyond what the middle of the frequencies can show. A recording without
+# planned excitation shows lags far less than a multisine, and must still cover two long lags that differ by a few
+# percent.
 
 
-_TOLERANCE = 1e-9         # of objective, parameters and gradient, relative
-_PLAUSIBLE_S = 1.0        # s; standard deviation of a lag that nothing is known of
+_TOLERANCE = 1e-9         # relative, of objective, parameters and gradient
+_PLAUSIBLE_S = 1.0        # s; standard deviation of an unknown lag
 _SHARED = 0.5         # of the residual
 
 
 @dataclass(frozen=True)
 class FitProblem:
-    """The equations, their noise, the priors, and the free parameters."""
+    """Equations, their noise, the priors, and the free parameters."""
 
     bins: Bins
     variance: FloatArray
@@ -136,7 +140,7 @@ class FitProblem:
         return np.array([_SHARED * value, speed_lag_s / _PLAUSIBLE_S, torque_lag_s / _PLAUSIBLE_S]), rows
 
     def stacked(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Real residuals (R,) whose sum of squares is −2 ln L, and their slopes (R, 10)."""
+        """Return real residuals (R,) whose sum of squares is −2 ln L, and their slopes (R, 10)."""
         found = evaluate(theta, self.bins)
         factor = np.where(self.bins.hertz > 0.0, np.sqrt(2.0), 1.0) / np.sqrt(self.variance)
         error, slopes = found.error * factor, found.slopes * factor[:, None]
@@ -151,12 +155,12 @@ class FitProblem:
         )
 
     def equations(self) -> int:
-        """Real equations, priors included."""
+        """Return the number of real equations, priors included."""
         return int(np.sum(np.where(self.bins.hertz > 0.0, 2, 1))) + len(self.priors)
 
 
 def box(inertia: float, middle_rad_s: float, torque_nm: float, priors: tuple[GaussianPrior, ...]) -> Box:
-    """Lags in [0, 2] s, |skew| ≤ 1 s, κ in [0, ½], J ≥ 0; wider where a prior says so."""
+    """Return the bounds: lags in [0, 2] s, |skew| ≤ 1 s, κ in [0, ½], J ≥ 0; wider if a prior requires it."""
     low, high, scale = np.full(PARAMETERS, -np.inf), np.full(PARAMETERS, np.inf), np.full(PARAMETERS, torque_nm)
     low[INERTIA], low[[SPEED_LAG, TORQUE_LAG, SPEED_SHAPE, TORQUE_SHAPE]] = 0.0, 0.0
     high[[SPEED_LAG, TORQUE_LAG]], high[[SPEED_SHAPE, TORQUE_SHAPE]] = LAG_BOUND_S, MOST_SHAPE
@@ -169,7 +173,7 @@ def box(inertia: float, middle_rad_s: float, torque_nm: float, priors: tuple[Gau
 
 
 def minimise(problem: FitProblem, start: FloatArray, held: dict[int, float] | None = None) -> Fit:
-    """One descent from ``start``; what is not free, or held, keeps its value."""
+    """Minimise once from ``start``. Parameters that are not free, or held, keep their value."""
     from scipy.optimize import least_squares
 
     held = held or {}
@@ -204,7 +208,9 @@ def minimise(problem: FitProblem, start: FloatArray, held: dict[int, float] | No
 
 
 def covariance(problem: FitProblem, theta: FloatArray, free: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance of the free parameters (F, F), quadratic, and the leverage of every bin (M,)."""
+    """Return the covariance of the free parameters (F, F), by the quadratic approximation, and each bin's leverage
+    (M,).
+    """
     _, slopes = problem.stacked(theta)
     scale = problem.box.scale[list(free)]
     u, sizes, vt = np.linalg.svd(slopes[:, list(free)] * scale, full_matrices=False)
@@ -218,32 +224,32 @@ def covariance(problem: FitProblem, theta: FloatArray, free: tuple[int, ...]) ->
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Which bins to believe, how loud their noise is, and the fit: each needs the others, so a few rounds of all three.
+# Selection of the bins, their noise, and the fit. Each needs the others, so a few rounds are made.
 #
-# A bin counts where the torque that the speed explains stands clear of the residual. Where it doesn't, the direction
-# of the regression would matter: least squares of torque on speed errs by the share of the noise in the speed, the
-# other way round by the share in the torque. And frequencies end where the longer lag turns the phase by more than
-# about a radian: up to there any filter is described by its mean and its spread. Beyond, the unknown structure counts;
-# but half of the information on the lags stands there, and most filters have one pole or two. So from that fit the
-# band is widened to three times as far, used where the wider one holds (`solve`).
+# A bin is used if the torque explained by speed is clear of the residual. Otherwise the direction of the regression
+# would matter: least squares of torque on speed errs by the share of noise in the speed, the reverse regression by the
+# share in the torque. Frequencies end where the longer lag turns the phase by more than about a radian: up to there,
+# mean and spread describe any filter. At higher frequencies the unknown structure matters, but half of the information
+# on the lags is there, and most filters have one or two poles. After the first fit the band is therefore widened three
+# times; the wider one is used if its model holds (`solve`).
 
 
 _STARTS = ((0.0, 0.0, 0.0), (0.40, 0.15, 0.0), (0.15, 0.40, 0.0), (0.1, 0.1, 0.0))
-_ROUNDS = 5               # of weighting again
-_NO_LAG = 0.1            # rad at the highest frequency
-_CLEAR = 20.0            # power of what is explained over the residual's
-_NARROW = 0.05           # of the frequency: where excitation is lines, what stands beside one need not stand clear
-_PHASE, _WIDE_PHASE = 1.2, 3.0     # rad
-_LEAST_BINS = 8           # frequencies above the noise that the fit needs
-_ENOUGH_BINS = 40        # that the phase rule leaves in any case, if they are clear
-_LEAST_LAG_S = 1e-3       # s; a lag counts as no shorter
-_ABOUT_AS_WELL = 9.0     # of −2 ln L
-_UNSEEN = 0.1            # standard deviations that friction as large as the whole torque would show: it is not seen
+_ROUNDS = 5               # rounds of reweighting
+_NO_LAG = 0.1            # rad at the highest frequency, below which a lag has no effect
+_CLEAR = 20.0            # least power that the speed explains, over that of the residual
+_NARROW = 0.05           # of the frequency: width of the mean; with lines, bins beside a line need not be clear
+_PHASE, _WIDE_PHASE = 1.2, 3.0     # rad; largest phase of the lags in the narrow and in the wide band
+_LEAST_BINS = 8           # fewest frequencies above the noise for the fit
+_ENOUGH_BINS = 40        # clear bins that the phase rule keeps in any case
+_LEAST_LAG_S = 1e-3       # s; a shorter lag counts as this one
+_ABOUT_AS_WELL = 9.0     # of −2 ln L: a smaller difference counts as an equal fit
+_UNSEEN = 0.1            # sd by which friction as large as the whole torque would show: with less it is unobservable
 
 
 @dataclass(frozen=True)
 class FoundFit:
-    """The problem as it stands in the end, its fit, and of all bins those that stand clear; ``keep``: what was used."""
+    """Final problem, its fit, and the clear ones of all bins; ``keep``: the bins that were used."""
 
     problem: FitProblem
     fit: Fit
@@ -252,9 +258,9 @@ class FoundFit:
 
 
 def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float) -> tuple[FoundFit, ...]:
-    """Fit in a wide band and in a narrow one, in this order; none where too few bins stand clear of the noise.
+    """Return the fits in a wide and in a narrow band, in this order; none if too few bins are clear of the noise.
 
-    Filters are taken as one pole each.
+    Each filter has one pole.
     """
     inertia = _rough(bins)
     if inertia is None:
@@ -274,7 +280,7 @@ def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float)
 
 
 def _settled(every: FitProblem, keep: BoolArray, fit: Fit, phase: float) -> FoundFit | None:
-    """After some rounds from ``fit``, of the bins ``keep`` (M,); None where too few bins stand clear of the noise."""
+    """Return the fit after some rounds from ``fit`` with the bins ``keep`` (M,); None if too few bins are clear."""
     bins, free = every.bins, every.free
     problem = _part(every, keep)
     clear = len(bins)
@@ -300,10 +306,11 @@ def _settled(every: FitProblem, keep: BoolArray, fit: Fit, phase: float) -> Foun
 
 
 def _starts_from(problem: FitProblem, theta: FloatArray) -> Iterator[FloatArray]:
-    """Theta, and where it has no lag to speak of on one signal the first lags once more.
+    """Yield theta; then theta with the first lags, for a signal that has nearly no lag.
 
-    At no lag descents stand still, a minimum or not: the skew takes a short lag's delay back, and its square, which is
-    left, has no slope there. What the first guess of the noise led there, the noise that was found may lead away again.
+    At zero lag a descent stops, even without a minimum: the skew compensates the delay of a short lag, and the
+    remaining term, its square, has no slope there. A descent that reached zero with the first guess of the noise may
+    leave it with the estimated noise.
     """
     yield theta
     fastest = float(np.max(np.abs(problem.bins.s)))
@@ -315,9 +322,9 @@ def _starts_from(problem: FitProblem, theta: FloatArray) -> Iterator[FloatArray]
 
 
 def _unseen_levels(problem: FitProblem, theta: FloatArray) -> tuple[int, ...]:
-    """A constant friction shows at frequency zero and next to it alone; without those bins its value is anything.
+    """Return the friction levels that the bins do not show. Constant friction shows only at and near frequency zero.
 
-    What is then left of it in the others is the arithmetic's, and following it would leave everything open.
+    Its traces in the other bins are rounding errors; a fit to them would leave all parameters open.
     """
     _, slopes = problem.stacked(theta)
     weight = np.linalg.norm(slopes, axis=0) * problem.box.scale
@@ -325,7 +332,7 @@ def _unseen_levels(problem: FitProblem, theta: FloatArray) -> tuple[int, ...]:
 
 
 def _levelled(every: FitProblem, theta: FloatArray, unseen: tuple[int, ...]) -> FloatArray:
-    """The same with the levels that no chosen bin sees as frequency zero has them, all else given."""
+    """Return theta with the unobservable friction levels set from frequency zero, all other parameters fixed."""
     if not unseen:
         return theta
     still = every.bins.chosen(every.bins.hertz == 0.0)
@@ -337,7 +344,7 @@ def _levelled(every: FitProblem, theta: FloatArray, unseen: tuple[int, ...]) -> 
 
 
 def _plain(problem: FitProblem, fit: Fit) -> FloatArray:
-    """Without lags, where that does about as well: lags that are alike cancel, and would be found anywhere."""
+    """Return theta without lags if the fit is about as good: equal lags cancel, and could have any value."""
     without = minimise(problem, fit.theta, {SPEED_LAG: 0.0, TORQUE_LAG: 0.0})
     return without.theta if without.objective - fit.objective <= _ABOUT_AS_WELL else fit.theta
 
@@ -347,7 +354,7 @@ def _part(every: FitProblem, keep: BoolArray) -> FitProblem:
 
 
 def _rough(bins: Bins) -> float | None:
-    """|T|/(ω|W|) over the lower part of the frequencies."""
+    """Return |T|/(ω|W|) over the lower part of the frequencies."""
     low = (bins.hertz > 0.0) & (bins.hertz <= np.quantile(bins.hertz, 0.2)) if len(bins) else np.zeros(0, dtype=bool)
     accelerated = float(np.sum(np.abs(bins.s[low] * bins.speed[low, 0]) ** 2))
     driven = float(np.sum(np.abs(bins.torque[low, 0]) ** 2))
@@ -356,7 +363,7 @@ def _rough(bins: Bins) -> float | None:
 
 
 def _worth_a_look(every: FitProblem, inertia: float) -> BoolArray:
-    """For the first fit: where torque and acceleration stand above their noise at the highest frequencies."""
+    """Return the bins for the first fit: torque and acceleration above their noise at the highest frequencies."""
     bins = every.bins
     moved, _ = smoothed(bins.hertz, np.abs(inertia * bins.s * bins.speed[:, 0]) ** 2 / bins.energy, _NARROW)
     keep = np.asarray(moved * bins.energy > _CLEAR * every.variance)

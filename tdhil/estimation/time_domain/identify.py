@@ -1,4 +1,4 @@
-"""Any record in, Identification out: ramps, steps, pulses, coasting, a trace from a drive's own tool.
+"""Identification of any recording: ramps, steps, pulses, coasting, a trace from a drive's own tool.
 
 1. Was there motion, and torque that caused it?  2. Which stretches does the equation hold in?  3. What do they say,
 seen through smooth windows at the frequencies that stand clear of the noise?  4. Is that a number?
@@ -31,19 +31,19 @@ from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure,
 from tdhil.recording import BoolArray, FloatArray, Recording
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What kind of motion a record holds, in words: a refusal names the missing part, not only that something is.
+# Kind of motion in a recording, in words, so that a refusal names the missing part.
 
 
 IntArray = NDArray[np.intp]
-_STEADY_SHARE = 0.05       # of the speed: less excursion than this is a constant speed
-_IDLE_SHARE = 0.02         # of the torque's span: torque this small is none
-_LIMIT_SHARE = 0.005      # of the samples that may be at a limit
+_STEADY_SHARE = 0.05       # of the speed: with less excursion the speed is constant
+_IDLE_SHARE = 0.02         # of the torque's span: a smaller torque counts as none
+_LIMIT_SHARE = 0.005      # largest share of samples at a limit
 _AT_LIMIT = 0.98          # of the torque limit: a torque above it is at the limit
-_FLAT_SHARE = 0.01        # of the samples that may lie on a plateau
-_LIVELY = 1.5             # median step between neighbours from noise alone, in quanta: it is seen
+_FLAT_SHARE = 0.01        # largest share of samples on a plateau
+_LIVELY = 1.5             # quanta; least median step between neighbours, from which noise is visible
 _BESIDE = 20              # samples on either side of a plateau
-_ALIKE = 8                # samples in a row that noise would not leave alike
-_TURNS = 2                 # changes of acceleration that one ramp has
+_ALIKE = 8                # equal samples in a row that noise would not produce
+_TURNS = 2                 # changes of acceleration in one ramp
 _BLOCKS = 60              # blocks over which a signal is averaged
 
 ADVICE = (
@@ -53,7 +53,7 @@ ADVICE = (
 
 
 def check_signals(recording: Recording, samples: Samples) -> None:
-    """Raise Refused where nothing moves, nothing pushes, or a limit shaped what is seen."""
+    """Raise Refused if nothing moves, nothing drives the motion, or a limit shaped the signals."""
     speed, torque = samples.speed_rad_s, samples.torque_nm
     if np.ptp(speed) <= 2.0 * recording.speed_resolution_rad_s or np.ptp(speed) == 0.0:
         raise Refused("the speed did not change", ADVICE, entry=MessageCode.NO_EXCITATION)
@@ -81,7 +81,7 @@ def check_signals(recording: Recording, samples: Samples) -> None:
 
 
 def refuse_open(samples: Samples, found: tuple[OneWayStretch, ...]) -> NoReturn:
-    """Raise Refused, the inertia being open: with which motion it was, and which would do."""
+    """Raise Refused for an open inertia, with the motion of the recording and the motion that would determine J."""
     if not found:
         raise Refused("the shaft never turned one way long enough without holes in the record", ADVICE,
                       entry=MessageCode.NO_EXCITATION)
@@ -108,15 +108,16 @@ def refuse_open(samples: Samples, found: tuple[OneWayStretch, ...]) -> NoReturn:
 
 
 def _blocks(signal: FloatArray) -> FloatArray:
-    """Means over some tens of parts in a row."""
+    """Return means over at most `_BLOCKS` parts of equal length."""
     return np.array([float(np.mean(part)) for part in np.array_split(signal, min(_BLOCKS, len(signal)))])
 
 
 def cut_off(signal: FloatArray, quantum: float) -> float | None:
-    """Share of samples at one extreme, where noise would not leave so many in a row alike; standstill is none.
+    """Return the share of samples at one extreme, in longer runs than noise allows; None without such runs, or at
+    standstill.
 
-    Whether there is noise is asked beside the plateaus: a record whose ramps climb many steps a sample may well be
-    calm while it is held, and then a plateau is a speed that was held.
+    The noise is measured beside the plateaus: a recording whose ramps climb many steps a sample may have no noise at
+    steady speed, and then a plateau is a steady speed.
     """
     for extreme in (float(signal.max()), float(signal.min())):
         if abs(extreme) <= quantum:
@@ -132,10 +133,10 @@ def cut_off(signal: FloatArray, quantum: float) -> float | None:
 
 
 def _lively_beside(signal: FloatArray, at: BoolArray, plateaus: IntArray, quantum: float) -> bool:
-    """Do the samples next to the plateaus [begin, end) wobble by more than rounding makes of a ramp?
+    """Return whether samples next to the plateaus [begin, end) scatter by more than rounding on a ramp would cause.
 
-    By second differences, which a ramp has none of; white noise makes them √3 of its first ones. Only of samples none
-    of which is at the extreme.
+    Uses second differences: a ramp has none; for white noise they are √3 of the first differences. Samples at the
+    extreme are left out.
     """
     beside = np.zeros(len(signal), dtype=np.bool_)
     for begin, end in plateaus.tolist():
@@ -151,7 +152,7 @@ def _lively_beside(signal: FloatArray, at: BoolArray, plateaus: IntArray, quantu
 # ---------------------------------------------------------------------------------------------------------------------
 
 MODEL = "rigid+lags (time domain)"
-_HIDDEN_S = 2.5        # before a stop, the reported speed may outlive the motion by so long
+_HIDDEN_S = 2.5        # s before a stop: the reported speed may outlast the motion by so long
 _LEAST_SKEW_SD_S = 1e-4   # s; least standard uncertainty of a stated time offset
 _WIDE = {
     "noise": "change the speed more often or by more, or record for longer",
@@ -160,18 +161,18 @@ _WIDE = {
 
 
 def recorded(case: Case) -> Case:
-    """The case with what is wrong with its record but leaves a number that stands."""
+    """Return the case with the warnings about its recording."""
     recording = case.recording
     warnings = (*case.warnings, *log_warnings(recording), *left_out_warnings(recording))
-    # Pulses and coasting of our own have calm between them, which a foreign trace need not have.
+    # pulses and coasting of this program have steady speed between them; a foreign trace need not
     return replace(case, warnings=warnings, sound=recording.excitation is not None)
 
 
 def identify_record(case: Case) -> Finding:
-    """Identify a rigid shaft from a record without periodic excitation. Raises Refused where it leaves J open.
+    """Identify a rigid shaft from a recording without periodic excitation. Raises Refused if J stays open.
 
-    Stick-slip is refused by name: friction is no constant where the shaft sticks, and the answers of such records miss
-    the true inertia more often than they state, whatever the residual test says.
+    Stick-slip is refused by name: friction is not constant if the shaft sticks. The intervals from such recordings miss
+    the true inertia more often than stated, for any result of the residual test.
     """
     if not shaft_model(case.options.model).lags:
         raise Refused(
@@ -192,7 +193,7 @@ def identify_record(case: Case) -> Finding:
 
 
 def _runs(samples: Samples, recording: Recording) -> tuple[OneWayStretch, ...]:
-    """Return the stretches that turn; for a machine that stops every few seconds the wait before a stop is shorter."""
+    """Return the stretches that turn. If a machine stops every few seconds, the wait before a stop is shorter."""
     found: tuple[OneWayStretch, ...] = ()
     for hidden in (_HIDDEN_S, 0.4 * _HIDDEN_S, 0.1 * _HIDDEN_S):
         found = runs(samples, recording.speed_resolution_rad_s, hidden)
@@ -204,9 +205,9 @@ def _runs(samples: Samples, recording: Recording) -> tuple[OneWayStretch, ...]:
 
 def _solved(recording: Recording, samples: Samples, found: tuple[OneWayStretch, ...],
     options: Options) -> tuple[Solved | None, tuple[str, ...]]:
-    """Solve with the stated lags; if both are stated and J stays open, with the signals taken as simultaneous.
+    """Solve with the stated lags. If both are stated and J stays open, take the signals as simultaneous.
 
-    And what J is conditional on by that.
+    The second value is the condition of J that follows from this.
     """
     placed = place_windows(found)
     if not placed:

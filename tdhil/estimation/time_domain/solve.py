@@ -34,25 +34,25 @@ from tdhil.estimation.time_domain.windows import Bins, TaperWindow
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Does any smooth response explain the bins better than the model? Then the model is wrong, and so may be its number.
+# Local test: if any smooth response explains the bins better than the model, the model is wrong, and J may be too.
 #
-# Within some neighbouring bins of one window every shaft's response is nearly a straight line over frequency,
+# Within neighbouring bins of one window the response of every shaft is nearly a straight line over frequency,
 #
 #     T = g₀ W_0 + g₁ (W_1 + (s − s₀) W_0),
 #
-# two complex unknowns (the local polynomial method). What that leaves is noise, measured without a model. If the model
-# leaves so much more that F says it is no chance, then the data contradict it.
+# with two complex unknowns (the local polynomial method). The rest is noise, measured without a model. If the residual
+# of the model is larger beyond chance (F test), the data contradict the model.
 
 
-_GROUPS = (6, 4, 3)      # bins a group: the most that leave enough groups; a machine that stops often has few in a row
-_FIRST = 2       # bins of a window below it are friction's, constant and all
+_GROUPS = (6, 4, 3)      # bins a group, largest first; a machine that stops often has few bins in a row
+_FIRST = 2       # first bin of a window that is used: lower ones contain friction, constant and all
 
 
 def local_test(problem: FitProblem, theta: FloatArray, factor: float) -> ResidualTest | None:
-    """F test of the model against local straight lines; None if there are not enough bins in a row.
+    """Return the F test of the model against local straight lines; None without enough bins in a row.
 
-    ``factor``: by how much more than its noise model says the inertia scatters over time. Noise that comes with the
-    motion is shared by many bins, so F is divided by factor², and its degrees of freedom are taken as half as many.
+    ``factor``: scatter of the inertia over time, relative to the noise model. Noise that comes with the motion is
+    common to many bins, so F is divided by factor², and its degrees of freedom are halved.
     """
     tests = (_local_test(problem, theta, factor, group) for group in _GROUPS)
     return next((test for test in tests if test is not None), None)
@@ -86,40 +86,40 @@ def _local_test(problem: FitProblem, theta: FloatArray, factor: float, group: in
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Is the scatter the same at all times? Errors of time stamps, rounding and friction come with the motion.
+# Scatter over time: errors of time stamps, rounding and friction come with the motion.
 #
-# The fit's score is a sum over bins, and by Parseval one over time too: with ε and δ the signals whose lines are the
-# residuals e_m/√v_m and their slopes ∂e_m/√v_m,
+# The score of the fit is a sum over bins, and by Parseval also one over time. With ε and δ, the signals whose lines are
+# the residuals e_m/√v_m and their slopes ∂e_m/√v_m,
 #
 #     Σ_m 2 Re(∂e_m* e_m)/v_m = 1/T ∫ δ ε dt = Σ_b g_b,      Σ_b g_b = 0 at the best fit,
 #
-# g_b a block of time's share, and Σ g_b g_bᵀ with its neighbours (weight ½) estimates the score's covariance whatever
-# the noise does over time: H⁻¹ (Σ …) H⁻¹ is the covariance of theta that needs no noise that is alike at all times
-# ("sandwich"). Divided by √v both are about white. Were e itself cut by blocks, what a slow load leaves at the lowest
-# frequencies would spread over the others, where so much is not expected, and the sandwich come out several times too
-# large.
+# with the part g_b of a block of time. Σ g_b g_bᵀ with its neighbours (weight ½) estimates the covariance of the score
+# for any noise over time: H⁻¹ (Σ …) H⁻¹ is a covariance of theta without the assumption of stationary noise
+# ("sandwich"). Divided by √v, both signals are nearly white. If e itself were cut into blocks, the residual of a slow
+# load at the lowest frequencies would spread over the others, where less is expected, and the sandwich would be several
+# times too large.
 
 
-_BLOCK_S = 4.0            # s; least length of a block, unless that makes too few
+_BLOCK_S = 4.0            # s; least length of a block, unless it gives too few blocks
 _BLOCKS = 40              # blocks, at most
 _LEAST_BLOCKS = 10        # blocks, at least
 
 
 @dataclass(frozen=True)
 class BlockVariance:
-    """Variance of one direction in parameter space by the sandwich, and the number of blocks it rests on."""
+    """Variance of one direction in parameter space by the sandwich, and the number of blocks for it."""
 
     variance: float
     count: float
 
 
 def block_scores(problem: FitProblem, placed: tuple[TaperWindow, ...], theta: FloatArray) -> FloatArray:
-    """g_b (blocks, 10), in the order of time."""
+    """Return g_b (blocks, 10), in order of time."""
     total = sum(window.hop_s for window in placed)
     length = max(total / _BLOCKS, min(_BLOCK_S, total / _LEAST_BLOCKS))
     bins = problem.bins
     whole = evaluate(theta, bins)
-    # the mean of a product of two real signals is half that of their lines, but at frequency zero
+    # the mean of a product of two real signals is half that of their lines, except at frequency zero
     white = np.where(bins.hertz > 0.0, 2.0, 1.0) / np.sqrt(problem.variance)
     both = np.column_stack([whole.error, whole.slopes]) * white[:, None]
     scores = []
@@ -144,29 +144,29 @@ def sandwich(scores: FloatArray, direction: FloatArray) -> BlockVariance:
     square = float(each @ each)
     neighbours = float(each[1:] @ each[:-1])
     count = square**2 / max(float(np.sum(each**4)), 1e-300)
-    # each block's share has lost what the fit took from it: about one part in their effective number
+    # the fit removes about one part in the effective number of blocks from each block
     return BlockVariance(max(square + neighbours, 0.5 * square) * count / max(count - 1.0, 1.0), count)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Intervals: every value that the data don't contradict, whatever the structure of the reporting filters.
+# Intervals: every value that the data do not contradict, for any structure of the reporting filters.
 #
-# The profile P(x) = min over all other parameters of −2 ln L, the filters' shapes κ among them, follows the valley in
-# which inertia and lags make up for each other. The interval is {x: P(x) ≤ P_min + (i t)²}: t is Student's quantile
-# for as many degrees of freedom as the scatter was measured with, i ≥ 1 how much more the parameter scatters over
-# time than the noise model says (`sandwich`).
+# The profile P(x) = min over all other parameters of −2 ln L, including the filters' shapes κ, follows the valley in
+# which inertia and lags compensate each other. The interval is {x: P(x) ≤ P_min + (i t)²}, with t, Student's quantile
+# for the degrees of freedom of the scatter, and i ≥ 1, the scatter of the parameter over time relative to the noise
+# model (`sandwich`).
 
 
-_LEAST_DOF = 3.0          # degrees of freedom, at least, for the quantile
+_LEAST_DOF = 3.0          # least degrees of freedom for the quantile
 _SHAPE_STARTS = ((0.02, 0.02), (0.3, 0.1), (0.1, 0.3))   # start values of the shapes of both filters
-_EQUAL_POLES, _NEAR_EQUAL = 0.25, 0.1      # of κ
+_EQUAL_POLES, _NEAR_EQUAL = 0.25, 0.1      # κ of two equal poles, and the distance that counts as equal to it
 
 
 @dataclass(frozen=True)
 class Spread:
     """Uncertainty of one parameter: sd of the quadratic approximation, the sandwich's factor on it, the quantile.
 
-    ``lean``: how far the other direction of regression would put the value (see `direction_gap`).
+    ``lean``: change of the value with the other direction of regression (see `direction_gap`).
     """
 
     sd: float
@@ -176,7 +176,7 @@ class Spread:
 
 
 def spread(problem: FitProblem, fit: Fit, scores: FloatArray, index: int, confidence: float) -> Spread:
-    """How uncertain a parameter is; ``scores`` of the blocks of time at this fit (`block_scores`)."""
+    """Return the uncertainty of a parameter; ``scores`` of the blocks of time at this fit (`block_scores`)."""
     found, _ = covariance(problem, fit.theta, problem.free)
     at = problem.free.index(index)
     sd = math.sqrt(max(float(found[at, at]), 0.0))
@@ -193,9 +193,9 @@ def spread(problem: FitProblem, fit: Fit, scores: FloatArray, index: int, confid
 
 
 def direction_gap(problem: FitProblem, theta: FloatArray) -> FloatArray:
-    """The score's shift, (10,), if all noise were in the speed instead of the torque.
+    """Return the shift of the score, (10,), if all noise were in the speed instead of the torque.
 
-    Least squares makes the residual e orthogonal to ∂G W, the speed as reported. If the noise moved the speed, T/G
+    Least squares makes the residual e orthogonal to ∂G W, with the reported speed W. If the noise is in the speed, T/G
     is the clean signal, W + e/G, and the normal equations gain Σ 2 Re(∂ln G* |e|²/v). The truth lies between.
     """
     bins = problem.bins
@@ -209,13 +209,13 @@ def direction_gap(problem: FitProblem, theta: FloatArray) -> FloatArray:
 
 
 def with_shapes(problem: FitProblem, stated: tuple[int, ...]) -> FitProblem:
-    """The same with the filters' structure free, but for a lag that was stated: that is a one-pole filter's."""
+    """Return the problem with free structures of the filters. A stated lag is that of a one-pole filter."""
     shapes = [shape for lag, shape in ((SPEED_LAG, SPEED_SHAPE), (TORQUE_LAG, TORQUE_SHAPE)) if lag not in stated]
     return replace(problem, free=(*problem.free, *shapes))
 
 
 def best_shapes(problem: FitProblem, near: Fit) -> Fit:
-    """The lowest of some descents from the one-pole fit."""
+    """Return the best of several descents from the one-pole fit."""
     fits = [near]
     for shapes in _SHAPE_STARTS:
         start = near.theta.copy()
@@ -227,7 +227,9 @@ def best_shapes(problem: FitProblem, near: Fit) -> Fit:
 
 
 def profile(problem: FitProblem, best: Fit, index: int, reach: float, step: float) -> Estimate:
-    """Return where the profile has risen by reach² on either side of ``best``; a bound, or ±inf, if it never does."""
+    """Return the interval up to a rise of the profile by reach² on either side of ``best``; a bound, or ±inf,
+    without it.
+    """
 
     def refit(start: FloatArray, value: float) -> Fit:
         return minimise(problem, start, {index: value})
@@ -235,7 +237,7 @@ def profile(problem: FitProblem, best: Fit, index: int, reach: float, step: floa
     shapes = [at for at in (SPEED_SHAPE, TORQUE_SHAPE) if at in problem.free and at != index]
 
     def others(fit: Fit, value: float) -> Iterator[Fit]:
-        """With two equal poles in a report that has one, or two unlike ones."""
+        """Yield starts with two equal poles, for each report that has one pole or two different ones."""
         for at in shapes:
             if abs(float(fit.theta[at]) - _EQUAL_POLES) > _NEAR_EQUAL:
                 start = fit.theta.copy()
@@ -247,7 +249,7 @@ def profile(problem: FitProblem, best: Fit, index: int, reach: float, step: floa
 
 
 def _shares(problem: FitProblem, theta: FloatArray, direction: FloatArray) -> float:
-    """On how many bins the parameter rests: (Σ c)²/Σ c² of their shares in its variance."""
+    """Return the effective number of bins behind the parameter: (Σ c)²/Σ c² of their shares in its variance."""
     _, slopes = problem.stacked(theta)
     count = len(problem.bins)
     pulled = (slopes @ direction) ** 2
@@ -257,13 +259,13 @@ def _shares(problem: FitProblem, theta: FloatArray, direction: FloatArray) -> fl
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_SURELY = 3.0       # times the reach², friction is taken as bent; from once it, both are held possible
+_SURELY = 3.0       # times the reach², from which friction is nonlinear; between 1 and this both are possible
 _OF_REPORTS = (SPEED_LAG, TORQUE_LAG, SKEW, SPEED_SHAPE, TORQUE_SHAPE)
 
 
 @dataclass(frozen=True)
 class Solved:
-    """Solution of the bins. ``bent``: friction grows with the square of the speed; ``shaped``: other than one pole."""
+    """Solution of the bins. ``bent``: friction has a part ∝ speed²; ``shaped``: a filter differs from one pole."""
 
     inertia: Estimate
     viscous: Estimate
@@ -280,7 +282,7 @@ class Solved:
 
 @dataclass(frozen=True)
 class ShaftEquation:
-    """One model of friction: its fit (structure of the filters free if ``shaped``), and J with its interval.
+    """Fit with one model of friction (structure of the filters free if ``shaped``), and J with its interval.
 
     ``scores`` (blocks, 10) are those of the fit with one-pole filters.
     """
@@ -299,7 +301,7 @@ class ShaftEquation:
 
 @dataclass(frozen=True)
 class _BandWalk:
-    """State of the walk over the bands. ``bands``: the wide one, if there is one, and the narrow one.
+    """State of the walk over the bands. ``bands``: the wide one, if it exists, and the narrow one.
 
     ``stated``: indices of the lags that were stated.
     """
@@ -316,7 +318,7 @@ def solve(
     bins: Bins, placed: tuple[TaperWindow, ...], priors: tuple[GaussianPrior, ...], torque_span_nm: float,
     confidence: float
 ) -> Solved | None:
-    """Walk the rows of a record (`tdhil.estimation.candidates`). None where too few bins stand clear of the noise."""
+    """Walk the rows of a recording (`tdhil.estimation.candidates`). None if too few bins are clear of the noise."""
     bands = search(bins, priors, torque_span_nm)
     stated = tuple(prior.index for prior in priors)
     return walk(FitRoute.RECORD, _BAND_TRIALS, _BandWalk(bands, placed, stated, confidence)).solved
@@ -362,7 +364,7 @@ class _FrictionWalk:
     ended: bool = False
 
     def explains(self, times: float) -> bool:
-        """Return whether friction of ω² lowers −2 ln L by more than so many times the square of J's reach."""
+        """Return whether friction ∝ ω² lowers −2 ln L by more than ``times`` the square of J's reach."""
         if self.straight is None:
             return False
         return self.band.fit.objective - self.square[1].objective > times * self.straight.reach**2
@@ -392,10 +394,10 @@ def _joined(one: Estimate, low: float, high: float) -> Estimate:
 
 
 def _solve(now: _BandWalk, found: FoundFit, narrower: tuple[FoundFit, ...]) -> Solved:
-    """Solve in one band. J's interval also holds that of one-pole filters in each narrower band.
+    """Solve in one band. The interval of J also contains that of one-pole filters in each narrower band.
 
-    There a filter of any structure is right, if less sharp; where the bands agree that changes nothing. A narrower
-    band adds no more than the half-width on either side, since it may say almost nothing.
+    In a narrower band a filter of any structure is correct, but J is less certain; if the bands agree, nothing changes.
+    A narrower band adds at most the half-width on either side, because it may contain little information.
     """
     stated, confidence = now.stated, now.confidence
     bent_problem = replace(found.problem, free=(*found.problem.free, BEND))
@@ -433,10 +435,11 @@ def _solve(now: _BandWalk, found: FoundFit, narrower: tuple[FoundFit, ...]) -> S
 def _shaft(
     problem: FitProblem, fit: Fit, placed: tuple[TaperWindow, ...], stated: tuple[int, ...], confidence: float
 ) -> ShaftEquation:
-    """J's interval over every structure of the filters, joined with that of one pole each; the value as each weighs.
+    """Return the interval of J over every structure of the filters, joined with that of one pole each; the value by
+    weight.
 
-    Where the structures lower −2 ln L by chance, their profile alone excludes the truth (docs/decisions/0045). One pole
-    each adds no more than the half-width on either side: its quadratic interval ignores the bounds of the lags.
+    If the structures lower −2 ln L by chance, their profile alone excludes the truth (docs/decisions/0045). One-pole
+    filters add at most the half-width on either side, because their quadratic interval ignores the bounds of the lags.
     """
     scores = block_scores(problem, placed, fit.theta)
     own = spread(problem, fit, scores, INERTIA, confidence)
@@ -455,7 +458,7 @@ def _shaft(
 
 
 def _one_pole_reach(found: FoundFit, placed: tuple[TaperWindow, ...], confidence: float) -> float:
-    """Half-width of J in one band, quadratic, with one pole each."""
+    """Return the half-width of J in one band, by the quadratic approximation, with one pole each."""
     own = spread(found.problem, found.fit, block_scores(found.problem, placed, found.fit.theta), INERTIA, confidence)
     return own.factor * own.quantile * own.sd
 
@@ -469,7 +472,7 @@ def _estimate(shaft: ShaftEquation, index: int, confidence: float) -> Estimate:
 
 
 def _coulomb(problem: FitProblem, fit: Fit, own: Spread) -> Estimate | None:
-    """T_c along the rotation; load included where it turned one way only."""
+    """Return T_c along the rotation; it includes the load if the shaft turned in one direction only."""
     both = [index for index in (FORWARD, BACK) if index in problem.free]
     if not both:
         return None
@@ -486,7 +489,7 @@ def _coulomb(problem: FitProblem, fit: Fit, own: Spread) -> Estimate | None:
 def _budget(
     shaft: ShaftEquation, inertia: Estimate, shift: float, bent: bool, stated: tuple[int, ...]
 ) -> tuple[BudgetLine, ...]:
-    """Noise with the lags held; what unknown lags add, what unknown structures add; the rest."""
+    """Return the budget: noise with the lags fixed, the parts of unknown lags and unknown structures, and the rest."""
     problem, fit, own = shaft.problem, shaft.fit, shaft.spread
     held = tuple(index for index in problem.free if index not in _OF_REPORTS)
     alone, _ = covariance(problem, fit.theta, held)

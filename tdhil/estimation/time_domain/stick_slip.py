@@ -1,8 +1,8 @@
-"""Stick-slip in a record: the shaft sticks while torque rises, and jumps when friction gives way.
+"""Stick-slip in a recording: the shaft sticks while torque rises, and jumps when static friction is exceeded.
 
 Static friction is larger than friction in motion, and a speed loop that is too soft cannot hold the speed between them.
-What is seen is a standstill, within the resolution of the speed, during which torque rises steadily; then motion, and
-standstill again. A start from standstill is another thing: there the torque is constant, and rises when motion begins.
+The recording shows a standstill, within the resolution of the speed, during which torque rises steadily; then motion,
+and standstill again. A start from standstill differs: the torque is constant, and rises when motion begins.
 """
 
 from dataclasses import dataclass
@@ -15,22 +15,23 @@ from tdhil.estimation.result import Refused
 from tdhil.estimation.samples import Samples
 from tdhil.recording import BoolArray, FloatArray
 
-_STILL_SHARE = 0.02       # of the highest speed: slower is standstill, …
-_STILL_QUANTA = 3.0       # … and so is what lies within so many steps of the reported speed
-_MOVES_SHARE = 0.2        # of the highest speed, that a jump reaches
-_LEAST_SAMPLES = 12       # of a standstill
-_SETTLED = 0.2            # of a standstill: at its begin the reports still show the motion before
-_STEADY = 0.9             # correlation of torque and time: a torque that rises late and at once has less
-_LEAST_RISE = 0.1         # of the torque's span: less is drift
-_MOST_JUMPS_APART = 0.5   # of all standstills between motions, that are stick-slip
-_LEAST_JUMPS = 3          # jumps that make stick-slip
+_STILL_SHARE = 0.02       # of the highest speed: a lower speed counts as standstill
+_STILL_QUANTA = 3.0       # resolution steps of the reported speed: a lower speed also counts as standstill
+_MOVES_SHARE = 0.2        # of the highest speed: least speed of a jump
+_LEAST_SAMPLES = 12       # fewest samples of a standstill
+_SETTLED = 0.2            # of a standstill: its beginning, in which the reports still show the motion before
+_STEADY = 0.9             # least correlation of torque and time: a torque that rises late and suddenly has less
+_LEAST_RISE = 0.1         # of the torque's span: a smaller rise is drift
+_MOST_JUMPS_APART = 0.5   # least share of stick-slip in all standstills between motions
+_LEAST_JUMPS = 3          # fewest jumps of stick-slip
 
 
 @dataclass(frozen=True)
 class StickSlip:
-    """``jumps``: how often the shaft stuck and jumped; ``still``: share of the record at standstill.
+    """Result of the search. ``jumps``: number of times the shaft stuck and jumped; ``still``: share of time at
+    standstill.
 
-    ``rise_nm``: how far torque rises before a jump, N·m, the median.
+    ``rise_nm``: median rise of torque before a jump, N·m.
     """
 
     jumps: int
@@ -39,7 +40,7 @@ class StickSlip:
 
 
 def refuse_stick_slip(samples: Samples, speed_quantum: float, torque_quantum: float) -> None:
-    """Raise Refused where a record has stick-slip, with the motion that would help."""
+    """Raise Refused if a recording has stick-slip, with the motion that would help."""
     seen = find_stick_slip(samples, speed_quantum, torque_quantum)
     if seen is None:
         return
@@ -53,7 +54,7 @@ def refuse_stick_slip(samples: Samples, speed_quantum: float, torque_quantum: fl
 
 
 def find_stick_slip(samples: Samples, speed_quantum: float, torque_quantum: float) -> StickSlip | None:
-    """The stick-slip in a record; None where it has none."""
+    """Return the stick-slip of a recording; None without stick-slip."""
     if len(samples) < 4 * _LEAST_SAMPLES:
         return None
     speed, torque = samples.speed_rad_s, samples.torque_nm
@@ -72,7 +73,7 @@ def find_stick_slip(samples: Samples, speed_quantum: float, torque_quantum: floa
         between += 1
         way = float(np.sign(jump[np.argmax(np.abs(jump))]))
         if way != _way_before(speed, still, first):
-            continue      # a speed loop that reverses the shaft winds up at standstill as well, for a moment
+            continue      # a speed loop that reverses the shaft also integrates at standstill, for a moment
         rise = _rise(samples.time_s[first:last], way * torque[first:last])
         if rise > max(_LEAST_RISE * span, 2.0 * torque_quantum):
             rises.append(rise)
@@ -82,7 +83,7 @@ def find_stick_slip(samples: Samples, speed_quantum: float, torque_quantum: floa
 
 
 def _way_before(speed: FloatArray, still: BoolArray, first: int) -> float:
-    """The sense of rotation before the standstill that begins with sample ``first``, ±1."""
+    """Return the direction of rotation before the standstill that begins with sample ``first``, ±1."""
     stops = np.flatnonzero(still[:first])
     begun = int(stops[-1]) + 1 if len(stops) else 0
     moving = speed[begun:first]
@@ -90,7 +91,7 @@ def _way_before(speed: FloatArray, still: BoolArray, first: int) -> float:
 
 
 def _rise(time: FloatArray, torque: FloatArray) -> float:
-    """How far torque rises over a standstill, N·m, once the reports have settled; 0 where it is not steady."""
+    """Return the rise of torque over a standstill after the reports settled, N·m; 0 if it is not steady."""
     begun = int(_SETTLED * len(time))
     time, torque = time[begun:] - time[begun], torque[begun:]
     if np.ptp(torque) == 0.0 or np.corrcoef(time, torque)[0, 1] < _STEADY:

@@ -1,13 +1,13 @@
-r"""Equations from runs: the record seen through smooth windows, at frequencies one window length apart.
+r"""Equations from runs: the recording through smooth windows, at frequencies one inverse window length apart.
 
-A window w of compact support times e^(−st) is a test function. Integrating by parts moves every derivative onto it, so
-that for any polynomial H (and any H smooth over the window's own bandwidth)
+A window w of compact support times e^(−st) is a test function. Integration by parts moves every derivative to it. For
+any polynomial H (and any H smooth over the window's own bandwidth)
 
     ∫ w e^(−st) H(d/dt) x dt = Σ_n H⁽ⁿ⁾(s)/n! · X_n,     X_n = (−1)ⁿ ∫ w⁽ⁿ⁾ e^(−st) x dt.
 
-No noise is differentiated, initial conditions don't matter, time stamps are used as they are (trapezoidal rule, on a
-cubic spline through the samples where a taper has few of them), and the noise at frequencies 1/(length of the window)
-apart is nearly uncorrelated. The windows of one run overlap in their tapers only and add up to one.
+No noise is differentiated, and initial conditions have no effect. The actual time stamps are used (trapezoidal rule, on
+a cubic spline through the samples if a taper has few of them). The noise at frequencies 1/(length of the window) apart
+is nearly uncorrelated. The windows of one run overlap only in their tapers, and add up to one.
 """
 
 import math
@@ -21,20 +21,19 @@ from tdhil.estimation.time_domain.taylor import ORDERS, ComplexArray, flat_top
 from tdhil.recording import BoolArray, FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Which parts of a record the equation holds in: turning one way, without holes.
+# Parts of a recording in which the equation holds: rotation in one direction, without gaps.
 #
-# Coulomb friction is constant only while the sense of rotation is. What is reported as speed lags behind: ω = ω_rep +
-# τ ω_rep' behind a first-order lag, so a report that dies away may come from a shaft that already stands. Near every
-# stop or reversal the samples before it are left out for as long as the longest lag may hide it.
+# Coulomb friction is constant only in one direction of rotation. The reported speed lags: ω = ω_rep + τ ω_rep' for a
+# first-order lag, so a reported speed that decays may come from a shaft at standstill. Before every stop or reversal
+# the samples are left out for as long as the longest lag may hide it.
 #
-# A long record at a high rate is averaged over groups of neighbouring samples first. Both signals pass the same
-# average over the same instants, and what both share cancels in torque over speed; the frequencies used lie far below
-# the rate.
+# A long recording at a high rate is first averaged over groups of neighbouring samples. Both signals have the same
+# average over the same instants, which cancels in torque over speed. The frequencies used are far below the rate.
 
 
-_MOST_SAMPLES = 200_000   # samples of a record that are used: more are averaged in groups
+_MOST_SAMPLES = 200_000   # most samples of a recording that are used: more are averaged in groups
 _LEAST_RATE_HZ = 50.0     # Hz; least rate after this averaging
-_STILL_SHARE = 0.04       # of the highest speed: below it the shaft may stand
+_STILL_SHARE = 0.04       # of the highest speed: below it the shaft may be at standstill
 _STILL_QUANTA = 3.0       # quanta of the speed below which the shaft stands still
 _GAP_STEPS = 4.5          # missing samples in a row that a straight line bridges
 _GAP_S = 0.05             # s; a shorter interval is no gap
@@ -43,7 +42,7 @@ _LEAST_SAMPLES_OF_STRETCH = 32   # fewer samples make no stretch
 
 @dataclass(frozen=True)
 class OneWayStretch:
-    """N samples while the shaft turns one way; ``direction`` is +1 or −1."""
+    """N samples while the shaft turns in one direction; ``direction`` is +1 or −1."""
 
     samples: Samples
     direction: float
@@ -66,13 +65,15 @@ def thinned(samples: Samples, most: int = _MOST_SAMPLES) -> Samples:
     def mean(signal: FloatArray) -> FloatArray:
         return np.asarray(signal[:whole].reshape(-1, group).mean(axis=1), dtype=np.float64)
 
-    # The time's first value is taken off: a mean of large stamps would round
+    # the first time is subtracted, because a mean of large time stamps would round
     start = float(samples.time_s[0])
     return Samples(mean(samples.time_s - start) + start, mean(samples.speed_rad_s), mean(samples.torque_nm))
 
 
 def runs(samples: Samples, speed_quantum: float, hidden_s: float) -> tuple[OneWayStretch, ...]:
-    """The usable runs; ``hidden_s``: how long before a stop the reported speed may still show motion."""
+    """Return the usable runs. ``hidden_s``: time before a stop during which the reported speed may still show
+    motion.
+    """
     if len(samples) < _LEAST_SAMPLES_OF_STRETCH:
         return ()
     time, speed = samples.time_s, samples.speed_rad_s
@@ -93,7 +94,7 @@ def runs(samples: Samples, speed_quantum: float, hidden_s: float) -> tuple[OneWa
 
 
 def _before_stops(time: FloatArray, moving: BoolArray, hidden_s: float) -> BoolArray:
-    """True for the samples within ``hidden_s`` before the motion is seen to end."""
+    """Return True for the samples within ``hidden_s`` before the end of reported motion."""
     ends = time[np.flatnonzero(moving[:-1] & ~moving[1:]) + 1]
     if len(ends) == 0:
         return np.zeros(len(time), dtype=np.bool_)
@@ -107,19 +108,19 @@ def _before_stops(time: FloatArray, moving: BoolArray, hidden_s: float) -> BoolA
 _LONGEST_S = 60.0         # s; longest window
 _TAPER_S = 6.0            # s; longest taper of a window
 _TAPER_SHARE = 0.25       # of the stretch: longest taper
-_MOST_BINS = 400          # a window
+_MOST_BINS = 400          # most bins of a window
 _RATE_SHARE = 0.2         # of the sampling rate: the highest frequency used
-_OF_TAPER = 100           # samples: of fewer the sums of a window's third derivative are no integrals
-_COINCIDENT = 0.3         # of the usual interval: of samples closer than that a spline would make a swing
-_CHUNK = 64               # frequencies at once: it bounds the memory
-_LEAST_SAMPLES = 32       # samples that a window needs
+_OF_TAPER = 100           # samples of a taper: with fewer the sums with a window's third derivative are not integrals
+_COINCIDENT = 0.3         # of the usual interval: a spline through closer samples would oscillate
+_CHUNK = 64               # frequencies at once, to limit the memory
+_LEAST_SAMPLES = 32       # fewest samples of a window
 
 
 @dataclass(frozen=True)
 class TaperWindow:
     """Place of a window in its run: tapers of ``taper_s`` at both ends, ``hop_s`` from one window to the next.
 
-    ``finer``: how many of the run's samples stand for one that was recorded.
+    ``finer``: samples of the run for each recorded sample.
     """
 
     run: OneWayStretch
@@ -134,11 +135,11 @@ class TaperWindow:
         return self.hop_s + self.taper_s
 
     def part(self, begin_s: float, end_s: float) -> Samples:
-        """The run's samples between two times from the window's start."""
+        """Return the samples of the run between two times from the start of the window, s."""
         return self.run.samples.between(self.start_s + begin_s, self.start_s + end_s)
 
     def shape(self, time: FloatArray) -> FloatArray:
-        """The window and its first three derivatives at times from its start, (N, 4)."""
+        """Return the window and its first three derivatives at times from its start, (N, 4)."""
         return flat_top(time, self.length_s, self.taper_s)
 
 
@@ -146,7 +147,8 @@ class TaperWindow:
 class Bins:
     """M equations. ``s`` = 2πj f (M,); ``speed``, ``torque`` (M, 4): X_n; ``level`` (M, 2): ∫φ turning forward, back.
 
-    ``bend`` (M, 4): X_n of ω|ω|; ``energy`` (M,): ∫w², s, by which a bin's noise power grows; ``window`` (M,): which.
+    ``bend`` (M, 4): X_n of ω|ω|; ``energy`` (M,): ∫w², s, factor of a bin's noise power; ``window`` (M,): index of its
+    window.
     """
 
     s: ComplexArray
@@ -165,13 +167,13 @@ class Bins:
         return len(self.s)
 
     def chosen(self, keep: BoolArray) -> "Bins":
-        """Those of a mask (M,)."""
+        """Return the bins of a mask (M,)."""
         return Bins(self.s[keep], self.speed[keep], self.torque[keep], self.level[keep], self.bend[keep],
                     self.energy[keep], self.window[keep])
 
 
 def joined(parts: list[Bins]) -> Bins:
-    """One after the other."""
+    """Return all bins of the parts, one part after the other."""
     if not parts:
         none, empty = np.zeros(0, dtype=np.complex128), np.zeros(0)
         wide = np.zeros((0, ORDERS), dtype=np.complex128)
@@ -181,7 +183,7 @@ def joined(parts: list[Bins]) -> Bins:
 
 
 def place_windows(found: tuple[OneWayStretch, ...]) -> tuple[TaperWindow, ...]:
-    """All windows of all runs, in the order of time."""
+    """Return all windows of all runs, in order of time."""
     placed: list[TaperWindow] = []
     for run in found:
         length = run.length_s
@@ -198,9 +200,9 @@ def place_windows(found: tuple[OneWayStretch, ...]) -> tuple[TaperWindow, ...]:
 
 
 def _interpolated(run: OneWayStretch, finer: int) -> OneWayStretch:
-    """The run on an even grid, so many times finer than its samples, by cubic splines.
+    """Return the run on an even grid, ``finer`` times as many samples, by cubic splines.
 
-    In the band that is used a spline is off by half a percent at most, and of both signals alike.
+    In the band that is used the error of a spline is 0.5 % at most, and equal for both signals.
     """
     from scipy.interpolate import CubicSpline
 
@@ -214,7 +216,7 @@ def _interpolated(run: OneWayStretch, finer: int) -> OneWayStretch:
 
 
 def measure(window: TaperWindow) -> Bins:
-    """Every frequency of a window."""
+    """Return the bins of a window at all its frequencies."""
     part = window.part(0.0, window.length_s)
     time = part.time_s - window.start_s
     rate = len(time) / window.finer / float(time[-1] - time[0])
@@ -225,7 +227,7 @@ def measure(window: TaperWindow) -> Bins:
 
 
 def seen_through(window: TaperWindow, part: Samples, shape: FloatArray, s: ComplexArray) -> Bins:
-    """The samples ``part`` (N) through ``shape`` (N, 4), a test function and its derivatives, at ``s`` (M,)."""
+    """Return the samples ``part`` (N) through ``shape`` (N, 4), a test function and its derivatives, at ``s`` (M,)."""
     time, speed, torque = part.time_s - window.start_s, part.speed_rad_s, part.torque_nm
     step = np.empty_like(time)
     step[1:-1] = 0.5 * (time[2:] - time[:-2])

@@ -1,4 +1,4 @@
-"""A trace that a drive's own tool exported as CSV: its layout found, read with line numbers, made a Recording."""
+"""Reading of a CSV trace from a drive's own tool: find its layout, read it with line numbers, return a Recording."""
 
 from tdhil.recording.csv.layout import (
     REFERENCE_FLAG as REFERENCE_FLAG, TIME_AND_TORQUE as TIME_AND_TORQUE, USUAL as USUAL,

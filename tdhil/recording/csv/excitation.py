@@ -1,4 +1,4 @@
-"""excitation.yaml: what the machine was made to do, where a trace can't say it.
+"""Reading of excitation.yaml: the motion of a machine, which a trace does not contain.
 
 ::
 
@@ -8,7 +8,7 @@
       - {start_s: 12.0, periods: 7, period_s: 20.0, settle_periods: 1, offset_rad_s: 2.2,
          lines_hz: [0.05, 0.1, 0.15, 0.25, 0.35, 0.5]}
 
-Times are the trace's own, in seconds; where it has clock times, they count from its first row.
+Times are those of the trace, in seconds. If it has clock times, they count from its first row.
 """
 
 import math
@@ -23,12 +23,12 @@ from tdhil.config import DEFAULT_EXCITATION, EXCITATIONS, Registered
 from tdhil.recording.recording import Excitation, FloatArray, Level, Segment
 
 _MOST_PERIODS = 100_000
-_WHOLE = 1e-3       # of a period that a line may be off a whole number of them
+_WHOLE = 1e-3       # of a period: tolerance for a whole number of periods of a line
 Hertz = Annotated[float, Field(gt=0, le=1e4)]
 
 
 class SegmentFile(DataModel):
-    """One stretch about one mean speed."""
+    """One stretch of excitation about one mean speed."""
 
     start_s: float = Field(description="s; when its first period began, in the trace's time")
     periods: int | None = Field(default=None, ge=1, le=_MOST_PERIODS, description="how many there were; or end_s")
@@ -42,7 +42,7 @@ class SegmentFile(DataModel):
 
     @property
     def whole_periods(self) -> int:
-        """How many periods it has, by either way of saying it; 0 without one."""
+        """Number of its whole periods, from either of the two keys; 0 without one."""
         if self.periods is not None:
             return self.periods
         if self.end_s is None or not self.end_s > self.start_s:
@@ -87,14 +87,14 @@ class SegmentFile(DataModel):
 
 
 class LevelFile(DataModel):
-    """A stretch of steady speed, whose mean torque is friction."""
+    """Stretch of steady speed, whose mean torque is friction."""
 
     start_s: float = Field(description="s")
     end_s: float = Field(description="s")
 
 
 class ExcitationFile(DataModel):
-    """The whole file."""
+    """Content of excitation.yaml."""
 
     kind: Annotated[str, Registered(EXCITATIONS, periodic=True)] = Field(
         default=DEFAULT_EXCITATION, description="a periodic excitation: multisine, sine, step or prbs"
@@ -120,7 +120,9 @@ class ExcitationFile(DataModel):
 
 
 def load_excitation(path: Path, time_s: FloatArray) -> tuple[Excitation, tuple[Level, ...]]:
-    """The excitation in ``path``, of a trace with these times. DataFileError with every problem and its line."""
+    """Return the excitation in ``path`` for a trace with these times. Raises DataFileError with every problem and
+    its line.
+    """
     loaded = load_with_lines(path, ExcitationFile)
     parts = loaded.value.segments
     first, last = float(time_s[0]), float(time_s[-1])

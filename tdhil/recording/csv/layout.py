@@ -1,4 +1,4 @@
-"""The header with its units, and where the numbers begin: all that is needed to read the rows.
+"""Layout of a trace: the header with its units, and the first row of numbers.
 
 A unit is taken from ``--columns``, else from a row of units below the header, else from the column's name
 (``n_rpm``, ``Speed [rpm]``), else SI, reported as an assumption. A file that contradicts itself is refused.
@@ -16,10 +16,10 @@ from tdhil.errors import CsvMisnamed, CsvUnusable, MessageCode, UsageError, show
 from tdhil.recording.csv.text import decimal_sign, is_missing, looks_numeric, split_cells
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Units that drives' tools write, and what each is in SI.
+# Units that the tools of drives write, and their values in SI.
 #
-# A value in SI is value · factor; for shares of the rated torque the factor is of ``--rated-torque``. 1/s is a
-# revolution a second, as in data sheets; a tool that means rad/s by it needs ``--columns``.
+# A value in SI is value · factor. For shares of the rated torque the factor applies to ``--rated-torque``. 1/s means a
+# revolution a second, as in data sheets; a tool that writes 1/s for rad/s needs ``--columns``.
 
 
 QUANTITIES = ("time", "speed", "torque")
@@ -41,7 +41,7 @@ _TURNS = ColumnUnit("speed", "1/s", _TURN)
 _PERCENT = ColumnUnit("torque", "%", 1e-2, of_rated=True)
 _PERMILLE = ColumnUnit("torque", "‰", 1e-3, of_rated=True)
 
-# What a trace may say beyond `profiles.quantities`, which takes nothing that could mean two things.
+# Units of traces besides `profiles.quantities`, which accepts no ambiguous unit.
 _ALSO = {
     "time": {},
     "speed": dict.fromkeys(("1/s", "s1", "hz"), _TURNS),
@@ -55,10 +55,10 @@ _IGNORED = re.compile(r"[\s·.*⋅_^⁻-]")
 
 
 def unit_of(quantity: str, text: str) -> ColumnUnit | None:
-    """The unit that ``text`` spells for a quantity: ``rpm``, ``[1/min]``, ``N.m``; None if none of ours."""
+    """Return the unit that ``text`` spells for a quantity: ``rpm``, ``[1/min]``, ``N.m``; None if it is unknown."""
     found = _BRACKETED.match(text.strip())
     inner = found.group(2) if found is not None and not found.group(1) else text
-    # Case separates milli from mega; no tool samples in megaseconds, and mN·m and MN·m are not read at all.
+    # case distinguishes milli from mega, but no tool samples in megaseconds, and mN·m and MN·m are not accepted
     word = _IGNORED.sub("", inner.replace("¹", "1").casefold())
     if (also := _ALSO[quantity].get(word)) is not None:
         return also
@@ -71,13 +71,15 @@ def _in_trace(unit: quantities.Unit) -> ColumnUnit:
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """``Speed [rpm]`` → (Speed, rpm); a name without brackets is itself, with no unit."""
+    """Return name and unit: ``Speed [rpm]`` → (Speed, rpm); a name without brackets has no unit."""
     found = _BRACKETED.match(name)
     return (found.group(1), found.group(2)) if found is not None and found.group(1) else (name, "")
 
 
 def unit_in_name(quantity: str, name: str) -> ColumnUnit | None:
-    """The unit a column's name ends with: ``speed_rad_s``, ``n_rpm``, ``Torque [%]``; the longest ending counts."""
+    """Return the unit at the end of a column's name: ``speed_rad_s``, ``n_rpm``, ``Torque [%]``; the longest ending
+    counts.
+    """
     base, bracketed = split_name(name)
     if bracketed:
         return unit_of(quantity, bracketed)
@@ -87,13 +89,13 @@ def unit_in_name(quantity: str, name: str) -> ColumnUnit | None:
 
 
 def known_units(quantity: str) -> tuple[str, ...]:
-    """The symbols to be offered in a message."""
+    """Return the symbols that a message offers."""
     plain = {"time": quantities.TIME, "speed": quantities.SPEED, "torque": quantities.TORQUE}[quantity]
     return tuple(dict.fromkeys((*quantities.known(plain), *(unit.symbol for unit in _ALSO[quantity].values()))))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Which column is which, as the command line says it: ``time=t_s speed=n_rpm:rpm torque=m_pct:%``.
+# Columns as given on the command line: ``time=t_s speed=n_rpm:rpm torque=m_pct:%``.
 
 
 _WHERE = "--columns"
@@ -102,7 +104,7 @@ REFERENCE_FLAG = "--column"
 
 @dataclass(frozen=True)
 class ColumnChoice:
-    """The column called ``name`` holds ``quantity``; ``unit`` None: as the file says. No name: the usual ones."""
+    """Choice of the column ``name`` for ``quantity``; ``unit`` None: from the file. Without a name: the usual names."""
 
     quantity: str
     name: str = ""
@@ -115,9 +117,10 @@ TIME_AND_TORQUE = ("time", "torque")
 
 
 def parse_columns(items: Iterable[str], quantities: Sequence[str] = QUANTITIES, flag: str = _WHERE) -> Choices:
-    """The columns of ``quantities``, in this order; one that isn't named keeps its usual name. UsageError.
+    """Return the columns of ``quantities``, in this order; a column without a choice has its usual name. Raises
+    UsageError.
 
-    ``flag``: the option that named them.
+    ``flag``: the option that contains the choices.
     """
     found: dict[str, ColumnChoice] = {}
     such_as = _such_as(quantities, flag)
@@ -149,7 +152,7 @@ def _such_as(quantities: Sequence[str], flag: str) -> str:
 
 def _choice(quantity: str, text: str, flag: str) -> ColumnChoice:
     name, colon, spelt = text.rpartition(":")
-    if not colon or spelt.startswith(" "):       # "Axis 1: speed" is a name
+    if not colon or spelt.startswith(" "):       # "Axis 1: speed" is a complete name
         return ColumnChoice(quantity, text)
     unit = unit_of(quantity, spelt)
     if unit is None or not name:
@@ -162,10 +165,10 @@ def _choice(quantity: str, text: str, flag: str) -> ColumnChoice:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Where the table begins, what separates its cells, and which columns are time, speed and torque.
+# Place of the table, separator of its cells, and columns of time, speed and torque.
 #
-# The header is the first of the beginning's lines in which all three are found; what stands above it is the tool's own
-# business. Names are compared without regard to case, first as they are, then without a unit in brackets.
+# The header is the first line with all three columns; lines above it are ignored. Names are compared without regard to
+# case, first complete, then without a unit in brackets.
 
 
 HEADER_LINES = 50
@@ -176,7 +179,7 @@ _DELIMITERS = ("\t", ";", ",")
 
 @dataclass(frozen=True)
 class Header:
-    """``line`` counts from 1; ``columns`` are the positions of the choices in ``names``, the time first."""
+    """Header of a table. ``line`` counts from 1; ``columns``: positions of the choices in ``names``, time first."""
 
     line: int
     delimiter: str
@@ -185,7 +188,9 @@ class Header:
 
 
 def find_header(lines: Sequence[str], choices: Choices, file: str) -> Header:
-    """The header in the file's first lines. CsvMisnamed if a column isn't there, CsvUnusable if there is no table."""
+    """Return the header from the file's first lines. Raises CsvMisnamed without a column, CsvUnusable without a
+    table.
+    """
     best: tuple[tuple[int, int, int], int, list[str]] | None = None
     usual = ",".join(_STANDARD[choice.quantity] for choice in choices)
     for number, line in enumerate(lines[:HEADER_LINES], 1):
@@ -218,7 +223,7 @@ def find_header(lines: Sequence[str], choices: Choices, file: str) -> Header:
 
 
 def _positions(names: Sequence[str], choice: ColumnChoice) -> list[int]:
-    """The columns that answer to a choice: by the whole name, else by the name without its unit."""
+    """Return the columns that fit a choice: by the whole name, else by the name without its unit."""
     full = [_folded(name) for name in names]
     bare = [_folded(split_name(name)[0]) for name in names]
     if choice.name:
@@ -255,7 +260,7 @@ def _one_each(
 
 
 def _flag(choices: Choices) -> str:
-    """The option that names these columns: `--column` of a reference without a speed, else `--columns`."""
+    """Return the option that names these columns: `--column` for a reference without a speed, else `--columns`."""
     return _WHERE if len(choices) == len(QUANTITIES) else REFERENCE_FLAG
 
 
@@ -275,13 +280,13 @@ def _no_column(choice: ColumnChoice, names: Sequence[str], where: str, choices: 
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_BELOW = 5          # rows that may stand between the header and the numbers
-_LOOKED_AT = 5000   # rows, for the decimal sign
+_BELOW = 5          # most rows between the header and the numbers
+_LOOKED_AT = 5000   # rows examined for the decimal sign
 
 
 @dataclass(frozen=True)
 class ColumnLayout:
-    """``units`` of the columns; ``clock``: the time is written as such; ``comma``: the decimal sign."""
+    """Layout: ``units`` of the columns; ``clock``: times are clock times; ``comma``: the decimal sign."""
 
     header: Header
     first_line: int
@@ -292,9 +297,9 @@ class ColumnLayout:
 
 
 def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayout:
-    """Return the layout from the first block. CsvMisnamed for columns and units, CsvUnusable without numbers."""
+    """Return the layout from the first block. Raises CsvMisnamed for columns and units, CsvUnusable without numbers."""
     header = find_header(lines, choices, file)
-    below = range(header.line, min(header.line + _BELOW + 1, len(lines)))     # positions, so one line further
+    below = range(header.line, min(header.line + _BELOW + 1, len(lines)))     # positions of the lines below the header
     rows = {at: _wanted(lines[at], header) for at in below if lines[at].strip()}
     first = next((at for at, row in rows.items() if _holds_data(row)), None)
     if first is None:
@@ -329,7 +334,9 @@ def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayo
 
 
 def _telling(lines: Sequence[str], delimiter: str) -> list[str]:
-    """The first lines, and where commas are no separators, some further ones with a comma: a standstill is all 0."""
+    """Return the first lines, and some later ones with a comma if it is no separator: at standstill all values are
+    0.
+    """
     further = (line for line in lines[_LOOKED_AT:] if "," in line) if delimiter != "," else ()
     return [*lines[:_LOOKED_AT], *islice(further, _LOOKED_AT)]
 
@@ -340,7 +347,7 @@ def _wanted(line: str, header: Header) -> list[str]:
 
 
 def _holds_data(row: Sequence[str]) -> bool:
-    """A time and numbers, or what stands for no number: channels that start late are empty at first."""
+    """Return whether a row has a time and numbers or empty cells: channels that start late are empty at first."""
     timed = looks_numeric(row[0]) or (":" in row[0] and any(sign.isdigit() for sign in row[0]))
     values = [looks_numeric(cell) for cell in row[1:]]
     return (timed or is_missing(row[0])) and all(
@@ -349,7 +356,7 @@ def _holds_data(row: Sequence[str]) -> bool:
 
 
 def named(choices: Choices) -> str:
-    """``time, speed and torque``."""
+    """Return the quantities as ``time, speed and torque``."""
     *first, last = (choice.quantity for choice in choices)
     return f"{', '.join(first)} and {last}"
 
@@ -367,7 +374,7 @@ def _unit(choice: ColumnChoice, name: str, stated: str, where: str, flag: str) -
     tell = f"Give it behind a colon: {flag} {quantity}='{shown(name)}:{SI[quantity]}'"
     odd = stated if below is None and not is_missing(stated) else ""
     if flag == REFERENCE_FLAG and named is None and below is None:
-        odd = odd or split_name(name)[1]      # a calibration assumes no unit where the file states another
+        odd = odd or split_name(name)[1]      # a calibration does not assume a unit if the file states another one
     if odd:
         raise CsvMisnamed(
             f"{shown(odd)!r} is no known unit of {quantity}; there are {', '.join(known_units(quantity))}",

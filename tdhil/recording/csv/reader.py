@@ -1,4 +1,4 @@
-"""A trace and what else is known of the bench, as a Recording."""
+"""Reading of a trace, with further data of the bench, as a Recording."""
 
 import math
 from collections.abc import Iterator
@@ -26,10 +26,10 @@ from tdhil.recording.csv.text import (
 from tdhil.recording.recording import BoolArray, FloatArray, LagPrior, Recording
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Rows to numbers: whole blocks by numpy where every row is as expected, cell by cell where one isn't.
+# Conversion of rows to numbers: whole blocks by numpy if every row is regular, else cell by cell.
 #
-# Rows left out are counted by cause, with the line of the first: a ragged row may be cut or may have decimal
-# commas between commas, and its columns are ambiguous.
+# Rows that are left out are counted by cause, with the line of the first. A ragged row may be cut or may have decimal
+# commas between commas, so its columns are ambiguous.
 
 
 LineArray = NDArray[np.int64]
@@ -37,7 +37,7 @@ LineArray = NDArray[np.int64]
 
 @dataclass
 class Tally:
-    """How many rows went one way, and the line of the first."""
+    """Number of rows with one cause, and the line of the first."""
 
     count: int = 0
     first: int = 0
@@ -48,7 +48,7 @@ class Tally:
 
 
 class RowReader:
-    """Reads a file's blocks in order; as the file has them, not yet in SI, but for clock times."""
+    """Reader of a file's blocks in order; values are in the file's units, except clock times, which become seconds."""
 
     def __init__(self, layout: ColumnLayout) -> None:
         header = layout.header
@@ -58,10 +58,12 @@ class RowReader:
         self.columns = self._columns = header.columns
         self._clock = ClockReader() if layout.clock else None
         self.ragged, self.missing, self.unreadable = Tally(), Tally(), Tally()
-        self.rows = 0              # all that weren't blank
+        self.rows = 0              # all rows that are not blank
 
     def read(self, block: LineBlock) -> tuple[FloatArray, LineArray]:
-        """(N, K) the layout's columns and (N,) line numbers of the usable rows at or below the layout's first line."""
+        """Return the columns of the layout (N, K) and the line numbers (N,) of the usable rows from the layout's
+        first line on.
+        """
         skipped = max(0, self._layout.first_line - block.first)
         lines, first = block.lines[skipped:], block.first + skipped
         values = self._at_once(lines)
@@ -78,7 +80,7 @@ class RowReader:
         return values[good], numbers[good]
 
     def _at_once(self, lines: list[str]) -> FloatArray | None:
-        """All lines, if none of them needs a second look."""
+        """Return all lines as numbers, if every line is regular."""
         if not lines or any('"' in line for line in lines):
             return None
         delimiter = self._delimiter
@@ -98,7 +100,7 @@ class RowReader:
         return values if self._clock is None else self._timed(lines, values)
 
     def _timed(self, lines: list[str], values: FloatArray) -> FloatArray | None:
-        """The block's clock times beside its values; None, with the clock where it was, if one can't be read."""
+        """Return the block's clock times with its values; None, with the clock unchanged, if one cannot be read."""
         assert self._clock is not None
         before = copy(self._clock)
         column, seconds = self._columns[0], self._clock.seconds
@@ -123,7 +125,7 @@ class RowReader:
 
     def _row(self, line: str, at: int) -> list[float] | None:
         cells = split_cells(line, self._delimiter)
-        # A separator behind the last cell is a habit of some tools, a row without its last, empty cells of others.
+        # some tools write a separator after the last cell; others leave out the last, empty cells of a row
         if len(cells) <= max(self._columns) or any(cells[self._width :]):
             self.ragged.add(at)
             return None
@@ -139,20 +141,20 @@ class RowReader:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Time stamps as a drive's tool left them: repeated, out of order, with gaps; what can be put right and what can't.
+# Checks of the time stamps from a drive's tool: repeated, out of order, or with gaps; some faults can be corrected.
 
 
 LONGEST_S = 7 * 86400.0
-_MOST_DROPPED = 0.10      # of the rows; more and it isn't one record
-_GAP = 5.0                # usual intervals
+_MOST_DROPPED = 0.10      # largest share of rows dropped; with more it is not one recording
+_GAP = 5.0                # usual intervals, from which a gap is reported
 
 
 def rising(time_s: FloatArray, lines: LineArray, file: str) -> tuple[BoolArray, list[str]]:
-    """(N,) the rows to keep, and warnings. CsvUnusable if the rows are no record in order, or a week or longer."""
+    """Return the rows to keep (N,), and warnings. Raises CsvUnusable for rows without order, or of a week or longer."""
     keep = np.ones(len(time_s), dtype=np.bool_)
     if len(time_s) < 2:
         return keep, []
-    # One stamp too high between two good ones: it is the one to go, not all that follow.
+    # drop a single stamp that is too high between two good ones, and not all rows after it
     keep[1:-1] = ~((time_s[1:-1] > time_s[2:]) & (time_s[2:] > time_s[:-2]))
     kept = np.flatnonzero(keep)
     highest = np.maximum.accumulate(time_s[kept])
@@ -197,16 +199,16 @@ def _row_list(count: int) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A trace exported from a drive's own tool: CSV in, samples in SI out, and what had to be assumed or left out.
+# Trace from a drive's own tool: samples in SI, and warnings on assumptions and on rows left out.
 
 
-MAX_ROWS = 10_000_000      # 32 bytes each while they are read
-_MOST_ODD = 0.10           # of the rows, ragged or without a number where one should be
+MAX_ROWS = 10_000_000      # rows, at most; each takes 32 bytes during reading
+_MOST_ODD = 0.10           # largest share of rows that are ragged, or without a number
 
 
 @dataclass(frozen=True)
 class CsvTrace:
-    """(N,) each, SI, time rising; ``warnings`` a line each."""
+    """Trace: (N,) each, SI, time rising; ``warnings``: one line each."""
 
     time_s: FloatArray
     speed_rad_s: FloatArray
@@ -215,9 +217,10 @@ class CsvTrace:
 
 
 def read_trace(path: Path, choices: Choices = USUAL, rated_torque_nm: float | None = None) -> CsvTrace:
-    """The trace in ``path``. CsvMisnamed for columns and units, CsvUnusable for the rest, both with file and line.
+    """Return the trace in ``path``. Raises CsvMisnamed for columns and units, CsvUnusable otherwise, with file and
+    line.
 
-    UsageError if the torque is a share of the rated torque, and that isn't given.
+    Raises UsageError if the torque is a share of the rated torque, and the rated torque is missing.
     """
     (time, speed, torque), warnings = _read_columns(path, choices, rated_torque_nm)
     return CsvTrace(time, speed, torque, warnings)
@@ -225,7 +228,7 @@ def read_trace(path: Path, choices: Choices = USUAL, rated_torque_nm: float | No
 
 @dataclass(frozen=True)
 class ReferenceTrace:
-    """Torque of a reference sensor: (N,) each, SI, time rising; ``warnings`` a line each."""
+    """Torque of a reference sensor: (N,) each, SI, time rising; ``warnings``: one line each."""
 
     time_s: FloatArray
     torque_nm: FloatArray
@@ -233,10 +236,11 @@ class ReferenceTrace:
 
 
 def read_reference(path: Path, choices: Choices) -> ReferenceTrace:
-    """The trace of a reference sensor, without a speed. Raises as `read_trace`, and CsvUnusable for a row left out.
+    """Return the trace of a reference sensor, without a speed. Raises like `read_trace`, and CsvUnusable for a lost
+    row.
 
-    A calibration takes every value as the sensor gave it: a value that is missing is refused, and so is a time that
-    does not rise. Only a row that repeats the one before it is left out.
+    A calibration uses every value of the sensor. A missing value, or a time that does not rise, is therefore refused.
+    Only a row that repeats the one before it is left out.
     """
     (time, torque), warnings = _read_columns(path, choices, None, whole=True)
     return ReferenceTrace(time, torque, warnings)
@@ -245,7 +249,7 @@ def read_reference(path: Path, choices: Choices) -> ReferenceTrace:
 def _read_columns(
     path: Path, choices: Choices, rated_torque_nm: float | None, *, whole: bool = False
 ) -> tuple[list[FloatArray], tuple[str, ...]]:
-    """The columns of the choices, and warnings. ``whole``: no row may be left out."""
+    """Return the columns of the choices, and warnings. ``whole``: no row may be left out."""
     file = str(path)
     encoding = encoding_of(path)
     source = blocks(path, encoding)
@@ -298,7 +302,7 @@ def _factors(layout: ColumnLayout, rated_torque_nm: float | None, file: str) -> 
 def _collect(
     source: Iterator[LineBlock], reader: RowReader, warnings: list[str], file: str
 ) -> tuple[list[FloatArray], LineArray]:
-    """The columns and the lines, at most `MAX_ROWS` of them."""
+    """Return the columns and the line numbers, at most `MAX_ROWS` rows."""
     parts: tuple[list[FloatArray], ...] = tuple([] for _ in reader.columns)
     numbers: list[LineArray] = []
     room = MAX_ROWS
@@ -317,12 +321,12 @@ def _collect(
     columns = []
     for part in parts:
         columns.append(np.concatenate(part))
-        part.clear()      # one column at a time, so that the peak is not twice the record
+        part.clear()      # one column at a time, so that the memory is not twice that of the recording
     return columns, np.concatenate(numbers)
 
 
 def _left_out(reader: RowReader, layout: ColumnLayout, choices: Choices, file: str) -> list[str]:
-    """Warnings for what was dropped; CsvUnusable where that is so much that the rest can't be trusted."""
+    """Return warnings for dropped rows. Raises CsvUnusable if there are too many of them."""
     ragged, odd = reader.ragged, reader.unreadable
     if ragged.count > _MOST_ODD * reader.rows:
         comma = layout.header.delimiter == ","
@@ -346,7 +350,7 @@ def _left_out(reader: RowReader, layout: ColumnLayout, choices: Choices, file: s
 def _possible(
     columns: list[FloatArray], lines: LineArray, choices: Choices, dropped: list[str], file: str
 ) -> tuple[list[FloatArray], LineArray]:
-    """Without the rows that no machine can have; CsvUnusable if none is left."""
+    """Return the rows without impossible values. Raises CsvUnusable if none is left."""
     good = np.ones(len(lines), dtype=np.bool_)
     for column in columns:
         good &= np.abs(column) < LARGEST
@@ -365,16 +369,17 @@ def _rows(tally: Tally) -> str:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_LOOKED_AT = 200_000     # samples, for the resolution
-_ROUNDING = 1e-9         # of the largest value: differences below it are the arithmetic's
+_LOOKED_AT = 200_000     # samples used to find the resolution
+_ROUNDING = 1e-9         # of the largest value: smaller differences are rounding of the arithmetic
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Data that a trace does not hold: N·m and 1 at the motor shaft; None if unknown.
+    """Data of the bench that a trace does not contain: N·m and 1 at the motor shaft; None if unknown.
 
-    ``skew_sd_s``: standard uncertainty of the time offset between speed and torque, s. None: one sample, because the
-    tool may read them one after the other, and at least the usual value within a frame (`LagPrior`).
+    ``skew_sd_s``: standard uncertainty of the time offset between speed and torque, s. None: the interval of one
+    sample, because the tool may read speed and torque one after the other, but at least the usual value within a frame
+    (`LagPrior`).
     """
 
     rated_torque_nm: float | None = None
@@ -388,9 +393,9 @@ class Bench:
 def read_recording(
     path: Path, choices: Choices = USUAL, excitation: Path | None = None, bench: Bench | None = None
 ) -> tuple[Recording, tuple[str, ...]]:
-    """The Recording, and a warning for everything that was assumed or left out.
+    """Return the Recording, and a warning for each assumption and for rows left out.
 
-    Raises what `read_trace` does, and DataFileError for the file of the excitation.
+    Raises like `read_trace`, and DataFileError for the file of the excitation.
     """
     bench = bench or Bench()
     trace = read_trace(path, choices, bench.rated_torque_nm)
@@ -418,9 +423,9 @@ def read_recording(
 
 
 def resolution(signal: FloatArray) -> float:
-    """The smallest step between two values that occur, 0 for a constant: of a quantised signal, its quantum.
+    """Return the smallest step between two values, 0 for a constant: the quantum of a quantised signal.
 
-    Without it the rounded crest of a small wave would look clipped.
+    Without the quantum, the rounded crest of a small wave would look clipped.
     """
     values = np.unique(signal[:_LOOKED_AT])
     steps = np.diff(values)

@@ -1,10 +1,10 @@
-"""A text file in blocks of whole lines, whatever its encoding, in bounded memory.
+"""Reading of a text file in blocks of whole lines, for any encoding, in limited memory.
 
-UTF-8 and UTF-16 are known by their byte order mark; without one it is UTF-8 if the beginning decodes as that, else
-Windows-1252, which holds Latin-1's letters. Line ends may be LF, CR LF or CR.
+UTF-8 and UTF-16 are recognised by their byte order mark. Without one the encoding is UTF-8 if the beginning decodes as
+UTF-8, else Windows-1252, which includes the letters of Latin-1. Line ends may be LF, CR LF or CR.
 
-Our own around `csv`, which splits the odd line: readers of tables (numpy's, pandas') stop at the first bad row, or pass
-over it unseen. Here each is counted by its cause, with its line.
+This is an own reader, with `csv` for lines with quotes. The readers of numpy and pandas stop at the first bad row, or
+skip it silently. Here each bad row is counted by its cause, with its line.
 """
 
 import codecs
@@ -19,12 +19,12 @@ from pathlib import Path
 from tdhil.errors import CsvUnusable
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Times of day and time stamps, as seconds from the first one's day.
+# Times of day and time stamps, as seconds since the beginning of the first day.
 #
-# Read are ``12:00:00.123`` (decimal comma too), ``00:12.3`` (minutes), with or without AM or PM, before it a date
-# (``2024-05-01T``, ``2024/05/01``, ``01.05.2024``), behind it a zone (``Z``, ``+02:00``). Without a date, a clock that
-# goes from the last hour of a day to the first one has passed midnight. ``5/1/2024`` is no date here: its
-# day and month are ambiguous.
+# Accepted forms: ``12:00:00.123`` (also with decimal comma), ``00:12.3`` (minutes), with or without AM or PM. A date
+# may precede (``2024-05-01T``, ``2024/05/01``, ``01.05.2024``), a zone may follow (``Z``, ``+02:00``). Without a date,
+# a clock that changes from the last hour of a day to the first one has passed midnight. ``5/1/2024`` is not accepted,
+# because day and month are ambiguous.
 
 
 _DAY_S = 86400.0
@@ -38,18 +38,18 @@ _YEAR_LAST = re.compile(r"(\d{1,2})[.](\d{1,2})[.](\d{4})", re.ASCII)
 
 
 class ClockReader:
-    """Reads one column from top to bottom; it has to remember the day."""
+    """Reader of one column of clock times from top to bottom; it stores the day."""
 
     def __init__(self) -> None:
-        self._prefix = "\0"        # up to the last colon of the row before, without zone and half
-        self._base_s = 0.0         # what that much is in seconds
-        self._last_s = 0.0         # of its own day
+        self._prefix = "\0"        # text up to the last colon of the row before, without zone and AM or PM
+        self._base_s = 0.0         # value of this text, s
+        self._last_s = 0.0         # s, within its own day
         self._days: dict[str, int] = {}
         self._night = 0
         self._first: int | None = None
 
     def seconds(self, cell: str) -> float | None:
-        """Seconds since the beginning of the first cell's day; None for what is no time."""
+        """Return seconds since the beginning of the first cell's day; None if the cell is not a time."""
         prefix, _, tail = cell.rpartition(":")
         if prefix == self._prefix and len(tail) >= 2 and tail[:2].isdigit():
             try:
@@ -74,7 +74,7 @@ class ClockReader:
         return self._base_s + second
 
     def _day(self, text: str, of_day_s: float) -> int | None:
-        """Days since the first cell's; None for a date that is none."""
+        """Return the days since the first cell's day; None for an invalid date."""
         if not text:
             if self._last_s >= _DAY_S - 3600.0 and of_day_s < 3600.0:
                 self._night += 1
@@ -93,7 +93,7 @@ class ClockReader:
 
 
 def _ordinal(text: str) -> int | None:
-    """Return the day's number; None for a date that is none, or that has an ambiguous day and month."""
+    """Return the day's number; None for an invalid date, or one with ambiguous day and month."""
     try:
         if found := _YEAR_FIRST.fullmatch(text):
             return date(int(found[1]), int(found[2]), int(found[3])).toordinal()
@@ -114,11 +114,11 @@ def _zone_s(zone: str | None) -> float:
 # ---------------------------------------------------------------------------------------------------------------------
 # Cells and the numbers in them: quotes, decimal comma or point, signs between thousands.
 #
-# A dot in a column with decimal commas, or a comma in one with decimal points, is read only where it can mean nothing
-# but thousands (``1.234,5``, ``1,234.5``). ``1.234`` among ``0,5`` could be either, and is no number here.
+# A dot in a column with decimal commas, or a comma in one with decimal points, is accepted only if it must separate
+# thousands (``1.234,5``, ``1,234.5``). ``1.234`` in a column with ``0,5`` is ambiguous, and is not accepted.
 
 
-LARGEST = 1e12        # beyond it, in SI, is no machine but a place-holder such as 3.4e38
+LARGEST = 1e12        # in SI; a larger value is a place-holder such as 3.4e38
 _MISSING = {"", "-", "--", "nan", "n/a", "na", "#n/a", "null", "none", "inf", "-inf", "+inf", "1.#qnan", "#nv", "?"}
 _POINTED = re.compile(r"[+-]?\d{1,3}(,\d{3})+\.\d*")
 _COMMAED = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d*")
@@ -127,7 +127,7 @@ _SPACES = str.maketrans({"\u2212": "-", "\u00a0": None, "\u202f": None, "'": Non
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
-    """The cells of one line, stripped. A quote never reaches beyond its line."""
+    """Return the cells of one line, stripped. A quote never extends beyond its line."""
     if '"' in line:
         try:
             return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
@@ -137,13 +137,13 @@ def split_cells(line: str, delimiter: str) -> list[str]:
 
 
 def is_missing(cell: str) -> bool:
-    """An empty cell, or what tools write for no value."""
+    """Return whether a cell is empty, or has a tool's text for no value."""
     return cell.casefold() in _MISSING
 
 
 def number(cell: str, comma: bool) -> float | None:
-    """The finite number in a cell, or None. ``comma``: the decimal sign."""
-    if not comma or ("." not in cell and "," in cell):       # the usual case, before what costs time
+    """Return the finite number in a cell, or None. ``comma``: the decimal sign is a comma."""
+    if not comma or ("." not in cell and "," in cell):       # the usual case first, because it is fast
         value = _float(cell.replace(",", ".") if comma else cell)
         if value is not None:
             return value
@@ -171,12 +171,12 @@ def _float(text: str) -> float | None:
 
 
 def looks_numeric(cell: str) -> bool:
-    """A number under either decimal sign."""
+    """Return whether a cell is a number with either decimal sign."""
     return number(cell, False) is not None or number(cell, True) is not None
 
 
 def decimal_sign(rows: Iterable[Sequence[str]]) -> str:
-    """``,`` or ``.``, or ``?`` where rows speak for both; of the wanted cells of some rows at the beginning."""
+    """Return ``,`` or ``.``, or ``?`` for a contradiction, from the required cells of some rows at the beginning."""
     signs = set()
     for row in rows:
         for cell in row:
@@ -195,7 +195,7 @@ def decimal_sign(rows: Iterable[Sequence[str]]) -> str:
 # ---------------------------------------------------------------------------------------------------------------------
 
 MAX_BYTES = 4 * 2**30
-MAX_LINE = 64 * 1024      # characters; a table's line has some hundred
+MAX_LINE = 64 * 1024      # characters; a line of a table has some hundred
 _BLOCK = 1 << 20          # characters
 _HEAD = 64 * 1024
 _MARKS = (
@@ -212,14 +212,16 @@ _PACKED = {
 
 @dataclass(frozen=True)
 class LineBlock:
-    """Lines without their ends; ``first`` is the number of the first one, from 1."""
+    """Lines without their ends; ``first`` is the number of the first line, from 1."""
 
     first: int
     lines: list[str]
 
 
 def encoding_of(path: Path) -> str:
-    """The codec to read ``path`` with. CsvUnusable for what is empty, too large, packed, binary or unreadable."""
+    """Return the encoding of ``path``. Raises CsvUnusable for an empty, too large, packed, binary or unreadable
+    file.
+    """
     try:
         size = path.stat().st_size
         with path.open("rb") as file:
@@ -238,7 +240,7 @@ def encoding_of(path: Path) -> str:
         if head.startswith(magic):
             raise CsvUnusable(f"this is {what} file, no text", where=str(path), next_step="Save the table as CSV")
     found = next((name for mark, name in _MARKS if head.startswith(mark)), None) or _unmarked(head)
-    # A logger whose power failed leaves NULs behind its last line.
+    # a logger that lost power leaves NUL characters after its last line
     text = codecs.getincrementaldecoder(found)(errors="replace").decode(head).rstrip("\0")
     odd = sum(sign < " " and sign not in "\t\n\r\f\v" for sign in text)
     if not text or "\0" in text[:1024] or odd > 0.05 * len(text):
@@ -251,14 +253,16 @@ def encoding_of(path: Path) -> str:
 
 def _unmarked(head: bytes) -> str:
     try:
-        codecs.getincrementaldecoder("utf-8")().decode(head)     # incremental: the cut may go through a character
+        codecs.getincrementaldecoder("utf-8")().decode(head)     # incremental: the cut may be inside a character
     except UnicodeDecodeError:
         return "cp1252"
     return "utf-8"
 
 
 def blocks(path: Path, encoding: str) -> Iterator[LineBlock]:
-    """The lines of the file, about a million characters at a time. CsvUnusable for a line beyond all measure."""
+    """Yield the lines of the file, about a million characters at a time. Raises CsvUnusable for a line that is too
+    long.
+    """
     first, rest = 1, ""
     try:
         with path.open("r", encoding=encoding, errors="replace", newline=None) as file:

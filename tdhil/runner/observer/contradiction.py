@@ -17,10 +17,12 @@ class Signal(Enum):
 
 @dataclass(frozen=True)
 class Contradiction:
-    """The first contradiction between reports stays. ``what``: a sentence with values, ``helps``: the next step."""
+    """First contradiction between reports; it is not replaced. ``what``: a sentence with values, ``helps``: the next
+    step.
+    """
 
     signals: frozenset[Signal]
     what: str
     helps: str
     time_s: float
-    lighter: bool = False              # a smaller inertia explains it: a part of the load may be lost
+    lighter: bool = False              # True: a smaller inertia explains it, so a part of the load may be lost

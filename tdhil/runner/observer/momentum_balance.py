@@ -11,29 +11,29 @@ from tdhil.runner.observer.shaft_bounds import ShaftBounds
 from tdhil.runner.settings import MachineLimits
 
 WINDOWS_S = (0.25, 0.5, 1.0, 2.0, 4.0)
-"""Windows of (1), s. Short ones find a jump; long ones find a report that no longer follows. The longest is for the
-time before J is known: over it friction that bends adds up to more than a known J leaves open."""
+"""Windows of (1), s. Short ones detect a jump; long ones detect a report that stops following. The longest is for
+the time before J is known, when nonlinear friction adds up to more than the bounds of a known J."""
 
 LIGHTEST_SHARE = 0.5
-"""The motor's own share of the inertia at least, where part of the load hangs on a shaft that twists."""
+"""Least share of the motor in the inertia, if a part of the load hangs on a compliant shaft."""
 
 LIGHTER_SHARE = 0.02
-"""An imbalance that this share of the inertia explains may be a lost load."""
+"""Share of the inertia: an imbalance that a reduction by this share explains may be a lost load."""
 
 STEEPEST = 0.9
-"""Factor on the acceleration of (2). Its inertia is far below the likeliest one; above a noisy bit a healthy shaft
-reaches 0.6 of the bound, elsewhere 0.3 (`benchmarks/healthy_runs.py`)."""
+"""Factor on the acceleration of (2). The inertia in (2) is far below the likeliest one. Above a noisy bit a healthy
+shaft reaches 0.6 of the bound, elsewhere 0.3 (`benchmarks/healthy_runs.py`)."""
 
 HIDDEN_SHARE = 0.25
-"""Torque beyond the reported one, as a share of the limit. In speed mode the drive may command torques that are too
-short for the lag of their report."""
+"""Torque beyond the reported one, as a share of the limit. In speed mode the drive may command torque pulses that
+are too short for the lag of their report."""
 
 MEMORY_S = 3.0
-"""A reported slope remembers the torque of so long, s: six of the longest plausible lags."""
+"""Time during which an earlier torque affects the reported slope, s: six of the longest plausible lags."""
 
 
 class MomentumBalance:
-    """Tests the points of a run against the bounds of its shaft. ``point_s``: time between two points."""
+    """Test of the points of a run against the bounds of its shaft. ``point_s``: time between two points."""
 
     def __init__(self, limits: MachineLimits, lag_s: float, point_s: float, torque_count_nm: float) -> None:
         self._limits = limits
@@ -43,11 +43,13 @@ class MomentumBalance:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the tests that failed."""
+        """Reset the counts of failed tests."""
         self._failed = [0] * (len(WINDOWS_S) + 1)
 
     def see(self, points: deque[Point], known: ShaftBounds, noise_rad_s: float) -> Contradiction | None:
-        """Return what does not fit at the last of these points, if so; ``noise_rad_s``: of a point's speed."""
+        """Return the contradiction at the last of these points, if there is one; ``noise_rad_s``: of a point's
+        speed.
+        """
         if not known.testable:
             return None
         now, found = points[-1], None
@@ -70,7 +72,7 @@ class MomentumBalance:
         return found
 
     def _fails(self, number: int, share: float) -> bool:
-        """Count a test that failed, and return whether it has failed often enough."""
+        """Count a failed test, and return whether enough tests in a row have failed."""
         self._failed[number] = self._failed[number] + 1 if share > 1.0 else 0
         return self._failed[number] >= IN_A_ROW
 
@@ -79,7 +81,7 @@ class MomentumBalance:
         limits, now = self._limits, points[-1]
         blur_rad_s2 = 2.0 * noise_rad_s / SLOPE_S
         if abs(now.slope) <= self._clear_rad_s2(now, known) + blur_rad_s2:
-            return 0.0                 # within the noise, or what the torque of this moment alone explains
+            return 0.0                 # within the noise, or explained by the torque of this moment alone
         recent = [point for point in points if now.time_s - point.time_s <= MEMORY_S]
         if now.time_s - points[0].time_s < MEMORY_S:
             least_nm, most_nm = -limits.torque_nm, limits.torque_nm
@@ -87,7 +89,7 @@ class MomentumBalance:
             least_nm = min([point.torque_least for point in recent])
             most_nm = max([point.torque_most for point in recent])
         fastest = max([abs(point.speed) for point in recent])
-        if limits.winds_up:            # a string; its rough inertia has a wide interval already
+        if limits.winds_up:            # above a string the rough inertia has a wide interval already
             load_low, load_high = recent[0].load_low, recent[0].load_high
             lightest = known.inertia_low
         else:
@@ -98,9 +100,9 @@ class MomentumBalance:
         return abs(now.slope) / (most + blur_rad_s2)
 
     def _clear_rad_s2(self, now: Point, known: ShaftBounds) -> float:
-        """Return the slope that the torque of this moment allows; friction, and the torque before it, only allow more.
+        """Return the slope that the torque of this moment allows. Friction and the earlier torque only allow more.
 
-        0 above a string, whose load may take all of it.
+        Returns 0 above a string, whose load may take the whole torque.
         """
         limits = self._limits
         if limits.winds_up:
@@ -112,10 +114,10 @@ class MomentumBalance:
         self, window: tuple[Point, Point, Point], known: ShaftBounds, inertias: tuple[float, ...], noise_rad_s: float,
         surplus_nm: tuple[float, float],
     ) -> float:
-        """Return the imbalance of (1) over what it allows, for the J that explains most.
+        """Return the imbalance of (1) over the allowed one, for the J that explains most of it.
 
-        (1) is linear in J, so its bounds will do. ``window``: its start, `AROUND_S` after it, and its end.
-        ``surplus_nm``: torque that is left to accelerate the shaft at the end, least and greatest.
+        (1) is linear in J, so the bounds of J suffice. ``window``: its start, `AROUND_S` after it, and its end.
+        ``surplus_nm``: least and greatest torque that accelerates the shaft at the end.
         """
         (start, after, now), lag_s = window, self._lag_s
         change = now.speed - start.speed
@@ -152,7 +154,9 @@ class MomentumBalance:
 
 
 def _contradiction(now: Point, start: Point, known: ShaftBounds, *, lighter: bool) -> Contradiction:
-    """Describe it. A smaller inertia explains a speed that grows with the torque, and not one that is gone."""
+    """Describe the contradiction. A smaller inertia explains a speed that rises with the torque, but not a lost
+    speed.
+    """
     lighter = lighter and abs(now.speed) > abs(start.speed) and now.speed * max(start.torque, now.torque) > 0.0
     went = (
         f"within {now.time_s - start.time_s:.2g} s the reported speed went from {start.speed:.2f} to"

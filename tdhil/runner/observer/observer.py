@@ -1,4 +1,4 @@
-"""The observer: takes every cycle, and holds its reports against each other. Pure."""
+"""Observer: evaluates every cycle, and compares its reports. Pure."""
 
 from __future__ import annotations
 
@@ -20,33 +20,37 @@ from tdhil.runner.observer.unanswered_torque import STANDSTILLS, PointInRun, rul
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
 
 LONGEST_GAP_S = 0.2
-"""Feedback that was missing for longer begins the comparison anew, s."""
+"""Longest gap in the feedback, s; after a longer one the comparison starts again."""
 
 BEYOND_LIMIT = 1.25
-"""A reported torque beyond this multiple of the torque limit is false: the drive holds the limit but for ripple."""
+"""Multiple of the torque limit beyond which a reported torque is false: the drive keeps the limit, except for
+ripple.
+"""
 
 NOISE_SDS = 6.0
-"""Standard deviations of the reported speed that count as its noise."""
+"""Standard deviations that count as the noise of the reported speed."""
 
 STILL_SHARE = 0.01
-"""Share of the speed limit below which a shaft may stand still: static friction then takes any torque up to its own."""
+"""Share of the speed limit below which a shaft may stand still; static friction then balances any torque up to its
+own.
+"""
 
 LOAD_RANGE, LOAD_BEFORE_S = 1.0, 10.0
-"""The torque of a string stays within this multiple of its range, about the middle, over so long before a window, s: a
-swing of a long string."""
+"""Assumed bound of a string's load: the multiple of its range about the middle, and the time before a window for
+this range, s: one oscillation of a long string."""
 
 UNSEEN_SHARE = 0.1
-"""Least friction, as a share of the torque that was applied, of a shaft that never reported a motion."""
+"""Least friction of a shaft without any reported motion, as a share of the applied torque."""
 
 UNSEEN_MOST_S = 60.0
-"""Longest time that a shaft without a reported motion gets to run out, s."""
+"""Longest run-out time of a shaft without any reported motion, s."""
 
 DOUBTED_REST_SHARE = 0.1
-"""Share of the speed that counts as standstill, for a report that was in doubt and may have a wrong scale."""
+"""Share of the standstill speed that is used after a contradiction, because the scale of the report may be wrong."""
 
 
 class Observer:
-    """Compares the reports of one drive over one run; `see` takes every cycle, `doubt` says what does not fit."""
+    """Comparison of one drive's reports over one run; `see` evaluates every cycle, `doubt` is the contradiction."""
 
     def __init__(
         self,
@@ -75,12 +79,14 @@ class Observer:
         self._revival: Revival | None = None
         self._angle_revival: Revival | None = None
         self.torque_offset_nm = 0.0
-        """Reported torque where none flows, N·m."""
+        """Reported torque without any torque, N·m."""
         self.swinging_offset_nm = 0.0
-        """The largest torque offset that the stage may command in speed mode, N·m."""
+        """Largest torque offset that the stage may command in speed mode, N·m."""
         self.doubt: Contradiction | None = None
         self.backwards = False
-        """Set by a stage that saw the shaft turn backwards under a forward torque: the sign of a report is inverted."""
+        """Set by a stage in which the shaft turned backwards under a forward torque: the sign of a report is
+        inverted.
+        """
         self._gap_s = max(LONGEST_GAP_S, 3.0 * period_s)
         self._block_s = self._point_s - 0.5 * period_s
         self._time_s = self._block_from_s = -math.inf
@@ -89,31 +95,31 @@ class Observer:
         self._friction_low = self._friction_high = 0.0
         self._cycles, self._sum_speed, self._sum_torque = 0, 0.0, 0.0
         self.demand_nm: float | None = None
-        """The demanded torque, where the drive reports one, N·m."""
+        """Demanded torque, N·m, if the drive reports one."""
         self._shows_state = True
-        self._way_of = 0               # the integral of speed begins anew with each restart
+        self._way_of = 0               # the integral of speed restarts with each gap
         self._unseen_nms = 0.0
         self._unseen_nm = 0.0
         self._moved = False
         self._restart()
 
-    # -- what is known ---------------------------------------------------------------------------------------
+    # -- knowledge of the shaft and the drive -------------------------------------------------------------------
 
     def position(self, count_rad: float, gap_s: float) -> None:
-        """Take what preflight found: one count of the position, and the gap after which its turns are not known, s."""
+        """Set the results of preflight: one count of the position, rad, and the longest gap without a lost turn, s."""
         self._angles.count_rad, self._angles.gap_s = count_rad, gap_s
 
     def compare_position(self, ratio: float) -> None:
-        """Compare the position from now on: it must move this many times as far as the reported speed accounts for."""
+        """Start to compare the position: it must change by ``ratio`` times the integral of the reported speed."""
         self._angles.ratio = ratio
         self._angles.restart()
 
     def heard_position(self, now_s: float, within_s: float) -> bool:
-        """Return whether a position came within the last ``within_s``."""
+        """Return whether a position was received within the last ``within_s``."""
         return now_s - self._angles.heard_s <= within_s
 
     def know(self, model: RigGuess) -> None:
-        """Take J and friction of stage 2, with their uncertainty."""
+        """Set J and friction of stage 2, with their uncertainty."""
         before = self._bounds.words
         if not self._bounds.know(model):
             self._doubt(
@@ -127,32 +133,34 @@ class Observer:
 
     @property
     def unseen_s(self) -> float:
-        """How long a shaft whose motion was never reported may go on turning without torque, s; 0: motion was seen."""
+        """Longest time, s, that a shaft without reported motion may continue to turn without torque; 0: motion was
+        reported.
+        """
         if self._moved or self._unseen_nm <= 0.0:
             return 0.0
-        if self._limits.winds_up:          # the string turns the shaft on, long after its torque is off
+        if self._limits.winds_up:          # the string continues to turn the shaft long after its torque is off
             return RUN_OUT_S
         return min(UNSEEN_MOST_S, self._unseen_nms / (UNSEEN_SHARE * self._unseen_nm))
 
     @property
     def blind_s(self) -> float:
-        """How long friction takes at most to stop what (1) cannot find, s."""
+        """Longest time in which friction stops a motion that (1) cannot detect, s."""
         return self._bounds.blind_s(self._still_rad_s)
 
     @property
     def turned(self) -> bool:
-        """Return whether the shaft turned when the stop began, or shortly before it."""
+        """True if the shaft turned when the stop began, or shortly before it."""
         return self.turns(self._runaway.start_rad_s)
 
     # -- each cycle ------------------------------------------------------------------------------------------
 
     def see(self, command: Command, sample: Sample) -> None:
-        """Take one cycle: what was commanded, and what was reported."""
+        """Evaluate one cycle: the command and the reports."""
         self._shows_state = sample.state is not PowerState.UNKNOWN
         if not sample.fresh or not self._shows_state:
-            return                     # feedback without a valid state shows nothing of the shaft
+            return                     # feedback without a valid state gives no information on the shaft
         frozen = self._frozen.see(command, sample, self.swinging_offset_nm)
-        if frozen is not None and not self._runaway.begun:     # in a stop the setpoint jumps to zero at once
+        if frozen is not None and not self._runaway.begun:     # during a stop the setpoint jumps to zero at once
             self._doubt(frozenset({Signal.ALL}), *frozen, sample.time_s)
         speed, torque, now_s = sample.speed_rad_s, sample.torque_nm - self.torque_offset_nm, sample.time_s
         if not (math.isfinite(speed) and math.isfinite(torque)):
@@ -184,7 +192,7 @@ class Observer:
             self._point(command, sample)
 
     def see_reading(self, reading: PositionReading) -> None:
-        """Take a position that came beside the cycle."""
+        """Evaluate a position that was read outside of the cycle."""
         if self._turns is None:
             self._turns = Unwrapped(reading.wraps_rad, self._limits.speed_max_rad_s)
             self._angles.restart()
@@ -195,7 +203,9 @@ class Observer:
             self._see_angle(angle_rad, reading.time_s, self._speed)
 
     def expected(self, apart_rad_s: float, within_rad_s: float, sample: Sample) -> None:
-        """Take how far the reported speed is from what a stage's own model of the shaft predicts, rad/s."""
+        """Compare: a contradiction follows if the speed differs from a stage's own model by more than
+        ``within_rad_s``.
+        """
         if sample.fresh and not abs(apart_rad_s) <= within_rad_s:
             self._doubt(
                 frozenset({Signal.SPEED, Signal.TORQUE}),
@@ -213,34 +223,34 @@ class Observer:
     # -- standstill ------------------------------------------------------------------------------------------
 
     def speed_rad_s(self, sample: Sample) -> float:
-        """The speed to judge a stop by: of the angle where the reported speed is in doubt and the angle is not."""
+        """Return the speed for the decision on a stop: from the position, if only the reported speed is in doubt."""
         rate = self.rate_rad_s
         return sample.speed_rad_s if rate is None or not self._position_lives else rate
 
     @property
     def _position_lives(self) -> bool:
-        """Return whether the position went on after a contradiction, and so may stand in for the speed."""
+        """True if the position continued after a contradiction, and so may replace the speed."""
         return self._angle_revival is not None and self._angle_revival.alive and self.rate_rad_s is not None
 
     @property
     def moved(self) -> bool:
-        """Return whether the shaft was ever reported to move."""
+        """True if any motion of the shaft was reported."""
         return self._moved
 
     @property
     def rate_rad_s(self) -> float | None:
-        """Speed by the position, rad/s; None where too little has been reported, or nothing of late."""
+        """Speed from the position, rad/s; None with too few positions, or without a recent one."""
         return self._angles.rate_rad_s if self.heard_position(self._time_s, STALE_S) else None
 
     @property
     def comes_down(self) -> bool:
-        """Return whether a speed in doubt has come down since as a shaft does under a quick stop."""
+        """True if a speed in doubt has decreased since then as a shaft does under a quick stop."""
         seen = (self._revival, self._angle_revival)
         return any(one is not None and one.falling and one.is_fresh(self._time_s) for one in seen)
 
     @property
     def believable(self) -> bool:
-        """Return whether a report of standstill counts: it has no contradiction, or that one has been refuted."""
+        """True if a report of standstill counts: there is no contradiction, or it has been refuted."""
         doubt = self.doubt
         if doubt is None or Signal.ALL in doubt.signals or Signal.SPEED not in doubt.signals:
             return True
@@ -249,13 +259,15 @@ class Observer:
         return self._revival is not None and self._revival.alive and self._balanced
 
     def rest_rad_s(self, at_rest_rad_s: float) -> float:
-        """The speed that counts as standstill, rad/s: less once a report was in doubt, since its scale may be wrong."""
+        """Return the speed that counts as standstill, rad/s; a lower one after a contradiction, as the scale may be
+        wrong.
+        """
         if self.doubt is None:
             return at_rest_rad_s
         return min(at_rest_rad_s, max(DOUBTED_REST_SHARE * at_rest_rad_s, self._noise_rad_s()))
 
     def angle_quiet(self, at_rest_rad_s: float) -> bool:
-        """Return whether the angle moves no faster than this, rad/s; true where no angle is reported."""
+        """Return whether the position moves no faster than this, rad/s; True without a position."""
         rate = self.rate_rad_s
         return rate is None or abs(rate) <= at_rest_rad_s + self._angles.blur_rad_s
 
@@ -267,28 +279,31 @@ class Observer:
             return True
         return abs(points[-1].torque) <= 0.5 * self._bounds.breakaway_low_nm + 5.0 * self._torque_count_nm
 
-    # -- a stop that does not stop -----------------------------------------------------------------------------
+    # -- a stop that has no effect ------------------------------------------------------------------------------
 
     def begin_stop(self) -> None:
-        """Note that a quick stop was requested: from now on the shaft must become slower."""
+        """Note that a quick stop was requested: the shaft must decelerate from now on."""
         self._runaway.begin(self._earlier_rad_s())
 
     def shows_s(self, at_rest_rad_s: float, torque_nm: float) -> float:
-        """How long a shaft that is disabled must be seen at rest, s; ``torque_nm``: what held it before.
+        """Return the time for which a disabled shaft must show standstill, s; ``torque_nm``: torque that held it
+        before.
 
-        A torque like that of friction may have kept the shaft turning, by a speed signal that is off by so much.
-        Without it the reported speed then leaves standstill at friction's rate.
+        A torque as large as friction may have kept the shaft turning, if the speed signal is wrong. Without this torque
+        the reported speed then leaves standstill at the rate of friction.
         """
         return self._bounds.shows_s(at_rest_rad_s, torque_nm)
 
     def runs_away(self, sample: Sample) -> str:
-        """How the shaft accelerates against the quick stop, seen in two independent ways; empty: it does not."""
+        """Return the evidence that the shaft accelerates against the quick stop, in two independent ways; '' without
+        it.
+        """
         return self._runaway.seen(self._belief, sample) if self._shows_state else ""
 
-    # -- inside ----------------------------------------------------------------------------------------------
+    # -- internal -----------------------------------------------------------------------------------------------
 
     def _restart(self) -> None:
-        """Forget the samples, keep what is known."""
+        """Discard the samples, but keep the bounds."""
         self._points: deque[Point] = deque(maxlen=2 + math.ceil((WINDOWS_S[-1] + AROUND_S) / self._point_s))
         self._loads: deque[float] = deque(maxlen=2 + math.ceil(LOAD_BEFORE_S / self._point_s))
         self._time_s = -math.inf
@@ -310,7 +325,7 @@ class Observer:
         point.rough = self._rough
         known = self._bounds
         self._around(point, command)
-        # A late speed still falls when the shaft stands already and its static friction takes any torque.
+        # a lagging speed still falls after the shaft stopped, when its static friction balances any torque
         point.still = self._still_rad_s + self._lag_s * abs(point.slope)
         low, high = known.friction(point.speed, point.still)
         self._friction_low += low * block_s
@@ -342,7 +357,7 @@ class Observer:
             self._doubt(frozenset({Signal.TORQUE}), *apart, sample.time_s)
 
     def _around(self, point: Point, command: Command) -> None:
-        """Slope, and bounds of slope and torque within `AROUND_S`."""
+        """Set the slope, and the bounds of slope and torque within `AROUND_S`."""
         points = self._points
         point.slope = 0.0
         for before in reversed(points):
@@ -360,7 +375,7 @@ class Observer:
         point.slope_low, point.slope_high = min(slopes), max(slopes)
         point.torque_low, point.torque_high = min(torques), max(torques)
         limit_nm = self._limits.torque_nm
-        # In speed mode the torque may have moved faster than its report shows: by a quarter of the limit.
+        # in speed mode the torque may change faster than its report shows: by a quarter of the limit
         hidden_nm = HIDDEN_SHARE * limit_nm
         point.torque_least = max(-limit_nm, min(torques) - hidden_nm)
         point.torque_most = min(limit_nm, max(torques) + hidden_nm)
@@ -368,7 +383,7 @@ class Observer:
             point.torque_least, point.torque_most = min(torques[:2]), max(torques[:2])
 
     def _load(self, point: Point) -> None:
-        """Bounds of what a drill string takes, from the torque of the time before, less what accelerated the shaft."""
+        """Set the bounds of a drill string's load, from the earlier torque less the accelerating part."""
         point.load_low = point.load_high = 0.0
         if not self._limits.winds_up:
             return
@@ -385,14 +400,14 @@ class Observer:
         if abs(point.speed) > 2.0 * self._still_rad_s or self._angles.moved:
             self._moved = True
             self._bounds.breakaway_nm = max(self._unseen_nm, abs(point.torque))
-            self._points.clear()       # what held the shaft before is not known
+            self._points.clear()       # the torque that held the shaft before is unknown
             self._points.append(point)
         elif sample.state is PowerState.ENABLED:
             self._unseen_nms += abs(point.torque) * block_s
             self._unseen_nm = max(self._unseen_nm, abs(point.torque))
 
     def _compare(self, point: Point, command: Command, block_s: float) -> None:
-        """Test the balance of momentum, and whether the speed answers the torque."""
+        """Test the momentum balance, and whether the speed responds to the torque."""
         noise_rad_s = self._noise_rad_s()
         self._contradict(self._balance.see(self._points, self._bounds, noise_rad_s))
         now = PointInRun(
@@ -406,16 +421,16 @@ class Observer:
         return Belief(self.doubt, self.believable, self.comes_down, self._moved, self.rate_rad_s, self.demand_nm)
 
     def _noise_rad_s(self) -> float:
-        """Noise of a point's speed, rad/s."""
+        """Return the noise of a point's speed, rad/s."""
         per_point = max(1.0, self._point_s / self._period_s)
         return NOISE_SDS * math.sqrt(self._bent / 6.0 / per_point) + self._count_rad_s
 
     def _earlier_rad_s(self) -> float:
-        """The reported speed of `BEFORE_S` ago, rad/s: what a contradiction hides has hardly begun then."""
+        """Return the reported speed `BEFORE_S` ago, rad/s: before the effect of a contradiction."""
         return next((point.speed for point in self._points if self._time_s - point.time_s <= BEFORE_S), 0.0)
 
     def _see_angle(self, position_rad: float, now_s: float, speed_rad_s: float) -> None:
-        # A position that comes while the cycle brings nothing has no way by the reported speed to be compared with.
+        # a position without a cycle cannot be compared, because the integral of the reported speed is missing
         covered = now_s - self._time_s <= max(0.1, 2.0 * self._period_s)
         way = Way(self._way_of if covered else -1, self._way, speed_rad_s)
         apart = self._angles.see(position_rad, now_s, way, self._noise_rad_s())
@@ -431,7 +446,7 @@ class Observer:
         self._contradict(Contradiction(signals, what, helps, time_s))
 
     def _contradict(self, found: Contradiction | None) -> None:
-        """Take what was found; the first contradiction of a run stays."""
+        """Store a contradiction; the first one of a run is not replaced."""
         if found is None or self.doubt is not None:
             return
         self.doubt, time_s = found, found.time_s

@@ -6,17 +6,17 @@ POINT_S = 0.04
 """Time between two points of the comparison, s; a slow line has one for each cycle."""
 
 SLOPE_S = 0.12
-"""Time over which a slope of the reported speed is taken, s: three points."""
+"""Time for a slope of the reported speed, s: three points."""
 
 AROUND_S = 0.25
-"""Slope and torque at an end of a window are bounded by what they are within this time of it, s: a dead time hides what
-comes later."""
+"""Time around an end of a window, s: slope and torque at the end are bounded by their values within it, because a
+dead time hides later ones."""
 
 IN_A_ROW = 2
-"""Points at which a test must fail, one after the other."""
+"""Number of consecutive points at which a test must fail."""
 
 STALE_S = 1.0
-"""A report that has not come for so long shows nothing of the present, s."""
+"""Age of a report, s, from which it has no information on the present."""
 
 
 class Point:

@@ -1,4 +1,4 @@
-"""Reported position against the way by the reported speed. Pure."""
+"""Comparison of the reported position with the integral of the reported speed. Pure."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import NamedTuple
 from tdhil.runner.observer.points import IN_A_ROW
 
 ANGLE_SHARE = 0.1
-"""Tolerance of the angle against the reported speed, as `speed_check.TOLERANCE`."""
+"""Relative tolerance of the angle against the reported speed, as `speed_check.TOLERANCE`."""
 
 MOVED_RAD = 0.5
-"""A position that moved so far shows that the shaft turns, and not that a string or a coupling winds up."""
+"""Change of position, rad, that shows rotation of the shaft, and not only twist of a string or a coupling."""
 
 ANGLE_WINDOW_S = (0.5, 2.0)
-"""Least and longest window of that comparison, s."""
+"""Least and longest window of the comparison, s."""
 
 
 class Way(NamedTuple):
-    """Way by the reported speed, rad, of which stretch without a gap, and the speed at its end, rad/s."""
+    """Integral of the reported speed, rad; number of its stretch without a gap; speed at its end, rad/s."""
 
     stretch: int
     way_rad: float
@@ -27,7 +27,7 @@ class Way(NamedTuple):
 
 
 class PositionWay:
-    """The reported angle beside the way by the reported speed."""
+    """Reported angle beside the integral of the reported speed."""
 
     def __init__(self, lag_s: float, count_rad_s: float, still_rad_s: float) -> None:
         self._lag_s = lag_s
@@ -47,7 +47,7 @@ class PositionWay:
 
     @property
     def rate_rad_s(self) -> float | None:
-        """Speed by the angle over the last half second, rad/s; None where too little has been reported."""
+        """Speed from the angle over the last half second, rad/s; None with too few positions."""
         if not self._rate_known:
             self._rate_known, self._rate_rad_s = True, self._rate()
         return self._rate_rad_s
@@ -71,11 +71,11 @@ class PositionWay:
 
     @property
     def blur_rad_s(self) -> float:
-        """Return the uncertainty of that speed by one count of the position, rad/s."""
+        """Return the uncertainty of this speed due to one count of the position, rad/s."""
         return self.count_rad / ANGLE_WINDOW_S[0]
 
     def see(self, position_rad: float, time_s: float, way: Way, noise_rad_s: float) -> str | None:
-        """Return in words how the position contradicts the speed; None: it does not."""
+        """Return the contradiction between position and speed in words; None without one."""
         seen = self._seen
         if seen and time_s <= seen[-1][0]:
             return None
@@ -94,7 +94,7 @@ class PositionWay:
             return None
         turned, reported = position_rad - first[1], self.ratio * (way.way_rad - first[2].way_rad)
         apart = abs(turned - reported) > self._allowed_rad(0.0, turned, reported, took_s, noise_rad_s)
-        if apart:                      # seldom: then the lag of the speed, which takes all speeds to find, counts too
+        if apart:                      # this is rare: only then the lag is added, because finding it takes all speeds
             speeds = [one[2].speed_rad_s for one in seen]
             late = abs(self.ratio) * self._lag_s * (max(speeds) - min(speeds))
             apart = abs(turned - reported) > self._allowed_rad(late, turned, reported, took_s, noise_rad_s)
@@ -109,7 +109,9 @@ class PositionWay:
     def _allowed_rad(
         self, late_rad: float, turned_rad: float, reported_rad: float, took_s: float, noise_rad_s: float
     ) -> float:
-        """Largest difference of both ways, rad; ``late_rad``: what the lag of the reported speed accounts for."""
+        """Return the largest allowed difference of the two angles, rad; ``late_rad``: the part due to the lag of the
+        speed.
+        """
         return (
             late_rad + 2.0 * self.count_rad + ANGLE_SHARE * max(abs(turned_rad), abs(reported_rad))
             + took_s * (0.5 * self._count_rad_s + 0.1 * noise_rad_s + self._still_rad_s)

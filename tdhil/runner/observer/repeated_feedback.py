@@ -8,12 +8,12 @@ from drivers import Command, Mode, Sample
 from tdhil.runner.settings import MachineLimits
 
 FROZEN_S, FROZEN_SHARE = 0.5, 0.1
-"""Speed and torque that stay the same to the last bit for so long, while the setpoint moves by this share of its limit,
-are repeated and not measured (row 19)."""
+"""Limits of frozen feedback (row 19): speed and torque stay equal to the last bit for this time, s, while the
+setpoint changes by this share of its limit. Such values are repeated, not measured."""
 
 
 class RepeatedFeedback:
-    """Feedback that repeats its last values, as a gateway does."""
+    """Detection of feedback that repeats its last values, as a gateway does."""
 
     def __init__(self, limits: MachineLimits) -> None:
         self._limits = limits
@@ -22,7 +22,7 @@ class RepeatedFeedback:
         self._since_s = self._lowest = self._highest = 0.0
 
     def see(self, command: Command, sample: Sample, offset_nm: float) -> tuple[str, str] | None:
-        """Return cause and next step once the feedback has repeated for long enough; else None."""
+        """Return cause and next step if the feedback has repeated for long enough; else None."""
         seen, torque_mode = (sample.speed_rad_s, sample.torque_nm), command.mode is Mode.TORQUE
         with_offset = offset_nm > 0.0 and not torque_mode
         setpoint = command.torque_nm if torque_mode else command.speed_rad_s
@@ -39,7 +39,7 @@ class RepeatedFeedback:
         return self.words("while the setpoint moved")
 
     def repeats_s(self, now_s: float) -> float:
-        """For how long speed and torque have not changed, s."""
+        """Return the time since the last change of speed or torque, s."""
         return 0.0 if self._seen is None else now_s - self._since_s
 
     def words(self, besides: str) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""Acceleration against a quick stop, seen in two independent ways. Pure."""
+"""Detection of acceleration against a quick stop, in two independent ways. Pure."""
 
 from __future__ import annotations
 
@@ -15,42 +15,45 @@ from tdhil.runner.observer.unanswered_torque import AT_LIMIT_SHARE, STANDSTILLS
 from tdhil.runner.settings import MachineLimits
 
 UNANSWERED_S, UNANSWERED_SHARE = 8.0, 0.05
-"""A reported speed does not answer the stop if it changes by no more than this share for so long, s, under a braking
-torque at its limit. A shaft that slow would take minutes to stop."""
+"""A reported speed does not respond to the stop if it changes by at most this share in this time, s, under a braking
+torque at its limit. A shaft with such a slow response would take minutes to stop."""
 
 PUSHING_S, PUSHING_SHARE = 1.0, 0.1
-"""A torque that pushes on for so long after a quick stop, past every reporting lag, drives the shaft: this share of the
-torque limit, where the reported speed is not believed or never showed a motion."""
+"""A torque that acts in the direction of motion for this time, s, after a quick stop and after every reporting lag,
+drives the shaft. The share of the torque limit applies if the reported speed is in doubt or never showed a motion."""
 
 DOUBTED_SHARE = 0.5
-"""With a report in doubt, this share of the torque limit is more than a quick stop takes in the direction of motion."""
+"""Share of the torque limit that, with a report in doubt, is more than a quick stop needs in the direction of
+motion.
+"""
 
 IMPULSE_SHARE = 0.3
-"""Uncertainty of the speed by impulse, as a share of the speed at which the stop began."""
+"""Uncertainty of the speed from the impulse, as a share of the speed at which the stop began."""
 
 FASTER_SHARE, FASTER_S, FASTER_BRAKED_S = 0.1, 0.4, 1.0
-"""Share of the speed limit by which a shaft must have become faster under a quick stop, and for how long, s. The last
-time holds while the reported torque brakes it. A slipping encoder may report a higher speed for a moment."""
+"""Acceleration under a quick stop: least rise of the speed, as a share of the speed limit, and its least duration,
+s. The last duration applies while the reported torque brakes the shaft. A slipping encoder may report a higher speed
+for a moment."""
 
 INVERTED_S, INVERTED_SHARE = 2.0, 0.3
-"""Over so long a speed that rises as the reported torque of the opposite sign accounts for, within this share and the
-bounds of J, shows an inverted polarity."""
+"""Time, s, and relative tolerance of an inverted sign: the speed rises as a reported torque of the opposite sign
+explains, within this share and the bounds of J."""
 
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """Belief in the reports at present."""
+    """Present trust in the reports."""
 
     doubt: Contradiction | None
-    believable: bool                   # a report of standstill counts
-    comes_down: bool                   # a speed in doubt has come down since as under a quick stop
-    moved: bool                        # the shaft was reported to move
-    rate_rad_s: float | None           # speed by the position
+    believable: bool                   # True if a report of standstill counts
+    comes_down: bool                   # True if a speed in doubt has decreased as under a quick stop
+    moved: bool                        # True if motion of the shaft was reported
+    rate_rad_s: float | None           # speed from the position
     demand_nm: float | None            # demanded torque
 
 
 class Runaway:
-    """Acceleration against a quick stop. ``still_rad_s``: the speed of standstill."""
+    """Detection of acceleration against a quick stop. ``still_rad_s``: speed that counts as standstill."""
 
     def __init__(self, limits: MachineLimits, still_rad_s: float) -> None:
         self._limits = limits
@@ -74,7 +77,9 @@ class Runaway:
         self.start_rad_s = speed_rad_s
 
     def unanswered(self, point: Point) -> Contradiction | None:
-        """Return a reported speed that does not change under a braking torque at its limit; before `see`."""
+        """Return the contradiction of a speed that does not change under a braking torque at its limit. Call it
+        before `see`.
+        """
         if not self.begun or self._before is None or point.time_s <= self._before.time_s:
             return None
         self._see_unanswered(point, point.time_s - self._before.time_s)
@@ -88,7 +93,7 @@ class Runaway:
         )
 
     def see(self, point: Point, known: ShaftBounds, belief: Belief) -> None:
-        """Take one point of a stop."""
+        """Evaluate one point of a stop."""
         if not self.begun:
             return
         before, self._before = self._before, point
@@ -101,23 +106,23 @@ class Runaway:
         self._see_inverted(point, known)
         took_s = point.time_s - before.time_s
         if self._by_impulse_rad_s is not None:
-            # What a string takes is not known well enough for more than a torque near its limit.
+            # the torque of a string is too uncertain, except for a torque near the limit
             counts = not self._limits.winds_up or abs(point.torque) >= DOUBTED_SHARE * self._limits.torque_nm
             held = abs(point.speed) <= point.still and abs(point.torque) <= known.friction(0.0, point.still)[1]
-            counts = counts and not (held and belief.believable)     # static friction takes it
+            counts = counts and not (held and belief.believable)     # static friction balances it
             self._by_impulse_rad_s += counts * (point.impulse - before.impulse) / known.likely_inertia
-        # What pushes in the direction of the last motion, beyond all friction. Of a shaft that was never seen to move
-        # nothing is known: any torque pushes.
+        # Torque in the direction of the last motion beyond all friction. If motion was never reported, friction is
+        # unknown and any torque counts.
         least = known.pushing_nm
         if belief.doubt is not None:
             least = min(least, DOUBTED_SHARE * self._limits.torque_nm)
         if not belief.believable:
             least = PUSHING_SHARE * self._limits.torque_nm
-        elif not belief.moved:       # a little torque may be left over that static friction holds
+        elif not belief.moved:       # static friction may balance a small remaining torque
             least = DOUBTED_SHARE * (self._limits.probe_torque_nm or self._limits.torque_nm)
         turning = belief.rate_rad_s if belief.rate_rad_s and belief.doubt is not None else self.start_rad_s
         if self._limits.winds_up and belief.believable:
-            turning = point.speed      # the string may have turned it back
+            turning = point.speed      # the string may have reversed the shaft
         forward = 1.0 if turning >= 0.0 else -1.0
         pushes = (forward * point.torque if belief.moved else abs(point.torque)) > least
         self._pushing_s = self._pushing_s + took_s if pushes else 0.0
@@ -127,7 +132,7 @@ class Runaway:
         self._took_s += took_s
 
     def _see_inverted(self, point: Point, known: ShaftBounds) -> None:
-        """Find a speed that rises as the reported torque of the opposite sign accounts for."""
+        """Detect a speed that rises as a reported torque of the opposite sign explains."""
         recent = self._recent
         recent.append(point)
         while point.time_s - recent[0].time_s > INVERTED_S:
@@ -147,7 +152,7 @@ class Runaway:
         self._inverted = least_nms - slack_nms <= expected_nms <= most_nms + slack_nms
 
     def _see_unanswered(self, point: Point, took_s: float) -> None:
-        """Measure for how long a torque at its limit opposes the reported speed, which does not change."""
+        """Measure the time for which a torque at its limit opposes a reported speed that does not change."""
         braking_nm = -point.torque * math.copysign(1.0, point.speed)
         opposes = braking_nm >= AT_LIMIT_SHARE * self._limits.torque_nm
         changed = abs(point.speed - self._unanswered_rad_s) > UNANSWERED_SHARE * abs(point.speed)
@@ -158,17 +163,17 @@ class Runaway:
         self._unanswered_s += took_s
 
     def seen(self, belief: Belief, sample: Sample) -> str:
-        """Return in words how the shaft accelerates, where two ways agree; else nothing."""
+        """Return the evidence of acceleration in words if two ways agree; else ''."""
         if not self.begun or self._for_s < PUSHING_S:
             return ""
         limit = self._limits.speed_max_rad_s
         more = FASTER_SHARE * limit
         if self._limits.winds_up:
-            # A string that is released turns back. Its torque is taken away only from a shaft that is beyond its limit.
+            # A released string turns back. Its torque is removed only if the shaft exceeds its limit.
             self._slowest_rad_s = self._slowest_angle_rad_s = limit
         faster = more + max(self._slowest_rad_s, IMPULSE_SHARE * abs(self.start_rad_s))
         doubt = belief.doubt
-        # Of a shaft that became lighter the inertia is not known any more, but its speed is followed.
+        # the inertia of a shaft that lost load is unknown, but its reported speed is used
         lighter = doubt is not None and doubt.lighter
         in_vain = (not belief.believable and not lighter and not belief.comes_down) or (
             not belief.moved and not self._limits.winds_up
@@ -191,7 +196,7 @@ class Runaway:
             if self._angle_above_s >= enough_s:
                 by_position = f"the position moves at {rate:.2f} rad/s"
         by_torque = "" if lighter else self._by_torque(belief.believable, more)
-        # The speed of a shaft that became lighter is followed; so it is where only the sign of the torque is wrong.
+        # The speed of a shaft that lost load is used, also if only the sign of the torque is wrong.
         if lighter and self._inverted and abs(sample.speed_rad_s) > limit:
             by_speed = by_speed or f"the reported speed rose to {sample.speed_rad_s:.2f} rad/s"
             by_torque = "it rises as the reported torque with the opposite sign accounts for"
@@ -199,12 +204,12 @@ class Runaway:
         return "; ".join(ways) if len(ways) >= 2 else ""
 
     def _by_torque(self, believable: bool, more_rad_s: float) -> str:
-        """Return what the torque alone shows. A torque that does not follow the demanded one accounts for nothing."""
+        """Return the evidence from the torque alone. A torque that does not follow the demanded one gives none."""
         if self._apart_nm_s > TORQUE_SHARE * self._limits.torque_nm * self._took_s:
             return ""
         if self._unanswered_s >= UNANSWERED_S:
             return f"{self._pushed_nm:.0f} N·m for {self._unanswered_s:.0f} s have stopped any such shaft"
-        # Above a string the stop begins with a ramp of the setpoint, which may push: until that has ended.
+        # above a string the stop begins with a ramp of the setpoint, which may accelerate the shaft until it has ended
         ramp_s = self._limits.speed_max_rad_s / self._limits.quick_stop_rad_s2
         pushes = not self._limits.winds_up or (believable and self._for_s >= ramp_s)
         if self._pushing_s >= PUSHING_S and pushes:
@@ -215,7 +220,7 @@ class Runaway:
         return ""
 
     def _beyond(self, by_impulse_rad_s: float, more_rad_s: float, believable: bool) -> bool:
-        """Return whether torque alone takes the shaft past its limit or, with a speed in doubt, past zero."""
+        """Return whether the torque alone drives the shaft beyond its limit or, with a speed in doubt, beyond zero."""
         start = abs(self.start_rad_s)
         forward = by_impulse_rad_s * (1.0 if self.start_rad_s >= 0.0 else -1.0)
         if believable or self._limits.winds_up:

@@ -1,4 +1,4 @@
-"""Bounds of the moment of inertia and of friction, as far as a run knows them. Pure."""
+"""Bounds of the moment of inertia and of friction from the run so far. Pure."""
 
 from __future__ import annotations
 
@@ -10,61 +10,65 @@ from tdhil.runner.observer.points import Point
 from tdhil.runner.settings import MachineLimits
 
 FRICTION_SHARE, FRICTION_LIMIT_SHARE = 0.3, 0.03
-"""Uncertainty of friction: this share of it, and this share of the torque limit. Two levels of stage 2 and a straight
-line through them are all that is known; friction that bends differs by so much within the window of speed."""
+"""Uncertainty of friction: this share of it, and this share of the torque limit. Only two levels of stage 2 and a
+straight line through them are known; nonlinear friction differs by this much within the window of speed."""
 
 SLOW_FRICTION = 2.0
-"""Below `SLOW_SHARE` of the speed limit friction may be so many times as large (Stribeck effect), or half of it; …"""
+"""Factor by which friction below `SLOW_SHARE` of the speed limit may be larger (Stribeck effect) or smaller."""
 
 BREAKAWAY = 1.3
-"""… but no larger than this multiple of the torque under which the shaft first moved."""
+"""Largest friction at low speed, as a multiple of the torque under which the shaft first moved."""
 
 SLOW_SHARE = 0.15         # of the speed limit, for `SLOW_FRICTION`
 
 LEARN_SHARE, LEARN_S = 0.03, 0.5
-"""Before stage 2 ends, the inertia has an upper bound once the speed changed by this share of its limit in so long."""
+"""Least change of speed, as a share of its limit, and its time, s, for an upper bound of the inertia before stage 2
+ends.
+"""
 
 LEVEL_S, LEVEL_SHARE = 1.0, 0.01
-"""A first level is steady once the speed stayed within this share of the limit for so long."""
+"""Steadiness of the first level: time, s, within which the speed stays within this share of its limit."""
 
 LEVEL_FRICTION = 0.25
-"""Uncertainty of the friction at the first level, as a share of it; away from it friction may grow or fall with the
-square of the speed."""
+"""Relative uncertainty of the friction at the first level. At other speeds friction may rise or fall with the square
+of the speed."""
 
 FRICTION_LEVELS = 1.3
-"""Friction on the way to the first level is at most so many times the friction there."""
+"""Largest friction on the way to the first level, as a multiple of the friction there."""
 
 RISING = 1.2
-"""Factor on the mean torque under which the speed rose: friction is no more than that there."""
+"""Factor on the mean torque under which the speed rose; friction is at most this product."""
 
 UNLEARNED = 1.5
-"""Factor on what was learned before stage 2 ended."""
+"""Factor on the bounds learned before stage 2 ended."""
 
 LEARNED_MARGIN = 1.1
-"""Stage 2's estimate must be above the lower bound by this factor. On 17 random healthy rigs it was 1.3 at least, and
-1.05 where the scale of speed doubled after the first ramp (`benchmarks/healthy_runs.py`)."""
+"""Least ratio of stage 2's estimate to the lower bound. On 17 random healthy rigs it was 1.3 or more, and 1.05 if
+the scale of speed doubled after the first ramp (`benchmarks/healthy_runs.py`)."""
 
 STIFFEST_STRING_S = 8.0
-"""Characteristic impedance of a string of unknown pipe: at most the torque limit divided by this many rad/s. A pipe of
-3.5 to 6.6 inches has a make-up torque of 60 to 120 rad/s times its impedance."""
+"""Largest characteristic impedance of a string of unknown pipe: the torque limit divided by this many rad/s. A pipe
+of 3.5 to 6.6 inches has a make-up torque of 60 to 120 rad/s times its impedance."""
 
 RUN_OUT_SHARE = 0.5
-"""Least friction, as a share of what stage 2 found, of a shaft that no torque holds."""
+"""Least friction of a shaft without torque, as a share of stage 2's result."""
 
 RUN_OUT_S = 240.0
-"""A shaft above a drill string that cannot be braked gets so long to run out, s. Friction alone stops it sooner, but
-the string turns it to and fro: after 190 s a simulated rig had 1.2 rad/s (`benchmarks/lying_reports.py`)."""
+"""Longest run-out time above a drill string that cannot be braked, s. Friction alone stops the shaft sooner, but the
+string turns it to and fro: after 190 s a simulated rig had 1.2 rad/s (`benchmarks/lying_reports.py`)."""
 
 BLIND_MOST_S = 5.0
-"""Standstill is watched for so long beyond the lags at most, so that friction stops what the reports can hide, s."""
+"""Longest time, beyond the lags, for which standstill is monitored, s: friction then stops any motion that the
+reports can hide.
+"""
 
 
 class ShaftBounds:
-    """Bounds of inertia and friction, as far as they are known.
+    """Bounds of inertia and friction, as known so far.
 
-    First comes the torque under which the shaft became faster: friction is no more than that. Then the first steady
-    level, whose mean torque is the friction there, with the ramp that led to it: both give bounds of the inertia. In
-    the end stage 2's rough model.
+    The first source is the torque under which the shaft accelerated: friction is at most that. The second is the first
+    steady level, whose mean torque is the friction there, with the ramp before it: both give bounds of the inertia. The
+    last is the rough model of stage 2.
     """
 
     def __init__(self, limits: MachineLimits, lag_s: float) -> None:
@@ -76,17 +80,17 @@ class ShaftBounds:
         self._level: tuple[float, float] | None = None                 # speed, friction
         self._friction_most = 0.0
         self.breakaway_nm = 0.0
-        """The largest torque before the shaft first moved, N·m: static friction is no more."""
+        """Largest torque before the shaft first moved, N·m; static friction is not larger."""
         self.inertia_low, self.inertia_high = 0.0, math.inf
         self.string_nm_s_rad = limits.wave_impedance_nm_s_rad or (
             limits.torque_nm / STIFFEST_STRING_S
         )
 
     def know(self, model: RigGuess) -> bool:
-        """Take stage 2's rough model, and return whether it agrees with what the first ramp showed.
+        """Set stage 2's rough model, and return whether it agrees with the first ramp.
 
-        For the balance of momentum J may be smaller: a part of the load may hang on a shaft that twists. Two ramps see
-        all of it.
+        For the momentum balance J may be smaller, because a part of the load may hang on a compliant shaft. Two ramps
+        give the whole inertia.
         """
         self._model = model
         error = model.inertia_rel_error
@@ -98,40 +102,42 @@ class ShaftBounds:
 
     @property
     def known(self) -> bool:
-        """Return whether J and friction come from stage 2."""
+        """True if J and friction come from stage 2."""
         return self._model is not None
 
     @property
     def testable(self) -> bool:
-        """Return whether (1) can be tested: with a string only once J is known."""
+        """True if (1) can be tested; with a string only if J is known."""
         return self.known or (self._friction_most > 0.0 and math.isfinite(self.inertia_high))
 
     @property
     def likely_inertia(self) -> float:
-        """Stage 2's estimate, kg·m²; before it the upper bound."""
+        """Stage 2's estimate of J, kg·m²; before that its upper bound."""
         return self.inertia_high if self._model is None else self._model.inertia_kg_m2
 
     @property
     def words(self) -> str:
-        """The bounds, for people."""
+        """Return the bounds of J as text."""
         if self.inertia_low == 0.0:
             return f"J up to {self.inertia_high:.3g} kg·m²"
         return f"J {self.inertia_low:.3g} to {self.inertia_high:.3g} kg·m²"
 
     @property
     def breakaway_low_nm(self) -> float:
-        """The least torque that keeps the shaft turning slowly, N·m; before stage 2 ends by what moved it first."""
+        """Least torque that keeps the shaft turning slowly, N·m; before stage 2 ends, from the torque that first
+        moved it.
+        """
         if self._model is None:
             return self.breakaway_nm / SLOW_FRICTION
         return (1.0 - FRICTION_SHARE) * self._model.coulomb_nm
 
     @property
     def pushing_nm(self) -> float:
-        """More torque than friction takes within the speed limit, N·m."""
+        """Torque above all friction within the speed limit, N·m."""
         return self.friction(self._limits.speed_max_rad_s, 0.0)[1]
 
     def friction(self, speed_rad_s: float, still_rad_s: float) -> tuple[float, float]:
-        """Least and greatest torque that opposes the motion, N·m; at standstill it has either sign."""
+        """Return the least and greatest friction torque against the motion, N·m; at standstill it has either sign."""
         model, speed, limits = self._model, abs(speed_rad_s), self._limits
         if model is not None:
             usual = max(0.0, model.coulomb_nm + model.viscous_nm_s_rad * speed)
@@ -152,7 +158,7 @@ class ShaftBounds:
         return (low, high) if speed_rad_s > 0.0 else (-high, -low)
 
     def surplus(self, point: Point) -> tuple[float, float]:
-        """Torque that is left to accelerate the shaft, N·m, least and greatest, with the likeliest friction."""
+        """Return the least and greatest torque that accelerates the shaft, N·m, for the likeliest friction."""
         low, high = self.friction(point.speed, point.still)
         if abs(point.speed) <= point.still:
             return tuple(one - max(low, min(high, one)) for one in (point.torque_low, point.torque_high))  # type: ignore[return-value]
@@ -160,7 +166,7 @@ class ShaftBounds:
         return point.torque_low - usual, point.torque_high - usual
 
     def learn(self, points: deque[Point]) -> None:
-        """Learn bounds from the points before stage 2 ends. Above a string they show nothing."""
+        """Learn bounds from the points before stage 2 ends. Above a string they give none."""
         done = self._model is not None or self._level is not None
         if done or self._limits.winds_up or self.breakaway_nm <= 0.0 or len(points) < 3:
             return
@@ -178,7 +184,7 @@ class ShaftBounds:
         self._see_level(points)
 
     def _see_level(self, points: deque[Point]) -> None:
-        """A first steady level behind a ramp: its friction, and the inertia that the ramp leaves."""
+        """Learn the friction of a first steady level after a ramp, and the inertia from the ramp."""
         now = points[-1]
         start = next((point for point in reversed(points) if now.time_s - point.time_s >= LEVEL_S), None)
         near = LEVEL_SHARE * self._limits.speed_max_rad_s
@@ -198,19 +204,19 @@ class ShaftBounds:
         self.inertia_low = max(0.0, left) / change / UNLEARNED
 
     def shows_s(self, at_rest_rad_s: float, torque_nm: float) -> float:
-        """Return how long a shaft that is disabled must be seen at rest, s; see `Observer.shows_s`."""
+        """Return the time for which a disabled shaft must show standstill, s; see `Observer.shows_s`."""
         model = self._model
         if model is None or self._limits.winds_up or abs(torque_nm) <= 0.5 * self.breakaway_low_nm:
             return 0.0
-        if model.coulomb_nm <= 0.0:        # two levels with a Stribeck effect between them
+        if model.coulomb_nm <= 0.0:        # case of two levels with a Stribeck effect between them
             return math.inf
         return 2.0 * at_rest_rad_s * self.inertia_high / (RUN_OUT_SHARE * model.coulomb_nm)
 
     def blind_s(self, still_rad_s: float) -> float:
-        """How long friction takes at most to stop what (1) cannot find, s."""
+        """Return the longest time in which friction stops a motion that (1) cannot detect, s."""
         model = self._model
         if model is None or self._limits.winds_up or self.breakaway_low_nm <= 0.0:
             return 0.0
-        # A lag hides lag·ΔT of impulse; while a shaft comes to rest the torque changes by about its friction.
+        # A lag hides an impulse of lag·ΔT; when a shaft comes to standstill the torque changes by about its friction.
         hidden_nms = self._lag_s * 2.0 * model.steady_torque_nm(self._limits.speed_min_rad_s)
         return min(BLIND_MOST_S, hidden_nms / self.breakaway_low_nm)

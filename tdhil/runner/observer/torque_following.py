@@ -1,4 +1,4 @@
-"""Reported torque against commanded torque, in torque mode. Pure."""
+"""Comparison of reported with commanded torque, in torque mode. Pure."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from drivers import Command, Mode, PowerState, Sample
 from tdhil.runner.settings import MachineLimits
 
 TORQUE_SHARE, TORQUE_LIMIT_SHARE, TORQUE_WINDOW_S = 0.25, 0.05, 4.0
-"""Reported and commanded torque may differ by this share of the command and of the torque limit, in the mean over so
-many seconds of torque mode. The verdict compares them with a coverage interval; this bound ends a run early."""
+"""Allowed difference of the means of reported and commanded torque: this share of the command and of the torque
+limit, over this time in torque mode, s. The verdict compares them with a coverage interval; this bound ends a run
+early."""
 
 CLEARLY = 0.99
-"""A running sum decides below this share of a bound. Its rounding is 1e-6 of the bound after a million points."""
+"""Share of a bound below which a running sum decides. Its rounding is 1e-6 of the bound after a million points."""
 
 
 class TorqueFollowing:
-    """Mean reported torque beside mean commanded torque, in torque mode."""
+    """Mean reported torque compared with mean commanded torque, in torque mode."""
 
     def __init__(self, limits: MachineLimits, lag_s: float) -> None:
         self._limits = limits
@@ -30,7 +31,7 @@ class TorqueFollowing:
         self._apart_nms = 0.0
 
     def see(self, command: Command, sample: Sample, offset_nm: float, block_s: float) -> tuple[str, str] | None:
-        """Return cause and next step where the means differ; else None."""
+        """Return cause and next step if the means differ; else None."""
         enabled = sample.state is PowerState.ENABLED
         if command.mode is not Mode.TORQUE or sample.mode is not Mode.TORQUE or sample.limit_active or not enabled:
             self._reset()
@@ -45,7 +46,7 @@ class TorqueFollowing:
             gone_s, gone_commanded_nm, gone_reported_nm = self._blocks.popleft()
             self._seconds -= gone_s
             self._apart_nms -= gone_s * (gone_reported_nm - gone_commanded_nm)
-        # Clearly within the share of the limit, whatever the exact sums are: the usual case, at every point of a run.
+        # Clearly within the share of the limit, for any exact sums: the usual case, at every point of a run.
         if abs(self._apart_nms) <= CLEARLY * TORQUE_LIMIT_SHARE * self._limits.torque_nm * self._seconds:
             return None
         commanded = math.fsum(part * one for part, one, _ in self._blocks) / self._seconds

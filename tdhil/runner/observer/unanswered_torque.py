@@ -1,7 +1,7 @@
-"""Reported speeds that do not answer the torque, where the balance of momentum bounds too little. Pure.
+"""Rules for reported speeds that do not respond to the torque, if the momentum balance bounds too little. Pure.
 
-Each rule takes every point of the run and returns what it finds. Above a drill string the load is not known, so these
-rules ask for more than a balance: a torque at its limit, a speed that stays the same, a shaft that does not yield.
+Each rule evaluates every point of the run and returns a contradiction. Above a drill string the load is unknown, so
+these rules need stronger evidence than a balance: a torque at its limit, a constant speed, a shaft that does not yield.
 """
 
 from __future__ import annotations
@@ -18,67 +18,68 @@ from tdhil.runner.observer.shaft_bounds import ShaftBounds
 from tdhil.runner.settings import MachineLimits
 
 AT_LIMIT_SHARE = 0.9
-"""Share of the torque limit from which on the torque counts as being at it."""
+"""Share of the torque limit from which the torque is at its limit."""
 
 HELD_S = 1.5
-"""A shaft that moved before and is reported to stand still for so long, in spite of a speed setpoint and a torque at
-its limit, is held or not seen."""
+"""Time, s, after which a shaft that moved before is blocked or not measured: it is reported at standstill in spite
+of a speed setpoint and a torque at its limit."""
 
 STRAINED_S, STRAINED_SHARE = 5.0, 0.1
-"""Time for which the torque may stay at its limit while the reported speed is within this share of the speed limit of
-the commanded one. A speed control that has its speed needs no such torque."""
+"""Time, s, for which the torque may stay at its limit while the reported speed is within this share of the speed
+limit of the commanded one. A speed loop at its setpoint does not need such a torque."""
 
 FLAT_S, FLAT_LIMIT_S, FLAT_LAGS = 1.0, 1.5, 3.0
-"""A reported speed that stays within its own noise is lost in two cases. In torque mode the commanded torque should
-have moved it for the first time, s, beyond so many lags. Or the torque stands at its limit for the second time, s:
-nothing controls the speed then, and only a load that equals the limit to the last newton metre would keep it."""
+"""A reported speed that stays within its own noise is lost in two cases. First case: in torque mode the commanded
+torque should have moved it for FLAT_S, beyond FLAT_LAGS lags. Second case: the torque stays at its limit for
+FLAT_LIMIT_S. The speed is then not controlled, and would be constant only under a load exactly equal to the limit."""
 
 FLAT_MOVES = 12.0
-"""How many times its noise a speed must have been moved, by the bounds of J and of the string's impedance. A string
-that swings keeps a healthy speed within its noise against 5.6 times that (`benchmarks/healthy_runs.py`)."""
+"""Least expected change of the speed, as a multiple of its noise, by the bounds of J and of the string's impedance.
+An oscillating string keeps a healthy speed within its noise up to 5.6 times that (`benchmarks/healthy_runs.py`)."""
 
 YIELD_S, SMOOTH_S = 4.0, 0.4
-"""Time over which the stop commands a yield, and length of the means that are compared, s."""
+"""Time for which the stop commands a yield, and length of the compared means, s."""
 
 YIELD_MOVES, YIELD_STILL = 3.0, 1.0
-"""Least commanded speed, as multiples of the noise of the reported one and of the speed of standstill."""
+"""Least commanded speed, as a multiple of the noise of the reported speed and of the standstill speed."""
 
 YIELD_LEFT, YIELD_STANDS = 0.05, 0.25
-"""A shaft with trapped torque follows a commanded yield, since the string pulls it. It does not follow if the reported
-speed stays within the first share of the range of the commanded speed, and below the second share of its mean."""
+"""A shaft with trapped torque follows a commanded yield, because the string pulls it. It does not follow if the
+reported speed stays within the first share of the range of the commanded speed, and below the second share of its
+mean."""
 
 YIELD_HELD = 1.5
-"""Static friction T_s holds a shaft while the torque stays within a range of 2 T_s. The torque that first moved the
-shaft is T_s and what its ramp added meanwhile. A shaft may stand within this multiple of that torque."""
+"""Range of torque in which static friction T_s may hold a shaft: 2 T_s. The torque that first moved the shaft is T_s
+and the rise of its ramp meanwhile. A shaft may stand within this multiple of that torque."""
 
 STANDSTILLS = 4.0
-"""A speed of so many times the speed of standstill is clearly not zero."""
+"""Multiple of the standstill speed from which a speed is clearly not zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class PointInRun:
-    """A point with what the run knows at it. ``points``: the latest ones, with this one at the end."""
+    """Point with the knowledge of the run. ``points``: the latest ones, this one last."""
 
     point: Point
     command: Command
     block_s: float
     points: deque[Point]
     bounds: ShaftBounds
-    noise_rad_s: float                 # of the point's speed
-    moved: bool                        # the shaft was reported to move before
-    stopping: bool                     # a quick stop was requested
+    noise_rad_s: float                 # noise of the point's speed
+    moved: bool                        # True if motion of the shaft was reported before
+    stopping: bool                     # True if a quick stop was requested
 
 
 class UnansweredTorque(Protocol):
-    """A rule: `see` takes each point and returns what does not fit, if so."""
+    """Rule: `see` evaluates each point and returns a contradiction or None."""
 
     def see(self, now: PointInRun) -> Contradiction | None:
-        """Take one point."""
+        """Evaluate one point."""
         ...
 
 
 def rules(limits: MachineLimits, still_rad_s: float, lag_s: float, point_s: float) -> tuple[UnansweredTorque, ...]:
-    """Return the rules for a shaft with these limits; ``still_rad_s``: the speed of standstill, rad/s."""
+    """Return the rules for a shaft with these limits; ``still_rad_s``: speed that counts as standstill, rad/s."""
     always: tuple[UnansweredTorque, ...] = (HeldShaft(limits, still_rad_s),)
     if not limits.winds_up:
         return always
@@ -93,7 +94,7 @@ def _strained(point: Point, limits: MachineLimits) -> bool:
 
 
 class HeldShaft:
-    """Standstill is reported in spite of a speed setpoint and all the torque there is, of a shaft that moved."""
+    """Rule: a shaft that moved is reported at standstill, in spite of a speed setpoint and torque at its limit."""
 
     def __init__(self, limits: MachineLimits, still_rad_s: float) -> None:
         self._limits = limits
@@ -101,7 +102,7 @@ class HeldShaft:
         self._held_s = 0.0
 
     def see(self, now: PointInRun) -> Contradiction | None:
-        """Take one point."""
+        """Evaluate one point."""
         point, command = now.point, now.command
         asked = command.mode is Mode.SPEED and abs(command.speed_rad_s) > STANDSTILLS * self._still_rad_s
         held = now.moved and asked and _strained(point, self._limits) and abs(point.speed) <= self._still_rad_s
@@ -117,7 +118,7 @@ class HeldShaft:
 
 
 class TorqueAtLimit:
-    """A torque at its limit although the reported speed is the commanded one; for the time before J is known."""
+    """Rule: torque at its limit although the reported speed is the commanded one; for the time before J is known."""
 
     def __init__(self, limits: MachineLimits, still_rad_s: float) -> None:
         self._limits = limits
@@ -125,12 +126,12 @@ class TorqueAtLimit:
         self._strained_s = 0.0
 
     def see(self, now: PointInRun) -> Contradiction | None:
-        """Take one point."""
+        """Evaluate one point."""
         point, command = now.point, now.command
         apart = abs(point.speed - command.speed_rad_s)
         near = command.mode is Mode.SPEED and apart <= STRAINED_SHARE * self._limits.speed_max_rad_s
         turns = abs(point.speed) > STANDSTILLS * self._still_rad_s
-        strained = _strained(point, self._limits) and near and turns and not now.bounds.known    # else (1) shows it
+        strained = _strained(point, self._limits) and near and turns and not now.bounds.known    # else (1) detects it
         self._strained_s = self._strained_s + now.block_s if strained else 0.0
         if self._strained_s < STRAINED_S:
             return None
@@ -143,7 +144,7 @@ class TorqueAtLimit:
 
 
 class FlatSpeed:
-    """A reported speed that stays within its noise while torque should have moved it."""
+    """Rule: a reported speed stays within its noise while torque should have moved it."""
 
     def __init__(self, limits: MachineLimits, still_rad_s: float, lag_s: float) -> None:
         self._limits = limits
@@ -154,7 +155,7 @@ class FlatSpeed:
         self._strained_s = 0.0
 
     def see(self, now: PointInRun) -> Contradiction | None:
-        """Take one point."""
+        """Evaluate one point."""
         point = now.point
         for_s = self._unanswered_s(now)
         if for_s <= 0.0 or abs(point.speed) <= STANDSTILLS * self._still_rad_s:
@@ -167,7 +168,7 @@ class FlatSpeed:
         )
 
     def _unanswered_s(self, now: PointInRun) -> float:
-        """Return for how long the speed has not answered, s; 0: it may well have."""
+        """Return the time for which the speed has not responded, s; 0: it may have responded."""
         point, command, noise_rad_s = now.point, now.command, 2.0 * now.noise_rad_s
         torque = command.torque_nm if command.mode is Mode.TORQUE else point.torque
         low, high = min(self._low, point.speed), max(self._high, point.speed)
@@ -195,7 +196,7 @@ class FlatSpeed:
 
 
 class IgnoredYield:
-    """A shaft that stands while the stop commands it to yield to the string, with more torque than friction takes."""
+    """Rule: a shaft stands still while the stop commands a yield to the string, with more torque than friction."""
 
     def __init__(self, still_rad_s: float, lag_s: float, point_s: float) -> None:
         self._still_rad_s = still_rad_s
@@ -204,7 +205,7 @@ class IgnoredYield:
         self._seen: deque[tuple[float, float, float]] = deque()      # time, commanded speed, reported speed
 
     def see(self, now: PointInRun) -> Contradiction | None:
-        """Take one point."""
+        """Evaluate one point."""
         seen, point, command = self._seen, now.point, now.command
         if not (now.stopping and command.mode is Mode.SPEED):
             seen.clear()
@@ -214,7 +215,7 @@ class IgnoredYield:
             seen.popleft()
         if point.time_s - seen[0][0] < YIELD_S - 2.0 * self._point_s:
             return None
-        # The latest command has not been answered yet, and what changes from cycle to cycle is torque noise.
+        # the response to the latest command is still missing, and changes from cycle to cycle are torque noise
         until_s = point.time_s - 2.0 * self._lag_s
         told = _means([(time_s, one) for time_s, one, _ in seen if time_s <= until_s], SMOOTH_S)
         went = [one for _, _, one in seen]

@@ -1,3 +1,3 @@
-"""How often the interval covers: seeded plants, identified by the hundred."""
+"""Coverage of the interval, measured on hundreds of seeded simulated plants."""
 
 from tdhil.studies.coverage.study import COVERAGE as COVERAGE

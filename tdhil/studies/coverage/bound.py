@@ -1,34 +1,35 @@
-"""The Cramér-Rao bound of the inertia, from the true parameters and the noise at the lines; no estimator's code.
+"""Cramér-Rao bound of the inertia, from the true parameters and the noise at the lines; uses no code of the estimator.
 
 Over P whole periods of length L at one mean speed, the lines W_k of reported speed and T_k of reported torque obey
 T_k = G_k W_k + r_k, with
 
     G = (J s + B) H_T(s)/H_w(s) e^(−d s),   E|r_k|² = 4 S_k/(P L).
 
-W_k is a nuisance parameter of its own, free at every line and mean speed. Concentrated out of the Gaussian likelihood
-of (T_k, W_k), whatever their covariance, it leaves the information about theta
+W_k is a nuisance parameter, free at every line and mean speed. Concentrated out of the Gaussian likelihood of (T_k,
+W_k), for any covariance of theirs, it leaves the information about theta
 
     F = 2 Re Σ_k |W_k|² (∂G_k/∂theta)ᴴ (∂G_k/∂theta) / E|r_k|²,
 
 and the mean torque T̄ = B ω̄ + T_c + r₀, E r₀² = S_0/(P L), adds (∂T̄/∂theta)ᵀ(∂T̄/∂theta) P L/S_0. S is the density
 (per Hz, two-sided) of r = T − G W on the sampled signals:
 
-- the load, once: in T − G W it appears as −H_T·load (speed answers it, the torque as reported doesn't know of it);
-- ripple turns the shaft and is reported: it cancels at the line, but what the sampling folds onto the line does not;
-- the sensor's noise, through H_w, times |G|²; its folds too;
-- what is added to each report and the rounding (q²/12), white over the samples.
+- the load, once: in T − G W it appears as −H_T·load (speed responds to it, the reported torque does not contain it);
+- ripple turns the shaft and is reported: it cancels at the line, but its aliases at the line do not;
+- the sensor's noise, through H_w, times |G|², and its aliases;
+- the noise added to each report and the rounding (q²/12), white over the samples.
 
 theta = (J, B, T_c, every lag, every average's width, the skew): derivatives by central differences.
 
-That bound knows how many poles and averages there are, and of which signal. Who doesn't, as before a drive
-that states nothing, has more to tell apart: with P = Π (1 + τ s) of each report,
+This bound assumes that the number of poles and averages of each signal is known. For a drive without such data, more
+parameters must be separated: with P = Π (1 + τ s) of each report,
 
     ln H_T/H_w − d s = ln P_w − ln P_T + a(s; u) − d s,    theta = (J, B, T_c, p₁ and p₂ of P_w, of P_T, u, d),
 
-p₁ and p₂ the coefficients of s and s² in P, and u the square of an average's width, over either signal. What is
-plausible counts as measured: p₁ to 1 s, u to 1 s², and p₂ to the spread of what lies evenly between none, one pole, and
-p₁²/2, a Butterworth filter. Where poles are equal the first bound promises more than is possible: to it they are one
-unknown, since to first order only their sum is seen (its information about each of them is singular).
+p₁ and p₂ are the coefficients of s and s² in P, and u is the square of an average's width, over either signal.
+Plausible values count as measurements: p₁ with 1 s, u with 1 s², and p₂ with the standard deviation of a uniform
+distribution between 0 (one pole) and p₁²/2 (a Butterworth filter). For equal poles the first bound is lower than
+possible: they count as one unknown, because to first order only their sum is visible (the information about each of
+them is singular).
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ import numpy as np
 from tdhil.studies.coverage.plants import ComplexArray, CoveragePlant, FloatArray, ReportFilter
 from tdhil.studies.coverage.simulate import quiet_shaft
 
-_FOLDS = 30              # multiples of the sampling rate that are folded in, either way
+_FOLDS = 30              # multiples of the sampling rate whose aliases are included, on either side
 _SINGULAR = 1e-10        # of the scaled information: below it the bound is not a number
 _KNOWN_LAGS = [0, 1, 2, -1]
 _PLAUSIBLE = 1.0         # s of a lag, s² of an average's square: standard deviations
@@ -51,7 +52,7 @@ _ROUGH = np.array([-0.8, -0.4, 0.0, 0.4, 0.8])    # five equal shares of the rou
 
 @dataclass(frozen=True)
 class WatchedSpeed:
-    """One mean speed: ``speed`` (K,) complex lines of reported speed, rad/s, over ``seconds`` of whole periods."""
+    """Measured lines at one mean speed: ``speed`` (K,) complex, reported, rad/s, over ``seconds`` of whole periods."""
 
     mean_rad_s: float
     speed: ComplexArray
@@ -59,7 +60,7 @@ class WatchedSpeed:
 
 
 def theta_of(plant: CoveragePlant) -> FloatArray:
-    """(J, B, T_c, speed lags, speed average, torque lags, torque average, skew)."""
+    """Return (J, B, T_c, speed lags, speed average, torque lags, torque average, skew)."""
     parts = [plant.inertia_kg_m2, plant.viscous_nm_s_rad, plant.coulomb_nm]
     for report in (plant.speed_report, plant.torque_report):
         parts += [*report.lags_s, *([report.average_s] if report.average_s > 0.0 else [])]
@@ -67,7 +68,7 @@ def theta_of(plant: CoveragePlant) -> FloatArray:
 
 
 def impedance_of(plant: CoveragePlant, theta: FloatArray, s: ComplexArray) -> ComplexArray:
-    """G(s) as the host sees it, (K,); the plant says which lags theta holds."""
+    """Return G(s) as the host measures it, (K,); the plant states which lags theta has."""
     rest = list(theta[3:-1])
     shown = []
     for report in (plant.speed_report, plant.torque_report):
@@ -79,7 +80,7 @@ def impedance_of(plant: CoveragePlant, theta: FloatArray, s: ComplexArray) -> Co
 
 
 def density(plant: CoveragePlant, hertz: FloatArray) -> FloatArray:
-    """S of T − G W at the lines, (N·m)²/Hz, (K,)."""
+    """Return S of T − G W at the lines, (N·m)²/Hz, (K,)."""
     noise, rate = plant.noise, plant.reading.rate_hz
     s = 2j * np.pi * hertz.astype(np.complex128)
     g2 = np.abs(impedance_of(plant, theta_of(plant), s)) ** 2
@@ -105,7 +106,7 @@ def density(plant: CoveragePlant, hertz: FloatArray) -> FloatArray:
 
 
 def slopes_of(plant: CoveragePlant, hertz: FloatArray) -> ComplexArray:
-    """∂G/∂theta where the filters' structure is known, (K, n)."""
+    """Return ∂G/∂theta for a known structure of the filters, (K, n)."""
     theta = theta_of(plant)
     s = 2j * np.pi * hertz.astype(np.complex128)
     columns = []
@@ -119,7 +120,7 @@ def slopes_of(plant: CoveragePlant, hertz: FloatArray) -> ComplexArray:
 
 
 def slopes_of_unknown(plant: CoveragePlant, hertz: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """∂G/∂theta where it isn't, (K, 9), and the information that what is plausible adds to it, (9, 9)."""
+    """Return ∂G/∂theta for an unknown structure, (K, 9), and the information from plausible values, (9, 9)."""
     s: ComplexArray = 2j * np.pi * hertz.astype(np.complex128)
     g = impedance_of(plant, theta_of(plant), s)
     one = np.ones_like(s)
@@ -141,7 +142,9 @@ def slopes_of_unknown(plant: CoveragePlant, hertz: FloatArray) -> tuple[ComplexA
 def information(
     plant: CoveragePlant, hertz: FloatArray, watched: list[WatchedSpeed], slopes: ComplexArray | None = None
 ) -> FloatArray:
-    """Fisher information about theta, (n, n); ``slopes`` (K, n): of another theta than the one whose lags are known."""
+    """Return the Fisher information about theta, (n, n); ``slopes`` (K, n): of another theta than that of known
+    filters.
+    """
     slopes = slopes_of(plant, hertz) if slopes is None else slopes
     at_lines, at_rest = density(plant, hertz), float(density(plant, np.zeros(1))[0])
     count = slopes.shape[1]
@@ -156,7 +159,7 @@ def information(
 
 
 def bound_of(fisher: FloatArray) -> float | None:
-    """Least standard deviation of the first parameter; None if the parameters can't be separated."""
+    """Return the least standard deviation of the first parameter; None if the parameters cannot be separated."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(fisher), 1e-300))
     scaled = fisher * np.outer(scale, scale)
     if float(np.linalg.eigvalsh(scaled)[0]) < _SINGULAR:
@@ -166,10 +169,10 @@ def bound_of(fisher: FloatArray) -> float | None:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Least standard deviations of J, kg·m²: where the filters' structure is known, and where it isn't.
+    """Least standard deviations of J, kg·m²: for a known and for an unknown structure of the filters.
 
-    Where the lags cannot be separated, ``known`` takes them for known: that is the best estimator there, and no bound
-    for ours. ``unknown`` is never less: a plant may have more of a structure than its theta.
+    If the lags cannot be separated, ``known`` assumes known lags; it is then not a bound for tdhil's estimator.
+    ``unknown`` is never smaller, because the structure of a plant may have more than its theta.
     """
 
     known: float | None
@@ -177,7 +180,7 @@ class Bounds:
 
 
 def cramer_rao(plant: CoveragePlant, periods: int) -> Bounds:
-    """Roots of the mean variance over rough inertias, which set the amplitude."""
+    """Return the roots of the mean variance over rough inertias, which set the amplitude."""
     asked, shaft = quiet_shaft(plant, _ROUGH, periods)
     known: list[float | None] = []
     unknown: list[float | None] = []

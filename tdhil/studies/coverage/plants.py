@@ -1,6 +1,6 @@
-"""The parts of a plant of the coverage benchmark: shaft, effects of the drive on its reports, noise, reading.
+"""Parts of a plant of the coverage benchmark: shaft, filters of the drive's reports, noise, sampling.
 
-Data only, with the frequency responses that follow from them. Nothing here is shared with the estimator.
+Only data, and the frequency responses that follow from them. The estimator uses none of this module.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class ReportFilter:
-    """How a drive shows one of its signals: H(s) = Π 1/(1 + τ s) · (1 − e^(−w s))/(w s) · e^(−d s).
+    """Filter of a drive's report: H(s) = Π 1/(1 + τ s) · (1 − e^(−w s))/(w s) · e^(−d s).
 
     ``lags_s``: τ of every pole; ``average_s``: w of a moving average, 0 for none; ``delay_s``: d.
     """
@@ -26,7 +26,7 @@ class ReportFilter:
     delay_s: float = 0.0
 
     def response(self, s: ComplexArray) -> ComplexArray:
-        """H(s), (K,)."""
+        """Return H(s), (K,)."""
         h: ComplexArray = np.exp(-self.delay_s * s)
         for lag in self.lags_s:
             h = h / (1.0 + lag * s)
@@ -45,8 +45,8 @@ class ReportFilter:
 class PlantNoise:
     """Standard deviations. The load is coloured (first order, ``load_time_s``); ripple and sensor are white per step.
 
-    Ripple is torque that truly turns the shaft; the sensor's noise is in speed before the drive's filter; the reported
-    noise is added after the filters, sample by sample, before rounding to the quantum.
+    Ripple is real torque at the shaft. The sensor's noise is in the speed before the drive's filter. The reported noise
+    is added after the filters, sample by sample, before rounding to the quantum.
     """
 
     load_nm: float = 0.0
@@ -61,11 +61,11 @@ class PlantNoise:
 
 @dataclass(frozen=True)
 class HostSampling:
-    """How the host samples. Stamps are true but for ``stamp_error_s`` (uniform, either way).
+    """Sampling by the host. Time stamps are correct except for ``stamp_error_s`` (uniform, either sign).
 
-    ``jitter_s``: uniform, either way, of the instants. Speed is taken ``speed_after_s`` and torque ``torque_after_s``
-    after the stamped instant. ``dropped``: share of samples that bring nothing new. ``command_s``: the torque command
-    is renewed this often and held between.
+    ``jitter_s``: of the instants, uniform, either sign. Speed is taken ``speed_after_s`` and torque ``torque_after_s``
+    after the stamped instant. ``dropped``: share of samples without new values. ``command_s``: interval between torque
+    commands, which are held.
     """
 
     rate_hz: float = 100.0
@@ -86,7 +86,7 @@ class NonlinearFriction:
     square_nm_s2_rad2: float = 0.0
 
     def torque(self, speed: FloatArray) -> FloatArray:
-        """N·m against rotation."""
+        """Return the friction torque against the rotation, N·m."""
         found: FloatArray = self.bell_nm * np.exp(-((speed / self.width_rad_s) ** 2))
         found += self.square_nm_s2_rad2 * speed * speed
         return found
@@ -94,10 +94,10 @@ class NonlinearFriction:
 
 @dataclass(frozen=True)
 class CoveragePlant:
-    """J dω/dt + B ω + T_c + bend = T + load at positive speed, seen through two reports.
+    """Plant J dω/dt + B ω + T_c + bend = T + load at positive speed, seen through two reports.
 
-    ``lowest_hz``: lowest line of the multisine. ``model_true``: a first-order lag on either report and a skew are the
-    whole truth. ``degenerate``: the lags are equal or absent, so that they cannot be separated.
+    ``lowest_hz``: lowest line of the multisine. ``model_true``: the plant has exactly a first-order lag on either
+    report and a skew. ``degenerate``: the lags are equal or absent, so that they cannot be separated.
     """
 
     name: str
@@ -125,7 +125,7 @@ class CoveragePlant:
 
     @property
     def skew_s(self) -> float:
-        """Delay of the torque report beyond the speed report's, lags and averages aside, s."""
+        """Delay of the torque report relative to the speed report, without lags and averages, s."""
         reading = self.reading
         return (self.torque_report.delay_s - reading.torque_after_s) - (
             self.speed_report.delay_s - reading.speed_after_s
@@ -133,11 +133,11 @@ class CoveragePlant:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The plants of the coverage benchmark, small to large within each family.
+# Plants of the coverage benchmark, small to large within each family.
 #
-# Lags are those that drives state or show: 6.4/3.2 ms (Altivar), 30/8 ms and none (servo drives), a 100 ms average
-# (Sinamics), 0.5/0.1 s (ACS880), 0.40/0.15 s (what the paper's field slopes ask for). The noise of the field rig is
-# that of the design's notes and is scaled to the torque and speed of the others.
+# The lags are those of real drives: 6.4/3.2 ms (Altivar), 30/8 ms and none (servo drives), a 100 ms average (Sinamics),
+# 0.5/0.1 s (ACS880), 0.40/0.15 s (from the paper's field slopes). The noise of the field rig is that of the design's
+# notes, scaled to the torque and speed of the others.
 
 
 RPM = 0.10471975511965977   # rad/s
@@ -263,7 +263,7 @@ FLEET: tuple[CoveragePlant, ...] = (
         _lag(0.40), _lag(0.15), FIELD_NOISE, HostSampling(jitter_s=0.004),
         bend=NonlinearFriction(square_nm_s2_rad2=0.6),
     ),
-    # What made intervals wide, or sound runs refused, on rigs that were drawn at random (benchmarks/random_rigs.py).
+    # plants that gave wide intervals, or refusals of sound runs, on randomly drawn rigs (benchmarks/random_rigs.py)
     CoveragePlant(
         "short_matched", "5 ms on both reports", 104.0, 8.0, 60.0, (0.5, 10.0), 400.0, _lag(0.005), _lag(0.005),
         FIELD_NOISE, HostSampling(jitter_s=0.004), model_true=True, degenerate=True,

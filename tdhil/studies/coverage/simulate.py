@@ -1,4 +1,4 @@
-"""Recordings from a plant and seeds. Every run has its own random stream, so grouping changes nothing."""
+"""Simulated recordings from a plant and seeds. Every run has its own random stream, so grouping has no effect."""
 
 from __future__ import annotations
 
@@ -17,18 +17,20 @@ from tdhil.runner.excitation import MotionLimits, Plan, PlanRequest, RigGuess, m
 from tdhil.studies.coverage.plants import CoveragePlant, FloatArray, ReportFilter
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The motion of the shaft: a plan of stage 5 per run, each from its own rough inertia, on one time grid.
+# Motion of the shaft: a plan of stage 5 per run, each from its own rough inertia, on one time grid.
 
 
-ROUGH_ERROR = 0.15        # the rough inertia is wrong by up to this share, uniformly, either way
-_FRICTION_ERROR = 0.03    # so is the rough friction: the steady holds of stages 2 to 4 tell it well
-_LEAD_S = 1.0             # steady speed before the excitation
-_TAIL_S = 1.0             # the excitation goes on after its last whole period, for what is read late
+ROUGH_ERROR = 0.15        # largest relative error of the rough inertia, uniform, either sign
+_FRICTION_ERROR = 0.03    # the same for the rough friction: the steady stretches of stages 2 to 4 give it accurately
+_LEAD_S = 1.0             # s; steady speed before the excitation
+_TAIL_S = 1.0             # s; excitation after its last whole period, for late reports
 
 
 @dataclass(frozen=True)
 class SimulatedMotion:
-    """``target`` (steps, runs) rad/s and ``feed`` (steps, runs) N·m; ``segments`` per run, ``rough`` (runs,) kg·m²."""
+    """Motion: ``target`` (steps, runs) rad/s and ``feed`` (steps, runs) N·m; ``segments`` per run, ``rough`` (runs,)
+    kg·m².
+    """
 
     target: FloatArray
     feed: FloatArray
@@ -48,14 +50,14 @@ def rough_guess(plant: CoveragePlant, shares: FloatArray) -> RigGuess:
 
 
 def plan_for(plant: CoveragePlant, guess: RigGuess, periods: int) -> Plan:
-    """The default multisine about two mean speeds: so many periods that count at each, after 10 s of settling."""
+    """Return the default multisine about two mean speeds: ``periods`` that count at each, after 10 s of settling."""
     limits = MotionLimits(*plant.window_rad_s, plant.torque_limit_nm)
     settle = max(1, math.ceil(10.0 * plant.lowest_hz - 1e-9))
     return make_plan(limits, guess, PlanRequest(frequency_hz=plant.lowest_hz, periods=settle + periods))
 
 
 def motion(plant: CoveragePlant, guesses: list[RigGuess], periods: int) -> SimulatedMotion:
-    """Every run's reference on the same grid, which depends on the plant only, not on which runs there are."""
+    """Return every run's reference on the same grid, which depends only on the plant, not on the other runs."""
     plans = [plan_for(plant, guess, periods) for guess in guesses]
     join = _join_s(plant, periods)
     length = plans[0].segments[0].duration_s
@@ -74,7 +76,7 @@ def motion(plant: CoveragePlant, guesses: list[RigGuess], periods: int) -> Simul
 
 
 def _join_s(plant: CoveragePlant, periods: int) -> float:
-    """Duration of the transition, s: the longest that the most wrong rough guesses ask for, and a tenth more."""
+    """Return the duration of the transition, s: the longest for the most wrong rough guesses, plus a tenth."""
     longest = 0.0
     for corner in ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)):
         plan = plan_for(plant, rough_guess(plant, np.array(corner)), periods)
@@ -85,7 +87,7 @@ def _join_s(plant: CoveragePlant, periods: int) -> float:
 def _one(
     plan: Plan, time: FloatArray, starts: tuple[float, float], length: float, join: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Speed and acceleration: steady, first segment, half a cosine, second segment."""
+    """Return speed and acceleration: steady, first segment, half a cosine, second segment."""
     speed, rate = np.empty_like(time), np.zeros_like(time)
     ends = [segment.reference.start_speed_rad_s for segment in plan.segments]
     lead = time < starts[0] - 1e-9
@@ -106,18 +108,18 @@ def _one(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The shaft of the benchmark, many runs at once, in fine steps.
+# Simulation of the shaft, many runs at once, in fine steps.
 #
-# Between two steps every input is taken as a straight line; for that, a first-order lag y' = (u − y)/τ has the exact
-# recursion, with h = step/τ and a = e^(−h),
+# Between two steps every input is a straight line. For this, a first-order lag y' = (u − y)/τ has the exact recursion,
+# with h = step/τ and a = e^(−h),
 #
 #     y₁ = a y₀ + g₀ u₀ + g₁ u₁,   g₀ = (1 − a)/h − a,   g₁ = 1 − (1 − a)/h.
 #
-# The shaft is such a lag of u = (T + load − T_c)/B with τ = J/B (positive speed, so that T_c is constant). A bend of
-# friction is part of u: known at the step's beginning, and at its end from the last two speeds by a straight line.
+# The shaft is such a lag of u = (T + load − T_c)/B with τ = J/B (positive speed, so that T_c is constant). Nonlinear
+# friction is part of u: it is known at the beginning of the step, and extrapolated at its end from the last two speeds.
 # The motor follows its command through a short lag. The command is feed-forward from the rough inertia plus a slow PI
-# on the mean speed, K_p = Ĵ ω_b, K_i = K_p ω_b/4, ω_b = 0.2/0.4 s, on a speed that is as late as the report's delay;
-# it is renewed once a host cycle and held between.
+# on the mean speed, K_p = Ĵ ω_b, K_i = K_p ω_b/4, ω_b = 0.2/0.4 s, on a speed with the delay of the report. It is
+# renewed once a host cycle and held between.
 
 
 _BANDWIDTH_RAD_S = 0.2 / 0.4
@@ -126,7 +128,7 @@ _LEAST_DELAY_S = 0.005
 
 @dataclass(frozen=True)
 class SimulatedShaft:
-    """The true motion, (steps, runs): speed in rad/s, torque at the shaft in N·m; row n at n·step_s."""
+    """True motion, (steps, runs): speed in rad/s, torque at the shaft in N·m; row n at n·step_s."""
 
     speed: FloatArray
     torque: FloatArray
@@ -134,14 +136,16 @@ class SimulatedShaft:
 
 
 def lag_weights(step_s: float, lag_s: float) -> tuple[float, float, float]:
-    """a, g₀, g₁ of the recursion above."""
+    """Return a, g₀, g₁ of the recursion for a first-order lag."""
     h = step_s / lag_s
     a, gone = float(np.exp(-h)), float(-np.expm1(-h))
     return a, gone / h - a, 1.0 - gone / h
 
 
 def coloured(white: FloatArray, step_s: float, time_s: float) -> FloatArray:
-    """Unit variance, correlation e^(−|t|/time_s), stationary from the first row; ``white`` (steps, runs)."""
+    """Return noise of unit variance, correlation e^(−|t|/time_s), stationary from the first row; ``white`` (steps,
+    runs).
+    """
     from scipy.signal import lfilter
 
     keep = float(np.exp(-step_s / time_s))
@@ -163,7 +167,7 @@ def turn(plant: CoveragePlant, motion: SimulatedMotion, load: FloatArray, ripple
     integral_step = proportional * (_BANDWIDTH_RAD_S / 4.0) * held * step
     steps, runs = motion.target.shape
     speed, torque = np.empty((steps, runs)), ripple
-    # from here on ``torque`` takes the ripple's place, and ``push`` the load's: nothing is stored twice
+    # to save memory, ``torque`` replaces the ripple from here on, and ``push`` the load
     push = load
     push -= plant.coulomb_nm
     omega, motor = motion.target[0].copy(), motion.feed[0].copy()
@@ -200,7 +204,7 @@ def turn(plant: CoveragePlant, motion: SimulatedMotion, load: FloatArray, ripple
 # ---------------------------------------------------------------------------------------------------------------------
 
 def simulate(plant: CoveragePlant, seeds: list[tuple[int, ...]], periods: int) -> list[Recording]:
-    """One recording per seed (a tuple of whole numbers, none of them negative)."""
+    """Return one recording per seed (a tuple of whole numbers ≥ 0)."""
     streams = [np.random.default_rng(np.random.SeedSequence(seed)) for seed in seeds]
     guesses = [rough_guess(plant, stream.uniform(-1.0, 1.0, 2)) for stream in streams]
     asked = motion(plant, guesses, periods)
@@ -219,13 +223,13 @@ def simulate(plant: CoveragePlant, seeds: list[tuple[int, ...]], periods: int) -
 
 
 def quiet_shaft(plant: CoveragePlant, shares: FloatArray, periods: int) -> tuple[SimulatedMotion, SimulatedShaft]:
-    """Return the motion without any noise, for rough inertias wrong by ``shares`` (runs,) of the largest error."""
+    """Return the motion without noise, for rough inertias wrong by ``shares`` (runs,) of the largest error."""
     asked = motion(plant, [rough_guess(plant, np.array([share, 0.0])) for share in shares], periods)
     return asked, turn(plant, asked, np.zeros_like(asked.target), np.zeros_like(asked.target))
 
 
 def _white(streams: list[np.random.Generator], steps: int) -> FloatArray:
-    """Standard normal, (steps, runs), every run from its own stream."""
+    """Return standard normal noise, (steps, runs), every run from its own stream."""
     found = np.empty((steps, len(streams)))
     for run, stream in enumerate(streams):
         found[:, run] = stream.standard_normal(steps)
@@ -233,7 +237,9 @@ def _white(streams: list[np.random.Generator], steps: int) -> FloatArray:
 
 
 def lagged(signal: FloatArray, report: ReportFilter, step_s: float) -> FloatArray:
-    """The poles of a report, exact for inputs that are straight between steps; (steps, runs), settled at the start."""
+    """Return the signal behind the poles of a report, exact for inputs that are straight between steps; (steps,
+    runs).
+    """
     from scipy.signal import lfilter
 
     for lag in report.lags_s:
@@ -243,14 +249,14 @@ def lagged(signal: FloatArray, report: ReportFilter, step_s: float) -> FloatArra
 
 
 def shown(signal: FloatArray, report: ReportFilter, step_s: float, at_s: FloatArray) -> FloatArray:
-    """One signal (steps,), its poles passed already, at instants of its own: moving average and delay."""
+    """Return one signal (steps,), already behind its poles, at its own instants: moving average and delay."""
     grid = np.arange(len(signal)) * step_s
     when = at_s - report.delay_s
     if report.average_s <= 0.0:
         return np.interp(when, grid, signal)
     area = np.concatenate(([0.0], np.cumsum(0.5 * (signal[1:] + signal[:-1]) * step_s)))
     before = when - report.average_s
-    began = np.minimum(before, 0.0) * signal[0]      # before the first row the signal stood still
+    began = np.minimum(before, 0.0) * signal[0]      # before the first row the signal was constant
     mean: FloatArray = (np.interp(when, grid, area) - np.interp(before, grid, area) - began) / report.average_s
     return mean
 
@@ -258,7 +264,7 @@ def shown(signal: FloatArray, report: ReportFilter, step_s: float, at_s: FloatAr
 def read(
     plant: CoveragePlant, asked: SimulatedMotion, run: int, shaft: SimulatedShaft, stream: np.random.Generator
 ) -> Recording:
-    """Sample one run as its host would; ``shaft`` holds that run's signals (steps,) behind the poles of the reports."""
+    """Sample one run as its host would; ``shaft``: signals (steps,) of that run behind the poles of the reports."""
     reading, noise, step = plant.reading, plant.noise, shaft.step_s
     end = (len(shaft.speed) - 1) * step - 0.1
     instants = np.arange(0.1, end, 1.0 / reading.rate_hz)
@@ -292,18 +298,18 @@ def _rounded(signal: FloatArray, quantum: float) -> FloatArray:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The runs of the benchmark: simulated, identified, kept as a line each; over several processes where wanted.
+# Runs of the benchmark: simulated, identified, each stored as a line; by several processes if requested.
 #
-# A run is named by (base seed, plant, number) and draws from its own stream, so the totals depend neither on the
-# number of processes nor on how runs are grouped.
+# A run is identified by (base seed, plant, number) and has its own random stream. The totals therefore depend neither
+# on the number of processes nor on the grouping of the runs.
 
 
-GROUP = 20     # runs simulated together: some 200 MB
+GROUP = 20     # runs simulated together; they need some 200 MB
 
 
 @dataclass(frozen=True)
 class SimulatedRun:
-    """The identification of one run; ``value``, ``low``, ``high`` in kg·m², None if it gave no number."""
+    """Identification of one run; ``value``, ``low``, ``high`` in kg·m², None without a number."""
 
     plant: str
     number: int
@@ -330,7 +336,7 @@ class SimulationTask:
 def tasks(
     plants: Iterable[CoveragePlant], seeds: int, base_seed: int, periods: int, confidence: float
 ) -> list[SimulationTask]:
-    """Every plant's runs in groups."""
+    """Return every plant's runs in groups."""
     return [
         SimulationTask(plant, first, min(GROUP, seeds - first), base_seed, periods, confidence)
         for plant in plants
@@ -340,7 +346,7 @@ def tasks(
 
 def run_task(task: SimulationTask) -> tuple[SimulatedRun, ...]:
     """Simulate and identify one group."""
-    own = zlib.crc32(task.plant.name.encode())      # by name: a plant's runs don't depend on which others there are
+    own = zlib.crc32(task.plant.name.encode())      # by name, so that a plant's runs do not depend on the other plants
     numbers = range(task.first, task.first + task.count)
     recordings = simulate(task.plant, [(task.base_seed, own, number) for number in numbers], task.periods)
     options = Options(confidence=task.confidence)
@@ -368,7 +374,9 @@ def run_all(wanted: list[SimulationTask], processes: int) -> Iterator[tuple[Simu
 
 
 def _by_several(wanted: list[SimulationTask], processes: int) -> Iterator[tuple[SimulatedRun, ...]]:
-    """Raises TdhilError where a process died with a task: a benchmark with a hole in it is none."""
+    """Run the tasks in several processes. Raises TdhilError if a process died with a task: the benchmark is then
+    incomplete.
+    """
     with Pool(run_task, min(processes, len(wanted)), TaskLimits(None, None)) as pool:
         for task, result in pool.run(wanted):
             if isinstance(result, Loss):

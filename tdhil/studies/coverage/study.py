@@ -1,7 +1,7 @@
-"""`tdhil study coverage`: does the interval cover the truth, on plants that the estimator knows nothing of?
+"""`tdhil study coverage`: coverage of the interval on plants that are independent of the estimator.
 
-Every plant of the fleet is simulated and identified many times over, each run with its own noise and its own rough
-inertia. Counted are the intervals that miss; bias and scatter are held against the least that is possible.
+Every plant of the fleet is simulated and identified many times, each run with its own noise and its own rough inertia.
+The intervals that miss are counted; bias and scatter are compared with the least possible values.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# One plant's figures from its runs, and the bounds of the proof held against them.
+# Figures of one plant from its runs, compared with the bounds of the proof.
 
 
 ONE_SIDED = 0.99          # confidence of each bound of the miss rate
@@ -43,9 +43,9 @@ _LEAST_MISSES = 0.4       # of the nominal miss rate: 2 % of 5 %
 
 @dataclass(frozen=True)
 class PlantFigures:
-    """Shares of the true inertia, but for rates, ratios and counts. None where no run gave a number or nothing applies.
+    """Shares of the true inertia, except rates, ratios and counts. None if no run gave a number or nothing applies.
 
-    ``miss_rate`` is over the runs that gave a number; a refusal is counted apart, as neither hit nor miss.
+    ``miss_rate`` is over the runs with a number; a refusal is counted separately, as neither hit nor miss.
     """
 
     plant: CoveragePlant
@@ -59,8 +59,8 @@ class PlantFigures:
     bias_error: float | None
     rmse: float | None
     half_width: float | None
-    bound: float | None             # root of the Cramér-Rao bound, the filters' structure known
-    bound_unknown: float | None     # the same without that
+    bound: float | None             # root of the Cramér-Rao bound for a known structure of the filters
+    bound_unknown: float | None     # the same for an unknown structure
     reasons: tuple[tuple[str, int], ...]
     run_seconds: float
 
@@ -70,29 +70,31 @@ class PlantFigures:
 
     @property
     def over_bound(self) -> float | None:
-        """RMSE over the root of the Cramér-Rao bound, where the model is the truth and not degenerate."""
+        """RMSE over the root of the Cramér-Rao bound, if the model is true and not degenerate; else None."""
         return self.rmse / self.bound if self.rmse is not None and self.bound and self.plant.bound_applies else None
 
     @property
     def over_unknown(self) -> float | None:
-        """Return RMSE over the root of the bound for an unknown filter structure; None with nonlinear friction."""
+        """RMSE over the root of the bound for an unknown filter structure; None with nonlinear friction."""
         if self.rmse is None or not self.bound_unknown or self.plant.bend is not None:
             return None
         return self.rmse / self.bound_unknown
 
     def width_over_bound(self, quantile: float) -> float | None:
-        """Mean half-width over that of an estimator at the bound which knows structure and noise."""
+        """Return the mean half-width over that of an estimator at the bound with known structure and noise."""
         return self.half_width / (quantile * self.bound) if self.half_width is not None and self.bound else None
 
     def width_over_unknown(self, quantile: float) -> float | None:
-        """Mean half-width over that of an estimator at the bound which knows the noise, but not the structure."""
+        """Return the mean half-width over that of an estimator at the bound with known noise and unknown structure."""
         if self.half_width is None or not self.bound_unknown or self.plant.bend is not None:
             return None
         return self.half_width / (quantile * self.bound_unknown)
 
 
 def clopper_pearson(hits: int, tries: int, one_sided: float = ONE_SIDED) -> tuple[float, float]:
-    """Bounds of a share, each exceeded with probability 1 − one_sided: quantiles of the beta distribution."""
+    """Return the bounds of a share, each exceeded with probability 1 − one_sided: quantiles of the beta
+    distribution.
+    """
     from scipy.stats import beta
 
     low = float(beta.ppf(1.0 - one_sided, hits, tries - hits + 1)) if hits > 0 else 0.0
@@ -101,7 +103,7 @@ def clopper_pearson(hits: int, tries: int, one_sided: float = ONE_SIDED) -> tupl
 
 
 def figures_of(plant: CoveragePlant, runs: Sequence[SimulatedRun], bounds: Bounds) -> PlantFigures:
-    """Added up in the order of the runs' numbers, so that the same runs give the same bits."""
+    """Return the figures, added in the order of the runs' numbers, so that the same runs give the same bits."""
     ordered = sorted(runs, key=lambda run: run.number)
     told = [
         (run.value, run.low, run.high)
@@ -138,28 +140,28 @@ def covers(found: PlantFigures, nominal: float) -> bool | None:
 
 
 def not_too_wide(found: PlantFigures, nominal: float) -> bool | None:
-    """Could the miss rate be 2 % or more (of a nominal 5 %)? Only where the model is the truth."""
+    """Return whether the miss rate may be 2 % or more (of a nominal 5 %); None if the model is not true."""
     if found.miss_rate is None or not found.plant.model_true:
         return None
     return found.miss_high >= _LEAST_MISSES * nominal
 
 
 def answers(found: PlantFigures) -> bool | None:
-    """Return whether at most 2 % of the runs give no number (lower 99 % bound). Only if the model is the truth."""
+    """Return whether at most 2 % of the runs give no number (lower 99 % bound); None if the model is not true."""
     if not found.plant.model_true or found.runs == 0:
         return None
     return clopper_pearson(found.refused, found.runs)[0] <= MOST_REFUSED
 
 
 def unbiased(found: PlantFigures) -> bool | None:
-    """|bias| ≤ max(0.2 %, 3 Monte-Carlo standard errors)."""
+    """Return whether |bias| ≤ max(0.2 %, 3 Monte-Carlo standard errors)."""
     if found.bias is None or found.bias_error is None:
         return None
     return abs(found.bias) <= max(_BIAS_FLOOR, _BIAS_ERRORS * found.bias_error)
 
 
 def efficient(found: PlantFigures) -> bool | None:
-    """RMSE ≤ 1.2 × the Cramér-Rao bound."""
+    """Return whether RMSE ≤ 1.2 × the Cramér-Rao bound."""
     return None if found.over_bound is None else found.over_bound <= _OVER_BOUND
 
 
@@ -169,14 +171,14 @@ def efficient_unknowing(found: PlantFigures) -> bool | None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The benchmark in one picture: miss rate with its bounds, and how close the scatter comes to the least possible.
+# Figure of the benchmark: miss rate with its bounds, and scatter over the least possible scatter.
 
 
 _GOOD, _BAD, _LIMIT = "#1f5fa8", "#c0392b", "#555555"
 
 
 def draw_coverage(figure: Figure, found: Sequence[PlantFigures], nominal: float) -> None:
-    """Plants from top to bottom in both panels; what breaks a bound is red."""
+    """Draw the plants from top to bottom in both panels; a plant that violates a bound is red."""
     left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"width_ratios": [3, 2]})
     names = [one.plant.name + ("" if one.plant.model_true else " *") for one in found]
     _misses(left, found, nominal)
@@ -221,11 +223,11 @@ def _ratios(axes: Axes, found: Sequence[PlantFigures]) -> None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The benchmark in tables and statements.
+# Tables and statements of the benchmark.
 
 
 def plant_table(found: Sequence[PlantFigures], confidence: float) -> ResultTable:
-    """One row a plant. Shares in percent of the true inertia; rates in percent of the runs that gave a number."""
+    """Return one row a plant. Shares in percent of the true inertia; rates in percent of the runs with a number."""
     quantile = normal_quantile(confidence)
     columns = (
         "plant", "inertia_kg_m2", "model_true", "runs", "refused_percent", "miss_percent", "miss_low99_percent",
@@ -274,13 +276,13 @@ def about_table(found: Sequence[PlantFigures]) -> ResultTable:
 
 
 def refusal_table(found: Sequence[PlantFigures]) -> ResultTable:
-    """Why runs gave no number, the most frequent reasons first."""
+    """Return the reasons of runs without a number, the most frequent first."""
     rows = tuple((one.plant.name, count, reason) for one in found for reason, count in one.reasons[:5])
     return ResultTable("refusals", ("plant", "runs", "reason"), rows)
 
 
 def said(found: Sequence[PlantFigures], confidence: float) -> tuple[Statement, ...]:
-    """The four bounds, plant by plant."""
+    """Return the four statements for each plant."""
     return tuple(statement for one in found for statement in _said_of(one, 1.0 - confidence))
 
 
@@ -341,21 +343,21 @@ def _figures(value: float | None) -> float | None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 class CoverageSettings(DataModel):
-    """How many runs, of which plants, how long, at what confidence."""
+    """Settings: number of runs, plants, duration, confidence."""
 
     seeds: Annotated[int, Field(ge=1, le=100_000)] = 500
-    """Runs a plant."""
+    """Runs of each plant."""
     plants: list[str] = Field(default_factory=list)
-    """Names of plants; none for all of them."""
+    """Names of plants; empty for all plants."""
     periods: Annotated[int, Field(ge=4, le=200)] = 10
-    """Periods that count, at each of two mean speeds."""
+    """Periods used at each of two mean speeds."""
     confidence: Annotated[float, Field(ge=0.5, lt=1.0)] = 0.95
     processes: Annotated[int, Field(ge=1, le=64)] = 2
     seed: Annotated[int, Field(ge=0)] = 1
 
     @property
     def chosen(self) -> tuple[CoveragePlant, ...]:
-        """The plants meant, in the fleet's order."""
+        """Return the selected plants, in the fleet's order."""
         return tuple(plant for plant in FLEET if not self.plants or plant.name in self.plants)
 
     @model_validator(mode="after")
@@ -372,17 +374,17 @@ class CoverageSettings(DataModel):
 
 @dataclass
 class CoverageStudy:
-    """`tdhil study coverage`."""
+    """Study `tdhil study coverage`."""
 
     name: str = "coverage"
     title: str = "Coverage of the interval and closeness to the Cramér-Rao bound, plant by plant"
     settings_model: type[CoverageSettings] = CoverageSettings
 
     def run(self, settings: CoverageSettings, progress: Progress) -> StudyOutcome:
-        """Every run of every plant; the same settings give the same bits, whatever the number of processes.
+        """Run every plant; the same settings give the same bits, for any number of processes.
 
-        Ctrl-C ends it with the figures of the runs that are done by then (``interrupted``); a second one, or one
-        before the first runs are done, ends it without.
+        Ctrl-C ends the study with the figures of the completed runs (``interrupted``). A second Ctrl-C, or one before
+        the first completed run, ends it without figures.
         """
         plants = settings.chosen
         wanted = tasks(plants, settings.seeds, settings.seed, settings.periods, settings.confidence)
@@ -398,7 +400,7 @@ class CoverageStudy:
                 of_plant = f"{group[0].plant}: {len(runs[group[0].plant])} of {settings.seeds} runs"
                 progress(0.98 * done / total, f"{of_plant}; {done} of {total} in all, about {_told(left_s)} left")
         except KeyboardInterrupt:
-            done = sum(map(len, runs.values()))     # it may have come between the two
+            done = sum(map(len, runs.values()))     # Ctrl-C may have come between the two
             if done == 0:
                 raise
             interrupted = True
@@ -417,7 +419,7 @@ def _told(duration_s: float) -> str:
 
 
 def cut_short(outcome: StudyOutcome, done: int, total: int) -> StudyOutcome:
-    """Return the same, marked everywhere as incomplete."""
+    """Return the outcome, marked everywhere as incomplete."""
     return replace(
         outcome,
         title=f"{outcome.title} (interrupted: {done} of {total} runs)",
@@ -427,7 +429,7 @@ def cut_short(outcome: StudyOutcome, done: int, total: int) -> StudyOutcome:
 
 
 def outcome_of(study: CoverageStudy, found: list[PlantFigures], settings: CoverageSettings) -> StudyOutcome:
-    """Figures as tables, statements, document and picture."""
+    """Return the figures as tables, statements, document and plot."""
     nominal = 1.0 - settings.confidence
 
     def draw(figure: Figure) -> None:
@@ -446,7 +448,7 @@ def outcome_of(study: CoverageStudy, found: list[PlantFigures], settings: Covera
 
 
 def _document(one: PlantFigures) -> dict[str, Any]:
-    """All of a plant's figures, and the plant itself."""
+    """Return all figures of a plant, and the plant itself."""
     return {
         **asdict(one), "answered": one.answered, "rmse_over_bound": one.over_bound,
         "rmse_over_unknown": one.over_unknown,

@@ -1,7 +1,7 @@
-"""Figures 20 and 21: amplitude of the speed, in and out, over P and over I of the drive's speed loop.
+"""Figures 20 and 21: amplitude of the speed, input and output, over P and over I of the drive's speed loop.
 
-The output is what the drive reports. Where the loop overshoots and the reporting lag takes as much away, input and
-output are equal: that is where |difference| is least. Both depend on the tone, which the paper doesn't give.
+The output is the speed that the drive reports. If the overshoot of the loop equals the reduction by the reporting lag,
+input and output are equal, and |difference| is least. Both depend on the frequency, which the paper does not give.
 """
 
 from __future__ import annotations
@@ -26,12 +26,14 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The pictures of figures 20 and 21: amplitudes, and their difference, over a gain of the loop.
+# Plots of figures 20 and 21: amplitudes, and their difference, over a gain of the loop.
 
 
 @dataclass(frozen=True)
 class GainPicture:
-    """``curves``: tone → output amplitude of the linear loop over the gain; ``published``: gain and difference."""
+    """Data of the plot. ``curves``: frequency → output amplitude of the linear loop over the gain; ``published``:
+    gain and difference.
+    """
 
     gain_name: str
     values: Sequence[float]
@@ -43,7 +45,7 @@ class GainPicture:
 
 
 def draw_gains(figure: Figure, picture: GainPicture) -> None:
-    """Input and output left, their difference right."""
+    """Draw input and output on the left, their difference on the right."""
     left, right = figure.subplots(1, 2)
     grid = np.geomspace(min(picture.values), max(picture.values), 300)
     inputs = [one.input_rad_s for one in picture.found]
@@ -81,13 +83,13 @@ def _published(axes: Axes, picture: GainPicture) -> None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What figures 20 and 21 claim, and whether it holds here.
+# Statements of figures 20 and 21, and whether tdhil confirms them.
 
 
 def said_of_kp(settings: GainSweepSettings, values: Sequence[float], found: Sequence[Amplitudes]) -> tuple[
     Statement, ...
 ]:
-    """Figure 20: first falling, then rising, least at 300."""
+    """Return the statements on figure 20: first falling, then rising, least at 300."""
     away = _away(found)
     best = int(np.argmin(away))
     valley = 0 < best < len(away) - 1 and bool(np.all(np.diff(away[: best + 1]) < 0.0) and np.all(
@@ -125,7 +127,7 @@ def said_of_kp(settings: GainSweepSettings, values: Sequence[float], found: Sequ
 def said_of_ki(settings: GainSweepSettings, values: Sequence[float], found: Sequence[Amplitudes]) -> tuple[
     Statement, ...
 ]:
-    """Figure 21: rising throughout, least at 200."""
+    """Return the statements on figure 21: rising throughout, least at 200."""
     away = _away(found)
     best, worst = int(np.argmin(away)), int(np.argmax(away))
     steady = bool(np.all(np.diff(away) > 0.0))
@@ -164,7 +166,7 @@ def _away(found: Sequence[Amplitudes]) -> FloatArray:
 
 
 def _edge(value: float, low: float, high: float) -> str:
-    """The minimum's place, or that it lies outside."""
+    """Return the place of the minimum, or that it lies outside."""
     if value <= 1.001 * low:
         return f"at or below {low:g}"
     return f"at or above {high:g}" if value >= 0.999 * high else f"{value:.0f}"
@@ -174,7 +176,7 @@ def _edge(value: float, low: float, high: float) -> str:
 
 @dataclass
 class KpSweep:
-    """`tdhil study figure20`."""
+    """Study `tdhil study figure20`."""
 
     bench: FieldBench
     name: str = "figure20"
@@ -182,7 +184,7 @@ class KpSweep:
     settings_model: type[FieldKpSweepSettings] = FieldKpSweepSettings
 
     def run(self, settings: FieldKpSweepSettings, progress: Progress) -> StudyOutcome:
-        """One run a P."""
+        """Do one run for each P."""
         loops = [(kp, settings.ki_nm_rad) for kp in settings.kp_values_nm_s_rad]
         found, simulated_s = _swept(self.bench, settings, loops, progress)
         statements = said_of_kp(settings, settings.kp_values_nm_s_rad, found)
@@ -191,7 +193,7 @@ class KpSweep:
 
 @dataclass
 class KiSweep:
-    """`tdhil study figure21`."""
+    """Study `tdhil study figure21`."""
 
     bench: FieldBench
     name: str = "figure21"
@@ -199,7 +201,7 @@ class KiSweep:
     settings_model: type[FieldKiSweepSettings] = FieldKiSweepSettings
 
     def run(self, settings: FieldKiSweepSettings, progress: Progress) -> StudyOutcome:
-        """One run an I."""
+        """Do one run for each I."""
         loops = [(settings.kp_nm_s_rad, ki) for ki in settings.ki_values_nm_rad]
         found, simulated_s = _swept(self.bench, settings, loops, progress)
         statements = said_of_ki(settings, settings.ki_values_nm_rad, found)

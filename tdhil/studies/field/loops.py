@@ -1,7 +1,7 @@
 """Figure 19: the paper's method at several P and I of the drive's speed loop.
 
-What a loop does to the shaft, it does to torque and acceleration alike; so the slope at one tone is the same for every
-loop, but for what noise in α takes off where the motion is small. One loop is run again with other seeds, to tell a
+A loop changes torque and acceleration equally. The slope at one frequency is therefore the same for every loop, except
+for the reduction by noise in α if the motion is small. One loop is repeated with other seeds, to distinguish a
 difference from chance.
 """
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The drive's speed loop as a linear one: what amplitudes theory expects, to set beside those from the bus.
+# Linear model of the drive's speed loop: theoretical amplitudes, for comparison with those from the bus.
 #
 # ::
 #
@@ -43,14 +43,14 @@ if TYPE_CHECKING:
 #
 #     speed/reference = C P / (1 + C P F),    C = (K_p + K_i/s)/(1 + t s),  P = 1/(J s + B),  F = 1/(1 + τ_f s)
 #
-# Coulomb friction is constant while the shaft turns one way, and drops out. K_p in N·m·s/rad, K_i in N·m/rad. Written
-# here and not taken from the simulator: two derivations that agree are worth more than one.
+# Coulomb friction is constant while the shaft turns in one direction, and has no effect. K_p in N·m·s/rad, K_i in
+# N·m/rad. This model is independent of the simulator, so agreement of the two is evidence.
 
 
 def gain(
     rig: SimulatedRig, hertz: FloatArray | float, kp: FloatArray | float, ki: FloatArray | float, *, reported: bool
 ) -> FloatArray:
-    """Output amplitude over input amplitude, broadcast over the arguments; of the shaft, or of what is reported."""
+    """Return output over input amplitude, of the shaft or of the reported speed, broadcast over the arguments."""
     s = 2j * np.pi * np.asarray(hertz, dtype=np.float64)
     control = (np.asarray(kp) + np.asarray(ki) / s) / (1.0 + rig.loop_torque_lag_s * s)
     forward = control / (rig.inertia_kg_m2 * s + rig.viscous_nm_s_rad)
@@ -62,7 +62,7 @@ def gain(
 
 
 def tones_with_steady_rise(rig: SimulatedRig, kp: float, ki_values: tuple[float, ...]) -> tuple[int, int]:
-    """Return at how many of how many tones from 0.05 to 1 Hz |gain − 1| rises over ``ki_values`` (figure 21)."""
+    """Return at how many of how many frequencies from 0.05 to 1 Hz |gain − 1| rises over ``ki_values`` (figure 21)."""
     tones = np.linspace(0.05, 1.0, 96)
     grid = np.linspace(min(ki_values), max(ki_values), 60)
     away = np.abs(gain(rig, tones[:, None], kp, grid[None, :], reported=True) - 1.0)
@@ -70,23 +70,23 @@ def tones_with_steady_rise(rig: SimulatedRig, kp: float, ki_values: tuple[float,
 
 
 def best_kp(rig: SimulatedRig, hertz: float, ki: float, low: float, high: float) -> float:
-    """The P between ``low`` and ``high`` at which |gain − 1| of the reported speed is least; an edge if it is there."""
+    """Return the P between ``low`` and ``high`` with the least |gain − 1| of the reported speed; possibly an end."""
     grid = np.geomspace(low, high, 400)
     return float(grid[int(np.argmin(np.abs(gain(rig, hertz, grid, ki, reported=True) - 1.0)))])
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Figure 23: amplitude of the speed, in and out, over the tone: a low-pass.
+# Figure 23: amplitude of the speed, input and output, over frequency: a low-pass.
 
 
 PUBLISHED_OUTPUT = {0.1: 1.3492, 1.0: 0.0992}
-"""Tone, Hz: output amplitude, rad/s."""
+"""Published output amplitude, rad/s, by frequency, Hz."""
 PUBLISHED_DIFFERENCE = {1.0: 0.8414}
 
 
 @dataclass
 class ToneSweep:
-    """`tdhil study figure23`."""
+    """Study `tdhil study figure23`."""
 
     bench: FieldBench
     name: str = "figure23"
@@ -94,7 +94,7 @@ class ToneSweep:
     settings_model: type[ToneSweepSettings] = ToneSweepSettings
 
     def run(self, settings: ToneSweepSettings, progress: Progress) -> StudyOutcome:
-        """One run a tone."""
+        """Do one run for each frequency."""
         tones = sorted(settings.frequencies_hz)
         runs = [(hertz, settings.kp_nm_s_rad, settings.ki_nm_rad, f"{hertz:g} Hz") for hertz in tones]
         found, simulated_s = swept_amplitudes(self.bench, settings, runs, progress)
@@ -118,9 +118,9 @@ class ToneSweep:
 
 
 def closest_loop(settings: ToneSweepSettings) -> tuple[float, float, float, float]:
-    """P and I within the published sweeps that come closest to the two published outputs with one input amplitude.
+    """Return P and I within the published sweeps that fit the two published outputs best, with one input amplitude.
 
-    Returns P, I and the outputs at 0.1 and 1 Hz, rad/s. Closest: least greater error of the two logarithms.
+    Returns P, I and the outputs at 0.1 and 1 Hz, rad/s. The best fit has the least larger error of the two logarithms.
     """
     kp, ki = np.meshgrid(np.geomspace(150.0, 1500.0, 120), np.geomspace(200.0, 2500.0, 120), indexing="ij")
     low, high = (settings.amplitude_rad_s * gain(settings.rig, hertz, kp, ki, reported=True) for hertz in (0.1, 1.0))
@@ -189,12 +189,12 @@ def _draw_tones(
 # ---------------------------------------------------------------------------------------------------------------------
 
 OUTSIDE = 3.0
-"""Slopes differ if they are further apart than so many times the spread of repeats."""
+"""Multiple of the spread of repeats from which slopes differ."""
 
 
 @dataclass(frozen=True)
 class FieldLoopRecord:
-    """One run."""
+    """Result of one run."""
 
     loop: LoopPair
     seed: int
@@ -204,7 +204,7 @@ class FieldLoopRecord:
 
 @dataclass
 class LoopScatter:
-    """`tdhil study figure19`."""
+    """Study `tdhil study figure19`."""
 
     bench: FieldBench
     name: str = "figure19"
@@ -212,7 +212,7 @@ class LoopScatter:
     settings_model: type[ScatterSettings] = ScatterSettings
 
     def run(self, settings: ScatterSettings, progress: Progress) -> StudyOutcome:
-        """Every loop once, the first one ``repeats`` times."""
+        """Run every loop once, the first one ``repeats`` times."""
         wanted = [(loop, settings.seed) for loop in settings.loops]
         wanted += [(settings.loops[0], settings.seed + more) for more in range(1, settings.repeats)]
         records = []

@@ -1,4 +1,4 @@
-"""The field studies on a bench: sections 5.1 and 5.2 of the paper, figures 19 to 23."""
+"""Registry of the field studies on a bench: sections 5.1 and 5.2 of the paper, figures 19 to 23."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ from tdhil.studies.study import Study
 
 
 def field_studies(bench: FieldBench) -> tuple[Study, ...]:
-    """The field studies, in the paper's order."""
+    """Return the field studies, in the paper's order."""
     return (LoopScatter(bench), KpSweep(bench), KiSweep(bench), FieldSlopes(bench), ToneSweep(bench))

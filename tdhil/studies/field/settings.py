@@ -1,4 +1,4 @@
-"""Settings of the field studies: what a user copies and changes. SI at the motor shaft, units in the names."""
+"""Settings of the field studies, for users to copy and change. SI at the motor shaft, units in the names."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Gains = Annotated[tuple[Positive, ...], Field(min_length=3, max_length=24)]
 
 
 class SimulatedRig(DataModel):
-    """The rig at the other end of the bus. Identification receives none of it.
+    """Rig at the other end of the bus. Identification receives none of these values.
 
     The reporting lags are those that reproduce the published slopes with one inertia (notes: 0.403 and 0.151 s); J, B
     and Coulomb friction of the real rig are not published.
@@ -31,7 +31,7 @@ class SimulatedRig(DataModel):
 
 
 class FieldSettings(DataModel):
-    """Settings of every field study."""
+    """Common settings of all field studies."""
 
     seed: int = Field(default=1, ge=0, le=2**31 - 1000, description="repeats the whole study, to the last sample")
     rate_hz: float = Field(default=100.0, ge=20, le=500, description="cycles per second")
@@ -40,7 +40,7 @@ class FieldSettings(DataModel):
 
 
 class Tone(DataModel):
-    """One record of figure 22. In torque mode the drive's speed loop does not stand in the way of the motion."""
+    """Settings of one record of figure 22. In torque mode the drive's speed loop does not oppose the motion."""
 
     frequency_hz: Positive
     mode: Literal["speed", "torque"] = "speed"
@@ -48,7 +48,7 @@ class Tone(DataModel):
 
 
 class SlopeSettings(FieldSettings):
-    """Figure 22: one record a tone."""
+    """Settings of figure 22: one record for each frequency."""
 
     seed: int = 3
     kp_nm_s_rad: Positive = Field(default=300.0, description="P of the drive's speed loop")
@@ -63,14 +63,14 @@ class SlopeSettings(FieldSettings):
 
 
 class LoopPair(DataModel):
-    """One setting of the drive's speed loop."""
+    """Gains of the drive's speed loop."""
 
     kp_nm_s_rad: Positive
     ki_nm_rad: Positive
 
 
 class ScatterSettings(FieldSettings):
-    """Figure 19: the paper's method at several settings of the speed loop, one of them repeated."""
+    """Settings of figure 19: the paper's method with several gains of the speed loop, one of them repeated."""
 
     torque_limit_nm: Positive = Field(default=500.0, description="N·m; P 300 with I 2500 rings, and takes above 400")
     frequency_hz: Positive = 0.3
@@ -88,10 +88,10 @@ class ScatterSettings(FieldSettings):
 
 
 class AmplitudeSettings(FieldSettings):
-    """Figures 20, 21 and 23: a sine in speed mode.
+    """Settings of figures 20, 21 and 23: a sine in speed mode.
 
-    P 300 and I 200 are the best of the published sweeps. The input amplitude is what the published figures at 1 Hz add
-    up to, 0.0992 + 0.8414 rad/s.
+    P 300 and I 200 are the best of the published sweeps. The input amplitude is the sum of the published figures at 1
+    Hz, 0.0992 + 0.8414 rad/s.
     """
 
     torque_limit_nm: Positive = 1200.0
@@ -103,25 +103,27 @@ class AmplitudeSettings(FieldSettings):
 
 
 class GainSweepSettings(AmplitudeSettings):
-    """Figures 20 and 21. The paper does not say at which tone; 0.2 Hz is that of its simulations (Table 7)."""
+    """Settings of figures 20 and 21. The paper does not state the frequency; 0.2 Hz is that of its simulations
+    (Table 7).
+    """
 
     frequency_hz: Positive = 0.2
     other_tones_hz: Tones = Field(default=(0.1, 0.3), description="shown from the linear loop only")
 
 
 class FieldKpSweepSettings(GainSweepSettings):
-    """Figure 20: over P."""
+    """Settings of figure 20: over P."""
 
     kp_values_nm_s_rad: Gains = (150.0, 225.0, 300.0, 450.0, 700.0, 1000.0, 1500.0)
 
 
 class FieldKiSweepSettings(GainSweepSettings):
-    """Figure 21: over I."""
+    """Settings of figure 21: over I."""
 
     ki_values_nm_rad: Gains = (200.0, 350.0, 500.0, 800.0, 1200.0, 1800.0, 2500.0)
 
 
 class ToneSweepSettings(AmplitudeSettings):
-    """Figure 23: over the tone."""
+    """Settings of figure 23: over frequency."""
 
     frequencies_hz: Tones = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0)

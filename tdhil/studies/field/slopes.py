@@ -1,8 +1,8 @@
-"""Figure 22: one inertia, four slopes; and the joint fit that finds the one behind the four.
+"""Figure 22: four slopes with one inertia, and the joint fit that finds this inertia.
 
-Published are T = 105.379 α + 73.216, 116.557 α + 70.467, 135.622 α + 70.598 and 185.757 α + 73.212 at 0.1, 0.3, 0.5 and
-1 Hz. The same method gives about the same four numbers on the simulated rig, whose one inertia does not change: what
-changes with the tone is what the reporting lags do to the slope (`tdhil.studies.field.slopes`).
+The published lines are T = 105.379 α + 73.216, 116.557 α + 70.467, 135.622 α + 70.598 and 185.757 α + 73.212 at 0.1,
+0.3, 0.5 and 1 Hz. The same method gives nearly the same four numbers on the simulated rig, whose inertia is constant:
+only the effect of the reporting lags on the slope changes with the frequency (`tdhil.studies.field.slopes`).
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# One tone at a time: not identifiable with nothing known of the lags, and with the joint fit's lags one J for all.
+# One frequency at a time: not identifiable with unknown lags; with the lags of the joint fit, one J for all.
 
 
 SPREAD = 0.01
-"""How far apart the tones' inertias may be, as a share of their mean; the paper's slopes are 76 % apart."""
+"""Largest spread of the inertias, as a share of their mean; the paper's slopes differ by 76 %."""
 
 
 @dataclass(frozen=True)
 class Alone:
-    """A tone by itself: with nothing known of the lags, and with them stated."""
+    """Results of one frequency alone: with unknown lags, and with stated lags."""
 
     hertz: float
     unknown: Identification
@@ -43,7 +43,7 @@ class Alone:
 
 
 def stated_lags(joint: Identification, confidence: float) -> LagPrior | None:
-    """The joint fit's lags as a drive would state them; None where it has none."""
+    """Return the lags of the joint fit in the form in which a drive states them; None if it has none."""
     if joint.speed_lag_s is None or joint.torque_lag_s is None:
         return None
     speed, torque = joint.speed_lag_s, joint.torque_lag_s
@@ -57,7 +57,7 @@ def _sd(one: Estimate, confidence: float) -> float:
 
 
 def each_alone(recordings: Sequence[Recording], joint: Identification, confidence: float) -> tuple[Alone, ...]:
-    """Every recording identified by itself, twice; () without a joint fit."""
+    """Return every recording identified alone, with unknown and with stated lags; () without a joint fit."""
     prior = stated_lags(joint, confidence)
     if prior is None:
         return ()
@@ -72,7 +72,7 @@ def each_alone(recordings: Sequence[Recording], joint: Identification, confidenc
 
 
 def alone_table(found: Sequence[Alone]) -> ResultTable:
-    """One row a tone."""
+    """Return one row for each frequency."""
     rows: list[tuple[Cell, ...]] = []
     for one in found:
         inertia = one.stated.inertia
@@ -83,7 +83,7 @@ def alone_table(found: Sequence[Alone]) -> ResultTable:
 
 
 def alone_statements(found: Sequence[Alone], true_inertia: float) -> list[Statement]:
-    """Refused where nothing is known; one J where the lags are."""
+    """Return the statements: refused with unknown lags, one J with stated lags."""
     if not found:
         return []
     refused = [one.unknown.inertia is None for one in found]
@@ -107,27 +107,27 @@ def alone_statements(found: Sequence[Alone], true_inertia: float) -> list[Statem
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What figure 22 claims, whether it holds here, and where it contradicts itself.
+# Statements of figure 22, whether tdhil confirms them, and contradictions within the paper.
 
 
 PUBLISHED = {0.1: (105.379, 73.216), 0.3: (116.557, 70.467), 0.5: (135.622, 70.598), 1.0: (185.757, 73.212)}
-"""Tone, Hz: slope, kg·m², and intercept, N·m (figure 22)."""
+"""Published slope, kg·m², and intercept, N·m, by frequency, Hz (figure 22)."""
 
 CLOSE = 0.03
-"""How close to the published slopes ours shall be."""
+"""Largest relative difference between published slopes and those of tdhil."""
 
 CURVE_CLOSE = 0.01
-"""How close the joint fit's curve shall be to our own slopes at the tones, where noise in α takes nothing off them."""
+"""Largest relative difference between the joint fit's curve and tdhil's slopes without the effect of noise in α."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """One tone as recorded and as the paper's method reads it."""
+    """One frequency as recorded, with the result of the paper's method."""
 
     hertz: float
     mode: str
     points: Scatter
-    at_the_tone: float                 # kg·m²; the slope without what noise in α takes off it
+    at_the_tone: float                 # kg·m²; slope without the reduction by noise in α
     mean_speed_rad_s: float
 
     @property
@@ -138,12 +138,14 @@ class Record:
 def said_of_slopes(
     settings: SlopeSettings, records: list[Record], joint: Identification, curve: FloatArray | None
 ) -> tuple[Statement, ...]:
-    """Slopes tone by tone, the one inertia behind them, and what stays open. ``curve``: the joint fit at the tones."""
+    """Return statements on the slopes, the common inertia, and open points. ``curve``: the joint fit at the
+    frequencies.
+    """
     return (*_slope_statements(records), *_joint_statements(settings, joint, records, curve), *_open(records))
 
 
 def percent(ours: float, published: float | None) -> float | None:
-    """How far ours is off, in percent; None where nothing was published."""
+    """Return the deviation of ``ours`` in percent; None without a published value."""
     return None if published is None else 100.0 * (ours / published - 1.0)
 
 
@@ -217,19 +219,19 @@ def _value(estimate: object) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Four records of one rig, one tone each: every one alone leaves the inertia open, together they tell it.
+# Four recordings of one rig, one frequency each: each alone leaves the inertia open, together they determine it.
 #
-# A tone is two equations for the five unknowns J, B, τ_w, τ_T and skew. The records are laid end to end in time as one
-# Recording with a segment each, and identified as any other: the same likelihood, on the lines of all four, with the
-# levels of their mean speeds for the friction.
+# One frequency gives two equations for the five unknowns J, B, τ_w, τ_T and skew. The recordings are joined in time to
+# one Recording with a segment for each, and identified like any other: the same likelihood, on the lines of all four,
+# with the levels of their mean speeds for the friction.
 
 
-_BETWEEN_S = 10.0      # of nothing, between two records
-_AROUND_S = 1.0        # kept before and after a record's segments
+_BETWEEN_S = 10.0      # s; gap between two records
+_AROUND_S = 1.0        # s; time kept before and after a record's segments
 
 
 def joined(recordings: Sequence[Recording]) -> Recording:
-    """One Recording of all: times shifted, each torque less its own offset.
+    """Return one Recording of all: times are shifted, and each torque has its own offset subtracted.
 
     Levels, ramps, commanded and demanded torque and the angle are left out: a slope needs none of them.
     """
@@ -273,13 +275,13 @@ def joined(recordings: Sequence[Recording]) -> Recording:
 def expected_slope(
     hertz: FloatArray, inertia: float, viscous: float, speed_lag_s: float, torque_lag_s: float, skew_s: float
 ) -> FloatArray:
-    """The slope T = slope·α + b that least squares finds on a tone, kg·m², (K,).
+    """Return the slope of T = slope·α + b that least squares finds at one frequency, kg·m², (K,).
 
-    Of T cos-like and α = dω/dt, both as reported, the slope is Re(T α*)/|α|² = Re(G(s)/s) at s = jω; without skew
+    For a sinusoidal T and α = dω/dt, both as reported, the slope is Re(T α*)/|α|² = Re(G(s)/s) at s = jω; without skew
 
         J (1 + ω² τ_w τ_T)/(1 + ω² τ_T²) + B (τ_w − τ_T)/(1 + ω² τ_T²).
 
-    Averaging both over the same 0.1 s changes nothing in it.
+    Averaging both over the same 0.1 s does not change it.
     """
     s = (2j * np.pi * np.asarray(hertz, dtype=np.float64)).astype(np.complex128)
     seen = (inertia * s + viscous) * (1.0 + speed_lag_s * s) / (1.0 + torque_lag_s * s) * np.exp(-skew_s * s)
@@ -288,7 +290,7 @@ def expected_slope(
 
 
 def slope_of(identification: Identification, hertz: FloatArray) -> FloatArray | None:
-    """The same for a joint fit; None where it gave no number."""
+    """Return the same slope for the parameters of a joint fit; None if the fit gave no number."""
     found = identification
     parts = (found.viscous_nm_s_rad, found.speed_lag_s, found.torque_lag_s, found.skew_s)
     if found.inertia is None or any(part is None for part in parts):
@@ -298,12 +300,12 @@ def slope_of(identification: Identification, hertz: FloatArray) -> FloatArray | 
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The picture of figure 22: left as in the paper, right what the four slopes have in common.
+# Plot of figure 22: left as in the paper, right the common inertia behind the four slopes.
 
 
 @dataclass(frozen=True)
 class SlopePicture:
-    """All that is drawn; ``true_inertia`` is the simulated rig's, kg·m²."""
+    """Data of the plot; ``true_inertia`` is that of the simulated rig, kg·m²."""
 
     records: Sequence[Record]
     joint: Identification
@@ -311,7 +313,7 @@ class SlopePicture:
 
 
 def draw_slopes(figure: Figure, picture: SlopePicture) -> None:
-    """Scatter with its fitted lines; slope over tone with the curve of the joint fit."""
+    """Draw the scatter with its fitted lines, and the slope over frequency with the curve of the joint fit."""
     left, right = figure.subplots(1, 2)
     _scatter(left, picture)
     _slopes(right, picture)
@@ -364,7 +366,7 @@ def _slopes(axes: Axes, picture: SlopePicture) -> None:
 
 @dataclass
 class FieldSlopes:
-    """`tdhil study figure22`."""
+    """Study `tdhil study figure22`."""
 
     bench: FieldBench
     name: str = "figure22"
@@ -372,7 +374,7 @@ class FieldSlopes:
     settings_model: type[SlopeSettings] = SlopeSettings
 
     def run(self, settings: SlopeSettings, progress: Progress) -> StudyOutcome:
-        """One run a tone, each with a seed of its own; then all records together."""
+        """Do one run for each frequency, each with its own seed; then identify all records together."""
         count = len(settings.tones)
         recordings, records = [], []
         for index, tone in enumerate(settings.tones):

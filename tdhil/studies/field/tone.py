@@ -1,4 +1,4 @@
-"""Evaluation of one recorded sine: amplitude in, amplitude out, and the paper's scatter of torque over acceleration."""
+"""Evaluation of one recorded sine: input and output amplitude, and the paper's scatter of torque over acceleration."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How the pictures of the field studies look: colours, grid, the mark of a published number.
+# Style of the plots of the field studies: colours, grid, the mark of a published number.
 
 
 COLOURS = ("#1f5fa8", "#d1642a", "#2e8b57", "#8b3fa0", "#a08020", "#3aa0b5", "#7a7a7a")
 PUBLISHED_STYLE: dict[str, Any] = {
     "color": "black", "marker": "D", "linestyle": "none", "markersize": 6, "markerfacecolor": "none"
 }
-"""Published numbers stand out as hollow black diamonds in every picture."""
+"""Style of published numbers in every plot: hollow black diamonds."""
 
 
 def tidy(axes: Axes, x: str, y: str, title: str = "") -> None:
-    """Labels, a light grid, no box."""
+    """Set labels and a light grid, and remove the frame."""
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     if title:
@@ -52,7 +52,7 @@ def tidy(axes: Axes, x: str, y: str, title: str = "") -> None:
 
 
 def colour(index: int) -> str:
-    """The same index, the same colour, in every panel."""
+    """Return the colour of an index, the same in every panel."""
     return COLOURS[index % len(COLOURS)]
 
 
@@ -68,17 +68,17 @@ class Amplitudes:
     input_rad_s: float
     output_rad_s: float
     sd_rad_s: float
-    limited: float                     # share of the samples at which the drive was at a limit
+    limited: float                     # share of the samples with the drive at a limit
 
     @property
     def difference_rad_s(self) -> float:
-        """Input minus output; negative where the output overshoots."""
+        """Input minus output amplitude; negative for an overshoot of the output."""
         return self.input_rad_s - self.output_rad_s
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """Points (N,) of figure 22, and the straight line through all of them (equations 7 and 16)."""
+    """Points (N,) of figure 22, and the straight line through them (equations 7 and 16)."""
 
     acceleration_rad_s2: FloatArray
     torque_nm: FloatArray
@@ -86,14 +86,14 @@ class Scatter:
 
 
 def periods_for(frequency_hz: float, measured_s: float) -> int:
-    """Whole periods to ask for: settling, and at least three that count."""
+    """Return the number of whole periods: settling, and at least three that count."""
     return max(1, math.ceil(SETTLE_S * frequency_hz - 1e-9)) + max(3, round(measured_s * frequency_hz))
 
 
 def sine_run(
     settings: AmplitudeSettings | ScatterSettings, hertz: float, kp: float, ki: float, seed: int
 ) -> FieldRun:
-    """A sine of the study's amplitude about its mean speed, for its measuring time."""
+    """Return a run with a sine of the study's amplitude about its mean speed, for its measuring time."""
     return FieldRun(
         settings.rig, hertz, kp, ki, seed, amplitude_rad_s=settings.amplitude_rad_s,
         offset_rad_s=settings.offset_rad_s, periods=periods_for(hertz, settings.measured_s), rate_hz=settings.rate_hz,
@@ -104,7 +104,7 @@ def sine_run(
 def swept_amplitudes(
     bench: FieldBench, settings: AmplitudeSettings, runs: Sequence[tuple[float, float, float, str]], progress: Progress
 ) -> tuple[tuple[Amplitudes, ...], float]:
-    """Run each (tone, P, I, name), each with a seed of its own; and their simulated seconds."""
+    """Run each (frequency, P, I, name), each with its own seed. Return the amplitudes and the simulated seconds."""
     found, simulated_s = [], 0.0
     for index, (hertz, kp, ki, text) in enumerate(runs):
         wish = sine_run(settings, hertz, kp, ki, settings.seed + index)
@@ -115,7 +115,7 @@ def swept_amplitudes(
 
 
 def excited(recording: Recording) -> Samples:
-    """The samples after settling, of a recording with one segment."""
+    """Return the samples after settling, of a recording with one segment."""
     assert recording.excitation is not None
     (segment,) = recording.excitation.segments
     return usable_samples(recording).between(*excited_window(segment))
@@ -140,9 +140,9 @@ def amplitudes(recording: Recording) -> Amplitudes:
 
 
 def line_slope(recording: Recording) -> float:
-    """The slope at the tone itself, kg·m²: Re T/(jω W) of the Fourier coefficients, averaged over the periods.
+    """Return the slope at the excited frequency, kg·m²: Re T/(jω W) of the Fourier coefficients, mean over the periods.
 
-    What least squares on the scatter tends to where noise in α takes nothing off it.
+    Least squares on the scatter tends to this slope without noise in α.
     """
     assert recording.excitation is not None
     samples = usable_samples(recording)
@@ -153,7 +153,7 @@ def line_slope(recording: Recording) -> float:
 
 
 def scatter(recording: Recording) -> Scatter:
-    """Acceleration as Δω over 0.1 s against the torque's mean over the same 0.1 s; the fit is identification's own."""
+    """Return Δω over 0.1 s against the mean torque of the same 0.1 s, with the line fit of the identification."""
     samples = excited(recording)
     estimate = paper_estimate((samples,))
     assert estimate is not None, "a recorded sine has samples"

@@ -1,4 +1,4 @@
-"""The paper's simulated experiments: tables, figures and sweeps beside what it published."""
+"""The paper's simulated experiments: tables, figures and sweeps beside the published values."""
 
 from tdhil.studies.paper.figures import (
     EffectStudy as EffectStudy, ScatterStudy as ScatterStudy, SignalStudy as SignalStudy,

@@ -1,4 +1,4 @@
-"""Carries a design out: every run simulated, its line fitted, its level means taken."""
+"""Execution of a design: every run is simulated, its line fitted, and the level means computed."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from tdhil.studies.paper.processing import backward_difference, settled_periods,
 from tdhil.studies.study import Progress
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Why the paper's estimate is low: the start from rest, in closed form.
+# Closed form of the error of the paper's estimate, which is low because of the start from standstill.
 #
 # The fit of T_in on α gives, with T_in = Jα + Bω + T_f,
 #
 #     Ĵ − J = B cov(ω, α)/var(α) + cov(T_f, α)/var(α) + a term from sampling.
 #
-# **Viscous.** Over a record 0…T that begins at rest and ends near the offset E, mean(ωα) = ω(T)²/2T and mean ω · mean
-# α ≈ E·E/T, so cov(ω, α) ≈ −E²/(2T): while the speed is still low, the acceleration is large.
+# **Viscous.** Over a record 0…T that begins at standstill and ends near the offset E, mean(ωα) = ω(T)²/2T and mean ω ·
+# mean α ≈ E·E/T, so cov(ω, α) ≈ −E²/(2T): the acceleration is large while the speed is low.
 #
 # **Sampling.** α between two samples belongs to the middle of the interval, T_in to its end: T_in is late by Ts/2,
 # which adds (Ts/2)·J·mean(α dα/dt) = (Ts/2)·J·(α(T)² − α(0)²)/(2T) ≈ −J Ts (Kp E/J)²/(4T), as the first torque is
@@ -35,12 +35,13 @@ from tdhil.studies.study import Progress
 # + B)s + Ki) at s = j2πf. A step to E makes α_tr = E(Kp s + Ki)/(J s² + (Kp + B)s + Ki), and by Parseval (the
 # integral of a second order, (b1² a0 + b0² a2)/(2 a0 a1 a2)) ∫α_tr² dt = E²(Kp² + Ki J)/(2J(Kp + B)).
 #
-# Left out: the bristle, which fills while the shaft starts (a few tenths to 4 kg·m², lower still), and reversals.
-# What remains in steady state is B·Ts/2 (see `processing.torque_line`): whole periods make cov(ω, α) zero.
+# Not included: the bristle, which is deflected during the start (lowers the estimate further, by a few tenths to 4
+# kg·m²), and reversals. In steady state B·Ts/2 remains (see `processing.torque_line`), because cov(ω, α) is zero over
+# whole periods.
 
 
 def closed_form_inertia(run: LoopSettings) -> float | None:
-    """Return approximately what the fit over all samples gives; None for references other than a sine."""
+    """Return the approximate result of the fit over all samples; None for references other than a sine."""
     if run.signal != "sine":
         return None
     inertia, viscous, offset, duration = run.inertia_kg_m2, run.viscous_nm_s_rad, run.offset_rad_s, run.duration_s
@@ -57,18 +58,18 @@ def closed_form_inertia(run: LoopSettings) -> float | None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The paper's simulated runs, identified as this tool does it: whole periods, errors in both signals, no lags.
+# The paper's simulated runs, identified by tdhil: whole periods, errors in both signals, no lags.
 #
-# The paper's fit of T on α finds 0.2 to 1.6 % too little in these very records (`closed_form_inertia` says why).
+# The paper's fit of T on α gives 0.2 to 1.6 % too little for the same records (`closed_form_inertia` gives the reason).
 
 
-_SETTLE = 1      # periods: the loop settles within J/Kp, below a second
+_SETTLE = 1      # periods; the loop settles within J/Kp, below 1 s
 
 
 def recording_of(
     settings: LoopSettings, time_s: FloatArray, speed_rad_s: FloatArray, torque_nm: FloatArray
 ) -> Recording:
-    """A run of the paper's loop as a recording: samples of one instant, unfiltered, lags declared absent."""
+    """Return a run of the paper's loop as a recording: samples of one instant, unfiltered, lags declared absent."""
     period = 1.0 / settings.frequency_hz
     whole = math.floor(float(time_s[-1]) / period + 1e-9)
     segment = Segment(
@@ -109,22 +110,22 @@ class DesignRun:
     factors: dict[str, float]
     settings: LoopSettings
     line: LineFit
-    """The paper's: all samples, start-up included."""
+    """Line of the paper: all samples, including the start."""
     settled: LineFit | None
-    """Whole periods only, the start-up dropped; None where no period is left."""
+    """Line over whole periods only, without the start; None if no period is left."""
     closed_form_kg_m2: float | None
     silent_kg_m2: float | None
-    """The paper's line with no noise at all; only where noise is a factor."""
+    """Line of the paper without any noise; only if noise is a factor."""
     alpha_rad_s2: FloatArray
     torque_nm: FloatArray
-    """Points of the scatter, evenly thinned out."""
+    """Points of the scatter, evenly reduced."""
     identification: Identification | None = None
-    """This tool's own, of the same samples, lags declared absent; None where the motion is no sine."""
+    """Identification by tdhil of the same samples, with lags declared absent; None if the motion is not a sine."""
 
 
 @dataclass(frozen=True)
 class DesignResult:
-    """All runs in array order, and what the factors do."""
+    """All runs in array order, and the effects of the factors."""
 
     runs: tuple[DesignRun, ...]
     effects: tuple[LevelMeans, ...]
@@ -133,17 +134,17 @@ class DesignResult:
 
     @property
     def inertias(self) -> tuple[float, ...]:
-        """J of every run, as the paper identifies it."""
+        """J of every run by the paper's method."""
         return tuple(run.line.inertia_kg_m2 for run in self.runs)
 
     @property
     def ranks(self) -> tuple[int, ...]:
-        """Return the ranks of the factors, 1 for the largest range."""
+        """Ranks of the factors, 1 for the largest range."""
         return ranking([effect.range for effect in self.effects])
 
 
 def run_design(settings: DesignSettings, progress: Callable[[float], None]) -> DesignResult:
-    """Simulates all runs side by side, and each a second time without noise if noise is a factor."""
+    """Simulate all runs together, and a second time without noise if noise is a factor."""
     runs = settings.runs()
     noisy = "noise_power_nm2_s" in {factor.field for factor in settings.factors}
     twins = [changed(run, noise_power_nm2_s=0.0) for run in runs] if noisy else []
@@ -167,7 +168,7 @@ class OverDesign:
         self.settings_model = model
 
     def carried_out(self, settings: DesignSettings, progress: Progress) -> DesignResult:
-        """Every run, with a word on how far they are."""
+        """Run the design, and report the progress."""
         return run_design(settings, lambda share: progress(share, f"{self.name}: {len(settings.rows)} runs"))
 
 

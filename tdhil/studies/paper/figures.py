@@ -1,4 +1,6 @@
-"""Figures 16 and 17: range analysis as main-effect plots, ours and the published level means."""
+"""Figures 11 and 14 to 17: scatter of torque over acceleration, step and sine, and range analysis as main-effect
+plots.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class ScatterStudy(OverDesign):
-    """``figure14`` (the runs of Table 6) and ``figure15`` (of Table 7)."""
+    """Studies ``figure14`` (the runs of Table 6) and ``figure15`` (of Table 7)."""
 
     def run(self, settings: DesignSettings, progress: Progress) -> StudyOutcome:
         result = self.carried_out(settings, progress)
@@ -57,7 +59,7 @@ class ScatterStudy(OverDesign):
 
 def _statements(result: DesignResult) -> tuple[Statement, ...]:
     worst = min(run.line.r2 for run in result.runs)
-    # T_in less Jα has the mean F_c + B·mean speed once it turns: that is what the intercept can be.
+    # the mean of T_in − Jα is F_c + B·mean speed while the shaft turns: the expected intercept
     pairs = [
         (run.line.intercept_nm, run.settings.coulomb_nm + run.settings.viscous_nm_s_rad * run.settings.offset_rad_s)
         for run in result.runs
@@ -76,7 +78,7 @@ def _statements(result: DesignResult) -> tuple[Statement, ...]:
 
 
 def draw_scatter(figure: Figure, result: DesignResult) -> None:
-    """One panel per run: points in blue, the line in red and dashed, its equation above."""
+    """Draw one panel per run: points in blue, the line in red and dashed, its equation above."""
     count = len(result.runs)
     wide = ceil(sqrt(count))
     grid = figure.subplots(ceil(count / wide), wide, squeeze=False)
@@ -106,13 +108,13 @@ def _panel(axes: Axes, number: int, run: DesignRun) -> None:
 # Figure 11: step and sine through the same loop (section 3.4.3).
 #
 # The paper prints a gain of 0.96 for the sine (1 Hz, amplitude 1, offset 2π) and a "steady-state gain" of 1.16 for the
-# step from 2π to 2π + 1 at 0.25 s. No PI loop has a steady-state gain other than 1. Read as (largest speed − 2π)/1 the
-# second is the overshoot, that of the start from rest included, and then both fit one pair out of Table 1: P 15000 and
-# I 9000 give 0.96 and 1.17. These are the defaults of figures 9 to 13.
+# step from 2π to 2π + 1 at 0.25 s. No PI loop has a steady-state gain other than 1. Taken as (largest speed − 2π)/1,
+# the second is the overshoot, including that of the start from standstill. Both values then fit one pair of Table 1: P
+# 15000 and I 9000 give 0.96 and 1.17. These are the defaults of figures 9 to 13.
 
 
 class SignalSettings(LoopSettings):
-    """The step goes from the offset to offset + amplitude at a quarter of the sine's period."""
+    """Settings. The step goes from the offset to offset + amplitude at a quarter of the sine's period."""
 
     signal: Literal["sine"] = "sine"
     duration_s: Positive = 5.0
@@ -126,12 +128,12 @@ class SignalSettings(LoopSettings):
 
     @property
     def period_steps(self) -> int:
-        """Samples in one period."""
+        """Number of samples in one period."""
         return round(1.0 / (self.frequency_hz * self.sample_period_s))
 
 
 class SignalStudy:
-    """Two runs side by side."""
+    """Study of step and sine in two parallel runs."""
 
     name = "figure11"
     title = "Figure 11: step and sine through the same loop"
@@ -205,7 +207,7 @@ def _draw(figure: Figure, record: LoopRecord) -> None:
         time, asked, speed, _ = record.of(number)
         axes.plot(time, asked, color="C3", lw=1.4, ls="--", label="input")
         axes.plot(time, speed, color="0.1", lw=1.3, label="output")
-        axes.set_ylim(asked.min() - 1.2, max(asked.max(), speed.max()) + 0.5)      # the start lies below
+        axes.set_ylim(asked.min() - 1.2, max(asked.max(), speed.max()) + 0.5)      # the start is below this range
         axes.set_ylabel(f"{name}: speed, rad/s")
         axes.grid(alpha=0.3)
         axes.legend(loc="lower right", fontsize=9)
@@ -216,7 +218,7 @@ def _draw(figure: Figure, record: LoopRecord) -> None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 class EffectStudy(OverDesign):
-    """``figure16`` (Table 6) and ``figure17`` (Table 7)."""
+    """Studies ``figure16`` (Table 6) and ``figure17`` (Table 7)."""
 
     def __init__(self, name: str, title: str, model: type[DesignSettings], table: str) -> None:
         super().__init__(name, title, model)
@@ -237,7 +239,7 @@ class EffectStudy(OverDesign):
 
 
 def draw_effects(figure: Figure, settings: DesignSettings, result: DesignResult, paper: PublishedDesign | None) -> None:
-    """Level means side by side, one panel per factor on a common axis, as the paper draws them."""
+    """Draw the level means, one panel per factor on a common axis, as in the paper."""
     panels = figure.subplots(1, len(settings.factors), sharey=True, squeeze=False)[0]
     for index, (axes, factor, effect) in enumerate(zip(panels, settings.factors, result.effects, strict=True)):
         at = range(1, len(effect.means) + 1)
@@ -259,5 +261,5 @@ def draw_effects(figure: Figure, settings: DesignSettings, result: DesignResult,
 
 
 def _short(level: float) -> str:
-    """For a tick: two decimals at most, unless it is a small one."""
+    """Return the text of a tick: two decimals at most, except for a small value."""
     return f"{round(level, 2):g}" if abs(level) >= 0.1 else f"{level:g}"

@@ -1,20 +1,20 @@
-r"""The paper's closed loop (figure 8), all runs at once.
+r"""The paper's closed loop (figure 8), simulated for all runs together.
 
 ::
 
     e = w_r − ω                         T_in = Kp e + Ki ∫e dt          (equations 9 and 10 of section 3.2.2)
     J dω/dt = T_in + d − T_f − B ω      dz/dt = ω (1 − (σ z/F_c) sgn ω), T_f = σ z          (equations 4 and 6)
 
-d is band-limited white torque, held over a sample: a disturbance of the shaft that T_in doesn't contain. Everything
-starts at rest: speed, bristle and integral are zero, so that T_in begins with Kp·w_r(0).
+d is band-limited white torque, held over a sample: a disturbance of the shaft that T_in does not contain. The start is
+at standstill: speed, bristle and integral are zero, so T_in begins with Kp·w_r(0).
 
-The controller is continuous. Over a step h the plant takes one torque, so the step is done twice (Heun's method): with
-the torque of the beginning, which predicts e, and again with the mean of that torque and the predicted one; the
-integral is trapezoidal. Both errors are of order h²: at Kp h/J = 0.017 (15000 N·m·s/rad, 1 ms, 900 kg·m²) about 1e-4 of
-the fastest transient, and at most 0.04 kg·m² in the J of any run of Tables 6 and 7 (a test halves h).
+The controller is continuous. The torque is constant over a step h of the plant, so the step is computed twice (Heun's
+method): with the torque at the beginning, which predicts e, and again with the mean of that torque and the predicted
+one. The integral is trapezoidal. Both errors are of order h²: at Kp h/J = 0.017 (15000 N·m·s/rad, 1 ms, 900 kg·m²)
+about 1e-4 of the fastest transient, and at most 0.04 kg·m² in the J of any run of Tables 6 and 7 (a test halves h).
 
-A sample holds T_in and ω of one instant. The paper's α between two samples (equation 16) is paired with the torque at
-the end of the interval, see `processing`.
+A sample contains T_in and ω of one instant. The paper's α between two samples (equation 16) is paired with the torque
+at the end of the interval, see `processing`.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from profiles import DataModel, Finding, refuse_if
 from sim_bus.plant import LARGEST_BRISTLE_STEP, SPEED, FixedStep, Shafts, white_torque
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What can be set about one run of the paper's closed loop, and the names by which a factor or `--set` calls it.
+# Settings of one run of the paper's closed loop, and their names for factors and `--set`.
 #
-# The defaults are Table 1's where the paper names one value and inferred where it does not: friction and duration from
-# Table 6, P and I from the two gains of section 3.4.3 (see `figures.SignalSettings`). They are consistent with the
-# published figures, not confirmed by them.
+# If Table 1 of the paper gives one value, it is the default. The other defaults are inferred: friction and duration
+# from Table 6, P and I from the two gains of section 3.4.3 (see `figures.SignalSettings`). They are consistent with the
+# published figures, but not confirmed by them.
 
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -44,7 +44,7 @@ NonNegative = Annotated[float, Field(ge=0.0)]
 SamplePeriod = Annotated[float, Field(gt=0.0, le=0.1)]
 
 MAX_SAMPLES = 2_000_000
-_MAX_GAIN = 0.5      # largest share of an error that P may remove in one sample: above it the samples aren't continuous
+_MAX_GAIN = 0.5      # largest share of an error that P may remove in one sample; above it, samples are too coarse
 _SHORTER = "take a shorter sample_period_s"
 
 
@@ -54,9 +54,9 @@ class LoopSettings(DataModel):
     inertia_kg_m2: Positive = 900.0
     viscous_nm_s_rad: NonNegative = 74.3
     coulomb_nm: NonNegative = 82.4
-    """Coulomb torque, the limit of Dahl's bristle (printed as N/m, is N·m)."""
+    """Coulomb torque, the limit of Dahl's bristle, N·m (the paper prints N/m)."""
     dahl_stiffness_nm_rad: Positive = 5000.0
-    """Stiffness of Dahl's bristle (printed as N/m, is N·m/rad)."""
+    """Stiffness of Dahl's bristle, N·m/rad (the paper prints N/m)."""
     friction: Literal["dahl", "coulomb"] = "dahl"
     kp_nm_s_rad: NonNegative = 15000.0
     ki_nm_rad: NonNegative = 9000.0
@@ -67,14 +67,14 @@ class LoopSettings(DataModel):
     chirp_end_hz: Positive = 2.0
     """End frequency of a chirp that begins at `frequency_hz`, Hz."""
     noise_power_nm2_s: NonNegative = 1.0e-4
-    """Spectral density of the torque disturbance, (N·m)²·s (printed as (N·m)²)."""
+    """Spectral density of the torque disturbance, (N·m)²·s (the paper prints (N·m)²)."""
     duration_s: Positive = 10.0
     sample_period_s: SamplePeriod = 0.001
     seed: Annotated[int, Field(ge=0)] = 1
 
     @property
     def steps(self) -> int:
-        """Samples after the first."""
+        """Number of samples after the first."""
         return round(self.duration_s / self.sample_period_s)
 
     @model_validator(mode="after")
@@ -107,7 +107,7 @@ SYMBOLS = {
     "Kp": "kp_nm_s_rad", "Ki": "ki_nm_rad", "f": "frequency_hz", "A": "amplitude_rad_s", "offset": "offset_rad_s",
     "P_noise": "noise_power_nm2_s", "T": "duration_s", "Ts": "sample_period_s",
 }
-"""Short names, as formulas write them; taken by `--set` and by factors."""
+"""Short names, as in formulas, for `--set` and for factors."""
 
 LABELS = {
     "inertia_kg_m2": "J, kg·m²", "viscous_nm_s_rad": "B, N·m·s/rad", "coulomb_nm": "F$_c$, N·m",
@@ -115,16 +115,16 @@ LABELS = {
     "frequency_hz": "f, Hz", "amplitude_rad_s": "amplitude, rad/s", "offset_rad_s": "offset, rad/s",
     "noise_power_nm2_s": "noise, (N·m)²·s",
 }
-"""For the axes of pictures."""
+"""Labels for the axes of plots."""
 
 
 def full_name(name: str) -> str:
-    """A symbol's field, or the name itself."""
+    """Return the field of a symbol, or the name itself."""
     return SYMBOLS.get(name, name)
 
 
 def changed(settings: LoopSettings, **values: object) -> LoopSettings:
-    """One run with some values replaced, checked again; what a subclass adds is left behind."""
+    """Return one run with some values replaced, validated again; fields of a subclass are dropped."""
     kept = {name: getattr(settings, name) for name in LoopSettings.model_fields}
     return LoopSettings.model_validate(kept | values)
 
@@ -137,7 +137,7 @@ FloatArray = NDArray[np.float64]
 
 
 class Reference(Protocol):
-    """A speed for every time; ``period_s`` is None where nothing repeats."""
+    """Reference speed for every time; ``period_s`` is None without a period."""
 
     @property
     def period_s(self) -> float | None: ...
@@ -176,7 +176,7 @@ class StepReference:
 
 @dataclass(frozen=True)
 class ChirpReference:
-    """w(t) = offset + A sin(2π(f0 t + (f1 − f0) t²/(2T))): the frequency goes linearly from f0 to f1 within T."""
+    """w(t) = offset + A sin(2π(f0 t + (f1 − f0) t²/(2T))): the frequency rises linearly from f0 to f1 within T."""
 
     offset_rad_s: float
     amplitude_rad_s: float
@@ -240,7 +240,7 @@ _PROGRESS_STEPS = 500
 
 @dataclass(frozen=True)
 class LoopRecord:
-    """The logged samples: one row per sample (the first at t = 0), one column per run."""
+    """Logged samples: one row per sample (the first at t = 0), one column per run."""
 
     time_s: FloatArray
     reference_rad_s: FloatArray
@@ -249,11 +249,11 @@ class LoopRecord:
 
     @property
     def simulated_s(self) -> float:
-        """Plant time, all runs added up."""
+        """Plant time of all runs together, s."""
         return float(self.time_s[-1].sum())
 
     def of(self, run: int, samples: slice = slice(None)) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """(time, reference, speed, torque) of one run."""
+        """Return (time, reference, speed, torque) of one run."""
         return (
             self.time_s[samples, run], self.reference_rad_s[samples, run], self.speed_rad_s[samples, run],
             self.torque_nm[samples, run],
@@ -265,7 +265,7 @@ def simulate(
     progress: Callable[[float], None] = lambda share: None,
     references: Sequence[Reference] | None = None,
 ) -> LoopRecord:
-    """Simulates ``runs`` side by side; they need the same number of samples, not the same duration.
+    """Simulate ``runs`` together; they need the same number of samples, not the same duration.
 
     The noise comes from the first run's seed.
     """

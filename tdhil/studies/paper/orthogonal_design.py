@@ -1,4 +1,4 @@
-"""Orthogonal designs as a tool: any array, any factors of the rig by name, and the runs that follow from them."""
+"""Orthogonal designs as a tool: any array, any factors of the rig by name, and the resulting runs."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from profiles import DataModel, Finding, parse_model, refuse_if
 from tdhil.studies.paper.loop import FACTORS, SYMBOLS, LoopSettings, changed, full_name
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Orthogonal arrays: those that ship, and the check that any other has to pass.
+# Orthogonal arrays: those in tdhil, and the check for any other.
 #
-# An array is orthogonal (of strength two) if in every pair of columns every pair of levels stands equally often. Then
-# the level means of one factor are free of all others' additive effects, which is all that range analysis asks.
+# An array is orthogonal (of strength two) if in every pair of columns every pair of levels occurs equally often. The
+# level means of one factor are then free of the additive effects of all others, as range analysis requires.
 
 
 Rows = tuple[tuple[int, ...], ...]
@@ -29,7 +29,7 @@ MAX_RUNS = 512
 
 
 class NamedArray(DataModel):
-    """An array that ships with the program."""
+    """Array that is part of the program."""
 
     name: str
     rows: Rows
@@ -41,7 +41,7 @@ class _Arrays(DataModel):
 
 @cache
 def shipped_arrays() -> dict[str, Rows]:
-    """L9, L16."""
+    """Return the arrays in tdhil: L9 and L16."""
     name = "design_arrays.yaml"
     text = files("tdhil.studies.paper").joinpath(name).read_text(encoding="utf-8")
     return {array.name: array.rows for array in parse_model(text, name, _Arrays).arrays}
@@ -86,10 +86,10 @@ def _times(count: int) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Range analysis (equation 17): how much the mean response moves when one factor of an orthogonal array moves.
+# Range analysis (equation 17): change of the mean response with one factor of an orthogonal array.
 #
-# Over the runs of one level of a factor, every other factor takes each of its levels equally often; if effects add up,
-# level means differ by that factor alone. R = largest level mean less smallest.
+# Over the runs with one level of a factor, every other factor has each of its levels equally often. If effects are
+# additive, level means differ only by that factor. R = largest level mean less smallest.
 
 
 FloatArray = NDArray[np.float64]
@@ -98,18 +98,18 @@ RangeRows = Sequence[Sequence[int]]
 
 @dataclass(frozen=True)
 class LevelMeans:
-    """One factor's means, level 1 first."""
+    """Means of one factor, level 1 first."""
 
     means: tuple[float, ...]
 
     @property
     def range(self) -> float:
-        """R of equation 17."""
+        """Range R of equation 17."""
         return max(self.means) - min(self.means)
 
 
 def main_effects(rows: RangeRows, responses: Sequence[float] | FloatArray) -> tuple[LevelMeans, ...]:
-    """For each column of the array, the mean response at each of its levels."""
+    """Return, for each column of the array, the mean response at each of its levels."""
     levels, found = np.asarray(rows), np.asarray(responses, dtype=np.float64)
     return tuple(
         LevelMeans(tuple(float(found[column == level].mean()) for level in np.unique(column))) for column in levels.T
@@ -117,7 +117,7 @@ def main_effects(rows: RangeRows, responses: Sequence[float] | FloatArray) -> tu
 
 
 def ranking(ranges: Sequence[float]) -> tuple[int, ...]:
-    """The rank of each factor, 1 for the largest range; equal ranges rank in their order."""
+    """Return the rank of each factor, 1 for the largest range; equal ranges rank in their order."""
     order = sorted(range(len(ranges)), key=lambda index: -ranges[index])
     ranks = [0] * len(ranges)
     for rank, index in enumerate(order, start=1):
@@ -132,10 +132,10 @@ def is_saturated(rows: RangeRows) -> bool:
 
 
 def runs_from_means(rows: RangeRows, means: Sequence[Sequence[float]]) -> tuple[float, ...]:
-    """The responses whose level means are ``means``: J_run = m + Σ over factors of (mean of its level − m).
+    """Return the responses whose level means are ``means``: J_run = m + Σ over factors of (mean of its level − m).
 
-    With a saturated array effects use up all degrees of freedom, so the sum is no model but the data themselves;
-    m is the grand mean (of the factors' own grand means, which rounding of printed figures lets differ).
+    For a saturated array the effects use all degrees of freedom, so the sum is exact. m is the grand mean: the mean of
+    the factors' own grand means, which differ because the printed figures are rounded.
     """
     if not is_saturated(rows):
         raise ValueError("the array isn't saturated: its level means don't fix the runs")
@@ -148,42 +148,42 @@ def runs_from_means(rows: RangeRows, means: Sequence[Sequence[float]]) -> tuple[
 # ---------------------------------------------------------------------------------------------------------------------
 
 class Factor(DataModel):
-    """One thing that is varied: a field of the settings, or its symbol, and a value for each level of its column."""
+    """Factor: a field of the settings, or its symbol, and a value for each level of its column."""
 
     name: str
     levels: tuple[float, ...]
 
     @property
     def field(self) -> str:
-        """The name in full."""
+        """Full name of the field."""
         return full_name(self.name)
 
 
 class DesignSettings(LoopSettings):
-    """A design: an array (by name, or row by row), its factors in the order of its columns, and what all runs share."""
+    """Design: an array (by name, or row by row), its factors in the order of its columns, and the common settings."""
 
     array: str | Rows = "L9"
     factors: tuple[Factor, ...] = ()
 
     @property
     def varied(self) -> frozenset[str]:
-        """Fields whose value comes from the array."""
+        """Fields whose values come from the array."""
         return frozenset(factor.field for factor in self.factors)
 
     @property
     def rows(self) -> Rows:
-        """The array, only the columns that carry a factor."""
+        """Rows of the array, with only the columns that have a factor."""
         rows = shipped_arrays()[self.array] if isinstance(self.array, str) else self.array
         return tuple(row[: len(self.factors)] for row in rows)
 
     def values(self, run: int) -> dict[str, float]:
-        """The factors of run ``run`` (from 0), by field name."""
+        """Return the factors of run ``run`` (from 0), by field name."""
         return {
             factor.field: factor.levels[level - 1] for factor, level in zip(self.factors, self.rows[run], strict=True)
         }
 
     def runs(self) -> list[LoopSettings]:
-        """Every run in full, in array order."""
+        """Return the settings of every run, in array order."""
         return [changed(self, **self.values(run)) for run in range(len(self.rows))]
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Evaluation of samples: the paper's section 4.3 (α, line, J) and 3.4.1 (amplitude, gain, phase)."""
+"""Evaluation of samples as in the paper's sections 4.3 (α, line, J) and 3.4.1 (amplitude, gain, phase)."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ FloatArray = NDArray[np.float64]
 
 
 def backward_difference(time_s: FloatArray, speed_rad_s: FloatArray) -> FloatArray:
-    """α = (ω1 − ω0)/(t1 − t0) in rad/s² (equation 16): one value less than there are samples."""
+    """Return α = (ω1 − ω0)/(t1 − t0), rad/s² (equation 16): one value less than samples."""
     return np.diff(speed_rad_s) / np.diff(time_s)
 
 
 def torque_line(time_s: FloatArray, speed_rad_s: FloatArray, torque_nm: FloatArray) -> LineFit:
-    """T = Jα + b by least squares (section 4.3): slope J, intercept b = T_c + B·mean speed (the paper: "damping").
+    """Return T = Jα + b by least squares (section 4.3): slope J, intercept b = T_c + B·mean speed (the paper:
+    "damping").
 
-    α belongs to the middle of an interval of Ts, the torque to its end, as a log pairs them. In steady state
-    T(t + Ts/2) ≈ T(t) + (Ts/2)(J dα/dt + B α): dα/dt is uncorrelated with α, and B α adds B·Ts/2 to the slope
-    (0.037 kg·m² at 74.3 N·m·s/rad and 1 ms).
+    α belongs to the middle of an interval Ts, the torque to its end, as in a log. In steady state T(t + Ts/2) ≈ T(t) +
+    (Ts/2)(J dα/dt + B α): dα/dt is uncorrelated with α, and B α adds B·Ts/2 to the slope (0.037 kg·m² at 74.3 N·m·s/rad
+    and 1 ms).
     """
     fit = line_fit(backward_difference(time_s, speed_rad_s), torque_nm[1:])
     if fit is None:
@@ -32,20 +33,22 @@ def torque_line(time_s: FloatArray, speed_rad_s: FloatArray, torque_nm: FloatArr
 
 
 def amplitude(signal: FloatArray) -> float:
-    """Half of largest less smallest value (equation 11)."""
+    """Return half of largest less smallest value (equation 11)."""
     return 0.5 * float(signal.max() - signal.min())
 
 
 def gain(output: FloatArray, given: FloatArray) -> float:
-    """A_out/A_in. Equation 12 prints A_in/A_out; the paper's words and figures (0.96 for a lagging sine) mean this."""
+    """Return A_out/A_in. Equation 12 prints A_in/A_out; the paper's text and figures (0.96 for a lagging sine) mean
+    this.
+    """
     return amplitude(output) / amplitude(given)
 
 
 def rising_zeros(time_s: FloatArray, signal: FloatArray) -> FloatArray:
-    """Times at which the signal's alternating part rises through zero, by linear interpolation.
+    """Return the times at which the signal's alternating part rises through zero, by linear interpolation.
 
-    The alternating part is taken about the middle of largest and smallest value, which a window that isn't a whole
-    number of periods does not move.
+    The alternating part is taken about the middle of largest and smallest value, which does not depend on a whole
+    number of periods.
     """
     swing = signal - 0.5 * float(signal.max() + signal.min())
     before = np.flatnonzero((swing[:-1] < 0.0) & (swing[1:] >= 0.0))
@@ -54,9 +57,9 @@ def rising_zeros(time_s: FloatArray, signal: FloatArray) -> FloatArray:
 
 
 def phase_by_zeros(time_s: FloatArray, output: FloatArray, given: FloatArray, frequency_hz: float) -> float:
-    """φ = 2πf(t_out − t_in) in rad (equation 13): positive where the output lags, in [−π, π); mean over all pairs.
+    """Return φ = 2πf(t_out − t_in), rad (equation 13): positive for a lagging output, in [−π, π); mean over all pairs.
 
-    Each rise of the input is paired with the rise of the output nearest to it; nan where there is none.
+    Each rise of the input is paired with the nearest rise of the output; nan without one.
     """
     starts, ends = rising_zeros(time_s, given), rising_zeros(time_s, output)
     if len(starts) == 0 or len(ends) == 0:
@@ -68,10 +71,10 @@ def phase_by_zeros(time_s: FloatArray, output: FloatArray, given: FloatArray, fr
 
 
 def fundamental(time_s: FloatArray, signal: FloatArray, frequency_hz: float) -> complex:
-    """The coefficient c of Re(c e^{j2πft}) in the signal.
+    """Return the coefficient c of Re(c e^{j2πft}) in the signal.
 
-    Least squares on [1, cos, sin]: over whole periods of evenly spaced samples that is the Fourier coefficient
-    (2/N) Σ x e^{−j2πft}, and it needs neither.
+    Least squares on [1, cos, sin]. For whole periods of evenly spaced samples this equals the Fourier coefficient (2/N)
+    Σ x e^{−j2πft}, but neither is required.
     """
     turn = 2.0 * pi * frequency_hz * time_s
     columns = np.column_stack((np.ones_like(turn), np.cos(turn), np.sin(turn)))
@@ -81,7 +84,7 @@ def fundamental(time_s: FloatArray, signal: FloatArray, frequency_hz: float) -> 
 
 @dataclass(frozen=True)
 class Response:
-    """How the speed follows a sine; lags are positive."""
+    """Response of the speed to a sine; lags are positive."""
 
     amplitude_in_rad_s: float
     amplitude_out_rad_s: float
@@ -94,12 +97,12 @@ class Response:
 
     @property
     def amplitude_difference_rad_s(self) -> float:
-        """A_in − A_out."""
+        """Difference A_in − A_out, rad/s."""
         return self.amplitude_in_rad_s - self.amplitude_out_rad_s
 
 
 def response(time_s: FloatArray, given: FloatArray, output: FloatArray, frequency_hz: float) -> Response:
-    """Equations 11 to 13, and gain and phase of the fundamental beside them."""
+    """Return equations 11 to 13, and gain and phase of the fundamental."""
     ratio = fundamental(time_s, output, frequency_hz) / fundamental(time_s, given, frequency_hz)
     return Response(
         amplitude(given), amplitude(output), gain(output, given),
@@ -109,7 +112,7 @@ def response(time_s: FloatArray, given: FloatArray, output: FloatArray, frequenc
 
 
 def settled_periods(steps: int, sample_period_s: float, period_s: float) -> slice | None:
-    """The last whole periods of a record's second half, samples of both ends included; None if not one fits.
+    """Return the last whole periods of a record's second half, both end samples included; None if no period fits.
 
     The start-up is over by then, and over whole periods speed and acceleration are uncorrelated.
     """

@@ -1,4 +1,4 @@
-"""The paper's printed figures that ours are put beside, and what follows from them alone: its single runs."""
+"""The paper's printed figures for comparison, and the single runs that follow from them."""
 
 from __future__ import annotations
 
@@ -29,36 +29,38 @@ class PublishedDesign(DataModel):
 
     @property
     def as_factors(self) -> tuple[Factor, ...]:
-        """The same factors, as a design wants them."""
+        """Return the same factors in the form that a design uses."""
         return tuple(Factor(name=factor.name, levels=factor.levels) for factor in self.factors)
 
     @property
     def runs_kg_m2(self) -> tuple[float, ...]:
-        """J of every run, which the paper doesn't print: its arrays are saturated, so the level means fix them."""
+        """J of every run, which the paper does not print: its arrays are saturated, so the level means determine
+        them.
+        """
         return runs_from_means(shipped_arrays()[self.array], [factor.mean_inertia_kg_m2 for factor in self.factors])
 
 
 class PublishedGains(DataModel):
-    """Section 3.4.3."""
+    """Gains of section 3.4.3."""
 
     step: float
     sine: float
 
 
 class Published(DataModel):
-    """Everything in published.yaml."""
+    """Content of published.yaml."""
 
     true_inertia_kg_m2: float
     designs: tuple[PublishedDesign, ...]
     gains: PublishedGains
 
     def design(self, study: str) -> PublishedDesign:
-        """Table 6 or Table 7 by the name of its study."""
+        """Return Table 6 or Table 7 by the name of its study."""
         return next(design for design in self.designs if design.study == study)
 
 
 @cache
 def published() -> Published:
-    """The data file beside this module."""
+    """Return the content of the data file beside this module."""
     name = "published.yaml"
     return parse_model(files("tdhil.studies.paper").joinpath(name).read_text(encoding="utf-8"), name, Published)

@@ -1,4 +1,4 @@
-"""The statements of section 3.4 about figures 9, 10, 12 and 13, and whether they hold here."""
+"""Statements of section 3.4 on figures 9, 10, 12 and 13, and whether tdhil confirms them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from tdhil.studies.study import Statement
 
 
 def grows(values: Sequence[float]) -> bool:
-    """Strictly, from each value to the next."""
+    """Return whether each value is larger than the one before."""
     return all(later > earlier for earlier, later in pairwise(values))
 
 
 def falls(values: Sequence[float]) -> bool:
-    """Strictly, from each value to the next."""
+    """Return whether each value is smaller than the one before."""
     return grows([-value for value in values])
 
 
@@ -33,7 +33,7 @@ def _column(points: Sequence[SweepPoint], name: str) -> list[float]:
 
 
 def _lag_moves(points: Sequence[SweepPoint], *, up: bool) -> bool:
-    """Return whether the lag moves in this direction by both ways of measuring."""
+    """Return whether the lag changes in this direction by both methods of measurement."""
     moves = grows if up else falls
     return moves(_column(points, "lag_fundamental_deg")) and moves(_column(points, "lag_zeros_deg"))
 
@@ -43,7 +43,7 @@ def _lags(points: Sequence[SweepPoint]) -> str:
 
 
 def figure9(settings: SweepSettings, points: list[SweepPoint]) -> tuple[Statement, ...]:
-    """Inertia."""
+    """Return the statements on figure 9, over inertia."""
     return (
         Statement(
             "amplitude attenuation grows monotonically with J", "section 3.4.1, figure 9b",
@@ -69,7 +69,7 @@ def figure9(settings: SweepSettings, points: list[SweepPoint]) -> tuple[Statemen
 
 
 def figure10(settings: SweepSettings, points: list[SweepPoint]) -> tuple[Statement, ...]:
-    """Frequency."""
+    """Return the statements on figure 10, over frequency."""
     gains = _column(points, "gain_fundamental")
     peak = gains.index(max(gains))
     inertia, kp, ki, viscous = (
@@ -96,7 +96,7 @@ def figure10(settings: SweepSettings, points: list[SweepPoint]) -> tuple[Stateme
 
 
 def figure12(_settings: SweepSettings, points: list[SweepPoint]) -> tuple[Statement, ...]:
-    """Proportional gain."""
+    """Return the statements on figure 12, over proportional gain."""
     gains = _column(points, "gain")
     return (
         Statement("gain grows with P", "section 3.4.4, figure 12", f"gain {_row(points, 'gain')}", grows(gains)),
@@ -105,7 +105,7 @@ def figure12(_settings: SweepSettings, points: list[SweepPoint]) -> tuple[Statem
 
 
 def figure13(_settings: SweepSettings, points: list[SweepPoint]) -> tuple[Statement, ...]:
-    """Integral gain."""
+    """Return the statements on figure 13, over integral gain."""
     short = [abs(one) for one in _column(points, "amplitude_difference_rad_s")]
     return (
         Statement(

@@ -1,8 +1,8 @@
-"""Figures 9, 10, 12 and 13: one thing is swept, the speed follows the sine more or less well (section 3.4).
+"""Figures 9, 10, 12 and 13: response of the speed to a sine, over one swept parameter (section 3.4).
 
-P and I of these figures aren't printed, and "the parameters are held constant" through 3.4.1 to 3.4.3: the defaults
-are those that give the two gains printed for figure 11 (`figures.SignalSettings`). Amplitude, gain and phase are taken
-over the last whole periods of each record's second half.
+P and I of these figures are not printed, but "the parameters are held constant" in 3.4.1 to 3.4.3: the defaults are
+therefore those that give the two gains printed for figure 11 (`figures.SignalSettings`). Amplitude, gain and phase are
+those of the last whole periods of each record's second half.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The picture of a sweep, as in figures 9, 10, 12 and 13: waveforms, amplitude difference, gain and phase.
+# Plot of a sweep, as in figures 9, 10, 12 and 13: waveforms, amplitude difference, gain and phase.
 
 
 FloatArray = NDArray[np.float64]
@@ -37,7 +37,7 @@ _SHOWN_PERIODS = 2.0
 
 @dataclass(frozen=True)
 class Curve:
-    """The settled part of one run; time in periods, so that frequencies share an axis."""
+    """Settled part of one run; time in periods, so that frequencies share an axis."""
 
     value: float
     periods: FloatArray
@@ -46,7 +46,7 @@ class Curve:
 
 
 def draw_sweep(figure: Figure, swept: str, curves: Sequence[Curve], responses: Sequence[Response]) -> None:
-    """Left the waveforms, the input in red as in the paper; right what is measured on them."""
+    """Draw the waveforms on the left, the input in red as in the paper; on the right the measured values."""
     grid = figure.add_gridspec(3, 2, width_ratios=(1.25, 1.0))
     waves = figure.add_subplot(grid[:, 0])
     shades = _shades(len(curves))
@@ -56,7 +56,7 @@ def draw_sweep(figure: Figure, swept: str, curves: Sequence[Curve], responses: S
     shown = curves[0].periods <= _SHOWN_PERIODS
     waves.plot(curves[0].periods[shown], curves[0].asked_rad_s[shown], color="C3", lw=1.6, ls="--", label="input")
     low, high = waves.get_ylim()
-    waves.set_ylim(low, high + 0.32 * (high - low))      # room for the legend
+    waves.set_ylim(low, high + 0.32 * (high - low))      # space for the legend
     waves.set(xlabel="time, periods", ylabel="speed, rad/s")
     waves.legend(title=LABELS[swept], fontsize=9, title_fontsize=9, ncols=2, loc="upper right")
     waves.grid(alpha=0.3)
@@ -86,7 +86,7 @@ def draw_sweep(figure: Figure, swept: str, curves: Sequence[Curve], responses: S
 
 
 def _shades(count: int) -> list[str]:
-    """The usual colours without red, which is the input's."""
+    """Return the usual colours without red, which is the input's."""
     usable = ("0.1", "C0", "C2", "C1", "C4", "C5", "C6", "C8", "C9")
     return [usable[index % len(usable)] for index in range(count)]
 
@@ -97,7 +97,7 @@ Values = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=24)]
 
 
 class SweepSettings(LoopSettings):
-    """One field takes ``values``; the rest is shared.
+    """Settings of a sweep: one field takes ``values``, all others are common.
 
     ``duration_s`` and ``sample_period_s`` are those of a run at ``frequency_hz``: a run at another frequency gets the
     same number of periods (the paper: ten) and of samples.
@@ -110,11 +110,11 @@ class SweepSettings(LoopSettings):
 
     @property
     def varied(self) -> frozenset[str]:
-        """A frequency that is swept still scales duration and sampling."""
+        """Fields that vary. A swept frequency is not among them, because it still scales duration and sampling."""
         return frozenset({self.swept} - {"frequency_hz"})
 
     def runs(self) -> list[LoopSettings]:
-        """One for each value."""
+        """Return one run for each value."""
         runs = []
         for value in self.values:
             longer = self.frequency_hz / value if self.swept == "frequency_hz" else 1.0
@@ -136,28 +136,28 @@ class SweepSettings(LoopSettings):
 
 
 class InertiaSweep(SweepSettings):
-    """Figure 9; J0 = 900 kg·m², and 0.5, 2 and 3 times as much."""
+    """Settings of figure 9; J0 = 900 kg·m², and 0.5, 2 and 3 times as much."""
 
     swept: ClassVar[str] = "inertia_kg_m2"
     values: Values = (450.0, 900.0, 1800.0, 2700.0)
 
 
 class FrequencySweep(SweepSettings):
-    """Figure 10."""
+    """Settings of figure 10."""
 
     swept: ClassVar[str] = "frequency_hz"
     values: Values = (0.1, 0.2, 0.5, 1.0, 2.0)
 
 
 class KpSweepSettings(SweepSettings):
-    """Figure 12; P of Table 1."""
+    """Settings of figure 12; P of Table 1."""
 
     swept: ClassVar[str] = "kp_nm_s_rad"
     values: Values = (5000.0, 10000.0, 15000.0)
 
 
 class KiSweepSettings(SweepSettings):
-    """Figure 13; I of Table 1."""
+    """Settings of figure 13; I of Table 1."""
 
     swept: ClassVar[str] = "ki_nm_rad"
     values: Values = (1500.0, 3000.0, 6000.0, 9000.0)
@@ -165,7 +165,7 @@ class KiSweepSettings(SweepSettings):
 
 @dataclass(frozen=True)
 class SweepPoint:
-    """One value of what is swept, and how the speed followed."""
+    """One value of the swept parameter, and the response of the speed."""
 
     value: float
     response: Response
@@ -175,7 +175,7 @@ Claims = Callable[[SweepSettings, list[SweepPoint]], tuple[Statement, ...]]
 
 
 class SweepStudy:
-    """One of figures 9, 10, 12, 13."""
+    """Study of one of figures 9, 10, 12, 13."""
 
     def __init__(self, name: str, title: str, model: type[SweepSettings], claims: Claims) -> None:
         self.name = name
@@ -191,7 +191,7 @@ class SweepStudy:
         points, curves = [], []
         for number, run in enumerate(runs):
             window = settled_periods(run.steps, run.sample_period_s, 1.0 / run.frequency_hz)
-            assert window is not None   # the settings were checked for it
+            assert window is not None   # the settings were checked for this
             time, asked, speed, _ = record.of(number, window)
             points.append(SweepPoint(settings.values[number], response(time, asked, speed, run.frequency_hz)))
             curves.append(Curve(settings.values[number], (time - time[0]) * run.frequency_hz, asked, speed))

@@ -1,4 +1,4 @@
-"""The statements of sections 4.4 and 3.4.2 about Tables 6 and 7, and whether they hold here."""
+"""Statements of sections 4.4 and 3.4.2 on Tables 6 and 7, and whether tdhil confirms them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tdhil.studies.paper.published import PublishedDesign
 from tdhil.studies.study import Statement
 
 BOUNDS_KG_M2 = {"table6": 1.1, "table7": 0.5}
-"""Largest RMS over the recovered runs."""
+"""Largest RMS deviation over the recovered runs, kg·m²."""
 
 _OWN_BOUND = 0.001
 
@@ -19,7 +19,7 @@ _OWN_BOUND = 0.001
 def design_statements(
     settings: DesignSettings, result: DesignResult, paper: PublishedDesign | None
 ) -> tuple[Statement, ...]:
-    """Those that any design can be asked; with the published design, those about it as well."""
+    """Return the statements for any design; with the published design, also those on it."""
     cause = (*_cause(result), *_own(result))
     if paper is None:
         return cause
@@ -44,10 +44,11 @@ def _order(ranges: list[float], letters: list[str]) -> str:
 
 
 def ranks_statement(result: DesignResult, paper: PublishedDesign) -> Statement:
-    """Return whether the factors rank as published."""
+    """Return whether the ranks of the factors are as published."""
     letters = [factor.letter for factor in paper.factors]
     theirs, ours = [factor.range_kg_m2 for factor in paper.factors], [effect.range for effect in result.effects]
-    # B and C of Table 6 differ by 0.18 kg·m², less than our runs' own deviation: their order is asked apart.
+    # B and C of Table 6 differ by 0.18 kg·m², less than the deviation of tdhil's runs: their order is a separate
+    # statement
     firm = 3 if paper.study == "table6" else len(letters)
     published_ranks, ranks = ranking(theirs), result.ranks
     same = all(mine == rank for mine, rank in zip(ranks, published_ranks, strict=True) if rank <= firm)
@@ -124,13 +125,13 @@ def _table7(result: DesignResult) -> tuple[Statement, ...]:
 
 
 def tdhil_inertia(run: DesignRun) -> float | None:
-    """J of this tool's own identification; None where it refused."""
+    """Return J of tdhil's own identification; None if it refused."""
     found = run.identification
     return None if found is None or found.inertia is None else found.inertia.value
 
 
 def _own(result: DesignResult) -> tuple[Statement, ...]:
-    """The same samples through `identify`, lags declared absent: error and coverage."""
+    """Return the statements on `identify` with the same samples, lags declared absent: error and coverage."""
     found = [
         (run.identification.inertia, run.settings.inertia_kg_m2)
         for run in result.runs if run.identification is not None and run.identification.inertia is not None
@@ -152,7 +153,9 @@ def _own(result: DesignResult) -> tuple[Statement, ...]:
 
 
 def _cause(result: DesignResult) -> tuple[Statement, ...]:
-    """The paper blames differentiation and friction; drop the start-up and the bias goes, with the same differences."""
+    """Return the statement on the cause. The paper blames differentiation and friction; without the start, the bias
+    disappears with the same differences.
+    """
     pairs = [
         (run.line.inertia_kg_m2 - run.settings.inertia_kg_m2, run.settled.inertia_kg_m2 - run.settings.inertia_kg_m2)
         for run in result.runs if run.settled

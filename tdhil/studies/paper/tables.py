@@ -1,7 +1,7 @@
-"""Tables 6 and 7: an orthogonal design, identified run by run, beside what the paper prints.
+"""Tables 6 and 7: an orthogonal design, identified run by run, beside the paper's figures.
 
-The paper prints level means only; its arrays are saturated, so they fix every run (`published`). Settings it leaves
-open are inferred from those runs: many neighbouring ones do about as well.
+The paper prints only level means. Its arrays are saturated, so the means determine every run (`published`). Settings
+that it does not state are inferred from those runs; many similar values fit nearly as well.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The picture of a design: J of every run, as the paper identifies it and otherwise.
+# Plot of a design: J of every run by the paper's method and by others.
 
 
 def draw_runs(figure: Figure, result: DesignResult, paper: PublishedDesign | None) -> None:
-    """J of every run: as the paper identifies it, published, in closed form, and without the start-up."""
+    """Draw J of every run: by the paper's method, published, in closed form, and without the start."""
     axes = figure.add_subplot()
     numbers = list(range(1, len(result.runs) + 1))
     if paper:
@@ -48,7 +48,9 @@ def draw_runs(figure: Figure, result: DesignResult, paper: PublishedDesign | Non
 # ---------------------------------------------------------------------------------------------------------------------
 
 class Table6Settings(DesignSettings):
-    """L16 over the system parameters. B, F_c, σ and the duration (the paper: 10/f in 3.4.2) are inferred."""
+    """Settings of L16 over the system parameters. B, F_c, σ and the duration (the paper: 10/f in 3.4.2) are
+    inferred.
+    """
 
     duration_s: Positive = 25.0
     array: str | Rows = "L16"
@@ -56,7 +58,7 @@ class Table6Settings(DesignSettings):
 
 
 class Table7Settings(DesignSettings):
-    """L9 over friction and noise. P, I, excitation, duration and sampling are inferred."""
+    """Settings of L9 over friction and noise. P, I, excitation, duration and sampling are inferred."""
 
     kp_nm_s_rad: NonNegative = 2500.0
     ki_nm_rad: NonNegative = 1500.0
@@ -70,7 +72,7 @@ class Table7Settings(DesignSettings):
 
 
 class DesignStudy(OverDesign):
-    """`table6` and `table7`; with an array or factors of one's own, the same without the published columns."""
+    """Studies `table6` and `table7`; with another array or other factors, without the published columns."""
 
     def run(self, settings: DesignSettings, progress: Progress) -> StudyOutcome:
         result = self.carried_out(settings, progress)
@@ -95,13 +97,13 @@ def published_for(name: str, settings: DesignSettings) -> PublishedDesign | None
 
 
 def rms_deviation(result: DesignResult, paper: PublishedDesign) -> float:
-    """Return the RMS deviation of our runs from the recovered published ones, kg·m²."""
+    """Return the RMS deviation of tdhil's runs from the recovered published ones, kg·m²."""
     pairs = zip(result.inertias, paper.runs_kg_m2, strict=True)
     return sqrt(sum((ours - theirs) ** 2 for ours, theirs in pairs) / len(result.runs))
 
 
 def run_table(name: str, result: DesignResult, paper: PublishedDesign | None) -> ResultTable:
-    """One row per run: factors; J as the paper identifies it, of whole periods, by the closed form, by this tool."""
+    """Return one row per run: factors; J by the paper's method, of whole periods, by the closed form, by tdhil."""
     silent = result.runs[0].silent_kg_m2 is not None
     columns = ["run", *result.runs[0].factors, "inertia_kg_m2", "without_start_up_kg_m2", "closed_form_kg_m2"]
     columns.append("tdhil_kg_m2")
@@ -121,7 +123,7 @@ def run_table(name: str, result: DesignResult, paper: PublishedDesign | None) ->
 def effect_table(
     name: str, settings: DesignSettings, result: DesignResult, paper: PublishedDesign | None
 ) -> ResultTable:
-    """One row per factor: level means, range and rank, each with the published one below it in a row of its own."""
+    """Return one row per factor (level means, range, rank), and below it the published values in their own row."""
     most = max(len(effect.means) for effect in result.effects)
     columns = ("factor", "of", *(f"mean_{level}_kg_m2" for level in range(1, most + 1)), "range_kg_m2", "rank")
     theirs = ranking([factor.range_kg_m2 for factor in paper.factors]) if paper else ()
@@ -138,7 +140,7 @@ def effect_table(
 
 
 def effect_document(settings: DesignSettings, result: DesignResult) -> list[dict[str, Any]]:
-    """The factors, for machines."""
+    """Return the factors as plain data."""
     return [
         {
             "name": factor.field, "levels": list(factor.levels), "means_kg_m2": list(effect.means),
@@ -149,7 +151,7 @@ def effect_document(settings: DesignSettings, result: DesignResult) -> list[dict
 
 
 def _own(run: DesignRun) -> dict[str, Any] | None:
-    """Return tdhil's own conclusions, as plain data."""
+    """Return tdhil's own result of a run as plain data."""
     found = run.identification
     if found is None:
         return None

@@ -1,6 +1,6 @@
-"""`tdhil study soft-torque`: what J is for, on one string: controllers, errors of J, stick-slip with and without.
+"""`tdhil study soft-torque`: use of J on one string: controllers, errors of J, and motion with and without stick-slip.
 
-The figures stand beside those of an earlier prototype (a chain of 50 lumps stepped in time; here: exact lines and
+The figures are compared with those of an earlier prototype (a chain of 50 lumps stepped in time; here: exact lines and
 characteristics). Each difference is reported with its reason.
 """
 
@@ -49,7 +49,9 @@ if TYPE_CHECKING:
 
 INERTIA_KG_M2 = 1500.0
 ERRORS = (-0.20, -0.0056, 0.0056, 0.04, 0.126, 0.76)
-"""Errors of the assumed J: −20 %, repeatability, torque scale, the paper's method, the spread of its slopes."""
+"""Relative errors of the assumed J: −20 %, repeatability, torque scale, the paper's method, the spread of its
+slopes.
+"""
 SHARE_ERRORS = (0.0, 0.04, 0.126, 0.76)
 SHORT_LAGS_S = (0.005, 0.002, 0.001)
 IDEAL = "ideal, Z = ζ"
@@ -57,7 +59,7 @@ SPEED_WITHIN_RPM, DAMPING_WITHIN, REFLECTION_WITHIN = 2.0, 0.005, 0.005
 
 
 class SoftTorqueSettings(DataModel):
-    """The reference case's machine, string and bit, and how critical speeds are looked for."""
+    """Machine, string and bit of the reference case, and the search for critical speeds."""
 
     length_m: float = Field(default=3000.0, gt=10.0, le=15_000.0)
     bottom_inertia_kg_m2: float = Field(default=374.0, gt=0.0)
@@ -75,7 +77,7 @@ class SoftTorqueSettings(DataModel):
     beside: bool = Field(default=True, description="also other ramps and beginnings, for what hangs on them")
 
     def string(self) -> DrillString:
-        """5 inch pipe, steel, and the bit."""
+        """Return the string of 5 inch steel pipe, and the bit."""
         section = PipeSection(length_m=self.length_m, outer_diameter_m=0.127, inner_diameter_m=0.1086)
         bottom = BottomEnd(
             inertia_kg_m2=self.bottom_inertia_kg_m2, friction="stribeck", static_nm=self.static_nm,
@@ -85,11 +87,11 @@ class SoftTorqueSettings(DataModel):
         return string_of(StringFile(sections=(section,), bottom=bottom))
 
     def drive(self) -> TopDrive:
-        """The top drive of the reference case."""
+        """Return the top drive of the reference case."""
         return TopDrive(INERTIA_KG_M2, 8.0, 60.0, self.inner_lags_s)
 
     def search(self) -> Search:
-        """How critical speeds are looked for."""
+        """Return the settings of the search for critical speeds."""
         coarse = 8.0 * self.resolution_rpm
         return Search(self.highest_rpm, self.lowest_rpm, coarse, self.resolution_rpm, self.duration_s,
                       min(20.0, 0.3 * self.duration_s), self.start_ramp_rpm_s)
@@ -108,7 +110,7 @@ class PrototypeResult:
 
 @dataclass(frozen=True)
 class ControllerRow:
-    """One controller and what came out."""
+    """One controller and its results."""
 
     name: str
     drive: TopDrive
@@ -119,7 +121,7 @@ class ControllerRow:
     modes_hz: tuple[float, ...]
     critical: CriticalSpeeds | None = None
     linear_rpm: float | None = None
-    """Linear stability limit."""
+    """Linear stability limit, rpm."""
 
 
 EXPECTED: Mapping[str, PrototypeResult] = {
@@ -139,16 +141,16 @@ ERROR_ROWS: Mapping[str, tuple[float | None, ...]] = {
     "a = 0.25, half compensated": (51, 53, 53, 54, 56, None),
     "a = 0.25, 0.65 compensated": (51, 52, 52, None, None, None),
 }
-"""Cure speeds, rpm; None: unstable."""
+"""Cure speeds of the prototype by error of J, rpm; None: unstable."""
 
 SHARE_ROWS: Mapping[str, tuple[float, ...]] = {"33 ms": (0.65, 0.60, 0.55, 0.35), "8 ms": (0.70, 0.65, 0.60, 0.35)}
 
 
 def controllers(settings: SoftTorqueSettings) -> list[ControllerRow]:
-    """The seven of the reference table, with what theory says of them."""
+    """Return the seven controllers of the reference table, with their theoretical values."""
     string, drive = settings.string(), settings.drive()
     held = string_modes_hz(string)
-    paper = 300.0 * INERTIA_KG_M2 / 104.0      # of a rig of 104 kg·m²: the same bandwidth
+    paper = 300.0 * INERTIA_KG_M2 / 104.0      # gain for a rig of 104 kg·m², scaled to the same bandwidth
     laws = dict(zip(EXPECTED, (
         stiff_controller(drive, 60.0),
         SpeedController(paper, paper),
@@ -172,14 +174,14 @@ def controllers(settings: SoftTorqueSettings) -> list[ControllerRow]:
 
 
 class SoftTorqueStudy:
-    """`tdhil study soft-torque`."""
+    """Study `tdhil study soft-torque`."""
 
     name = "soft-torque"
     title = "Soft torque: what J is for, on 3,000 m of 5 inch pipe"
     settings_model = SoftTorqueSettings
 
     def run(self, settings: SoftTorqueSettings, progress: Progress) -> StudyOutcome:
-        """Theory first, then the simulations; the same settings give the same figures."""
+        """Compute the theory first, then the simulations; the same settings give the same figures."""
         begun_s = time.monotonic()
         string, search = settings.string(), settings.search()
         progress(0.0, "poles and reflection")
@@ -214,11 +216,11 @@ SOFT_TORQUE = SoftTorqueStudy()
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What is computed.
+# Computations.
 
 
 def recipes(settings: SoftTorqueSettings) -> dict[str, Callable[[float], SpeedController]]:
-    """Controllers by the J that is believed."""
+    """Return controllers as functions of the assumed J."""
     string, drive = settings.string(), settings.drive()
     mode_hz = string_modes_hz(string)[0]
 
@@ -232,7 +234,7 @@ def recipes(settings: SoftTorqueSettings) -> dict[str, Callable[[float], SpeedCo
 
 
 def cures_by_error(settings: SoftTorqueSettings) -> dict[str, tuple[float | None, ...]]:
-    """Cure speed, rpm, by recipe and error of J; None: unstable. Above the highest speed tried it is infinite."""
+    """Return the cure speed, rpm, by recipe and error of J; None: unstable. Infinite above the highest speed tried."""
     string, drive = settings.string(), settings.drive()
     laws = {(name, error): recipe((1.0 + error) * INERTIA_KG_M2)
             for name, recipe in recipes(settings).items() for error in ERRORS}
@@ -243,7 +245,7 @@ def cures_by_error(settings: SoftTorqueSettings) -> dict[str, tuple[float | None
 
 
 def largest_shares(settings: SoftTorqueSettings, lags_s: tuple[float, ...]) -> tuple[float, ...]:
-    """Largest stable share of the believed J, in steps of 0.05, a = 0.25, for `SHARE_ERRORS`."""
+    """Return the largest stable share of the assumed J, in steps of 0.05, a = 0.25, for `SHARE_ERRORS`."""
     string = settings.string()
     mode_hz = string_modes_hz(string)
     shares = []
@@ -257,7 +259,7 @@ def largest_shares(settings: SoftTorqueSettings, lags_s: tuple[float, ...]) -> t
 
 
 def start_by_ramp(rows: Sequence[ControllerRow], settings: SoftTorqueSettings) -> ResultTable:
-    """Start speed by the ramp."""
+    """Return the table of start speeds with a ramp."""
     ramps = (3.0, 4.0, 5.0, 10.0)
     loops = [(row.drive, row.law) for row in rows]
     string, search = settings.string(), settings.search()
@@ -267,7 +269,7 @@ def start_by_ramp(rows: Sequence[ControllerRow], settings: SoftTorqueSettings) -
 
 
 def stick_slip(rows: Sequence[ControllerRow], settings: SoftTorqueSettings) -> tuple[tuple[str, ...], SimulationTrace]:
-    """Bit and top under three of them, from a stuck bit."""
+    """Return the motion of bit and top with three controllers, from a stuck bit."""
     taken = (rows[0], rows[1], rows[3])
     target = np.full((len(taken), 1), settings.shown_at_rpm * RPM)
     trace = simulate(settings.string(), [(row.drive, row.law) for row in taken], Begin("stuck", target), target, 1.0,
@@ -280,7 +282,7 @@ def stick_slip(rows: Sequence[ControllerRow], settings: SoftTorqueSettings) -> t
 
 
 def controller_table(rows: Sequence[ControllerRow]) -> ResultTable:
-    """The reference table."""
+    """Return the reference table."""
     def cells(row: ControllerRow) -> tuple[Cell, ...]:
         speeds = row.critical
         return (row.name, row.law.gain_nm_s_rad, row.law.integral_nm_rad, row.law.compensated_kg_m2, row.reflection,
@@ -291,7 +293,7 @@ def controller_table(rows: Sequence[ControllerRow]) -> ResultTable:
 
 
 def modes_table(rows: Sequence[ControllerRow]) -> ResultTable:
-    """Each of the lowest modes."""
+    """Return the table of the lowest modes."""
     cells: list[tuple[Cell, ...]] = []
     for row in rows:
         cells += [(row.name, row.dampings[k], row.expected.dampings[k] if k < len(row.expected.dampings) else None)
@@ -300,7 +302,7 @@ def modes_table(rows: Sequence[ControllerRow]) -> ResultTable:
 
 
 def error_table(errors: Mapping[str, Sequence[float | None]]) -> ResultTable:
-    """Cure speeds by errors of J."""
+    """Return the table of cure speeds by error of J."""
     names = tuple(f"J_{100 * error:+.3g}_%" for error in ERRORS)
     rows: tuple[tuple[Cell, ...], ...] = tuple(
         (name, *("unstable" if one is None else one for one in row)) for name, row in errors.items())
@@ -315,7 +317,7 @@ def share_table(shares: Mapping[str, Sequence[float]]) -> ResultTable:
 
 
 def controller_statements(rows: Sequence[ControllerRow]) -> list[Statement]:
-    """Two a controller: what theory says, and what the simulation does."""
+    """Return two statements for each controller: theory and simulation."""
     found = []
     for row in rows:
         expected = row.expected
@@ -352,7 +354,7 @@ def _speeds(row: ControllerRow, critical: CriticalSpeeds) -> Statement:
 
 
 def error_statements(errors: Mapping[str, Sequence[float | None]]) -> list[Statement]:
-    """One a recipe."""
+    """Return one statement for each recipe."""
     found = []
     for name, row in errors.items():
         expected = ERROR_ROWS[name]
@@ -365,7 +367,7 @@ def error_statements(errors: Mapping[str, Sequence[float | None]]) -> list[State
 
 
 def share_statements(shares: Mapping[str, Sequence[float]]) -> list[Statement]:
-    """One for each lag."""
+    """Return one statement for each lag."""
     return [
         Statement(f"largest stable share of J with {name} of inner lag, J wrong by 0, +4, +12.6, +76 %",
                   _list(SHARE_ROWS[name], 2), _list(row, 2),
@@ -383,7 +385,7 @@ def _cures(values: Sequence[float | None]) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The picture.
+# Plot of the study.
 
 
 def draw(
@@ -391,7 +393,7 @@ def draw(
     settings: SoftTorqueSettings,
     figure: Figure,
 ) -> None:
-    """|r(f)| of all, then bit and top in time."""
+    """Draw |r(f)| of all controllers, then bit and top over time."""
     names, trace = shown
     every: Any = figure.subplots(1 + len(names), 1, height_ratios=(1.4, *[1.0] * len(names)))
     hertz = np.geomspace(0.02, 2.0, 300)
