@@ -15,11 +15,12 @@ from profiles.modbus import Bits, Control, StatusState
 STILL_S = 0.2
 LEAST_SAMPLES = 5
 MOST_GAPS = 2
-"""Lost replies in a row that do not reset the detection: a shaft can't start and stop meanwhile."""
+"""Number of successive lost replies that do not reset the detection. A shaft can't start and stop within this time."""
 COUNTS, SHARE = 5, 0.005
 """Limit of each sample: this number of counts, or this share of the speed limit if that is more."""
 MEAN_COUNTS, MEAN_SHARE = 1, 0.001
-"""Limit of the mean: noise averages out, a creeping shaft does not."""
+"""Limit of the mean: number of counts, or share of the speed limit. The mean of noise is small; that of a creeping
+shaft is not."""
 
 
 class ZeroSpeed:

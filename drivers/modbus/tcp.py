@@ -56,7 +56,7 @@ class TcpLink:
         self._buffer = b""
         self._transaction = 0
         self._renew = False
-        self._opening: socket.socket | None = None      # anew, and not open yet
+        self._opening: socket.socket | None = None      # a new connection that is not open yet
         self._renewed_s: deque[float] = deque(maxlen=MOST_RENEWED)
         self._family, self._peer = socket.AF_INET, ()
         try:
@@ -72,7 +72,7 @@ class TcpLink:
         if self._socket is None:
             self._lost("the connection is gone")
         while self._untaken():
-            # The other end has not acknowledged the request before: another one would only queue behind it.
+            # The peer has not acknowledged the previous request. Another request would only wait behind it.
             if self.clock.now_s() >= deadline_s:
                 raise self._silent(timeout_s, "the connection takes nothing: half open, or the cable is out")
             self._read(0.005)

@@ -19,8 +19,8 @@ LEAST_CYCLES = 5
 """The watchdog must not trip because of one or two lost replies."""
 MEASURED_ROUNDS = 20
 CARRIES, MARGIN = 1.02, 1.1
-"""The line carries a period that is longer than its slowest usual round by the first factor. If it does not carry the
-requested rate, the period is longer by the second."""
+"""Factors for the period. The line carries a period that is longer than its slowest usual round by the first factor. If
+it does not carry the requested rate, the period is longer than that round by the second factor."""
 COUNT_S, COUNT_EVERY_S = 3.0, 0.2
 """Time of counting other clients' requests, s, and longest interval between two readings, s."""
 LEAST_TIMEOUT_S = 0.05
