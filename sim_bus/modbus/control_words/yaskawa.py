@@ -23,7 +23,7 @@ class YaskawaWords(StartStop):
     def obey(self, before: int, word: int) -> None:
         self.select(word)
         self.reversed = bool(word & 2)
-        if word & ~before & 8 and not word & 3:      # no reset while a run command stands
+        if word & ~before & 8 and not word & 3:      # no reset during a run command
             self.reset()
         if word & 4:
             self.application.fault()
@@ -33,7 +33,7 @@ class YaskawaWords(StartStop):
             self.ramp_stop()
 
     def ramp_stop(self) -> None:
-        # One deceleration for all stops: the quick stop's.
+        # One deceleration for all stops: that of the quick stop.
         self.application.settings.decel_rad_s2 = self.application.settings.quick_stop_rad_s2
         super().ramp_stop()
 
