@@ -17,7 +17,7 @@ NonNegative = Annotated[float, Field(ge=0.0)]
 
 
 class Validated(BaseModel):
-    """A frozen parameter set; a unit stands in every field name."""
+    """A frozen parameter set; field names include the unit."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 

@@ -364,7 +364,7 @@ def _conversions(tree: Tree, path: KeyPath) -> list[Conversion]:
     try:
         value = quantities.read(written, unit)
     except ValueError:
-        return []      # the message of the validation says why
+        return []      # the message of the validation states the reason
     return [_put(tree, path, path, written.strip(), value, unit)]
 
 

@@ -204,7 +204,7 @@ class Application:
         self._slow_for_s = 0.0
         self._in_window_s = 0.0
 
-    # -- what is asked of it ------------------------------------------------------------------------------
+    # -- requests -----------------------------------------------------------------------------------------
 
     def write_controlword(self, word: int) -> None:
         """Take 6040h: a state command, fault reset on the rising edge of bit 7, halt in bit 8."""
@@ -273,7 +273,7 @@ class Application:
         self._enter(State.SWITCH_ON_DISABLED)
         self.inverter.control.off()
 
-    # -- what it says ------------------------------------------------------------------------------------
+    # -- state -------------------------------------------------------------------------------------------
 
     @property
     def first_mode(self) -> OperationMode:

@@ -143,7 +143,7 @@ class Cia402Bus(ABC):
 
     @abstractmethod
     def listen_until(self, tick_s: float) -> None:
-        """Wait until this control time, s, and handle what comes meanwhile."""
+        """Wait until this control time, s, and handle incoming frames meanwhile."""
 
     @abstractmethod
     def begin(self, try_again: bool) -> float:

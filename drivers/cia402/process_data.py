@@ -1,4 +1,4 @@
-"""Process data of a CiA 402 drive: its objects, their units, the pure codec between counts and SI, and what is cyclic.
+"""Process data of a CiA 402 drive: its objects, their units, the pure codec between counts and SI, the cyclic objects.
 
 - A drive without torque mode receives only 6040h and 60FFh.
 - In velocity mode (vl, 2) the speed setpoint is 6042h and the reported speed 6044h, 16 bits each.

@@ -214,7 +214,9 @@ class EthercatBus(cia402.Cia402Bus):
         return self.clock.now_s()
 
     def send(self, setpoints: cia402.CycleSetpoints) -> None:
-        """Send the process data. Outside of OP the drive takes none: then the controlword goes by SDO too, to stop."""
+        """Send the process data. Outside of OP the drive ignores them: then the controlword is also sent by SDO, to
+        stop.
+        """
         self.ticks.check()
         self._setpoints.pack(setpoints)
         self._transmit()
@@ -328,7 +330,9 @@ class EthercatBus(cia402.Cia402Bus):
             self._asked = round(MAILBOX_S / self.period_s) + 1
 
     def put(self, index: int, sub: int, data: bytes) -> None:
-        """Send a write request without waiting. The controlword also goes into the process data, which replace it."""
+        """Send a write request without waiting. The controlword is also set in the process data, which would overwrite
+        it.
+        """
         if (index, sub) == (0x6040, 0):
             self._setpoints.stop(int.from_bytes(data, "little"))
         with suppress(CommunicationLost, ObjectRefused):

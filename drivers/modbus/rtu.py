@@ -127,7 +127,7 @@ class RtuLink:
         deadline_s = sent_s + timeout_s
         try:
             self._port.write(self._framer.encode(pdu, unit, 0))
-        except Exception as error:      # pyserial passes on what the driver below it raises
+        except Exception as error:      # any type of error, from pyserial or the driver below it
             raise self._gone(str(error)) from error
         try:
             reply = self._await(unit, pdu, deadline_s)

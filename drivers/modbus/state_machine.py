@@ -85,7 +85,7 @@ def decode_after(control: Control, status: int) -> StatusState | None:
     """Return the state of a drive that has been enabled: from then on 0000h is not a state either.
 
     In each family some bit is set in any state of such a drive (remote, no coast stop, ready). In the CiA 402 family
-    the drive has left not ready to switch on for good, whatever the other bits of the word are.
+    the drive can't return to not ready to switch on, for any value of the word's other bits.
     """
     state = decode(control, status)
     over = state is not None and control.family == "cia402" and state.means == "not_ready"

@@ -196,7 +196,7 @@ def _write(
 def is_off(access: RegisterAccess, parameter: Parameter, told: Mapping[str, float]) -> bool:
     """Return whether the time-out is 0, which switches it off, or the drive refuses to report it.
 
-    ``told``: values by name, for a time-out without a register: a 0 that rig.yaml states.
+    ``told``: values by name, for a time-out without a register, such as a 0 in rig.yaml.
     """
     return told.get(parameter.name) == 0.0 if parameter.register_ is None else not counts_of(access, parameter)
 

@@ -219,7 +219,7 @@ class ParameterStore:
         times = None if parameter.set_to in {"quick_stop_time", "ramp_up_time"} else parameter.times
         return self.scale(parameter.per_lsb, parameter.unit, times)
 
-    # -- what they mean ------------------------------------------------------------------------------------
+    # -- meaning -------------------------------------------------------------------------------------------
 
     @property
     def rated_torque_nm(self) -> float:

@@ -98,7 +98,7 @@ class Map:
         if cycle.torque_setpoint is not None:
             application.target_torque_nm = self._to_si(cycle.torque_setpoint, self._torque_counts)
 
-    # -- what stands in the registers ----------------------------------------------------------------------
+    # -- content of the registers --------------------------------------------------------------------------
 
     def _cycle(self) -> list[Slot]:
         cycle, words, application = self._profile.cycle, self._words, self._application

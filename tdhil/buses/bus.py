@@ -259,7 +259,7 @@ class Bus:
 
     # The page of a profile.
     profile_facts: Callable[[Any], Sequence[tuple[str, str]]] = _no_facts
-    """Return (name, text) of the facts that stand at the top of a profile's page."""
+    """Return (name, text) of the facts at the top of a profile's page."""
     profile_tables: Callable[[Any], Iterable[ProfileTable]] = _no_tables
     """Return the tables of objects or registers."""
     profile_sections: tuple[str, ...] | None = None

@@ -159,7 +159,7 @@ SIMULATOR_STARTS_S = 30.0
 
 @contextmanager
 def _simulated(plan: PeerPlan, trace: Path | None) -> Iterator[str]:
-    """Yield the host's end of the pair. Raises SimulatorUnusable where the system does not permit it."""
+    """Yield the host's end of the pair. Raises SimulatorUnusable if the system does not permit it."""
     import multiprocessing
     import os
 

@@ -116,7 +116,7 @@ def confirm_speed(
 
 
 def require_terminal(what: str) -> None:
-    """Raise PreflightRefused (exit 4) where no operator can confirm ``what`` at a terminal."""
+    """Raise PreflightRefused (exit 4) if no operator can confirm ``what`` at a terminal."""
     if sys.stdin is None or not sys.stdin.isatty():
         raise PreflightRefused(f"no operator can confirm {what}", where="no terminal",
                                next_step="Run it at a terminal. --yes does not answer this question",

@@ -19,7 +19,7 @@ from tdhil.runner import ExcitationRequest, MachineLimits
 
 
 TORQUE_SHARE, PROBE_SHARE = 0.5, 0.25
-"""Shares of the simulated drive's torque limit. This limit also stands for the make-up torque of the joints."""
+"""Shares of the simulated drive's torque limit. This limit also replaces the make-up torque of the joints."""
 TIME_S = 1800.0
 QUICK_STOP_RAD_S2 = 1.0
 RAMP_S = 40.0
@@ -58,7 +58,7 @@ def suited(rig: Rig | None, plant: Any) -> Rig | None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 ASSUMED_TORQUE_SCALE_REL_SD = 0.03
-"""Assumed standard uncertainty of a real drive's torque scale if none is stated: inverters know it to some percent."""
+"""Assumed standard uncertainty of a real drive's torque scale if none is stated: inverters know it to a few percent."""
 
 UNKNOWN_LAG_SD_SHARE = 0.1
 """Standard deviation, as a share, of a lag that is stated without one."""
