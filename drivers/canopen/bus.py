@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 # Offset between the time stamps of the frames and control time. It is a diagnostic only: no timing depends on it.
 #
 # SocketCAN stamps frames with the wall clock, which may be set during a run. The time of a sample is the control time
-# of its SYNC, and its age is control time too, so a jump of the wall clock does not affect them. Jumps are counted
-# because they matter when a candump is compared with the log.
+# of its SYNC. Its age is control time too. So a jump of the wall clock does not affect them. Jumps are counted because
+# they matter when a candump is compared with the log.
 
 
 WINDOW_S: Final = 0.5

@@ -2,8 +2,8 @@
 
 It is written as an object (6040h, bit 2 low), which needs no mapping and no cycle. If the quick stop of the drive is
 set to coast (605Ah = 0), another option is written first; if the drive refuses it, the halt bit is used. In torque mode
-the drive gets speed mode at zero first, as in a run, unless the profile states that its quick stop decelerates in
-torque mode. Otherwise the quick stop could release a turning shaft.
+the drive gets speed mode at zero first, as in a run. Otherwise the quick stop could release a turning shaft. This step
+is left out if the profile states that the quick stop decelerates in torque mode.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Modbus over TCP: one socket, one request at a time, checked transaction ids.
 
-pymodbus makes the frames. Its synchronous client is not used: it reconnects by itself before a request, which an
-enabled drive must not see, reports a foreign transaction id as silence, and takes up to twice its time-out
-(`ModbusBaseSyncClient.execute`, `TransactionManager.sync_get_response`, 3.16).
+pymodbus makes the frames. Its synchronous client is not used, for three reasons. It reconnects by itself before a
+request, which an enabled drive must not see. It reports a foreign transaction id as silence. It takes up to twice its
+time-out (`ModbusBaseSyncClient.execute`, `TransactionManager.sync_get_response`, 3.16).
 
 TCP must not deliver old data to the drive. So requests are not queued behind a dead connection, and closing discards
 the queue: no old setpoint arrives when the cable is connected again.

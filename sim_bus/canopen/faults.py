@@ -1,8 +1,8 @@
 """Scripted faults of one simulated drive: each fault begins and ends on time, and frames pass through active faults.
 
 All times are plant time: in stepped time a script repeats to the last frame. If a SYNC to the drive is lost in stepped
-time, time still advances, and the host is informed of the end of each cycle (`profiles.simulator_marker.CYCLE_ID`),
-from the first cycle on. So a frame that a fault adds after the feedback still belongs to its cycle.
+time, time still advances. From the first cycle on, the host is informed of the end of each cycle
+(`profiles.simulator_marker.CYCLE_ID`). So a frame that a fault adds after the feedback still belongs to its cycle.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The loop that owns the bus: it takes frames and advances plant time. The same loop in a thread, for one process.
 
 In stepped time only the SYNC advances time, unless the host is silent. The host counts as silent after ``silence_s`` of
-wall time without a frame while the simulator itself was awake, or at once if the bus reports its end. Then the
-simulator continues in its own time, so that the drive's watchdog acts and the shaft comes to standstill. New frames
-return it to stepped time. Before the first SYNC time stands still.
+wall time without a frame while the simulator itself was awake. It also counts as silent at once if the bus reports its
+end. Then the simulator continues in its own time, so that the drive's watchdog acts and the shaft comes to standstill.
+New frames return it to stepped time. Before the first SYNC time stands still.
 """
 
 import math
