@@ -1,4 +1,4 @@
-"""Talks to drives; knows nothing of tests, logs or estimation."""
+"""Drives and their buses. This room knows nothing of tests, logs or estimation."""
 
 from typing import TYPE_CHECKING
 

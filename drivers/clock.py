@@ -52,7 +52,7 @@ class MonotonicClock:
 
 
 class SteppedClock:
-    """Advances only on request: a wait returns at once, exactly at the requested time."""
+    """Clock that advances only on request: a wait returns at once, exactly at the requested time."""
 
     stepped = True
 

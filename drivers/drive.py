@@ -70,8 +70,8 @@ class Sample(NamedTuple):
     feedback: the values are then those of the cycle before.
 
     ``position_rad`` is the motor shaft's angle at ``time_s``, counted by the drive apart from its speed, and unwrapped
-    since the first reading (`drivers.angle`). None where the cycle brought none. In a sample that was polled for
-    (`Polled`) it was read right behind the rest.
+    since the first reading (`drivers.angle`). It is None if the cycle brought no angle. In a polled sample (`Polled`)
+    the angle is read directly after the other values.
     """
 
     time_s: float
@@ -142,7 +142,7 @@ class Outcome(Enum):
     """Result of a preflight check."""
 
     OK = "ok"
-    NOTE = "note"                  # worth a line, no obstacle
+    NOTE = "note"                  # reported, but no obstacle
     REFUSED = "refused"
 
 
@@ -291,7 +291,7 @@ class RemovesTorque(Protocol):
 
 @runtime_checkable
 class KeptAlive(Protocol):
-    """A drive whose peer, in stepped time, needs a sign of life during long computations; no time passes by it."""
+    """A drive whose peer, in stepped time, needs a sign of life during long computations. It does not advance time."""
 
     def keep_alive(self) -> None: ...
 

@@ -11,8 +11,8 @@
     │   ├── ModeNotConfirmed        6061h did not follow 6060h in time
     │   └── ReportsContradict       the reported speed fell by 4 rad/s while the reported torque accelerates the shaft
     ├── LimitHit                    speed left its window; torque or time limit reached
-    ├── StopNotConfirmed            the shaft was not seen at rest after the stop sequence
-    └── CommandRejected             a NaN or out-of-range setpoint; never reached the bus
+    ├── StopNotConfirmed            no standstill was detected after the stop sequence
+    └── CommandRejected             a NaN or out-of-range setpoint; it never reached the bus
 
 Errors of a single bus are leaves of these (`drivers.modbus.pdu`). `tdhil.errors` assigns the exit codes.
 """
@@ -42,7 +42,7 @@ class PreflightRefused(TdhilError):
 
 
 class ObjectRefused(PreflightRefused):
-    """The drive aborted the transfer of an object; objects are read and written before the shaft moves only."""
+    """The drive aborted the transfer of an object. Objects are read and written only before the shaft moves."""
 
     entry = MessageCode.OBJECT_REFUSED
 

@@ -1,8 +1,8 @@
 """The drive's own limits stay as tight as they were found, unless the operator accepts a wider one by name.
 
-They were set for the motor, the gear, or an earlier test; and a host that dies leaves its own values. So a torque or
-speed limit is lowered to rig.yaml's and never raised, and a quick-stop ramp is made steeper and never gentler. If the
-drive is tighter, its limit stays and the run keeps within it (`Preflight.kept_torque_nm`,
+These limits were set for the motor, the gear, or an earlier test; and a host that dies leaves its own values. So a
+torque or speed limit is lowered to rig.yaml's and never raised, and a quick-stop ramp is made steeper and never
+gentler. If the drive is tighter, its limit stays and the run keeps within it (`Preflight.kept_torque_nm`,
 `Preflight.kept_speed_rad_s`); a quick stop that brakes harder stays too.
 
 This also holds for a simulated drive, whose factory limits are wide.
@@ -23,7 +23,7 @@ _SLACK = 1e-6
 
 
 class OwnLimits:
-    """Decides limit by limit. ``kept``: the tightest limit that stayed, by name, N·m, rad/s or rad/s²."""
+    """Decision for each limit. ``kept``: the tightest limit that stayed, by name, N·m, rad/s or rad/s²."""
 
     def __init__(self, accepted: Collection[str]) -> None:
         self._accepted = frozenset(accepted)

@@ -124,7 +124,7 @@ class StopState(Enum):
 
 @dataclass(frozen=True)
 class StopRound:
-    """One round. ``seen``: None after an error. ``heard``: the drive replied, if only with an error."""
+    """One round. ``seen``: None after an error. ``heard``: the drive replied, also if only with an error."""
 
     time_s: float
     seen: Seen | None

@@ -33,7 +33,7 @@ class Change:
 
     @property
     def text(self) -> str:
-        """Text for people: 6072h was left at 400, and was 100 before."""
+        """Text for messages: 6072h was left at 400, and was 100 before."""
         now, then = (int.from_bytes(data, "little") for data in (self.after, self.before))
         return f"{self.where} was left at {now}, and was {then} before"
 
@@ -71,7 +71,7 @@ class UndoJournal:
     def given_back(self, where: str) -> None:
         """Clear a setting that was restored, or changed by another tool."""
         if self._path is not None and self._entries.pop(where, None) is not None:
-            with suppress(PreflightRefused):       # too much in the file does no harm: it is compared with the drive
+            with suppress(PreflightRefused):       # a surplus entry does no harm: it is compared with the drive
                 self._save()
 
     def _save(self) -> None:

@@ -1,4 +1,4 @@
-"""Drive profiles as data: the schema, a strict YAML loader, and what ships."""
+"""Drive profiles as data: the schemas, a strict YAML loader, and the profiles that tdhil contains."""
 
 from typing import TYPE_CHECKING
 

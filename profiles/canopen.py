@@ -1,4 +1,4 @@
-"""Schema of a CANopen drive's profile: what CiA 402 says on any bus, and what is particular to CANopen.
+"""Schema of a CANopen drive's profile: entries of CiA 402, which apply to any bus, and entries of CANopen.
 
 Data only. Each section carries its ``source`` and its ``confidence``, because a profile is only as good as its sources.
 """
@@ -33,13 +33,13 @@ class Watchdog(HostWatchdog):
     """Means that stops the drive when the host is silent."""
 
     kind: Literal["heartbeat", "node_guarding", "none"] = Field(
-        description="heartbeat: the drive watches the host's heartbeat; node_guarding: it watches the host's questions "
-        "(100Ch guard time x 100Dh life time factor)"
+        description="heartbeat: the drive supervises the host's heartbeat; node_guarding: it supervises the host's "
+        "requests (100Ch guard time x 100Dh life time factor)"
     )
     consumer_index: Index = Field(default=0x1016, description="object with the host's node number and the time in ms")
     consumer_sub: SubIndex = Field(default=1, description="its sub-index")
     life_time_factor: int = Field(
-        default=4, ge=2, le=255, description="node guarding: so many questions may fail to come (100Dh)"
+        default=4, ge=2, le=255, description="node guarding: number of requests that may be missing (100Dh)"
     )
 
 

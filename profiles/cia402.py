@@ -1,7 +1,7 @@
-"""Schema of what is known of a CiA 402 drive on any bus: its objects, their units, and the confidence in each entry.
+"""Schema of a CiA 402 drive on any bus: its objects, their units, and the confidence in each entry.
 
-Data only. Scalings are "so many <unit> for one count"; None means that the drive does not have the object. Each section
-carries its ``source`` and its ``confidence``, because a profile is only as good as its sources.
+Data only. A scaling is the number of units for one count; None means that the drive does not have the object. Each
+section carries its ``source`` and its ``confidence``, because a profile is only as good as its sources.
 """
 
 from typing import Annotated, Literal, Self
@@ -14,7 +14,7 @@ from profiles.model import DataModel, Finding, refuse_if
 # ---------------------------------------------------------------------------------------------------------------------
 # Settings of a drive beyond CiA 402's own objects: read, required, written, or used as a scale.
 #
-# The words are those of `profiles.modbus.Parameter`. A value in its unit is
+# Parameters have the same keys as `profiles.modbus.Parameter`. A value in its unit is
 #
 #     raw x per_lsb [x value of the parameter named in ``times``]        scale: linear
 #     2^raw                                                              scale: power_of_two
@@ -58,7 +58,7 @@ class Parameter(ProfileEntry):
         "the speed of the parameter in `from_speed` down to zero",
     )
     from_speed: Name | None = Field(default=None, description="for quick_stop_time: the speed that the ramp begins at")
-    advice: str | None = Field(default=None, description="what to do at the drive where it reads wrong")
+    advice: str | None = Field(default=None, description="what to do at the drive if the value is wrong")
 
     @model_validator(mode="after")
     def _one_use(self) -> Self:
@@ -78,7 +78,7 @@ class Parameter(ProfileEntry):
 # ---------------------------------------------------------------------------------------------------------------------
 # The sections of a profile: identity, modes, quick stop, speed, torque, watchdog, filters, cycle.
 #
-# Scalings are "so many <unit> for one count"; None says that the drive does not have the object.
+# A scaling is the number of units for one count; None means that the drive does not have the object.
 
 
 U32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
@@ -97,8 +97,8 @@ class IdentityEntry(ProfileEntry):
 class Modes(ProfileEntry):
     """Modes of operation (6060h) in order of preference; the drive's 6502h decides which of them it gets."""
 
-    speed: tuple[I8, ...] = Field(min_length=1, description="modes that regulate speed, such as [9, 3]")
-    torque: tuple[I8, ...] = Field(description="modes that regulate torque, such as [10, 4]; [] if it has none")
+    speed: tuple[I8, ...] = Field(min_length=1, description="modes of speed control, such as [9, 3]")
+    torque: tuple[I8, ...] = Field(description="modes of torque control, such as [10, 4]; [] if it has none")
     switch_while_enabled: bool = Field(description="may 6060h change while operation is enabled?")
     mapped: bool = Field(
         default=True, description="can 6060h be mapped into a PDO? false: written by SDO in preflight, and it stays"
@@ -125,12 +125,12 @@ class QuickStop(ProfileEntry):
         description="does a quick stop in a torque mode brake the shaft under speed control? false: speed mode first"
     )
     ends: Literal["quick_stop", "off"] = Field(
-        default="quick_stop", description="the state in which the drive is left once at rest; off: torque switched off"
+        default="quick_stop", description="state of the drive after standstill; off: torque switched off"
     )
 
 
 class Speed(ProfileEntry):
-    """Speed as reported in 606Ch and commanded in 60FFh, and what limits it."""
+    """Speed as reported in 606Ch and commanded in 60FFh, and the objects that limit it."""
 
     vl: bool = Field(
         default=False,
@@ -150,9 +150,9 @@ class Speed(ProfileEntry):
 
 
 class Position(ProfileEntry):
-    """The motor shaft's angle as the drive counts it: what tells whether the unit of speed is right.
+    """The motor shaft's angle as the drive counts it. It shows whether the unit of speed is right.
 
-    Read only, and believed only where the drive has it.
+    It is only read, and used only if the drive has the object.
     """
 
     index: Index = Field(default=0x6064, description="object with the count")
@@ -172,7 +172,7 @@ STANDARD_POSITION = Position(source="CiA 402-2, 6064h and 608Fh, where the drive
 
 
 class TorqueActual(ObjectAt):
-    """Object of the reported torque, of one instant with the speed, and its unit."""
+    """Object of the reported torque, and its unit. Its value belongs to the same instant as the speed."""
 
     per_lsb: Positive
     unit: Literal["rated", "nm"] = Field(description="share of the rated torque, or N·m")
@@ -187,14 +187,14 @@ class TorqueActual(ObjectAt):
 class Torque(ProfileEntry):
     """Torque as reported in 6077h and commanded in 6071h, as a share of the rated torque.
 
-    6071h is used where `Modes.torque` names a mode, and only there.
+    6071h is used only if `Modes.torque` names a mode.
     """
 
     rated_torque_nm_per_lsb: Positive | None = Field(
         description="unit of 6076h in N·m; null = not reported: rig.yaml must state drive_data.rated_torque_nm"
     )
     rated: ObjectAt = Field(
-        default=ObjectAt(index=0x6076, type="u32"), description="where what counts as rated torque stands instead"
+        default=ObjectAt(index=0x6076, type="u32"), description="object of the rated torque, if it is not 6076h"
     )
     actual: TorqueActual | None = Field(default=None, description="instead of 6077h; null = 6077h")
     rated_per_lsb: Positive = Field(description="unit of 6071h and 6077h as a share of rated torque, such as 0.001")
@@ -208,9 +208,9 @@ class Torque(ProfileEntry):
 
 
 class TorqueOffset(ProfileEntry):
-    """A torque that the drive adds to that of its own speed loop: 60B2h, torque offset (CiA 402-2).
+    """Torque that the drive adds to the output of its own speed loop: 60B2h, torque offset (CiA 402-2).
 
-    Mapped and used by those runs alone that ask for it, such as the measurement of the drive's own impedance.
+    It is mapped and used only in runs that request it, such as the measurement of the drive's own impedance.
     """
 
     index: Index = Field(default=0x60B2, description="object that takes it, 16 bits with a sign")
@@ -222,14 +222,14 @@ class TorqueOffset(ProfileEntry):
 
 
 class HostWatchdog(ProfileEntry):
-    """Means that stops the drive when the host is silent, and the drive's reaction; each bus adds how it is fed."""
+    """Means that stops the drive when the host is silent, and the drive's reaction. Each bus adds how it is fed."""
 
     kind: str = Field(description="how the drive supervises the host; none: it does not")
     reaction_index: Index | None = Field(default=None, description="object that chooses the reaction; null = none")
     reaction_sub: SubIndex = Field(default=0, description="its sub-index")
-    reaction_value: I16 | None = Field(default=None, description="what is written there and read back")
+    reaction_value: I16 | None = Field(default=None, description="value that is written there and read back")
     reaction: Literal["quick_stop", "fault_reaction", "coast", "none"] = Field(
-        description="what the drive then does; coast = torque off and the shaft runs out"
+        description="reaction of the drive; coast = torque off and the shaft runs down"
     )
 
     @model_validator(mode="after")
@@ -246,20 +246,20 @@ class HostWatchdog(ProfileEntry):
 
 
 class ReportingFilter(ProfileEntry):
-    """An object that holds the smoothing which the drive puts on a reported signal."""
+    """Object with the filter that the drive applies to a reported signal."""
 
     signal: Literal["speed", "torque"] = Field(description="the signal that it smooths")
     index: Index = Field(description="object")
     sub: SubIndex = Field(default=0, description="its sub-index")
     type: ObjectType = Field(description="its data type")
-    quantity: Literal["time_constant_s", "cutoff_hz"] = Field(description="what it holds")
+    quantity: Literal["time_constant_s", "cutoff_hz"] = Field(description="quantity in the object")
     per_lsb: Positive = Field(default=1.0, description="seconds, or hertz, for one count")
 
 
 class Cycle(ProfileEntry):
     """The cycle of setpoints and feedback."""
 
-    rate_hz: float = Field(default=250.0, gt=0, le=2000, description="cycles a second unless told otherwise")
+    rate_hz: float = Field(default=250.0, gt=0, le=2000, description="cycles per second, unless the run states a rate")
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -273,7 +273,7 @@ class Cia402Profile(DriveProfile):
     speed: Speed
     position: Position | None = Field(
         default=STANDARD_POSITION,
-        description="the motor's angle, held against the reported speed; left out = 6064h and 608Fh where the drive "
+        description="the motor's angle, compared with the reported speed; left out = 6064h and 608Fh where the drive "
         "has them; null = none; the operator then confirms the speed by sight",
     )
     torque: Torque
@@ -284,7 +284,7 @@ class Cia402Profile(DriveProfile):
     cyclic: Cycle
     filters: tuple[ReportingFilter, ...] = Field(default=(), description="where reported-signal filters can be read")
     parameters: tuple[Parameter, ...] = Field(default=(), description="settings beyond CiA 402's own objects")
-    hints: tuple[str, ...] = Field(default=(), description="what else to set or know, a line each, for `profiles show`")
+    hints: tuple[str, ...] = Field(default=(), description="other settings and facts, a line each, for `profiles show`")
 
     @model_validator(mode="after")
     def _vl_alone(self) -> Self:
@@ -307,7 +307,7 @@ class Cia402Profile(DriveProfile):
         for number, one in enumerate(self.parameters):
             wanted += [(f"parameters.{number}.times", one.times), (f"parameters.{number}.from_speed", one.from_speed)]
         findings += [(at, f"no parameter '{name}'") for at, name in wanted if name is not None and name not in names]
-        # One level only: no value may hang on itself by a detour.
+        # One level only: a value must not depend on itself through another one.
         scales = {one.name: one.times for one in self.parameters}
         findings += [
             (f"parameters.{number}.times", f"'{one.times}' is multiplied by another one itself")
@@ -317,11 +317,11 @@ class Cia402Profile(DriveProfile):
         return self
 
     def parameter(self, name: str) -> Parameter:
-        """The parameter of that name; KeyError if there is none (references are checked on loading)."""
+        """Return the parameter of that name. Raises KeyError if there is none; references are checked on loading."""
         return {one.name: one for one in self.parameters}[name]
 
     def entries(self) -> tuple[tuple[str, ProfileEntry], ...]:
-        """(name, entry) of everything that the profile says, with its source and confidence."""
+        """Return (name, entry) for all entries of the profile that have a source and a confidence."""
         found: list[tuple[str, ProfileEntry]] = [
             (name, part) for name, part in self if isinstance(part, ProfileEntry) and part != STANDARD_POSITION
         ]
@@ -330,12 +330,12 @@ class Cia402Profile(DriveProfile):
 
     @property
     def can_torque(self) -> bool:
-        """Can torque be regulated over the bus, and be switched to while the shaft turns?"""
+        """True if torque can be controlled over the bus, and selected while the shaft turns."""
         return bool(self.modes.torque) and self.modes.switch_while_enabled
 
     @property
     def usual_rate_hz(self) -> float:
-        """Cycles a second unless told otherwise."""
+        """Cycles per second, unless the run states another rate."""
         return self.cyclic.rate_hz
 
     @property

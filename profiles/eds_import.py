@@ -1,6 +1,6 @@
-"""Starts a CANopen profile from an EDS or DCF; entries that the file can't know are marked unverified.
+"""Begins a CANopen profile from an EDS or DCF. Entries that the file does not contain are marked unverified.
 
-Names and numbers come from the maker, all other words are ours. If the file leaves a point open, the safer value is
+Names and numbers come from the file, all other words are our own. If the file leaves a point open, the safer value is
 written: no change of mode while enabled, speed mode before a quick stop, and a drive that coasts.
 """
 
@@ -25,10 +25,11 @@ _MUST = {
 _MUST_VL = {key: _MUST[key] for key in (0x6040, 0x6041)} | {
     0x6042: ("vl target velocity", "i16"), 0x6044: ("vl velocity actual", "i16"),
 }
-"""Entries of a drive that has velocity mode (vl, 2) instead."""
+"""Required entries of a drive that has velocity mode (vl, 2) instead."""
 _ROTATIONS = {0xB4: 1.0, 0x10: 1.0 / (2.0 * math.pi), 0x41: 1.0 / 360.0}
 _TIMES_S = {0x03: 1.0, 0x47: 60.0}
-"""Turns and seconds in the units of 60A9h, by their numbers in CiA 303-2 (B4h: a revolution, of CiA 402)."""
+"""Turns in the numerators, and seconds in the denominators, of the units of 60A9h, by their numbers in CiA 303-2. B4h,
+a revolution, is of CiA 402."""
 _KEEP_MODE = "CiA 402-2 leaves open whether 6060h may change while the drive is enabled"
 
 
@@ -41,9 +42,9 @@ class Begun:
 
 
 def begin_profile(eds: EdsFile, path: str) -> Begun:
-    """The profile that an EDS or DCF allows; ``path`` is for messages.
+    """Return the profile that an EDS or DCF allows; ``path`` is for messages.
 
-    DataFileError where the file describes no CiA 402 drive that this program can talk to.
+    Raises DataFileError if the file does not describe a CiA 402 drive that tdhil can use.
     """
     _refuse_unless_possible(eds, path)
     text = "\n".join(_Writer(eds).lines()) + "\n"
@@ -68,7 +69,7 @@ def _refuse_unless_possible(eds: EdsFile, path: str) -> None:
 
 
 def _modes_told(eds: EdsFile) -> int | None:
-    """6502h; None where the file gives no value."""
+    """Return 6502h; None if the file gives no value."""
     one = eds.get(0x6502)
     return None if one is None or not one.stands else int(one.stands)
 
@@ -84,7 +85,7 @@ def _only_vl(eds: EdsFile) -> bool:
 
 
 class _Writer:
-    """Section by section; each says what the file knows, and where in a manual the rest stands."""
+    """Writer of the profile's sections. Each states the entries of the file, and what to look up in the manual."""
 
     def __init__(self, eds: EdsFile) -> None:
         self._eds = eds
@@ -267,7 +268,9 @@ class _Writer:
         yield from self._entry(said, confidence)
 
     def _si_unit(self) -> float | None:
-        """Rpm for one count by 60A9h; None where it isn't told, is no speed of a shaft, or not vl's."""
+        """Return rpm for one count by 60A9h; None if the file does not state it, for another unit than of speed, or for
+        vl mode.
+        """
         one = self._eds.get(0x60A9)
         if _only_vl(self._eds) or one is None or one.type != "u32" or not one.readable or not one.stands:
             return None
@@ -285,16 +288,18 @@ class _Writer:
         return "60.0" if self._counted() else "1.0"
 
     def _ramp(self, index: int) -> str | None:
-        """One count of a ramp in rpm/s, where the file tells the unit of the speed; None = left alone."""
+        """Return rpm/s for one count of a ramp, if the file states the unit of the speed; None: leave the ramp as it
+        is.
+        """
         return self._rpm_text() if self._si_unit() is not None and self._writable(index, "u32") is not None else None
 
     def _counted(self) -> bool:
-        """Return whether there is an encoder resolution for the unit of speed."""
+        """Return whether the drive has an encoder resolution for the unit of speed."""
         one = self._eds.get(0x608F, 1)
         return not _only_vl(self._eds) and one is not None and one.type == "u32" and one.readable
 
     def _scale(self) -> tuple[list[str], str]:
-        """(the lines of times and over, source): a guess that the drive's own objects scale."""
+        """Return (the lines of times and over, source). It is a guess that the drive's own objects are the scale."""
         if not self._counted():
             return [], f"{self._file} says nothing of the unit: 1 rpm is a guess"
         times, over = [], [self._scaling("encoder_increments", 0x608F, 1, "Position encoder resolution, increments")]
@@ -313,7 +318,7 @@ class _Writer:
         return one is not None and one.type == "u32" and one.readable
 
     def _scaling(self, name: str, index: int, sub: int, title: str) -> str:
-        """A parameter that scales the speed; its name."""
+        """Add a parameter that scales the speed. Return its name."""
         told = self._eds.objects[index, sub].stands
         self._parameters += [
             f"  - name: {name}", f"    title: {_quoted(f'{index:04X}h:{sub} {title}')}", f"    index: 0x{index:04X}",
@@ -422,7 +427,7 @@ class _Writer:
                                "computers keep and a bus at 500 kbit/s carries", "verified")
 
     def _mapping_hints(self) -> None:
-        """Can what a run needs be mapped, and can the mapping be written?"""
+        """Add hints: can the objects of a run be mapped, and can the mapping be written?"""
         wanted = (*(_MUST_VL if _only_vl(self._eds) else _MUST), 0x6061)
         unmapped = [index for index in wanted if (one := self._eds.get(index)) is None or not one.mappable]
         if unmapped:
@@ -435,24 +440,24 @@ class _Writer:
                                "mapping, and what must be set for it")
 
     def _writable(self, index: int, kind: str) -> EdsObject | None:
-        """An object that is there, of that type, and can be written; else None."""
+        """Return the object if the drive has it, with that type, and it can be written; else None."""
         one = self._eds.get(index)
         return one if one is not None and one.type == kind and one.writable else None
 
 
 def _comment(text: str) -> list[str]:
-    """A paragraph of comment, within the width of a page."""
+    """Return a paragraph as comment lines within the page's width."""
     return [f"# {line}" for line in textwrap.wrap(text, 116, break_long_words=True, break_on_hyphens=False)]
 
 
 def _plain(text: str) -> str:
-    """A maker's name on one short line, whatever the file holds."""
+    """Return a name from the file as one short printable line."""
     clean = "".join(sign if sign.isprintable() else " " for sign in text)
     return " ".join(clean.split())[:60].strip()
 
 
 def _quoted(text: str) -> str:
-    """A YAML scalar that nothing in it can break out of."""
+    """Return a quoted YAML scalar; quotes and backslashes are escaped."""
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 

@@ -1,8 +1,8 @@
-"""EDS and DCF files (CiA 306) read strictly: what the drive's maker says of it, or every problem with its line.
+"""EDS and DCF files (CiA 306), read strictly: the content of the file, or every problem with its line.
 
-The canopen library makes the object dictionary; it swallows what it can't read in a value, takes an indented line for
-the end of the one before it, and stops at the first mistake with no line at all. So the text is looked through here
-first, and what is handed on is clean: keywords as CiA 306 spells them, parents before their subindices.
+The canopen library makes the object dictionary. It ignores values that it can't read, takes an indented line for the
+end of the line before, and stops at the first error without a line number. So this module checks the text first, and
+passes clean text to the library: keywords as CiA 306 spells them, parents before their subindices.
 """
 
 import io
@@ -26,33 +26,33 @@ _KEYWORDS = {word.lower(): word for word in (
 )}
 _KEPT = {
     "DeviceInfo": ("VendorName", "VendorNumber", "ProductName", "ProductNumber", "RevisionNumber"),
-    "DeviceComissioning": ("NodeID",),      # so spelt by CiA 306
+    "DeviceComissioning": ("NodeID",),      # spelt this way by CiA 306
 }
-"""Sections beside the objects that are handed on, and their keys; canopen stumbles over slips in others."""
+"""Sections beside the objects, and their keys, that canopen gets. Errors in other sections could stop canopen."""
 _LISTS = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 _SECTIONS = {name.lower(): name for name in _KEPT}
 _ACCESS = ("ro", "wo", "rw", "rwr", "rww", "const")
 _DOMAIN, _VAR, _ARRAY, _RECORD = 2, 7, 8, 9
 _KINDS = (0, _DOMAIN, 5, 6, _VAR, _ARRAY, _RECORD)
-"""ObjectType of CiA 301; 0 (empty), 5 and 6 (type definitions) hold no values."""
+"""ObjectType of CiA 301. 0 (empty), 5 and 6 (type definitions) hold no values."""
 _PLAIN = {3: "i16", 2: "i8", 4: "i32", 5: "u8", 6: "u16", 7: "u32", 8: "f32"}
 _LAST_TYPE = 0x1B
 _TEXT = (9, 10, 11, 15)
-"""Data types of CiA 301 whose values are no numbers: strings and domains."""
+"""Data types of CiA 301 without a number as value: strings and domains."""
 
 
 @dataclass(frozen=True)
 class EdsObject:
-    """One object, or one subindex of it, as the file has it; ``line`` is that of its section."""
+    """One object, or one subindex of it, as in the file. ``line``: line of its section."""
 
     index: int
     sub: int
-    type: str                          # u8, i16 … f32; "other" for what is none of them
+    type: str                          # u8, i16 … f32; "other" for any other type
     access: str
     mappable: bool
     line: int
     default: float | None = None       # DefaultValue
-    value: float | None = None         # ParameterValue, in a DCF: what this one drive is set to
+    value: float | None = None         # ParameterValue, in a DCF: the setting of this one drive
     low: float | None = None
     high: float | None = None
 
@@ -66,7 +66,7 @@ class EdsObject:
 
     @property
     def stands(self) -> float | None:
-        """The value of the object: as set in the DCF, else the default; None if the file has none."""
+        """Value of the object: the setting in the DCF, else the default; None if the file has none."""
         return self.default if self.value is None else self.value
 
     def takes(self, number: float) -> bool:
@@ -76,18 +76,18 @@ class EdsObject:
 
 @dataclass(frozen=True)
 class EdsFile:
-    """Content of an EDS or DCF, as far as a profile can use it. Texts are the file's own, not cleaned."""
+    """Content of an EDS or DCF, as far as a profile can use it. Texts are as in the file."""
 
-    name: str                          # of the file, without its folder
+    name: str                          # name of the file, without its folder
     vendor_name: str
     product_name: str
-    vendor: int | None                 # DeviceInfo; None where 0
+    vendor: int | None                 # DeviceInfo; None for 0
     product: int | None
-    node: int | None                   # of a DCF
+    node: int | None                   # of a DCF; None in an EDS
     objects: MappingProxyType[tuple[int, int], EdsObject]
 
     def get(self, index: int, sub: int = 0) -> EdsObject | None:
-        """The object; None if the file has none."""
+        """Return the object; None if the file has none."""
         return self.objects.get((index, sub))
 
 
@@ -108,7 +108,7 @@ class _Reader:
         self._problems.append(Problem(self._file, line, message))
 
     def check(self) -> None:
-        """Raises DataFileError with what was found so far."""
+        """Raise DataFileError with the problems found so far."""
         if self._problems:
             found = sorted(dict.fromkeys(self._problems), key=lambda problem: problem.line)
             more = len(found) - MAX_PROBLEMS
@@ -136,10 +136,10 @@ class _Reader:
         try:
             return raw.decode("utf-8-sig")
         except UnicodeDecodeError:
-            return raw.decode("latin-1")       # what most makers' tools write
+            return raw.decode("latin-1")       # encoding of most manufacturers' tools
 
     def split(self, text: str) -> None:
-        """Lines into sections and their keys."""
+        """Split the text into sections and their keys."""
         section: _Section | None = None
         for number, raw in enumerate(re.split(r"\r\n|\r|\n", text), start=1):
             line = raw.strip()
@@ -169,7 +169,7 @@ class _Reader:
                 section.lines[key] = number
 
     def number(self, section: _Section, key: str, low: int = 0, high: int = 0xFFFF_FFFF) -> int | None:
-        """A number of the section; None, and a problem, if it is none."""
+        """Return a number of the section; None, and a problem, if the text is not a number in the range."""
         text = section.values[key]
         try:
             found = int(text, 0)
@@ -183,7 +183,7 @@ class _Reader:
         return found
 
     def check_entries(self) -> None:
-        """Everything that canopen reads in a number or can't do without."""
+        """Check every key that canopen reads as a number or requires."""
         if "DeviceInfo" not in self._sections:
             self.refuse(0, "has no section [DeviceInfo]: this is no EDS, or only a part of one")
         for name, keys in _KEPT.items():
@@ -231,7 +231,7 @@ class _Reader:
                             f"AccessType is {_shown(access)}: {', '.join(_ACCESS)} are what there is")
 
     def values_of(self, name: str, data_type: int) -> dict[str, float]:
-        """Default, value and limits; a problem for each that isn't a number of its type."""
+        """Return default, value and limits. Add a problem for each that isn't a number of its type."""
         section = self._sections.get(name)
         found: dict[str, float] = {}
         if section is None or data_type in _TEXT:
@@ -250,7 +250,9 @@ class _Reader:
         return found
 
     def clean(self) -> str:
-        """The file as canopen is to have it: an object before its subindices, and nothing that no profile needs."""
+        """Return the file for canopen: each object before its subindices, and only the sections that a
+        profile needs.
+        """
         out = io.StringIO()
         for rank in range(4):
             for name, section in self._sections.items():
@@ -267,7 +269,7 @@ class _Reader:
         return bool(kind) and int(kind, 0) in (0, 5, 6)
 
     def section_of(self, index: int, sub: int, *, alone: bool) -> tuple[str, int]:
-        """(section that describes it, its line)."""
+        """Return (section that describes the subindex, its line)."""
         names = (f"{index:04X}",) if alone or sub else ()
         names = names if alone else (f"{index:04X}sub{sub:X}", *names)
         name = next((name for name in names if name in self._sections), "")
@@ -284,7 +286,7 @@ def read_eds(path: Path) -> EdsFile:
         from canopen.objectdictionary import ODVariable, eds
 
         dictionary = eds.import_eds(io.StringIO(reader.clean()), None)
-    except Exception as error:      # whatever a library makes of a stranger's file, it is the file's
+    except Exception as error:      # any error of the library is an error of the file
         said = f"canopen can't read it ({type(error).__name__}: {_shown(str(error))})"
         raise DataFileError((Problem(str(path), 0, said),)) from error
     found: dict[tuple[int, int], EdsObject] = {}
@@ -305,7 +307,9 @@ def read_eds(path: Path) -> EdsFile:
 
 
 def _pair(key: str, value: str) -> str:
-    """A maker's own data types are domains to us: canopen would look for their definition."""
+    """Return the line of a key. A manufacturer's own data type becomes a domain, because canopen would look for its
+    definition.
+    """
     if key == "DataType" and int(value, 0) > _LAST_TYPE:
         value = "0x0F"
     return f"{key}={value}\n"
@@ -321,14 +325,14 @@ def _rank(name: str) -> int:
 
 
 def _canonical(name: str) -> str:
-    """1016SUB1 and 1016Sub01 are 1016sub1; names of sections as CiA 306 has them."""
+    """Return the section's name in one spelling: 1016SUB1 and 1016Sub01 as 1016sub1, other names as in CiA 306."""
     if match := _OBJECT.fullmatch(name):
         return match[1].upper() + ("" if match[2] is None else f"sub{int(match[2], 16):X}")
     return _SECTIONS.get(name.lower(), name)
 
 
 def _number(text: str, data_type: int) -> float:
-    """A value of that type of CiA 301; hexadecimal numbers of signed types are two's complements."""
+    """Return the value of that type of CiA 301. A hexadecimal number of a signed type is a two's complement."""
     if data_type in (0x08, 0x11):
         number = float(text) if not text.lower().startswith("0x") else float(int(text, 16))
         if not math.isfinite(number):
@@ -345,6 +349,6 @@ def _number(text: str, data_type: int) -> float:
 
 
 def _shown(text: str) -> str:
-    """A stranger's words in a message: one printable line, cut."""
+    """Return a text of the file for a message: printable signs, at most 40."""
     clean = "".join(sign if sign.isprintable() else "·" for sign in text)
     return f"'{clean[:40]}{'…' if len(clean) > 40 else ''}'"

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from profiles.model import DataModel, refuse_if
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a setting of a drive must read before a shaft may turn; the same words on every bus.
+# Required value of a drive's setting before a shaft may turn. The keys are the same on every bus.
 
 
 class Require(DataModel):
@@ -30,16 +30,17 @@ class Require(DataModel):
 # ---------------------------------------------------------------------------------------------------------------------
 
 Confidence = Literal["verified", "likely", "unverified"]
-"""verified: read in the manufacturer's document or file · likely: a consistent second-hand source · unverified."""
+"""verified: read in the manufacturer's document or file · likely: a consistent second-hand source · unverified:
+neither."""
 
 Positive = Annotated[float, Field(gt=0)]
 ProfileName = Annotated[str, Field(pattern=r"^[a-z0-9_-]+/[a-z0-9._-]+$")]
 
 
 class ProfileEntry(DataModel):
-    """One thing that a profile claims."""
+    """One entry of a profile."""
 
-    source: str = Field(min_length=3, description="the document, file or measurement that says so")
+    source: str = Field(min_length=3, description="document, file or measurement that states it")
     confidence: Confidence = Field(description="verified, likely or unverified")
 
 
@@ -48,7 +49,7 @@ class ProfileEntry(DataModel):
 
 
 class ControllerGain(ProfileEntry):
-    """Its proportional gain."""
+    """Proportional gain of the speed controller."""
 
     title: str = Field(min_length=3, description="the manual's number and name, such as 'p1470 P gain'")
     unit: Literal["nm_s_rad", "percent_per_percent", "unknown"] = Field(
@@ -58,7 +59,7 @@ class ControllerGain(ProfileEntry):
 
 
 class ControllerIntegral(ProfileEntry):
-    """Its integral part."""
+    """Integral part of the speed controller."""
 
     title: str = Field(min_length=3, description="the manual's number and name")
     unit: Literal["s", "ms", "nm_rad", "unknown"] = Field(
@@ -71,7 +72,7 @@ class SpeedControllerParameters(DataModel):
 
     gain: ControllerGain
     integral: ControllerIntegral
-    note: str | None = Field(default=None, description="what to know beside: adaptation, a filter, where it acts")
+    note: str | None = Field(default=None, description="further facts: adaptation, a filter, where it acts")
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -82,27 +83,27 @@ class DriveProfile(DataModel):
     name: ProfileName = Field(description="vendor/model, as in --profile")
     title: str = Field(min_length=3, description="one line for tables and reports")
     bus: str
-    experimental: bool = Field(default=False, description="second-hand, or never tried on the bus that it names")
+    experimental: bool = Field(default=False, description="second-hand, or never tested on the bus that it names")
     speed_controller: SpeedControllerParameters | None = Field(
-        default=None, description="its speed controller's gains, for `tdhil tune`; no run touches them"
+        default=None, description="parameters of its speed controller, for `tdhil tune`; no run changes them"
     )
 
     def entries(self) -> tuple[tuple[str, ProfileEntry], ...]:
-        """(name, entry) of everything that the profile says, with its source and confidence."""
+        """Return (name, entry) for all entries of the profile that have a source and a confidence."""
         raise NotImplementedError
 
     def below(self, confidence: Confidence) -> tuple[str, ...]:
-        """Names of the entries of exactly this confidence."""
+        """Return the names of the entries of exactly this confidence."""
         return tuple(name for name, part in self.entries() if part.confidence == confidence)
 
     @property
     def can_torque(self) -> bool:
-        """Can torque be regulated over the bus, and be switched to while the shaft turns?"""
+        """True if torque can be controlled over the bus, and selected while the shaft turns."""
         raise NotImplementedError
 
     @property
     def usual_rate_hz(self) -> float:
-        """Cycles a second unless told otherwise."""
+        """Cycles per second, unless the run states another rate."""
         raise NotImplementedError
 
     @property
@@ -112,5 +113,5 @@ class DriveProfile(DataModel):
 
     @property
     def untold(self) -> Sequence[Any]:
-        """The parameters that can't be read over the bus, each with ``name``, ``title`` and ``unit``."""
+        """Parameters that can't be read over the bus, each with ``name``, ``title`` and ``unit``."""
         return ()

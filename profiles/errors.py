@@ -1,7 +1,7 @@
 """The root of the error tree, and the errors of data files.
 
-The root stands here because `profiles` lies below every other room; `drivers.errors` re-exports it and
-draws the whole tree.
+The root is defined here because `profiles` lies below every other room. `drivers.errors` re-exports it and draws the
+whole tree.
 """
 
 import re
@@ -17,11 +17,11 @@ _FLAG: Final = re.compile(r"(?<![\w-])--?[a-z][a-z-]*(?![\w-])")
 
 
 class TdhilError(Exception):
-    """Root of each error that a user can cause or meet.
+    """Root of all errors that a user can cause or meet.
 
-    ``what`` happened, ``where`` (file:line, object, register, stage) and ``next_step``, the cure. Texts name options by
-    their flags; ``spelling`` maps a flag to its name in another interface (API, Python).
-    ``entry``: the entry of the table of messages; without one, that of the class.
+    ``what`` happened, ``where`` (file:line, object, register, stage), and ``next_step``, the remedy. Texts name options
+    by their flags; ``spelling`` maps a flag to its name in another interface (API, Python). ``entry``: the entry of the
+    table of messages; without it, that of the class.
     """
 
     spelling: Mapping[str, str] = MappingProxyType({})
@@ -37,7 +37,7 @@ class TdhilError(Exception):
 
     @property
     def coded(self) -> str:
-        """The text for a person, followed by its code."""
+        """Return the text of the error with its code."""
         return with_code(str(self), self.entry.code)
 
     def __str__(self) -> str:
@@ -48,9 +48,9 @@ class TdhilError(Exception):
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing wrong with a data file; ``line`` counts from 1, 0 where no line can be named.
+    """One problem in a data file. ``line`` counts from 1; it is 0 if no line is known.
 
-    As text it is one printable line, whatever the file holds: a key may be a line break or turn the writing around.
+    Its text is one printable line, also if a key in the file contains a line break or changes the direction of writing.
     """
 
     file: str
@@ -63,7 +63,7 @@ class Problem:
 
 
 class DataFileError(TdhilError):
-    """A YAML, EDS or other data file that can't be used; carries every problem found, not only the first."""
+    """A YAML, EDS or other data file that can't be used. It carries every problem found, not only the first."""
 
     entry = MessageCode.DATA_FILE_WRONG
 

@@ -1,4 +1,4 @@
-"""Schema of an EtherCAT drive's profile: what CiA 402 says on any bus, and what is particular to CoE.
+"""Schema of an EtherCAT drive's profile: entries of CiA 402, which apply to any bus, and entries of CoE.
 
 Data only. Each section carries its ``source`` and its ``confidence``, because a profile is only as good as its sources.
 """

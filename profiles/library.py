@@ -1,4 +1,4 @@
-"""Finds profiles: those that ship, by name, and a user's own, by path."""
+"""Search for profiles: by name for those that tdhil contains, by path for the user's own."""
 
 import difflib
 import re
@@ -31,7 +31,7 @@ def _known_bus(value: Any) -> Any:
 
 
 class _Head(DataModel):
-    """The key that says which schema the rest follows."""
+    """The key that selects the schema of the other keys."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -39,14 +39,15 @@ class _Head(DataModel):
 
 
 def profile_names() -> tuple[str, ...]:
-    """Every profile that ships, as vendor/model."""
+    """Return the names of all profiles that tdhil contains, as vendor/model."""
     return tuple(sorted(f"{path.parent.name}/{path.stem}" for path in _ROOT.glob("*/*.yaml")))
 
 
 def matching_names(text: str) -> tuple[str, ...]:
-    """Those that ship and that ``text`` may be short for: a vendor's all, else what begins so; capitals don't count.
+    """Return the names of profiles that tdhil contains and that ``text`` abbreviates, without regard to case.
 
-    ``abb`` is all of ABB's, ``abb/acs880`` or ``acs880`` two of them; a whole name is itself alone.
+    ``text`` may be a vendor, or the beginning of a name with or without its vendor. ``abb`` gives all of ABB's,
+    ``abb/acs880`` or ``acs880`` two of them; a whole name gives itself alone.
     """
     asked, names = text.strip().lower(), profile_names()
     if not asked or asked in names:
@@ -60,9 +61,10 @@ def matching_names(text: str) -> tuple[str, ...]:
 
 
 def profile_path(name_or_path: str) -> Path:
-    """The file of a profile; DataFileError, with names that come close, if none ships under that name.
+    """Return the file of a profile. Raises DataFileError, with similar names, if tdhil contains no profile of that
+    name.
 
-    What ends in .yaml or .yml is a path, anything else a name.
+    A text that ends in .yaml or .yml is a path; any other text is a name.
     """
     if name_or_path.endswith(_SUFFIXES):
         return Path(name_or_path)
@@ -73,9 +75,10 @@ def profile_path(name_or_path: str) -> Path:
 
 
 def load_profile(name_or_path: str, bus: str | None = None) -> Profile:
-    """A profile that ships (``generic/cia402``) or a file of the user's (``./my-drive.yaml``), of any bus or of this.
+    """Return a profile that tdhil contains (``generic/cia402``) or a user's file (``./my-drive.yaml``), for ``bus`` if
+    given.
 
-    DataFileError with every problem and its line, and for a profile of another bus.
+    Raises DataFileError with every problem and its line, and for a profile of another bus.
     """
     path = profile_path(name_or_path)
     profile = _parsed(read_text(path), str(path))
@@ -86,37 +89,41 @@ def load_profile(name_or_path: str, bus: str | None = None) -> Profile:
 
 
 def profile_text(name_or_path: str) -> str:
-    """The text of the file that `load_profile` reads. DataFileError where it can't be read."""
+    """Return the text of the file that `load_profile` reads. Raises DataFileError if it can't be read."""
     return read_text(profile_path(name_or_path))
 
 
 def parse_profile(text: str, name: str) -> Profile:
-    """A profile from its text; ``name`` stands in messages. DataFileError with every problem and its line."""
+    """Return a profile from its text; messages call it ``name``. Raises DataFileError with every problem
+    and its line.
+    """
     return _parsed(text, name)
 
 
 @lru_cache(maxsize=64)
 def _parsed(text: str, name: str) -> Profile:
-    """The same text is parsed once: what comes of it is frozen, and a scan or a table asks for all of them."""
+    """Parse a text once: the result is frozen, and a scan or a table needs all profiles."""
     return parse_model(text, name, SCHEMAS[parse_model(text, name, _Head).bus])
 
 
 def load_canopen_profile(name_or_path: str) -> CanopenProfile:
-    """Do the same as `load_profile`; DataFileError for a profile of another bus."""
+    """Return a CANopen profile like `load_profile`. Raises DataFileError for a profile of another bus."""
     profile = load_profile(name_or_path, "canopen")
     assert isinstance(profile, CanopenProfile)
     return profile
 
 
 def load_modbus_profile(name_or_path: str) -> ModbusProfile:
-    """Do the same as `load_profile`; DataFileError for a profile of another bus."""
+    """Return a Modbus profile like `load_profile`. Raises DataFileError for a profile of another bus."""
     profile = load_profile(name_or_path, "modbus")
     assert isinstance(profile, ModbusProfile)
     return profile
 
 
 def eds_path(name_or_path: str) -> Path | None:
-    """The EDS that the profile names, beside it; None if it names none, DataFileError if the file isn't there."""
+    """Return the EDS that the profile names, in the same folder; None if it names none. Raises DataFileError if it is
+    missing.
+    """
     profile = load_profile(name_or_path)
     if not isinstance(profile, CanopenProfile) or profile.eds is None:
         return None
@@ -129,7 +136,7 @@ def eds_path(name_or_path: str) -> Path | None:
 
 def _unknown(name: str, names: tuple[str, ...]) -> str:
     shown = re.sub(r"\s+", " ", name)[:60]
-    # People type the vendor alone, or the model without its vendor; or one of them wrongly.
+    # Users type the vendor alone, or the model without its vendor, or misspell one of them.
     close = list(matching_names(name[:80])) or difflib.get_close_matches(name[:80], names, n=3, cutoff=0.5)
     if not close:
         parts = {part: known for known in reversed(names) for part in known.split("/")}

@@ -820,17 +820,17 @@ class MessageCode(Enum):
 
     @property
     def code(self) -> str:
-        """The code as it is shown: ``TDH-001``, ``TDH-412``, ``TDH-1010``."""
+        """Code as shown in messages: ``TDH-001``, ``TDH-412``, ``TDH-1010``."""
         return f"{PREFIX}{self.number:03d}"
 
     @property
     def group(self) -> int:
-        """The exit code that the entry belongs to; 13 stands for all signals, 130 and above."""
+        """Exit code of the entry; 13 for all signals (130 and above)."""
         return self.number // 100
 
 
 class CodedText(str):
-    """A sentence with its entry of the table: a plain text to all that read it, which keeps its code."""
+    """A sentence with its entry of the table. It is a plain text that keeps its code."""
 
     __slots__ = ("entry",)
     entry: MessageCode
@@ -850,12 +850,14 @@ def entry_of(text: str, otherwise: MessageCode) -> MessageCode:
 
 
 def with_code(text: str, code: str) -> str:
-    """Return a text as it is shown to a person: the code follows it in brackets."""
+    """Return a text as shown to the user: with the code behind it in brackets."""
     return f"{text} [{code}]" if code else text
 
 
 def message_of(code: str) -> MessageCode | None:
-    """Return the entry of a code as a person types it: ``TDH-412``, ``tdh412`` or ``412``; None for no such code."""
+    """Return the entry of a code as a user types it: ``TDH-412``, ``tdh412`` or ``412``; None if no such
+    code exists.
+    """
     digits = code.strip().upper().removeprefix("TDH").removeprefix("-")
     if not digits.isdecimal():
         return None

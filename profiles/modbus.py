@@ -20,11 +20,12 @@ Word = Annotated[int, Field(ge=0, le=0xFFFF)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 
 Unit = Literal["rpm", "rpm_s", "nm", "rated", "s", "hz", "kw", "none"]
-"""rated = share of the rated torque, which the parameter `ModbusProfile.rated_torque` or rig.yaml tells in N·m."""
+"""Units of a value. rated = share of the rated torque, whose value in N·m is in `ModbusProfile.rated_torque` or
+rig.yaml."""
 
 
 class Register(DataModel):
-    """Place of a number. 32 bit: two registers, their order is `BusLine.word_order`."""
+    """Place of a number. A 32-bit number takes two registers in the order `BusLine.word_order`."""
 
     address: Address = Field(description="on the wire, counted from 0")
     type: Literal["u16", "i16", "u32", "i32"] = Field(default="i16", description="how its bits are read")
@@ -33,7 +34,7 @@ class Register(DataModel):
 
     @property
     def count(self) -> int:
-        """How many registers it takes."""
+        """Number of registers that the type takes."""
         return 2 if self.type in ("u32", "i32") else 1
 
 
@@ -44,11 +45,11 @@ class CyclicSignal(ProfileEntry):
     per_lsb: Positive = Field(description="units for one count")
     unit: Literal["rpm", "nm", "rated"]
     times: Name | None = Field(default=None, description="parameter whose value multiplies it")
-    note: str | None = Field(default=None, description="what to know: why this one and not its smoothed twin, say")
+    note: str | None = Field(default=None, description="further facts, such as why not the smoothed register")
 
 
 class Bits(DataModel):
-    """Bits of a word: they say yes where word & mask == value."""
+    """Bits of a word. They are set if word & mask == value."""
 
     mask: Word
     value: Word
@@ -61,12 +62,12 @@ class WordSignal(ProfileEntry):
 
 
 class StatusState(DataModel):
-    """One state of the drive: seen where statusword & mask == value; the first of the list that fits counts."""
+    """One state of the drive, present if statusword & mask == value. The first state of the list that fits counts."""
 
     mask: Word
     value: Word
     means: Literal["not_ready", "off", "ready", "enabled", "quick_stop", "fault"] = Field(
-        description="off: no torque, nothing asked; ready: on the way; enabled: setpoints act; quick_stop: braking, "
+        description="off: no torque, no request; ready: on the way; enabled: setpoints act; quick_stop: braking, "
         "or holding afterwards"
     )
     onward: Word | None = Field(
@@ -75,23 +76,23 @@ class StatusState(DataModel):
 
 
 class Control(ProfileEntry):
-    """The words: what is sent towards each wish, and what the status means."""
+    """Control words for each request, and meaning of the status word."""
 
     family: Literal["cia402", "profidrive", "abb", "danfoss_fc", "yaskawa", "delta"] = Field(
-        description="whose bits these are; the simulator behaves as that family's manual says, not as this file does"
+        description="family of the bits; the simulator follows that family's manual, not this file"
     )
     states: tuple[StatusState, ...] = Field(min_length=3)
-    off: Word = Field(description="disables a shaft at rest")
-    quick_stop: Word = Field(description="brakes to rest, under the drive's own speed control")
+    off: Word = Field(description="disables the drive at standstill")
+    quick_stop: Word = Field(description="brakes to standstill, under the drive's own speed control")
     fault_reset: tuple[Word, ...] = Field(min_length=1, description="words sent one after the other to reset a fault")
-    speed_bits: Word = Field(default=0, description="set besides, in every word, while speed is regulated")
-    torque_bits: Word = Field(default=0, description="set besides, in every word, while torque is regulated")
+    speed_bits: Word = Field(default=0, description="bits set in every word in speed control")
+    torque_bits: Word = Field(default=0, description="bits set in every word in torque control")
     reverse_bits: Word | None = Field(
-        default=None, description="set besides where the speed setpoint is negative and its register has no sign"
+        default=None, description="bits set for a negative speed setpoint if its register has no sign"
     )
-    standstill: Bits | None = Field(default=None, description="statusword bits that say that the shaft is at rest")
-    limit_active: Bits | None = Field(default=None, description="statusword bits that say that a limit acts")
-    remote: Bits | None = Field(default=None, description="statusword bits that say that the field bus has control")
+    standstill: Bits | None = Field(default=None, description="statusword bits that show standstill")
+    limit_active: Bits | None = Field(default=None, description="statusword bits that show that a limit acts")
+    remote: Bits | None = Field(default=None, description="statusword bits that show that the field bus has control")
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -113,7 +114,7 @@ class ModeDisplay(DataModel):
 
 
 class ModeSwitch(ProfileEntry):
-    """Speed or torque."""
+    """Control mode of the drive: speed or torque."""
 
     torque: bool = Field(description="can torque be regulated over the bus? false: speed-mode variant of the protocol")
     by: Literal["control_bits", "register", "none"] = Field(
@@ -122,7 +123,7 @@ class ModeSwitch(ProfileEntry):
     register_: Register | None = Field(default=None, alias="register")
     speed_value: Word | None = None
     torque_value: Word | None = None
-    display: ModeDisplay | None = Field(default=None, description="null: the drive does not tell")
+    display: ModeDisplay | None = Field(default=None, description="null: the drive does not display its mode")
     switch_while_enabled: bool = Field(description="may it change while operation is enabled?")
 
     @model_validator(mode="after")
@@ -140,8 +141,8 @@ class ModeSwitch(ProfileEntry):
 class QuickStop(ProfileEntry):
     """Effect of the quick-stop word."""
 
-    decelerates_in_torque_mode: bool = Field(description="false: the host asks for speed mode at zero speed first")
-    ends: Literal["quick_stop", "off"] = Field(description="the state in which the drive is left once at rest")
+    decelerates_in_torque_mode: bool = Field(description="false: the host requests speed mode at zero speed first")
+    ends: Literal["quick_stop", "off"] = Field(description="state of the drive after standstill")
 
 
 class Parameter(ProfileEntry):
@@ -169,11 +170,13 @@ class Parameter(ProfileEntry):
         "that 'times' names down to zero; ramp_up_time: s from rest up to it, as steep as the quick stop",
     )
     writable_in_operation: bool = Field(default=True, description="false: takes effect after a restart only")
-    advice: str | None = Field(default=None, description="what to do at the drive where it reads wrong")
+    advice: str | None = Field(default=None, description="what to do at the drive if the value is wrong")
 
     @property
     def factor(self) -> str | None:
-        """The parameter that multiplies this one: not the speed that a ramp time counts from or to."""
+        """Name of the parameter that multiplies this one. The start or end speed of a ramp time is no such
+        parameter.
+        """
         return None if self.set_to in ("quick_stop_time", "ramp_up_time") else self.times
 
     @model_validator(mode="after")
@@ -204,7 +207,7 @@ class ModbusWatchdog(ProfileEntry):
         default="unverified", description="confidence of fed_by alone; below verified, it counts as any_request"
     )
     reaction: Literal["quick_stop", "ramp_stop", "fault_reaction", "coast", "none"] = Field(
-        description="what the drive then does; coast = torque off and the shaft runs out"
+        description="reaction of the drive; coast = torque off and the shaft runs down"
     )
     reaction_parameter: Name | None = Field(default=None, description="parameter that chooses it, with 'require'")
 
@@ -214,7 +217,7 @@ class ModbusWatchdog(ProfileEntry):
 
     @property
     def fed_by_any_client(self) -> bool:
-        """Return whether a client that only reads may feed the watchdog after this host has died."""
+        """True if a client that only reads may feed the watchdog after this host has died."""
         return self.kind != "none" and (
             self.fed_by in ("any_request", "unknown") or self.fed_by_confidence == "unverified"
         )
@@ -226,7 +229,7 @@ class ModbusWatchdog(ProfileEntry):
 
 
 class ModbusFilter(ProfileEntry):
-    """The smoothing on a reported signal: read from a parameter, or as documented."""
+    """Filter of a reported signal: read from a parameter, or as documented."""
 
     signal: Literal["speed", "torque"]
     parameter: Name | None = Field(default=None, description="parameter that holds it, in s or in hz (cut-off)")
@@ -241,7 +244,7 @@ class ModbusFilter(ProfileEntry):
 
 
 class NamePlate(ProfileEntry):
-    """Three parameters that must fit P = T·ω: a wrong address, scale or word order in any of them doesn't."""
+    """Three parameters that must fit P = T·ω. A wrong address, scale or word order of one of them gives a mismatch."""
 
     power: Name
     speed: Name
@@ -250,9 +253,10 @@ class NamePlate(ProfileEntry):
 
 
 class Echo(ProfileEntry):
-    """A register of the drive's own in which a setpoint shows up again, written at standstill, disabled.
+    """A register of the drive that shows a setpoint again. It is checked at standstill, with the drive disabled.
 
-    Worth most where it has a unit and a scale of its own: one that shares them with the setpoint can't tell them wrong.
+    An echo with a unit and a scale of its own finds most errors. An echo that shares them with the setpoint can't show
+    that they are wrong.
     """
 
     setpoint: Literal["speed", "torque"]
@@ -267,10 +271,10 @@ class Temperature(ProfileEntry):
 
     title: str = Field(min_length=3, description="the manual's number and name")
     register_: Register = Field(alias="register")
-    too_hot: Bits | None = Field(default=None, description="bits that say so; the status word costs no request")
+    too_hot: Bits | None = Field(default=None, description="bits that show it; the status word needs no request")
     per_lsb: Positive = Field(default=1.0, description="units for one count")
     unit: Literal["celsius", "share"] = Field(
-        default="celsius", description="celsius: held below limits.temperature_c of rig.yaml; share: of what is allowed"
+        default="celsius", description="celsius: limit in limits.temperature_c of rig.yaml; share: of the allowed value"
     )
     at_most: Positive | None = Field(default=None, description="in its unit; with celsius, rig.yaml's may be lower")
 
@@ -286,11 +290,13 @@ _NO_ECHO = ProfileEntry(
     "and sign up in the manual",
     confidence="unverified",
 )
-"""Stands where an echo is missing: no check at standstill can find that setpoint's entry wrong, so a person answers."""
+"""Entry for a missing echo: no check at standstill can find an error in that setpoint's entry, so the
+operator decides.
+"""
 
 
 class Position(ProfileEntry):
-    """The motor shaft's angle as the drive counts it: what tells whether the unit of speed is right. Read only."""
+    """The motor shaft's angle as the drive counts it. It shows whether the unit of speed is right. Read only."""
 
     register_: Register = Field(alias="register")
     counts_per_turn: Positive = Field(description="counts for one turn of the motor; 1 for a counter of turns")
@@ -300,7 +306,7 @@ class Position(ProfileEntry):
 
 
 class ModbusCycle(ProfileEntry):
-    """The numbers of every cycle."""
+    """Registers of every cycle."""
 
     control: WordSignal
     status: WordSignal
@@ -310,18 +316,18 @@ class ModbusCycle(ProfileEntry):
     torque: CyclicSignal
     torque_demand: CyclicSignal | None = None
     functions: tuple[Literal[3, 4, 6, 8, 16, 23], ...] = Field(
-        min_length=1, description="function codes the drive knows"
+        min_length=1, description="function codes that the drive supports"
     )
     largest_gap: int = Field(
-        default=0, ge=0, le=60, description="registers between two wanted ones that may be read along"
+        default=0, ge=0, le=60, description="number of registers between two required ones that may be read too"
     )
     largest_read: int = Field(default=125, ge=1, le=125, description="registers in one read")
     largest_write: int = Field(default=123, ge=1, le=123, description="registers in one write")
-    rate_hz: float = Field(default=20.0, gt=0, le=1000, description="cycles a second unless told otherwise")
+    rate_hz: float = Field(default=20.0, gt=0, le=1000, description="cycles per second, unless the run states a rate")
 
 
 class BusLine(ProfileEntry):
-    """How the drive is reached, as it leaves the factory."""
+    """Connection to the drive, with its factory settings."""
 
     transports: tuple[Literal["tcp", "rtu"], ...] = Field(min_length=1)
     port: int = Field(default=502, ge=1, le=65535)
@@ -344,7 +350,7 @@ class ModbusProfile(DriveProfile):
     cycle: ModbusCycle
     position: Position | None = Field(
         default=None,
-        description="the motor's angle, held against the reported speed; null = none; the operator then "
+        description="the motor's angle, compared with the reported speed; null = none; the operator then "
         "confirms the speed by sight",
     )
     rated_torque: Name | None = Field(
@@ -356,7 +362,7 @@ class ModbusProfile(DriveProfile):
     name_plate: NamePlate | None = None
     echoes: tuple[Echo, ...] = ()
     temperatures: tuple[Temperature, ...] = ()
-    hints: tuple[str, ...] = Field(default=(), description="what else to set or know, a line each, for `profiles show`")
+    hints: tuple[str, ...] = Field(default=(), description="other settings and facts, a line each, for `profiles show`")
 
     @model_validator(mode="after")
     def _refers(self) -> Self:
@@ -391,11 +397,13 @@ class ModbusProfile(DriveProfile):
         return self
 
     def parameter(self, name: str) -> Parameter:
-        """The parameter of that name; KeyError if there is none (references are checked on loading)."""
+        """Return the parameter of that name. Raises an error if there is none; references are checked on loading."""
         return next(one for one in self.parameters if one.name == name)
 
     def entries(self) -> tuple[tuple[str, ProfileEntry], ...]:
-        """(name, entry) of everything that carries a source and a confidence; a missing echo is one, unverified."""
+        """Return (name, entry) for all entries with a source and a confidence. A missing echo is an
+        unverified entry.
+        """
         found: list[tuple[str, ProfileEntry]] = [(name, part) for name, part in self if isinstance(part, ProfileEntry)]
         found += [(f"cycle.{name}", part) for name, part in self.cycle if isinstance(part, ProfileEntry)]
         found += [(f"parameters.{part.name}", part) for part in self.parameters]
@@ -407,19 +415,19 @@ class ModbusProfile(DriveProfile):
 
     @property
     def unseen(self) -> tuple[Literal["speed", "torque"], ...]:
-        """Setpoints of which the drive doesn't show, before motion, what it has made of them."""
+        """Setpoints that the drive doesn't show back before motion."""
         used: tuple[Literal["speed", "torque"], ...] = ("speed", "torque") if self.modes.torque else ("speed",)
         shown = {echo.setpoint for echo in self.echoes}
         return tuple(setpoint for setpoint in used if setpoint not in shown)
 
     @property
     def can_torque(self) -> bool:
-        """Can torque be regulated over the bus, and be switched to while the shaft turns?"""
+        """True if torque can be controlled over the bus, and selected while the shaft turns."""
         return self.modes.torque and self.modes.switch_while_enabled
 
     @property
     def usual_rate_hz(self) -> float:
-        """Cycles a second unless told otherwise."""
+        """Cycles per second, unless the run states another rate."""
         return self.cycle.rate_hz
 
     @property
@@ -429,5 +437,5 @@ class ModbusProfile(DriveProfile):
 
     @property
     def untold(self) -> tuple[Parameter, ...]:
-        """The parameters that stand in no register."""
+        """Parameters without a register."""
         return tuple(one for one in self.parameters if one.register_ is None)

@@ -17,7 +17,7 @@ NonNegative = Annotated[float, Field(ge=0.0)]
 
 
 class Validated(BaseModel):
-    """A frozen parameter set; a unit stands in every field name."""
+    """A frozen parameter set; field names include the unit."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -27,11 +27,13 @@ class Validated(BaseModel):
 CROSS_FIELD = "cross_field"
 
 Finding = tuple[str, str]
-"""(dotted path of the key below the model that checks, message)."""
+"""(dotted path of the key, relative to the model that checks; message)."""
 
 
 class DataModel(BaseModel):
-    """Frozen; unknown keys refused; no conversion between text, numbers and truth values; no NaN, no infinity."""
+    """Base of all models of data files: frozen, no unknown keys, no NaN, no infinity. Text, numbers and truth values
+    are not converted into each other.
+    """
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=False, hide_input_in_errors=True
@@ -56,15 +58,15 @@ class DataModel(BaseModel):
 
 
 def refuse_if(findings: Sequence[Finding]) -> None:
-    """To be called in a model validator (mode 'after'): refuses with all of ``findings``, each at its key's line."""
+    """Refuse with all of ``findings``, each at its key's line. For use in a model validator (mode 'after')."""
     if findings:
         text = "; ".join(f"{at}: {message}" if at else message for at, message in findings)
-        # Braces would be taken for place-holders of the template.
+        # Braces in the text would count as placeholders of the template.
         raise PydanticCustomError(CROSS_FIELD, "{text}", {"text": text, "findings": list(findings)})
 
 
 def one_of(known: Sequence[str], value: Any) -> Any:
-    """``value``, in a validator: refused with all of ``known`` where it is none of them, as by a Literal."""
+    """Return ``value`` in a validator. If it is not one of ``known``, refuse it with their list, as for a Literal."""
     if value in known:
         return value
     *first, last = map(repr, known)
@@ -72,6 +74,6 @@ def one_of(known: Sequence[str], value: Any) -> Any:
 
 
 def values_of(model: DataModel) -> dict[str, Any]:
-    """Every value by its field's name; sections as mappings likewise."""
+    """Return every value by its field's name; sections are mappings likewise."""
     found = {name: getattr(model, name) for name in type(model).model_fields}
     return {name: values_of(value) if isinstance(value, DataModel) else value for name, value in found.items()}

@@ -1,7 +1,7 @@
-"""Quantities as people write them: ``100 rpm``, ``90°``, ``2 kNm``, ``15 min``, ``5 %``; and what unit a key has.
+"""Quantities as users write them: ``100 rpm``, ``90°``, ``2 kNm``, ``15 min``, ``5 %``; and the unit of a key.
 
-One table for every place that takes a quantity: data files, the command line, the columns of a trace. What could
-mean two things is not read: ``1/s`` and ``Hz`` of a speed (revolutions or radians), ``m`` (minutes or milli), ``MNm``.
+One table for data files, the command line and the columns of a trace. A text with two meanings is refused: ``1/s`` and
+``Hz`` for a speed (revolutions or radians), ``m`` (minutes or milli), ``MNm``.
 """
 
 import math
@@ -15,7 +15,7 @@ _TURN: Final = 2.0 * math.pi
 
 @dataclass(frozen=True)
 class Unit:
-    """A value in it is value · ``times`` / ``over`` in SI; two numbers, so that 0.35 % is 0.0035 to the last bit."""
+    """A unit: value · ``times`` / ``over`` is in SI. Two numbers are kept, so that 0.35 % is 0.0035 to the last bit."""
 
     dimension: str
     symbol: str
@@ -23,17 +23,17 @@ class Unit:
     over: float = 1.0
 
     def si(self, value: float) -> float:
-        """``value``, given in this unit, in SI."""
+        """Convert ``value`` from this unit to SI."""
         return _scaled(value, self.times, self.over)
 
     def of_si(self, value: float) -> float:
-        """``value``, given in SI, in this unit."""
+        """Convert ``value`` from SI to this unit."""
         return _scaled(value, self.over, self.times)
 
 
 def _scaled(value: float, times: float, over: float) -> float:
     if times.is_integer() and over.is_integer() and abs(value) < 1e15:
-        return float(Fraction(repr(float(value))) * int(times) / int(over))       # as if it had been typed in decimals
+        return float(Fraction(repr(float(value))) * int(times) / int(over))       # as if typed in decimals
     return value * times / over
 
 
@@ -75,7 +75,7 @@ _CENTI = Unit("moment of inertia", "kg·cm²", 1.0, 1e4)
 _TONNE = Unit("moment of inertia", "t·m²", 1e3)
 _KILOHERTZ, _MILLIHERTZ = Unit("frequency", "kHz", 1e3), Unit("frequency", "mHz", 1.0, 1e3)
 
-# How each is spelt once case, spaces and the signs · . * - _ ^ are out of the way.
+# Spellings of each unit, in any case, without spaces and the signs · . * - _ ^.
 _SPELT: Final[tuple[tuple[Unit, str], ...]] = (
     (SPEED, "rad/s rads rad/sec rads1"),
     (RPM, "rpm r/min rev/min revs/min 1/min /min min1 u/min upm"),
@@ -122,9 +122,9 @@ _NUMBER: Final = re.compile(
     r"\s*([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)(?![0-9])\s*(\S.*)?", re.DOTALL
 )
 _LONGEST: Final = 60
-"""Characters; more is no quantity."""
+"""Longest text of a quantity, characters."""
 
-# What a key's name ends with; of several the longest counts.
+# Endings of a key's name and their units. If several fit, the longest counts.
 _ENDINGS: Final = {
     "rad_s": SPEED, "rad_s2": ACCELERATION, "rad": ANGLE, "nm": TORQUE, "nm_s": TORQUE_RATE, "nm_s_rad": FRICTION,
     "nm_rad": STIFFNESS, "kg_m2": INERTIA, "s": TIME, "hz": FREQUENCY, "rel_sd": SHARE, "share": SHARE,
@@ -136,13 +136,13 @@ _ENDINGS: Final = {
 
 
 def unit_of(text: str) -> Unit | None:
-    """The unit that ``text`` spells: ``rpm``, ``1/min``, ``N.m``, ``kg m^2``; None if none that is known."""
+    """Return the unit that ``text`` spells: ``rpm``, ``1/min``, ``N.m``, ``kg m^2``; None if it is unknown."""
     bare = _IGNORED.sub("", text.replace("¹", "1").replace("²", "2").replace("μ", "µ"))
     return _CASE_COUNTS[bare] if bare in _CASE_COUNTS else _UNITS.get(bare.casefold())
 
 
 def split(text: str) -> tuple[float, str] | None:
-    """Number and the rest behind it (``''`` without one); None where no number stands at the front."""
+    """Return the number and the text behind it (``''`` without one); None if the text does not begin with a number."""
     if len(text) > _LONGEST or (found := _NUMBER.fullmatch(text)) is None:
         return None
     value = float(found[1])
@@ -154,7 +154,9 @@ def _a(noun: str) -> str:
 
 
 def read(text: str, unit: Unit) -> float:
-    """``text`` in ``unit``; a number without one is in ``unit``. ValueError, in words for the user, names no number."""
+    """Return the quantity ``text`` in ``unit``. A number alone is in ``unit``. Raises ValueError with a text for the
+    user, which repeats no number.
+    """
     parts = split(text)
     if parts is None:
         raise ValueError(f"a number and its unit are wanted, such as '3 {example(unit)}'")
@@ -172,12 +174,12 @@ def read(text: str, unit: Unit) -> float:
 
 
 def example(unit: Unit) -> str:
-    """A word for the unit that can be typed."""
+    """Return the unit's spelling as a user can type it."""
     return "%" if unit.dimension == "share" else unit.symbol
 
 
 def known(unit: Unit) -> tuple[str, ...]:
-    """The symbols of the same dimension, to be offered in a message."""
+    """Return the symbols of the same dimension, for a message."""
     return tuple(one.symbol for one, _ in _SPELT if one.dimension == unit.dimension)
 
 
@@ -186,20 +188,23 @@ def key_ending(key: str) -> tuple[str, Unit] | None:
     parts = key.split("_")
     for start in range(len(parts)):
         if (unit := _ENDINGS.get("_".join(parts[start:]))) is not None:
-            # 'tolerance' names the quantity itself, 'torque_scale_rel_sd' its unit too: the base tells keys apart.
+            # 'tolerance' is the name of the quantity, 'torque_scale_rel_sd' ends with its unit. The base distinguishes
+            # such keys.
             base = key if unit is SHARE else "_".join(parts[:start])
             return base, unit
     return None
 
 
 def unit_of_key(key: str) -> Unit | None:
-    """The unit in which the key's value is; None where its name says none."""
+    """Return the unit of the key's value; None if its name states none."""
     found = key_ending(key)
     return found[1] if found is not None else None
 
 
 def same_quantity(key: str, other: str) -> bool:
-    """Are these two keys one quantity in different units: ``speed_max_rpm`` and ``speed_max_rad_s``?"""
+    """Return whether two keys are one quantity in different units, such as ``speed_max_rpm`` and
+    ``speed_max_rad_s``.
+    """
     one, two = key_ending(key), key_ending(other)
     if one is None or two is None or one[1] == two[1] or one[1].dimension != two[1].dimension:
         return False
@@ -208,6 +213,6 @@ def same_quantity(key: str, other: str) -> bool:
 
 
 def shown(value: float, unit: Unit) -> str:
-    """For people: ``10.47 rad/s``; a share as a bare number."""
+    """Return the value for messages: ``10.47 rad/s``; a share as a number alone."""
     number = f"{value:.4g}" if not float(value).is_integer() or abs(value) >= 1e9 else f"{value:.0f}"
     return number if unit is SHARE else f"{number} {unit.symbol}"

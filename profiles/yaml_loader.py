@@ -1,12 +1,13 @@
-"""Data files read strictly: one answer to what each line means, or every problem at once, each with its line.
+"""Data files read strictly: one meaning for each line, or every problem at once, each with its line.
 
 ::
 
     file → text (size, UTF-8) → `yaml_tree` (YAML 1.2 core; no tags, aliases, duplicates) → pydantic, strict
                                                                     ↑ `settle` (100 rpm → 10.47 rad/s) ↵
 
-A value with a unit of its own is converted where the reader shows both (``convert``), else refused with what it is.
-Checks across several keys (`DataModel.contradictions`) run as far as the keys that they need are right.
+A value with a unit of its own is converted if the caller shows both values (``convert``), else refused with the value
+in the key's unit. Checks across several keys (`DataModel.contradictions`) run as far as the keys that they need are
+valid.
 """
 
 import difflib
@@ -28,7 +29,7 @@ from profiles.quantities import Unit
 from profiles.yaml_tree import KeyPath, Tree, hint
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a failed validation says to the person who wrote the file: at which line, in plain words.
+# Messages of a failed validation for the author of the file: the line, and the problem in plain words.
 
 
 _WANTED = {
@@ -49,7 +50,7 @@ _WANTED = {
     "none_required": "nothing",
 }
 _NOT_THE_VALUE = {CROSS_FIELD, "missing", "extra_forbidden"}
-"""Kinds of error of a section, not of a value in it."""
+"""Kinds of error that concern a section, not a value in it."""
 _BOUNDS = {
     "greater_than": ("gt", "greater than"),
     "greater_than_equal": ("ge", "at least"),
@@ -59,7 +60,7 @@ _BOUNDS = {
 
 
 def problems_of(error: ValidationError, tree: Tree, model: type[BaseModel]) -> list[Problem]:
-    """Every problem, once; none about values that were refused before."""
+    """Return every problem once, without problems of values that were refused before."""
     return [
         Problem(tree.file, line, f"{_dotted(path)}: {message}" if path else message)
         for path, line, message in _explained(error, tree, model)
@@ -68,21 +69,21 @@ def problems_of(error: ValidationError, tree: Tree, model: type[BaseModel]) -> l
 
 
 def messages_of(error: ValidationError, data: Any, model: type[BaseModel]) -> list[tuple[KeyPath, str]]:
-    """The same words for values that stand in no file: what is wrong, and at which path."""
+    """Return (path, problem) in the same words for values that are not in a file."""
     return [(path, message) for path, _, message in _explained(error, Tree("", data), model)]
 
 
 def _explained(error: ValidationError, tree: Tree, model: type[BaseModel]) -> list[tuple[KeyPath, int, str]]:
     items = [dict(item) for item in error.errors(include_url=False)]
     items = [item for item in items if not _long_enough(item, _value(tree.data, path_in_file(item, tree)))]
-    listed: set[KeyPath] = set()          # sections whose known keys were told: once is enough
+    listed: set[KeyPath] = set()          # sections whose known keys were already listed
     found = [
         explained for item in items if item["type"] not in _WANTED
         for explained in _explain(item, tree, model, listed)
     ]
     unions: dict[KeyPath, list[str]] = {}
     for item in items:
-        if item["type"] in _WANTED:      # a union gives one of these for each of its members
+        if item["type"] in _WANTED:      # a union gives one such error for each of its members
             unions.setdefault(path_in_file(item, tree), []).append(item["type"])
     found += [(path, tree.value_lines.get(path, 0), _wanted(kinds, tree, path)) for path, kinds in unions.items()]
     wrong = {path_in_file(item, tree) for item in items if item["type"] not in _NOT_THE_VALUE} | set(tree.refused)
@@ -92,7 +93,7 @@ def _explained(error: ValidationError, tree: Tree, model: type[BaseModel]) -> li
 
 
 def _long_enough(item: dict[str, Any], value: Any) -> bool:
-    """A list that is too short for pydantic alone, which counts the entries that are right."""
+    """Return whether a list is long enough. Pydantic calls it too short because it counts only the valid entries."""
     return item["type"] == "too_short" and isinstance(value, list) and len(value) >= item["ctx"]["min_length"]
 
 
@@ -130,7 +131,7 @@ def _right_values(
 
 
 def _section_of(annotation: Any) -> type[DataModel] | None:
-    """The one model that a key's value is a section of; None for anything else."""
+    """Return the one model of which the key's value is a section; None for any other value."""
     members = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
     models = [one for one in members if isinstance(one, type) and issubclass(one, DataModel)]
     return models[0] if len(models) == 1 else None
@@ -199,7 +200,9 @@ def _advice(kind: str, value: Any, path: KeyPath) -> str:
 
 
 def _unit_advice(text: str, path: KeyPath) -> str:
-    """Why a number with something behind it is not read. No number is offered: who wrote a unit meant it."""
+    """Return why a number with a text behind it is refused. No converted number is offered, because the unit was
+    intended.
+    """
     parts = quantities.split(text)
     if parts is None or not parts[1]:
         return ""
@@ -244,13 +247,13 @@ def _dotted(path: KeyPath) -> str:
 
 
 def _clean(text: str) -> str:
-    """One line of bounded length: keys are the user's and may hold anything."""
+    """Return the text on one line, at most 80 characters. Keys are the user's and may contain anything."""
     text = " ".join(text.split())
     return text if len(text) <= 80 else text[:77] + "..."
 
 
 def path_in_file(item: dict[str, Any], tree: Tree) -> KeyPath:
-    """The error's location without what pydantic adds to it: names of union members, a missing key."""
+    """Return the path of the error without parts that pydantic adds: names of union members, a missing key."""
     path: KeyPath = ()
     value = tree.data
     for part in item["loc"]:
@@ -266,7 +269,7 @@ def _value(data: Any, path: KeyPath) -> Any:
 
 
 def field_names(model: type[BaseModel], path: KeyPath) -> set[str]:
-    """The keys that may stand in the section at ``path``."""
+    """Return the keys that are permitted in the section at ``path``."""
     return {info.alias or name for found in _models_at(model, path) for name, info in found.model_fields.items()}
 
 
@@ -285,7 +288,7 @@ def _description(model: type[BaseModel], path: KeyPath, key: str) -> str:
 
 
 def _models_at(annotation: Any, path: KeyPath) -> Iterator[type[BaseModel]]:
-    """The models that may stand at ``path`` below ``annotation``."""
+    """Yield the models that are possible at ``path`` below ``annotation``."""
     origin = get_origin(annotation)
     if origin is Annotated:
         yield from _models_at(get_args(annotation)[0], path)
@@ -304,7 +307,7 @@ def _models_at(annotation: Any, path: KeyPath) -> Iterator[type[BaseModel]]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Values with a unit, and keys in another unit than ours, become the ones that a model has: every manual speaks rpm.
+# Values with a unit, and keys in another unit than the model's, are converted to the model's, because manuals use rpm.
 #
 # ``speed_max_rad_s: 100 rpm`` and ``speed_max_rpm: 100`` are both 10.47 rad/s. Only a value that the
 # model refuses is converted, so that text stays text. `Conversion` keeps both values for the reader.
@@ -315,7 +318,7 @@ _NUMBERS = frozenset({"float_type", "int_type", "float_parsing", "int_parsing"})
 
 @dataclass(frozen=True)
 class Conversion:
-    """``written`` in line ``line`` was taken for ``value`` of ``unit`` at ``path``."""
+    """A converted value: ``written`` in line ``line`` is ``value`` of ``unit`` at ``path``."""
 
     path: KeyPath
     line: int
@@ -325,7 +328,7 @@ class Conversion:
 
     @property
     def text(self) -> str:
-        """``100 rpm = 10.47 rad/s``."""
+        """Text of the conversion, such as ``100 rpm = 10.47 rad/s``."""
         return f"{self.written} = {quantities.shown(self.value, self.unit)}"
 
     def refused(self, file: str) -> Problem:
@@ -336,7 +339,7 @@ class Conversion:
 
 
 def settle(tree: Tree, error: ValidationError, model: type[BaseModel]) -> tuple[Conversion, ...]:
-    """Convert the refused values and keys that can be converted, in ``tree``; contradictions become its problems."""
+    """Convert the refused values and keys that can be converted, in ``tree``. Contradictions become its problems."""
     found: list[Conversion] = []
     seen: set[KeyPath] = set()
     for item in error.errors(include_url=False, include_context=False):
@@ -361,7 +364,7 @@ def _conversions(tree: Tree, path: KeyPath) -> list[Conversion]:
     try:
         value = quantities.read(written, unit)
     except ValueError:
-        return []      # the message of the validation says why
+        return []      # the message of the validation states the reason
     return [_put(tree, path, path, written.strip(), value, unit)]
 
 
@@ -412,7 +415,9 @@ def _put(tree: Tree, path: KeyPath, there: KeyPath, written: str, value: float, 
 
 
 def _refused(tree: Tree, path: KeyPath, message: str, instead: KeyPath | None = None) -> list[Conversion]:
-    """A problem of its own words; the key is taken out, and the one that it stands for isn't said to be missing."""
+    """Add a problem with its own message, and remove the key. The key ``instead``, which it stands for, is not reported
+    as missing.
+    """
     above = _at(tree.data, path[:-1])
     tree.problems.append(Problem(tree.file, tree.line(path), message))
     above.pop(path[-1])
@@ -448,26 +453,26 @@ class Loaded(Generic[M]):
     file: str
     lines: MappingProxyType[yaml_tree.KeyPath, int]
     conversions: tuple[Conversion, ...] = ()
-    """Values that had a unit of their own."""
+    """Values that were converted from another unit."""
 
 
 def load_model(path: Path, model: type[M]) -> M:
-    """The model in the file at ``path``; DataFileError with all its problems."""
+    """Return the model in the file at ``path``. Raises DataFileError with all problems."""
     return load_with_lines(path, model).value
 
 
 def parse_model(text: str, name: str, model: type[M]) -> M:
-    """The model in ``text``, which messages call ``name``; DataFileError with all its problems."""
+    """Return the model in ``text``; messages call it ``name``. Raises DataFileError with all problems."""
     return parse_with_lines(text, name, model).value
 
 
 def load_with_lines(path: Path, model: type[M], *, convert: bool = False) -> Loaded[M]:
-    """Do the same as `load_model`, and return the line of each key."""
+    """Return the model in the file at ``path``, with the line of each key."""
     return parse_with_lines(read_text(path), str(path), model, convert=convert)
 
 
 def parse_with_lines(text: str, name: str, model: type[M], *, convert: bool = False) -> Loaded[M]:
-    """Do the same as `parse_model`, and return each key's line. ``convert``: the caller shows ``conversions``."""
+    """Return the model in ``text``, with the line of each key. ``convert``: the caller shows ``conversions``."""
     if len(text) > MAX_BYTES:
         raise _one(name, 0, f"larger than {MAX_BYTES // 1024} KiB; this is no file of this program")
     tree = yaml_tree.read_tree(text, name)
@@ -490,12 +495,12 @@ def parse_with_lines(text: str, name: str, model: type[M], *, convert: bool = Fa
 
 
 def _validated(tree: yaml_tree.Tree, model: type[M]) -> M:
-    # By way of JSON: strict Python input takes no list for a tuple and no word for an enumeration.
+    # By way of JSON: strict Python input accepts no list for a tuple and no text for an enumeration.
     return model.model_validate_json(json.dumps(tree.data), strict=True)
 
 
 def read_text(path: Path) -> str:
-    """The text of the file at ``path``; DataFileError if it can't be read, or is no UTF-8."""
+    """Return the text of the file at ``path``. Raises DataFileError if it can't be read or is not UTF-8."""
     name = str(path)
     try:
         with path.open("rb") as stream:
@@ -511,7 +516,7 @@ def read_text(path: Path) -> str:
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        if len(raw) > MAX_BYTES:      # the cut may go through a character; the size is what is wrong
+        if len(raw) > MAX_BYTES:      # the cut may split a character; the error is the size
             return "x" * (MAX_BYTES + 1)
         line = raw.count(b"\n", 0, error.start) + 1
         raise _one(name, line, "not UTF-8 text; save the file in UTF-8") from None

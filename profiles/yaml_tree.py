@@ -1,8 +1,8 @@
-"""Text → plain maps, lists and scalars, with the line of each, and every problem found on the way.
+"""Text → plain maps, lists and scalars, with the line of each, and every problem on the way.
 
-Built on PyYAML's event stream and on nothing above it: its constructors follow YAML 1.1, let later keys
-overwrite earlier ones, and resolve tags and aliases, none of which a data file here needs.
-Our own, since loaders stop at the first mistake and hand on objects without the line of each key.
+The module uses PyYAML's event stream only. PyYAML's constructors follow YAML 1.1, let later keys overwrite earlier
+ones, and resolve tags and aliases, which no data file here needs. Other loaders stop at the first error and return
+objects without the line of each key.
 """
 
 import math
@@ -28,7 +28,8 @@ from yaml.events import (
 from profiles.errors import Problem
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a bare word in a YAML file means: the core rules of YAML 1.2, with 1.1's surprises defused.
+# Meaning of an unquoted word in a YAML file: the core rules of YAML 1.2; the ambiguous words of YAML 1.1 are text or
+# refused.
 #
 # =================================  ==========================================================
 # written                            read as
@@ -45,13 +46,14 @@ from profiles.errors import Problem
 # anything in quotes                 text
 # =================================  ==========================================================
 #
-# Text where a number or a truth value is wanted is refused later; `hint` then says what was meant.
+# Text instead of a required number or truth value is refused later; `hint` then returns the probable meaning.
 
 
 Scalar = None | bool | int | float | str
 
 MAX_NUMBER_LENGTH = 40
-"""Characters; longer ones are typing errors, and Python's conversion of them is quadratic."""
+"""Longest number, characters. A longer one is a typing error, and the time of Python's conversion grows with its
+square."""
 
 _NULL = frozenset({"", "~", "null", "Null", "NULL"})
 _BOOL = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
@@ -65,7 +67,7 @@ _TRUTH_WORDS = {"on": "true", "yes": "true", "y": "true", "off": "false", "no": 
 
 
 def plain(text: str) -> Scalar:
-    """The value of an unquoted scalar; ValueError, in words for the user, where it is refused."""
+    """Return the value of an unquoted scalar. Raises ValueError with a text for the user if it is refused."""
     if text in _NULL:
         return None
     if text in _BOOL:
@@ -114,7 +116,7 @@ def hint(text: str) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# PyYAML's syntax errors in the words of a person who edits the file.
+# PyYAML's syntax errors in words for the author of the file.
 
 
 _WORDS = (
@@ -129,7 +131,7 @@ _WORDS = (
 
 
 def syntax_error(error: yaml.MarkedYAMLError) -> tuple[int, str]:
-    """Line (from 1; 0 if unknown) and plain words."""
+    """Return the line (from 1; 0 if unknown) and the problem in plain words."""
     mark = error.problem_mark or error.context_mark
     line = int(mark.line) + 1 if mark is not None else 0
     problem = error.problem or error.context or "can't be parsed"
@@ -148,7 +150,7 @@ MAX_NODES = 20_000
 
 
 class BrokenYaml(Exception):
-    """The text can't be read on; ``line`` counts from 1."""
+    """The rest of the text can't be read. ``line`` counts from 1."""
 
     def __init__(self, line: int, message: str) -> None:
         super().__init__(message)
@@ -160,9 +162,9 @@ class BrokenYaml(Exception):
 class Tree:
     """One document.
 
-    ``lines`` holds the line of each key (of each item in a list), ``value_lines`` the line where its value
-    begins, ``refused`` the paths whose value was replaced by None because it already has its problem,
-    ``written`` what stood there where a value was converted (`yaml_loader.settle`).
+    ``lines``: line of each key, and of each item in a list. ``value_lines``: line where its value begins. ``refused``:
+    paths whose value was replaced by None because it already has its problem. ``written``: original text of a converted
+    value (`yaml_loader.settle`).
     """
 
     file: str
@@ -174,7 +176,7 @@ class Tree:
     problems: list[Problem] = field(default_factory=list)
 
     def line(self, path: KeyPath) -> int:
-        """The line of ``path``, or of the nearest thing above it that stands in the file; 1 at the top."""
+        """Return the line of ``path``, or of the nearest key above it in the file; 1 at the top."""
         while path and path not in self.lines:
             path = path[:-1]
         return self.lines.get(path, 1)
@@ -242,7 +244,7 @@ class _Builder:
         return result
 
     def _key(self, event: Event, path: KeyPath) -> str | None:
-        """The key's text; None, with a problem noted, for what can't be one."""
+        """Return the key's text; None, with a problem added, if it can't be a key."""
         if not isinstance(event, ScalarEvent):
             self.node(event, (*path, ""))
             self._problem(event, "a key must be text, not a list, a map or an alias")
@@ -286,7 +288,7 @@ class _Builder:
 
 
 def read_tree(text: str, file: str) -> Tree:
-    """Every value and every problem of ``text``; raises nothing: what can't be parsed is a problem too."""
+    """Return all values and problems of ``text``. Raises nothing: text that can't be parsed is a problem too."""
     tree = Tree(file)
     loader: Any = None
     try:
@@ -300,7 +302,7 @@ def read_tree(text: str, file: str) -> Tree:
     except yaml.MarkedYAMLError as error:
         tree.problems.append(Problem(file, *syntax_error(error)))
     except (yaml.YAMLError, ValueError, OverflowError) as error:
-        # PyYAML hands escapes such as "\UFFFFFFFF" to chr() unchecked.
+        # PyYAML passes escapes such as "\UFFFFFFFF" to chr() without a check.
         line = loader.line + 1 if loader is not None else 0
         tree.problems.append(Problem(file, line, f"not YAML ({str(error).splitlines()[0]})"))
     return tree

@@ -1,4 +1,4 @@
-"""Pretends to be the drive and the shaft: plant, inverter, and their face on the bus."""
+"""Simulated drive and shaft: plant, inverter, and their interface on each bus."""
 
 from typing import TYPE_CHECKING
 

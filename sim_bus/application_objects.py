@@ -1,4 +1,4 @@
-"""Which CiA 402 object is what in the drive, and in which unit: of our own EDS unless a profile says otherwise.
+"""The CiA 402 objects of the simulated drive and their units: those of our own EDS, or those of a profile.
 
 ==========  =======================================================  ======================
 606B 606C 60FF 606D 606F   velocities and their windows                0.1 rpm (60A9h)
@@ -27,9 +27,10 @@ from sim_bus.params import DriveParams
 from sim_bus.reports import Feedback
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What one count of each of the drive's objects is, in SI at the shaft; by itself, or as a profile says.
+# Value of one count of each object, in SI at the shaft: of our own EDS, or as in a profile.
 #
-# Worked out in revolutions, apart from the drivers' own scaling, so that one mistake doesn't hide the other.
+# The values are computed in revolutions, apart from the drivers' own scaling, so that one error does not hide the
+# other.
 
 
 TURN = 2.0 * pi
@@ -38,7 +39,7 @@ TURN = 2.0 * pi
 
 @dataclass(frozen=True)
 class ObjectUnits:
-    """Speeds in rad/s, accelerations in rad/s², torques in N·m, for one count each."""
+    """Value of one count of each object: speeds in rad/s, accelerations in rad/s², torques in N·m."""
 
     velocity: float                # 606Bh 606Ch 60FFh 606Dh 606Fh
     acceleration: float            # 6083h
@@ -46,10 +47,10 @@ class ObjectUnits:
     quick_stop: float              # 6085h
     motor_speed: float             # 6080h
     target_torque: float           # 6071h 6074h
-    actual_torque: float           # 6077h, or where the profile has it
+    actual_torque: float           # 6077h, or the profile's object
     max_torque: float              # 6072h 60E0h 60E1h
     torque_slope: float            # 6087h, per second
-    rated_torque: float            # 6076h, or where the profile has it
+    rated_torque: float            # 6076h, or the profile's object
     torque_offset: float           # 60B2h
 
 
@@ -63,7 +64,9 @@ def standard_units(drive: DriveParams) -> ObjectUnits:
 
 
 def profile_units(drive: DriveParams, profile: CanopenProfile, scales: dict[str, float]) -> ObjectUnits:
-    """Return the units of the profile; ``scales`` are the values of the parameters it multiplies and divides by."""
+    """Return the units of the profile; ``scales`` are the values of the parameters that multiply and divide
+    its units.
+    """
     usual, speed, torque, offset = standard_units(drive), profile.speed, profile.torque, profile.torque_offset
     turns_per_s = speed.rpm_per_lsb / 60.0
     for name in speed.times:
@@ -99,24 +102,26 @@ def profile_units(drive: DriveParams, profile: CanopenProfile, scales: dict[str,
 # ---------------------------------------------------------------------------------------------------------------------
 
 def clamped(value: float, bits: int) -> int:
-    """Rounded to the nearest integer that a signed field of ``bits`` can hold."""
+    """Return the nearest integer that a signed field of ``bits`` can hold."""
     counts, top = round(value), (1 << bits - 1) - 1
     return counts if -top <= counts <= top else max(-top - 1, min(top, counts))
 
 
 def wrapped(counts: float, bits: int = 32, *, signed: bool = True) -> int:
-    """A counter of so many bits, which starts over when it is full."""
+    """Return the counter in a field of ``bits``, which starts over when it is full."""
     seen = floor(counts) % (1 << bits)
     return seen - (1 << bits) if signed and seen >> (bits - 1) else seen
 
 
 def counts_per_turn(store: ObjectStore) -> float:
-    """608Fh as it stands once the drive has put its profile on, which may bring an encoder of its own."""
+    """Return the counts of a turn by 608Fh, after the profile was applied; it may bring an encoder of its own."""
     return store.default(key_of(0x608F, 1)) / max(1, store.default(key_of(0x608F, 2)))
 
 
 class ApplicationObjects:
-    """Binds an application's quantities to a store; ``setters`` are the fast ways in for RPDOs."""
+    """Connection of an application's quantities with the objects of a store. ``setters``: direct write functions for
+    RPDOs.
+    """
 
     def __init__(self, store: ObjectStore, application: Application, units: ObjectUnits | None = None) -> None:
         self._application = application
@@ -137,7 +142,9 @@ class ApplicationObjects:
         self._bind_limits()
 
     def _ratings(self) -> None:
-        """The defaults that depend on the rig; the drive's own limits are also the highest that may be written."""
+        """Set the defaults that depend on the rig. The drive's own limits are also the highest values that may be
+        written.
+        """
         drive, store, units = self._application.inverter.params.drive, self._store, self._units
         torque = min(65535, round(drive.torque_limit_nm / units.max_torque))
         speed = max(1, round(drive.speed_limit_rpm * RPM / units.motor_speed))
@@ -189,7 +196,9 @@ class ApplicationObjects:
         self._scaled(0x6087, "torque_slope_nm_s", units.torque_slope, usual.torque_slope)
 
     def _bind_limits(self) -> None:
-        """6072h bounds both directions, 60E0h and 60E1h one each; 6080h is the speed."""
+        """Connect the limits: 6072h limits the torque in both directions, 60E0h and 60E1h in one each,
+        6080h the speed.
+        """
         store, limits, unit = self._store, self._application.inverter.control.limits, self._units.max_torque
         speed_unit = self._units.motor_speed
         present = {0x6072: 65535, 0x60E0: 65535, 0x60E1: 65535}
@@ -220,7 +229,7 @@ class ApplicationObjects:
         self._store.hooks[key_of(index)] = write
 
     def _scaled(self, index: int, name: str, unit: float, usual: float) -> None:
-        """One rate or window; its default is that of our own EDS, in another unit another number, at least 1."""
+        """Connect one rate or window. Its default is that of our own EDS, converted to the unit, at least 1 count."""
         settings: ApplicationSettings = self._application.settings
         if unit != usual:
             counts = self._store.default(key_of(index)) * usual / unit
@@ -236,7 +245,7 @@ class ApplicationObjects:
             raise SdoAbortedError(ABORT_VALUE)
 
     def _mode_by_pdo(self, code: int) -> None:
-        self._application.set_mode(code)      # an unsupported one is ignored: 6061h keeps showing the old one
+        self._application.set_mode(code)      # an unsupported code is ignored: 6061h still shows the old one
 
     def _set_target_torque(self, counts: int) -> None:
         self._application.target_torque_nm = counts * self._units.target_torque

@@ -1,12 +1,12 @@
 """The CiA 402 device profile over one inverter: states, modes, option codes, statusword. Knows no bus.
 
-Every way to a stop goes through speed control, from torque mode too: quick stop (605Ah), halt (605Dh), shutdown and
-disable operation with ramp (605Bh, 605Ch), fault reaction (605Eh). Ramp by option code: 1 slow-down ramp 6084h,
-2 quick-stop ramp 6085h, 3 torque limit; 5, 6, 7 are 1, 2, 3 and then stay in quick stop active.
+All stops use speed control, from torque mode too: quick stop (605Ah), halt (605Dh), shutdown and disable operation with
+ramp (605Bh, 605Ch), fault reaction (605Eh). Ramp by option code: 1 slow-down ramp 6084h, 2 quick-stop ramp 6085h, 3
+torque limit; 5, 6, 7 are 1, 2, 3 and then stay in quick stop active.
 
 A drive may have a quick stop that doesn't brake from the torque modes: it then switches off (`ApplicationSettings`). A
-quick stop that the drive began by itself (6007h) is not undone by an enable-operation word that merely keeps coming:
-another command has to be seen first.
+quick stop that the drive began by itself (6007h) is not ended by a repeated enable-operation word: another command must
+come first.
 """
 
 
@@ -47,18 +47,20 @@ MODE_SPECIFIC = 0x1000
 
 
 DISABLED_BY_HOST = "power stage off by the host's controlword"
-"""The event of that, at once or after a ramp. A drive that ends a quick stop by itself is none."""
+"""Event of a switch-off by the host, at once or after a ramp. The end of a quick stop by the drive itself is no such
+event."""
 
 RAMP_SHARE, RAMP_TOLERANCE, RAMP_STEPS, RAMP_GAP_S = 0.35, 0.015, 16, 0.2
-"""A speed setpoint that falls in at least 15 steps, none later than 0.2 s, to 35 % of where it began is a stop: no
-stage goes so far down along a line. Every step lies on the line within 1.5 % of the fall, which a sine does not."""
+"""Definition of a stop by the speed setpoint: it falls in at least 15 steps, with gaps of at most 0.2 s, to 35 % of its
+initial value. No stage lowers the setpoint so far along a line. Every step lies on the line within 1.5 % of the fall;
+those of a sine do not."""
 
 TURNING_SHARE = 0.05
 """Share of the speed limit above which a shaft counts as turning, for a scripted stop. A sign probe stays below."""
 
 
 class State(Enum):
-    """The states by name; `STATUS` has their statusword bits."""
+    """States by name; `STATUS` has their statusword bits."""
 
     __hash__ = object.__hash__     # Enum's own is Python code, too slow for a look-up in every cycle
 
@@ -110,11 +112,11 @@ TRANSITIONS: dict[tuple[State, DeviceCommand], State] = {
     (State.QUICK_STOP, DeviceCommand.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,          # 12
     (State.QUICK_STOP, DeviceCommand.ENABLE): State.ENABLED,                              # 16, see `next_state`
 }
-"""Transitions on command. Those without one: 0 and 1 (start), 12 (quick stop done), 13 and 14 (fault), 15 (reset)."""
+"""Transitions on command. The others are 0 and 1 (start), 12 (quick stop done), 13 and 14 (fault), 15 (reset)."""
 
 
 def decode(controlword: int) -> DeviceCommand:
-    """The command in bits 0 to 3; every word is one."""
+    """Return the command in bits 0 to 3; every word has one."""
     if not controlword & 0b0010:
         return DeviceCommand.DISABLE_VOLTAGE
     if not controlword & 0b0100:
@@ -132,7 +134,7 @@ def next_state(state: State, command: DeviceCommand, quick_stop_option: int) -> 
 
 
 def fault_reset_edge(before: int, now: int) -> bool:
-    """Bit 7 has risen."""
+    """Return whether bit 7 has risen."""
     return bool(now & ~before & FAULT_RESET)
 
 
@@ -141,7 +143,7 @@ def fault_reset_edge(before: int, now: int) -> bool:
 class OperationMode(IntEnum):
     """Modes of operation, 6060h."""
 
-    VELOCITY = 2                         # vl: follows its setpoint only where controlword bits 4 to 6 release it
+    VELOCITY = 2                         # vl: follows its setpoint only with bits 4 to 6 set
     PROFILE_VELOCITY = 3
     PROFILE_TORQUE = 4
     CYCLIC_VELOCITY = 9
@@ -166,7 +168,7 @@ class ApplicationSettings:
     window_s: float = 0.0                # 606Eh
     standstill_rad_s: float = 0.05       # 606Fh
     standstill_s: float = 0.1            # 6070h
-    torque_quick_stop: bool = True       # does a quick stop on command decelerate from a torque mode?
+    torque_quick_stop: bool = True       # True: a quick stop on command decelerates from a torque mode
 
 
 def _ignore(_text: str) -> None:
@@ -174,7 +176,7 @@ def _ignore(_text: str) -> None:
 
 
 class Application:
-    """The drive between its objects and its inverter; `step` moves it, everything else only says what is wanted."""
+    """The drive between its objects and its inverter. `step` advances it; all other methods only set requests."""
 
     def __init__(self, inverter: Inverter) -> None:
         self.inverter = inverter
@@ -184,28 +186,28 @@ class Application:
         self.controlword = 0
         self.target_speed_rad_s = 0.0
         self.target_torque_nm = 0.0
-        self.torque_offset_nm = 0.0    # 60B2h, of the cyclic synchronous modes
-        self.modes = frozenset(OperationMode) - {OperationMode.VELOCITY}    # only a drive whose profile says so has it
+        self.torque_offset_nm = 0.0    # 60B2h, for the cyclic synchronous modes
+        self.modes = frozenset(OperationMode) - {OperationMode.VELOCITY}    # a profile may add vl
         self.warning = False
         self.deaf = False              # scripted: no command moves the state machine
-        self.keeps_mode = False        # scripted: 6060h is taken and not followed
+        self.keeps_mode = False        # scripted: 6060h is accepted without effect
         self.on_event: Callable[[str], None] = _ignore
         self.on_fault_reset: Callable[[], None] = lambda: None
         self.on_stop: Callable[[], None] | None = None      # scripted: a stop is requested, once
-        self._after_stop: State | None = None       # where a stop under way ends
-        self._stop_option = 0                       # and the ramp it uses
+        self._after_stop: State | None = None       # state after the stop under way
+        self._stop_option = 0                       # option code of its ramp
         self._own_stop = False                      # quick stop begun by the drive itself
         self._time_s = 0.0
-        self._fall: list[tuple[float, float]] = []      # time and magnitude of a speed setpoint that comes down
-        self._by_host = False                       # the stop under way ends in what the host has ordered
+        self._fall: list[tuple[float, float]] = []      # time and magnitude of a falling speed setpoint
+        self._by_host = False                       # the host has requested the state after the stop
         self._weighed: tuple[int, State] | None = None
         self._slow_for_s = 0.0
         self._in_window_s = 0.0
 
-    # -- what is asked of it ------------------------------------------------------------------------------
+    # -- requests -----------------------------------------------------------------------------------------
 
     def write_controlword(self, word: int) -> None:
-        """6040h: a state command, fault reset on the rising edge of bit 7, halt in bit 8."""
+        """Take 6040h: a state command, fault reset on the rising edge of bit 7, halt in bit 8."""
         if self.deaf or self._weighed == (word, self.state):
             return
         before, self.controlword = self.controlword, word
@@ -227,7 +229,7 @@ class Application:
         self._weighed = (word, self.state)
 
     def set_mode(self, code: int) -> bool:
-        """6060h; False where the mode is not supported. 0 means no change (CiA 402-2)."""
+        """Take 6060h. Return False if the mode is not supported. 0 means no change (CiA 402-2)."""
         if code in {0, self.mode} or self.keeps_mode:
             return True
         if code not in self.modes:
@@ -238,7 +240,7 @@ class Application:
         return True
 
     def fault(self) -> None:
-        """Transition 13: fault reaction after 605Eh, then fault."""
+        """Enter a fault (transition 13): fault reaction after 605Eh, then fault."""
         if self.state in {State.FAULT, State.FAULT_REACTION}:
             return
         turning = self.energised
@@ -249,7 +251,9 @@ class Application:
             self._enter(State.FAULT)
 
     def abort_connection(self) -> None:
-        """6007h: 0 nothing, 1 fault, 2 disable voltage, 3 quick stop. The fault itself (1) is the caller's to raise."""
+        """React by 6007h: 0 nothing, 1 fault, 2 disable voltage, 3 quick stop. The caller reports the fault
+        itself (1).
+        """
         option = self.settings.connection_option
         if option == 1:
             self.fault()
@@ -260,7 +264,7 @@ class Application:
         self._weighed = None
 
     def power_off(self) -> None:
-        """Reset of the device: no torque, switch on disabled, setpoints forgotten."""
+        """Reset the device: no torque, switch on disabled, setpoints cleared."""
         self.controlword = 0
         self.mode = self.first_mode
         self.target_speed_rad_s = self.target_torque_nm = self.torque_offset_nm = 0.0
@@ -269,22 +273,22 @@ class Application:
         self._enter(State.SWITCH_ON_DISABLED)
         self.inverter.control.off()
 
-    # -- what it says ------------------------------------------------------------------------------------
+    # -- state -------------------------------------------------------------------------------------------
 
     @property
     def first_mode(self) -> OperationMode:
-        """After power on: profile velocity, or what the drive has instead."""
+        """Mode after power-on: profile velocity, or the first one that the drive has instead."""
         usual = OperationMode.PROFILE_VELOCITY
         return usual if usual in self.modes else min(self.modes, default=OperationMode.VELOCITY)
 
     @property
     def standstill(self) -> bool:
-        """Slower than 606Fh for 6070h."""
+        """True if the speed has been below 606Fh for 6070h."""
         return self._slow_for_s >= self.settings.standstill_s
 
     @property
     def energised(self) -> bool:
-        """Torque may flow on the host's behalf."""
+        """True if torque may flow by a command of the host."""
         return self.state in {State.ENABLED, State.QUICK_STOP}
 
     @property
@@ -294,13 +298,15 @@ class Application:
 
     @property
     def stopping(self) -> bool:
-        """On the way to rest, or held there, by command: quick stop, halt, or a ramp before switching off."""
+        """True while the drive stops or holds the shaft by command: quick stop, halt, or a ramp before
+        switching off.
+        """
         if self.state is State.ENABLED:
             return bool(self.controlword & HALT) or self._after_stop is not None
         return self.state is State.QUICK_STOP or self._after_stop is not None
 
     def statusword(self) -> int:
-        """6041h."""
+        """Return the statusword 6041h."""
         word = STATUS[self.state] | VOLTAGE_ENABLED | REMOTE
         if self.warning:
             word |= WARNING
@@ -328,7 +334,7 @@ class Application:
     # -- time --------------------------------------------------------------------------------------------
 
     def step(self, dt_s: float) -> None:
-        """One step of at most the control period, with the setpoints as `regulate` left them."""
+        """Advance by one step of at most the control period, with the setpoints that `regulate` has set."""
         inverter, settings = self.inverter, self.settings
         inverter.step(dt_s)
         self._time_s += dt_s
@@ -344,7 +350,7 @@ class Application:
             self.regulate()
 
     def regulate(self) -> None:
-        """Hands state, mode and setpoints to the control loops; called once before the steps of a cycle."""
+        """Pass state, mode and setpoints to the control loops; called once before the steps of a cycle."""
         if self.on_stop is not None and self._told_to_rest():
             tell, self.on_stop = self.on_stop, None
             tell()
@@ -370,7 +376,9 @@ class Application:
             control.speed(self.target_speed_rad_s, settings.accel_rad_s2, settings.decel_rad_s2)
 
     def _told_to_rest(self) -> bool:
-        """The shaft turns, and the host wants it not to: quick stop, halt, no enabling any more, or a speed of zero."""
+        """Return whether the host stops a turning shaft: quick stop, halt, no enable request any more, or a speed of
+        zero.
+        """
         if abs(self.inverter.speed_rad_s) < TURNING_SHARE * self.inverter.control.limits.speed_rad_s:
             return False
         if self.state is not State.ENABLED or self.halted or self._after_stop is not None:
@@ -379,7 +387,7 @@ class Application:
         return in_speed and (self.target_speed_rad_s == 0.0 or self._ramped_down())
 
     def _ramped_down(self) -> bool:
-        """The host takes the speed setpoint down along a straight line, as it does above a drill string."""
+        """Return whether the host lowers the speed setpoint along a straight line, as above a drill string."""
         target, fall = abs(self.target_speed_rad_s), self._fall
         if fall and (target > fall[-1][1] or self._time_s - fall[-1][0] > RAMP_GAP_S):
             fall.clear()
@@ -394,13 +402,15 @@ class Application:
     # -- transitions -------------------------------------------------------------------------------------
 
     def _obey(self, command: DeviceCommand) -> bool:
-        """Carries out one transition on command; True where the state changed, so that the next may follow."""
+        """Execute one transition on command. Return whether the state changed, so that the next transition
+        may follow.
+        """
         if self._own_stop and command is DeviceCommand.ENABLE:
             return False
         target = next_state(self.state, command, self.settings.quick_stop_option)
         if target is self.state:
             if command is DeviceCommand.ENABLE and self.state is State.ENABLED:
-                self._after_stop = None                  # taken back while slowing down
+                self._after_stop = None                  # the stop is cancelled while slowing down
             return False
         if self.state is State.ENABLED and target in {State.READY, State.SWITCHED_ON}:
             option = self.settings.shutdown_option if target is State.READY else self.settings.disable_option
@@ -421,7 +431,7 @@ class Application:
         self._stop_option = option
 
     def _ramp(self, option: int) -> float:
-        """The deceleration of an option code (1, 2, 3), rad/s²."""
+        """Return the deceleration of an option code (1, 2, 3), rad/s²."""
         if option == 1:
             return self.settings.decel_rad_s2
         return self.settings.quick_stop_rad_s2 if option == 2 else inf

@@ -11,7 +11,7 @@ _KINDS = {
 
 
 def add_kinds(parser: argparse.ArgumentParser) -> None:
-    """A sub-command for each kind; the chosen one's ``run`` is left in the namespace."""
+    """Add a sub-command for each kind. The namespace gets the ``run`` of the selected one."""
     from sim_bus import canopen, ethercat, modbus
 
     kinds = parser.add_subparsers(dest="kind", required=True, metavar="KIND")
@@ -22,7 +22,7 @@ def add_kinds(parser: argparse.ArgumentParser) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """``python -m sim_bus KIND …``; the exit code."""
+    """Run ``python -m sim_bus KIND …``. Return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m sim_bus", description="A simulated drive with a shaft on it.")
     add_kinds(parser)
     namespace = parser.parse_args(argv)

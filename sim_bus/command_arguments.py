@@ -1,4 +1,6 @@
-"""Common parts of the commands of all simulated drives: options, signals, and one line for an error of use."""
+"""Common parts of the commands of all simulated drives: options, signals, and a one-line message for an
+error of use.
+"""
 
 import argparse
 import contextlib
@@ -21,11 +23,11 @@ EXIT_USAGE = 2
 
 
 class Unusable(Exception):
-    """Something the user gave can't be used; the text is the line to print."""
+    """An input of the user that can't be used. The text is the line to print."""
 
 
 def add_rig_arguments(group: argparse._ArgumentGroup) -> None:
-    """The shaft and what is written of it."""
+    """Add the options of the shaft and of its trace."""
     group.add_argument("--plant", metavar="FILE", type=Path, help="YAML with other parameters of the rig")
     group.add_argument("--gains", metavar=("P", "I"), nargs=2, type=_gain,
                        help="of its speed loop, N·m·s/rad and N·m/rad at the motor, over those of --plant")
@@ -40,7 +42,9 @@ def add_rig_arguments(group: argparse._ArgumentGroup) -> None:
 
 
 def rig_of(namespace: argparse.Namespace) -> "RigParams":
-    """The rig of ``--plant``, with what other options say over it. DataFileError for a file that can't be used."""
+    """Return the rig of ``--plant``, changed by the other options. Raises DataFileError for a file that
+    can't be used.
+    """
     from sim_bus.params import RigParams, load_rig
 
     params = load_rig(namespace.plant) if namespace.plant is not None else RigParams()
@@ -53,7 +57,7 @@ def rig_of(namespace: argparse.Namespace) -> "RigParams":
 
 
 def add_fault_argument(group: argparse._ArgumentGroup, such_as: str) -> None:
-    """Scripted misbehaviour; which faults there are is the bus's own."""
+    """Add the option for scripted faults. Each bus has faults of its own."""
     group.add_argument("--fault", metavar="FAULT", action="append", default=[],
                        help=f"a scripted fault, such as {such_as}; repeatable; 'list' shows them all")
 
@@ -76,13 +80,13 @@ def ready(text: str) -> None:
 
 
 def never_came(faults: Iterable[str]) -> None:
-    """Print, at the end, the scripted faults that never happened."""
+    """Print, at the end, the scripted faults that never occurred."""
     for fault in faults:
         print(f"simulate: the fault {fault} never came: its moment was not reached", file=sys.stderr)  # noqa: T201
 
 
 def host_and_port(text: str) -> tuple[str, int]:
-    """HOST:PORT; the host of this machine where it is left out."""
+    """Return HOST and PORT of a text HOST:PORT. The default host is this computer."""
     host, colon, port = text.rpartition(":")
     if not colon or not port.isdigit() or int(port) > 65535:
         raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT")
@@ -90,7 +94,7 @@ def host_and_port(text: str) -> tuple[str, int]:
 
 
 def number_from(lowest: int, highest: int, what: str) -> Callable[[str], int]:
-    """An argument type: a whole number in that range."""
+    """Return an argument type: a whole number in this range."""
     def parse(text: str) -> int:
         if not text.isdigit() or not lowest <= int(text) <= highest:
             raise argparse.ArgumentTypeError(f"{text!r} is not {what} from {lowest} to {highest}")
@@ -125,7 +129,7 @@ def _seed(text: str) -> int:
 
 @contextlib.contextmanager
 def _signals(stop: threading.Event) -> Iterator[None]:
-    """SIGINT and SIGTERM end the simulation; in another thread than the main one they can't be caught."""
+    """End the simulation on SIGINT and SIGTERM. Only the main thread can catch them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,6 +1,7 @@
-"""Scripted faults of a drive and of what it turns, on any bus of CiA 402; each sets something and restores it.
+"""Scripted faults of a drive and of its load, on any CiA 402 bus. Each changes a value and restores it.
 
-And what the faults of a bus are made of: something done where a fault takes place, and the script of one drive.
+The module also has the parts of which the faults of a bus are made: an act at the place of the fault, and the script of
+one drive.
 """
 
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from sim_bus.timed_drive import TimedDrive
 
 _PROFILE_VELOCITY = 3
 M = TypeVar("M")
-"""Type of a fault on the bus in question."""
+"""Type of a fault on the bus."""
 
 F = TypeVar("F", bound=Passing)
 P = TypeVar("P")
@@ -23,7 +24,7 @@ V = TypeVar("V")
 
 
 class FaultAct(Passing, Generic[P]):
-    """Act at its place when it begins, and when it ends."""
+    """Act at the place of the fault, once when it begins and once when it ends."""
 
     place: P
 
@@ -31,17 +32,17 @@ class FaultAct(Passing, Generic[P]):
         self._begin, self._end = begin, end
 
     def begin(self) -> None:
-        """It starts."""
+        """Act at the begin."""
         self._begin(self.place)
 
     def end(self) -> None:
-        """It is over."""
+        """Act at the end."""
         if self._end is not None:
             self._end(self.place)
 
 
 def changed(of: Callable[[P], Any], name: str, value: Callable[[P], object]) -> FaultAct[P]:
-    """An attribute has another value while the fault lasts."""
+    """Return a fault that gives an attribute another value while it lasts."""
     before: list[object] = []
 
     def begin(place: P) -> None:
@@ -52,7 +53,7 @@ def changed(of: Callable[[P], Any], name: str, value: Callable[[P], object]) -> 
 
 
 def once(parse: Callable[[str], V], act: Callable[[P, V], None]) -> Callable[[str], FaultAct[P]]:
-    """Something that happens once, with the value of the fault."""
+    """Return a fault that acts once, with the fault's value."""
     def make(text: str) -> FaultAct[P]:
         value = parse(text)
         return FaultAct(lambda place: act(place, value))
@@ -61,13 +62,13 @@ def once(parse: Callable[[str], V], act: Callable[[P, V], None]) -> Callable[[st
 
 
 class FaultSchedule(Generic[F]):
-    """The script of one drive; `happen_to` makes it act."""
+    """Script of one drive; `happen_to` activates it."""
 
     def __init__(self, script: tuple[Scripted, ...], make: Callable[[Scripted], F]) -> None:
         self.cast: Cast[F] = Cast(script, make)
 
     def happen_to(self, drive: TimedDrive) -> None:
-        """Let the faults happen to this drive from now on."""
+        """Apply the faults to this drive from now on."""
         self._drive = drive
         drive.on_time = self.moved
         drive.on_stage = self._on_stage
@@ -75,11 +76,11 @@ class FaultSchedule(Generic[F]):
 
     @property
     def waiting(self) -> tuple[str, ...]:
-        """Faults whose moment hasn't come, as they were written."""
+        """Faults that have not begun yet, as they were written."""
         return self.cast.waiting
 
     def moved(self, now_us: int) -> None:
-        """Plant time has come so far."""
+        """Begin and end the faults that are due at this plant time, µs."""
         self.cast.moved(now_us, self._drive.note)
 
     def _on_stage(self, number: int) -> None:
@@ -88,17 +89,17 @@ class FaultSchedule(Generic[F]):
 
 
 class InjectedFault:
-    """Nothing by itself; a fault overrides what it needs."""
+    """A fault without effect; a subclass overrides the methods that it needs."""
 
     def begin(self, drive: TimedDrive) -> None:
-        """It starts."""
+        """Begin the fault."""
 
     def end(self, drive: TimedDrive) -> None:
-        """It is over."""
+        """End the fault."""
 
 
 class Deaf(InjectedFault):
-    """The state machine doesn't move on commands any more."""
+    """State machine that ignores all commands."""
 
     def begin(self, drive: TimedDrive) -> None:
         drive.application.deaf = True
@@ -116,7 +117,7 @@ class SafeTorqueOff(Deaf):
 
 
 class ModeKept(InjectedFault):
-    """6060h is taken and not followed: 6061h goes on showing the old mode."""
+    """Mode change without effect: 6060h is accepted, and 6061h still shows the old mode."""
 
     def begin(self, drive: TimedDrive) -> None:
         drive.application.keeps_mode = True
@@ -126,7 +127,9 @@ class ModeKept(InjectedFault):
 
 
 class ModeLost(ModeKept):
-    """The drive goes over to its profile velocity mode (3) by itself, and stays there whatever 6060h says."""
+    """Loss of the mode: the drive changes to profile velocity mode (3) by itself and stays there, whatever the value of
+    6060h.
+    """
 
     def begin(self, drive: TimedDrive) -> None:
         drive.application.set_mode(_PROFILE_VELOCITY)
@@ -134,7 +137,7 @@ class ModeLost(ModeKept):
 
 
 class LimitedTorque(InjectedFault):
-    """An internal limit leaves this share of the torque limit."""
+    """Internal limit: only this share of the torque limit is left."""
 
     def __init__(self, share: float) -> None:
         self._share = share
@@ -151,7 +154,7 @@ class LimitedTorque(InjectedFault):
 
 
 class LoadLost(InjectedFault):
-    """The coupled load comes off: this share of the motor end's inertia and friction is left."""
+    """Loss of the coupled load: this share of the motor end's inertia and friction is left."""
 
     def __init__(self, share: float) -> None:
         self._share = share
@@ -161,7 +164,7 @@ class LoadLost(InjectedFault):
 
 
 class Lying(InjectedFault):
-    """Sensor, power stage or reports of the drive are wrong (`sim_bus.reports`)."""
+    """Wrong sensor, power stage or reports of the drive (`sim_bus.reports`)."""
 
     def __init__(self, lie: Lie) -> None:
         self._lie = lie
@@ -174,7 +177,7 @@ class Lying(InjectedFault):
 
 
 def of_drive(act: Callable[[InjectedFault], M]) -> dict[str, FaultKind[M]]:
-    """The table as faults of one bus; ``act`` makes one of its faults."""
+    """Return the table as faults of one bus. ``act`` converts a fault into one of the bus."""
     return {
         "stuck-state": FaultKind(31, "the controlword is ignored", plain(lambda: act(Deaf()))),
         "mode-not-followed": FaultKind(32, "6061h doesn't follow 6060h", plain(lambda: act(ModeKept()))),

@@ -1,12 +1,12 @@
-"""When a scripted fault begins and ends, in plant time, and how that is written. Pure.
+"""Begin and end of a scripted fault in plant time, and the text form of a fault. Pure.
 
 ::
 
     NAME[@WHEN][=VALUE][/DURATION]      heartbeat-lost@hold+2s    frame-loss@acquire+5s=5%/20s    sto@12.5s
-    WHEN    12.5s  from power-on    STAGE or STAGE+2s  from the moment at which the host says that the stage begins
-            STAGE may also be stop: from the moment at which the drive is first told to come to rest
+    WHEN    12.5s  from power-on    STAGE or STAGE+2s  from the moment at which the host reports the stage's begin
+            STAGE may also be stop: from the moment of the first request to stop the drive
             left out: from the start
-    DURATION  left out: for good
+    DURATION  left out: without end
 """
 
 import re
@@ -18,7 +18,7 @@ from typing import Generic, TypeVar
 from profiles import STAGE_NUMBERS, MessageCode, TdhilError
 
 STOP = max(STAGE_NUMBERS.values()) + 1
-"""Number of the moment at which a stop is requested while the shaft turns; no host announces it."""
+"""Number of the moment at which a stop is requested while the shaft turns. No host announces it."""
 
 _MOMENTS = {**STAGE_NUMBERS, "stop": STOP}
 _NUMBER = r"\d+(?:\.\d+)?"
@@ -30,7 +30,7 @@ _WHEN = re.compile(rf"(?:(?P<stage>[a-z]+)(?:\+(?P<after>{_NUMBER}m?s))?|(?P<tim
 
 
 class FaultRefused(TdhilError):
-    """The text is not a fault that can be scripted."""
+    """Error for a text that is no fault that can be scripted."""
 
     entry = MessageCode.FAULT_SCRIPT_WRONG
 
@@ -39,7 +39,9 @@ class FaultRefused(TdhilError):
 
 @dataclass(frozen=True)
 class Moment:
-    """``after_s`` of plant time from the beginning of a stage (by its number), or from power-on where that is 0."""
+    """Moment of a fault: ``after_s`` of plant time after the begin of a stage (by number), or after power-on for stage
+    0.
+    """
 
     stage: int = 0
     after_s: float = 0.0
@@ -47,7 +49,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class Scripted:
-    """One fault of a script, as it was written."""
+    """One fault of a script, with its original text."""
 
     name: str
     at: Moment = Moment()
@@ -57,7 +59,7 @@ class Scripted:
 
 
 class Schedule:
-    """Which faults begin and end at a plant time. Each begins once, the first time its moment comes."""
+    """Begin and end of the faults in plant time. Each fault begins once, when its moment is reached the first time."""
 
     def __init__(self, faults: tuple[Scripted, ...]) -> None:
         self._waiting = list(enumerate(faults))
@@ -66,17 +68,17 @@ class Schedule:
         self._next_us = 0
 
     def stage(self, number: int, now_us: int) -> None:
-        """A stage has begun; a second time, as after a restart of the host, changes nothing."""
+        """Record the begin of a stage. A repeated begin, after a restart of the host, has no effect."""
         self._stages_us.setdefault(number, now_us)
         self._next_us = 0
 
     @property
     def waiting(self) -> tuple[str, ...]:
-        """Those whose moment hasn't come, as they were written."""
+        """Faults that have not begun yet, as they were written."""
         return tuple(fault.text for _, fault in self._waiting)
 
     def due(self, now_us: int) -> tuple[list[int], list[int]]:
-        """The numbers of the faults that begin now, and of those that end now."""
+        """Return the numbers of the faults that begin now, and of those that end now."""
         if now_us < self._next_us:
             return [], []
         begin = [(n, fault) for n, fault in self._waiting if self._begins_us(fault) <= now_us]
@@ -94,20 +96,20 @@ class Schedule:
 
 
 class Passing:
-    """A fault that starts and is over; what either does is its own."""
+    """A fault with a begin and an end; subclasses define both."""
 
     def begin(self) -> None:
-        """It starts."""
+        """Begin the fault."""
 
     def end(self) -> None:
-        """It is over."""
+        """End the fault."""
 
 
 F = TypeVar("F", bound=Passing)
 
 
 class Cast(Generic[F]):
-    """The faults of a script, in its order, and the active ones; ``note`` is called for each change."""
+    """Faults of a script, in its order, and the active ones. ``note`` is called for each change."""
 
     def __init__(self, script: tuple[Scripted, ...], make: Callable[[Scripted], F]) -> None:
         self._script = script
@@ -117,15 +119,15 @@ class Cast(Generic[F]):
 
     @property
     def waiting(self) -> tuple[str, ...]:
-        """Those whose moment hasn't come, as they were written."""
+        """Faults that have not begun yet, as they were written."""
         return self._schedule.waiting
 
     def stage(self, number: int, now_us: int) -> None:
-        """A stage has begun."""
+        """Record the begin of a stage."""
         self._schedule.stage(number, now_us)
 
     def moved(self, now_us: int, note: Callable[[str], None]) -> bool:
-        """Begins and ends what is due; whether anything was."""
+        """Begin and end the faults that are due. Return whether there was one."""
         begin, end = self._schedule.due(now_us)
         for number in begin:
             note(f"fault: {self._script[number].text}")
@@ -139,7 +141,7 @@ class Cast(Generic[F]):
 
 
 def parse(text: str) -> Scripted:
-    """One fault as the user writes it; its name and value are looked up in `Kinds`. Raises FaultRefused."""
+    """Return one fault from the user's text; `Kinds` checks its name and value. Raises FaultRefused."""
     found = _FAULT.fullmatch(text.strip())
     if found is None:
         raise FaultRefused(f"{text!r} is no fault", where="--fault",
@@ -167,18 +169,18 @@ def _seconds(text: str) -> float:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a list of scripted faults is made of, whatever the bus: name, row of the fault table, value; looking one up.
+# Parts of a list of scripted faults, for any bus: name, row of the fault table, value, and the look-up of a fault.
 
 
 M = TypeVar("M")
-"""Type of a fault on the bus in question."""
+"""Type of a fault on the bus."""
 
 
 @dataclass(frozen=True)
 class FaultKind(Generic[M]):
-    """``value``: the default, '' where the fault takes none. ``make`` may raise ValueError."""
+    """One entry of the list. ``value``: the default, '' for a fault without a value. ``make`` may raise ValueError."""
 
-    row: int                           # of docs/reference/faults.md; 0: none of its own
+    row: int                           # row of docs/reference/faults.md; 0: no row
     summary: str
     make: Callable[[str], M]
     value: str = ""
@@ -194,7 +196,7 @@ def number(text: str) -> float:
 
 
 def share(text: str) -> float:
-    """A share as a number or in percent. Raises ValueError."""
+    """Return a share from a number or a percentage. Raises ValueError."""
     found = number(text[:-1]) / 100.0 if text.endswith("%") else number(text)
     if not 0.0 <= found <= 1.0:
         raise ValueError("a share from 0 to 1, or 0% to 100%")
@@ -202,7 +204,7 @@ def share(text: str) -> float:
 
 
 def seconds(text: str) -> float:
-    """A time such as 1s or 200ms. Raises ValueError."""
+    """Return a time, s, from a text such as 1s or 200ms. Raises ValueError."""
     found = number(text[:-2]) / 1000.0 if text.endswith("ms") else number(text.removesuffix("s"))
     if not 0.001 <= found <= 3600.0:
         raise ValueError("a time from 1ms to 3600s")
@@ -233,7 +235,7 @@ def object_place(text: str) -> tuple[int, int]:
 
 
 def plain(make: Callable[[], M]) -> Callable[[str], M]:
-    """Make a fault that has no value."""
+    """Return a function that makes a fault without a value."""
     return lambda _value: make()
 
 
@@ -241,7 +243,7 @@ def plain(make: Callable[[], M]) -> Callable[[str], M]:
 class KnownFault:
     """A fault that can be scripted. ``row`` of docs/reference/faults.md (0: none); ``takes``: its value, '' for none.
 
-    ``from_start``: so is the drive, from the start and for good.
+    ``from_start``: the fault acts from the start and without end.
     """
 
     name: str
@@ -253,7 +255,7 @@ class KnownFault:
 
 
 class Kinds(dict[str, FaultKind[M]]):
-    """The faults of one bus by their names."""
+    """Faults of one bus by name."""
 
     def make(self, fault: Scripted) -> M:
         """Return the effect of a scripted fault. Raises FaultRefused for an unknown name or value."""
@@ -275,21 +277,21 @@ class Kinds(dict[str, FaultKind[M]]):
             ) from None
 
     def parse_all(self, texts: Sequence[str]) -> tuple[Scripted, ...]:
-        """All the faults of a command line, each checked. Raises FaultRefused."""
+        """Return all faults of a command line, each checked. Raises FaultRefused."""
         faults = tuple(parse(text) for text in texts)
         for fault in faults:
             self.make(fault)
         return faults
 
     def listed(self, from_start: Container[str] = ()) -> tuple[KnownFault, ...]:
-        """Every fault, in the order of the fault table's rows."""
+        """Return every fault, in the order of the fault table's rows."""
         return tuple(
             KnownFault(name, kind.summary, kind.row, kind.value, kind.takes, name in from_start)
             for name, kind in sorted(self.items(), key=lambda item: (item[1].row or 99, item[0]))
         )
 
     def listing(self) -> str:
-        """Every fault with its row and value, for people."""
+        """Return the list of faults with row and value as a text."""
         lines = [
             f"NAME[@WHEN][=VALUE][/DURATION]; WHEN is 12.5s, or a stage: {', '.join(_MOMENTS)}, hold+2s",
             "", f"{'row':>3}  {'name':<37}what happens",

@@ -1,4 +1,4 @@
-"""The drive's inside with the shaft on it: measure, regulate, lag, disturb, move, report; one call per step.
+"""Inside of the drive with the shaft: measure, control, lag, disturb, move, report; one call per step.
 
 ::
 
@@ -6,8 +6,8 @@
                                                                    │                     │
                                                         reporting: lags, noise, quanta ◄─┘
 
-The drive's own units of torque and speed may be wrong (`ReportingParams`). All its torques, commanded, demanded and
-reported, share the wrong unit, and so do commanded and reported speed; the position counts true turns.
+The drive's own units of torque and speed may be wrong (`ReportingParams`). Commanded, demanded and reported torque have
+the same wrong unit, and so do commanded and reported speed. The position counts true turns.
 
 It owns no clock and no thread: the caller of `step` states the time step.
 """
@@ -26,27 +26,29 @@ from sim_bus.plant import ShaftState as RigidState
 from sim_bus.reports import Feedback, Lies
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Seeded disturbances: white sensor and torque noise, and a load that wanders (Ornstein–Uhlenbeck).
+# Seeded disturbances: white sensor and torque noise, and a load that varies at random (Ornstein–Uhlenbeck process).
 #
-# The load obeys dx = −x/τ dt + sd √(2/τ) dW; sampled every h, exactly: x ← a x + sd √(1 − a²) n, a = e^(−h/τ).
-# White noise is given as it stands in a step of 2 ms; in a step of h its sd is √(2 ms/h) times as large, so
-# that its spectral density does not depend on the step.
+# The load obeys dx = −x/τ dt + sd √(2/τ) dW; sampled every h, exactly: x ← a x + sd √(1 − a²) n, a = e^(−h/τ). White
+# noise is specified for a step of 2 ms; in a step of h its standard deviation is √(2 ms/h) times as large, so that its
+# spectral density does not depend on the step.
 
 
 REFERENCE_STEP_S = 0.002
 CHANNELS = 5
-"""Independent normals per step: speed sensor, torque, load, reported speed, reported torque."""
+"""Number of independent normal variates per step: speed sensor, torque, load, reported speed, reported torque."""
 _BLOCK = 2048
 
 
 def normals(rng: np.random.Generator) -> Iterator[list[float]]:
-    """Endless rows of standard normals, drawn in blocks (a draw per step would cost more than the plant)."""
+    """Yield endless rows of standard normal variates, drawn in blocks. One draw per step would cost more time than the
+    plant.
+    """
     while True:
         yield from rng.standard_normal((_BLOCK, CHANNELS)).tolist()
 
 
 class Disturbance:
-    """The wandering load, and the sizes of the white noises for the step in use."""
+    """Random load, and standard deviations of the white noises for the present step."""
 
     __slots__ = ("_decay", "_kick", "_params", "load_nm", "sensor_sd_rad_s", "torque_sd_nm")
 
@@ -56,7 +58,7 @@ class Disturbance:
         self.prepare(REFERENCE_STEP_S)
 
     def prepare(self, dt_s: float) -> None:
-        """Fits the coefficients to a step of ``dt_s``."""
+        """Compute the coefficients for a step of ``dt_s``."""
         params = self._params
         self._decay = exp(-dt_s / params.load_correlation_s)
         self._kick = params.load_nm * sqrt(1.0 - self._decay**2)
@@ -65,7 +67,7 @@ class Disturbance:
         self.torque_sd_nm = params.torque_nm * scale
 
     def wander(self, normal: float) -> float:
-        """Moves the load by one step and returns it, N·m."""
+        """Advance the load by one step and return it, N·m."""
         self.load_nm = self._decay * self.load_nm + self._kick * normal
         return self.load_nm
 
@@ -79,7 +81,7 @@ class BottomLoad:
         self._load_nm = 0.0
 
     def wander(self, dt_s: float) -> float:
-        """Moves it by a step and returns it, N·m."""
+        """Advance the load by one step and return it, N·m."""
         decay = exp(-dt_s / self._params.bottom_correlation_s)
         kick = self._params.bottom_load_nm * sqrt(1.0 - decay**2)
         self._load_nm = decay * self._load_nm + kick * next(self._normals)
@@ -87,23 +89,23 @@ class BottomLoad:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What the drive says about itself: a first-order lag on speed and on torque, noise, then a quantum.
+# Reported signals: a first-order lag on speed and on torque, noise, then quantisation.
 #
-# The lag dy/dt = (x − y)/τ is exact for an input constant over the step: y ← y + (1 − e^(−h/τ)) (x − y).
-# Torque is constant over a step; of the speed the step's mean is taken.
+# The lag dy/dt = (x − y)/τ is exact for an input constant over the step: y ← y + (1 − e^(−h/τ)) (x − y). The torque is
+# constant over a step; for the speed the mean of the step is taken.
 
 
 RPM = 2.0 * pi / 60.0
-"""rad/s."""
+"""rad/s in one rev/min."""
 
 
 def lag_gain(dt_s: float, lag_s: float) -> float:
-    """1 − e^(−h/τ); 1 where there is no lag."""
+    """Return 1 − e^(−h/τ); 1 without a lag."""
     return -expm1(-dt_s / lag_s) if lag_s > 0.0 else 1.0
 
 
 class Reporting:
-    """Reported speed and torque, renewed with every step and held in between."""
+    """Reported speed and torque, updated with every step and held in between."""
 
     __slots__ = (
         "_dt_s", "_params", "_speed_gain", "_speed_lagged", "_speed_quantum", "_torque_gain", "_torque_lagged",
@@ -122,13 +124,13 @@ class Reporting:
         self.prepare(rig.drive.control_period_s)
 
     def prepare(self, dt_s: float) -> None:
-        """Fits the lags to a step of ``dt_s``."""
+        """Compute the lags for a step of ``dt_s``."""
         self._dt_s = dt_s
         self._speed_gain = lag_gain(dt_s, self._params.speed_lag_s)
         self._torque_gain = lag_gain(dt_s, self._params.torque_lag_s)
 
     def step(self, speed_rad_s: float, torque_nm: float, speed_normal: float, torque_normal: float) -> None:
-        """One step with the measured mean speed and the torque of that step, and two standard normals."""
+        """Advance by one step: measured mean speed and torque of that step, and two standard normal variates."""
         params = self._params
         self._speed_lagged = speed = self._speed_lagged + self._speed_gain * (speed_rad_s - self._speed_lagged)
         self._torque_lagged = torque = self._torque_lagged + self._torque_gain * (torque_nm - self._torque_lagged)
@@ -144,22 +146,22 @@ class Reporting:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The drive's loops: speed PI with anti-windup, torque mode under a speed limit, ramps, bumpless switching.
+# The drive's control loops: speed PI with anti-windup, torque mode under a speed limit, ramps, bumpless switching.
 #
-# Speed control: e = ramped reference − filtered speed, demand = K_p e + I, dI/dt = K_i e, clamped to the
-# torque limits; the integral stands still while the clamp holds and e would push further into it. The reference may be
-# smoothed first. A torque offset (CiA 402-2, 60B2h) is added to the demand, inside the clamp. The standard does not
-# define it in a quick stop. Here it acts for as long as speed is regulated, which is the worse case for the stop.
+# Speed control: e = ramped reference − filtered speed, demand = K_p e + I, dI/dt = K_i e, clamped to the torque limits.
+# The integral is held while the clamp acts and e would drive it further into the clamp. The reference may be smoothed
+# first. A torque offset (CiA 402-2, 60B2h) is added to the demand, inside the clamp. The standard does not define it in
+# a quick stop. Here it acts during all speed control, which is the worse case for the stop.
 #
-# Torque mode: demand = ramped torque − K_p x − I with x the speed beyond the limit and dI/dt = K_i x, I ≥ 0: nothing
-# happens below the limit, and in the long run the limit is held exactly. The same on the negative side.
+# Torque mode: demand = ramped torque − K_p x − I with x the speed beyond the limit and dI/dt = K_i x, I ≥ 0. Below the
+# limit the limiter has no effect, and in the steady state the limit is held exactly. The negative side is the same.
 #
-# Switching: to speed, the integral starts at the torque demand that flows and a ramp at the actual speed;
-# to torque, a ramp starts at the torque demand that flows. A setpoint without ramp acts at once: the
-# caller that switches sets it first.
+# Switching: to speed, the integral starts at the present torque demand and a ramp at the actual speed; to torque, a
+# ramp starts at the present torque demand. A setpoint without ramp acts at once: the caller that switches sets it
+# first.
 #
-# Stopping: the ramp starts at the actual speed. Once the speed has come to zero the integral is dropped, which
-# until then held the braking torque and would drive the shaft backwards.
+# Stopping: the ramp starts at the actual speed. When the speed has reached zero, the integral is cleared. Until then it
+# held the braking torque; after that it would drive the shaft backwards.
 
 
 class Regulation(Enum):
@@ -183,7 +185,7 @@ class LoopLimits:
 
 
 class Controller:
-    """The loops and their memory; `step` is called with the measured speed once per control period."""
+    """Control loops with their states; `step` is called with the measured speed once per control period."""
 
     __slots__ = (
         "_came_from",
@@ -214,17 +216,17 @@ class Controller:
         self.demand_nm = 0.0
         self.reference = 0.0           # ramped setpoint: rad/s, or N·m in torque mode
         self._target = 0.0
-        self._up = inf                 # ramp towards larger magnitude, per second
+        self._up = inf                 # ramp away from zero, per second
         self._down = inf               # ramp towards zero, per second
         self._integral = 0.0
         self._overspeed = 0.0          # integral of the speed limiter, N·m
         self._came_from = 0.0          # sign of the speed when the stop began
         self.offset_nm = 0.0           # torque offset
-        self._smoothed = 0.0           # the reference behind its filter, rad/s
+        self._smoothed = 0.0           # filtered reference, rad/s
         self.prepare(params.control_period_s)
 
     def prepare(self, dt_s: float) -> None:
-        """Fits the speed and reference filters to a step of ``dt_s``."""
+        """Compute the speed and reference filters for a step of ``dt_s``."""
         self._filter_gain = lag_gain(dt_s, self._params.speed_filter_s)
         self._reference_gain = lag_gain(dt_s, self._params.reference_filter_s)
 
@@ -236,14 +238,14 @@ class Controller:
             self.limited = False
 
     def speed(self, target_rad_s: float, accel_rad_s2: float = inf, decel_rad_s2: float = inf) -> None:
-        """Regulates speed, along a ramp unless the rates are infinite."""
+        """Control speed, along a ramp unless the rates are infinite."""
         if self.regulation is not Regulation.SPEED:
             self._enter_speed_control(Regulation.SPEED)
         self._target = target_rad_s
         self._up, self._down = accel_rad_s2, decel_rad_s2
 
     def stop(self, decel_rad_s2: float = inf) -> None:
-        """Brings the shaft to rest under speed control and holds it there; infinite: at the torque limit."""
+        """Bring the shaft to standstill under speed control and hold it there; infinite: at the torque limit."""
         if self.regulation is not Regulation.STOP:
             self._enter_speed_control(Regulation.STOP)
             self.reference = self.filtered_rad_s
@@ -252,7 +254,7 @@ class Controller:
         self._up = self._down = decel_rad_s2
 
     def torque(self, target_nm: float, slope_nm_s: float = inf) -> None:
-        """Regulates torque, along a ramp unless the slope is infinite."""
+        """Control torque, along a ramp unless the slope is infinite."""
         if self.regulation is not Regulation.TORQUE:
             self.regulation = Regulation.TORQUE
             self.reference = self.demand_nm
@@ -262,12 +264,12 @@ class Controller:
 
     @property
     def ramp_done(self) -> bool:
-        """The ramped setpoint has arrived at its target."""
+        """True if the ramped setpoint has reached its target."""
         return self.reference == self._target
 
     @property
     def speed_reference_rad_s(self) -> float:
-        """The ramped speed setpoint; 0 where speed is not regulated."""
+        """Ramped speed setpoint, rad/s; 0 if speed is not controlled."""
         return self.reference if self.regulation in {Regulation.SPEED, Regulation.STOP} else 0.0
 
     @property
@@ -276,7 +278,7 @@ class Controller:
         return self.regulation in {Regulation.SPEED, Regulation.STOP} and self.reference == 0.0 == self._target
 
     def step(self, measured_rad_s: float, dt_s: float) -> float:
-        """The torque demand for the coming ``dt_s``, N·m."""
+        """Return the torque demand for the coming ``dt_s``, N·m."""
         self.filtered_rad_s += self._filter_gain * (measured_rad_s - self.filtered_rad_s)
         regulation = self.regulation
         if regulation is Regulation.OFF:
@@ -286,7 +288,7 @@ class Controller:
         if regulation is Regulation.TORQUE:
             limits = self.limits
             if self._overspeed == 0.0 and -limits.speed_rad_s <= self.filtered_rad_s <= limits.speed_rad_s:
-                wanted = self.reference        # the usual case: the speed limiter has nothing to do
+                wanted = self.reference        # the usual case: the speed limiter has no effect
             else:
                 wanted = self._torque_wanted(dt_s)
             demand = wanted
@@ -304,7 +306,7 @@ class Controller:
         self.regulation = regulation
 
     def _ramp(self, dt_s: float) -> None:
-        """Moves the reference towards the target: down to zero with one rate, away from zero with the other."""
+        """Advance the reference towards the target: down to zero with one rate, away from zero with the other."""
         now, target = self.reference, self._target
         falling = now * target < 0.0 or abs(target) < abs(now)
         rate = self._down if falling else self._up
@@ -344,7 +346,9 @@ class Controller:
         return demand
 
     def _torque_wanted(self, dt_s: float) -> float:
-        """The ramped torque, less what the speed limit takes away from a shaft that is, or was, beyond it."""
+        """Return the ramped torque minus the torque of the speed limiter. The limiter acts while or after the shaft is
+        too fast.
+        """
         params, limit = self._params, self.limits.speed_rad_s
         speed, taken = self.filtered_rad_s, self._overspeed
         forward = taken > 0.0 or (taken == 0.0 and speed > limit)
@@ -360,7 +364,7 @@ class Controller:
 
 
 def limits_sum(limits: LoopLimits) -> float:
-    """The most that the speed limiter may ever have to take away: from one torque limit to the other."""
+    """Return the largest torque of the speed limiter, N·m: from one torque limit to the other."""
     return limits.torque_forward_nm + limits.torque_reverse_nm
 
 
@@ -378,13 +382,13 @@ class Inverter:
         self.params = params
         self.control = Controller(params.drive)
         self.lies = Lies()
-        """Scripted: what sensor, power stage and reports make of the truth."""
+        """Scripted: distortions by sensor, power stage and reports."""
         self.reporting = Reporting(params, self.lies)
         plant = build(params.plant)
         self.state: MotorState = plant.rest()
         self._move: Callable[..., MotorState] = plant.step
         self.torque_nm = 0.0
-        """True torque on the shaft during the last step."""
+        """True torque on the shaft during the last step, N·m."""
         self._disturbance = Disturbance(params.noise)
         self._normals = normals(rng)
         self._bottom_load = BottomLoad(params.noise, rng.spawn(1)[0]) if params.noise.bottom_load_nm > 0.0 else None
@@ -396,21 +400,21 @@ class Inverter:
 
     @property
     def speed_rad_s(self) -> float:
-        """The motor shaft's true speed."""
+        """True speed of the motor shaft, rad/s."""
         return self.state.speed_rad_s
 
     @property
     def reported_demand_nm(self) -> float:
-        """The torque demand as the drive tells it."""
+        """Torque demand as the drive reports it, N·m."""
         return self.lies.last(Feedback.DEMAND, self.control.demand_nm)
 
     @property
     def reported_angle_rad(self) -> float:
-        """The motor shaft's angle as the drive's sensor counts it and the drive tells it."""
+        """Angle of the motor shaft as the drive's sensor counts it and the drive reports it, rad."""
         return self.lies.angle_rad(self.state.angle_rad)
 
     def step(self, dt_s: float) -> None:
-        """Everything moves on by ``dt_s`` (at most the control period, see `steps`)."""
+        """Advance by ``dt_s`` (at most the control period, see `steps`)."""
         if dt_s != self._dt_s:
             self._prepare(dt_s)
         sensor, ripple, load, speed_noise, torque_noise = next(self._normals)
@@ -444,14 +448,18 @@ class Inverter:
             lies.told(Feedback.POSITION, lies.counted_rad(state.angle_rad), dt_s)
 
     def steps(self, duration_s: float) -> tuple[int, float]:
-        """How many equal steps, none longer than the control period, make up ``duration_s``."""
+        """Return the number and length, s, of equal steps that make up ``duration_s``, none longer than the control
+        period.
+        """
         if duration_s != self._divided_s:
             count = max(1, -int(-duration_s / self.params.drive.control_period_s * (1.0 - 1e-9) // 1))
             self._divided_s, self._division = duration_s, (count, duration_s / count)
         return self._division
 
     def lose_load(self, share: float) -> None:
-        """Scripted: what hangs on the motor comes off; a rigid shaft with this share of the motor end's is left."""
+        """Scripted: disconnect the load. A rigid shaft with this share of the motor end's inertia and
+        friction is left.
+        """
         motor, before = self.params.plant, self.state
         left = RigidParams(
             inertia_kg_m2=share * motor.inertia_kg_m2,

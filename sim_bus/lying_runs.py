@@ -1,8 +1,8 @@
-"""Combinations of a lying drive: which lie, from when on, on which rig and bus, in which program of tdhil. Pure.
+"""Combinations of a drive with wrong reports: fault, moment, rig, bus, and program of tdhil. Pure.
 
-A *program* is what tdhil is asked to do on one simulated rig, short enough for two or three seconds of processor time.
-`product` has every combination; `standard` every lie at every moment, with the programs taking turns; `sample` a seeded
-part of the product. `sim_bus.shaft_judge` judges what the true shaft did.
+A *program* is a task of tdhil on one simulated rig, short enough for two or three seconds of processor time. `product`
+has every combination; `standard` every lie at every moment, with alternating programs; `sample` a seeded part of the
+product. `sim_bus.shaft_judge` judges the motion of the true shaft.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ import numpy as np
 from sim_bus.reports import LIES
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Programs: the rig as described to tdhil, and the plant that turns.
+# Programs: the rig as described to tdhil, and the simulated plant.
 
 
 @dataclass(frozen=True)
 class CommandLine:
-    """One command line, with ``{folder}`` for the folder in which `files` have been written."""
+    """One command line, with ``{folder}`` for the folder that contains `files`."""
 
     name: str
     arguments: tuple[str, ...]
     inertia_kg_m2: float
     coulomb_nm: float
     torque_nm: float
-    """The rig's torque limit."""
+    """Torque limit of the rig, N·m."""
     speed_max_rad_s: float
     files: Mapping[str, str] = field(default_factory=dict)
     string: bool = False
     position: bool = True
-    """The drive reports a position."""
+    """True if the drive reports a position."""
     demand: bool = True
-    """The drive reports its torque demand."""
+    """True if the drive reports its torque demand."""
     modbus: bool = False
     skipped: frozenset[str] = frozenset()
-    """Stages that this program does without."""
+    """Stages that this program does not have."""
     torque_mode: bool = True
-    """It commands torque while it measures."""
+    """True if it commands torque while it measures."""
 
 
 _STRING_PLANT = """\
@@ -142,7 +142,7 @@ _TUNING = json.dumps({
         "critical_rpm": {"cure": _interval(57.0, 56.0, 59.0)},
     }],
 })
-"""Document of `tdhil tune --json` for this string below this top drive, as far as `tdhil evaluate` reads it."""
+"""Document of `tdhil tune --json` for this string below this top drive, with the keys that `tdhil evaluate` reads."""
 
 _IDENTIFY = ("identify", "--simulate")
 _PLANT, _RIG = ("--plant", "{folder}/plant.yaml"), ("--rig", "{folder}/rig.yaml")
@@ -176,7 +176,7 @@ PROGRAMS: Mapping[str, CommandLine] = {one.name: one for one in (
 )}
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Lies with their values. Amounts are shares of the rig's own limits.
+# Lies with their values. An amount is a share of a limit of the rig.
 
 
 _FROM_START, _IN_STOP = frozenset({"", "setup+2s"}), frozenset({"stop", "stop+500ms"})
@@ -185,14 +185,14 @@ _SCALES = ("-scale", "torque-constant")
 
 @dataclass(frozen=True)
 class LieWithValue:
-    """A lie with a value; ``of``: the limit that an amount is a share of."""
+    """A lie with a value. ``of``: the limit of which the amount is a share."""
 
     name: str
     value: str = ""
     of: str = ""
 
     def text(self, program: CommandLine) -> str:
-        """The value as the fault script takes it."""
+        """Return the value for the fault script."""
         if not self.of:
             return self.value
         whole = program.speed_max_rad_s if self.of == "speed" else program.torque_nm
@@ -227,10 +227,10 @@ TOLD: tuple[LieWithValue, ...] = (
 )
 
 MOMENTS = ("", "setup+2s", "speed+12s", "torque+3s", "hold+3s", "acquire+20s", "stop", "stop+500ms")
-"""'' is power-on: so from the start."""
+"""Moments at which a lie begins; '' is power-on, so it acts from the start."""
 
 _EARLY_STOP = "emcy@acquire+5s"
-"""A harmless reason to stop, so that a lie in the stop needs no whole run."""
+"""A harmless cause of a stop, so that a lie during the stop needs no whole run."""
 
 
 @dataclass(frozen=True)
@@ -249,20 +249,20 @@ class Combination:
 
     @property
     def fault(self) -> str:
-        """The fault as the script writes it."""
+        """Fault as in the script."""
         when, value = self.moment and f"@{self.moment}", self.told.text(self.program)
         return f"{self.told.name}{when}" + (f"={value}" if value else "")
 
     @property
     def where(self) -> str:
-        """Which part of the drive is wrong."""
+        """Wrong part of the drive."""
         if self.told.name.startswith("sensor"):
             return "sensor"
         return "power stage" if self.told.name in _POWER_STAGE else "report"
 
     @property
     def scale_change(self) -> float | None:
-        """Relative change of a scale in mid-run, as the larger of f − 1 and 1/f − 1; None: no such lie."""
+        """Relative change of a scale during the run, as the larger of f − 1 and 1/f − 1; None for another lie."""
         if self.moment in _FROM_START or not self.told.name.endswith(_SCALES):
             return None
         factor = float(self.told.value)
@@ -270,11 +270,13 @@ class Combination:
 
     @property
     def ends_early(self) -> bool:
-        """Something harmless stops the run; half of those whose lie begins in the stop, where the bus has it."""
+        """True if a harmless cause stops the run: in half of the runs whose lie begins in the stop, if the bus offers
+        one.
+        """
         return self.moment.startswith("stop") and not self.program.modbus and self.number % 2 == 0
 
     def arguments(self, folder: str) -> list[str]:
-        """The command line without log, trace and format."""
+        """Return the command line without log, trace and format."""
         faults = [self.fault, *[_EARLY_STOP] * self.ends_early]
         options = [part for fault in faults for part in ("--fault", fault)]
         return [one.replace("{folder}", folder) for one in self.program.arguments] + [
@@ -295,7 +297,7 @@ _POWER_STAGE = {"torque-constant", "motor-polarity", "quick-stop-inverted", "tor
 
 @dataclass(frozen=True)
 class Unknowable:
-    """A lie that no arithmetic on the reports can find, and the rules that are not asked of it then."""
+    """A lie that no arithmetic on the reports can detect, and the rules that are then not applied to it."""
 
     reason: str
     rules: frozenset[str]
@@ -307,13 +309,13 @@ class Blind:
 
     lies: tuple[str, ...]
     unknowable: Unknowable
-    moments: frozenset[str] = frozenset()      # none: at any
-    string: bool | None = None                 # None: with or without
-    demand: bool | None = None                 # only where the drive reports no torque demand, and in speed mode
+    moments: frozenset[str] = frozenset()      # empty: at any moment
+    string: bool | None = None                 # None: with or without a string
+    demand: bool | None = None                 # True: torque is commanded or its demand reported; False: neither
 
     @property
     def words(self) -> str:
-        """Which combinations these are."""
+        """Description of these combinations."""
         load = {None: "", True: ", above a string", False: ", without a string"}[self.string]
         when = f", {' or '.join(sorted(one or 'from the start' for one in self.moments))}" if self.moments else ""
         return " and ".join(name.rstrip("-") for name in self.lies) + load + when
@@ -356,11 +358,14 @@ UNKNOWABLE: tuple[Blind, ...] = (
         "the reports are those of a lost encoder and a torque that pushes the shaft on: the torque is removed",
         frozenset("a")), _IN_STOP, string=False),
 )
-"""`docs/explanation/stop.md` names each. Later in a run than stated each of them is a change, which can be found."""
+"""Lies that can't be detected. `docs/explanation/stop.md` names each. If one begins later in a run than stated, it is a
+change, which can be detected."""
 
 
 def unknowable(combination: Combination) -> Unknowable | None:
-    """Why a combination can't be known, if so; of several the rules together."""
+    """Return why a combination can't be detected; None if it can. If several reasons apply, their rules are
+    combined.
+    """
     found = [one.unknowable for one in UNKNOWABLE
              if one.holds(combination.told, combination.moment, combination.program)]
     if not found:
@@ -372,7 +377,7 @@ def unknowable(combination: Combination) -> Unknowable | None:
 
 
 def _makes_sense(program: CommandLine, told: LieWithValue, moment: str) -> bool:
-    """The drive reports that signal, and the run has that moment."""
+    """Return whether the drive reports that signal and the run has that moment."""
     if told.name not in LIES and told.name != "frozen-feedback":
         raise ValueError(f"no lie is called {told.name}")
     reported = {"position": program.position, "demand": program.demand}
@@ -382,14 +387,14 @@ def _makes_sense(program: CommandLine, told: LieWithValue, moment: str) -> bool:
 
 @cache
 def product() -> tuple[Combination, ...]:
-    """Every combination, numbered."""
+    """Return every combination, numbered."""
     every = ((program, told, moment) for told in TOLD for moment in MOMENTS for program in PROGRAMS.values()
              if _makes_sense(program, told, moment))
     return tuple(Combination(number, *one) for number, one in enumerate(every))
 
 
 def standard() -> Iterator[Combination]:
-    """Every lie at every moment once, the programs taking turns."""
+    """Yield every lie at every moment once, with alternating programs."""
     groups: dict[tuple[LieWithValue, str], list[Combination]] = {}
     for one in product():
         groups.setdefault((one.told, one.moment), []).append(one)
@@ -398,6 +403,6 @@ def standard() -> Iterator[Combination]:
 
 
 def sample(count: int, seed: int) -> list[Combination]:
-    """A seeded part of the product."""
+    """Return a seeded part of the product."""
     rng = np.random.default_rng((seed, 0x25))
     return [product()[number] for number in sorted(rng.choice(len(product()), count, replace=False).tolist())]

@@ -1,8 +1,8 @@
-"""The object dictionary as it lives in the drive: values, live objects, write hooks, limits, abort codes.
+"""The object dictionary in the drive: values, live objects, write hooks, limits, abort codes.
 
-Keys are ``index << 8 | subindex``. A *live* object is read from the drive at the moment of asking; a *hook*
-sees a value before it is stored and may refuse it with an SDO abort. This replaces the data store and the callbacks
-of canopen's LocalNode, of which the SDO server is kept: its callbacks start a heartbeat thread on 1017h.
+Keys are ``index << 8 | subindex``. A *live* object is read from the drive at the moment of the request. A *hook* gets a
+value before it is stored and may refuse it with an SDO abort. This replaces the data store and the callbacks of
+canopen's LocalNode, because its callbacks start a heartbeat thread on 1017h. Its SDO server is kept.
 """
 
 from collections.abc import Callable
@@ -31,18 +31,18 @@ FORMATS = {
     datatypes.INTEGER8: "b", datatypes.UNSIGNED8: "B", datatypes.INTEGER16: "h", datatypes.UNSIGNED16: "H",
     datatypes.INTEGER32: "i", datatypes.UNSIGNED32: "I", datatypes.REAL32: "f",
 }
-"""Formats of what a PDO may carry, by data type, for `struct`."""
+"""`struct` formats of the data types that a PDO may carry."""
 
 Value = int | float | str
 
 
 def key_of(index: int, subindex: int = 0) -> int:
-    """The key of an object."""
+    """Return the key of an object."""
     return index << 8 | subindex
 
 
 def generic_eds() -> str:
-    """The path of our own EDS."""
+    """Return the path of our own EDS."""
     return str(files("profiles") / "generic" / "cia402.eds")
 
 
@@ -63,22 +63,22 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
                     self._factory[key_of(variable.index, variable.subindex)] = variable.default
 
     def associate_network(self, network: canopen.Network) -> None:
-        """Subscribes the SDO server only: NMT and EMCY are ours."""
+        """Subscribe the SDO server only: NMT and EMCY are our own."""
         self.network = network
         self.sdo.network = network
         network.subscribe(self.sdo.rx_cobid, self.sdo.on_request)
 
     def set_default(self, index: int, subindex: int, value: Value) -> None:
-        """Replaces what the EDS gives as default."""
+        """Replace the default of the EDS."""
         self._factory[key_of(index, subindex)] = value
 
     def default(self, key: int) -> int:
-        """A numeric object's default."""
+        """Return the default of a numeric object."""
         value = self._factory.get(key, 0)
         return value if isinstance(value, int) else 0
 
     def restore(self, first: int = 0x1000, last: int = 0x9FFF) -> None:
-        """Gives stored objects their defaults back, through their hooks; live ones are their owners' to reset."""
+        """Set stored objects to their defaults, through their hooks. The owners of live objects reset them."""
         for key, value in sorted(self._factory.items()):
             if first <= key >> 8 <= last and key not in self.live:
                 hook = self.hooks.get(key)
@@ -90,7 +90,7 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
                 self.values[key] = value
 
     def number(self, key: int) -> float:
-        """The present value of a numeric object."""
+        """Return the present value of a numeric object."""
         live = self.live.get(key)
         if live is not None:
             return live()
@@ -100,7 +100,7 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
         return value
 
     def variable(self, index: int, subindex: int) -> ODVariable:
-        """The object's description; raises the right SDO abort where there is none."""
+        """Return the object's description. Raises the SDO abort for a missing object."""
         found = self.object_dictionary.get(index)
         if found is None:
             raise SdoAbortedError(ABORT_NO_OBJECT)
@@ -119,7 +119,7 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
         return bool(able) and variable.data_type in FORMATS and entry & 0xFF == len(variable)
 
     def write(self, key: int, value: int) -> None:
-        """Checks a number against the limits and the hook, then stores it; an SDO abort says what is wrong."""
+        """Check a number against the limits and the hook, then store it. Raises an SDO abort with the reason."""
         variable = self.variable(key >> 8, key & 0xFF)
         if variable.min is not None and value < variable.min:
             raise SdoAbortedError(ABORT_TOO_LOW)
@@ -131,7 +131,7 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
         self.values[key] = value
 
     def get_data(self, index: int, subindex: int, check_readable: bool = False) -> bytes:
-        """An SDO upload."""
+        """Handle an SDO upload."""
         variable = self.variable(index, subindex)
         if check_readable and not variable.readable:
             raise SdoAbortedError(ABORT_READ_WRITE_ONLY)
@@ -142,7 +142,7 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
         return bytes(variable.encode_raw(value))
 
     def set_data(self, index: int, subindex: int, data: bytes, check_writable: bool = False) -> None:
-        """An SDO download."""
+        """Handle an SDO download."""
         variable = self.variable(index, subindex)
         if check_writable and not variable.writable:
             raise SdoAbortedError(ABORT_WRITE_READ_ONLY)
@@ -159,7 +159,7 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
         self.write(key_of(index, subindex), value)
 
     def _write_float(self, key: int, value: float) -> None:
-        """A REAL32; NaN and the infinities are out of every range."""
+        """Write a REAL32. NaN and the infinities are out of every range."""
         if not isfinite(value):
             raise SdoAbortedError(ABORT_VALUE)
         hook = self.float_hooks.get(key)
@@ -168,7 +168,7 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
         self.values[key] = value
 
     def add(self, index: int, subindex: int, data_type: int, *, writable: bool, mappable: bool, name: str) -> None:
-        """Puts an object in, in place of one that stands there; without a default it is read by its live getter."""
+        """Add an object, or replace one. Without a default its live getter is read."""
         variable = ODVariable(name, index, subindex)
         variable.data_type = data_type
         variable.access_type = "rw" if writable else "ro"
@@ -187,7 +187,7 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
             table.pop(key_of(index, subindex), None)
 
     def remove(self, index: int) -> None:
-        """Takes an object out, all of its subindices: SDO then says 06020000h."""
+        """Remove an object with all its subindices: SDO then aborts with 06020000h."""
         if index not in self.object_dictionary:
             return
         del self.object_dictionary[index]

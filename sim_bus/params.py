@@ -1,7 +1,7 @@
-"""Everything that can be set about the simulated rig; ``plant.yaml`` may replace any of it.
+"""All settings of the simulated rig; ``plant.yaml`` may replace each of them.
 
-The defaults are a field-like rig: they reproduce the paper's four field slopes with one inertia.
-A noise, lag or quantum of 0 switches that effect off.
+The defaults are a field-like rig: they reproduce the paper's four field slopes with one inertia. A noise, lag or
+quantum of 0 switches that effect off.
 """
 
 from pathlib import Path
@@ -14,7 +14,7 @@ from sim_bus.plant import AnyPlantParams
 from sim_bus.plant import Params as PlantParams
 
 SCALES = (0.1, 10.0)
-"""Least and greatest ratio of a drive's own unit to the true one."""
+"""Smallest and largest ratio of a drive's own unit to the true one."""
 
 
 class DriveParams(Validated):
@@ -28,10 +28,10 @@ class DriveParams(Validated):
     speed_integral_gain_nm_rad: NonNegative = 300.0
     speed_filter_s: NonNegative = 0.02
     reference_filter_s: NonNegative = 0.0
-    """First-order smoothing of the speed setpoint, before the speed loop."""
+    """First-order filter of the speed setpoint, before the speed loop."""
     torque_lag_s: NonNegative = 0.01
     control_period_s: float = Field(default=0.002, gt=0.0, le=0.01)
-    """The longest step of control and plant."""
+    """Longest step of control and plant, s."""
 
 
 class ReportingParams(Validated):
@@ -45,13 +45,13 @@ class ReportingParams(Validated):
     torque_quantum_permille: NonNegative = 1.0
     """Resolution of the torque, ‰ of rated torque."""
     torque_scale: float = Field(default=1.0, ge=SCALES[0], le=SCALES[1])
-    """Torque in the drive's own unit over true torque: commanded, demanded and reported torque share it."""
+    """Torque in the drive's own unit over true torque. Commanded, demanded and reported torque share it."""
     speed_scale: float = Field(default=1.0, ge=SCALES[0], le=SCALES[1])
     """Speed in the drive's own unit over true speed, commanded and reported. The position counts true turns."""
 
 
 class NoiseParams(Validated):
-    """Standard deviations of what disturbs; white ones as they stand in a plant step of 2 ms."""
+    """Standard deviations of the disturbances; those of white noise are for a plant step of 2 ms."""
 
     speed_sensor_rad_s: NonNegative = 0.02
     torque_nm: NonNegative = 10.0
@@ -79,7 +79,7 @@ class RigParams(Validated):
     def with_scales(
         self, torque_scale: float | None, speed_scale: float | None, added_inertia_kg_m2: float | None
     ) -> Self:
-        """The same rig with these, as the models of their sections have them; None: as it is."""
+        """Return the rig with these values, each checked by the model of its section; None: as before."""
         told = {"torque_scale": torque_scale, "speed_scale": speed_scale}
         scales = {name: value for name, value in told.items() if value is not None}
         body = {} if added_inertia_kg_m2 is None else {"added_inertia_kg_m2": added_inertia_kg_m2}
@@ -95,11 +95,11 @@ FAITHFUL = ReportingParams(
     speed_lag_s=0.0, torque_lag_s=0.0, speed_noise_rad_s=0.0, torque_noise_nm=0.0,
     speed_quantum_rpm=0.0, torque_quantum_permille=0.0,
 )
-"""Reports the truth."""
+"""Reporting parameters without any error: the reports are the true values."""
 
 
 def load_rig(path: Path) -> RigParams:
-    """Reads ``plant.yaml``; raises `profiles.errors.DataFileError` with every problem and its line."""
+    """Read ``plant.yaml``. Raises `profiles.errors.DataFileError` with every problem and its line."""
     from profiles import load_model
 
     return load_model(path, RigParams)

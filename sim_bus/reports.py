@@ -1,4 +1,4 @@
-"""Lying reports: what a wrong sensor, a wrong power stage or a wrong report makes of the drive's own quantities.
+"""Wrong reports: the effect of a wrong sensor, power stage or report on the drive's own quantities.
 
 ::
 
@@ -8,12 +8,12 @@
               speed,      demand        torque      each through its distortions ──► the words on the bus
               angle
 
-A distortion of the *report* changes what the bus carries; the drive itself goes on with the true value. A distortion of
-the *sensor* is what the drive's speed control, its speed limiter and its position counter get as well. A fault of the
-*power stage* changes the torque on the shaft.
+A distortion of the *report* changes the value on the bus; the drive itself continues with the true value. A distortion
+of the *sensor* also changes the input of the drive's speed control, its speed limiter and its position counter. A fault
+of the *power stage* changes the torque on the shaft.
 
-One table, `LIES`, serves every bus. A quantity is distorted in SI; a word (all zero, all ones, another signal's count)
-where the bus makes its number. Knows no bus and no clock.
+One table, `LIES`, serves every bus. A quantity is distorted in SI. A word (all zero, all ones, another signal's count)
+is distorted where the bus makes its number. Knows no bus and no clock.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ class Feedback(Enum):
 
 
 class Distortion:
-    """Another value instead of the true one."""
+    """A distortion: another value instead of the true one."""
 
     def step(self, value: float, _dt_s: float) -> float:
-        """The value after ``dt_s`` more, for the true one."""
+        """Return the distorted value of the true ``value``, ``dt_s`` later."""
         return value
 
 
 class Linear(Distortion):
-    """A wrong scale and a wrong zero; a scale of 0 is a signal that is lost."""
+    """Wrong scale and wrong zero. A scale of 0 is a lost signal."""
 
     def __init__(self, scale: float, offset: float = 0.0) -> None:
         self._scale, self._offset = scale, offset
@@ -61,7 +61,7 @@ class Linear(Distortion):
 
 
 class FrozenValue(Distortion):
-    """The first value stays."""
+    """Frozen value: the first one stays."""
 
     def __init__(self) -> None:
         self._value: float | None = None
@@ -73,7 +73,7 @@ class FrozenValue(Distortion):
 
 
 class DelayedValue(Distortion):
-    """Every value comes ``delay_s`` later; until then the first one stays."""
+    """Delayed value: every value comes ``delay_s`` later. Until then the first one stays."""
 
     def __init__(self, delay_s: float) -> None:
         self._delay_s = delay_s
@@ -92,7 +92,7 @@ class DelayedValue(Distortion):
 
 
 class Coarse(Distortion):
-    """Only multiples of ``step`` are there."""
+    """Coarse value: multiples of ``step`` only."""
 
     def __init__(self, step: float) -> None:
         self._step = step
@@ -102,7 +102,7 @@ class Coarse(Distortion):
 
 
 class Slipping(Distortion):
-    """The coupling of the sensor slips: it stands still for this share of every `SLIP_PERIOD_S`."""
+    """Slipping coupling of the sensor: it stands still for this share of every `SLIP_PERIOD_S`."""
 
     def __init__(self, share: float) -> None:
         self._slips_s = share * SLIP_PERIOD_S
@@ -118,17 +118,19 @@ SLIP_PERIOD_S = 1.0
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Distortions of a word, where a bus makes its number. ``Read`` is how a signal's number is made on this bus.
+# Distortions of a word, where a bus makes its number. ``Read`` returns a signal's number on this bus.
 
 
 Read = Callable[[], float]
 
 
 class Word:
-    """Another number instead of the true one."""
+    """A distortion of a word: another number instead of the true one."""
 
     def number(self, read: Read, ones: float, other: Callable[[Feedback], float]) -> float:
-        """For a signal that would read ``read()``. ``ones``: all bits set; ``other``: another signal's number."""
+        """Return the number of a signal whose true number is ``read()``. ``ones``: all bits set; ``other``: another
+        signal's number.
+        """
         raise NotImplementedError
 
 
@@ -147,7 +149,7 @@ class Ones(Word):
 
 
 class Kept(Word):
-    """The number that is read first stays."""
+    """Frozen word: the number that is read first stays."""
 
     def __init__(self) -> None:
         self._number: float | None = None
@@ -159,7 +161,7 @@ class Kept(Word):
 
 
 class Swapped(Word):
-    """The number of another signal: a mapping with two entries exchanged."""
+    """Swapped word: the number of another signal, as in a mapping with two entries exchanged."""
 
     def __init__(self, signal: Feedback) -> None:
         self._signal = signal
@@ -169,22 +171,22 @@ class Swapped(Word):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What the power stage makes of the torque that control wants.
+# Effect of the power stage on the torque that control demands.
 
 
 @dataclass(frozen=True)
 class PowerStage:
-    """The torque on the shaft, and what the drive takes it for."""
+    """True torque on the shaft, and the drive's own value of it."""
 
     factor: float = 1.0
     """Factor on the torque that the drive assumes: a wrong torque constant, or motor phases exchanged (−1)."""
     in_stop: float = 1.0
     """Factor on the torque while the drive stops the shaft; the drive measures the real torque."""
     stuck_nm: float | None = None
-    """The torque while the power stage is on, whatever control wants; the drive measures it."""
+    """Torque while the power stage is on, N·m, independent of the demand. The drive measures it."""
 
     def torque(self, wanted_nm: float, *, stopping: bool) -> tuple[float, float]:
-        """True torque and torque that the drive believes in, N·m."""
+        """Return the true torque and the drive's own value of it, N·m."""
         believed = wanted_nm if self.stuck_nm is None else self.stuck_nm
         if stopping:
             believed *= self.in_stop
@@ -195,7 +197,7 @@ class PowerStage:
 
 
 class Lies:
-    """All distortions of one drive that act at present. An inverter owns it; faults of a script `begin` and `end`."""
+    """All active distortions of one drive. An inverter owns it; faults of a script `begin` and `end`."""
 
     def __init__(self) -> None:
         self._values: dict[Feedback, list[Distortion]] = {}
@@ -205,18 +207,18 @@ class Lies:
         self._readers: dict[Feedback, Read] = {}
         self._told: dict[Feedback, float] = {}
         self._clean_rad_s = self._slipped_rad = 0.0
-        # Plain attributes: every step of the plant looks at them.
+        # Plain attributes, because every step of the plant reads them.
         self.of_values = False
-        """A quantity is reported wrong."""
+        """True if a quantity is reported wrong."""
         self.of_sensor = False
-        """The sensor is wrong."""
+        """True if the sensor is wrong."""
         self.of_stage = False
-        """The power stage is wrong."""
+        """True if the power stage is wrong."""
 
     # -- for the inverter ----------------------------------------------------------------------------------
 
     def measured(self, speed_rad_s: float, noise_rad_s: float, dt_s: float) -> float:
-        """Speed as a wrong sensor measures it."""
+        """Return the speed that a wrong sensor measures, rad/s."""
         clean = speed_rad_s
         noisy = speed_rad_s + noise_rad_s
         for of_angle, of_speed in self._sensor:
@@ -226,11 +228,13 @@ class Lies:
         return noisy
 
     def turned(self, angle_rad: float, dt_s: float) -> None:
-        """The shaft has turned so far; a wrong sensor counts the integral of the speed it measures, without noise."""
+        """Take the shaft's travel of one step. A wrong sensor counts the integral of its measured speed,
+        without noise.
+        """
         self._slipped_rad += self._clean_rad_s * dt_s - angle_rad
 
     def torque(self, wanted_nm: float, *, stopping: bool) -> tuple[float, float]:
-        """True torque and torque that the drive believes in, N·m."""
+        """Return the true torque and the drive's own value of it, N·m."""
         true = believed = wanted_nm
         for stage in self._stages:
             true, believed = stage.torque(true, stopping=stopping)
@@ -246,13 +250,13 @@ class Lies:
         return value
 
     def counted_rad(self, true_rad: float) -> float:
-        """The angle as the sensor has counted it."""
+        """Return the angle that the sensor has counted, rad."""
         return true_rad + self._slipped_rad
 
     # -- for the bus ---------------------------------------------------------------------------------------
 
     def angle_rad(self, true_rad: float) -> float:
-        """The angle that is reported."""
+        """Return the reported angle, rad."""
         return self.last(Feedback.POSITION, self.counted_rad(true_rad))
 
     def last(self, signal: Feedback, true: float) -> float:
@@ -260,9 +264,9 @@ class Lies:
         return self._told.get(signal, true) if self._told else true
 
     def word(self, signal: Feedback, read: Read, ones: float = -1) -> Read:
-        """``read`` as the bus gets it; ``ones``: the number whose bits are all set (of a REAL32: no number)."""
+        """Return ``read`` with its distortions. ``ones``: number with all bits set (NaN for a REAL32)."""
         self._readers[signal] = read
-        chain = self._words.setdefault(signal, [])      # the list stays; `add_word` and `remove_word` change it
+        chain = self._words.setdefault(signal, [])      # the list is kept; `add_word` and `remove_word` change it
 
         def number() -> float:
             return read() if not chain else chain[-1].number(read, ones, self._other)
@@ -275,12 +279,12 @@ class Lies:
     # -- for the script ------------------------------------------------------------------------------------
 
     def add_value(self, signal: Feedback, one: Distortion) -> None:
-        """A quantity is distorted from now on."""
+        """Distort a quantity from now on."""
         self._values.setdefault(signal, []).append(one)
         self.of_values = True
 
     def remove_value(self, signal: Feedback, one: Distortion) -> None:
-        """And no more."""
+        """End a distortion of a quantity."""
         self._values[signal].remove(one)
         if not self._values[signal]:
             del self._values[signal]
@@ -288,47 +292,47 @@ class Lies:
         self.of_values = bool(self._values)
 
     def add_word(self, signal: Feedback, one: Word) -> None:
-        """A word is distorted from now on; the last one that was added acts."""
+        """Distort a word from now on. The distortion that was added last acts."""
         self._words.setdefault(signal, []).append(one)
 
     def remove_word(self, signal: Feedback, one: Word) -> None:
-        """And no more."""
+        """End a distortion of a word."""
         self._words[signal].remove(one)
 
     def add_sensor(self, pair: tuple[Distortion, Distortion]) -> None:
-        """The sensor is wrong from now on: in its angle, and in its speed."""
+        """Distort the sensor from now on: its angle, and its speed."""
         self._sensor.append(pair)
         self.of_sensor = True
 
     def remove_sensor(self, pair: tuple[Distortion, Distortion]) -> None:
-        """And right again; the angle that was missed stays missed."""
+        """End a distortion of the sensor. The angle that it has missed stays missed."""
         self._sensor.remove(pair)
         self.of_sensor = bool(self._sensor)
 
     def add_stage(self, stage: PowerStage) -> None:
-        """The power stage is wrong from now on."""
+        """Distort the power stage from now on."""
         self._stages.append(stage)
         self.of_stage = True
 
     def remove_stage(self, stage: PowerStage) -> None:
-        """And right again."""
+        """End a distortion of the power stage."""
         self._stages.remove(stage)
         self.of_stage = bool(self._stages)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The table: a row for each way of lying, a scripted fault for each row and signal.
+# The table: a row for each kind of distortion, and a scripted fault for each row and signal.
 
 
 class Lie:
     """One scripted fault of `LIES`."""
 
     def begin(self, lies: Lies) -> None:
-        """It acts from now on."""
+        """Begin the distortion."""
         raise NotImplementedError
 
     def end(self, lies: Lies) -> None:
-        """And no more."""
+        """End the distortion."""
         raise NotImplementedError
 
 
@@ -390,7 +394,9 @@ class OfStage(Lie):
 
 @dataclass(frozen=True)
 class ReportFault:
-    """A scripted fault: ``make`` of its value's text may raise ValueError. ``value`` '': it takes none."""
+    """A scripted fault. ``make`` gets the text of its value and may raise ValueError. ``value`` '': the fault has no
+    value.
+    """
 
     name: str
     summary: str
@@ -403,7 +409,7 @@ class ReportFault:
 
 @dataclass(frozen=True)
 class _QuantityDistortion:
-    """A way of distorting a quantity."""
+    """A kind of distortion of a quantity."""
 
     name: str
     text: str
@@ -504,7 +510,7 @@ LIES: dict[str, ReportFault] = {row.name: row for row in _ROWS}
 
 
 def lying(act: Callable[[Lie], M]) -> dict[str, FaultKind[M]]:
-    """The table as faults of one bus; ``act`` makes one of its faults."""
+    """Return the table as faults of one bus. ``act`` converts a fault into one of the bus."""
     def make(row: ReportFault) -> Callable[[str], M]:
         return lambda value: act(row.make(value))
 

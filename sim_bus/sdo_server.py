@@ -1,4 +1,4 @@
-"""The SDO server of CiA 301 over an object dictionary, for a bus whose messages hold more than eight bytes. Pure.
+"""SDO server of CiA 301 over an object dictionary, for a bus whose messages hold more than eight bytes. Pure.
 
 ::
 
@@ -24,7 +24,7 @@ _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = range(5)
 _ABORT_TOGGLE, _ABORT_COMMAND, _ABORT_COMPLETE, _ABORT_TRANSFER = 0x05030000, 0x05040001, 0x06010000, 0x08000020
 _COMPLETE = 0x10
 _LARGEST = 4096
-"""Most bytes that a segmented download may bring."""
+"""Largest length of a segmented download, bytes."""
 
 
 class Meddling(Enum):
@@ -46,7 +46,7 @@ class _Transfer:
 
 
 class SdoServer:
-    """Answers one request after the other; ``room`` is what a message of the bus holds, in bytes."""
+    """Server that answers one request after the other. ``room``: length of a message of the bus, bytes."""
 
     def __init__(self, store: ObjectStore, room: int) -> None:
         self._store = store
@@ -55,7 +55,7 @@ class SdoServer:
         self.meddling: dict[tuple[int, int], Meddling] = {}
 
     def reset(self) -> None:
-        """Forgets a transfer under way."""
+        """Discard a transfer under way."""
         self._transfer = None
 
     def answer(self, request: bytes) -> bytes:

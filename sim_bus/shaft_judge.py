@@ -1,11 +1,11 @@
-"""The true shaft's motion compared with the run's statements: five rules for a run with wrong reports. Pure.
+"""Comparison of the true shaft's motion with the run's statements: five rules for a run with wrong reports. Pure.
 
-a  The host never disables a drive whose shaft turns. Excepted: no string hangs on it, the shaft accelerates against
-   the quick stop, and the outcome says that the torque was removed.
-b  The shaft turns slower than `TURNING_RAD_S` when it is reported to be at rest.
-c  An inertia that is `valid` or `valid_wide` has the true one in its total interval. Excepted: a scale changed in the
-   run by less than the least change that the run says it can show.
-d  The true speed stays below 1.1 times the limit, and what torque limit and friction add in a reaction time.
+a  The host never disables a drive whose shaft turns. Exception: there is no string, the shaft accelerates against the
+   quick stop, and the outcome states that the torque was removed.
+b  The shaft turns slower than `TURNING_RAD_S` when it is reported to be at standstill.
+c  An inertia that is `valid` or `valid_wide` has the true one in its total interval. Exception: a scale changed in the
+   run by less than the least change that the run states it can show.
+d  The true speed stays below 1.1 times the limit, plus the effect of torque limit and friction in a reaction time.
 e  The process ends with a known exit code and a closed log.
 """
 
@@ -24,19 +24,19 @@ from numpy.typing import NDArray
 from sim_bus.cia402 import DISABLED_BY_HOST
 
 TURNING_RAD_S = 0.2
-"""A shaft that is faster is not at rest."""
+"""Least speed of a turning shaft, rad/s. A slower one counts as at standstill."""
 
 SPEED_SHARE = 1.1
 """Multiple of the speed limit that the true speed may always have."""
 
 REACTION_S = 1.0
-"""For how long the drive's torque may act before it is noticed, unless stated otherwise."""
+"""Time for which the drive's torque may act before it is detected, s, unless stated otherwise."""
 
 ACCELERATES_RAD_S = 0.3
-"""A shaft that gets faster by so much in a stop accelerates against it."""
+"""Least increase of the speed in a stop that counts as an acceleration against it, rad/s."""
 
 BEFORE_S = 3.0
-"""Before the quick stop of a release above a string: the comparison uses the speed of this time before, s."""
+"""Time before the quick stop of a release above a string, s. The comparison uses the speed at that time."""
 
 EXIT_CODES = frozenset({0, 3, 4, 5, 6, 7, 8, 9, 12, 130, 143})
 """Exit codes of `tdhil.errors`, except 1 (an internal error) and 2 (an impossible request)."""
@@ -53,14 +53,14 @@ class TrueShaft:
     speed_rad_s: NDArray[np.float64]
     torque_nm: NDArray[np.float64]
     enabled: NDArray[np.bool_]
-    """The power stage is on."""
+    """True while the power stage is on."""
     disabled_s: tuple[float, ...]
-    """When the host switched it off."""
+    """Times at which the host switched it off, s."""
     stop_s: float
-    """The first quick stop after the shaft has turned; inf without one."""
+    """Time of the first quick stop after the shaft has turned, s; inf without one."""
 
     def speed_at(self, time_s: float) -> float:
-        """The speed's magnitude."""
+        """Return the magnitude of the speed, rad/s."""
         return abs(float(np.interp(time_s, self.time_s, self.speed_rad_s))) if len(self.time_s) else 0.0
 
     def reversed_at(self, time_s: float) -> bool:
@@ -70,7 +70,7 @@ class TrueShaft:
 
     @property
     def fastest_rad_s(self) -> float:
-        """Magnitude."""
+        """Largest magnitude of the speed, rad/s."""
         return float(np.abs(self.speed_rad_s).max(initial=0.0))
 
 
@@ -78,7 +78,7 @@ _ON = {"operation enabled", "quick stop active", "fault reaction active"}
 
 
 def read_shaft(path: Path) -> TrueShaft:
-    """A trace that is complete."""
+    """Return the true shaft of a complete trace."""
     rows = [line.split(",") for line in path.read_text(encoding="utf-8").split("\n")[1:-1]]
     numbers = np.array([[float(cell) for cell in row[:3]] for row in rows]).reshape(-1, 3)
     stops = [float(row[0]) for row in rows if row[4] == "state: quick stop active"]
@@ -90,22 +90,22 @@ def read_shaft(path: Path) -> TrueShaft:
 
 @dataclass(frozen=True)
 class ProcessOutcome:
-    """How a process ended, and what it said."""
+    """End of a process, and its statements."""
 
     code: int
     at_rest: bool
-    """It reported that the shaft is at rest."""
+    """True if it reported standstill."""
     seen_s: float | None
-    """Control time at which it says to have seen that."""
+    """Control time of the standstill that it reports, s."""
     verdict: str | None
     low_total: float
     high_total: float
     removed: bool
-    """It says that torque was removed from a turning shaft."""
+    """True if it reports that torque was removed from a turning shaft."""
     log_closed: bool
     message: str = ""
     least_scale_change: float = 0.0
-    """The least relative change of a signal's scale that the run says it can show; 0: it says nothing."""
+    """Least relative change of a signal's scale that the run states it can show; 0: no statement."""
 
 
 def outcome_of(code: int, document: Mapping[str, Any] | None, said: str, *, log_closed: bool) -> ProcessOutcome:
@@ -124,7 +124,7 @@ def outcome_of(code: int, document: Mapping[str, Any] | None, said: str, *, log_
 
 @dataclass(frozen=True)
 class JudgedMachine:
-    """The judge's knowledge of the rig. ``torque_nm``: largest torque of the power stage on the shaft."""
+    """Data of the rig for the judge. ``torque_nm``: largest torque of the power stage on the shaft."""
 
     inertia_kg_m2: float
     coulomb_nm: float
@@ -135,18 +135,20 @@ class JudgedMachine:
 
 @dataclass(frozen=True)
 class Judged:
-    """``broken``: rule → what was seen. ``excused``: the same of rules that were not asked."""
+    """Result. ``broken``: rule → observation. ``excused``: the same for rules that were not applied."""
 
     broken: Mapping[str, str]
     excused: Mapping[str, str]
     reaction_s: float
-    """How much of the reaction time was used beyond 1.1 times the limit."""
+    """Used part of the reaction time beyond 1.1 times the limit, s."""
     fastest_rad_s: float
 
 
 def judge(shaft: TrueShaft, outcome: ProcessOutcome, machine: JudgedMachine, *, not_asked: frozenset[str] = frozenset(),
           scale_change: float | None = None, reaction_s: float = REACTION_S) -> Judged:
-    """Which rules a run broke. ``scale_change``: relative change of a scale in mid-run, if that is the lie."""
+    """Return the rules that a run broke. ``scale_change``: relative change of a scale in mid-run, if that
+    is the lie.
+    """
     if scale_change is not None and scale_change <= outcome.least_scale_change:
         not_asked |= {"c"}
     seen: dict[str, str] = {}
@@ -177,7 +179,7 @@ def _disabled(shaft: TrueShaft, outcome: ProcessOutcome, machine: JudgedMachine)
         speed > shaft.speed_at(shaft.stop_s) + ACCELERATES_RAD_S or shaft.reversed_at(at_s)
     )
     accelerated = accelerated or speed > shaft.speed_at(at_s - BEFORE_S) + ACCELERATES_RAD_S
-    beyond = speed > machine.speed_max_rad_s       # above a string torque is removed from such a shaft only
+    beyond = speed > machine.speed_max_rad_s       # above a string torque is removed only beyond the limit
     if accelerated and outcome.removed and (beyond or not machine.string):
         return ""
     return f"disabled at {speed:.2f} rad/s, {at_s:.2f} s" + ", accelerating" * accelerated

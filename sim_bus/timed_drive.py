@@ -1,6 +1,6 @@
-"""A simulated drive in plant time: inverter and CiA 402 application, moved on together, and the trace of the shaft.
+"""A simulated drive in plant time: inverter and CiA 402 application that advance together, and the trace of the shaft.
 
-It owns no clock and no thread, and knows no bus: the caller says how much time has passed.
+It owns no clock and no thread, and knows no bus: the caller states the time that has passed.
 """
 
 from collections.abc import Callable
@@ -31,14 +31,14 @@ class TimedDrive:
         self.time_us = 0
         self.stepped = stepped
         self.trace = trace
-        self.on_time: Callable[[int], None] = _ignore       # plant time in µs, before each piece of it
-        self.on_stage: Callable[[int], None] = _ignore      # the host says that a stage begins
+        self.on_time: Callable[[int], None] = _ignore       # called with plant time in µs before each piece
+        self.on_stage: Callable[[int], None] = _ignore      # called when the host reports the begin of a stage
         self._next_row_us = 0
         self.inverter = Inverter(params, np.random.default_rng(seed))
         self.application = Application(self.inverter)
 
     def advance_us(self, duration_us: int) -> None:
-        """The plant moves on, in equal steps of at most the control period."""
+        """Advance the plant, in equal steps of at most the control period."""
         application, inverter = self.application, self.inverter
         begin_us = self.time_us
         self.on_time(begin_us)
@@ -56,7 +56,7 @@ class TimedDrive:
                     )
 
     def run_out(self) -> None:
-        """After a rehearsal the host is gone: what the drive then does by itself belongs to the trace."""
+        """Advance after a rehearsal, without the host. The drive's own actions then are part of the trace."""
         end_us = self.time_us + _RUN_OUT_US
         quiet_us = 0
         while quiet_us < _REST_US and self.time_us < end_us:
@@ -64,14 +64,16 @@ class TimedDrive:
             quiet_us = 0 if abs(self.inverter.speed_rad_s) > _AT_REST_RAD_S else quiet_us + _CHUNK_US
 
     def note(self, event: str) -> None:
-        """An event, or a change of state where ``event`` is empty, for the trace."""
+        """Add an event to the trace, or a change of state if ``event`` is empty."""
         self.trace.row(
             self.time_us * 1e-6, self.inverter.state.speed_rad_s, self.inverter.torque_nm,
             self.application.state.value, event or f"state: {self.application.state.value}",
         )
 
     def bind_marker(self, store: ObjectStore) -> None:
-        """The marker object: who it is, stepped time, and the stage of the host. Call it after other members."""
+        """Connect the marker object: identity, stepped time, and stage of the host. Call this after other members are
+        set.
+        """
         store.add(MARKER_INDEX, MARKER_STAGE, datatypes.UNSIGNED8, writable=True, mappable=False, name="Stage")
         store.live[key_of(MARKER_INDEX, 2)] = lambda: int(self.stepped)
         store.hooks[key_of(MARKER_INDEX, 2)] = self.set_stepped
@@ -81,12 +83,12 @@ class TimedDrive:
         store.values[key_of(MARKER_INDEX, 1)] = MARKER_TEXT
 
     def tell_stage(self, number: int) -> None:
-        """The host says that a stage begins."""
+        """Take the begin of a stage from the host."""
         self.note(f"stage {number}")
         self.on_stage(number)
 
     def set_stepped(self, value: int) -> None:
-        """5FFEh:2: time moves with the cycles of the host, or by itself."""
+        """Set 5FFEh:2: time advances with the cycles of the host, or by itself."""
         if bool(value) is not self.stepped:
             self.stepped = bool(value)
             self.note("stepped time" if value else "own time")

@@ -6,8 +6,8 @@
     0.010000,0.00314,1.25,operation enabled,
     0.012000,0.0041,1.3,quick stop active,host silent: running on in own time
 
-Plant time; a row per 10 ms, one more per change of state and per event. Flushed with every event and at least
-each 0.25 s of wall time, so that a reader sees a stop while it happens.
+Times are plant time. The trace has a row per 10 ms, and one for each change of state and each event. It is flushed with
+every event and at least each 0.25 s of wall time, so that a reader sees a stop while it happens.
 """
 
 import time
@@ -22,7 +22,7 @@ _FLUSH_S = 0.25
 
 
 class NotATrace(TdhilError):
-    """The file that a trace is to be written to holds something else."""
+    """Error for a trace path whose file holds other data."""
 
     entry = MessageCode.TRACE_NOT_OURS
 
@@ -30,7 +30,7 @@ class NotATrace(TdhilError):
 
 
 def check_trace_path(path: Path, where: str = "trace") -> None:
-    """An older trace may be written over, nothing else. Raises NotATrace."""
+    """Check that the path is free or holds an older trace, which may be overwritten. Raises NotATrace."""
     if not path.is_file():
         return
     with path.open("rb") as file:
@@ -41,7 +41,7 @@ def check_trace_path(path: Path, where: str = "trace") -> None:
 
 
 class ShaftTrace:
-    """Writes the file, over an older trace; without a path nothing happens. Raises NotATrace for any other file."""
+    """Writer of the trace file, which replaces an older trace. Without a path it does nothing. Raises NotATrace."""
 
     def __init__(self, path: Path | None) -> None:
         if path is not None:
@@ -58,7 +58,7 @@ class ShaftTrace:
         return self._file is not None
 
     def row(self, time_s: float, speed_rad_s: float, torque_nm: float, state: str, event: str = "") -> None:
-        """One row; an event is flushed at once."""
+        """Write one row. An event is flushed at once."""
         if self._file is None:
             return
         text = event.replace(",", ";").replace("\n", " ")
@@ -66,7 +66,7 @@ class ShaftTrace:
         self.flush(now=bool(event))
 
     def flush(self, *, now: bool = False) -> None:
-        """Flushes if it is time to, or ``now``."""
+        """Flush if it is due, or if ``now``."""
         if self._file is None:
             return
         wall_s = time.monotonic()
@@ -75,7 +75,7 @@ class ShaftTrace:
             self._flushed_s = wall_s
 
     def close(self) -> None:
-        """Closes the file; safe to repeat."""
+        """Close the file; safe to repeat."""
         if self._file is not None:
             self._file.close()
             self._file = None

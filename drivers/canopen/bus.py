@@ -27,22 +27,22 @@ if TYPE_CHECKING:
 # Offset between the time stamps of the frames and control time. It is a diagnostic only: no timing depends on it.
 #
 # SocketCAN stamps frames with the wall clock, which may be set during a run. The time of a sample is the control time
-# of its SYNC, and its age is control time too, so a jump of the wall clock does not affect them. Jumps are counted
-# because they matter when a candump is compared with the log.
+# of its SYNC. Its age is control time too. So a jump of the wall clock does not affect them. Jumps are counted because
+# they matter when a candump is compared with the log.
 
 
 WINDOW_S: Final = 0.5
 WINDOW_FRAMES: Final = 4
 JUMP_S: Final = 0.1
 _EPOCH_S: Final = 1e9
-"""Smaller stamps count from the start of the adapter, or are absent (0). They are not wall-clock times."""
+"""Least time stamp from a wall clock, s. Smaller stamps count from the start of the adapter, or are absent (0)."""
 
 
 class FrameStamps:
     """Offset between wall clock and control time.
 
     ``offset_s`` is wall clock minus control time; None while it is unknown. A frame that waited in a buffer makes the
-    offset look smaller. So the largest offset of each half second counts: a burst that was read late is shorter.
+    offset look smaller. So the largest offset of each half second counts, because a burst that is read late is shorter.
     """
 
     def __init__(self) -> None:
@@ -111,17 +111,19 @@ Handler = Callable[[bytes], None]
 LONGEST_DRAIN_S = 0.25
 """Longest time for one drain, s of wall time. A flooded bus must not block a cycle."""
 PEER_DEAD_S = 4.0
-"""Time limit in stepped time: a peer without an answer for this wall time, s, is dead. No other limit ends the wait."""
+"""Wall time, s, after which a peer without an answer counts as dead in stepped time. No other limit ends the wait."""
 PEER_STILL_DEAD_S = 0.05
-"""Wait for a dead peer, s, until a frame from it arrives again."""
+"""Waiting time for a dead peer, s. It applies until a frame from the peer arrives again."""
 ASK_S, ASK_SOON_S, ASK_AGAIN_S = 0.05, 0.002, 0.25
-"""Waiting time before tdhil asks the peer whether it has finished, s: first, after a failed wait, and repeated."""
+"""Waiting times before tdhil asks the peer whether it has finished, s: the first, one after a failed wait, a repeated
+one."""
 BABBLE_FRAMES = 2000
-"""More frames than a 1 Mbit/s bus carries in `LONGEST_DRAIN_S`. With fewer, this computer was delayed."""
+"""Number of frames in one drain that shows a flooded bus: more than a 1 Mbit/s bus carries in `LONGEST_DRAIN_S`. With
+fewer frames, this computer was delayed."""
 
 
 class CanLink:
-    """Sends and receives on a python-can bus. ``tap`` gets every frame, ``handlers`` the frames of their identifier."""
+    """Sender and receiver on a python-can bus. ``tap`` gets all frames, ``handlers`` the frames of their identifier."""
 
     def __init__(self, bus: can.BusABC, clock: Clock, tap: FrameTap | None = None) -> None:
         from can import Message
@@ -134,11 +136,11 @@ class CanLink:
         self.remote_handlers: dict[int, Handler] = {}      # for remote frames, which carry no data
         self._shut = ""                # why transmission has ended
         self.error_frames = 0
-        self.passive = 0               # number of error-passive reports of the adapter
+        self.passive = 0               # number of error-passive states that the adapter reported
         self.stamps = FrameStamps()
         self.name = str(bus.channel_info)
         self.asks = False              # simulated peer in stepped time: it can report its cycle
-        # All frames that a frame makes the peers send are in the queue when `send` returns: an empty queue stays empty.
+        # When `send` returns, the queue holds all frames that the peers send in reply. So an empty queue stays empty.
         self._answers_at_once: bool = getattr(bus, "answers_at_once", False)
         self._question = 0
         self._answered = self._in_vain = self._dead = False
@@ -156,7 +158,7 @@ class CanLink:
             self._tap(RawFrame(self._clock.now_s(), True, identifier, data))
 
     def ask(self, identifier: int) -> None:
-        """Put a remote frame of one byte on the bus (node guarding); tapped as a frame without data."""
+        """Send a remote frame of one byte (node guarding). ``tap`` gets it as a frame without data."""
         self._put(self._message(
             arbitration_id=identifier, is_remote_frame=True, dlc=1, is_extended_id=False, check=False
         ))
@@ -189,7 +191,7 @@ class CanLink:
         """
         try:
             message = self._bus.recv(timeout_s)
-        except Exception as error:  # see send
+        except Exception as error:  # any type of error, as in `_put`
             raise CommunicationLost(
                 f"no frame can be received: {error}",
                 where=self.name,
@@ -205,7 +207,7 @@ class CanLink:
         if not self._clock.stepped:
             self.stamps.take(message.timestamp, now_s)
         identifier, data = message.arbitration_id, bytes(message.data)
-        if identifier == CYCLE_ID and data[:1] == CYCLE_ANSWER:     # no part of the run: optional
+        if identifier == CYCLE_ID and data[:1] == CYCLE_ANSWER:     # not a part of the run: ``tap`` does not get it
             self._answered |= data[1:] == bytes((self._question,))
             return identifier, data
         if self._tap is not None:
@@ -262,7 +264,7 @@ class CanLink:
         """Handle frames until ``done()`` is true or the expected frame is lost. Return whether ``done()`` was true.
 
         In real time the frame is lost after ``timeout_s``. A peer that can report its cycle (`asks`) reports that it
-        has nothing more to send. No clock decides then, except about a dead peer.
+        has nothing more to send. Then no clock ends the wait, except for a dead peer (`PEER_DEAD_S`).
         """
         if not self.asks or self._answers_at_once:
             return self.pump_until(done, timeout_s)

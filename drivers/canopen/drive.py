@@ -1,6 +1,6 @@
 """CiA 402 on a CAN bus: PDOs, SYNC, NMT and heartbeat for `drivers.cia402.drive.Cia402Drive`.
 
-One cycle; this loop sends all of it, no other thread and not the kernel::
+The control loop sends all frames of a cycle; no other thread and no timer of the kernel sends any::
 
     tick ─ heartbeat (when due) ─ RPDO2 (when the mode changes) ─ RPDO1 ─ SYNC ─► TPDO1 (─ TPDO2)
            700h+host              6060h                         6040h 6071h 60FFh   6041h 6077h 606Ch
@@ -56,18 +56,19 @@ START, ENTER_PRE_OPERATIONAL = 0x01, 0x80
 NMT_COMMANDS = {START: "start", 0x02: "stop", ENTER_PRE_OPERATIONAL: "enter pre-operational", 0x81: "reset node",
                 0x82: "reset communication"}
 FIRST_ANSWERS, FIRST_ANSWER_S = 3, 0.05
-"""The first SYNCs, at standstill, get this waiting time, s. It shows the response time of the drive."""
+"""Number of first SYNCs, at standstill, with a longer waiting time, and that time, s. They show the drive's response
+time."""
 DOUBLED_ANSWERS = 3
-"""This number of doubled answers shows two nodes with one node-ID; `Cia402Drive.connect` sends about ten requests."""
+"""Number of doubled answers that shows two nodes with one node-ID. `Cia402Drive.connect` sends about ten requests."""
 TPDO_COMMUNICATION, TPDO_MAPPING = 0x1800, 0x1A00
 _NO_WORD = b""
 _UPLOAD, _ABORT = 2, 4
 
 
 class CanopenBus(Cia402Bus):
-    """One node. ``tap`` gets every frame."""
+    """One CANopen node as the bus of a CiA 402 drive. ``tap`` gets every frame."""
 
-    feedback_timing = (TPDO_COMMUNICATION, 2)      # of TPDO1: transmission type
+    feedback_timing = (TPDO_COMMUNICATION, 2)      # TPDO1: transmission type
 
     def __init__(
         self, bus: can.BusABC, profile: CanopenProfile, clock: Clock, *, node: int, period_s: float,
@@ -197,7 +198,7 @@ class CanopenBus(Cia402Bus):
         self._watch.stop()
         self._life.feed()
         self.take()
-        with suppress(ObjectRefused):  # then it follows the SYNC alone
+        with suppress(ObjectRefused):  # a drive without 1006h follows the SYNC alone
             arming.set_period(self._objects, self._profile, period_s)
         with suppress(ObjectRefused):
             changed.append((TPDO_COMMUNICATION + 1, 2, arming.set_slow_syncs(self._objects, period_s)))
@@ -214,7 +215,7 @@ class CanopenBus(Cia402Bus):
     # -- the cycle -------------------------------------------------------------------------------------------
 
     def listen_until(self, tick_s: float) -> None:
-        """Wait for the next tick and handle frames meanwhile. Feedback among them is late."""
+        """Wait for the next tick and handle frames meanwhile. Feedback that arrives meanwhile is late."""
         clock, feedback = self.clock, self._feedback
         before = feedback.arrived - feedback.older
         if clock.stepped:
@@ -249,7 +250,7 @@ class CanopenBus(Cia402Bus):
         feedback.begin(now_s, sync=sync)
         if sync:
             self._slow.begin()
-            self._link.send(SYNC, _NO_WORD, self.ticks.check)     # it is the SYNC that makes a setpoint act
+            self._link.send(SYNC, _NO_WORD, self.ticks.check)     # the SYNC makes the setpoint act
         age_s = self._await_feedback(now_s)
         self._cycles += 1
         doubted = feedback.doubted()
@@ -315,11 +316,11 @@ class CanopenBus(Cia402Bus):
         self._life.feed_when_due(now_s)
 
     def feed_between(self) -> None:
-        """Send one more sign of life. The ones due in control time stay due."""
+        """Send one additional sign of life. It does not change the time at which the next is due."""
         self._life.feed_between()
 
     def stop_feeding(self) -> None:
-        """Send no sign of life any more."""
+        """End the host's sign of life, so that the drive's watchdog trips."""
         self._life.end()
 
     # -- beside the cycle ------------------------------------------------------------------------------------
@@ -365,12 +366,12 @@ class CanopenBus(Cia402Bus):
         self._remapped |= index in (TPDO_MAPPING, TPDO_MAPPING + 1)
 
     def intervals_s(self, period_s: float) -> tuple[float, float]:
-        """Return the times between two displays of the mode and between two angles, both in TPDO2, s."""
+        """Return the intervals of the mode display and of the angle in TPDO2, s."""
         apart_s = slow_syncs(period_s) * period_s
         return apart_s, period_s if self._wide else apart_s
 
     def late_since(self, since_s: float) -> list[float]:
-        """Return the delays of TPDO1 after their cycles, s, since this control time."""
+        """Return the delays of TPDO1s that came after the end of their cycles, s, for arrivals since ``since_s``."""
         return self._feedback.late_since(since_s)
 
     def traffic(self) -> Traffic:
@@ -380,7 +381,7 @@ class CanopenBus(Cia402Bus):
         return Traffic(late, link.error_frames, link.passive, stamps.offset_s, stamps.jumps)
 
     def summary(self) -> tuple[str, ...]:
-        """Return what other masters wrote to the drive during the whole run."""
+        """Return remarks on the writes of other masters to the drive during the whole run."""
         return self._foreign_traffic.summary()
 
     def _on_nmt(self, data: bytes) -> None:

@@ -2,15 +2,14 @@
 
 Only this host may send these frames to this drive. If one is received, another node sent it::
 
-        700h + host      heartbeat: it would feed the drive's watchdog (1016h) after this computer has died
-        700h + node      remote frame: the same, for a drive that is supervised by node guarding
+    700h + host      heartbeat: it would feed the drive's watchdog (1016h) after this computer has died
+    700h + node      remote frame: it would do the same for a drive that is supervised by node guarding
     080h             SYNC
     RPDOs            setpoints
-        600h + node      SDO requests: a tool that reads does no harm; one that writes may
+    600h + node      SDO requests: a tool that reads does no harm; a tool that writes may
 
 A single frame is reported (`NodeWatch.tell`). The second frame of a kind, at any time in the run, ends the run
-(`NodeWatch`).
-A tool that writes driving objects (6040h, 6060h, 6071h, 60FFh) repeatedly is a second master too.
+(`NodeWatch`). A tool that writes driving objects (6040h, 6060h, 6071h, 60FFh) repeatedly counts as a second master too.
 """
 
 from __future__ import annotations
@@ -28,16 +27,18 @@ from drivers.preflight import PreflightTable
 from profiles import MessageCode
 
 LISTEN_S = 3.0
-"""Time of listening to the bus before motion, s. Heartbeats usually come at least once a second."""
+"""Duration of listening to the bus before motion, s. Heartbeats usually come at least once a second."""
 HIGHEST_NODE = 127
 FOREIGN_WRITES = 3
-"""This number of writes to driving objects in one run shows a second master."""
+"""Number of foreign writes to driving objects in one run that shows a second master."""
 DRIVING = frozenset({0x6040, 0x6042, 0x6060, 0x6071, 0x60FF})
 _DOWNLOAD, _EXPEDITED, _SIZED = 1, 0x02, 0x01
 
 
 class ForeignTraffic:
-    """Listens from the start. ``number`` is the host's node number; ``on_write`` is called for each foreign write."""
+    """Detector of foreign frames, active from the start. ``number``: the host's node number; ``on_write``: called for
+    each foreign write.
+    """
 
     def __init__(self, link: CanLink, watch: NodeWatch, clock: Clock, *, node: int, number: int) -> None:
         self._link = link

@@ -78,11 +78,11 @@ class FrameShape(CyclicObjects):
 
     @property
     def wide(self) -> bool:
-        """Torque of 32 bits: the statusword comes in TPDO2."""
+        """True for a torque of 32 bits: the statusword then comes in TPDO2."""
         return self.torque[2] == 32
 
     def setpoints(self, word: int, torque_raw: int, speed_raw: int) -> bytes:
-        """Return RPDO1."""
+        """Return the data of RPDO1."""
         if self.target_torque:
             return RPDO1.pack(word, torque_raw, speed_raw)
         if self.vl:
@@ -95,13 +95,13 @@ class FrameShape(CyclicObjects):
         return (MODE,) * self.mode + (() if self.offset is None else (self.offset,))
 
     def slow_setpoints(self, code: int, offset_raw: int) -> bytes:
-        """Return RPDO2."""
+        """Return the data of RPDO2."""
         if self.offset is None:
             return RPDO2.pack(code)
         return RPDO2_MODE_OFFSET.pack(code, offset_raw) if self.mode else RPDO2_OFFSET.pack(offset_raw)
 
     def data_size(self) -> int:
-        """Return the bytes of TPDO1."""
+        """Return the length of TPDO1, bytes."""
         return self.feedback.size - 2 if self.wide else self.feedback.size
 
 
@@ -132,12 +132,12 @@ class Slow:
 
     @property
     def size(self) -> int:
-        """Bytes, without the statusword of a wide shape."""
+        """Length in bytes, without the statusword of a wide shape."""
         return self.layout.size
 
     @cached_property
     def layout(self) -> Struct:
-        """Mode display, demand and angle, if present."""
+        """Binary layout of mode display, demand and angle, if they are mapped."""
         angle = "" if self.position is None else LAYOUTS[self.position.type].format.lstrip("<")
         return Struct("<b" + "h" * self.demand + angle)
 
@@ -178,16 +178,16 @@ def shape_of(profile: CanopenProfile) -> FrameShape:
 
 _NO_WORD = b""
 ANSWER_WITHIN_S = 0.5
-"""An answer counts as lost after this time, s. The host gives up a silent drive after half of it."""
+"""Time after which an answer counts as lost, s. The host gives up a silent drive after half of this time."""
 LONGEST_LATE_S = 0.05
-"""Longest delay of an adapter, s. With a longer cycle, a late answer counts as lost."""
+"""Longest delay of an adapter, s. If the cycle is longer, a late answer counts as lost."""
 _USUAL_SHARE, _QUICKEST_SHARE = 0.25, 0.5
 _RECENT = 1000
 
 
 class PdoFeedback:
-    """Feedback of the current cycle; `begin` starts the next. ``now_s``: control time in real time; None: nothing is
-    late.
+    """Feedback of the current cycle; `begin` starts the next. ``now_s`` returns the control time in real time; None in
+    stepped time, where no answer is late.
     """
 
     def __init__(self, shape: FrameShape, now_s: Callable[[], float] | None = None, period_s: float = 0.0) -> None:
@@ -196,24 +196,24 @@ class PdoFeedback:
         self._now_s = now_s
         self._period_s = period_s
         self._waits = now_s is not None and period_s < LONGEST_LATE_S
-        self._half: tuple[float, bool, bytes] | None = None    # time, whether it is the status, data
+        self._half: tuple[float, bool, bytes] | None = None    # time, True for the statusword, data
         self._due: deque[float] = deque()      # SYNCs whose answers may come yet, in order; the last is this cycle's
         self._given_up: deque[float] = deque() # answers that count as lost, but may still come
         self._begun_s = 0.0
         self._here = 0                 # answers since `begin`
-        self._last_s = 0.0             # time of the last one
+        self._last_s = 0.0             # arrival time of the latest answer, s
         self._spoiled = False          # a frame of another length has come since `begin`
         self._doubtful = False         # an answer of the previous cycle was given up; it may come in this one
         self._quickest_s: float | None = None
         self._usual_s = 0.0            # time from a SYNC to its answer
-        self._extra = False            # since the last call of `doubted`
+        self._extra = False            # a surplus answer has come since the last call of `doubted`
         self._ends_cycles = False      # a simulated peer reports the end of a cycle
         self.data = _NO_WORD           # statusword, torque, speed; as `FrameShape.feedback` packs them
         self.over = False              # the peer reported the end of this cycle
-        self.arrived = 0               # all TPDO1s
-        self.second = 0                # second ones in a cycle that the peer had not ended
-        self.older = 0                 # answers to a SYNC before this cycle's
-        self.contradictions = 0        # frames that contradict the first one of their cycle
+        self.arrived = 0               # number of all TPDO1s
+        self.second = 0                # number of surplus TPDO1s in cycles that the peer had not ended
+        self.older = 0                 # number of answers to a SYNC before this cycle's
+        self.contradictions = 0        # number of frames that contradict the first one of their cycle
         self._late_s: deque[tuple[float, float]] = deque(maxlen=_RECENT)   # time of arrival, delay after its cycle
 
     def begin(self, now_s: float = 0.0, *, sync: bool = True) -> None:
@@ -245,7 +245,7 @@ class PdoFeedback:
         self._given_up.append(self._begun_s)
 
     def late_since(self, since_s: float) -> list[float]:
-        """Return the delays of answers after their cycles, s, for answers since ``since_s``."""
+        """Return the delays of answers that came after the end of their cycles, s, for arrivals since ``since_s``."""
         return [late_s for came_s, late_s in self._late_s if came_s >= since_s]
 
     @property

@@ -14,18 +14,19 @@ from profiles import MessageCode
 
 DISABLED = 1 << 31
 SLOW_SYNCS, SLOW_S = 5, 0.1
-"""TPDO2 (mode display, torque demand, angle) comes with every fifth SYNC: the control loop does not need it, and the
-bus load is limited. With a slow cycle it comes more often: a lost mode, and an angle, must show within 0.1 s or a
-cycle."""
+"""Number of SYNCs between two TPDO2 (mode display, torque demand, angle), and longest interval, s. The control loop
+does not need TPDO2 in each cycle, and fewer frames limit the bus load. With a slow cycle TPDO2 comes more often: a lost
+mode, and an angle, must show within 0.1 s or one cycle."""
 _LEAST_RPDOS, _MOST_RPDOS = 8, 64
-"""RPDOs that are read: the first eight in any case, because numbers may be missing; then as long as there are more."""
+"""Number of RPDOs that are read: the first eight in any case, because numbers may be missing; then further ones, up to
+64, until one is missing."""
 
 
 @dataclass(frozen=True)
 class PdoMapping:
     """Required state of one PDO: ``number`` counts from 1, ``sync_type`` is its transmission type (1 = every SYNC)."""
 
-    receive: bool                  # as the drive sees it
+    receive: bool                  # True for an RPDO, which the drive receives
     number: int
     sync_type: int
     mapped: tuple[tuple[int, int, int], ...]
@@ -39,8 +40,8 @@ class PdoMapping:
         return (0x1600 if self.receive else 0x1A00) + self.number - 1
 
     def identifier(self, node: int) -> int:
-        """Return the COB-ID of the predefined connection set (CiA 301): RPDO1 200h, TPDO1 180h, each further 100h
-        more.
+        """Return the COB-ID of the predefined connection set (CiA 301): RPDO1 200h, TPDO1 180h, and 100h more for each
+        next PDO.
         """
         return (0x200 if self.receive else 0x180) + 0x100 * (self.number - 1) + node
 

@@ -31,7 +31,7 @@ _CONTROLWORD = 0x6040
 
 
 class CanopenTarget(Cia402Target):
-    """One node on an open bus."""
+    """One CANopen node on an open bus, for a bare quick stop."""
 
     def __init__(self, bus: can.BusABC, profile: CanopenProfile, clock: Clock, *, node: int) -> None:
         self._link = CanLink(bus, clock)

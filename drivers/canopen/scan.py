@@ -25,7 +25,8 @@ ASK_DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
 PACE_S = 0.0015
 """Interval between two requests, s: one frame at 125 kbit/s, so that no transmit queue overflows."""
 FULL_TRIES, FULL_PAUSE_S = 20, 0.01
-"""Time for a full transmit queue to empty, s, if another node acknowledges the frames."""
+"""Attempts to send a frame while the transmit queue is full, and pause between them, s. The queue empties in this time
+if another node acknowledges the frames."""
 _STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
 @dataclass
 class Heard:
@@ -38,7 +39,9 @@ class Heard:
 
 
 def ask_all(bus: can.BusABC, nodes: Iterable[int], wait_s: float) -> tuple[CanLink, Heard]:
-    """Ask, then listen for ``wait_s`` of wall time. Raises CommunicationLost if the bus takes no frames."""
+    """Send the requests, then listen for ``wait_s`` of wall time. Raises CommunicationLost if the bus accepts no
+    frames.
+    """
     heard = Heard()
     link = CanLink(bus, MonotonicClock())
     for node in range(1, 128):
@@ -77,7 +80,7 @@ def _listen(link: CanLink, seconds: float, heard: Heard) -> None:
 
 
 def _answered(heard: Heard, node: int, data: bytes) -> None:
-    """Note an answer of an SDO server: the node exists; one that refuses 1000h has type 0."""
+    """Record an answer of an SDO server: the node exists. The type is 0 if the node refuses 1000h."""
     if len(data) == 8 and data[1:4] == ASK_DEVICE_TYPE[1:4]:
         heard.device_types[node] = int.from_bytes(data[4:8], "little") if data[0] & 0xE0 == 0x40 else 0
 

@@ -49,7 +49,7 @@ def is_answer(request: bytes, response: bytes) -> bool:
 
 
 class _PumpingClient(SdoClient):  # type: ignore[misc]
-    """Waits for a response by taking frames off the link."""
+    """SDO client that takes frames off the link while it waits for a response."""
 
     RESPONSE_TIMEOUT = 0.5
     MAX_RETRIES = 3
@@ -59,8 +59,8 @@ class _PumpingClient(SdoClient):  # type: ignore[misc]
         self.network = _LinkNetwork(link)
         self._link = link
         self._asked = bytes(8)
-        self._answers = 0              # to the current request
-        self.doubled = 0               # answers to a request that was already answered
+        self._answers = 0              # number of answers to the current request
+        self.doubled = 0               # number of answers to requests that were already answered
         self.aside: Callable[[bytes], None] = lambda data: None
         link.handlers[self.tx_cobid] = self._take
 
@@ -97,7 +97,7 @@ class SdoObjects(Objects):
         self._node = node
 
     def on_answer(self, take: Callable[[bytes], None]) -> None:
-        """Have ``take`` see every SDO answer of the drive, including answers to other clients."""
+        """Register ``take``, which is called with every SDO answer of the drive, including answers to other clients."""
         self._client.aside = take
 
     @property

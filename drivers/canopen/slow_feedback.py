@@ -13,7 +13,7 @@ from typing import NamedTuple
 from drivers.canopen.pdo import Slow
 
 FORGOTTEN = 3
-"""After this number of missing ones tdhil stops waiting: the time of the next is unknown."""
+"""Number of missing TPDO2 after which tdhil stops waiting for them, because the time of the next is unknown."""
 
 
 class ModeAndDemand(NamedTuple):
@@ -24,39 +24,39 @@ class ModeAndDemand(NamedTuple):
 
 
 class SlowFeedback:
-    """Content of TPDO2; ``every``: number of SYNCs between two TPDO2."""
+    """Content of TPDO2. ``every``: number of SYNCs between two TPDO2."""
 
     def __init__(self, carried: Slow, every: int) -> None:
         self.carried = carried
         self._every = every
-        self._syncs = 0                # sent so far
-        self._came_at: int | None = None           # the SYNC that the last one belongs to
-        self._counts: float | None = None          # of the angle, of this cycle's SYNC
+        self._syncs = 0                # number of SYNCs sent so far
+        self._came_at: int | None = None           # number of the SYNC of the latest TPDO2
+        self._counts: float | None = None          # angle at this cycle's SYNC
         self._waited_for = False
         self._held: ModeAndDemand | None = None
 
     def begin(self) -> None:
-        """Note that a SYNC is about to go out."""
+        """Count a SYNC, immediately before it is sent."""
         self._syncs += 1
         self._counts = None
 
     @property
     def due(self) -> bool:
-        """True if to wait for one in this cycle."""
+        """True if this cycle must wait for a TPDO2."""
         if self.carried.position is None or self._came_at is None:
             return False
         since = self._syncs - self._came_at
         return since > 0 and since % self._every == 0 and since <= FORGOTTEN * self._every
 
     def wait(self) -> None:
-        """Note that this cycle now waits for TPDO2 alone; its content is shown with the next cycle."""
+        """Record that this cycle now waits for TPDO2 alone; its content is shown with the next cycle."""
         self._waited_for = True
 
     def take(self, data: bytes, behind_feedback: bool) -> ModeAndDemand | None:
         """Take one frame, without a wide shape's statusword. Return the values to show at once.
 
-        ``behind_feedback``: this cycle's TPDO1 has come, so the frame belongs to the same SYNC; otherwise to the one
-        before.
+        ``behind_feedback``: this cycle's TPDO1 has come, so the frame belongs to the same SYNC. Otherwise it belongs to
+        the SYNC before.
         """
         code, demand, counts = self.carried.unpack(data)
         self._came_at = self._syncs if behind_feedback else self._syncs - 1

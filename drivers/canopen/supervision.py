@@ -20,21 +20,22 @@ PRE_OPERATIONAL = 0x7F
 _NMT_NAMES = {STOPPED: "stopped", OPERATIONAL: "operational", PRE_OPERATIONAL: "pre-operational"}
 
 FOREIGN_FRAMES, FOREIGN_S = 3, 1.0
-"""This number of foreign frames within this time, s, with an identifier that only the drive sends: another drive."""
+"""Number of foreign frames, with an identifier that only the drive sends, and time, s. So many frames within this time
+show a second drive."""
 FOREIGN_IN_A_RUN = 2
-"""This number of frames of one kind that only we send (SYNC, the drive's RPDOs, our heartbeat) shows another node, at
-any distance in time: CAN's checksum excludes an accident. Before the start it takes `FOREIGN_FRAMES`, because frames
-from the queue of another run may still arrive."""
+"""Number of frames of one kind that shows another node, if only this host sends that kind (SYNC, the drive's RPDOs, the
+host's heartbeat). The time between the frames does not matter: CAN's checksum excludes an accident. Before the start
+`FOREIGN_FRAMES` are required, because frames from the queue of another run may still arrive."""
 
 START_GRACE_S = 0.5
-"""A heartbeat that was in transit when the node was started still reports pre-operational."""
+"""Time after the start of the node, s, in which a heartbeat may still report pre-operational: it was in transit."""
 
 HOST_LOST = 0x8130
 """EMCY of a drive that lost its host: life guard error or heartbeat error (CiA 301)."""
 
 
 class NodeWatch(DriveWatch):
-    """Follows one node. ``allowed_silence_s`` is the longest time without a heartbeat (0 = not supervised).
+    """Supervision of one node. ``allowed_silence_s`` is the longest time without a heartbeat (0 = not supervised).
 
     With node guarding, `Guarding` passes the answers on as if they were heartbeats.
     """
@@ -51,7 +52,7 @@ class NodeWatch(DriveWatch):
         self._operational = False
         self.allowed_silence_s = 0.0
         self.emcy_code = 0
-        self.nmt_state: int | None = None      # last reported by the drive; None before
+        self.nmt_state: int | None = None      # latest state that the drive reported; None before
         self.on_boot_up: Callable[[], None] = lambda: None
         self.sign_of_life: Callable[[], tuple[str, str]] = lambda: ("heartbeat has been missing", "1017h")
 
@@ -203,8 +204,8 @@ class NodeWatch(DriveWatch):
 #     drive  700h + node, toggle | state   ─►  bit 7 changes with every answer, bits 0 to 6 are the NMT state
 #
 # The control loop itself sends the requests, so that a frozen or dead host is silent and the drive's watchdog trips. An
-# answer without a toggle does not count: it is an old frame, or another station's. `NodeWatch` checks the state and the
-# longest time without one.
+# answer without a toggle does not count: it is an old frame, or the frame of another station. `NodeWatch` checks the
+# state and the longest time without an answer.
 
 
 class Guarding:
@@ -257,7 +258,7 @@ ANSWER_S = 0.2
 
 
 class SignOfLife:
-    """Sends heartbeats of ``host_node``, or guards ``node`` and takes its answers from the link."""
+    """Heartbeat of ``host_node``, or node guarding of ``node`` with the answers from the link."""
 
     def __init__(
         self, link: CanLink, watch: NodeWatch, clock: Clock, profile: CanopenProfile, *, node: int, host_node: int
@@ -274,11 +275,11 @@ class SignOfLife:
 
     @property
     def asks(self) -> bool:
-        """True if the drive is supervised by node guarding, so that it must answer; else the host sends a heartbeat."""
+        """True if node guarding supervises the drive, so that it must answer. Otherwise the host sends a heartbeat."""
         return self._asks
 
     def feed(self) -> None:
-        """Send one now; the next is due one period later."""
+        """Send a sign of life now. The next is due one period later."""
         if self._ended:
             return
         if self._guarding is not None and self._asks:
@@ -288,26 +289,26 @@ class SignOfLife:
         self._next_s = self._clock.now_s() + self._every_s
 
     def end(self) -> None:
-        """Send none any more: the drive's watchdog is to trip."""
+        """End the sign of life, so that the drive's watchdog trips."""
         self._ended = True
 
     def feed_when_due(self, now_s: float) -> None:
-        """Send one if it is due; called in every cycle."""
+        """Send a sign of life if it is due; called in every cycle."""
         if now_s >= self._next_s:
             self.feed()
 
     def feed_between(self) -> None:
-        """Send one more between two cycles. The ones due in control time stay due."""
+        """Send one additional sign of life between two cycles. It does not change the time at which the next is due."""
         due_s = self._next_s
         self.feed()
         self._next_s = due_s
 
     def pace(self, every_s: float) -> None:
-        """Set the longest period, s."""
+        """Set the period to ``every_s``, s, but at most to `HEARTBEAT_S`."""
         self._every_s = min(HEARTBEAT_S, every_s)
 
     def keep_to(self, feed_s: float) -> None:
-        """Set the period of the armed watchdog, s; 0: it is not armed."""
+        """Set the period at which the armed watchdog must be fed, s; 0: it is not armed."""
         if not feed_s:                 # not every adapter carries remote frames
             self._asks = False
         self.pace(feed_s or HEARTBEAT_S)

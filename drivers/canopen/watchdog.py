@@ -187,8 +187,8 @@ def _arm_guarding(
     table: PreflightTable, objects: Objects, time_ms: int, factor: int, ask: Callable[[], None],
     answered: Callable[[], bool]
 ) -> float:
-    """Arm guard time 100Ch in ms x 100Dh factor = life time (CiA 301): the drive reacts without a request for so
-    long.
+    """Arm node guarding (CiA 301): guard time 100Ch in ms x factor 100Dh = life time. The drive reacts if no request
+    comes within the life time.
     """
     factor = min(factor, time_ms)
     guard_ms = time_ms // factor

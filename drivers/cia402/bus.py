@@ -143,7 +143,7 @@ class Cia402Bus(ABC):
 
     @abstractmethod
     def listen_until(self, tick_s: float) -> None:
-        """Wait until this control time, s, and handle what comes meanwhile."""
+        """Wait until this control time, s, and handle incoming frames meanwhile."""
 
     @abstractmethod
     def begin(self, try_again: bool) -> float:
@@ -158,7 +158,7 @@ class Cia402Bus(ABC):
 
     @abstractmethod
     def receive(self, now_s: float, sync: bool) -> CycleInputs:
-        """Complete the cycle: ``sync`` starts the exchange of the frames. Return the feedback."""
+        """Complete the cycle and return the feedback. With ``sync``, start the exchange of the frames first."""
 
     def check(self) -> None:
         """Raise the oldest error of the drive that was not raised yet."""
@@ -217,7 +217,7 @@ class Cia402Bus(ABC):
         return
 
     def changed(self, index: int, sub: int) -> None:
-        """Take note that another master has changed an object that is read back."""
+        """Handle the change of an object that is read back, by another master."""
         return
 
     def intervals_s(self, period_s: float) -> tuple[float, float]:
@@ -225,7 +225,7 @@ class Cia402Bus(ABC):
         return period_s, period_s
 
     def late_since(self, since_s: float) -> list[float]:
-        """Return the delays of answers after their cycles, s, since this control time."""
+        """Return the delays of answers that came after the end of their cycles, s, for arrivals since ``since_s``."""
         return []
 
     def traffic(self) -> Traffic:

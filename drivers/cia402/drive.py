@@ -65,19 +65,20 @@ from profiles import MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS, MessageCode
 from profiles.cia402 import Cia402Profile
 
 LOCAL_CYCLES = 3
-"""A missing bit counts after this number of cycles; one damaged frame does not matter."""
+"""Number of cycles after which a missing remote bit counts (statusword, bit 9). One damaged frame does not matter."""
 QUICK_STOP_OPTION = 0x605A
 DRIVE_SILENT_S = 0.5
-"""A drive counts as lost after this time without its sign of life, s."""
+"""Time without the drive's sign of life after which it counts as lost, s."""
 MODE_STALE_S, MODE_STALE_TIMES = 0.5, 10
-"""The displayed mode counts as unknown after this time, s, and this number of frame periods without a display."""
+"""Time without a display, s, and number of frame periods, after which the displayed mode counts as unknown."""
 THIN_S, THIN_CYCLES, THIN_SHARE = 1.0, 10, 0.5
-"""Limit for missing feedback: more than this share of the cycles within this time (at least this number of cycles).
-With less feedback the shaft cannot be guarded. A bus that loses every tenth frame is far below the limit."""
+"""Time, s, least number of cycles, and share of cycles: limit for missing feedback. If more than this share of the
+cycles within this time brings no feedback, the shaft cannot be guarded. A bus that loses every tenth frame is far below
+the limit."""
 _DISABLED = (State.SWITCH_ON_DISABLED, State.FAULT)
 _OUT_OF_OPERATION = (State.QUICK_STOP_ACTIVE, State.FAULT, State.FAULT_REACTION_ACTIVE)
 _REPEAT_MODE_CYCLES = 25
-"""A mode that is not displayed is requested again after this number of cycles: one lost frame must not end a run."""
+"""Number of cycles after which a mode that is not displayed is requested again. One lost frame must not end a run."""
 
 
 @dataclass(slots=True)
@@ -100,10 +101,10 @@ class _Power:
 
     wish: PowerRequest = PowerRequest.OFF
     removes_torque: bool = False
-    in_operation: bool = False     # enabled, and seen enabled since
-    ever_asked: bool = False       # to be enabled
+    in_operation: bool = False     # enabled, and reported as enabled since
+    ever_asked: bool = False       # the drive was requested to enable at least once
     was_remote: bool = False       # bit 9 was set in operation
-    local: int = 0                 # cycles without it
+    local: int = 0                 # number of cycles since then without bit 9
     fed: bool = True               # the host feeds the drive's watchdog
 
 
@@ -112,18 +113,18 @@ class _ModeSent:
     """Mode of operation as sent last."""
 
     code: int = 0
-    cycles: int = 0                # since then
-    overwritten: bool = False      # by another master, since then
+    cycles: int = 0                # number of cycles since it was sent
+    overwritten: bool = False      # by another master, since it was sent
 
 
 @dataclass(slots=True)
 class _Cycles:
-    """Cycles, and those without feedback: since the start, and lately."""
+    """Count of cycles and of cycles without feedback: since the start, and in the recent cycles."""
 
-    recent: deque[bool]            # whether feedback came, in the last cycles
+    recent: deque[bool]            # True for each recent cycle with feedback
     all: int = 0
     missed: int = 0
-    missed_lately: int = 0         # of the recent ones
+    missed_lately: int = 0         # number of recent cycles without feedback
 
     @classmethod
     def at(cls, period_s: float) -> _Cycles:
@@ -131,7 +132,7 @@ class _Cycles:
         return cls(deque(maxlen=max(THIN_CYCLES, round(THIN_S / period_s))))
 
     def note(self, fresh: bool) -> None:
-        """Take one more of the recent cycles."""
+        """Add a cycle to the recent ones. ``fresh``: it brought feedback."""
         recent = self.recent
         if len(recent) == recent.maxlen and not recent[0]:
             self.missed_lately -= 1
@@ -140,7 +141,7 @@ class _Cycles:
             self.missed_lately += 1
 
     def forget(self) -> None:
-        """Begin the recent cycles anew."""
+        """Discard the recent cycles."""
         self.recent.clear()
         self.missed_lately = 0
 
@@ -206,7 +207,7 @@ class Cia402Drive:
     # -- before motion ---------------------------------------------------------------------------------------
 
     def connect(self) -> Identity:
-        """Find the drive, take it, read its identity (1018h) and the simulator's marker."""
+        """Find the drive, put it into pre-operational, read its identity (1018h) and the simulator's marker."""
         objects = self._bus.objects
         checks.find_free_node(objects)
         self._taken = True
@@ -420,9 +421,9 @@ class Cia402Drive:
         again = code != reported.shown_code and mode.cycles >= _REPEAT_MODE_CYCLES
         changes = code != mode.code or again or mode.overwritten
         word = DISABLE_VOLTAGE if power.removes_torque else controlword_towards(reported.state, power.wish)
-        if content.vl and word == ENABLE_OPERATION:    # an enabled drive follows its setpoint only if it is released
+        if content.vl and word == ENABLE_OPERATION:    # in vl mode the setpoint acts only with bits 4 to 6 set
             word |= VL_RELEASED
-        # Noted before: an answer may show them in this cycle.
+        # Recorded before they are sent: an answer in this cycle may show them.
         if content.offset is not None:
             back.sent(content.offset[0], offset_raw)
         back.sent(target_speed[0], speed_raw)
@@ -449,8 +450,8 @@ class Cia402Drive:
         return self._judge(now_s, self._bus.receive(now_s, fed or self.clock.stepped))
 
     def _stand(self) -> None:
-        """Write quick stop as an object and disable all cyclic setpoints: another master reversed it, or the drive did
-        not execute it.
+        """Write quick stop as an object and disable all cyclic setpoints, because another master reversed the quick
+        stop or the drive did not execute it.
         """
         self._standing.by_object = True
         done = self._bus.disable_setpoints()
@@ -503,7 +504,7 @@ class Cia402Drive:
         if fresh and missed and missed > THIN_SHARE * (recent.maxlen or 0):
             self._bus.watch.thin_feedback(missed, len(recent), self.period_s, self._bus.feedback_place)
             if (timing := self._bus.feedback_timing) is not None:
-                with suppress(CommunicationLost):      # for the stop that follows
+                with suppress(CommunicationLost):      # restores the feedback for the stop that follows
                     self._read_back.put_back(*timing)
 
     def _listen(self, tick_s: float) -> None:
@@ -606,17 +607,17 @@ class Cia402Drive:
         self._bus.stop_feeding()
 
     def remarks(self) -> tuple[str, ...]:
-        """Return what other masters sent since the last call; see `drivers.drive.Telling`."""
+        """Return remarks on foreign traffic since the last call; see `drivers.drive.Telling`."""
         return self._bus.watch.remarks()
 
     def summary(self) -> tuple[str, ...]:
-        """Return what other masters wrote to the drive during the whole run."""
+        """Return remarks on the writes of other masters to the drive during the whole run."""
         return self._bus.summary()
 
     def keep_alive(self) -> None:
         """Feed the watchdog between two cycles: in stepped time a simulated peer treats silence as a dead host.
 
-        What is due in control time stays due.
+        The time at which the next sign of life is due does not change.
         """
         self._bus.feed_between()
 

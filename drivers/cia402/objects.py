@@ -1,4 +1,4 @@
-"""Objects of a drive's object dictionary: read, written, changed with a way back. The transfer is the bus's.
+"""Objects of a drive's object dictionary: read, write, change and restore. Each bus implements the transfer.
 
 The names are those of CiA 301: index, sub-index, little-endian bytes. CANopen and EtherCAT (CoE) share them.
 """
@@ -23,7 +23,8 @@ class Objects(ABC):
         self._undo: list[Callable[[], None]] = []
         self._changed: set[tuple[int, int]] = set()
         self.journal: UndoJournal | None = None        # records each change before it is made
-        self.stands: dict[tuple[int, int], bytes] = {}     # last value read back, or found right
+        # bytes of each object as last read back, or as found if they were right
+        self.stands: dict[tuple[int, int], bytes] = {}
 
     @contextmanager
     def answered_within(self, answer_s: float) -> Iterator[None]:
@@ -63,7 +64,7 @@ class Objects(ABC):
         return int.from_bytes(back, "little", signed=signed)
 
     def change_bytes(self, index: int, subindex: int, data: bytes) -> bytes:
-        """Do the same as `change`, for an object of any type."""
+        """Write the bytes of an object of any type, remember the former ones, and return the bytes read back."""
         before = self.read_bytes(index, subindex)
         if before != data:
             self._note_change(index, subindex, before, data)
@@ -86,7 +87,7 @@ class Objects(ABC):
             self.journal.given_back(name(index, subindex))
 
     def on_restore(self, undo: Callable[[], None]) -> None:
-        """Have ``undo`` called by `restore`."""
+        """Register ``undo``, which `restore` calls."""
         self._undo.append(undo)
 
     def restore(self) -> tuple[str, ...]:

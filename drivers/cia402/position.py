@@ -24,7 +24,7 @@ FEWEST_COUNTS = 16
 """Least counts of 608Fh for one turn. A lower value is not an encoder, but an object that was never set."""
 _ENCODER, _GEAR, _FEED, _UNIT = 0x608F, 0x6091, 0x6092, 0x60A8
 _INCREMENTS = (0x0000_0000, 0x00B5_0000)
-"""60A8h where one count of 6064h is one increment (CiA 303-2: B5h)."""
+"""Values of 60A8h for which one count of 6064h is one increment (CiA 303-2: B5h)."""
 _TITLE = "angle of the motor"
 _ASKED = "tdhil asks the operator to confirm the speed of the shaft"
 

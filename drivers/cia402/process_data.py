@@ -1,4 +1,4 @@
-"""Process data of a CiA 402 drive: its objects, their units, the pure codec between counts and SI, and what is cyclic.
+"""Process data of a CiA 402 drive: its objects, their units, the pure codec between counts and SI, the cyclic objects.
 
 - A drive without torque mode receives only 6040h and 60FFh.
 - In velocity mode (vl, 2) the speed setpoint is 6042h and the reported speed 6044h, 16 bits each.
@@ -30,7 +30,7 @@ from profiles.cia402 import Cia402Profile, ObjectType
 RPM = 2.0 * math.pi / 60.0
 """rad/s in one rev/min."""
 
-# (index, subindex, bits).
+# Objects, each as (index, subindex, bits).
 CONTROLWORD = (0x6040, 0, 16)
 STATUSWORD = (0x6041, 0, 16)
 MODE = (0x6060, 0, 8)
@@ -87,7 +87,7 @@ def encode_torque_offset(torque_nm: float, units: Units) -> int:
 
 
 def _counts(value: float, per_lsb: float, bits: int) -> int | None:
-    """Return the value in LSB; None if it is not finite, or out of the range of so many bits beside the sign."""
+    """Return the value in LSB; None if it is not finite, or does not fit into this number of bits plus a sign bit."""
     if not math.isfinite(value):
         return None
     counts, end = round(value / per_lsb), 1 << bits
@@ -144,7 +144,7 @@ class Reported:
 
     def __init__(self) -> None:
         self.state = State.NOT_READY
-        self._started = False          # it has shown a state other than not ready since its start
+        self._started = False          # the drive has shown a state other than not ready since its start
         self.shown_code = 0            # 6061h
         self.shown_s = 0.0             # control time of the last display of the mode
         self._status = 0

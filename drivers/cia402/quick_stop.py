@@ -2,8 +2,8 @@
 
 It is written as an object (6040h, bit 2 low), which needs no mapping and no cycle. If the quick stop of the drive is
 set to coast (605Ah = 0), another option is written first; if the drive refuses it, the halt bit is used. In torque mode
-the drive gets speed mode at zero first, as in a run, unless the profile states that its quick stop decelerates in
-torque mode. Otherwise the quick stop could release a turning shaft.
+the drive gets speed mode at zero first, as in a run. Otherwise the quick stop could release a turning shaft. This step
+is left out if the profile states that the quick stop decelerates in torque mode.
 """
 
 from __future__ import annotations
@@ -41,12 +41,14 @@ from profiles.cia402 import Cia402Profile
 
 
 UNDONE_S, UNDONE_CYCLES = 0.3, 5
-"""A drive that is in operation for this time, s, and this number of cycles after a quick stop does not follow it."""
+"""Time, s, and number of cycles. A drive that is still in operation after both does not follow the quick stop."""
 _LEFT_ALONE = frozenset(State) - {State.OPERATION_ENABLED, State.UNKNOWN}
 
 
 class Standing:
-    """``put`` sends a write request without waiting; ``target``: the speed's setpoint (index, subindex, bits)."""
+    """Quick stop by objects, for a drive that another master takes out of its quick stop. ``put`` sends a write request
+    without waiting; ``target``: the speed's setpoint (index, subindex, bits).
+    """
 
     def __init__(
         self, put: Callable[[int, int, bytes], None], period_s: float, target: tuple[int, int, int] = TARGET_VELOCITY
@@ -65,9 +67,12 @@ class Standing:
         self._period_s = period_s
 
     def undone(self, now_s: float, state: State, others: bool) -> bool:
-        """Return whether to take over, once per cycle after a quick stop. ``others``: RPDOs of another master came."""
+        """Return whether to write objects from now on. Called once per cycle after a quick stop. ``others``: setpoints
+        of another master came.
+        """
         if state is not State.OPERATION_ENABLED:
-            # With such frames the drive may be enabled in between unseen; so may one that shows no valid state.
+            # Between two cycles such setpoints may enable the drive without being seen. A drive that shows no valid
+            # state may be enabled too.
             if not others and state is not State.UNKNOWN:
                 self._since_s = None
             return False
@@ -111,7 +116,7 @@ _COAST, _BRAKE_AND_HOLD = 0, 6
 
 
 class Cia402Target:
-    """One drive on an open bus, by its objects. A bus adds stronger means, and what it hears of another master."""
+    """One drive on an open bus, stopped by its objects. Each bus adds stronger means, and remarks on another master."""
 
     def __init__(self, objects: Objects, profile: Cia402Profile, clock: Clock) -> None:
         self._objects = objects
@@ -143,7 +148,7 @@ class Cia402Target:
             raise refused
 
     def enforce(self, attempt: int) -> None:
-        """Use means of the bus that are stronger than an object, from some attempt on. May raise DriveFault."""
+        """Use a stronger means of the bus than an object, from some attempt on. May raise DriveFault."""
 
     def wait(self, time_s: float) -> None:
         """Wait between two objects, s."""

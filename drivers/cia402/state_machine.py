@@ -16,7 +16,7 @@ from drivers.drive import PowerRequest, PowerState
 
 
 class State(Enum):
-    """States of the figure in the standard."""
+    """States of the power drive system, in the figure of CiA 402-2."""
 
     __hash__ = object.__hash__     # Enum's own is Python code, too slow for a look-up in every cycle
 

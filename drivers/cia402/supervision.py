@@ -20,10 +20,10 @@ HOST_SILENT = "host silent"
 THIN = "thin feedback"
 OF_A_LATE_HOST = (HOST_SILENT, THIN)
 OF_A_SILENT_HOST = ("heartbeat", "nmt", *OF_A_LATE_HOST)
-"""Kinds of error that a delay of this host causes, or that it mistakes for errors of the drive."""
+"""Kinds of error that a delay of this host causes. After a delay some of them only look like errors of the drive."""
 
 MOST_REMARKS = 20
-"""Number of different remarks in one run."""
+"""Largest number of different remarks in one run."""
 
 # EMCY error code classes (CiA 301) and the CiA 402 codes a field engineer meets first.
 _EMCY_CLASSES = {
@@ -72,9 +72,10 @@ class DriveWatch:
         self._said: set[str] = set()
         self.expect_operational = False
         self.host_stood_still: Callable[[], str] = lambda: ""
-        """Returns the delay of this host, in words, to report before the error; empty if there was none."""
+        """Function that returns the delay of this host, in words, to report before the error; empty without one."""
         self.host_late: Callable[[], str] = lambda: ""
-        """The same for repeated short delays, on which a drive's watchdog acts."""
+        """Function that returns repeated short delays of this host, in words. A drive's watchdog may trip because of
+        them."""
 
     def start(self, allowed_silence_s: float) -> None:
         """Treat what happens to the drive as errors from now on. ``allowed_silence_s``: 0 = not supervised."""
@@ -148,10 +149,10 @@ class DriveWatch:
 #
 # A tool, the drive's panel or another fieldbus may change the watchdog, its reaction, the quick stop or a limit while
 # the shaft turns, without any frame on this bus. So a request is sent after a cycle's feedback; tdhil does not wait for
-# the answer and checks it when it comes. Watchdog and quick stop have every third
-# turn, limits and setpoints another, and the content of the feedback frames (mapping, transmission type, COB-ID of the
-# TPDOs) the third. So a change shows within 0.5 s times three times the number of objects in its group. An object that
-# a tool writes on this bus is checked in the next cycle.
+# the answer and checks it when it comes. Three groups of objects take turns: watchdog and quick stop; limits and
+# setpoints; content of the feedback frames (mapping, transmission type, COB-ID of the TPDOs). So a change shows within
+# 0.5 s times three times the number of objects in its group. An object that a tool writes on this bus is checked in the
+# next cycle.
 #
 # Setpoints and mode (6071h, 60FFh, 6060h) are read too: they must be the values that this host sent last. A drive
 # echoes them if it has returned a value of ours other than zero. Only then does another value come from another master.
@@ -194,7 +195,9 @@ class _WatchedObject:
 
 
 class ReadBack:
-    """``ask`` sends a read request, ``put`` a write request; `step` is called once a cycle, `take` for each answer."""
+    """Read-back of the drive's settings. ``ask`` sends a read request, ``put`` a write request. `step` is called once a
+    cycle, `take` for each answer.
+    """
 
     def __init__(
         self, watch: DriveWatch, ask: Callable[[int, int], None], put: Callable[[int, int, bytes], None], place: str
@@ -206,7 +209,7 @@ class ReadBack:
         self._groups: dict[Group, list[_WatchedObject]] = {group: [] for group in Group}
         self.on_changed: Callable[[int, int], None] = lambda index, sub: None
         """Called with index and sub-index of an object that another master changed, before the error is raised."""
-        self._next: deque[_WatchedObject] = deque()      # to read before their turn
+        self._next: deque[_WatchedObject] = deque()      # objects to read before their turn
         self._turn = 0
         self._asked: _WatchedObject | None = None
         self._asked_s = 0.0

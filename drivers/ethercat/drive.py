@@ -33,7 +33,7 @@ from profiles.ethercat import EthercatProfile
 INTERPOLATION = 0x60C2
 """Period of the setpoints in the cyclic synchronous modes: value (u8), exponent of ten (i8), in s."""
 MAILBOX_S = 0.05
-"""Time between two looks at the mailbox for emergency messages, s."""
+"""Interval between two queries of the mailbox for emergency messages, s."""
 STEPPED_ANSWER_US = 200_000
 """Wall time for a frame in stepped time, µs. A frame that takes longer is lost."""
 ANSWER_SHARE, CYCLE_SHARE = 0.5, 0.2
@@ -48,7 +48,9 @@ SETPOINTS, FEEDBACK = 2, 3
 
 
 class EthercatBus(cia402.Cia402Bus):
-    """One slave. ``tap`` gets the process data and the mailbox messages; the identifier is the sync manager."""
+    """One EtherCAT slave as the bus of a CiA 402 drive. ``tap`` gets the process data and the mailbox messages; the
+    identifier is the sync manager.
+    """
 
     feedback_place = "working counter"
 
@@ -185,7 +187,7 @@ class EthercatBus(cia402.Cia402Bus):
         self.period_s = period_s
         self.watch.stop()
         self.take()
-        with suppress(ObjectRefused):                  # then it follows the frames
+        with suppress(ObjectRefused):                  # a drive without 60C2h follows the frames
             self._set_interpolation()
         return ()
 
@@ -201,7 +203,7 @@ class EthercatBus(cia402.Cia402Bus):
     # -- the cycle -------------------------------------------------------------------------------------------
 
     def listen_until(self, tick_s: float) -> None:
-        """Wait until the tick. A simulated drive that is left to its watchdog goes on in its own time."""
+        """Wait until the tick. A simulated drive that is left to its watchdog continues in its own time."""
         if self.clock.stepped and not self._fed:
             time.sleep(self.period_s)
         self.clock.wait_until(tick_s)
@@ -212,7 +214,9 @@ class EthercatBus(cia402.Cia402Bus):
         return self.clock.now_s()
 
     def send(self, setpoints: cia402.CycleSetpoints) -> None:
-        """Send the process data. Outside of OP the drive takes none: then the controlword goes by SDO too, to stop."""
+        """Send the process data. Outside of OP the drive ignores them: then the controlword is also sent by SDO, to
+        stop.
+        """
         self.ticks.check()
         self._setpoints.pack(setpoints)
         self._transmit()
@@ -220,7 +224,7 @@ class EthercatBus(cia402.Cia402Bus):
             self.put(0x6040, 0, setpoints.word.to_bytes(2, "little"))
 
     def receive(self, now_s: float, sync: bool) -> cia402.CycleInputs:
-        """Take the frame back, and look at working counter, AL state and mailbox.
+        """Receive the frame, and check working counter, AL state and mailbox.
 
         Without ``sync``, or if the watchdog is no longer fed, the feedback is read from the slave's memory.
         """
@@ -274,7 +278,7 @@ class EthercatBus(cia402.Cia402Bus):
         return None
 
     def _look(self, now_s: float) -> None:
-        """Look at AL state, mailbox and watchdog registers. An unanswered datagram shows in the working counter too."""
+        """Check AL state, mailbox and watchdog registers. An unanswered datagram shows in the working counter too."""
         with suppress(CommunicationLost):
             found = self._station.al_status()
             self._al_state = found.state
@@ -310,7 +314,9 @@ class EthercatBus(cia402.Cia402Bus):
             self._frame()
 
     def stop_feeding(self) -> None:
-        """Send no setpoints any more. A simulated drive in stepped time then goes on in its own time."""
+        """End the setpoints, so that the watchdog trips. A simulated drive in stepped time then continues in its own
+        time.
+        """
         if self._fed and self.clock.stepped:
             self.put(MARKER_INDEX, 2, bytes(1))
         self._fed = False
@@ -324,7 +330,9 @@ class EthercatBus(cia402.Cia402Bus):
             self._asked = round(MAILBOX_S / self.period_s) + 1
 
     def put(self, index: int, sub: int, data: bytes) -> None:
-        """Send a write request without waiting. The controlword also goes into the process data, which replace it."""
+        """Send a write request without waiting. The controlword is also set in the process data, which would overwrite
+        it.
+        """
         if (index, sub) == (0x6040, 0):
             self._setpoints.stop(int.from_bytes(data, "little"))
         with suppress(CommunicationLost, ObjectRefused):

@@ -1,8 +1,9 @@
 """CoE through the mailbox of a slave: SDO (expedited, normal, segmented) and emergency messages.
 
-A request goes to sync manager 0, the answer is fetched from sync manager 1 when its status shows a full buffer. The
-control loop does both itself, so a slow drive does not delay a cycle: `Mailbox.post` sends, and `Mailbox.pump` looks.
-The counter in the header is 0, which every slave accepts as a new message.
+A request is written to sync manager 0. The answer is read from sync manager 1 when its status shows a full buffer. The
+control loop does both itself, so a slow drive does not delay a cycle: `Mailbox.post` sends a request, and
+`Mailbox.pump` reads an answer if there is one. The counter in the header is 0, which every slave accepts as a new
+message.
 
 ::
 
@@ -70,7 +71,7 @@ class Mailbox:
         """Called with each SDO answer that no request waits for."""
 
     def find(self) -> None:
-        """Read where the two mailboxes are. Raises CommunicationLost if the slave has none."""
+        """Read addresses and lengths of the two mailboxes. Raises CommunicationLost if the slave has none."""
         (self._out, self._out_size), (self._in, self._in_size) = map(self._station.sync_manager, (0, 1))
         if not self._out_size or not self._in_size:
             raise not_answered("the slave has no mailbox in this state", self._station.place)

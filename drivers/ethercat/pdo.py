@@ -1,7 +1,8 @@
 """PDO mapping by CoE (1600h, 1A00h) and assignment to the sync managers (1C12h, 1C13h), and the process image.
 
-Written in PRE-OP, in the order of ETG.1000.6: empty the assignment, empty the mapping, fill it, assign it. A drive with
-fixed PDOs gets its assignment only. In both cases the content is read back, and the image follows what was read.
+tdhil writes in PRE-OP, in the order of ETG.1000.6: empty the assignment, empty the mapping, fill it, assign it. A drive
+with fixed PDOs gets its assignment only. In both cases the content is read back, and the image follows the content that
+was read.
 """
 
 from __future__ import annotations

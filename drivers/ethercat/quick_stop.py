@@ -23,7 +23,7 @@ BY_SDO_TRIES = 5
 
 
 class EthercatTarget(Cia402Target):
-    """One slave. ``close`` closes what was opened for it."""
+    """One slave, for a bare quick stop. ``close`` closes everything that was opened for it."""
 
     def __init__(self, station: Station, profile: EthercatProfile, clock: Clock, close: Callable[[], None]) -> None:
         self._station = station

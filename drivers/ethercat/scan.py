@@ -30,9 +30,9 @@ class FoundSlave:
 
 @contextmanager
 def stations_at(interface: str) -> Iterator[tuple[Sequence[Station], str]]:
-    """Open all slaves, in PRE-OP unless another master drives one of them. Yield them, and who drives them in words.
+    """Open all slaves, in PRE-OP unless another master drives one of them. Yield them, with a text about such a drive.
 
-    Raises CommunicationLost if none answers.
+    The text is empty if no other master drives a slave. Raises CommunicationLost if no slave answers.
     """
     look = RawSegment(interface)
     try:
@@ -60,7 +60,7 @@ def objects_of(station: Station) -> CoeObjects:
 
 
 def found_slave(position: int, station: Station, driven: bool = False) -> FoundSlave:
-    """Return what a slave says of itself. Reads only; the mailbox of a ``driven`` slave is left to its master."""
+    """Return the description that a slave reports. Reads only; the mailbox of a ``driven`` slave is not used."""
     state, alias = station.al_status(), station.number(ALIAS)
     known = FoundSlave(position, alias, state.text)
     if driven or state.state == INIT:

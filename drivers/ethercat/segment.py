@@ -14,8 +14,8 @@ from drivers.ethercat.station import Station, not_answered, station_of
 from profiles import MessageCode
 
 FRAME_US, START_TRIES = 20_000, 3
-"""Time after which SOEM sends a frame of the start again, µs, and attempts to find the slaves. Its own 2 ms are short
-for a busy computer."""
+"""Time after which SOEM repeats a frame of the start, µs, and attempts to find the slaves. SOEM's default of 2 ms is
+too short for a busy computer."""
 
 
 class SoemStation(Station):
@@ -89,7 +89,7 @@ def _told(error: Exception) -> str:
 
 
 def open_segment(interface: str, position: int = 0, alias: int | None = None) -> EthercatSegment:
-    """Open an interface with pysoem, after a look at the AL states: a segment that is driven stays untouched.
+    """Check the AL states, then open an interface with pysoem. A segment that another master drives is left unchanged.
 
     Raises PreflightRefused, and CommunicationLost if pysoem is missing.
     """

@@ -24,7 +24,8 @@ WATCHDOG_DIVIDER, WATCHDOG_TIME = 0x0400, 0x0420
 WATCHDOG_TICK_S = 40e-9
 """Clock period of the divider 0400h, s (25 MHz); the divider counts two periods more."""
 SYNC_MANAGERS, SYNC_MANAGER_BYTES = 0x0800, 8
-"""Each: start address u16, length u16, control u8, status u8, activation u8, PDI control u8."""
+"""Address of the first sync manager's registers, and their length, bytes: start address u16, length u16, control u8,
+status u8, activation u8, PDI control u8."""
 WATCHDOG_TRIGGER = 1 << 6
 """Bit of a sync manager's control byte: writing to it triggers the watchdog."""
 HAS_CLOCKS = 1 << 2

@@ -30,7 +30,9 @@ READ_BACK_S = 0.5
 
 
 class SlaveWatch(DriveWatch):
-    """Follows one slave. ``allowed_silence_s``: longest time without a right working counter, s; 0: not supervised."""
+    """Supervision of one slave. ``allowed_silence_s``: longest time without a right working counter, s; 0: not
+    supervised.
+    """
 
     def __init__(self, place: str, clock: Clock) -> None:
         super().__init__(place)
@@ -45,7 +47,7 @@ class SlaveWatch(DriveWatch):
         super().start(allowed_silence_s)
 
     def heard(self) -> None:
-        """Note a cycle with the right working counter."""
+        """Record a cycle with the right working counter."""
         self._heard_s = self._clock.now_s()
 
     def check(self) -> None:
@@ -92,7 +94,7 @@ class SlaveWatch(DriveWatch):
     def on_emergency(self, data: bytes) -> None:
         """Handle an emergency message: error code u16, error register u8, manufacturer's bytes; code 0: no error left.
 
-        Codes A0xxh report a refused change of the AL state (ETG.1000.6); the AL status code tells more.
+        Codes A0xxh report a refused change of the AL state (ETG.1000.6); the AL status code states the reason.
         """
         code = int.from_bytes(data[:2], "little")
         if code and code >> 8 != 0xA0 and self.expect_operational:

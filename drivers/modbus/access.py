@@ -31,7 +31,7 @@ class RegisterAnswer(NamedTuple):
 
 
 class RegisterAccess:
-    """Reads and writes registers of one unit; ``tap`` sees every PDU.
+    """Register access to one unit; ``tap`` gets every PDU.
 
     Raises RegisterRefused for an exception reply and CommunicationLost (NoReply, BadReply, LinkLost) otherwise.
     """
@@ -44,7 +44,7 @@ class RegisterAccess:
         self._order = order
         self._functions = functions
         self._tap = tap
-        self.asked = 0                 # requests sent to this unit so far
+        self.asked = 0                 # number of requests sent to this unit
         self._undo: dict[tuple[str, int], Callable[[], None]] = {}
 
     @property
@@ -117,7 +117,7 @@ class RegisterAccess:
         return self.read(register)
 
     def press(self, register: Register, counts: int, before: int, timeout_s: float) -> None:
-        """Write once in a cycle; ``before`` is restored like any change."""
+        """Write counts once in a cycle. `restore` writes ``before`` back."""
         self._undo.setdefault((register.table, register.address), lambda: self.write(register, before))
         words = to_words(counts, register.type, self._order)
         self.once(self.write_request(register.address, words), timeout_s, register_name(register))

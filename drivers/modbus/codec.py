@@ -121,7 +121,7 @@ def from_words(words: Sequence[int], kind: RegisterType, order: WordOrder) -> in
 def to_counts(
     value: float, per_lsb: float, register: Register, where: str, rounding: Callable[[float], int] = round
 ) -> int:
-    """A value in its unit → counts of ``per_lsb``.
+    """Convert a value in its unit to counts of ``per_lsb``.
 
     Raises CommandRejected if it is not finite or doesn't fit into the register.
     """

@@ -176,7 +176,7 @@ def _pair(writes: Sequence[RegisterSpan], reads: Sequence[RegisterSpan],
     fit = [span.length <= pdu.MOST_WRITTEN_WITH_READ for span in writes]
     pairs = min(len(writes), len(pairable)) if all(fit) else 0
     alone, paired = writes[: len(writes) - pairs], writes[len(writes) - pairs :]
-    # The last pairable reads: those that bring speed and torque then come in the same transactions as the control word.
+    # Take the last pairable reads, so that speed and torque come in the same transactions as the control word.
     shared = pairable[len(pairable) - pairs :]
     rest = [span for span in reads if span not in shared]
     return (
@@ -192,7 +192,7 @@ def _write(span: RegisterSpan, functions: frozenset[int]) -> Transaction:
     if pdu.WRITE_MANY in functions:
         return Transaction(pdu.WRITE_MANY, span, None)
     if pdu.READ_WRITE in functions:
-        # The written span is read too: the function can't go without a read.
+        # The written span is read too, because function 23 always reads.
         return Transaction(pdu.READ_WRITE, span, span)
     raise _unable("written", span)
 
@@ -227,7 +227,7 @@ class Round(NamedTuple):
     words: Mapping[tuple[str, int], int]
     sent_s: float
     received_s: float
-    longest_s: float               # of the single transactions
+    longest_s: float               # duration of the longest single transaction, s
 
 
 def go_round(

@@ -69,18 +69,18 @@ from profiles import MessageCode
 from profiles.modbus import ModbusProfile, Register, StatusState
 
 REPEAT_MODE_CYCLES = 25
-"""A mode that is not displayed is requested again after this number of cycles: one lost write must not end a run."""
+"""Number of cycles after which a mode that is not displayed is requested again. One lost write must not end a run."""
 READ_MODE_CYCLES = 20
-"""Cycles between two readings of the mode display, if it costs a transaction of its own."""
+"""Number of cycles between two readings of the mode display, if they need a transaction of their own."""
 RESET_PAUSE_S = 0.1
 """Pause between the words of a fault reset, s: some drives read their field bus only every few ten milliseconds."""
 BUDGET_SHARE = 0.5
-"""Share of the watchdog time that may pass without a valid reply, or with a delay of this loop."""
+"""Share of the watchdog time for which a valid reply may be missing, or this loop may be delayed."""
 
 LOCAL_CYCLES = 3
-"""A missing bit counts after this number of cycles; one damaged reply does not matter."""
+"""Number of cycles after which the loss of remote control counts. One damaged reply does not matter."""
 SETTLED_CYCLES = 5
-"""Cycles without an enabled drive; a drive that is enabled after them was not enabled by this run."""
+"""Number of cycles without an enabled drive. If the drive is enabled after them, another master enabled it."""
 INSIST_SHARE = 0.8
 """Share of a period in which the words of the stop are repeated against another master."""
 SILENT_TIMES = 1.5
@@ -130,16 +130,16 @@ class ModbusDrive:
         self._codec = Codec(profile, Scales(1.0, 1.0, 1.0, 1.0, 1.0), has_demand=self._plan.has_demand)
         self._standstill = ZeroSpeed(1.0, 1.0, self.period_s)
         self._identity: Identity | None = None
-        self._stage = ""               # as announced
+        self._stage = ""               # latest stage sent to a simulated peer
         self._modes: frozenset[Mode] = frozenset()
         self._watchdog_s = self._timeout_s = 0.0
         self._angle: AngleRegister | None = None
         self._unwrapped: Unwrapped | None = None
         self._wish = PowerRequest.OFF
         self._was_enabled = self._told_fault = self._reverse = self._at_rest = self._removes_torque = False
-        self._ever_asked = False       # to be enabled
-        self._ever_enabled = False     # seen so
-        self._was_remote, self._local = False, 0       # controlled by the bus; cycles since in which it wasn't
+        self._ever_asked = False       # the drive was requested to enable at least once
+        self._ever_enabled = False     # the drive was reported as enabled at least once
+        self._was_remote, self._local = False, 0       # the bus had control; cycles since then without
         self._state: StatusState | None = None
         self._feedback = _NOTHING_YET
         self._shown: Mode | None = None
@@ -147,13 +147,13 @@ class ModbusDrive:
         self._since_mode_sent = self._since_mode_read = 0
         self._failing_since_s: float | None = None
         self._told_loss = self._told_other = False
-        self._out_of_operation = 0     # cycles since this run last requested operation
+        self._out_of_operation = 0     # cycles without operation since this run last requested it
         self._heat = Heat(self._access, profile)
         self._other = OtherMaster(self._access, profile, self._plan)
         self._speed_limits: list[tuple[Register, float, int]] = []      # register, rad/s a count, counts as found
         self._quick_stop_rad_s2 = self._pressed_rad_s = 0.0
         self._pressed_s: float | None = None
-        self._silent_since_s: float | None = None       # not fed any more, so that the drive's watchdog acts
+        self._silent_since_s: float | None = None       # since when feeding has ended, to let the watchdog trip
         self._ticks = Ticks(self.clock, self.period_s)
         self._cycles = self._missed = self._late_before = 0
 
@@ -334,7 +334,7 @@ class ModbusDrive:
         setpoints = self._codec.setpoints(command)
         self._unless_frozen(self._ticks.wait)
         if setpoints.speed:
-            self._reverse = setpoints.reverse       # a setpoint of zero keeps the direction it is braked from
+            self._reverse = setpoints.reverse       # a setpoint of zero keeps the direction of the shaft that brakes
         if not self._may_write():
             return self._watch()
         self._poll_other_masters()
@@ -410,7 +410,7 @@ class ModbusDrive:
             self._feedback = self._codec.feedback(got.words)
             self._state = self._decoded(self._feedback.status)
             took_s = self.clock.now_s() - sent_s
-            if took_s <= 0.0:          # a line without delay would never leave this loop
+            if took_s <= 0.0:          # on a line without delay this loop would not end
                 break
         self._ticks.done()
         return got

@@ -43,7 +43,7 @@ def tell_stage(access: RegisterAccess, stage: str) -> None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 class Marker(NamedTuple):
-    """``stepped`` is true only for a simulated peer."""
+    """Marker of the simulator. ``stepped`` is true only for a simulated peer."""
 
     simulated: bool
     stepped: bool

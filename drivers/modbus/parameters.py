@@ -119,7 +119,9 @@ def satisfied(require: Require, value: float, lsb: float) -> bool:
 def find_rated_torque(
     table: PreflightTable, profile: ModbusProfile, found: Parameters, rated_torque_nm: float | None
 ) -> float | None:
-    """Return the N·m of 100 %: rig.yaml's, which the drive must confirm, else the drive's; None if both are missing."""
+    """Return the rated torque (100 %), N·m: rig.yaml's, which the drive must confirm, otherwise the drive's; None
+    without both.
+    """
     name = profile.rated_torque
     from_drive = found.values.get(name) if name is not None else None
     where = "profile, rated_torque" if name is None else where_of(profile.parameter(name))
@@ -155,7 +157,9 @@ def check_name_plate(table: PreflightTable, profile: ModbusProfile, found: Param
 
 
 def find_filters(table: PreflightTable, profile: ModbusProfile, found: Parameters) -> ReportingFilters:
-    """Return first-order lags of the reported signals; None if not reported. A cut-off f_c is 1/(2π f_c)."""
+    """Return first-order lags of the reported signals, s; None if not reported. A cut-off frequency f_c is a lag of
+    1/(2π f_c).
+    """
     lags: dict[str, float] = {}
     sources = []
     for entry in profile.filters:
@@ -247,7 +251,9 @@ _LIMIT = {
 def set_limits(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, limits: DriveLimits,
                rated_nm: float,
                found: Parameters, own: OwnLimits) -> None:
-    """Write every parameter with `set_to` except the watchdog, which comes last; a row each. ``own``: which may be."""
+    """Write every parameter with `set_to`, and add a row for each. The watchdog is set later. ``own`` decides which of
+    the drive's limits stay.
+    """
     kinds = set()
     for parameter in profile.parameters:
         if parameter.set_to is None or parameter.set_to == "watchdog":

@@ -17,9 +17,9 @@ from profiles import MessageCode
 # ::
 #
 #     CommunicationLost
-#     ├── NoReply            nothing came in time
+#     ├── NoReply            no reply came in time
 #     ├── BadReply           CRC, length, unit, function or transaction id are not those of the request
-#     │   └── NoisyReply     a reply that the line has damaged: the same may be asked again at once
+#     │   └── NoisyReply     a reply that the line has damaged: the request may be repeated at once
 #     └── LinkLost           connection reset or closed, port gone; stays so until a new link is opened
 #     ObjectRefused
 #     └── RegisterRefused    exception reply to a request before motion
@@ -55,7 +55,7 @@ _STEPS = {
 
 
 class NoReply(CommunicationLost):
-    """The time for a reply has passed."""
+    """Missing reply: none came within the time-out."""
 
     entry = MessageCode.NO_REPLY
 

@@ -100,7 +100,7 @@ def _check_one(
                 for poll in range(1 if echo is None else ECHO_POLLS):
                     if poll:
                         access.clock.wait_until(access.clock.now_s() + ECHO_POLL_S)
-                    access.write(register, counts)      # each time: a watchdog may be on already
+                    access.write(register, counts)      # repeated, to feed a watchdog that may be on
                     found = access.read(seen_in) * seen_lsb
                     if good := math.isclose(found, counts * lsb, rel_tol=1e-9, abs_tol=slack):
                         break

@@ -22,14 +22,14 @@ from profiles.modbus import ModbusProfile, StatusState
 
 NEAR_ZERO_RAD_S, NEAR_ZERO_COUNTS = 0.05, 5
 NEAR_ZERO_SHARE = 0.005
-"""Share of the first speed, if its unit is unknown."""
+"""Limit of a speed near zero as a share of the first speed read, if its unit is unknown."""
 MODE_S, MODE_UNTOLD_S = 1.0, 0.3
 """Longest time for the change to speed mode, s: with a mode display, and without."""
 _POWERED = (PowerState.ENABLED, PowerState.QUICK_STOP, PowerState.READY)
 
 
 class ModbusTarget:
-    """One unit on an open line."""
+    """One unit on an open line, for a bare quick stop."""
 
     def __init__(self, link: Link, profile: ModbusProfile, *, unit: int, tap: FrameTap | None = None) -> None:
         self._profile = profile
@@ -50,7 +50,7 @@ class ModbusTarget:
         state = decode(control, status) if status else None        # zeros may come from a gateway
         power = power_state(state)
         if state is not None and power not in _POWERED:
-            return                     # but an unknown state may be under power
+            return                     # no power; a drive in an unknown state may have power
         if power is PowerState.ENABLED and state is not None and not self._in_speed_mode(state):
             return
         self._stops += 1
@@ -75,7 +75,9 @@ class ModbusTarget:
             return True
 
     def _stop_would_brake(self) -> bool:
-        """Return whether a quick stop would brake: nothing to change, in speed mode now, or it never changes."""
+        """Return whether a quick stop brakes now: in speed mode, without need of a switch, or after an unconfirmed
+        switch.
+        """
         modes, stop = self._profile.modes, self._profile.quick_stop
         if not modes.torque or stop.decelerates_in_torque_mode or not modes.switch_while_enabled:
             return True

@@ -98,7 +98,7 @@ class RtuLink:
         self._framer = FramerRTU(DecodePDU(False))
         self._silence_s = max(SILENT_CHARACTERS * CHARACTER_BITS / baud, LEAST_SILENCE_S)
         self._quiet_from_s = 0.0
-        self._listen_s = 0.0        # before the next request; 0: the line is in step
+        self._listen_s = 0.0        # listening time before the next request, s; 0: in step
         self._owed = False          # a reply is outstanding that may yet come
         self._usual_s = 0.0         # longest time of a valid reply
         self._lost = ""
@@ -127,7 +127,7 @@ class RtuLink:
         deadline_s = sent_s + timeout_s
         try:
             self._port.write(self._framer.encode(pdu, unit, 0))
-        except Exception as error:      # pyserial passes on what the driver below it raises
+        except Exception as error:      # any type of error, from pyserial or the driver below it
             raise self._gone(str(error)) from error
         try:
             reply = self._await(unit, pdu, deadline_s)
@@ -227,14 +227,14 @@ class RtuLink:
     def _port_waiting(self) -> int:
         try:
             return int(self._port.in_waiting)
-        except Exception as error:      # see transact
+        except Exception as error:      # any type of error, as in `transact`
             raise self._gone(str(error)) from error
 
     def _read(self) -> bytes:
         """Return the data received within one time slice."""
         try:
             return bytes(self._port.read(max(1, int(self._port.in_waiting))))
-        except Exception as error:      # see transact
+        except Exception as error:      # any type of error, as in `transact`
             raise self._gone(str(error)) from error
 
     def _gone(self, what: str) -> LinkLost:

@@ -15,11 +15,12 @@ from profiles.modbus import Bits, Control, StatusState
 STILL_S = 0.2
 LEAST_SAMPLES = 5
 MOST_GAPS = 2
-"""Lost replies in a row that do not reset the detection: a shaft can't start and stop meanwhile."""
+"""Number of successive lost replies that do not reset the detection. A shaft can't start and stop within this time."""
 COUNTS, SHARE = 5, 0.005
 """Limit of each sample: this number of counts, or this share of the speed limit if that is more."""
 MEAN_COUNTS, MEAN_SHARE = 1, 0.001
-"""Limit of the mean: noise averages out, a creeping shaft does not."""
+"""Limit of the mean: number of counts, or share of the speed limit. The mean of noise is small; that of a creeping
+shaft is not."""
 
 
 class ZeroSpeed:
@@ -84,7 +85,7 @@ def decode_after(control: Control, status: int) -> StatusState | None:
     """Return the state of a drive that has been enabled: from then on 0000h is not a state either.
 
     In each family some bit is set in any state of such a drive (remote, no coast stop, ready). In the CiA 402 family
-    the drive has left not ready to switch on for good, whatever the other bits of the word are.
+    the drive can't return to not ready to switch on, for any value of the word's other bits.
     """
     state = decode(control, status)
     over = state is not None and control.family == "cia402" and state.means == "not_ready"

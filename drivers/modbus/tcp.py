@@ -1,8 +1,8 @@
 """Modbus over TCP: one socket, one request at a time, checked transaction ids.
 
-pymodbus makes the frames. Its synchronous client is not used: it reconnects by itself before a request, which an
-enabled drive must not see, reports a foreign transaction id as silence, and takes up to twice its time-out
-(`ModbusBaseSyncClient.execute`, `TransactionManager.sync_get_response`, 3.16).
+pymodbus makes the frames. Its synchronous client is not used, for three reasons. It reconnects by itself before a
+request, which an enabled drive must not see. It reports a foreign transaction id as silence. It takes up to twice its
+time-out (`ModbusBaseSyncClient.execute`, `TransactionManager.sync_get_response`, 3.16).
 
 TCP must not deliver old data to the drive. So requests are not queued behind a dead connection, and closing discards
 the queue: no old setpoint arrives when the cable is connected again.
@@ -56,7 +56,7 @@ class TcpLink:
         self._buffer = b""
         self._transaction = 0
         self._renew = False
-        self._opening: socket.socket | None = None      # anew, and not open yet
+        self._opening: socket.socket | None = None      # a new connection that is not open yet
         self._renewed_s: deque[float] = deque(maxlen=MOST_RENEWED)
         self._family, self._peer = socket.AF_INET, ()
         try:
@@ -72,7 +72,7 @@ class TcpLink:
         if self._socket is None:
             self._lost("the connection is gone")
         while self._untaken():
-            # The other end has not acknowledged the request before: another one would only queue behind it.
+            # The peer has not acknowledged the previous request. Another request would only wait behind it.
             if self.clock.now_s() >= deadline_s:
                 raise self._silent(timeout_s, "the connection takes nothing: half open, or the cable is out")
             self._read(0.005)

@@ -19,8 +19,8 @@ LEAST_CYCLES = 5
 """The watchdog must not trip because of one or two lost replies."""
 MEASURED_ROUNDS = 20
 CARRIES, MARGIN = 1.02, 1.1
-"""The line carries a period that is longer than its slowest usual round by the first factor. If it does not carry the
-requested rate, the period is longer by the second."""
+"""Factors for the period. The line carries a period that is longer than its slowest usual round by the first factor. If
+it does not carry the requested rate, the period is longer than that round by the second factor."""
 COUNT_S, COUNT_EVERY_S = 3.0, 0.2
 """Time of counting other clients' requests, s, and longest interval between two readings, s."""
 LEAST_TIMEOUT_S = 0.05
@@ -196,7 +196,7 @@ def _write(
 def is_off(access: RegisterAccess, parameter: Parameter, told: Mapping[str, float]) -> bool:
     """Return whether the time-out is 0, which switches it off, or the drive refuses to report it.
 
-    ``told``: values by name, for a time-out without a register: a 0 that rig.yaml states.
+    ``told``: values by name, for a time-out without a register, such as a 0 in rig.yaml.
     """
     return told.get(parameter.name) == 0.0 if parameter.register_ is None else not counts_of(access, parameter)
 

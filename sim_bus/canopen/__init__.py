@@ -1,4 +1,4 @@
-"""The CANopen face of the simulated drive: a CiA 402 node with its objects, PDOs and services, and scripted faults."""
+"""CANopen interface of the simulated drive: a CiA 402 node with objects, PDOs, services, and scripted faults."""
 
 from typing import TYPE_CHECKING
 

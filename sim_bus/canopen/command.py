@@ -1,4 +1,4 @@
-"""The command ``simulate canopen``: its options, and running it."""
+"""The command ``simulate canopen``: its options and its execution."""
 
 import argparse
 import contextlib
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of a simulated CANopen drive; python-can's bus options among them."""
+    """Add the options of a simulated CANopen drive, with python-can's bus options."""
     from can.cli import add_bus_arguments
 
     add_bus_arguments(parser)
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Simulates until SIGINT or SIGTERM; prints one line ``ready: …`` on stdout. Returns the exit code."""
+    """Simulate until SIGINT or SIGTERM. Print one line ``ready: …`` on stdout. Return the exit code."""
     if "list" in namespace.fault:
         from sim_bus.canopen.faults import listing
 
@@ -72,7 +72,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 @contextlib.contextmanager
 def _open_bus(namespace: argparse.Namespace) -> Iterator[tuple["can.BusABC", str]]:
-    """The bus, and how others reach it."""
+    """Open the bus. Yield it with a text on how other programs reach it."""
     bus, reached_by = _hub_bus(*namespace.hub) if namespace.hub is not None else _can_bus(namespace)
     try:
         yield bus, reached_by
@@ -106,7 +106,7 @@ def _can_bus(namespace: argparse.Namespace) -> tuple["can.BusABC", str]:
 
 
 def _configured() -> bool:
-    """python-can finds an interface in its files or in CAN_* variables."""
+    """Return whether python-can finds an interface in its files or in CAN_* variables."""
     import can.util
 
     try:
@@ -117,7 +117,7 @@ def _configured() -> bool:
 
 
 def _probe(host: str, port: int) -> None:
-    """python-can would try for ten seconds, at full load, to reach a server that isn't there."""
+    """Check the server first: python-can would try for ten seconds, at full load, to reach a missing server."""
     try:
         socket.create_connection((host, port), timeout=2.0).close()
     except OSError as error:

@@ -1,8 +1,8 @@
 """Scripted faults of one simulated drive: each fault begins and ends on time, and frames pass through active faults.
 
 All times are plant time: in stepped time a script repeats to the last frame. If a SYNC to the drive is lost in stepped
-time, time still advances, and the host is informed of the end of each cycle (`profiles.simulator_marker.CYCLE_ID`),
-from the first cycle on. So a frame that a fault adds after the feedback still belongs to its cycle.
+time, time still advances. From the first cycle on, the host is informed of the end of each cycle
+(`profiles.simulator_marker.CYCLE_ID`). So a frame that a fault adds after the feedback still belongs to its cycle.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from sim_bus.fault_script import (
 )
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a scripted fault may do: change frames on their way in or out, and lay hands on the drive itself.
+# Effects of a scripted fault: it changes frames on their way in or out, or changes the drive itself.
 
 
 Frame = tuple[int, bytes | bytearray]
@@ -40,20 +40,20 @@ Frames = Iterable[Frame]
 
 @dataclass(frozen=True)
 class Scene:
-    """Place of a fault. ``put`` sends a frame past all faults, as another station on the bus would."""
+    """Place of a fault. ``put`` sends a frame past all faults, like another station on the bus."""
 
     node: Cia402Node
     put: Callable[[int, bytes], None]
     rng: np.random.Generator
 
     def foreign(self, can_id: int, data: bytes) -> None:
-        """A frame of a third party: all nodes on the bus receive it, the drive among them."""
+        """Send a frame of a third party: all nodes on the bus receive it, the drive among them."""
         self.put(can_id, data)
         self.node.on_frame(can_id, data)
 
 
 class Misbehaviour(Passing):
-    """Nothing by itself; a fault overrides what it needs. `begin` comes before anything else."""
+    """A fault without effect; a subclass overrides the methods that it needs. `begin` is called first."""
 
     scene: Scene
 
@@ -67,11 +67,11 @@ class Misbehaviour(Passing):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Faults of the drive itself and of what it turns.
+# Faults of the drive itself and of its load.
 
 
 class Emcy(Misbehaviour):
-    """An emergency message, and nothing else."""
+    """Emergency message without any other effect."""
 
     def __init__(self, code: int) -> None:
         self._code = code
@@ -81,7 +81,7 @@ class Emcy(Misbehaviour):
 
 
 class FaultReaction(Emcy):
-    """The drive finds a fault: emergency message, its own fault reaction (605Eh), fault state."""
+    """Fault of the drive: emergency message, its own fault reaction (605Eh), fault state."""
 
     def begin(self) -> None:
         super().begin()
@@ -89,7 +89,7 @@ class FaultReaction(Emcy):
 
 
 class Restart(Misbehaviour):
-    """The drive restarts: torque off, defaults, boot-up message."""
+    """Restart of the drive: torque off, defaults, boot-up message."""
 
     def begin(self) -> None:
         node = self.scene.node
@@ -97,7 +97,7 @@ class Restart(Misbehaviour):
 
 
 class ForeignNmt(Misbehaviour):
-    """A third party sends an NMT command: 2 stop, 128 pre-operational (CiA 301)."""
+    """NMT command of a third party: 2 stop, 128 pre-operational (CiA 301)."""
 
     def __init__(self, command: int) -> None:
         self._command = command
@@ -107,7 +107,7 @@ class ForeignNmt(Misbehaviour):
 
 
 class OfDrive(Misbehaviour):
-    """A fault that a drive may have on any bus."""
+    """Fault that a drive may have on any bus."""
 
     def __init__(self, fault: InjectedFault) -> None:
         self._fault = fault
@@ -130,7 +130,7 @@ _AT_REST = b"\x37\x16"        # operation enabled, target reached, speed zero
 
 
 class Dead(Misbehaviour):
-    """Nothing gets through, either way: a cable that is cut, an adapter that is pulled."""
+    """Loss of all frames in both directions: a cable is cut, an adapter is pulled."""
 
     def outgoing(self, can_id: int, data: bytes) -> Frames:
         return ()
@@ -140,7 +140,7 @@ class Dead(Misbehaviour):
 
 
 class Lossy(Misbehaviour):
-    """A share of all frames is lost, either way."""
+    """Loss of a share of all frames, in both directions."""
 
     def __init__(self, share: float) -> None:
         self._share = share
@@ -153,7 +153,7 @@ class Lossy(Misbehaviour):
 
 
 class Without(Misbehaviour):
-    """The drive no longer sends frames of these kinds (the identifier less the node)."""
+    """Missing frames: the drive no longer sends frames of these kinds (identifier minus node-ID)."""
 
     def __init__(self, *kinds: int) -> None:
         self._kinds = kinds
@@ -163,7 +163,7 @@ class Without(Misbehaviour):
 
 
 class Doubled(Misbehaviour):
-    """A share of the TPDOs comes twice."""
+    """Doubled TPDOs: a share of them comes twice."""
 
     def __init__(self, share: float) -> None:
         self._share = share
@@ -174,7 +174,7 @@ class Doubled(Misbehaviour):
 
 
 class Reordered(Misbehaviour):
-    """A share of the first TPDO is held back until after that of the next SYNC."""
+    """Delayed TPDO1: a share of them comes after that of the next SYNC."""
 
     def __init__(self, share: float) -> None:
         self._share = share
@@ -196,7 +196,7 @@ class Reordered(Misbehaviour):
 
 
 class FrozenTpdos(Misbehaviour):
-    """The TPDOs go on coming, and say what they last said: a gateway that repeats its process image."""
+    """Frozen TPDOs: they continue with their last content, like a gateway that repeats its process image."""
 
     def __init__(self) -> None:
         self._kept: dict[int, bytes] = {}
@@ -208,9 +208,7 @@ class FrozenTpdos(Misbehaviour):
 
 
 class Replayed(Misbehaviour):
-    """A recording of this drive, enabled and at standstill, is played back: old TPDOs precede each of the drive's
-    own.
-    """
+    """Replay of a recording of this drive, enabled and at standstill: old TPDOs precede each of the drive's own."""
 
     def __init__(self, before: int) -> None:
         self._before = before
@@ -223,11 +221,11 @@ class Replayed(Misbehaviour):
 
 
 class SecondNode(Misbehaviour):
-    """Another drive has the same node ID: it answers too, and shows itself switched off."""
+    """Second drive with the same node-ID: it answers too, and reports that it is switched off."""
 
     def begin(self) -> None:
         if self.scene.node.sync_seen:
-            self.scene.put(_HEARTBEAT + self.scene.node.id, b"\0")     # it has just been switched on
+            self.scene.put(_HEARTBEAT + self.scene.node.id, b"\0")     # a drive that was just switched on
 
     def outgoing(self, can_id: int, data: bytes) -> Frames:
         kind = can_id - self.scene.node.id
@@ -239,7 +237,9 @@ class SecondNode(Misbehaviour):
 
 
 class SecondMaster(Misbehaviour):
-    """Another host runs the drive: enabled before we come; later its own SYNC and setpoints beside ours."""
+    """Another host that operates the drive: it enables the drive before our host; later it sends its own SYNC and
+    setpoints.
+    """
 
     def begin(self) -> None:
         node = self.scene.node
@@ -256,7 +256,7 @@ class SecondMaster(Misbehaviour):
 
 
 class ForeignHeartbeat(Misbehaviour):
-    """Another node uses the host's number 127: its heartbeat comes periodically."""
+    """Periodic heartbeat of another node with the host's number 127."""
 
     def __init__(self, every_s: float) -> None:
         self._every_us = round(1e6 * every_s)
@@ -271,7 +271,7 @@ class ForeignHeartbeat(Misbehaviour):
 
 
 class ToolWrites(Misbehaviour):
-    """A tool writes one object by SDO, once; all nodes on the bus receive it."""
+    """A single write of a tool to one object by SDO; all nodes on the bus receive it."""
 
     def __init__(self, index: int, sub: int, value: int, size: int) -> None:
         self._request = bytes((0x23 | (4 - size) << 2,)) + index.to_bytes(2, "little") + bytes((sub,)) + (
@@ -282,7 +282,7 @@ class ToolWrites(Misbehaviour):
 
 
 class SettingChanged(Misbehaviour):
-    """One object gets another value from the drive's own panel: nothing of it is on the bus."""
+    """Change of one object at the drive's own panel: no frame on the bus shows it."""
 
     def __init__(self, index: int, sub: int, value: int) -> None:
         self._key, self._value = index << 8 | sub, value
@@ -292,16 +292,16 @@ class SettingChanged(Misbehaviour):
 
 
 class ForeignSetpoints(Misbehaviour):
-    """Another master sends enable operation and a speed of 500 counts in RPDO4, at each SYNC.
+    """Another master that sends enable operation and a speed of 500 counts in RPDO4, at each SYNC.
 
-    ``again``: and it switches that RPDO on again, by SDO, whenever it finds it off.
+    ``again``: it also switches that RPDO on again, by SDO, whenever the RPDO is off.
     """
 
     def __init__(self, again: bool) -> None:
         self._again = again
 
     def begin(self) -> None:
-        self.scene.node.store.write(0x1403 << 8 | 2, 1)        # synchronous: acts beside the host's
+        self.scene.node.store.write(0x1403 << 8 | 2, 1)        # synchronous: acts in addition to the host's
 
     def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
         node = self.scene.node
@@ -314,7 +314,7 @@ class ForeignSetpoints(Misbehaviour):
 
 
 class SdoMaster(Misbehaviour):
-    """Another master writes enable operation and a speed of 500 counts by SDO, after each SYNC."""
+    """Another master that writes enable operation and a speed of 500 counts by SDO, after each SYNC."""
 
     def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
         node = self.scene.node
@@ -327,7 +327,7 @@ class SdoMaster(Misbehaviour):
 
 
 class Answers(Misbehaviour):
-    """Base of those that meddle with SDO. ``index`` and ``sub`` name the object."""
+    """Base of the faults that change SDO transfers. ``index`` and ``sub`` name the object."""
 
     def __init__(self, index: int, sub: int) -> None:
         self._object = index.to_bytes(2, "little") + bytes((sub,))
@@ -342,7 +342,7 @@ class Answers(Misbehaviour):
 
 
 class Aborted(Answers):
-    """The drive aborts every transfer of the object: 08000020h, data can't be transferred or stored."""
+    """Abort of every transfer of the object: 08000020h, data can't be transferred or stored."""
 
     def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
         if not self._asked(can_id, data, 1, 2):
@@ -352,14 +352,14 @@ class Aborted(Answers):
 
 
 class Unanswered(Answers):
-    """The drive does not answer requests for the object."""
+    """Missing answers to all requests for the object."""
 
     def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
         return () if self._asked(can_id, data, 1, 2) else ((can_id, data),)
 
 
 class NotKept(Answers):
-    """A write is answered as if it had been taken over; what stood there before goes on standing there."""
+    """Write without effect: the drive confirms it, and the object keeps its value."""
 
     def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
         if not self._asked(can_id, data, 1):
@@ -369,7 +369,7 @@ class NotKept(Answers):
 
 
 class Otherwise(Answers):
-    """The object reads as something else: its lowest byte comes with one bit changed."""
+    """Wrong value of an object when it is read: one bit of its lowest byte is changed."""
 
     def outgoing(self, can_id: int, data: bytes) -> Frames:
         upload = can_id == _ANSWER + self.scene.node.id and data[0] >> 5 == 2 and data[0] & 2
@@ -379,7 +379,7 @@ class Otherwise(Answers):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The faults that can be scripted on CANopen: name, row of the fault table, what they do, what their value means.
+# Table of the faults on CANopen: name, row of the fault table, effect, meaning of the value.
 
 
 def _frames(text: str) -> int:
@@ -395,7 +395,7 @@ def _again(text: str) -> bool:
 
 
 def _written(text: str) -> tuple[int, int, int, int]:
-    """6072h=100 or 1016h:1=0: object, value, and its size in bytes, as CiA 301 and 402 have it."""
+    """Return object, value and its size in bytes from a text such as 6072h=100 or 1016h:1=0 (CiA 301 and 402)."""
     where, _, value = text.partition("=")
     index, sub = object_place(where)
     if not re.fullmatch(r"[0-9]{1,10}|[0-9A-Fa-f]{1,8}h", value):
@@ -471,15 +471,15 @@ _SEED = 0xFA17
 
 
 class Faults(FaultSchedule[Misbehaviour]):
-    """The script of one drive. `attach` makes it act; frames then come in by `came`."""
+    """Script of one drive. `attach` activates it; then `came` gets the frames."""
 
     def __init__(self, script: tuple[Scripted, ...], seed: int = 0) -> None:
         super().__init__(script, make)
         self._rng = np.random.default_rng((seed, _SEED))
-        self._ends_cycles = False          # and the host knows
+        self._ends_cycles = False          # True after the host was informed
 
     def attach(self, node: Cia402Node, sender: Sender) -> None:
-        """Let the faults happen to this node from now on."""
+        """Apply the faults to this node from now on."""
         self._node = node
         self._put: Callable[[int, bytes], None] = sender.put
         scene = Scene(node, sender.put, self._rng)
@@ -489,7 +489,7 @@ class Faults(FaultSchedule[Misbehaviour]):
         self.happen_to(node)
 
     def came(self, can_id: int, data: bytes | bytearray) -> None:
-        """A frame from the bus, on its way to the node."""
+        """Take a frame from the bus, on its way to the node."""
         node = self._node
         if can_id == SYNC and node.stepped and not self._ends_cycles and self._more:
             self._ends_cycles = True
@@ -509,7 +509,7 @@ class Faults(FaultSchedule[Misbehaviour]):
 
     @property
     def _more(self) -> bool:
-        """Something goes on, or is still to come."""
+        """True if a fault is active or still to come."""
         return bool(self.cast.active or self.cast.waiting)
 
     def _outgoing(self, can_id: int, data: bytes) -> list[Frame]:

@@ -1,17 +1,17 @@
-"""A stepped simulator in the host's own thread: no other thread, and no wait for one.
+"""A stepped simulator in the host's own thread: there is no other thread, and no wait for one.
 
 ::
 
-    host   bus.send(SYNC) ──► the drive hears it, answers, and moves on by a period
+    host   bus.send(SYNC) ──► the drive receives it, replies, and advances by one period
                           ◄── returns
-           bus.recv()     ◄── TPDO1, TPDO2, heartbeat …, in the order in which the drive said them
+           bus.recv()     ◄── TPDO1, TPDO2, heartbeat …, in the order in which the drive sent them
 
-All replies to a frame are in the queues of the stations when `send` returns. Which cycle an answer belongs to
-then doesn't depend on how a computer shares its time, and a run repeats to the last frame of its log. The drive is
-that of `sim_bus.canopen.simulator.EmbeddedSimulator`: it sends the same frames in the same order.
+All replies to a frame are in the queues of the stations when `send` returns. So the cycle of an answer does not depend
+on the computer's scheduling, and a run repeats to the last frame of its log. The drive is that of
+`sim_bus.canopen.simulator.EmbeddedSimulator`: it sends the same frames in the same order.
 
-Plant time moves with the SYNC alone, and a pause of the host of any length changes nothing, as there: nothing else
-advances the time. A drive that leaves stepped time (5FFEh:2) catches up with the wall clock when it receives a frame.
+Only the SYNC advances plant time, so a pause of the host of any length has no effect. A drive that leaves stepped time
+(5FFEh:2) catches up with the wall clock when it receives a frame.
 """
 
 import time
@@ -32,10 +32,10 @@ from sim_bus.params import RigParams
 
 
 class InlineBus(can.BusABC):
-    """A station on the line of an `InlineSimulator`, which makes it."""
+    """A station on the line of an `InlineSimulator`, which creates it."""
 
     answers_at_once = True
-    """All that a frame makes the others send lies in their queues when `send` returns. A host reads it by this name."""
+    """True: when `send` returns, all replies of the other stations are in their queues. A host reads this attribute."""
 
     def __init__(self, channel: str, stations: "list[InlineBus]", hear: Callable[[can.Message], None]) -> None:
         super().__init__(channel)
@@ -45,7 +45,10 @@ class InlineBus(can.BusABC):
         self.heard: SimpleQueue[can.Message] = SimpleQueue()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """The other stations have it and the drive has answered it. CanOperationError on a bus that is shut down."""
+        """Send a frame. The other stations have it and the drive has replied when this returns.
+
+        Raises CanOperationError on a bus that is shut down.
+        """
         if self._is_shutdown:
             self._refuse_shut()
         if len(self._stations) > 1:
@@ -55,7 +58,9 @@ class InlineBus(can.BusABC):
         self._hear(msg)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next frame; None after ``timeout`` s of wall time. CanOperationError on a bus that is shut down."""
+        """Return the next frame; None after ``timeout`` s of wall time. Raises CanOperationError on a bus that is shut
+        down.
+        """
         if self._filters is None and not self._is_shutdown:
             heard = self.heard
             if not heard.empty():
@@ -72,7 +77,7 @@ class InlineBus(can.BusABC):
             return None, False
 
     def shutdown(self) -> None:
-        """Nothing comes or goes any more; safe to repeat."""
+        """End the exchange of frames; safe to repeat."""
         super().shutdown()
         if self in self._stations:
             self._stations.remove(self)
@@ -83,10 +88,12 @@ class InlineBus(can.BusABC):
 
 
 class _DrivesEnd(InlineBus):
-    """The drive's end for sending. It receives nothing: a frame is passed on when it is sent."""
+    """The drive's end for sending. It has no queue: each frame from another station goes to the drive at once."""
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """All stations have it; the first one itself, as the drive makes a frame for one sending only."""
+        """Send a frame to all stations. The first one gets the frame itself, because the drive makes a new frame for
+        each sending.
+        """
         for number, station in enumerate(self._stations):
             station.heard.put(_stamped(deepcopy(msg) if number else msg))
 
@@ -97,10 +104,10 @@ def _stamped(message: can.Message) -> can.Message:
 
 
 class InlineSimulator(Embedded):
-    """A stepped simulator that acts whenever a station sends; ``bus`` is one, and `station` makes more.
+    """A stepped simulator that acts whenever a station sends. ``bus`` is one station; `station` makes more.
 
-    What fails in it leaves it silent, as a thread is that has ended, and is raised by `Embedded.check` and
-    `Embedded.close`. An exception from outside (KeyboardInterrupt) goes on its way, and nothing more is taken then: it
+    After an error the simulator is silent, like a thread that has ended; `Embedded.check` and `Embedded.close` raise
+    the error. An exception from outside (KeyboardInterrupt) is passed on. Then no more frames are accepted, because it
     may have come in the middle of a step.
     """
 
@@ -125,7 +132,7 @@ class InlineSimulator(Embedded):
         return bus
 
     def open(self) -> Self:
-        """Powers the drive on; frames sent before are lost."""
+        """Switch the drive on. Frames sent before are lost."""
         with self._one_at_a_time:
             self._on = True
             self._do(self.simulator.begin)
@@ -158,7 +165,7 @@ class InlineSimulator(Embedded):
             self._failed(error)
 
     def _failed(self, error: BaseException) -> None:
-        """Falls silent. What comes from outside, and is no error of the simulation, goes on its way."""
+        """Fall silent. An exception from outside that is not an error of the simulation is passed on."""
         own = isinstance(error, Exception)
         if own:
             self._failure = error

@@ -1,4 +1,4 @@
-"""The drive's CANopen face: NMT, SYNC, PDOs, heartbeat, EMCY, marker, and plant time.
+"""CANopen interface of the drive: NMT, SYNC, PDOs, heartbeat, EMCY, marker, and plant time.
 
 One thread calls `on_frame` and `advance_us`; nothing here waits or reads a clock. In stepped time a SYNC
 
@@ -32,12 +32,12 @@ from sim_bus.trace import ShaftTrace
 SYNC = 0x080
 COMMUNICATION_AREA = (0x1000, 0x1FFF)
 PROFILE_AREA = (0x6000, 0x9FFF)
-MANUFACTURER_AREA = (0x2000, 0x5FFD)      # the marker stays as it is
+MANUFACTURER_AREA = (0x2000, 0x5FFD)      # the marker is unchanged
 Route = Callable[[bytes | bytearray], None]
 
 
 class Cia402Node(TimedDrive):
-    """A CiA 402 slave over a simulated inverter; of our own EDS, or wearing a ``profile``."""
+    """A CiA 402 slave over a simulated inverter, with our own EDS or with a ``profile``."""
 
     def __init__(self, sender: Sender, params: RigParams, *, node_id: int, seed: int, trace: ShaftTrace,
                  stepped: bool, profile: CanopenProfile | None = None) -> None:
@@ -74,7 +74,7 @@ class Cia402Node(TimedDrive):
     # -- frames ------------------------------------------------------------------------------------------
 
     def on_frame(self, can_id: int, data: bytes | bytearray) -> None:
-        """One data frame with an 11-bit identifier."""
+        """Handle one data frame with an 11-bit identifier."""
         if can_id == SYNC:
             self._on_sync()
             return
@@ -83,7 +83,7 @@ class Cia402Node(TimedDrive):
             route(data)
 
     def on_remote(self, can_id: int) -> None:
-        """One remote frame: node guarding is answered by a drive that has it and produces no heartbeat of its own."""
+        """Handle one remote frame. A drive with node guarding and without a heartbeat of its own replies."""
         guarded = self.worn is not None and self.worn.profile.watchdog.kind == "node_guarding"
         if can_id != 0x700 + self.id or not guarded or self._producer.active:
             return
@@ -92,7 +92,7 @@ class Cia402Node(TimedDrive):
             self._supervised("node guarding began")
 
     def boot(self) -> None:
-        """Power-on: everything at its defaults, boot-up message, pre-operational."""
+        """Switch on: everything at its defaults, boot-up message, pre-operational."""
         self._restore(COMMUNICATION_AREA, MANUFACTURER_AREA, PROFILE_AREA)
         self.note("power on")
         self.on_time(self.time_us)
@@ -101,7 +101,7 @@ class Cia402Node(TimedDrive):
         self._changed_state()
 
     def pass_cycle(self) -> None:
-        """A SYNC that the drive did not hear: nothing happens, but in stepped time it is one period later."""
+        """Handle a SYNC that the drive did not receive: in stepped time one period passes, without any other effect."""
         self.sync_seen = True
         if self.stepped and self._period_us:
             self.advance_us(self._period_us)
@@ -156,7 +156,7 @@ class Cia402Node(TimedDrive):
             self._supervised("heartbeat supervision began")
 
     def _supervised(self, event: str) -> None:
-        """The host is there, for the first time or again."""
+        """Record that the host is supervised, for the first time or again."""
         self.note(event)
         if self.application.warning:
             self.application.warning = False
@@ -166,7 +166,7 @@ class Cia402Node(TimedDrive):
     # -- time --------------------------------------------------------------------------------------------
 
     def advance_us(self, duration_us: int) -> None:
-        """The plant, and all that is timed, moves on."""
+        """Advance the plant and all timers."""
         super().advance_us(duration_us)
         now_us = self.time_us
         if self._consumer.expired(now_us):
@@ -188,7 +188,7 @@ class Cia402Node(TimedDrive):
     # -- the connection ----------------------------------------------------------------------------------
 
     def _host_lost(self, event: str) -> None:
-        """The host fell silent: EMCY 8130h, the reaction of 6007h, and 1029h:1 for the NMT state."""
+        """React to a silent host: EMCY 8130h, the reaction of 6007h, and 1029h:1 for the NMT state."""
         self.note(event)
         self.emergency.report(emcy.HEARTBEAT_LOST, emcy.COMMUNICATION)
         self.application.warning = True
@@ -199,7 +199,9 @@ class Cia402Node(TimedDrive):
             self._changed_state()
 
     def _connection_lost(self) -> None:
-        """NMT took the connection away: the reaction of 6007h where torque may flow, no EMCY beside that of a fault."""
+        """React to the end of the connection by NMT: the reaction of 6007h if torque may flow, and no EMCY except that
+        of a fault.
+        """
         if not self.application.energised:
             return
         self.application.abort_connection()
@@ -246,7 +248,9 @@ class Cia402Node(TimedDrive):
         self._send_events()
 
     def _route(self) -> None:
-        """Which identifier goes where; built anew whenever a PDO, the consumer or the NMT state changes."""
+        """Build the table of identifiers and their handlers again, after a PDO, the consumer or the NMT state has
+        changed.
+        """
         routes: dict[int, Route] = {}
         if self._consumer.cob_id >= 0:
             routes[self._consumer.cob_id] = self._on_heartbeat

@@ -6,7 +6,8 @@
     type (sub 2)       0 at the next SYNC after a change · 1..240 every n-th SYNC · 254, 255 by event
     mapping entry      index << 16 | subindex << 8 | bits
 
-Remapping as CiA 301 asks: bit 31 set, count 0, entries, count, bit 31 cleared; everything else is refused.
+The order of a mapping is that of CiA 301: bit 31 set, count 0, entries, count, bit 31 cleared. Every other order is
+refused.
 """
 
 from collections.abc import Callable
@@ -25,7 +26,7 @@ Getter = Callable[[], float]
 
 
 class Pdo:
-    """One PDO's configuration; a subclass compiles it."""
+    """Configuration of one PDO; a subclass compiles it."""
 
     receives = False
 
@@ -53,26 +54,26 @@ class Pdo:
 
     @property
     def valid(self) -> bool:
-        """It exists: bit 31 of its COB-ID is clear."""
+        """True if the PDO exists: bit 31 of its COB-ID is clear."""
         return not self.cob_id & INVALID
 
     @property
     def can_id(self) -> int:
-        """Its CAN identifier."""
+        """CAN identifier of the PDO."""
         return self.cob_id & 0x7FF
 
     @property
     def synchronous(self) -> bool:
-        """It acts at SYNC."""
+        """True if the PDO acts at SYNC."""
         return self.transmission <= 240
 
     def clear(self) -> None:
-        """Makes it not exist, with nothing mapped."""
+        """Disable the PDO and empty its mapping."""
         self.cob_id, self.count = INVALID, 0
         self.compile()
 
     def load(self) -> None:
-        """Takes the defaults of the object dictionary."""
+        """Load the defaults of the object dictionary."""
         default = self.store.default
         self.entries = [default(key_of(self._mapping, number + 1)) for number in range(8)]
         self.count = default(key_of(self._mapping, 0))
@@ -82,7 +83,7 @@ class Pdo:
         self._on_change()
 
     def compile(self) -> None:
-        """Builds the fast path from the mapping."""
+        """Build the fast path from the mapping."""
         raise NotImplementedError
 
     def _set_cob_id(self, value: int) -> None:
@@ -130,14 +131,14 @@ class Pdo:
             raise SdoAbortedError(od.ABORT_NOT_MAPPABLE)
 
     def _layout(self) -> tuple[Struct, list[int]]:
-        """The frame's layout and the keys in it."""
+        """Return the frame's binary layout and the keys of its objects."""
         keys = [entry >> 8 for entry in self.entries[: self.count]]
         formats = [FORMATS[self.store.variable(key >> 8, key & 0xFF).data_type] for key in keys]
         return Struct("<" + "".join(formats)), keys
 
 
 class ReceivePdo(Pdo):
-    """Host to drive. ``setters`` are the fast ways in; other objects are written through the store."""
+    """PDO from host to drive. ``setters``: direct write functions; other objects are written through the store."""
 
     receives = True
 
@@ -158,7 +159,7 @@ class ReceivePdo(Pdo):
         self._latched = None
 
     def receive(self, data: bytes | bytearray) -> None:
-        """A frame has come: it acts now, or at the next SYNC."""
+        """Take a frame: it acts now, or at the next SYNC."""
         if len(data) < self._struct.size:
             self._on_short()
         elif self._acts_at_sync:
@@ -167,7 +168,7 @@ class ReceivePdo(Pdo):
             self._apply(data)
 
     def on_sync(self) -> None:
-        """Lets the latched frame act."""
+        """Let the latched frame act."""
         data = self._latched
         if data is not None:
             self._latched = None
@@ -183,7 +184,7 @@ class ReceivePdo(Pdo):
         return self._fast.get(key) or (lambda value: self._write(key, value))
 
     def _write(self, key: int, value: int) -> None:
-        """A value out of range is dropped: a PDO has no way to say no."""
+        """Write a value. A value out of range is dropped, because a PDO cannot be refused."""
         try:
             self.store.write(key, value)
         except SdoAbortedError:
@@ -191,7 +192,7 @@ class ReceivePdo(Pdo):
 
 
 class TransmitPdo(Pdo):
-    """Drive to host."""
+    """PDO from drive to host."""
 
     def __init__(self, store: ObjectStore, number: int, on_change: Callable[[], None]) -> None:
         self.inhibit_us = 0
@@ -213,7 +214,7 @@ class TransmitPdo(Pdo):
         self._sent = b""
 
     def pack(self) -> bytes:
-        """The frame's data at this instant."""
+        """Return the frame's data at this instant."""
         return self._struct.pack(*[getter() for getter in self._getters])
 
     def at_sync(self) -> bytes | None:

@@ -1,6 +1,7 @@
-"""A simulated drive wears a profile: its identity, the objects it has and has not, its units, its watchdog.
+"""A simulated drive with a profile: its identity, its objects and missing objects, its units, its watchdog.
 
-What the profile doesn't say stays as in our own EDS. The marker object stays too: a drive that is simulated says so.
+Entries that the profile does not state stay as in our own EDS. The marker object stays too: a simulated drive shows
+that it is simulated.
 """
 
 
@@ -18,9 +19,9 @@ from sim_bus.objects import ObjectStore, key_of
 from sim_bus.reports import Feedback
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The manufacturer's settings of a worn profile: their objects, what they stand at, and what those that limit do.
+# Manufacturer's settings of an emulated profile: their objects, initial values, and the effect of those that limit.
 #
-# A simulated drive is delivered ready: what a profile requires to be set by hand is set.
+# The initial values include the settings that the profile requires to be set by hand.
 
 
 DATA_TYPES = {
@@ -28,14 +29,14 @@ DATA_TYPES = {
     "i16": datatypes.INTEGER16, "i32": datatypes.INTEGER32, "f32": datatypes.REAL32,
 }
 _USUAL_COUNTS = 10_000.0
-"""A limit stands at about so many counts where the profile doesn't know the constant that scales it."""
+"""Approximate initial value of a limit, counts, if the profile does not state the constant that scales it."""
 
 _USUAL_ENCODER = 4096.0
-"""Counts a turn, where the profile divides by a resolution that it doesn't know."""
+"""Counts of a turn, if the profile divides by a resolution that it does not state."""
 
 
 class WornSettings:
-    """``raw`` is what stands in each object; `scales` what that means."""
+    """Manufacturer's settings. ``raw``: value in each object, counts. `scales`: values in their units."""
 
     def __init__(self, profile: CanopenProfile, application: Application) -> None:
         self._profile = profile
@@ -56,7 +57,7 @@ class WornSettings:
                 self.raw[one.name] = float(round(self.raw[one.name]))
 
     def scales(self) -> dict[str, float]:
-        """Every setting in its unit, but for limits."""
+        """Return every setting in its unit, except limits."""
         return {one.name: self.value(one.name) for one in self._profile.parameters if one.set_to is None}
 
     def value(self, name: str) -> float:
@@ -66,7 +67,7 @@ class WornSettings:
         return float(2 ** int(raw)) if one.scale == "power_of_two" else raw * self._unit(one)
 
     def bind(self, store: ObjectStore) -> None:
-        """Puts the objects into the store."""
+        """Add the objects to the store."""
         for one in self._profile.parameters:
             key = key_of(one.index, one.sub)
             store.add(one.index, one.sub, DATA_TYPES[one.type], writable=True, mappable=False, name=one.name)
@@ -81,7 +82,7 @@ class WornSettings:
         return _Write(self, name)
 
     def write(self, name: str, raw: float) -> None:
-        """A new value, and everything that hangs on it."""
+        """Store a new value, and update everything that depends on it."""
         self.raw[name] = raw
         limits, settings = self._application.inverter.control.limits, self._application.settings
         rated_nm = self._application.inverter.params.drive.rated_torque_nm
@@ -130,7 +131,7 @@ class WornSettings:
         return value if one.scale == "power_of_two" else value / self._unit(one)
 
     def _limit(self, one: Parameter) -> float:
-        """The simulated machine's own limit, in the parameter's unit."""
+        """Return the simulated machine's own limit, in the parameter's unit."""
         drive = self._application.inverter.params.drive
         torque = drive.torque_limit_nm if one.unit == "nm" else drive.torque_limit_nm / drive.rated_torque_nm
         return {
@@ -141,7 +142,7 @@ class WornSettings:
 
 
 class _Write:
-    """A write hook of one setting."""
+    """Write hook of one setting."""
 
     def __init__(self, settings: WornSettings, name: str) -> None:
         self._settings, self._name = settings, name
@@ -158,7 +159,9 @@ _QUICK_STOP_RAMP = 2
 
 
 class WornProfile:
-    """Made before the objects are bound, for the units; `apply` is called after, for what comes and goes."""
+    """Emulation of a profile. It is made before the objects are connected, for the units; `apply` then adds and removes
+    objects.
+    """
 
     def __init__(self, profile: CanopenProfile, application: Application) -> None:
         self.profile = profile
@@ -170,7 +173,7 @@ class WornProfile:
         application.mode = application.first_mode
 
     def apply(self, store: ObjectStore, guard: LifeGuard, set_period: Callable[[int], None]) -> None:
-        """Everything at once."""
+        """Apply the whole profile."""
         self._remove(store)
         self._identify(store)
         self._watchdog(store, guard)
@@ -216,7 +219,7 @@ class WornProfile:
             if not there:
                 store.remove(index)
         settings = self._application.settings
-        if not present[0x6083]:        # no ramp that the host could know of: a speed setpoint acts at once
+        if not present[0x6083]:        # no ramp object: a speed setpoint acts at once
             settings.accel_rad_s2 = settings.decel_rad_s2 = float("inf")
         if stop.option_code is None:
             settings.quick_stop_option = _QUICK_STOP_RAMP + (4 if stop.ends == "quick_stop" else 0)
@@ -294,7 +297,7 @@ class WornProfile:
             store.set_default(0x60A9, 0, self.profile.speed.si_unit)
 
     def _position(self, store: ObjectStore) -> None:
-        """The angle in the profile's object, in its counts; the standard's 6064h is there already."""
+        """Add the angle in the profile's object, in its counts. The standard's 6064h exists already."""
         position, inverter = self.profile.position, self._application.inverter
         if position is None or (position.counts_per_turn is None and position.index == 0x6064):
             return
@@ -330,7 +333,7 @@ class WornProfile:
 
 
 def _unmap_what_is_gone(store: ObjectStore) -> None:
-    """A PDO whose default mapping names an object that isn't there is delivered empty."""
+    """Empty the default mapping of a PDO that names a missing object."""
     for area in (0x1600, 0x1A00):
         for mapping in range(area, area + 4):
             entries = [store.default(key_of(mapping, 1 + number)) for number in range(8)]

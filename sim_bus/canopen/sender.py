@@ -1,4 +1,4 @@
-"""Frames out: one sender that survives a dying bus, a cheap message, canopen's network on top of it."""
+"""Sending of frames: a sender that tolerates a failing bus, a cheap message, and canopen's network above it."""
 
 from collections.abc import Callable, Sequence
 
@@ -22,21 +22,21 @@ class Frame(can.Message):
 
 
 class Sender:
-    """Sends; after an error frames are dropped until `revive`, and ``on_lost`` has been called once."""
+    """Sender of frames. After an error it drops frames until `revive`; ``on_lost`` is called once."""
 
     def __init__(self, bus: can.BusABC, on_lost: Callable[[BaseException], None]) -> None:
         self._bus_send = bus.send
         self._on_lost = on_lost
         self.lost = False
         self.script: Callable[[int, bytes], Sequence[tuple[int, bytes | bytearray]]] | None = None
-        """Replacement of an outgoing frame, if faults are scripted."""
+        """Function that returns the frames to send instead, if faults are scripted."""
 
     def revive(self) -> None:
-        """The bus has been heard again."""
+        """Send again: a frame from the bus was received."""
         self.lost = False
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Sends one data frame, or what the script makes of it."""
+        """Send one data frame, or the frames that the script returns for it."""
         if self.script is None:
             self.put(can_id, data)
             return
@@ -44,7 +44,7 @@ class Sender:
             self.put(one, bytes(body))
 
     def put(self, can_id: int, data: bytes) -> None:
-        """Puts one data frame on the bus."""
+        """Put one data frame on the bus."""
         if self.lost:
             return
         try:
@@ -55,7 +55,7 @@ class Sender:
 
 
 class PassiveNetwork(canopen.Network):  # type: ignore[misc, unused-ignore]
-    """A network that is never connected: it is fed by ``notify`` and sends through our sender, in one thread."""
+    """A network without a connection: ``notify`` feeds it, and it sends through our sender, in one thread."""
 
     def __init__(self, sender: Sender) -> None:
         super().__init__()

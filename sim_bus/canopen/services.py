@@ -10,7 +10,7 @@ from canopen.sdo import SdoAbortedError
 from sim_bus.objects import ABORT_NO_DATA, ABORT_VALUE, ObjectStore, key_of
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Error register 1001h, error history 1003h, error code 603Fh and the EMCY that tells of them (CiA 301).
+# Error register 1001h, error history 1003h, error code 603Fh, and the EMCY that reports them (CiA 301).
 #
 # ::
 #
@@ -49,7 +49,7 @@ class Emergency:
         store.live[key_of(0x1003, number + 1)] = read
 
     def report(self, code: int, register: int, *, lasting: bool = True) -> None:
-        """Sends an EMCY and notes it; what is not ``lasting`` leaves no trace in 1001h and 603Fh."""
+        """Send an EMCY and record it. An error that is not ``lasting`` is not kept in 1001h and 603Fh."""
         if lasting:
             self.register |= register | GENERIC
             self.code = code
@@ -57,13 +57,13 @@ class Emergency:
         self._send(_EMCY.pack(code, self.register | register | GENERIC))
 
     def reset(self) -> None:
-        """Nothing is wrong any more; says so where something was."""
+        """Clear all errors, and report that if there was one."""
         if self.register or self.code:
             self.register = self.code = 0
             self._send(_EMCY.pack(0, 0))
 
     def forget(self) -> None:
-        """Power-on: no error, no history, no message."""
+        """Switch on: no error, no history, no message."""
         self.register = self.code = 0
         self._history = []
 
@@ -74,11 +74,11 @@ class Emergency:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Heartbeat both ways in plant time: 1017h sends ours, 1016h:1 watches the host's (CiA 301).
+# Heartbeat in both directions, in plant time: 1017h sends the drive's, 1016h:1 supervises the host's (CiA 301).
 
 
 class HeartbeatConsumer:
-    """Supervision of one node, begun by its first heartbeat; `expired` says once that it has fallen silent."""
+    """Supervision of one node, from its first heartbeat on. `expired` reports once that the node has fallen silent."""
 
     def __init__(self) -> None:
         self.setting = 0
@@ -88,7 +88,9 @@ class HeartbeatConsumer:
         self._last_us = 0
 
     def configure(self, value: int) -> None:
-        """1016h:1 = node << 16 | milliseconds; 0 in either switches off. Supervision waits for a heartbeat again."""
+        """Set 1016h:1 = node << 16 | milliseconds; 0 in either switches off. Supervision waits for a
+        heartbeat again.
+        """
         self.setting = value
         node, milliseconds = value >> 16 & 0xFF, value & 0xFFFF
         active = 1 <= node <= 127 and milliseconds > 0
@@ -97,13 +99,13 @@ class HeartbeatConsumer:
         self.alive = False
 
     def beat(self, now_us: int) -> bool:
-        """A heartbeat came; True where it is the first one, or the first after a silence."""
+        """Record a heartbeat. Return True for the first one, and for the first after a silence."""
         first, self.alive = not self.alive, True
         self._last_us = now_us
         return first
 
     def expired(self, now_us: int) -> bool:
-        """True once, when the time has run out."""
+        """Return True once after the time has passed."""
         if self.alive and now_us - self._last_us >= self._timeout_us:
             self.alive = False
             return True
@@ -111,7 +113,7 @@ class HeartbeatConsumer:
 
 
 class HeartbeatProducer:
-    """When our own heartbeat is due."""
+    """Timer of the drive's own heartbeat."""
 
     def __init__(self) -> None:
         self._period_us = 0
@@ -120,16 +122,16 @@ class HeartbeatProducer:
 
     @property
     def active(self) -> bool:
-        """It is switched on."""
+        """True if the heartbeat is switched on."""
         return self._period_us > 0
 
     def configure(self, milliseconds: int) -> None:
-        """1017h; 0 switches off, otherwise the first one is due at once."""
+        """Set 1017h. 0 switches off; otherwise the first heartbeat is due at once."""
         self._period_us = 1000 * milliseconds
         self._next_us = self._now_us
 
     def due(self, now_us: int) -> bool:
-        """True when one has to be sent now; several missed ones are one."""
+        """Return True if a heartbeat must be sent now. Several missed heartbeats count as one."""
         self._now_us = now_us
         if not self._period_us or now_us < self._next_us:
             return False
@@ -140,9 +142,9 @@ class HeartbeatProducer:
 # ---------------------------------------------------------------------------------------------------------------------
 # Node guarding and life guarding, slave side, in plant time (CiA 301).
 #
-# Every remote frame on 700h + node is answered with one byte: bit 7 toggles (0 in the first answer after a reset),
-# bits 0 to 6 are the NMT state. With 100Ch and 100Dh both set, the first question begins the life guarding: their
-# product, in ms, is the time after which a host that doesn't ask counts as dead.
+# Every remote frame on 700h + node is answered with one byte: bit 7 toggles (0 in the first answer after a reset), bits
+# 0 to 6 are the NMT state. If 100Ch and 100Dh are both set, the first request begins the life guarding: their product,
+# in ms, is the time after which a host without requests counts as dead.
 
 
 class LifeGuard:
@@ -156,22 +158,22 @@ class LifeGuard:
         self._toggle = 0
 
     def set_guard(self, milliseconds: int) -> None:
-        """100Ch; supervision waits for a question again."""
+        """Set 100Ch. Supervision waits for a request again."""
         self.guard_ms = milliseconds
         self.alive = False
 
     def set_factor(self, factor: int) -> None:
-        """100Dh; supervision waits for a question again."""
+        """Set 100Dh. Supervision waits for a request again."""
         self.factor = factor
         self.alive = False
 
     def answer(self, state: int) -> bytes:
-        """The byte that answers a question."""
+        """Return the byte that answers a request."""
         byte, self._toggle = self._toggle | state, self._toggle ^ 0x80
         return bytes([byte])
 
     def asked(self, now_us: int) -> bool:
-        """A question came; True where supervision begins with it."""
+        """Record a request. Return True if supervision begins with it."""
         if not self.guard_ms * self.factor:
             return False
         first, self.alive = not self.alive, True
@@ -179,14 +181,14 @@ class LifeGuard:
         return first
 
     def expired(self, now_us: int) -> bool:
-        """True once, when the life time has run out."""
+        """Return True once after the life time has passed."""
         if self.alive and now_us - self._last_us >= 1000 * self.guard_ms * self.factor:
             self.alive = False
             return True
         return False
 
     def reset(self) -> None:
-        """Boot-up: the toggle begins at 0 again, nothing is supervised."""
+        """Boot: the toggle bit starts at 0 again, and supervision ends."""
         self._toggle = 0
         self.alive = False
 
@@ -194,7 +196,7 @@ class LifeGuard:
 # ---------------------------------------------------------------------------------------------------------------------
 
 class NmtState(IntEnum):
-    """The byte of a heartbeat; 0 is the boot-up message."""
+    """Byte of a heartbeat; 0 is the boot-up message."""
 
     INITIALISING = 0
     STOPPED = 4
@@ -203,7 +205,7 @@ class NmtState(IntEnum):
 
 
 class NmtCommand(IntEnum):
-    """The first byte of a frame with identifier 0."""
+    """First byte of a frame with identifier 0."""
 
     START = 1
     STOP = 2
@@ -213,13 +215,13 @@ class NmtCommand(IntEnum):
 
 
 class Nmt:
-    """The state, and what a command makes of it."""
+    """NMT state, and its change by a command."""
 
     def __init__(self) -> None:
         self.state = NmtState.INITIALISING
 
     def obey(self, code: int) -> NmtCommand | None:
-        """Takes a command; None where there is no such one. After a reset the node itself goes on from initialising."""
+        """Execute a command. Return it; None for an unknown one. After a reset the node itself leaves initialising."""
         try:
             command = NmtCommand(code)
         except ValueError:

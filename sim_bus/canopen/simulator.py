@@ -1,9 +1,9 @@
-"""The loop that owns the bus: frames in, plant time on. And the same in a thread, for one process.
+"""The loop that owns the bus: it takes frames and advances plant time. The same loop in a thread, for one process.
 
-Stepped time moves with the SYNC alone, but for a host that has fallen silent: after ``silence_s`` of wall time in which
-the simulator itself was awake and no frame came, or at once when the bus reports its end, the simulator runs on in its
-own time, so that the drive's watchdog acts and the shaft comes to rest. Frames that come again make it go on stepped.
-Before the first SYNC there is nothing to run on from, and time stands still.
+In stepped time only the SYNC advances time, unless the host is silent. The host counts as silent after ``silence_s`` of
+wall time without a frame while the simulator itself was awake. It also counts as silent at once if the bus reports its
+end. Then the simulator continues in its own time, so that the drive's watchdog acts and the shaft comes to standstill.
+New frames return it to stepped time. Before the first SYNC time stands still.
 """
 
 import math
@@ -53,21 +53,21 @@ class Simulator:
 
     @property
     def speed_rad_s(self) -> float:
-        """The true shaft's speed."""
+        """Speed of the true shaft, rad/s."""
         return self.node.inverter.speed_rad_s
 
     @property
     def time_s(self) -> float:
-        """Plant time."""
+        """Plant time, s."""
         return self.node.time_us * 1e-6
 
     @property
     def faults_waiting(self) -> tuple[str, ...]:
-        """Scripted faults whose moment hasn't come, as they were written."""
+        """Scripted faults that have not begun yet, as they were written."""
         return self._faults.waiting if self._faults is not None else ()
 
     def run(self, stop: threading.Event) -> None:
-        """Serves the bus until ``stop`` is set. The trace is closed at the end."""
+        """Serve the bus until ``stop`` is set. The trace is closed at the end."""
         with self._trace:
             self.begin()
             while not stop.is_set():
@@ -86,12 +86,12 @@ class Simulator:
             self.end()
 
     def begin(self) -> None:
-        """Power-on, with its boot-up message."""
+        """Switch the drive on; it sends its boot-up message."""
         self.node.boot()
         self._wall_s = time.monotonic()
 
     def hear(self, message: can.Message) -> None:
-        """One frame from the bus; what it makes the drive say has been sent when this returns."""
+        """Take one frame from the bus. The drive's replies have been sent when this returns."""
         if message.is_extended_id or message.is_error_frame:
             return
         node = self.node
@@ -118,28 +118,28 @@ class Simulator:
             self._wall_s = time.monotonic()
 
     def end(self) -> None:
-        """The host is gone for good: a rehearsal is played to its end."""
+        """Advance to the end of a rehearsal, after the host has left for good."""
         if self._faults is not None and self.node.stepped and self.node.sync_seen:
             self.node.run_out()
 
     def close_trace(self) -> None:
-        """Closes the trace; safe to repeat."""
+        """Close the trace; safe to repeat."""
         self._trace.close()
 
     def _nothing_came(self, timeout_s: float, before_s: float, stop: threading.Event) -> None:
         self._trace.flush()
         if self._running_on or not self.node.stepped:
             if time.monotonic() - before_s < 0.5 * timeout_s:
-                stop.wait(timeout_s)          # a bus that returns at once, as a closed socketcand client does
+                stop.wait(timeout_s)          # the bus returned at once, like a closed socketcand client
             self._follow_wall_clock()
             return
-        # The first empty wait counts as a whole one; from then on it is measured, a dead bus returns at once.
+        # The first empty wait counts as a whole one. Later ones are measured, because a dead bus returns at once.
         waited_s = time.monotonic() - before_s if self._silent_s else timeout_s
         if waited_s < 0.5 * timeout_s:
             stop.wait(timeout_s)
             waited_s += timeout_s
-        # A process that gets no processor time can't know that others are silent: no wait counts for more than its
-        # length.
+        # A process without processor time can't know whether other stations are silent: no wait counts for more than
+        # its length.
         self._silent_s += min(waited_s, timeout_s)
         if self._silent_s >= self._silence_s:
             self._run_on("host silent: running on in own time")
@@ -161,7 +161,7 @@ class Simulator:
         self.node.note(f"sending failed: {error}")
 
     def _follow_wall_clock(self) -> None:
-        """The plant catches up with the monotonic clock, in whole chunks."""
+        """Advance the plant to the monotonic clock, in whole chunks."""
         behind = int((time.monotonic() - self._wall_s) * 1e6) // _CHUNK_US
         for _ in range(behind):
             self.node.advance_us(_CHUNK_US)
@@ -169,26 +169,26 @@ class Simulator:
 
 
 class Embedded:
-    """A simulator in this process; how frames reach it is a subclass's. What fails in it is raised by `check`."""
+    """A simulator in this process. A subclass passes the frames to it. `check` raises its errors."""
 
     def __init__(self) -> None:
         self._failure: BaseException | None = None
 
     def open(self) -> Self:
-        """Powers the drive on."""
+        """Switch the drive on."""
         raise NotImplementedError
 
     def _end(self) -> None:
-        """Ends the simulation and gives the bus back; safe to repeat."""
+        """End the simulation and release the bus; safe to repeat."""
         raise NotImplementedError
 
     def check(self) -> None:
-        """Raises RuntimeError for what failed in the simulation."""
+        """Raise RuntimeError for an error in the simulation."""
         if self._failure is not None:
             raise RuntimeError("the simulated drive failed") from self._failure
 
     def close(self) -> None:
-        """Ends the simulation, gives the bus back and raises what failed; safe to repeat."""
+        """End the simulation, release the bus and raise its error; safe to repeat."""
         self._end()
         self.check()
 
@@ -206,9 +206,9 @@ class EmbeddedSimulator(Embedded):
     """A simulator in a daemon thread of this process, on a python-can ``virtual`` channel of its own.
 
     ``with EmbeddedSimulator(params) as simulated: bus = can.Bus(interface="virtual", channel=simulated.channel)``.
-    ``profile`` is what the simulated drive wears. By default stepped, and a pause of the host, however long, changes
-    nothing: host and simulator share a fate, and a run must repeat on a slow machine. In stepped time
-    `sim_bus.canopen.inline.InlineSimulator` says the same, several times as fast.
+    ``profile``: profile of the simulated drive. By default it is stepped, and a pause of the host, however long, has no
+    effect: host and simulator run in one process, and a run must repeat on a slow machine. In stepped time
+    `sim_bus.canopen.inline.InlineSimulator` sends the same frames, several times as fast.
     """
 
     def __init__(self, params: RigParams | None = None, *, node_id: int = 1, seed: int = 0, trace: Path | None = None,
@@ -226,7 +226,7 @@ class EmbeddedSimulator(Embedded):
         self._thread = threading.Thread(target=self._run, name="simulated drive", daemon=True)
 
     def open(self) -> Self:
-        """Starts the thread."""
+        """Start the thread."""
         self._thread.start()
         return self
 

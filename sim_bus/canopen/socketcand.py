@@ -1,10 +1,10 @@
-"""A small socketcand server: a CAN bus over TCP, where the kernel has none.
+"""A small socketcand server: a CAN bus over TCP, for computers whose kernel has none.
 
-python-can's stock ``socketcand`` client talks to it (``tcp_tune=True`` on the client's side, otherwise Nagle and
-delayed acknowledgement leave 22 cycles a second). A frame goes to all other clients and local ports, never back.
+python-can's ``socketcand`` client connects to it (with ``tcp_tune=True``; otherwise Nagle and delayed acknowledgement
+limit the bus to 22 cycles a second). A frame goes to all other clients and local ports, never back.
 
-It has no thread: the user of the bus calls `poll`, which moves frames while it waits. A simulator
-uses a `HubPort`. Bytes that a client does not fetch are kept up to a limit; then the client is disconnected.
+It has no thread: the user of the bus calls `poll`, which moves frames while it waits. A simulator uses a `HubPort`.
+Bytes that a client does not read are kept up to a limit; then the client is disconnected.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import can
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The words of socketcand's raw mode, as python-can's stock client speaks and understands them. Pure.
+# Words of socketcand's raw mode, as python-can's client uses them. Pure.
 #
 # ::
 #
@@ -28,18 +28,18 @@ import can
 #     client → server   < send 123 2 a 1f >                  identifier (3 or 8 digits), length, bytes; hex
 #     server → client   < frame 123 1700000000.123456 0A1F > bytes without blanks; none at all: two blanks before >
 #
-# A length with no bytes is what the client makes of a remote frame.
+# python-can's client sends a length without bytes for a remote frame.
 
 
 HI = b"< hi >"
 OK = b"< ok >"
 LONGEST_WORD = 512
-"""A client that sends so much without a ``>`` isn't one."""
+"""Longest text without a ``>``, bytes. A client that sends more is not a socketcand client."""
 
 
 @dataclass(frozen=True, slots=True)
 class WireFrame:
-    """A frame on its way through the hub."""
+    """A frame in the hub."""
 
     can_id: int
     extended: bool
@@ -48,7 +48,7 @@ class WireFrame:
 
 
 def split(buffer: bytearray) -> list[str]:
-    """Takes the complete words ``< … >`` out of the front of ``buffer`` and returns what stands inside them."""
+    """Take the complete words ``< … >`` off the front of ``buffer``. Return their contents."""
     end = buffer.rfind(b">")
     if end < 0:
         return []
@@ -58,7 +58,7 @@ def split(buffer: bytearray) -> list[str]:
 
 
 def parse_send(word: str) -> WireFrame | None:
-    """The frame in ``send …``; None where it is none."""
+    """Return the frame in ``send …``; None if the word contains no frame."""
     parts = word.split()
     try:
         can_id, length = int(parts[1], 16), int(parts[2], 16)
@@ -82,13 +82,14 @@ def frame_word(frame: WireFrame, time_s: float) -> bytes:
 # ---------------------------------------------------------------------------------------------------------------------
 
 HOLD_S = 0.020
-"""The client takes the ``< ok >`` of rawmode by itself: a frame glued to it would be an error to it."""
+"""Delay of frames after the ``< ok >`` of rawmode, s. The client expects the ``< ok >`` alone: an immediate frame would
+cause an error."""
 _MOST_PENDING_BYTES = 1 << 20
 _BACKLOG = 16
 
 
 class _SocketcandClient:
-    """One connection and what is under way on it."""
+    """One connection with its buffers."""
 
     def __init__(self, connection: socket.socket) -> None:
         self.socket = connection
@@ -99,7 +100,7 @@ class _SocketcandClient:
 
 
 class Hub:
-    """The server. ``port`` 0 takes any free one; the one taken stands in ``port``."""
+    """The server. ``port`` 0 selects any free port; the attribute ``port`` is the one in use."""
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, channel: str = "can0") -> None:
         self.host, self.channel = host, channel
@@ -123,15 +124,15 @@ class Hub:
         self._selector.register(self._listener, selectors.EVENT_READ)
 
     def tap(self, deliver: Callable[[WireFrame], None]) -> None:
-        """Adds a local port, called in `poll` with every frame of a client."""
+        """Add a local port: ``deliver`` is called in `poll` with every frame of a client."""
         self._taps.append(deliver)
 
     def send(self, frame: WireFrame) -> None:
-        """A frame of a local port goes to all clients. (A remote frame has no word in this protocol.)"""
+        """Send a frame of a local port to all clients. This protocol has no word for a remote frame."""
         self._spread(frame, None)
 
     def poll(self, timeout_s: float) -> None:
-        """Waits up to ``timeout_s`` for something to happen on the sockets and deals with it."""
+        """Wait up to ``timeout_s`` for an event on the sockets and handle it."""
         held = [client.hold_until_s for client in self._clients if client.hold_until_s]
         if held:
             timeout_s = min(timeout_s, max(min(held) - time.monotonic(), 0.0))
@@ -152,7 +153,7 @@ class Hub:
                     self._flush(client)
 
     def close(self) -> None:
-        """Closes every connection."""
+        """Close every connection."""
         for client in self._clients:
             client.socket.close()
         self._clients.clear()
@@ -223,7 +224,7 @@ class Hub:
             self._drop(client)
 
     def _flush(self, client: _SocketcandClient) -> None:
-        """Sends what the socket takes; the rest waits until it takes more."""
+        """Send as much as the socket accepts. The rest waits."""
         if client.pending and not client.hold_until_s:
             try:
                 sent = client.socket.send(client.pending)
@@ -251,11 +252,13 @@ class Hub:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A python-can bus that is a port of our own hub: receiving moves the hub, so that no second thread is needed.
+# A python-can bus that is a port of our own hub. Receiving runs the hub, so that no second thread is needed.
 
 
 class HubPort(can.BusABC):
-    """The local end. When the last client leaves, `recv` raises `can.CanOperationError` once: the bus has ended."""
+    """Local end of the bus. When the last client leaves, `recv` raises `can.CanOperationError` once: the
+    bus has ended.
+    """
 
     def __init__(self, hub: Hub) -> None:
         self._hub = hub
@@ -265,7 +268,7 @@ class HubPort(can.BusABC):
         super().__init__(channel=hub.channel)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """To all clients; what a client doesn't take at once waits in the hub."""
+        """Send a frame to all clients. Data that a client does not accept at once waits in the hub."""
         if not (msg.is_remote_frame or msg.is_error_frame):
             self._hub.send(WireFrame(msg.arbitration_id, msg.is_extended_id, bytes(msg.data)))
 
@@ -285,6 +288,6 @@ class HubPort(can.BusABC):
         ))
 
     def shutdown(self) -> None:
-        """Ends the hub as well."""
+        """End the hub too."""
         super().shutdown()
         self._hub.close()

@@ -1,4 +1,4 @@
-"""EtherCAT face of the simulated drive: slave controller, CoE, process data. A test tool, not a product slave."""
+"""EtherCAT interface of the simulated drive: slave controller, CoE, process data. A test tool, not a product slave."""
 
 from typing import TYPE_CHECKING
 

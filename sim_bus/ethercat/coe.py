@@ -23,7 +23,7 @@ _SDO_SIZE = 8
 
 
 class CoeServer:
-    """Answers messages of the master; ``post`` puts a message into the mailbox that the master reads."""
+    """CoE server for messages of the master. ``post`` puts a message into the mailbox that the master reads."""
 
     def __init__(self, store: ObjectStore, post: Callable[[bytes], None], mailbox_size: int) -> None:
         self.sdo = SdoServer(store, mailbox_size - _HEAD)
@@ -33,16 +33,16 @@ class CoeServer:
         """Scripted: no message is answered."""
 
     def reset(self) -> None:
-        """The mailbox starts anew."""
+        """Reset the mailbox."""
         self._counter = self._last_counter = 0
         self.sdo.reset()
 
     def emergency(self, code: int, register: int) -> None:
-        """Tells the master of an error of the drive; 0 and 0: none any more."""
+        """Report an error of the drive to the master; 0 and 0: no error left."""
         self._send(_EMERGENCY, code.to_bytes(2, "little") + bytes((register, 0, 0, 0, 0, 0)))
 
     def take(self, message: bytes) -> None:
-        """One message from the master; one that it repeats is dropped."""
+        """Take one message from the master. A repeated message is dropped."""
         length, _address, _channel, kind = _MAILBOX.unpack_from(message)
         counter = kind >> 4 & 7
         if self.silent or (counter and counter == self._last_counter):

@@ -1,4 +1,4 @@
-"""The command ``simulate ethercat``: its options, and running it."""
+"""The command ``simulate ethercat``: its options and its execution."""
 
 import argparse
 import threading
@@ -17,7 +17,7 @@ from sim_bus.command_arguments import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of a simulated EtherCAT drive."""
+    """Add the options of a simulated EtherCAT drive."""
     group = parser.add_argument_group("simulated drive", "A test tool and a simulator, not a product slave.")
     group.add_argument("-i", "--interface", metavar="NAME",
                        help="the Ethernet interface to answer on, such as one end of a veth pair (needs CAP_NET_RAW)")
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Simulates until SIGINT or SIGTERM; prints one line ``ready: …`` on stdout. Returns the exit code."""
+    """Simulate until SIGINT or SIGTERM. Print one line ``ready: …`` on stdout. Return the exit code."""
     from sim_bus.ethercat.faults import listing, parse_all
 
     if "list" in namespace.fault:

@@ -35,7 +35,7 @@ _WRITABLE = ((0x0010, 0x0012), (0x0100, 0x0104), (0x0120, 0x0122), (0x0200, 0x02
              (0x0400, 0x0402), (0x0410, 0x0412), (0x0420, 0x0422), (0x0442, 0x0444), (0x0500, 0x0510),
              (_FMMU, _FMMU + 16 * FMMUS), (0x0900, 0x0904), (0x0910, 0x0918), (0x0920, 0x0936), (0x0980, 0x09A8),
              *((at + first, at + end) for at in range(_MANAGER, _MANAGER + 8 * MANAGERS, 8)
-               for first, end in ((0, 5), (6, 7))),         # a SyncManager's status and PDI control are the slave's
+               for first, end in ((0, 5), (6, 7))),         # SyncManager: status and PDI control belong to the slave
              (RAM, MEMORY_SIZE))
 _COUNTERS = ((0x0300, 0x0314), (0x0442, 0x0444))
 """Registers that any write clears."""
@@ -70,7 +70,7 @@ _BROADCAST = {EscCommand.BRD, EscCommand.BWR, EscCommand.BRW}
 
 
 class Pdi(Protocol):
-    """The side of the slave's processor: what it hears from the master, and its inputs at this moment."""
+    """Interface to the slave's processor: events of the master, and the present inputs."""
 
     def al_control(self, word: int) -> None: ...
     def mailbox(self, message: bytes) -> None: ...
@@ -80,7 +80,7 @@ class Pdi(Protocol):
 
 
 class SyncManager:
-    """One SyncManager as its eight registers say."""
+    """One SyncManager, from its eight registers."""
 
     def __init__(self, number: int, registers: bytes | bytearray) -> None:
         self.start, self.length, control, _status, active, _pdi = _MANAGER_REGISTERS.unpack(registers)
@@ -91,12 +91,12 @@ class SyncManager:
         self.status_at = _MANAGER + 8 * number + 5
 
     def covers(self, begin: int, end: int) -> bool:
-        """The range touches its buffer."""
+        """Return whether the range touches its buffer."""
         return self.enabled and begin < self.end and self.start < end
 
 
 class Fmmu:
-    """One fieldbus memory management unit as its sixteen registers say; it maps whole bytes."""
+    """One fieldbus memory management unit (FMMU), from its sixteen registers. It maps whole bytes."""
 
     def __init__(self, registers: bytes | bytearray) -> None:
         self.logical, self.length, _first, _last, self.physical, _bit, kind, active = _FMMU_REGISTERS.unpack(registers)
@@ -104,7 +104,7 @@ class Fmmu:
         self.active = bool(active & 1) and self.length > 0
 
     def part(self, logical: int, count: int) -> tuple[int, slice]:
-        """The physical address and the place in the datagram of what it maps of that range."""
+        """Return the physical address, and the part of the datagram, of the mapped section of that range."""
         begin, end = max(logical, self.logical), min(logical + count, self.logical + self.length)
         return self.physical + begin - self.logical, slice(begin - logical, max(begin, end) - logical)
 
@@ -120,15 +120,16 @@ class Esc:
             self.memory[at:at + len(data)] = data
         self.memory[0x0012:0x0014] = eeprom[8:10]
         self.clock_ns = self.fine_ns = 0
-        """Local time of the distributed clock: that of the plant, and how far the frame is ahead of it."""
+        """Local time of the distributed clock, ns: ``clock_ns`` is plant time, ``fine_ns`` the lead of the frame over
+        it."""
         self.locked: Container[int] = ()
-        """Scripted: registers that keep what they have."""
+        """Scripted: registers that keep their values."""
         self.managers = [SyncManager(n, bytes(8)) for n in range(MANAGERS)]
         self._fmmus: list[Fmmu] = []
         self._waiting: deque[bytes] = deque()
         self._last_answer = b""
         self._unfed_s: float | None = None
-        """Time since the last outputs; None while no watchdog runs."""
+        """Time since the last outputs, s; None if no watchdog runs."""
         self._after_write: tuple[tuple[int, int, Callable[[], None]], ...] = (
             (AL_CONTROL, AL_CONTROL + 2, lambda: pdi.al_control(self.word(AL_CONTROL))),
             (_SII_CONTROL, _SII_CONTROL + 2, self._access_sii),
@@ -137,7 +138,7 @@ class Esc:
         )
 
     def word(self, at: int) -> int:
-        """A register of 16 bits."""
+        """Return a register of 16 bits."""
         return int.from_bytes(self.memory[at:at + 2], "little")
 
     def set_word(self, at: int, value: int) -> None:
@@ -147,7 +148,7 @@ class Esc:
     # -- frames ------------------------------------------------------------------------------------------
 
     def answer(self, frame: bytes) -> bytes:
-        """Return the frame as it leaves the slave; one of another ethertype leaves as it came."""
+        """Return the frame as it leaves the slave. A frame of another ethertype leaves unchanged."""
         data = bytearray(frame)
         if len(data) < _ETHERNET_SIZE + 2 or int.from_bytes(data[12:14], "big") != ETHERTYPE:
             return bytes(data)
@@ -173,7 +174,9 @@ class Esc:
         return bytes(data)
 
     def _physical(self, command: int, position: int, offset: int, body: bytearray) -> tuple[int, int]:
-        """One datagram with a physical address; what the working counter gains, and the position that leaves."""
+        """Execute a datagram with a physical address. Return the increment of the working counter, and the position
+        that leaves.
+        """
         if command in _BY_POSITION:
             addressed, position = position == 0, (position + 1) & 0xFFFF
         elif command in _BROADCAST:
@@ -193,7 +196,7 @@ class Esc:
         return gained, position
 
     def _logical(self, command: int, logical: int, body: bytearray) -> int:
-        """One datagram with a logical address; what the working counter gains. Reads come first."""
+        """Execute a datagram with a logical address. Return the increment of the working counter. Reads come first."""
         sent, was_read, was_written = bytes(body), False, False
         for fmmu in self._fmmus:
             at, place = fmmu.part(logical, len(body))
@@ -210,7 +213,7 @@ class Esc:
     # -- memory ------------------------------------------------------------------------------------------
 
     def _read(self, at: int, count: int) -> bytes | None:
-        """Return what a master reads there; None where it may not."""
+        """Return the data that a master reads there; None if reading is not allowed."""
         end = at + count
         if end > MEMORY_SIZE:
             return None
@@ -233,7 +236,7 @@ class Esc:
         return found
 
     def _write(self, at: int, data: bytes) -> bool:
-        """Write as a master; False where it may not."""
+        """Write as a master. Return False if writing is not allowed."""
         end = at + len(data)
         parts = [(max(at, a), min(end, b)) for a, b in _WRITABLE if at < b and a < end]
         if end > MEMORY_SIZE or not parts:
@@ -257,7 +260,7 @@ class Esc:
         return True
 
     def _written(self, manager: SyncManager) -> None:
-        """The last byte of a buffer is there."""
+        """Handle the last byte of a buffer."""
         data = bytes(self.memory[manager.start:manager.end])
         if manager.mailbox:
             self._mark(manager, 8)
@@ -285,7 +288,7 @@ class Esc:
         for one in self.managers:
             self.memory[one.status_at] &= 0xFF * one.enabled
         request, acknowledged = (self.memory[_MANAGER + 8 + own] & 2 for own in (6, 7))
-        if request != acknowledged:            # the master asks for the last message again: its frame was lost
+        if request != acknowledged:            # the master requests the last message again: its frame was lost
             self.memory[_MANAGER + 8 + 7] ^= 2
             if self._last_answer:
                 self._put(self._last_answer)
@@ -293,13 +296,13 @@ class Esc:
     # -- mailbox to the master ---------------------------------------------------------------------------
 
     def post(self, message: bytes) -> None:
-        """Puts a message into the mailbox that the master reads, after those that wait."""
+        """Put a message into the mailbox that the master reads, behind those that wait."""
         self._waiting.append(message)
         if not self._full(self.managers[1]):
             self._next_answer()
 
     def clear_mailbox(self) -> None:
-        """Forgets all messages: the mailbox starts or ends."""
+        """Clear all messages, when the mailbox starts or ends."""
         self._waiting.clear()
         self._last_answer = b""
         self._mark(self.managers[1], 0)
@@ -318,7 +321,7 @@ class Esc:
     # -- SII, watchdog, clock ----------------------------------------------------------------------------
 
     def _access_sii(self) -> None:
-        """Reads four bytes of the EEPROM; a write is refused."""
+        """Read four bytes of the EEPROM. A write is refused."""
         control = self.word(_SII_CONTROL)
         at = 2 * int.from_bytes(self.memory[_SII_ADDRESS:_SII_ADDRESS + 4], "little")
         if control & _SII_READ:
@@ -327,22 +330,22 @@ class Esc:
 
     @property
     def watchdog_s(self) -> float:
-        """Time of the process data watchdog, 0400h and 0420h; 0 where it is off."""
+        """Return the time of the process data watchdog (0400h, 0420h), s; 0 if it is off."""
         return (self.word(_DIVIDER) + 2) * _WATCHDOG_UNIT_S * self.word(_WATCHDOG)
 
     def stop_watchdog(self) -> None:
-        """Expect no outputs any more."""
+        """End the watchdog: no outputs are expected."""
         self._unfed_s = None
 
     def expire_watchdog(self) -> None:
-        """The time of the watchdog has run out."""
+        """Handle the end of the watchdog's time."""
         self._unfed_s = None
         self.memory[_WATCHDOG_STATUS] &= ~1
         self.memory[_WATCHDOG_COUNT] = min(255, self.memory[_WATCHDOG_COUNT] + 1)
         self._pdi.watchdog_expired()
 
     def pass_time(self, duration_us: int) -> None:
-        """Time has passed for clock and watchdog."""
+        """Advance clock and watchdog by this time."""
         self.clock_ns += 1000 * duration_us
         if self._unfed_s is not None:
             self._unfed_s += 1e-6 * duration_us
@@ -354,7 +357,7 @@ class Esc:
         _TIME.pack_into(self.memory, _SYSTEM_TIME, (self.clock_ns + self.fine_ns + offset) % (1 << 64))
 
     def _latch(self) -> None:
-        """Receive times of this frame, at port 0 and at the processing unit."""
+        """Store the receive times of this frame, at port 0 and at the processing unit."""
         now = self.clock_ns + self.fine_ns
         _TIME.pack_into(self.memory, _LOCAL_TIME, now)
         self.memory[_LATCH:_LATCH + 4] = self.memory[_LOCAL_TIME:_LOCAL_TIME + 4]

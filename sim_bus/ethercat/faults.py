@@ -28,7 +28,7 @@ Misbehaviour = FaultAct["Faults"]
 
 
 def _part(name: str) -> Callable[[str], Misbehaviour]:
-    """A share of the frames, by the name of the attribute."""
+    """Return a fault that affects a share of the frames, given by the name of the attribute."""
     def make(text: str) -> Misbehaviour:
         part = share(text)
         return changed(lambda line: line, name, lambda _: part)
@@ -37,7 +37,7 @@ def _part(name: str) -> Callable[[str], Misbehaviour]:
 
 
 def _transfers(how: Meddling) -> Callable[[str], Misbehaviour]:
-    """All transfers of an object."""
+    """Return a fault that affects all transfers of an object."""
     def make(text: str) -> Misbehaviour:
         key = object_place(text)
         return Misbehaviour(lambda line: line.slave.coe.sdo.meddling.update({key: how}),
@@ -51,7 +51,7 @@ def _of_drive(fault: InjectedFault) -> Misbehaviour:
 
 
 def _garbage(line: "Faults") -> bytes:
-    """The EEPROM with an identity of ones and a wrong checksum."""
+    """Return an EEPROM with an identity of ones and a wrong checksum."""
     content = bytearray(line.slave.esc.eeprom)
     content[14], content[16:32] = content[14] ^ 0xFF, b"\xff" * 16
     return bytes(content)
@@ -112,7 +112,7 @@ parse_all, listed, listing = KINDS.parse_all, KINDS.listed, KINDS.listing
 
 
 class Faults(FaultSchedule[Misbehaviour]):
-    """The script of one drive, between host and slave."""
+    """Script of one drive, between host and slave."""
 
     def __init__(self, script: tuple[Scripted, ...], slave: Cia402Slave, seed: int) -> None:
         super().__init__(script, KINDS.make)
@@ -127,7 +127,7 @@ class Faults(FaultSchedule[Misbehaviour]):
             self.moved(0)
 
     def answer(self, frame: bytes) -> bytes:
-        """The frame as it comes back; empty where it is lost. A lost cycle takes its time all the same."""
+        """Return the frame as it comes back; empty if it is lost. A lost cycle takes its time too."""
         command = frame[_FIRST] if len(frame) > _HEAD else 0
         if self._happens(self.loss):
             if command in (_LWR, _LRW):

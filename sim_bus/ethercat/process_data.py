@@ -11,7 +11,7 @@ from sim_bus.ethercat.sii import PdoEntry, SiiPdo
 from sim_bus.objects import FORMATS, ObjectStore, key_of
 
 PDOS, ENTRIES, SIZE_LIMIT = 4, 8, 64
-"""PDOs of a direction, entries of a PDO, bytes of a direction."""
+"""Number of PDOs in one direction, entries of a PDO, bytes of one direction."""
 
 _GAPS = {8: "x", 16: "xx", 32: "xxxx"}
 """Formats of an entry without an object (index 0), by bits."""
@@ -34,7 +34,7 @@ class _Numbers:
 
     @property
     def used(self) -> list[int]:
-        """Entries that count."""
+        """Return the entries up to the count."""
         return self.entries[:self.count]
 
     def _bind(self, store: ObjectStore, key: int, sub: int) -> None:
@@ -77,24 +77,24 @@ class ProcessData:
 
     @property
     def size(self) -> int:
-        """Bytes of the process data."""
+        """Length of the process data, bytes."""
         return self._struct.size
 
     def pack(self) -> bytes:
-        """The inputs at this instant."""
+        """Return the inputs at this instant."""
         return self._struct.pack(*[getter() for getter in self._getters])
 
     def unpack(self, data: bytes) -> list[tuple[int, float]]:
-        """The keys of the outputs, with their values."""
+        """Return the keys of the outputs with their values."""
         return list(zip(self._keys, self._struct.unpack_from(data), strict=True))
 
     def delivered(self) -> SiiPdo:
-        """The first PDO as the EEPROM tells it."""
+        """Return the first PDO for the EEPROM."""
         entries = [PdoEntry(one >> 16, one >> 8 & 0xFF, self._kind(one), one & 0xFF) for one in self._mappings[0].used]
         return SiiPdo(self.first, self.manager, entries)
 
     def compile(self) -> None:
-        """Builds the fast path of what is assigned; refused outside PRE-OPERATIONAL."""
+        """Build the fast path of the assigned PDOs. Refused outside PRE-OPERATIONAL."""
         self._check_state()
         self._compile()
 
@@ -123,7 +123,7 @@ class ProcessData:
             raise SdoAbortedError(od.ABORT_VALUE)
 
     def _check_entry(self, entry: int) -> None:
-        """An entry names an object that can be mapped in this direction, or a gap, with its length."""
+        """Check an entry: an object that can be mapped in this direction, or a gap, with its length."""
         self._check_state()
         gap = not entry >> 16
         if not (not entry or entry in _GAPS if gap else self._store.mappable(entry, receives=self.outputs)):

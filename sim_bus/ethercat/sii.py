@@ -15,7 +15,7 @@ STRINGS, GENERAL, FMMUS, SYNC_MANAGERS, INPUTS, OUTPUTS, END = 10, 30, 40, 41, 5
 SIZE = 2048
 _COE = 0x0004
 _COE_DETAILS = 0b00001101
-"""SDO, PDO assignment and PDO configuration; no SDO information, no complete access."""
+"""Supported: SDO, PDO assignment and PDO configuration. Not supported: SDO information, complete access."""
 
 
 class Area(NamedTuple):

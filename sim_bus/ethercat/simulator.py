@@ -19,10 +19,10 @@ _FRAME_SIZE = 2048
 
 
 class Simulator:
-    """A simulated drive. Its caller says what time it is: `answer` and `idle` wait for nothing and read no clock.
+    """A simulated drive. Its caller states the time: `answer` and `idle` wait for nothing and read no clock.
 
-    Stepped time moves with the outputs of the host. After ``silence_s`` without a frame the drive runs on in its own
-    time, so that its watchdog acts. Frames that come again make it go on stepped.
+    Only the host's outputs advance stepped time. After ``silence_s`` without a frame the drive continues in its own
+    time, so that its watchdog acts. New frames return it to stepped time.
     """
 
     def __init__(self, params: RigParams | None = None, *, seed: int = 0, trace: Path | None = None,
@@ -37,11 +37,11 @@ class Simulator:
 
     @property
     def faults_waiting(self) -> tuple[str, ...]:
-        """Scripted faults whose moment hasn't come, as they were written."""
+        """Scripted faults that have not begun yet, as they were written."""
         return self._faults.waiting
 
     def answer(self, frame: bytes, now_s: float) -> bytes:
-        """Return the frame as it comes back at ``now_s`` of the caller's clock; empty where it is lost."""
+        """Return the frame as it comes back at ``now_s`` of the caller's clock; empty if it is lost."""
         self._follow(now_s)
         self._silent_s = 0.0
         if self._running_on:
@@ -50,7 +50,7 @@ class Simulator:
         return self._faults.answer(frame)
 
     def idle(self, now_s: float, waited_s: float = _POLL_S) -> None:
-        """Note that no frame has come for ``waited_s``, or for less, if the caller had no processor time."""
+        """Record that no frame has come for ``waited_s``. A shorter time counts if the caller had no processor time."""
         self._silent_s += waited_s
         if self.slave.stepped and self.slave.cycled and self._silent_s >= self._silence_s and not self._running_on:
             self._running_on, self._plant_s = True, now_s
@@ -58,7 +58,7 @@ class Simulator:
         self._follow(now_s)
 
     def _follow(self, now_s: float) -> None:
-        """Let the plant catch up in its own time with the caller's clock, in whole chunks."""
+        """Advance the plant in its own time to the caller's clock, in whole chunks."""
         slave, before_s, self._last_s = self.slave, self._last_s, now_s
         if not before_s or (slave.stepped and not self._running_on):
             self._plant_s, slave.esc.fine_ns = now_s, 0
@@ -70,7 +70,7 @@ class Simulator:
         slave.esc.fine_ns = round(1e9 * (now_s - self._plant_s))
 
     def run(self, line: socket.socket, stop: threading.Event) -> None:
-        """Serves a raw socket until ``stop`` is set, and plays a rehearsal to its end. The trace is closed then."""
+        """Serve a raw socket until ``stop`` is set. Then advance to the end of a rehearsal and close the trace."""
         line.settimeout(_POLL_S)
         with self.trace:
             while not stop.is_set():

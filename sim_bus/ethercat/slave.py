@@ -1,8 +1,8 @@
-"""EtherCAT face of the simulated drive: state machine of the slave, objects, process data.
+"""EtherCAT interface of the simulated drive: state machine of the slave, objects, process data.
 
 One thread calls `Cia402Slave.answer` and `Cia402Slave.advance_us`; nothing here waits or reads a clock. In stepped time
-a frame that brings outputs 1. gets the reported values as its inputs, 2. lets its outputs act, and then 3. the plant
-moves on by exactly 5FFEh:3 (µs), in equal steps of at most the control period.
+a frame with outputs 1. gets the reported values as its inputs, 2. makes its outputs act, and 3. advances the plant by
+exactly 5FFEh:3 (µs), in equal steps of at most the control period.
 """
 
 from contextlib import suppress
@@ -23,22 +23,22 @@ from sim_bus.timed_drive import TimedDrive
 from sim_bus.trace import ShaftTrace
 
 MAILBOX = 128
-"""Bytes of each mailbox."""
+"""Length of each mailbox, bytes."""
 
 _OUTPUTS_AT, _INPUTS_AT = 0x1200, 0x1400
 _CAN_ONLY = (0x1005, 0x1006, 0x1014, 0x1016, 0x1017, 0x1029, 0x1200,
              *(base + number for base in (0x1400, 0x1600, 0x1800, 0x1A00) for number in range(4)))
 _TEXT, _TEXT_LIMIT = key_of(MARKER_INDEX, 5), 512
-"""Object for segmented transfers: a text of at most so many bytes."""
+"""Object for segmented transfers: a text, and its largest length in bytes."""
 
 HOST_LOST = 0x8130
-"""Error code when the process data end while torque may flow (CiA 301: heartbeat error)."""
+"""Error code if the process data end while torque may flow (CiA 301: heartbeat error)."""
 
 _GENERIC, _COMMUNICATION = 0x01, 0x10
 
 
 class AlState(IntEnum):
-    """States of the slave, as 0120h and 0130h have them."""
+    """States of the slave, with their codes in 0120h and 0130h."""
 
     INIT, PRE_OPERATIONAL, BOOT, SAFE_OPERATIONAL, OPERATIONAL = 1, 2, 3, 4, 8
 
@@ -56,7 +56,7 @@ class SlaveObjects(ObjectStore):
     """The objects, with a text of any length to write and read back."""
 
     def set_data(self, index: int, subindex: int, data: bytes, check_writable: bool = False) -> None:
-        """An SDO download."""
+        """Handle an SDO download."""
         if key_of(index, subindex) != _TEXT:
             super().set_data(index, subindex, data, check_writable)
         elif len(data) > _TEXT_LIMIT or not data.isascii():
@@ -72,11 +72,11 @@ class Cia402Slave(TimedDrive):
         super().__init__(params, seed=seed, trace=trace, stepped=stepped)
         self.state = AlState.INIT
         self.cycled = False
-        """Outputs have come."""
+        """True after outputs have come."""
         self.period_us = 0
         """5FFEh:3: period of a cycle in stepped time."""
         self.frozen: bytes | None = None
-        """Scripted: the inputs whatever the drive does."""
+        """Scripted: constant inputs, independent of the drive."""
         self.fault_code = self._register = 0
         self._outputs_came = self._op_requested = False
         self.store = SlaveObjects(1, generic_eds())
@@ -105,25 +105,25 @@ class Cia402Slave(TimedDrive):
         return answered
 
     def pass_cycle(self) -> None:
-        """The host has sent its outputs; whether they were heard or not, in stepped time it is one period later."""
+        """Advance by one period in stepped time after the host has sent its outputs, whether or not they arrived."""
         self.cycled = True
         if self.stepped and self.period_us:
             self.advance_us(self.period_us)
 
     def advance_us(self, duration_us: int) -> None:
-        """The plant, and all that is timed, moves on."""
+        """Advance the plant and all timers."""
         super().advance_us(duration_us)
         self.esc.pass_time(duration_us)
 
     # -- the slave controller's other side ---------------------------------------------------------------
 
     def mailbox(self, message: bytes) -> None:
-        """The master has filled the mailbox."""
+        """Handle a message that the master has put into the mailbox."""
         if self.state is not AlState.INIT:
             self.coe.take(message)
 
     def outputs(self, data: bytes) -> None:
-        """The master has written the process data outputs; they act in OPERATIONAL."""
+        """Handle process data outputs of the master; they act in OPERATIONAL."""
         self._outputs_came = True
         if self._op_requested:
             self._enter(AlState.OPERATIONAL)
@@ -134,7 +134,7 @@ class Cia402Slave(TimedDrive):
             if setter is not None:
                 setter(int(value))
             else:
-                with suppress(SdoAbortedError):      # a value out of range is dropped: a PDO has no way to say no
+                with suppress(SdoAbortedError):      # a value out of range is dropped: a PDO cannot be refused
                     self.store.write(key, int(value))
 
     def inputs(self) -> bytes:
@@ -147,7 +147,7 @@ class Cia402Slave(TimedDrive):
             self.al_error(WATCHDOG)
 
     def al_control(self, word: int) -> None:
-        """The master has requested a state. An error must be acknowledged first."""
+        """Handle a request of the master for a state. An error must be acknowledged first."""
         if self.esc.word(AL_STATUS) & _ERROR and not word & _ERROR:
             return
         self._op_requested = False
@@ -155,19 +155,19 @@ class Cia402Slave(TimedDrive):
         if code := self._refusal(target):
             self._tell(code)
         elif target == AlState.OPERATIONAL and self.state is AlState.SAFE_OPERATIONAL:
-            self._op_requested = True             # with the first valid outputs
+            self._op_requested = True             # it begins with the first valid outputs
             self._tell(0)
         else:
             self._enter(AlState(target))
 
     def al_error(self, code: int) -> None:
-        """The slave leaves OPERATIONAL by itself, and says why."""
+        """Leave OPERATIONAL by the slave itself, with the AL status code as the reason."""
         if self.state is AlState.OPERATIONAL:
             self._enter(AlState.SAFE_OPERATIONAL)
         self._tell(code)
 
     def restart(self) -> None:
-        """The drive restarts: no torque, INIT."""
+        """Restart the drive: no torque, INIT."""
         self.application.power_off()
         self._enter(AlState.INIT)
 
@@ -175,7 +175,7 @@ class Cia402Slave(TimedDrive):
         return self.state is AlState.PRE_OPERATIONAL
 
     def _refusal(self, target: int) -> int:
-        """The AL status code of a state that can't be entered; 0: it can."""
+        """Return the AL status code that refuses a state; 0: the state is allowed."""
         if target == AlState.BOOT or target not in list(AlState):
             return NO_BOOT if target == AlState.BOOT else UNKNOWN_STATE
         if target <= self.state:
@@ -207,7 +207,7 @@ class Cia402Slave(TimedDrive):
             self.application.warning = False
         elif before is AlState.OPERATIONAL:
             self.esc.stop_watchdog()
-            if self.application.energised:         # the reaction of 6007h where torque may flow
+            if self.application.energised:         # reaction of 6007h if torque may flow
                 self.report(HOST_LOST)
                 self.application.warning = True
                 self.application.abort_connection()
@@ -221,7 +221,7 @@ class Cia402Slave(TimedDrive):
     # -- objects -----------------------------------------------------------------------------------------
 
     def report(self, code: int) -> None:
-        """An error of the drive in 603Fh, 1001h and an emergency message; 0: none any more."""
+        """Report an error of the drive in 603Fh, 1001h and an emergency message; 0: no error left."""
         if code or self.fault_code:
             self.fault_code, self._register = code, (_GENERIC | _COMMUNICATION) * (code > 0)
             self.coe.emergency(code, self._register)

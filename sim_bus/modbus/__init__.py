@@ -1,6 +1,6 @@
-"""The Modbus face of the simulated drive: it wears a profile, over the same inverter and shaft as the CANopen face.
+"""Modbus interface of the simulated drive: a profile over the same inverter and shaft as on CANopen.
 
-`control_words` says what words do, from the manuals · `codec`, `registers`: which number stands where · `machine`: the
+`control_words`: effect of the words, from the manuals · `codec`, `registers`: place of each number · `machine`: the
 drive without its bus · `embedded`: in the host's own time · `server`: on TCP or a serial line, in real time.
 """
 

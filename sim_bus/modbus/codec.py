@@ -1,6 +1,6 @@
-"""A number in registers, as the drive itself stores it: two's complement, halves in the line's order, saturation.
+"""A number in registers, as the drive stores it: two's complement, halves in the line's order, saturation.
 
-Written for the simulated drive alone, on integers; the host has its own.
+The module is written for the simulated drive alone, on integers; the host has its own.
 """
 
 
@@ -8,21 +8,21 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What comes back on the line for one request: as a rule the drive's reply, and what a scripted fault made of it.
+# Data that comes back on the line for one request: usually the drive's reply, or the data after a scripted fault.
 
 
 class DriveReply(NamedTuple):
-    """``pdu`` None: nothing comes. What TCP or RTU alone has is left alone by the other."""
+    """One reply. ``pdu`` None: no reply. Fields of TCP alone have no effect on RTU, and vice versa."""
 
     pdu: bytes | None
     late_s: float = 0.0
-    """After the moment at which it was due."""
+    """Delay after the time at which the reply was due, s."""
     transaction_bits: int = 0
-    """TCP: bits of the transaction that are wrong."""
+    """TCP: wrong bits of the transaction id."""
     crc_bits: int = 0
-    """RTU: bits of the CRC that are wrong. Where frames have none, the reply is lost: no receiver passes it on."""
+    """RTU: wrong bits of the CRC. On a line without frames the reply is lost, because no receiver would pass it on."""
     connection: Literal["", "reset", "half-open"] = ""
-    """TCP: what becomes of the connection on which the request came."""
+    """TCP: end of the connection on which the request came."""
 
 
 NONE = DriveReply(None)
@@ -44,38 +44,38 @@ class RegisterLayout:
 
     @property
     def signed(self) -> bool:
-        """It has a sign."""
+        """True if the type has a sign."""
         return self.kind[0] == "i"
 
     @property
     def lowest(self) -> int:
-        """The smallest number that fits."""
+        """Smallest number that fits."""
         return -(1 << _BITS[self.kind] - 1) if self.signed else 0
 
     @property
     def highest(self) -> int:
-        """The largest number that fits."""
+        """Largest number that fits."""
         return (1 << _BITS[self.kind] - int(self.signed)) - 1
 
     @property
     def addresses(self) -> range:
-        """The registers it takes."""
+        """Addresses of its registers."""
         return range(self.address, self.address + _BITS[self.kind] // 16)
 
     def saturated(self, value: float) -> int:
-        """The nearest whole number that fits; an unsigned register takes the magnitude."""
+        """Return the nearest whole number that fits. An unsigned register takes the magnitude."""
         whole = round(value if self.signed else abs(value))
         return self.lowest if whole < self.lowest else min(whole, self.highest)
 
     def words(self, number: int) -> tuple[int, ...]:
-        """The registers' contents for a number that fits."""
+        """Return the contents of the registers for a number that fits."""
         if _BITS[self.kind] == 16:
             return (number % 0x10000,)
         high, low = divmod(number % 0x1_0000_0000, 0x10000)
         return (high, low) if self.high_first else (low, high)
 
     def number(self, words: tuple[int, ...]) -> int:
-        """The number that the registers hold."""
+        """Return the number in the registers."""
         plain = 0
         for word in words if self.high_first else reversed(words):
             plain = plain * 0x10000 + word

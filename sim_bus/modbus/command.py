@@ -1,4 +1,4 @@
-"""The command ``simulate modbus``: its options, and running it."""
+"""The command ``simulate modbus``: its options and its execution."""
 
 import argparse
 import threading
@@ -20,7 +20,7 @@ DEFAULT_PROFILE = "generic/modbus"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of a simulated Modbus drive."""
+    """Add the options of a simulated Modbus drive."""
     parser.set_defaults(complain=parser.error)
     group = parser.add_argument_group("simulated drive")
     group.add_argument("--profile", metavar="NAME", default=DEFAULT_PROFILE,
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Simulates until SIGINT or SIGTERM; prints one line ``ready: …`` on stdout. Returns the exit code."""
+    """Simulate until SIGINT or SIGTERM. Print one line ``ready: …`` on stdout. Return the exit code."""
     if "list" in namespace.fault:
         from sim_bus.modbus.faults import listing
 

@@ -20,11 +20,11 @@ from sim_bus.modbus.wrong_maps import Wrong
 from sim_bus.params import RigParams
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How long a request and its reply take on the line. Pure; seconds.
+# Duration of a request and its reply on the line, s. Pure.
 #
-# RTU: a character is 11 bits (start, 8, parity, stop; or two stops), a frame is unit + PDU + two of CRC, and its end
-# is known after 3.5 characters of silence, 1.75 ms above 19,200 baud (Modbus over serial line, section 2.5.1.1). TCP:
-# no characters, but a latency each way, with a jitter on top.
+# RTU: a character is 11 bits (start, 8, parity, stop; or two stops). A frame is unit + PDU + two of CRC. Its end is
+# known after 3.5 characters of silence, 1.75 ms above 19,200 baud (Modbus over serial line, section 2.5.1.1). TCP: no
+# characters, but a latency in each direction, and a jitter in addition.
 #
 # ::
 #
@@ -33,7 +33,7 @@ from sim_bus.params import RigParams
 
 CHARACTER_BITS = 11
 _FRAME = 3
-"""Unit and CRC, in characters."""
+"""Length of unit and CRC, characters."""
 _FIXED_SILENCE_S = 0.00175
 _FIXED_ABOVE_BAUD = 19200
 TCP_LATENCY_S = 0.0005
@@ -42,33 +42,33 @@ TCP_JITTER_S = 0.0003
 
 @dataclass(frozen=True, slots=True)
 class LineTiming:
-    """One line with a drive at its end."""
+    """Timing of one line with a drive at its end."""
 
     character_s: float = 0.0
     silence_s: float = 0.0
-    """Between two frames."""
+    """Silence between two frames, s."""
     turn_around_s: float = 0.0
     """Time from the end of a request at the drive to the first character of its reply, s."""
     latency_s: float = 0.0
-    """Each way."""
+    """Latency in each direction, s."""
     jitter_s: float = 0.0
-    """The most that is added to the latency, each way."""
+    """Largest addition to the latency in each direction, s."""
 
     @classmethod
     def rtu(cls, baud: int, turn_around_s: float) -> Self:
-        """A serial line."""
+        """Return the timing of a serial line."""
         character_s = CHARACTER_BITS / baud
         silence_s = _FIXED_SILENCE_S if baud > _FIXED_ABOVE_BAUD else 3.5 * character_s
         return cls(character_s=character_s, silence_s=silence_s, turn_around_s=turn_around_s)
 
     @classmethod
     def tcp(cls, turn_around_s: float, latency_s: float = TCP_LATENCY_S, jitter_s: float = TCP_JITTER_S) -> Self:
-        """A network."""
+        """Return the timing of a network."""
         return cls(turn_around_s=turn_around_s, latency_s=latency_s, jitter_s=jitter_s)
 
     @classmethod
     def of(cls, line: BusLine) -> Self:
-        """The line that a profile describes: TCP where it has that."""
+        """Return the timing of the line that a profile describes: TCP if the profile has it."""
         if "tcp" in line.transports:
             return cls.tcp(line.turn_around_s)
         return cls.rtu(line.baud, line.turn_around_s)
@@ -89,14 +89,14 @@ class LineTiming:
 _BROADCAST = 0
 AT_REST_RAD_S = 0.01
 RESTING_S, LONGEST_S = 1.2, 60.0
-"""How long a shaft that the host has left must be at rest, and how long it is watched at most."""
+"""Duration of standstill after which a shaft without a host is no longer simulated, and longest simulated time, s."""
 _LOOK_S = 0.1
 
 
 class EmbeddedModbusDrive:
-    """A drive that wears ``profile``, at the end of a line of ``timing`` (the profile's own unless given).
+    """A drive with ``profile``, at the end of a line with ``timing`` (by default that of the profile).
 
-    ``script`` as `sim_bus.modbus.faults.parse_all` gives it. TdhilError where it doesn't fit the profile.
+    ``script``: result of `sim_bus.modbus.faults.parse_all`. Raises TdhilError if it does not fit the profile.
     """
 
     def __init__(self, params: RigParams, profile: ModbusProfile, *, unit: int = 1, seed: int = 0,
@@ -108,33 +108,33 @@ class EmbeddedModbusDrive:
         self.machine = Machine(params, profile, seed=seed, trace=trace, wrongs=wrongs, stepped=True)
         self._faults = Faults(self.machine, profile, script, seed)
         self._chances = np.random.default_rng((seed, 1))
-        self._free_s = 0.0              # the line has been silent long enough from here on
+        self._free_s = 0.0              # time from which the line has been silent long enough
         self._time_s = 0.0
         self._closed = False
 
     @property
     def time_s(self) -> float:
-        """Control time up to which the drive has run."""
+        """Control time up to which the drive has run, s."""
         return self._time_s
 
     @property
     def speed_rad_s(self) -> float:
-        """The true shaft's speed."""
+        """Speed of the true shaft, rad/s."""
         return self.machine.inverter.speed_rad_s
 
     @property
     def faults_waiting(self) -> tuple[str, ...]:
-        """Scripted faults whose moment hasn't come, as they were written."""
+        """Scripted faults that have not begun yet, as they were written."""
         return self._faults.waiting
 
     @property
     def rated_torque_nm(self) -> float:
-        """100 % torque."""
+        """100 % torque, N·m."""
         return self.machine.parameters.rated_torque_nm
 
     @property
     def untold(self) -> Mapping[str, float]:
-        """Values of the parameters that have no register: what rig.yaml would have to state."""
+        """Values of the parameters without a register, as rig.yaml would have to state them."""
         return self.machine.parameters.untold
 
     def serve(
@@ -145,7 +145,7 @@ class EmbeddedModbusDrive:
         ``connection`` distinguishes clients. The plant has then run up to the moment at which the drive acted. A busy
         line delays the request.
         """
-        if unit == self.unit and tells_stage(pdu):     # belongs to the rehearsal: takes no time on the line
+        if unit == self.unit and tells_stage(pdu):  # the stage belongs to the rehearsal: it takes no time on the line
             self.run_until(now_s)
             return self._faults.request(pdu).pdu, now_s
         timing = self.timing
@@ -164,7 +164,7 @@ class EmbeddedModbusDrive:
         return heard, complete_s + reply.late_s
 
     def run_until(self, time_s: float) -> None:
-        """The plant runs on; a watchdog that is due acts on the way."""
+        """Advance the plant. A watchdog that becomes due acts on the way."""
         if time_s > self._time_s:
             self._time_s = time_s
             self.machine.run_until(time_s)
@@ -180,7 +180,7 @@ class EmbeddedModbusDrive:
             resting_s = resting_s + _LOOK_S if abs(self.speed_rad_s) < AT_REST_RAD_S else 0.0
 
     def close(self) -> None:
-        """The trace is written; safe to repeat."""
+        """Close the trace; safe to repeat."""
         self._closed = True
         self.machine.close()
 

@@ -1,4 +1,4 @@
-"""Scripted faults of one simulated Modbus drive: each fault begins and ends on time, requests pass through active ones.
+"""Scripted faults of one simulated Modbus drive: each fault begins and ends on time, and changes requests and replies.
 
 All times are plant time. The host's write of the stage (`profiles.simulator_marker.MARKER_STAGE_REGISTER`) belongs to
 the rehearsal, not to the line: no fault affects it.
@@ -37,11 +37,11 @@ from sim_bus.modbus.wrong_maps import Wrong, parse
 from sim_bus.reports import Lie, lying
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a scripted fault of a Modbus drive may do: come between request and reply, and lay hands on the drive itself.
+# Effects of a scripted fault of a Modbus drive: it acts between request and reply, or changes the drive itself.
 
 
 Ask = Callable[[bytes], DriveReply]
-"""A request PDU → what comes back for it."""
+"""Function: request PDU → reply."""
 
 
 @dataclass(frozen=True)
@@ -54,17 +54,17 @@ class Scene:
 
 
 class Misbehaviour(Passing):
-    """Nothing by itself; a fault overrides what it needs. `begin` comes before anything else."""
+    """A fault without effect; a subclass overrides the methods that it needs. `begin` is called first."""
 
     scene: Scene
 
     def asked(self, pdu: bytes, ask: Ask) -> DriveReply:
-        """A request comes; ``ask`` is what would happen to it without this fault."""
+        """Return the reply to a request. ``ask`` returns the reply without this fault."""
         return ask(pdu)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Faults of a Modbus line: requests and replies that are lost, late, damaged, refused, old; connections that die.
+# Faults of a Modbus line: requests and replies that are lost, late, damaged, refused or old; connections that end.
 #
 # Codes and frames: Modbus application protocol V1.1b3, section 7; messaging guide, 3.1.3; serial line guide, 2.5.1.
 
@@ -74,7 +74,7 @@ _TABLES = {3: "holding", 4: "input", 23: "holding"}
 
 
 class _Some(Misbehaviour):
-    """Happens to a share of the requests."""
+    """Base of faults that affect a share of the requests."""
 
     def __init__(self, share: float) -> None:
         self._share = share
@@ -87,28 +87,28 @@ class _Some(Misbehaviour):
 
 
 class LostExchange(_Some):
-    """Neither request nor reply gets through; the drive doesn't act."""
+    """Loss of request and reply; the drive does not act."""
 
     def _spoilt(self, pdu: bytes, ask: Ask) -> DriveReply:
         return NONE
 
 
 class WrongTransaction(_Some):
-    """The drive acts, and its reply bears the transaction of another request."""
+    """Wrong transaction id: the drive acts, and its reply has the id of another request."""
 
     def _spoilt(self, pdu: bytes, ask: Ask) -> DriveReply:
         return ask(pdu)._replace(transaction_bits=_OTHER_TRANSACTION)
 
 
 class BadCrc(_Some):
-    """The drive acts, and its reply has a wrong CRC."""
+    """Wrong CRC: the drive acts, and the CRC of its reply is wrong."""
 
     def _spoilt(self, pdu: bytes, ask: Ask) -> DriveReply:
         return ask(pdu)._replace(crc_bits=_OTHER_CRC)
 
 
 class Short(_Some):
-    """The drive acts, and says half of its reply."""
+    """Short reply: the drive acts, and sends half of its reply."""
 
     def _spoilt(self, pdu: bytes, ask: Ask) -> DriveReply:
         reply = ask(pdu)
@@ -116,7 +116,7 @@ class Short(_Some):
 
 
 class LateReply(Misbehaviour):
-    """The drive acts at once, and its reply comes so much later, s."""
+    """Late reply: the drive acts at once, and its reply comes later by this time, s."""
 
     def __init__(self, late_s: float) -> None:
         self._late_s = late_s
@@ -127,7 +127,7 @@ class LateReply(Misbehaviour):
 
 
 class Refusing(Misbehaviour):
-    """The drive hears every request, does nothing, and answers with an exception."""
+    """Refusal: the drive receives every request, does nothing, and replies with an exception."""
 
     def __init__(self, code: int) -> None:
         self._code = code
@@ -137,7 +137,7 @@ class Refusing(Misbehaviour):
 
 
 class LostConnection(Misbehaviour):
-    """The connection on which the next request comes is lost, once; a new one works."""
+    """Loss of the connection on which the next request comes, once. A new connection works."""
 
     def __init__(self, how: Literal["reset", "half-open"]) -> None:
         self._how: Literal["reset", "half-open"] = how
@@ -151,9 +151,9 @@ class LostConnection(Misbehaviour):
 
 
 class FrozenReads(Misbehaviour):
-    """Feedback reads repeat the first values: a gateway that repeats its process image.
+    """Frozen feedback: reads repeat the first values, like a gateway that repeats its process image.
 
-    Writes pass through.
+    Writes are not affected.
     """
 
     def __init__(self) -> None:
@@ -169,7 +169,7 @@ class FrozenReads(Misbehaviour):
         return reply._replace(pdu=self._kept.setdefault(pdu[:5], reply.pdu))
 
     def _is_feedback(self, pdu: bytes) -> bool:
-        """Reads speed or torque."""
+        """Return whether the request reads speed or torque."""
         table = _TABLES.get(pdu[0])
         first, count = int.from_bytes(pdu[1:3], "big"), int.from_bytes(pdu[3:5], "big")
         cycle = self.scene.profile.cycle
@@ -180,11 +180,11 @@ class FrozenReads(Misbehaviour):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Faults of the Modbus drive itself and of what it turns.
+# Faults of the Modbus drive itself and of its load.
 
 
 class Act(Misbehaviour):
-    """Something is done to the drive, and undone where it can be."""
+    """A change of the drive, which is reversed at the end if possible."""
 
     def __init__(self, begin: Callable[[Machine], None], end: Callable[[Machine], None] | None = None) -> None:
         self._begin, self._end = begin, end
@@ -198,7 +198,7 @@ class Act(Misbehaviour):
 
 
 class NotArmed(Misbehaviour):
-    """The watchdog's time is written without an error, and keeps what it was."""
+    """Watchdog that is not armed: its time is written without an error, and keeps its value."""
 
     def begin(self) -> None:
         watchdog = self.scene.profile.watchdog.parameter
@@ -210,28 +210,28 @@ class NotArmed(Misbehaviour):
 
 
 def drive_fault() -> Act:
-    """The drive finds a fault: its own fault reaction, then fault."""
+    """Return the fault: the drive finds a fault, executes its fault reaction, and stays in fault."""
     return Act(Machine.trip)
 
 
 def stuck() -> Act:
-    """The state machine doesn't move on commands any more."""
+    """Return the fault: the state machine ignores all commands."""
     return Act(lambda machine: _deaf(machine, True), lambda machine: _deaf(machine, False))
 
 
 def safe_torque_off() -> Act:
-    """STO: torque off at once, and no enabling while it lasts. The shaft coasts."""
+    """Return the fault STO: torque off at once, and no enabling while it lasts. The shaft coasts."""
     def begin(machine: Machine) -> None:
         mode = machine.application.mode
         machine.application.power_off()
-        machine.application.set_mode(mode.value)        # how the drive regulates is its wiring's
+        machine.application.set_mode(mode.value)        # the control mode follows from the wiring
         _deaf(machine, True)
 
     return Act(begin, lambda machine: _deaf(machine, False))
 
 
 def mode_kept() -> Act:
-    """Speed or torque is chosen and not followed; the display shows what was before."""
+    """Return the fault: speed or torque is selected without effect; the display shows the old mode."""
     def keep(machine: Machine, keeps: bool) -> None:
         machine.application.keeps_mode = keeps
 
@@ -239,7 +239,7 @@ def mode_kept() -> Act:
 
 
 def mode_lost() -> Act:
-    """The drive regulates speed from then on, whatever is chosen, and shows it."""
+    """Return the fault: the drive controls speed from then on, whatever is selected, and displays it."""
     def lose(machine: Machine) -> None:
         machine.application.set_mode(OperationMode.CYCLIC_VELOCITY.value)
         machine.application.keeps_mode = True
@@ -251,22 +251,22 @@ def mode_lost() -> Act:
 
 
 def limited_torque(share: float) -> Act:
-    """An internal limit leaves this share of the torque limits, whatever their registers say."""
+    """Return the fault: an internal limit leaves this share of the torque limits, independent of their registers."""
     return Act(lambda machine: machine.leave_torque(share), lambda machine: machine.leave_torque(1.0))
 
 
 def hot(temperature_c: float) -> Act:
-    """Motor and drive have become so hot."""
+    """Return the fault: motor and drive have this temperature, °C."""
     return Act(lambda machine: machine.heat(temperature_c), lambda machine: machine.heat(40.0))
 
 
 def load_lost(share: float) -> Act:
-    """The coupled load comes off: this share of the motor end's inertia and friction is left."""
+    """Return the fault: the coupled load is lost, and this share of the motor end's inertia and friction is left."""
     return Act(lambda machine: machine.inverter.lose_load(share))
 
 
 def lying_drive(lie: Lie) -> Act:
-    """Sensor, power stage or reports of the drive are wrong (`sim_bus.reports`)."""
+    """Return the fault: sensor, power stage or reports of the drive are wrong (`sim_bus.reports`)."""
     return Act(lambda machine: lie.begin(machine.inverter.lies), lambda machine: lie.end(machine.inverter.lies))
 
 
@@ -275,17 +275,17 @@ def _deaf(machine: Machine, deaf: bool) -> None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The faults that can be scripted on Modbus: name, row of the fault table, what they do, what their value means.
+# Table of the faults on Modbus: name, row of the fault table, effect, meaning of the value.
 
 
 WRONGS = {
     "word-order": "word_order", "scale-10": "scale_10", "address-off-by-one": "address_off_by_one", "sign": "sign",
     "unsigned": "unsigned", "write-not-kept": "write_not_applied", "reads-back-otherwise": "reads_back_something_else",
 }
-"""Faults that are the drive's wiring (`sim_bus.modbus.wrong_maps`): so from the start, for good."""
+"""Faults that are errors of the register map (`sim_bus.modbus.wrong_maps`), from the start and without end."""
 
 ONLY_ON = {"wrong-transaction-id": ("tcp",), "reset": ("tcp",), "half-open": ("tcp",), "bad-crc": ("rtu", "embedded")}
-"""Lines on which a fault can be, where that isn't all of tcp, rtu and embedded."""
+"""Lines on which a fault is possible, if not on all of tcp, rtu and embedded."""
 
 _LINES = {
     "tcp": "tdhil simulate modbus --tcp HOST:PORT", "rtu": "tdhil simulate modbus --rtu",
@@ -368,7 +368,7 @@ make, listing = KINDS.make, KINDS.listing
 
 
 def parse_all(texts: Sequence[str], line_kind: str) -> tuple[Scripted, ...]:
-    """All the faults of a command line, each checked, on ``tcp``, ``rtu`` or ``embedded``. Raises FaultRefused."""
+    """Return all faults of a command line, each checked, for ``tcp``, ``rtu`` or ``embedded``. Raises FaultRefused."""
     faults = KINDS.parse_all(texts)
     for fault in faults:
         where = f"--fault {fault.text}"
@@ -383,7 +383,9 @@ def parse_all(texts: Sequence[str], line_kind: str) -> tuple[Scripted, ...]:
 
 
 def wrongs_of(script: Iterable[Scripted], parameters: Sequence[str]) -> tuple[Wrong, ...]:
-    """The wiring that a script asks for. Raises FaultRefused for a parameter that the profile hasn't."""
+    """Return the errors of the register map in a script. Raises FaultRefused for a parameter that is not in the
+    profile.
+    """
     wrongs = []
     for fault in script:
         if fault.name not in WRONGS:
@@ -398,7 +400,7 @@ def wrongs_of(script: Iterable[Scripted], parameters: Sequence[str]) -> tuple[Wr
 
 
 def listed(line_kind: str) -> tuple[KnownFault, ...]:
-    """Every fault that there can be on ``tcp``, ``rtu`` or ``embedded``."""
+    """Return every fault that is possible on ``tcp``, ``rtu`` or ``embedded``."""
     kinds = Kinds({name: kind for name, kind in KINDS.items() if line_kind in ONLY_ON.get(name, _LINES)})
     return kinds.listed(WRONGS)
 
@@ -411,12 +413,12 @@ _STAGE_REGISTER = MARKER_STAGE_REGISTER.to_bytes(2, "big")
 
 
 def tells_stage(pdu: bytes) -> bool:
-    """The host says which stage has begun."""
+    """Return whether the request is the host's report of a stage."""
     return len(pdu) > 3 and pdu[0] in _WRITES and pdu[1:3] == _STAGE_REGISTER
 
 
 class Faults:
-    """The script of one drive; from now on it happens. Requests come in by `request`."""
+    """Script of one drive, active from now on. Requests come in by `request`."""
 
     def __init__(self, machine: Machine, profile: ModbusProfile, script: tuple[Scripted, ...] = (),
                  seed: int = 0) -> None:
@@ -433,16 +435,16 @@ class Faults:
 
     @property
     def waiting(self) -> tuple[str, ...]:
-        """Faults whose moment hasn't come, as they were written."""
+        """Faults that have not begun yet, as they were written."""
         return self._cast.waiting
 
     def moved(self, now_us: int) -> None:
-        """Plant time has come so far."""
+        """Begin and end the faults that are due at this plant time, µs."""
         if self._cast.moved(now_us, self._machine.note):
             self._machine.application.regulate()
 
     def request(self, pdu: bytes, connection: int = 0) -> DriveReply:
-        """A request for the drive, at the time that it is: what comes back."""
+        """Return the reply to a request to the drive at the present time."""
         ask: Ask = partial(self._ask, connection=connection)
         if tells_stage(pdu):
             return ask(pdu)

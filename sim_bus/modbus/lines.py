@@ -1,4 +1,4 @@
-"""Lines of the simulated drive: a TCP port, a serial device, or a pseudo terminal that it makes itself."""
+"""Lines of the simulated drive: a TCP port, a serial device, or a pseudo terminal that it creates itself."""
 
 import os
 import socket
@@ -20,22 +20,23 @@ from sim_bus.modbus.codec import DriveReply
 #     TCP   transaction:2 protocol:2 = 0  length:2  unit:1  PDU          (messaging guide, section 3.1.3)
 #     RTU   unit:1  PDU  CRC:2, low byte first                            (serial line guide, section 2.5.1)
 #
-# The RTU end of frame is known from its function code; where the code is unknown, from a CRC that fits. Silence clears
-# what is left of a broken frame. Written for the drive alone; the host has its own.
+# The end of an RTU frame is known from its function code; for an unknown code, from a CRC that fits. Silence clears the
+# rest of a broken frame. The code is written for the drive alone; the host has its own.
 
 
 _MBAP = Struct(">HHHB")
 _LONGEST_TCP = 260
 _LONGEST_RTU = 256
 _SILENCE_S = 0.05
-"""A pty has no bit rate, and a host may be held up between two bytes: far more than the 1.75 ms of a line."""
+"""Silence that ends a frame, s. A pty has no bit rate, and a host may be delayed between two bytes, so it is much
+longer than the 1.75 ms of a line."""
 _FIXED = dict.fromkeys((1, 2, 3, 4, 5, 6, 8), 8)
 _COUNTED = {15: (6, 9), 16: (6, 9), 23: (10, 13)}
-"""function: (where its byte count stands, length without what it counts)."""
+"""function: (position of its byte count, length without the counted bytes)."""
 
 
 class ReceivedRequest(NamedTuple):
-    """To whom, what, and the transaction that the reply repeats; ``connection`` tells clients apart."""
+    """Unit, PDU, and the transaction id that the reply repeats. ``connection`` distinguishes clients."""
 
     unit: int
     pdu: bytes
@@ -44,11 +45,11 @@ class ReceivedRequest(NamedTuple):
 
 
 class NotModbus(Exception):
-    """The peer doesn't speak Modbus."""
+    """Error for a peer that does not use Modbus."""
 
 
 def tcp_requests(buffer: bytearray) -> Iterator[ReceivedRequest]:
-    """Takes whole frames off ``buffer``. NotModbus for anything else."""
+    """Take whole frames off ``buffer`` and yield them. Raises NotModbus for other data."""
     while len(buffer) >= _MBAP.size:
         transaction, protocol, length, unit = _MBAP.unpack_from(buffer)
         if protocol or not 2 <= length <= _LONGEST_TCP - 6:
@@ -61,19 +62,19 @@ def tcp_requests(buffer: bytearray) -> Iterator[ReceivedRequest]:
 
 
 def tcp_reply(request: ReceivedRequest, pdu: bytes, wrong_bits: int = 0) -> bytes:
-    """The frame that answers; ``wrong_bits`` of its transaction are another's."""
+    """Return the frame of a reply; ``wrong_bits``: bits of its transaction id that are inverted."""
     return _MBAP.pack(request.transaction ^ wrong_bits, 0, len(pdu) + 1, request.unit) + pdu
 
 
 class RtuReceiver:
-    """Bytes in as they come, requests out."""
+    """Receiver of RTU bytes that yields requests."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._heard_s = 0.0
 
     def feed(self, data: bytes, now_s: float) -> Iterator[ReceivedRequest]:
-        """``now_s`` on any clock that doesn't go back."""
+        """Take received bytes and yield the requests. ``now_s``: time of any clock that doesn't go back."""
         if now_s - self._heard_s > _SILENCE_S:
             self._buffer.clear()
         self._heard_s = now_s
@@ -84,7 +85,7 @@ class RtuReceiver:
                 return
             frame, self._buffer = self._buffer[:length], self._buffer[length:]
             if crc(frame[:-2]) != int.from_bytes(frame[-2:], "little"):
-                self._buffer.clear()        # out of step: silence will tell where the next frame begins
+                self._buffer.clear()        # out of step: silence shows where the next frame begins
                 return
             yield ReceivedRequest(frame[0], bytes(frame[1:-2]))
 
@@ -105,13 +106,13 @@ class RtuReceiver:
 
 
 def rtu_reply(request: ReceivedRequest, pdu: bytes, wrong_bits: int = 0) -> bytes:
-    """The frame that answers; ``wrong_bits`` of its CRC are wrong."""
+    """Return the frame of a reply; ``wrong_bits``: bits of its CRC that are inverted."""
     body = bytes((request.unit,)) + pdu
     return body + (crc(body) ^ wrong_bits).to_bytes(2, "little")
 
 
 def crc(data: bytes | bytearray) -> int:
-    """CRC-16 of the serial line guide: polynomial A001h, reflected, from FFFFh."""
+    """Return the CRC-16 of the serial line guide: polynomial A001h, reflected, initial value FFFFh."""
     value = 0xFFFF
     for byte in data:
         value ^= byte
@@ -121,20 +122,20 @@ def crc(data: bytes | bytearray) -> int:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Frames that a scripted fault holds back, in real time.
+# Frames that a scripted fault delays, in real time.
 
 
 To = TypeVar("To")
 
 
 class LateQueue(Generic[To]):
-    """Each with whom it is for, until it is due."""
+    """Delayed frames with their receivers."""
 
     def __init__(self) -> None:
         self._held: list[tuple[float, To, bytes]] = []
 
     def put(self, to: To, frame: bytes, late_s: float) -> None:
-        """Due so long from now."""
+        """Add a frame that is due ``late_s`` from now."""
         self._held.append((time.monotonic() + late_s, to, frame))
 
     def due(self) -> list[tuple[To, bytes]]:
@@ -152,33 +153,33 @@ class LateQueue(Generic[To]):
 _CLIENTS = 16
 _SEND_TIMEOUT_S = 1.0
 _AT_ONCE = struct.pack("ii", 1, 0)
-"""SO_LINGER: closing sends a reset."""
+"""SO_LINGER setting with which closing sends a reset."""
 Serve = Callable[[ReceivedRequest], DriveReply]
-"""A request → what comes back."""
+"""Function: request → reply."""
 
 
 class RequestListener(Protocol):
-    """A line on which requests come."""
+    """A line on which requests arrive."""
 
     @property
     def reached_by(self) -> str:
-        """For the ready line."""
+        """Return the address for the ready line."""
 
     def sources(self) -> list[int]:
-        """File descriptors to wait for."""
+        """Return the file descriptors to wait for."""
 
     def ready(self, source: int, serve: Serve) -> None:
-        """One of them has something."""
+        """Handle data on one of these descriptors."""
 
     def send_late(self) -> None:
-        """Replies that were held back and are due."""
+        """Send the delayed replies that are due."""
 
     def close(self) -> None:
-        """Gives everything back; safe to repeat."""
+        """Close the line; safe to repeat."""
 
 
 class TcpListener:
-    """Modbus TCP, several hosts at a time."""
+    """Modbus TCP for several hosts at a time."""
 
     def __init__(self, host: str, port: int) -> None:
         try:
@@ -190,8 +191,8 @@ class TcpListener:
                 entry=MessageCode.SIMULATOR_UNUSABLE,
             ) from error
         self._clients: dict[int, tuple[socket.socket, bytearray, int]] = {}
-        self._accepted = 0             # so many clients so far: the last one's number
-        self._silent: list[socket.socket] = []     # half open: never looked at again
+        self._accepted = 0             # number of clients so far
+        self._silent: list[socket.socket] = []     # half-open connections: never read again
         self._late: LateQueue[socket.socket] = LateQueue()
 
     @property
@@ -228,7 +229,7 @@ class TcpListener:
 
     def send_late(self) -> None:
         for client, frame in self._late.due():
-            with suppress(OSError):            # it has gone: so is the reply
+            with suppress(OSError):            # the client has gone, so the reply is lost
                 client.sendall(frame)
 
     def close(self) -> None:
@@ -260,7 +261,7 @@ class TcpListener:
 
 
 class RtuListener:
-    """Modbus RTU on a terminal: a serial device, or without one a pseudo terminal whose other end hosts open."""
+    """Modbus RTU on a terminal: a serial device, or a pseudo terminal whose other end hosts open."""
 
     def __init__(self, device: str | None, *, baud: int, parity: str, stop_bits: int) -> None:
         self._slave = -1
@@ -275,7 +276,7 @@ class RtuListener:
             ) from error
         try:
             if device is None:
-                self._fd, self._slave = os.openpty()       # kept open, or reading fails whenever no host is there
+                self._fd, self._slave = os.openpty()       # kept open, or reading fails while there is no host
                 tty.setraw(self._slave)
                 self.reached_by = f"rtu {os.ttyname(self._slave)}"
             else:
@@ -333,7 +334,7 @@ def _write(fd: int, frame: bytes) -> None:
 
 
 def _set_line(fd: int, baud: int, parity: str, stop_bits: int) -> None:
-    """Raw, eight bits, at the given rate; termios.error where the device can't."""
+    """Set a raw line with eight bits at the given rate. Raises termios.error if the device does not support it."""
     import termios
     import tty
 

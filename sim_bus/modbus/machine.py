@@ -1,7 +1,7 @@
 """Simulated drive with the interface of a profile: registers, words, watchdog, loops and shaft, without its bus.
 
-Plant and control move on the drive's own grid, the control period of plant.yaml; a request acts between two steps.
-It owns no clock: the caller of `run_until` states the time.
+Plant and control advance on the drive's own grid, the control period of plant.yaml. A request acts between two steps.
+The module owns no clock: the caller of `run_until` states the time.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,8 @@ from sim_bus.params import RigParams
 from sim_bus.trace import ROW_PERIOD_US, ShaftTrace
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The drive's supervision of its host: begins with the first message that feeds it, acts once when none comes. Pure.
+# The drive's supervision of its host. It begins with the first message that feeds it, and acts once if none comes.
+# Pure.
 
 
 _OWN = "_of_this_connection"
@@ -36,10 +37,12 @@ class SimulatedWatchdog:
         self._commander: int | None = None
         self._fed_s: float | None = None
         self.lost = False
-        """The host has been found silent, and hasn't been heard since."""
+        """True if the host has been found silent and was not received since."""
 
     def heard(self, time_s: float, *, wrote: bool, commanded: bool, connection: int = 0) -> None:
-        """A request for this drive came; ``connection`` tells clients apart: the first that commands is the host."""
+        """Record a request to this drive. ``connection`` distinguishes clients: the first one that commands is the
+        host.
+        """
         if commanded and (self._commander is None or self.lost):
             self._commander = connection
         if self._own_only and connection != self._commander:
@@ -49,7 +52,7 @@ class SimulatedWatchdog:
             self.lost = False
 
     def expired(self, time_s: float, timeout_s: float) -> bool:
-        """The host has just been silent for too long; 0 s switches the supervision off."""
+        """Return True once after the host was silent for ``timeout_s``; 0 s switches the supervision off."""
         if self._fed_s is None or timeout_s <= 0.0 or time_s - self._fed_s < timeout_s:
             return False
         self._fed_s = None
@@ -69,7 +72,7 @@ standstill to the default rig's speed limit in 14 s. The profiles have no regist
 
 
 class Machine:
-    """A drive on Modbus, and the shaft on it."""
+    """A drive on Modbus with its shaft."""
 
     def __init__(self, params: RigParams, profile: ModbusProfile, *, seed: int = 0, trace: Path | None = None,
                  wrongs: tuple[Wrong, ...] = (), stepped: bool = True) -> None:
@@ -92,8 +95,8 @@ class Machine:
         self._next_row_us = 0
         self._torque_share = 1.0
         self._connection = 0
-        self._was_told = False         # the request that is being answered says which stage has begun
-        self.on_time: Callable[[int], None] | None = None      # plant time in µs, after each step
+        self._was_told = False         # the present request reports a stage
+        self.on_time: Callable[[int], None] | None = None      # called with plant time in µs after each step
         self.on_stage: Callable[[int], None] = lambda _number: None
         application.on_event = self.note
         self._obey_parameters()
@@ -101,11 +104,11 @@ class Machine:
 
     @property
     def time_s(self) -> float:
-        """Plant time."""
+        """Plant time, s."""
         return self._steps * self._period_s
 
     def request(self, pdu: bytes, connection: int = 0) -> bytes:
-        """A request for this drive, at the time that it is; ``connection`` tells clients apart."""
+        """Return the reply to a request at the present time; ``connection`` distinguishes clients."""
         self._connection = connection
         self._was_told = False
         answer = self._bank.answer(pdu)
@@ -114,21 +117,21 @@ class Machine:
         return answer.pdu
 
     def refuse(self, pdu: bytes, code: int) -> bytes:
-        """Scripted: a request is heard and not done; the reply is an exception of this code."""
+        """Scripted: receive a request without executing it, and reply with the exception of this code."""
         self._fed(Answer(b""))
         return bytes((pdu[0] | 0x80, code))
 
     def heat(self, temperature_c: float) -> None:
-        """Scripted: whatever the drive tells a temperature of has this one."""
+        """Scripted: set this temperature, °C, for all that the drive reports."""
         self._map.temperature_c = temperature_c
 
     def leave_torque(self, share: float) -> None:
-        """Scripted: an internal limit leaves this share of the torque limits."""
+        """Scripted: limit the torque internally to this share of the torque limits."""
         self._torque_share = share
         self._obey_parameters()
 
     def run_until(self, time_s: float) -> None:
-        """Everything moves on, up to the last step of the grid that is not later."""
+        """Advance everything up to the last step of the grid that is not later."""
         last = int(time_s / self._period_s * (1.0 + 1e-12) + 1e-6)
         if last > self._steps:
             self.application.regulate()
@@ -141,22 +144,22 @@ class Machine:
                 self.on_time(round(1e6 * self.time_s))
 
     def trip(self) -> None:
-        """The drive finds a fault of its own."""
+        """Enter a fault of the drive itself."""
         self.application.fault()
         self.note("fault")
 
     def note(self, event: str) -> None:
-        """A row of the trace that says what happened; '' is a new state."""
+        """Add a row with an event to the trace; '' is a new state."""
         state = self.application.state.value
         self._trace.row(self.time_s, self.inverter.speed_rad_s, self.inverter.torque_nm, state,
                         event or f"state: {state}")
 
     def close(self) -> None:
-        """The trace is written; safe to repeat."""
+        """Close the trace; safe to repeat."""
         self._trace.close()
 
     def flush(self) -> None:
-        """Lets readers of the trace see what is there."""
+        """Write buffered rows, so that readers of the trace see them."""
         self._trace.flush()
 
     def __enter__(self) -> Self:
@@ -168,7 +171,7 @@ class Machine:
     # -- inside --------------------------------------------------------------------------------------------
 
     def _worn(self, params: RigParams) -> RigParams:
-        """The rig, reporting as the profile's drive does: its own lags; the quanta are those of the registers."""
+        """Return the rig with the reporting lags of the profile's drive. The quantisation is that of the registers."""
         reporting: dict[str, float] = {"speed_quantum_rpm": 0.0, "torque_quantum_permille": 0.0}
         for signal in ("speed", "torque"):
             lag_s = reporting_lag_s(self._profile, self.parameters, signal)
@@ -208,7 +211,9 @@ class Machine:
             self._host_lost()
 
     def _host_lost(self) -> None:
-        """The profile's reaction; none where the parameter that chooses it reads something else than it should."""
+        """Execute the profile's reaction. There is none if the parameter that selects it does not have the required
+        value.
+        """
         self.note("host silent")
         watchdog, settings = self._profile.watchdog, self.application.settings
         self.application.warning = True

@@ -1,4 +1,4 @@
-"""The simulated drive's parameters: what each counts in, and what it does. What they start with: `start`."""
+"""The simulated drive's parameters: their units and effects. `start` sets their initial values."""
 
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from sim_bus.modbus.wrong_maps import Wrong, something_else
 from sim_bus.params import RigParams
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a parameter has to read, and a value that does.
+# Required value of a parameter: check, and a value that meets it.
 
 
 def meets(value: float, require: Require) -> bool:
-    """The value is as required."""
+    """Return whether the value is as required."""
     near = 1e-9 * max(1.0, abs(value))
     return (
         (require.equals is None or abs(value - require.equals) <= near)
@@ -28,7 +28,7 @@ def meets(value: float, require: Require) -> bool:
 
 
 def value_that_meets(require: Require) -> float:
-    """One that does."""
+    """Return a value that meets the requirement."""
     if require.equals is not None:
         return require.equals
     choices = require.one_of or tuple(one for one in (require.at_least, require.at_most) if one is not None)
@@ -36,12 +36,12 @@ def value_that_meets(require: Require) -> float:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What the simulated drive's parameters start with.
+# Initial values of the simulated drive's parameters.
 #
-# A rig decides what a profile leaves open. Rated torque and name plate are the rig's, consistent with each other (P =
-# T·ω, after rounding to their registers); a filter tells the lag that the drive has, and the drive has the lag that
-# it tells; whatever the profile requires of a hand-set parameter is set, and a watchdog that is set by hand is;
-# everything else is at its documented default.
+# The rig determines values that a profile leaves open. Rated torque and name plate are the rig's, consistent with each
+# other (P = T·ω, after rounding to their registers). A filter parameter and the drive's lag agree. A parameter that the
+# profile requires to be set by hand is set, as is a watchdog that is set by hand. Every other parameter has its
+# documented default.
 
 
 QUICK_STOP_RAD_S2 = 3.0
@@ -53,11 +53,13 @@ _TIME_OUT_S = 0.5
 
 
 def start(store: ParameterStore, profile: ModbusProfile, rig: RigParams) -> float:
-    """Gives every parameter its first value; returns the rated speed, rpm. TdhilError where the rig doesn't fit."""
+    """Set the initial value of every parameter. Return the rated speed, rpm. Raises TdhilError if the rig
+    doesn't fit.
+    """
     plate = profile.name_plate
     torque_names = {name for name in (profile.rated_torque, plate and plate.torque) if name}
     rated_rpm = _fitting_rated_rpm(profile, rig)
-    # What multiplies others comes before them.
+    # Parameters that multiply others come first.
     for parameter in sorted(profile.parameters, key=lambda one: (one.times is not None, one.name not in torque_names)):
         name = parameter.name
         if name in torque_names:
@@ -84,7 +86,7 @@ def _put_exactly(store: ParameterStore, profile: ModbusProfile, name: str, value
 
 
 def _fitting_rated_rpm(profile: ModbusProfile, rig: RigParams) -> float:
-    """The speed limit, or what lets the registers of the name plate tell power and speed."""
+    """Return the speed limit, rpm, changed so that the name plate's registers can hold power and speed."""
     rpm = rig.drive.speed_limit_rpm
     if profile.name_plate is None:
         return rpm
@@ -115,7 +117,9 @@ def _initial(
 
 
 def _lag_s(profile: ModbusProfile, rig: RigParams, name: str) -> float | None:
-    """The rig's lag, for the first filter parameter of each signal; none for further ones."""
+    """Return the rig's lag, s, for the first filter parameter of each signal; 0 for further ones, None for other
+    parameters.
+    """
     for signal, lag_s in (("speed", rig.reporting.speed_lag_s), ("torque", rig.reporting.torque_lag_s)):
         names = [one.parameter for one in profile.filters if one.signal == signal and one.parameter]
         if name in names:
@@ -149,29 +153,31 @@ def _of_rig(store: ParameterStore, rig: RigParams, parameter: Parameter, rated_r
 # ---------------------------------------------------------------------------------------------------------------------
 
 _BEYOND = 1e12
-"""More than any register holds; finite."""
+"""A finite number that is larger than any register holds."""
 
 
 class ParameterStore:
-    """Numbers as they stand in the drive's registers, and their values."""
+    """Numbers in the drive's registers, and their values."""
 
     def __init__(self, profile: ModbusProfile, rig: RigParams, wrongs: tuple[Wrong, ...] = ()) -> None:
         self._profile = profile
         self._rig = rig
         self._by_name = {parameter.name: parameter for parameter in profile.parameters}
         self._by_role: dict[str, Parameter] = {one.set_to: one for one in profile.parameters if one.set_to}
-        self._stored: dict[str, float] = {}        # counts; of a parameter without register its value
-        self._acting: dict[str, float] = {}        # what still acts where another is stored: until a restart
+        self._stored: dict[str, float] = {}        # counts; without a register the value
+        self._acting: dict[str, float] = {}        # active value until a restart, if another one is stored
         self._tenths = any(wrong.kind == "scale_10" for wrong in wrongs)
         self._other = {wrong.of for wrong in wrongs if wrong.kind == "reads_back_something_else"}
-        self.not_kept = set[str]()                 # of these no writing is
+        self.not_kept = set[str]()                 # names of parameters that keep their value
         self.keeps = not any(wrong.kind == "write_not_applied" for wrong in wrongs)
         self.rated_rpm = start(self, profile, rig)
 
     # -- counts and values ---------------------------------------------------------------------------------
 
     def scale(self, per_lsb: float, unit: str, times: str | None, *, echo: bool = False) -> float:
-        """Units for one count of a register; what echoes a setpoint counts in units of its own, right or not there."""
+        """Return the units for one count of a register. An echo has a unit of its own, which the fault scale_10 does
+        not change.
+        """
         tenth = 0.1 if self._tenths and unit != "none" and not echo else 1.0
         return per_lsb * tenth * (self.value(times) if times is not None else 1.0)
 
@@ -200,7 +206,7 @@ class ParameterStore:
         self._stored[name] = number
 
     def put(self, name: str, value: float) -> None:
-        """Sets the value as closely as the register can."""
+        """Set the value as closely as the register permits."""
         parameter = self._by_name[name]
         if parameter.register_ is None:
             self._stored[name] = value
@@ -209,35 +215,35 @@ class ParameterStore:
             self._stored[name] = RegisterLayout(0, parameter.register_.type).saturated(counts)
 
     def _scale_of(self, parameter: Parameter) -> float:
-        # The time of a ramp names the speed at its upper end, which doesn't multiply it.
+        # `times` of a ramp time is the speed at the ramp's upper end, which is no factor.
         times = None if parameter.set_to in {"quick_stop_time", "ramp_up_time"} else parameter.times
         return self.scale(parameter.per_lsb, parameter.unit, times)
 
-    # -- what they mean ------------------------------------------------------------------------------------
+    # -- meaning -------------------------------------------------------------------------------------------
 
     @property
     def rated_torque_nm(self) -> float:
-        """100 % torque, as the drive tells it; the rig's where it can't."""
+        """100 % torque, N·m, as the drive reports it; the rig's if it does not."""
         name = self._profile.rated_torque
         return self.value(name) if name is not None else self._rig.drive.rated_torque_nm
 
     def si(self, value: float, unit: str) -> float:
-        """rad/s, rad/s², N·m or s of a value in a profile's unit."""
+        """Convert a value in a profile's unit to rad/s, rad/s², N·m or s."""
         if unit in {"rpm", "rpm_s"}:
             return value * RPM
         return value * self.rated_torque_nm if unit == "rated" else value
 
     def in_unit(self, si: float, unit: str) -> float:
-        """The other way."""
+        """Convert a value from SI to a profile's unit."""
         return si / self.si(1.0, unit)
 
     def met(self, name: str | None) -> bool:
-        """The parameter reads as required; True where nothing is."""
+        """Return whether the parameter has the required value; True without a requirement."""
         require = self._by_name[name].require if name is not None else None
         return require is None or name is None or meets(self.value(name), require)
 
     def quick_stop_rad_s2(self) -> float:
-        """The deceleration that the parameters give; 0 in either of them: as hard as the torque limit lets."""
+        """Return the deceleration by the parameters, rad/s²; inf, at the torque limit, for a parameter of 0."""
         parameter = self._by_role.get("quick_stop_deceleration")
         if parameter is not None:
             return self.value(parameter.name) * RPM or inf
@@ -248,24 +254,28 @@ class ParameterStore:
         return self.reference_rpm(parameter) * RPM / time_s if time_s else inf
 
     def limit_nm(self, role: str) -> float:
-        """A torque limit's magnitude, never above what the rig's inverter has."""
+        """Return the magnitude of a torque limit, N·m, at most that of the rig's inverter."""
         most = self._rig.drive.torque_limit_nm
         parameter = self._by_role.get(role) or self._by_role.get("torque_limit")
         return most if parameter is None else min(most, abs(self.si(self.value(parameter.name), parameter.unit)))
 
     def speed_limit_rad_s(self) -> float:
-        """Forwards, never above the rig's; the simulated loops have one limit for both directions."""
+        """Return the forward speed limit, rad/s, at most the rig's. The simulated loops have one limit for both
+        directions.
+        """
         most = self._rig.drive.speed_limit_rpm * RPM
         parameter = self._by_role.get("speed_limit")
         return most if parameter is None else min(most, abs(self.si(self.value(parameter.name), parameter.unit)))
 
     def reference_rpm(self, parameter: Parameter) -> float:
-        """The speed that a quick-stop time starts from."""
+        """Return the speed from which a quick-stop time counts, rpm."""
         return self.value(parameter.times) if parameter.times is not None else self.rated_rpm
 
 
 def reporting_lag_s(profile: ModbusProfile, parameters: ParameterStore, signal: str) -> float | None:
-    """The smoothing that the drive itself tells or documents for a signal; None where the profile says nothing."""
+    """Return the filter time constant that the drive reports or documents for a signal, s; None if the profile has
+    none.
+    """
     for one in profile.filters:
         if one.signal != signal:
             continue

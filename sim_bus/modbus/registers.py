@@ -6,10 +6,10 @@
     06      address word                                      → the same
     08      000Eh 0 (requests to this drive so far)           → the same, the count
     16      address count bytes words                         → address count
-    23      read address count, write address count bytes …   → bytes, words; the writing comes first
-    else    exception 1; unknown address 2; bad count or value 3; not now 4
+    23      read address count, write address count bytes …   → bytes, words; the write comes first
+    else    exception 1; unknown address 2; bad count or value 3; not possible now 4
 
-A read takes all registers of one moment. A write checks everything before anything acts.
+A read takes all registers at one moment. A write checks everything before anything acts.
 """
 
 
@@ -38,10 +38,10 @@ from sim_bus.modbus.wrong_maps import (
 from sim_bus.reports import Feedback
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Which register holds what: the profile's map laid over the simulated drive, with the wrongs that it has.
+# Content of each register: the profile's map over the simulated drive, with its scripted errors.
 #
-# Numbers in a slot are those of the register (counts); how they are scaled is the drive's own arithmetic, in floats,
-# and what doesn't fit saturates, as in a drive.
+# Numbers in a slot are those of the register (counts). The drive itself scales them, in floats. A number that doesn't
+# fit saturates, as in a drive.
 
 
 HOT_C = 120.0
@@ -50,18 +50,20 @@ HOT_C = 120.0
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """One number in its registers. ``refuses`` raises what `sim_bus.modbus.wrong_maps` has; nothing is written then."""
+    """One number in its registers. ``refuses`` raises the errors of `sim_bus.modbus.wrong_maps`; then nothing is
+    written.
+    """
 
     layout: RegisterLayout
     read: Callable[[], int]
     write: Callable[[int], None] | None = None
     refuses: Callable[[int], None] | None = None
     commands: bool = False
-    """Control word or setpoint."""
+    """True for the control word and for setpoints."""
 
 
 class Map:
-    """All slots; of two on one register the first counts."""
+    """All slots. If two use one register, the first counts."""
 
     def __init__(self, profile: ModbusProfile, parameters: ParameterStore, words: ControlWords,
                  wrongs: tuple[Wrong, ...],
@@ -71,7 +73,7 @@ class Map:
         self._words = words
         self._application: Application = words.application
         self._wrongs = {wrong.kind for wrong in wrongs}
-        self.temperature_c = 40.0      # of everything that has one
+        self.temperature_c = 40.0      # of all parts that report a temperature
         self._speed_counts = 0
         self._torque_counts = 0
         named = self._cycle() + self._mode() + self._echoes() + self._position() + self._families() + self._settings()
@@ -87,7 +89,7 @@ class Map:
         self._lay(Slot(RegisterLayout(MARKER_STAGE_REGISTER), lambda: self._stage, self._set_stage))
 
     def act(self) -> None:
-        """Setpoints take effect; where the drive isn't listening, they keep."""
+        """Apply the setpoints. If the drive ignores them now, they are kept."""
         application, words, cycle = self._application, self._words, self._profile.cycle
         if not words.listens:
             return
@@ -96,7 +98,7 @@ class Map:
         if cycle.torque_setpoint is not None:
             application.target_torque_nm = self._to_si(cycle.torque_setpoint, self._torque_counts)
 
-    # -- what stands in the registers ----------------------------------------------------------------------
+    # -- content of the registers --------------------------------------------------------------------------
 
     def _cycle(self) -> list[Slot]:
         cycle, words, application = self._profile.cycle, self._words, self._application
@@ -144,7 +146,7 @@ class Map:
         return [self._reported(echo, targets[echo.setpoint]) for echo in self._profile.echoes]
 
     def _position(self) -> list[Slot]:
-        """The sensor's angle in counts; the counter starts over when it is full."""
+        """Return the slots of the sensor's angle, counts. The counter starts over when it is full."""
         position = self._profile.position
         if position is None:
             return []
@@ -168,7 +170,7 @@ class Map:
         return slots
 
     def _temperature(self, layout: RegisterLayout, one: Temperature) -> int:
-        """Its number, or a word with its bits as they must stand."""
+        """Return its number, or a word with its bits in the required state."""
         if one.too_hot is not None:
             return one.too_hot.value if self._is_hot else ~one.too_hot.value & one.too_hot.mask
         share = self.temperature_c / (1.0 if one.unit == "celsius" else HOT_C)
@@ -183,7 +185,7 @@ class Map:
                 extra in self._words.extras().items()]
 
     def _settings(self) -> list[Slot]:
-        """Parameters: what preflight sets, or a person at the drive, may be written."""
+        """Return the slots of the parameters. Those that preflight or the operator sets may be written."""
         parameters, slots = self._parameters, list[Slot]()
         for one in self._profile.parameters:
             if one.register_ is None:
@@ -195,7 +197,7 @@ class Map:
         return slots
 
     def _lying(self, signal: Feedback, slot: Slot) -> Slot:
-        """A slot whose number goes through the scripted distortions of its word."""
+        """Return a slot whose number passes the scripted distortions of its word."""
         layout = slot.layout
         ones = -1 if layout.signed else layout.highest
         number = self._application.inverter.lies.word(signal, slot.read, ones)
@@ -270,7 +272,7 @@ class Map:
             self.slots.update(dict.fromkeys(keys, slot))
 
     def _fill_gaps(self, largest: int) -> None:
-        """Registers between two of the map that may be read along, and say nothing."""
+        """Add registers with the value 0 between two of the map that may be read together."""
         for table in ("holding", "input"):
             taken = sorted(address for where, address in self.slots if where == table)
             for low, high in pairwise(taken):
@@ -295,12 +297,12 @@ _BOTH = Struct(">HHHHB")
 
 
 class Answer(NamedTuple):
-    """A reply, and what the request did."""
+    """A reply, and the effect of its request."""
 
     pdu: bytes
     wrote: bool = False
     commanded: bool = False
-    """Wrote to the control word or a setpoint."""
+    """True if the request wrote the control word or a setpoint."""
 
 
 class Bank:
@@ -309,7 +311,7 @@ class Bank:
     def __init__(self, slots: Mapping[tuple[str, int], Slot], functions: tuple[int, ...], written: Callable[[], None],
                  *, largest_read: int, largest_write: int) -> None:
         self._slots = slots
-        self._written = written         # lets what has been written take effect
+        self._written = written         # applies the written values
         self._largest_read = largest_read
         self._largest_write = largest_write
         known: dict[int, Callable[[bytes], Answer]] = {
@@ -324,7 +326,7 @@ class Bank:
         self._known = {code: known[code] for code in {3, *functions}}
 
     def answer(self, pdu: bytes) -> Answer:
-        """The reply to one request; never raises."""
+        """Return the reply to one request. Never raises."""
         code = pdu[0] if pdu else 0
         self._asked += 1
         try:
@@ -378,13 +380,15 @@ class Bank:
         return Answer(self._read("holding", _PAIR.pack(read, read_count)), True, commanded)
 
     def _words_of(self, data: bytes, count: int) -> list[int]:
-        """The words after their byte count."""
+        """Return the words after their byte count."""
         if not 1 <= count <= self._largest_write or data[0] != 2 * count or len(data) != 1 + 2 * count:
             raise IllegalValue
         return [int.from_bytes(data[at : at + 2], "big") for at in range(1, len(data), 2)]
 
     def _write(self, address: int, words: list[int]) -> bool:
-        """Writes registers; True where one of them commands. Half of a 32-bit number leaves the other half."""
+        """Write registers. Return whether one of them commands. Half of a 32-bit number leaves the other
+        half as it is.
+        """
         images: dict[int, tuple[Slot, list[int]]] = {}
         for at, word in enumerate(words, address):
             slot = self._slots.get(("holding", at))

@@ -16,7 +16,7 @@ _ANY_UNIT = 255
 
 
 class DriveServer:
-    """One drive on one line, with what happens to its requests; `run` is the only thread."""
+    """One drive on one line, with its scripted faults; `run` is the only thread."""
 
     def __init__(self, machine: Machine, unit: int, listener: RequestListener, *, gateway: bool,
                  faults: Faults | None = None) -> None:
@@ -30,7 +30,7 @@ class DriveServer:
         self._began_s = time.monotonic()
 
     def run(self, stop: threading.Event) -> None:
-        """Serves until ``stop`` is set."""
+        """Serve until ``stop`` is set."""
         self._began_s = time.monotonic()
         while not stop.is_set():
             ready, _, _ = select.select(self._listener.sources(), [], [], _POLL_S)

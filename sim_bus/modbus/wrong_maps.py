@@ -1,17 +1,17 @@
-"""Scripted register-level wrongs: the drive's map isn't what its profile says. Pure.
+"""Scripted errors of the register map: the drive's map differs from its profile. Pure.
 
 ========================  ==========================================================================================
-word_order                32-bit numbers stand with their halves exchanged
+word_order                the halves of 32-bit numbers are exchanged
 scale_10                  every scaled register counts in tenths: its number is ten times as large
-address_off_by_one        every register stands one address higher
-sign                      what the drive reports of signed registers has the opposite sign
-unsigned                  signed registers have no sign: set below zero they read as large, reported is the magnitude
-write_not_applied         parameters are written without an error, and keep what they had
-reads_back_something_else `:NAME` the parameter NAME reads half as large again, and one more
+address_off_by_one        every register has an address that is one higher
+sign                      the reported values of signed registers have the opposite sign
+unsigned                  signed registers have no sign: negative setpoints count as large, magnitudes are reported
+write_not_applied         parameters are written without an error, and keep their values
+reads_back_something_else `:NAME` the parameter NAME reads as 1.5 times its value plus one count
 ========================  ==========================================================================================
 
-A register that echoes a setpoint is another one, with a count and a type of its own: scale_10 and unsigned leave it as
-it is, and what the drive has made of the setpoint shows there.
+A register that echoes a setpoint is another register, with a count and a type of its own. scale_10 and unsigned do not
+change it, so it shows the setpoint as the drive understood it.
 """
 
 
@@ -22,35 +22,35 @@ from typing import Literal, get_args
 from sim_bus.fault_script import FaultRefused
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How the drive refuses a request: a Modbus exception reply (Modbus application protocol, section 7).
+# Refusal of a request by the drive: a Modbus exception reply (Modbus application protocol, section 7).
 
 
 class RequestRefused(Exception):
-    """The request is answered by an exception of this code."""
+    """Error that is answered by an exception of this code."""
 
     code = 4
 
 
 class IllegalFunction(RequestRefused):
-    """01: the drive doesn't know the function."""
+    """01: the drive does not support the function."""
 
     code = 1
 
 
 class IllegalAddress(RequestRefused):
-    """02: no such register, or not to be written."""
+    """02: no such register, or it must not be written."""
 
     code = 2
 
 
 class IllegalValue(RequestRefused):
-    """03: a count or a value that can't be."""
+    """03: an impossible count or value."""
 
     code = 3
 
 
 class DeviceFailure(RequestRefused):
-    """04: understood, and can't be done now."""
+    """04: the request is valid, but can't be executed now."""
 
     code = 4
 
@@ -64,14 +64,16 @@ KINDS: tuple[str, ...] = get_args(Kind)
 
 @dataclass(frozen=True, slots=True)
 class Wrong:
-    """One wrong; ``of`` names the parameter that reads back something else."""
+    """One error of the map; ``of`` names the parameter that reads back another value."""
 
     kind: Kind
     of: str | None = None
 
 
 def parse(text: str, parameters: Iterable[str] = ()) -> Wrong:
-    """``scale_10``, or ``reads_back_something_else:time_out``; FaultRefused names what there is."""
+    """Return the error of ``scale_10`` or ``reads_back_something_else:time_out``. Raises FaultRefused with the known
+    ones.
+    """
     kind, _, of = text.partition(":")
     known = tuple(parameters)
     if kind not in KINDS:

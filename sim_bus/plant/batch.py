@@ -4,16 +4,16 @@ r"""Many rigid shafts at once: the equations of `sim_bus.plant.rigid`, one state
 
     J dω/dt = u − B ω − T_f          u = torque − load, held constant over a step
 
-State is an array of three rows (speed, angle, bristle) and one column per run; parameters are arrays of one entry per
-run, and so is the step: runs of different duration go through the same number of steps. Every formula is the scalar
-plant's (exact for Coulomb friction; bristle exact and speed of second order for Dahl's), evaluated for all runs, with
-the choice between cases as masks. It agrees with the scalar plant to 1e-9, relative to the larger of 1 and the value,
-over a run of thousands of steps; what differs is the last bit of numpy's exponential.
+The state is an array of three rows (speed, angle, bristle) and one column per run. Parameters and step are arrays of
+one entry per run: runs of different duration have the same number of steps. Every formula is the scalar plant's (exact
+for Coulomb friction; bristle exact and speed of second order for Dahl's), evaluated for all runs, with masks that
+select between cases. The result agrees with the scalar plant to 1e-9, relative to the larger of 1 and the value, over a
+run of thousands of steps. The difference is the last bit of numpy's exponential.
 
-A bristle wants a short step, σ h²/J ≤ 0.005. Where that fails the scalar plant cuts the step into pieces, each run its
-own number; here such a step is refused.
+A bristle needs a short step, σ h²/J ≤ 0.005. Otherwise the scalar plant divides the step into pieces, whose number
+differs between runs; here such a step is refused.
 
-There is no clock and no seed here: time is the caller's, and so is the generator of `white_torque`.
+There is no clock and no seed here: the caller provides the time and the generator of `white_torque`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SPEED, ANGLE, BRISTLE = 0, 1, 2
 """Rows of the state."""
 
 LARGEST_BRISTLE_STEP = 0.005
-"""σ h²/J: the scalar plant's own bound, above which it takes more pieces."""
+"""Largest σ h²/J, as in the scalar plant. Above it the scalar plant divides the step."""
 
 _TINY = 1e-15
 _LIGHTLY_DAMPED = 0.02
@@ -50,14 +50,14 @@ class Shafts:
     coulomb_nm: FloatArray
     dahl_stiffness_nm_rad: FloatArray
     dahl: BoolArray
-    """Dahl's bristle where true, else Coulomb friction."""
+    """True: Dahl's bristle; False: Coulomb friction."""
 
     @classmethod
     def of(
         cls, inertia_kg_m2: ArrayLike, viscous_nm_s_rad: ArrayLike, coulomb_nm: ArrayLike,
         dahl_stiffness_nm_rad: ArrayLike, dahl: ArrayLike,
     ) -> Shafts:
-        """Make shafts from numbers or lists, each spread over as many runs as the longest has."""
+        """Return shafts from numbers or lists, each expanded to the number of runs of the longest."""
         numbers = np.broadcast_arrays(
             *(np.atleast_1d(np.asarray(one, dtype=np.float64))
               for one in (inertia_kg_m2, viscous_nm_s_rad, coulomb_nm, dahl_stiffness_nm_rad, dahl))
@@ -65,19 +65,19 @@ class Shafts:
         inertia, viscous, coulomb, stiffness, bristles = (np.array(one) for one in numbers)
         if np.any(inertia <= 0.0) or np.any(stiffness <= 0.0) or np.any(viscous < 0.0) or np.any(coulomb < 0.0):
             raise ValueError("inertia and stiffness must be positive, friction not negative")
-        # A bristle without friction carries nothing, and its equation divides by the friction.
+        # A bristle without friction carries no load, and its equation divides by the friction.
         return cls(inertia, viscous, coulomb, stiffness, (bristles != 0.0) & (coulomb > 0.0))
 
     def __len__(self) -> int:
         return len(self.inertia_kg_m2)
 
     def at_rest(self) -> FloatArray:
-        """The state of shafts that have never moved."""
+        """Return the state of shafts that have never moved."""
         return np.zeros((3, len(self)))
 
 
 class FixedStep:
-    """Advances all shafts by one step of ``dt_s`` (one number, or one for each run)."""
+    """Solver of one step of ``dt_s`` for all shafts (one number, or one for each run)."""
 
     def __init__(self, shafts: Shafts, dt_s: ArrayLike) -> None:
         self.shafts = shafts
@@ -93,7 +93,7 @@ class FixedStep:
         self._any_dahl, self._all_dahl = bool(shafts.dahl.any()), bool(shafts.dahl.all())
 
     def advance(self, state: FloatArray, drive_nm: FloatArray) -> FloatArray:
-        """The state one step later under the torque ``drive_nm`` (motor's less load's)."""
+        """Return the state one step later under the torque ``drive_nm`` (motor torque minus load)."""
         speed, angle, bristle = state
         if not self._any_dahl:
             end, travel = self._coulomb(speed, drive_nm)
@@ -107,13 +107,15 @@ class FixedStep:
         return np.stack((end, angle + travel, deflection))
 
     def _respond(self, dt_s: FloatArray) -> FloatArray:
-        """(1 − e^−x)/B with x = B h/J, and h/J for B → 0: speed gained per unit of net torque."""
+        """Return (1 − e^−x)/B with x = B h/J, and h/J for B → 0: speed gained per unit of net torque."""
         viscous, inertia = self.shafts.viscous_nm_s_rad, self.shafts.inertia_kg_m2
         damped = viscous * dt_s > _TINY * inertia
         return np.where(damped, -np.expm1(-viscous * dt_s / inertia) / np.where(damped, viscous, 1.0), dt_s / inertia)
 
     def _coulomb(self, speed: FloatArray, drive: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(speed, travel): exact; a run that reaches zero sticks there, or goes on with the rest of the step."""
+        """Return (speed, travel), exact. A run that reaches zero sticks there, or continues with the rest
+        of the step.
+        """
         shafts, dt = self.shafts, self.dt_s
         dry, viscous, inertia = shafts.coulomb_nm, shafts.viscous_nm_s_rad, shafts.inertia_kg_m2
         holds = np.abs(drive) <= dry
@@ -124,7 +126,7 @@ class FixedStep:
         still = (speed == 0.0) & holds
         crosses = (end * side < 0.0) & ~still
         if crosses.any():
-            with np.errstate(all="ignore"):      # of runs that don't cross; their values are not taken
+            with np.errstate(all="ignore"):      # runs without a zero crossing; their values are not used
                 damped = np.abs(speed) * viscous > _TINY * np.abs(net)
                 slowed = np.log1p(np.where(damped, -speed * viscous / net, 0.0)) * inertia / viscous
                 crossing = np.where(crosses, np.where(damped, slowed, -speed * inertia / net), 0.0)
@@ -148,7 +150,7 @@ class FixedStep:
     def _dahl(
         self, speed: FloatArray, bristle: FloatArray, drive: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(speed, bristle, travel); the step of a run that passes zero is cut there."""
+        """Return (speed, bristle, travel). The step of a run that passes zero is divided there."""
         dt = self.dt_s
         end, deflection = self._dahl_piece(speed, bristle, drive, dt, self._response)
         travel = 0.5 * (speed + end) * dt
@@ -166,7 +168,9 @@ class FixedStep:
     def _dahl_piece(
         self, speed: FloatArray, bristle: FloatArray, drive: FloatArray, dt: FloatArray, response: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """(speed, bristle) after ``dt`` in which no speed changes sign: two passes for the speed at mid-step."""
+        """Return (speed, bristle) after ``dt`` without a change of the speed's sign. Two passes find the speed at
+        mid-step.
+        """
         stiffness, limit = self.shafts.dahl_stiffness_nm_rad, self._limit
         free = drive - self.shafts.viscous_nm_s_rad * speed
         middle = speed + 0.5 * (free - stiffness * bristle) * response
@@ -190,9 +194,9 @@ class FixedStep:
 
 
 def white_torque(power_nm2_s: FloatArray, dt_s: FloatArray, steps: int, rng: np.random.Generator) -> FloatArray:
-    """Band-limited white torque, held over each step: (steps, runs) in N·m.
+    """Return band-limited white torque, held over each step: (steps, runs) in N·m.
 
     White noise of the two-sided density P, in (N·m)²·s, averaged over a step h has the variance P/h: the standard
-    deviation is √(P/h). (A power in (N·m)², as sometimes printed, would be no density.)
+    deviation is √(P/h). A power in (N·m)², as sometimes printed, is not a density.
     """
     return rng.standard_normal((steps, len(power_nm2_s))) * np.sqrt(power_nm2_s / dt_s)

@@ -1,4 +1,4 @@
-r"""A drill string: the torsional wave equation between the motor and what turns at the bottom.
+r"""A drill string: the torsional wave equation between the motor and the bottom end.
 
 ::
 
@@ -10,18 +10,19 @@ r"""A drill string: the torsional wave equation between the motor and what turns
 
 Source: d'Alembert's waves; for strings S. L. Chen and M. Géradin (1995), J. D. Jansen (1993).
 
-**Characteristics.** a = τ + Zω runs down and b = Zω − τ runs up, both unchanged at speed v. The string is cut into M
-cells of one tick T/M ≤ 2 ms each, so that a tick moves each wave by one cell: the delay is exact, nothing is
-interpolated, nothing disperses. Drag sits between cells, β = d L/M each: arriving a and b leave as
+**Characteristics.** Wave a = τ + Zω travels down and wave b = Zω − τ travels up, both unchanged at speed v. The string
+is divided into M cells of one tick T/M ≤ 2 ms each, so that a tick moves each wave by one cell. The delay is exact,
+without interpolation and dispersion. Drag acts between cells, β = d L/M each: arriving a and b leave as
 
     Zω = (a + b) Z/(2Z + β)        b_above = 2 Zω − a        a_below = 2 Zω − b
 
-which takes β ω² from the energy and never adds any; half a β sits at each end.
+This takes β ω² from the energy and never adds any. Half a β acts at each end.
 
-**Ends.** A wave that arrives is known for the whole tick, so that an end is one shaft with the string's impedance as
-further viscous friction, J dω/dt = u + b − (B + Z + β/2) ω − T_f at the top and J dω/dt = a − … at the bottom: its step
-is its friction model's own, sticking included. It sends back 2Z (mean ω) minus what came, the means over a tick; the
-top's is gathered from steps of any length, cut at the ticks. A free bottom has no inertia, a clamped one never turns.
+**Ends.** An arriving wave is known for the whole tick. So an end is one shaft with the string's impedance as additional
+viscous friction, J dω/dt = u + b − (B + Z + β/2) ω − T_f at the top and J dω/dt = a − … at the bottom. Its step is that
+of its friction model, with sticking. It sends back 2Z (mean ω) minus the arriving wave, with means over a tick. At the
+top the mean is taken over steps of any length, divided at the ticks. A free bottom has no inertia, a clamped one never
+turns.
 """
 
 from math import ceil, pi, sqrt
@@ -42,7 +43,7 @@ Wave = NDArray[np.float64]
 
 
 class StringParams(MotorEnd):
-    """The motor's end, as a rigid shaft has it, the pipe (5 inch, 19.5 lb/ft), and the bottom."""
+    """Parameters of a string: the motor's end, as for a rigid shaft, the pipe (5 inch, 19.5 lb/ft), and the bottom."""
 
     kind: Literal["string"] = "string"
     inertia_kg_m2: Positive = 1500.0
@@ -52,10 +53,10 @@ class StringParams(MotorEnd):
     shear_modulus_pa: Positive = 79.3e9
     density_kg_m3: Positive = 7850.0
     drag_nm_s_rad_m: NonNegative = 0.005
-    """Viscous drag of the mud, per metre."""
+    """Viscous drag of the mud, N·m·s/rad per metre."""
     bottom_end: Literal["free", "clamped", "mass"] = "mass"
     bottom: Bottom = Bottom()
-    """Looked at with bottom_end: mass."""
+    """Bottom parameters, used with bottom_end: mass."""
 
     @model_validator(mode="after")
     def _is_a_string(self) -> Self:
@@ -70,22 +71,24 @@ class StringParams(MotorEnd):
 
     @property
     def polar_moment_m4(self) -> float:
-        """I of the pipe's section."""
+        """Polar moment I of the pipe's section, m⁴."""
         return pi / 32.0 * (self.outer_diameter_m**4 - self.inner_diameter_m**4)
 
     @property
     def delay_s(self) -> float:
-        """T, from one end to the other."""
+        """Travel time T of a wave from one end to the other, s."""
         return self.length_m * sqrt(self.density_kg_m3 / self.shear_modulus_pa)
 
     @property
     def impedance_nm_s_rad(self) -> float:
-        """Z: torque that a wave carries, per rad/s."""
+        """Characteristic impedance Z, N·m·s/rad: torque that a wave carries, per rad/s."""
         return self.polar_moment_m4 * sqrt(self.shear_modulus_pa * self.density_kg_m3)
 
 
 class StringState(NamedTuple):
-    """Motor end first; the bottom and the waves are those of the last whole tick. Arrays are never changed in place."""
+    """State, motor end first. The bottom and the waves are those of the last whole tick. Arrays are never changed in
+    place.
+    """
 
     speed_rad_s: float
     angle_rad: float
@@ -94,17 +97,17 @@ class StringState(NamedTuple):
     bottom_angle_rad: float
     bottom_bristle_rad: float
     down_nm: Wave
-    """a, cell by cell from the top."""
+    """Wave a in each cell, from the top, N·m."""
     up_nm: Wave
-    """b, cell by cell from the top."""
+    """Wave b in each cell, from the top, N·m."""
     into_tick_s: float
-    """Time since the last whole tick."""
+    """Time since the last whole tick, s."""
     tick_angle_rad: float
-    """The motor's angle then."""
+    """Angle of the motor at the last whole tick, rad."""
 
 
 class DrillString:
-    """Moves a `StringState` on; holds what follows from the parameters, and nothing that changes."""
+    """Solver for a `StringState`. It holds constants computed from the parameters, and nothing that changes."""
 
     def __init__(self, params: StringParams) -> None:
         self.params = params
@@ -118,16 +121,18 @@ class DrillString:
         self._load_nm = params.load_nm
 
     def rest(self) -> StringState:
-        """Nothing turns, nothing is twisted."""
+        """Return the state at standstill without twist."""
         silence = np.zeros(self.cells)
         return StringState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, silence, silence, 0.0, 0.0)
 
     def step(
         self, state: StringState, torque_nm: float, dt_s: float, load_nm: float = 0.0, bottom_load_nm: float = 0.0
     ) -> StringState:
-        """The state ``dt_s`` later, under constant torque; ``load_nm`` acts at the motor, against positive speed.
+        """Return the state ``dt_s`` later, under constant torque; ``load_nm`` acts at the motor, against positive
+        speed.
 
-        ``bottom_load_nm`` likewise at the bottom, beside its own, for the ticks that end within the step.
+        ``bottom_load_nm`` acts at the bottom in the same way, in addition to its own load, for the ticks that end
+        within the step.
         """
         drive = torque_nm - load_nm - self._load_nm
         left = dt_s
@@ -144,15 +149,15 @@ class DrillString:
         return state
 
     def top_torque_nm(self, state: StringState) -> float:
-        """τ at the top, what the string takes from the motor."""
+        """Return the torque τ at the top, which the string takes from the motor, N·m."""
         return self.impedance_nm_s_rad * state.speed_rad_s - float(state.up_nm[0])
 
     def _tick(self, state: StringState, bottom_load_nm: float) -> StringState:
-        """Waves one cell on, the bottom one tick on."""
+        """Advance the waves by one cell and the bottom by one tick."""
         down, up, twice = state.down_nm, state.up_nm, 2.0 * self.impedance_nm_s_rad
         arrived = down.item(-1)
         speed, angle, bristle, travel = self._bottom_end(state, arrived, bottom_load_nm)
-        falling, rising = down[:-1], up[1:]        # what meets between two cells
+        falling, rising = down[:-1], up[1:]        # waves that meet between two cells
         between = falling + rising
         between *= self._pass
         new_down, new_up = np.empty(self.cells), np.empty(self.cells)
@@ -167,7 +172,7 @@ class DrillString:
     def _bottom_end(
         self, state: StringState, arrived: float, load_nm: float
     ) -> tuple[float, float, float, float]:
-        """(speed, angle, bristle, travel) of the bottom after a tick."""
+        """Return (speed, angle, bristle, travel) of the bottom after a tick."""
         angle = state.bottom_angle_rad
         if self.params.bottom_end == "clamped":
             return 0.0, angle, 0.0, 0.0

@@ -23,26 +23,26 @@ from sim_bus.plant.two_mass import TwoMassParams
 
 
 class MotorState(Protocol):
-    """Values of every state."""
+    """Common values of all states."""
 
     @property
     def speed_rad_s(self) -> float:
-        """Speed of the motor's shaft."""
+        """Speed of the motor's shaft, rad/s."""
     @property
     def angle_rad(self) -> float:
-        """Angle of the motor's shaft."""
+        """Angle of the motor's shaft, rad."""
 
 
 S = TypeVar("S", bound=MotorState)
 
 
 class Plant(Protocol[S]):
-    """Anything that a motor turns."""
+    """Any load of the motor."""
 
     def rest(self) -> S:
-        """The state in which nothing turns and nothing is twisted."""
+        """Return the state at standstill without twist."""
     def step(self, state: S, torque_nm: float, dt_s: float, load_nm: float = 0.0) -> S:
-        """The state ``dt_s`` later, under constant torque and load at the motor."""
+        """Return the state ``dt_s`` later, under constant torque and load at the motor."""
 
 
 class Rigid:
@@ -75,11 +75,13 @@ PLANTS: dict[str, PlantKind] = {
     "two_mass": PlantKind(TwoMassParams, TwoMass, winds_up=True),
     "string": PlantKind(StringParams, DrillString, winds_up=True),
 }
-"""Every kind of plant; plant.yaml takes these, and what a file may say is read off their models."""
+"""Every kind of plant. plant.yaml accepts these kinds, and the keys of their models."""
 
 
 def build(params: Any) -> Plant[Any]:
-    """The plant that ``params``, of one of `PLANTS`, describe; a body on the motor's shaft is part of its inertia."""
+    """Return the plant of ``params``, which are of one of `PLANTS`. A body on the motor's shaft is part of
+    its inertia.
+    """
     body = getattr(params, "added_inertia_kg_m2", 0.0)
     if body > 0.0:
         whole = params.inertia_kg_m2 + body
@@ -88,7 +90,7 @@ def build(params: Any) -> Plant[Any]:
 
 
 def _rigid_unless_said(section: Any) -> Any:
-    """Fills in ``kind``; a kind that does not exist, or a key of another kind, is refused by name."""
+    """Add ``kind`` if it is missing. A kind that does not exist, or a key of another kind, is refused by name."""
     if not isinstance(section, dict):
         return section
     kind = section.get("kind", "rigid")
@@ -106,7 +108,7 @@ def _rigid_unless_said(section: Any) -> Any:
 
 
 def _read(section: Any) -> Any:
-    """The section as the model of its kind has it. Raises what that model raises."""
+    """Return the section as the model of its kind. Raises the errors of that model."""
     if isinstance(section, tuple(kind.params for kind in PLANTS.values())):
         return section
     section = _rigid_unless_said(section)
@@ -119,4 +121,4 @@ if TYPE_CHECKING:
 else:
     _ANY = reduce(or_, (kind.params for kind in PLANTS.values()))
     AnyPlantParams = Annotated[_ANY, PlainValidator(_read), PlainSerializer(lambda one: one.model_dump())]
-"""The section ``plant`` of plant.yaml."""
+"""Type of the section ``plant`` of plant.yaml."""

@@ -1,11 +1,11 @@
-r"""The shaft as the paper takes it: one rigid inertia with viscous and dry friction (its equations 4 to 6).
+r"""The shaft of the paper: one rigid inertia with viscous and dry friction (equations 4 to 6).
 
 ::
 
     J dω/dt = u − B ω − T_f        u = torque − load, held constant over a step
 
-T_f, with how a step of each model is made, stands in `sim_bus.plant.friction`. What hangs on a string or has two masses
-is in `sim_bus.plant.two_mass` and `sim_bus.plant.drill_string`; `sim_bus.plant.kinds` chooses.
+`sim_bus.plant.friction` has T_f and the step of each friction model. `sim_bus.plant.two_mass` and
+`sim_bus.plant.drill_string` are the other plants; `sim_bus.plant.kinds` selects one.
 """
 
 from collections.abc import Callable
@@ -29,15 +29,15 @@ class ShaftState(NamedTuple):
 
 
 def step(params: Params, state: ShaftState, torque_nm: float, dt_s: float, load_nm: float = 0.0) -> ShaftState:
-    """The state ``dt_s`` later, under constant torque.
+    """Return the state ``dt_s`` later, under constant torque.
 
-    ``load_nm`` acts against positive speed, on top of the constant load.
+    ``load_nm`` acts against positive speed, in addition to the constant load.
     """
     return stepper(params)(state, torque_nm, dt_s, load_nm)
 
 
 def stepper(params: Params) -> Callable[..., ShaftState]:
-    """`step` of one shaft, whose friction model is looked up once."""
+    """Return `step` for one shaft, whose friction model is looked up once."""
     move, constant_nm = advance_of(params), params.load_nm
 
     def step_on(state: ShaftState, torque_nm: float, dt_s: float, load_nm: float = 0.0) -> ShaftState:
@@ -49,5 +49,7 @@ def stepper(params: Params) -> Callable[..., ShaftState]:
 
 
 def friction_torque(params: Params, state: ShaftState, drive_nm: float = 0.0) -> float:
-    """Dry friction in N·m, as it acts against motion; where the model sticks, at rest it balances ``drive_nm``."""
+    """Return the dry friction against motion, N·m. At standstill the friction of a model that sticks balances
+    ``drive_nm``.
+    """
     return torque(params, state.speed_rad_s, state.bristle_rad, drive_nm)

@@ -8,13 +8,13 @@ r"""Two masses on a torsion spring: the paper's figure 7, friction at both ends.
 
     J kg·m², k N·m/rad, c and B N·m·s/rad, T dry friction and τ N·m
 
-Source: the paper, section 2.3, which draws the model and drops it for equations 4 to 6.
+Source: the paper, section 2.3, which shows the model and then uses equations 4 to 6 instead.
 
-A step of h is the mid-point rule on the spring alone: τ is taken with the twist at mid-step and the mean of the
-speed differences before and after, which two passes find; then each end moves as if alone, exactly as its friction
-model does, so that an end sticks exactly while the spring can't tear it loose. Second order: a swing of natural
-frequency Ω = √(k (1/J_r + 1/J_L)) is fast by (Ωh)²/24 of it, and keeps its energy. Steps are cut to Ωh ≤ 0.1 and
-c (1/J_r + 1/J_L) h ≤ 0.1.
+A step of h uses the mid-point rule for the spring alone: τ is computed with the twist at mid-step and the mean of the
+speed differences before and after, which two passes find. Then each end moves by itself, exactly as its friction model
+does. So an end sticks exactly while the spring's torque is below its breakaway torque. The method is of second order: a
+torsional oscillation of natural frequency Ω = √(k (1/J_r + 1/J_L)) is too fast by the share (Ωh)²/24, and keeps its
+energy. Steps are divided so that Ωh ≤ 0.1 and c (1/J_r + 1/J_L) h ≤ 0.1.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ from profiles import NonNegative, Positive, refuse_if
 from sim_bus.plant.friction import MotorEnd, ShaftParams, advance_of
 
 FASTEST_RAD_S = 1000.0
-"""Swings beyond this would take hundreds of pieces per step."""
+"""Highest natural frequency, rad/s. A higher one would need hundreds of pieces per step."""
 _CUT = 0.1
 
 
@@ -41,7 +41,7 @@ class Bottom(ShaftParams):
 
 
 class TwoMassParams(MotorEnd):
-    """The motor's end, as a rigid shaft has it, the spring, and the bottom."""
+    """Parameters of two masses: the motor's end, as for a rigid shaft, the spring, and the bottom."""
 
     kind: Literal["two_mass"] = "two_mass"
     inertia_kg_m2: Positive = 1500.0
@@ -51,7 +51,7 @@ class TwoMassParams(MotorEnd):
 
     @property
     def mobility_1_kg_m2(self) -> float:
-        """1/J_r + 1/J_L."""
+        """Mobility of the spring's ends: 1/J_r + 1/J_L, 1/(kg·m²)."""
         return 1.0 / (self.inertia_kg_m2 + self.added_inertia_kg_m2) + 1.0 / self.bottom.inertia_kg_m2
 
     @model_validator(mode="after")
@@ -67,7 +67,7 @@ class TwoMassParams(MotorEnd):
 
 
 class TwoMassState(NamedTuple):
-    """Motor end first; the twist is ``angle_rad − bottom_angle_rad``."""
+    """State, motor end first. The twist is ``angle_rad − bottom_angle_rad``."""
 
     speed_rad_s: float = 0.0
     angle_rad: float = 0.0
@@ -79,15 +79,15 @@ class TwoMassState(NamedTuple):
 
 def step(params: TwoMassParams, state: TwoMassState, torque_nm: float, dt_s: float,
          load_nm: float = 0.0, bottom_load_nm: float = 0.0) -> TwoMassState:
-    """The state ``dt_s`` later, under constant torque; ``load_nm`` acts at the motor, against positive speed.
+    """Return the state ``dt_s`` later, under constant torque; ``load_nm`` acts at the motor, against positive speed.
 
-    ``bottom_load_nm`` likewise at the bottom, beside its own.
+    ``bottom_load_nm`` acts at the bottom in the same way, in addition to its own load.
     """
     return stepper(params)(state, torque_nm, dt_s, load_nm, bottom_load_nm)
 
 
 def stepper(params: TwoMassParams) -> Callable[..., TwoMassState]:
-    """`step` of one shaft, with what follows from its parameters alone computed once."""
+    """Return `step` for one shaft. Constants that follow from its parameters are computed once."""
     mobility, constant_nm, below_nm = params.mobility_1_kg_m2, params.load_nm, params.bottom.load_nm
     fastest = max(sqrt(params.stiffness_nm_rad * mobility), params.damping_nm_s_rad * mobility)
     piece = _piece_of(params)
@@ -105,7 +105,7 @@ def stepper(params: TwoMassParams) -> Callable[..., TwoMassState]:
 
 
 def spring_torque(params: TwoMassParams, state: TwoMassState) -> float:
-    """τ, what the string takes from the motor, N·m."""
+    """Return the torque τ that the string takes from the motor, N·m."""
     return (params.stiffness_nm_rad * (state.angle_rad - state.bottom_angle_rad)
             + params.damping_nm_s_rad * (state.speed_rad_s - state.bottom_speed_rad_s))
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The address of a drive, and what is opened there.
+# Address of a drive, and the objects that are opened there.
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Connection:
 
     @property
     def configured(self) -> bool:
-        """Return whether an address of the drive is given. If not, the embedded simulator is meant."""
+        """Return whether an address of the drive is given. Without one the embedded simulator runs."""
         return any(name in self.line.settings for name in self.bus.place)
 
 
@@ -83,7 +83,7 @@ class PeerPlan:
     seed: int | None
     plant: Any
     faults: tuple[Any, ...] = ()       # scripted faults of the embedded simulator (`sim_bus.fault_script`)
-    never_came: list[str] = field(default_factory=list)    # those that the run ended too early to trigger
+    never_came: list[str] = field(default_factory=list)    # faults that the run ended too early to trigger
     left_in: Path | None = None        # folder of the undo journal of the drive's settings; None: beside the log
 
     @property
@@ -111,7 +111,7 @@ class Opening:
 
 @dataclass(frozen=True)
 class FoundDrive:
-    """A drive that a scan found. ``address``: its number on the bus. ``line``: how the line was set when it answered,
+    """A drive that a scan found. ``address``: its number on the bus. ``line``: settings of the line when it answered,
     if a scan tries several settings.
     """
 
@@ -121,8 +121,8 @@ class FoundDrive:
     identity: str
     simulated: bool
     profile: str | None = None
-    why: str = ""                       # why this profile, or why none
-    seen: str = ""                      # what it sent without a request
+    why: str = ""                       # reason for this profile, or for none
+    seen: str = ""                      # frames that it sent without a request
     line: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -139,7 +139,7 @@ class ValueSeen(Protocol):
         ...
 
     def plain(self) -> dict[str, Any]:
-        """Return it as in the JSON document."""
+        """Return the value as in the JSON document."""
         ...
 
 
@@ -187,11 +187,11 @@ def _no_arguments(scan: argparse._ArgumentGroup) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Bus:
-    """A bus above its driver: words, options, section of rig.yaml, opening, simulator, scan, doctor, profile page."""
+    """A bus above its driver: names, options, section of rig.yaml, opening, simulator, scan, doctor, profile page."""
 
     # Words.
     name: str                           # as in BUSES, --drive, and `bus:` of a profile
-    title: str                          # as it is written in texts
+    title: str                          # name in texts
     named_by: str                       # options that name a drive on it, in words
     examples: tuple[str, ...]           # options that name a drive on it, as examples to type
     nothing_there: str                  # why the embedded simulator runs although it was not requested
@@ -259,14 +259,14 @@ class Bus:
 
     # The page of a profile.
     profile_facts: Callable[[Any], Sequence[tuple[str, str]]] = _no_facts
-    """Return (name, text) of the facts that stand at the top of a profile's page."""
+    """Return (name, text) of the facts at the top of a profile's page."""
     profile_tables: Callable[[Any], Iterable[ProfileTable]] = _no_tables
     """Return the tables of objects or registers."""
     profile_sections: tuple[str, ...] | None = None
     """Entries of a profile that its page shows one by one; None: all but the parameters."""
 
     def asked_for(self, cli: Mapping[str, Any], besides: frozenset[str] = frozenset()) -> str | None:
-        """Return the given flag that belongs only to this bus, ``besides`` these; None if there is none."""
+        """Return the given flag that belongs only to this bus, except those in ``besides``; None if there is none."""
         return next((flag for name, flag in self.flags.items() if cli.get(name) is not None and name not in besides),
                     None)
 
@@ -293,7 +293,7 @@ def all_buses() -> tuple[Bus, ...]:
 
 
 def examples() -> str:
-    """Return how a drive is named on each bus, as options to type."""
+    """Return the options that name a drive on each bus, as examples to type."""
     *first, last = (one for bus in all_buses() for one in bus.examples)
     return f"{', '.join(first)} or {last}" if first else last
 

@@ -624,7 +624,7 @@ def _identify(link: driver.CanLink, node: int, heard: driver.Heard, profiles: li
         title = _text(objects, 0x1008)
         simulated = _text(objects, MARKER_INDEX, 1) == MARKER_TEXT
     except CommunicationLost:
-        values += [None] * (4 - len(values))           # it answered once and then no more: show what is known
+        values += [None] * (4 - len(values))           # it answered once and then no more: show the known values
     profile, why = match(heard.device_types[node], values[:3], profiles)
     return FoundDrive("canopen", node, title, identity_text(values) or "not reported (1018h)", simulated, profile, why,
                       heard.states.get(node, ""))

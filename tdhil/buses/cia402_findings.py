@@ -14,7 +14,7 @@ _CIA402 = 402
 
 def match(device_type: int, identity: Sequence[int | None], profiles: Iterable[Cia402Profile],
           plain: str = "generic/cia402") -> tuple[str | None, str]:
-    """Return (profile, reason): the one whose identity (vendor, product, revision of 1018h) fits best."""
+    """Return (profile, reason) for the profile whose identity (vendor, product, revision of 1018h) fits best."""
     best, most = None, 0
     for profile in profiles:
         wanted = (profile.identity.vendor, profile.identity.product, profile.identity.revision)

@@ -1,4 +1,4 @@
-"""One line of `tdhil doctor`: what was checked, its state, and what to do."""
+"""One line of `tdhil doctor`: the check, its result, and the remedy."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class DoctorFinding:
 
     @property
     def text(self) -> str:
-        """Return one line; a second one states what to do."""
+        """Return one line; a second one with the remedy."""
         line = f"{self.grade:<5} {self.name:<16} {self.said}"
         return visible(f"{line}\n{'':<22} → {self.do}" if self.do else line, keep="\n")
 
@@ -64,7 +64,7 @@ def attempted(name: str, work: Callable[[], Iterable[DoctorFinding]]) -> list[Do
     found: list[DoctorFinding] = []
     try:
         for one in work():
-            found.append(one)  # noqa: PERF402 (what came before the failure counts)
+            found.append(one)  # noqa: PERF402 (findings before a failure are kept)
     except TdhilError as error:
         found.append(of_error(name, error))
     return found

@@ -159,7 +159,7 @@ SIMULATOR_STARTS_S = 30.0
 
 @contextmanager
 def _simulated(plan: PeerPlan, trace: Path | None) -> Iterator[str]:
-    """Yield the host's end of the pair. Raises SimulatorUnusable where the system does not permit it."""
+    """Yield the host's end of the pair. Raises SimulatorUnusable if the system does not permit it."""
     import multiprocessing
     import os
 
@@ -216,7 +216,7 @@ def _serve(
 
     from sim_bus.ethercat import Simulator, parse_all, raw_socket
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)       # a Ctrl-C is the host's: it still needs the drive for its stop
+    signal.signal(signal.SIGINT, signal.SIG_IGN)       # Ctrl-C is for the host, which needs the drive for its stop
     stop = threading.Event()
 
     def wait() -> None:
@@ -272,7 +272,7 @@ def _open(asked: Opening) -> Iterator[Drive]:
 
 @contextmanager
 def _open_target(options: RunOptions, connection: Connection, clock: Clock) -> Iterator[Target]:
-    """Open the drive alone, without a change of its AL state where it can be reached so."""
+    """Open the drive alone, without a change of its AL state if possible."""
     position, alias = _place(connection)
     with _interface(_REAL, connection) as interface:
         target = driver.open_target(interface, position, alias, profile_of(connection), clock)

@@ -341,7 +341,7 @@ class RegisterUse:
     meaning: str
     register: Register
     per_lsb: float | None
-    unit: str                   # as it is written in texts
+    unit: str                   # the unit as in texts
     times: str | None
     entry: ProfileEntry
 
@@ -593,7 +593,7 @@ def _settings(plan: PeerPlan, line: ModbusLine) -> Iterator[ModbusLine]:
 
 
 def _said(line: ModbusLine, name: str) -> bool:
-    """Return whether it is given on the command line or in rig.yaml, not by the profile."""
+    """Return whether the setting is given on the command line or in rig.yaml, not by the profile."""
     return line.origin(name) in (Origin.COMMAND_LINE, Origin.RIG_FILE)
 
 
@@ -651,7 +651,7 @@ class RegisterSeen:
         return self.use.address, "-" if self.counts is None else str(self.counts), self.shown, self.use.meaning
 
     def plain(self) -> dict[str, Any]:
-        """Return it as in the JSON document."""
+        """Return the register as in the JSON document."""
         return {
             "name": self.use.name, "address": self.use.register.address, "table": self.use.register.table,
             "meaning": self.use.meaning, "counts": self.counts, "value": self.value, "unit": self.use.unit,

@@ -17,12 +17,12 @@ MARKS = {"verified": "", "likely": "likely", "unverified": "UNVERIFIED"}
 
 
 def unit_text(unit: str) -> str:
-    """Return a unit of the schema as it is written in texts."""
+    """Return a unit of the schema as in texts."""
     return _UNITS.get(unit, unit)
 
 
 def object_table(parameters: Sequence[Parameter]) -> ProfileTable:
-    """Return a drive's own objects of CiA 402, on any bus that carries them."""
+    """Return the table of a drive's own objects of CiA 402, on any bus."""
     rows = []
     for one in parameters:
         scale = f"{one.per_lsb:g}{f' × {one.times}' if one.times else ''} {unit_text(one.unit)}".strip()
@@ -42,7 +42,7 @@ def modes_text(profile: Profile) -> str:
 
 
 def watchdog_text(profile: Profile) -> str:
-    """Return what stops the drive when the host fails."""
+    """Return the means that stops the drive when the host fails."""
     kind, reaction = profile.watchdog.kind, profile.watchdog.reaction
     if kind == "none":
         return "none: the drive would keep turning"

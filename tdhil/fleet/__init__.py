@@ -1,4 +1,4 @@
-"""Many logs: identified by a pool or a cluster into one table; compared, and watched over time."""
+"""Many logs: identified by a pool or a cluster into one table; compared; followed over time."""
 
 from typing import TYPE_CHECKING
 

@@ -2,33 +2,33 @@
 
 Pure: numbers in, numbers out. The terminal, a page and a web service use these same functions.
 
-**What a result is.** An inverter's torque is right but for a factor, which is the same in every run on that drive, and
-goes straight into J, into viscous and into Coulomb friction. With the true value θ,
+**Model of a result.** An inverter's torque is right except for a factor. The factor is the same in every run on that
+drive, and multiplies J, viscous and Coulomb friction. With the true value θ,
 
     ln x_k = ln θ_k + s_d(k) + e_k,    s_d ~ N(0, σ_s²) once for each drive d,    e_k ~ N(0, σ_k²) for each run.
 
 The interval ``low`` to ``high`` (repeatability) is that of e_k alone; σ_k is half its width in ln x over the normal
-quantile of its confidence. A part of it (unstated filters, for example) is alike in runs on one rig; it is taken for
-independent here, which makes differences wider than they are, not narrower. Quantities that torque doesn't scale (lags)
-or that may be zero (skew) go the same way without logarithm, with s = 0.
+quantile of its confidence. A part of it (unstated filters, for example) is the same in runs on one rig. It counts as
+independent here, which makes the intervals of differences wider, not narrower. Quantities that the torque scale does
+not multiply (lags) or that may be zero (skew) are treated in the same way without logarithm, with s = 0.
 
 **A difference** of two results on one drive has s in both: it cancels, and the variance is σ_a² + σ_b². On two drives
 it is σ_a² + σ_b² + σ_s,a² + σ_s,b².
 
-**A history.** x = ln x_k is normal about μ·1 + δ·h, where h is 0 before a step and 1 from it on, or rises evenly with
-time from 0 to 1 (drift); μ is anything (flat). Its covariance is Σ = κ² diag(σ_k²) + Σ_d σ_s² 1_d 1_dᵀ. κ says that
-intervals may be too narrow or too wide for what happens from run to run: it is averaged over, as is the size of the
-change, δ ~ N(0, τ²). With P = Σ⁻¹ − Σ⁻¹1(1ᵀΣ⁻¹1)⁻¹1ᵀΣ⁻¹, which takes μ out, a = hᵀPh and b = hᵀPx,
+**A history.** x = ln x_k is normal about μ·1 + δ·h. Here h is 0 before a step and 1 from the step on, or rises evenly
+with time from 0 to 1 (drift); μ has a flat prior. The covariance is Σ = κ² diag(σ_k²) + Σ_d σ_s² 1_d 1_dᵀ. The factor κ
+allows for intervals that are too narrow or too wide for the scatter between runs. Results are averaged over κ and over
+the size of the change, δ ~ N(0, τ²). With P = Σ⁻¹ − Σ⁻¹1(1ᵀΣ⁻¹1)⁻¹1ᵀΣ⁻¹, which eliminates μ, a = hᵀPh and b = hᵀPx,
 
     ln p(x | κ, none) = −½ (ln|Σ| + ln 1ᵀΣ⁻¹1 + xᵀPx) + const
     p(x | κ, h, τ) / p(x | κ, none) = (1 + τ²a)^−½ exp(½ τ²b² / (1 + τ²a)),
 
-since the change adds τ²hhᵀ to the covariance (Sherman and Morrison, and the matrix determinant lemma). Bayes' rule over
-none (½), a step (¼, evenly over its places) and drift (¼) gives the probabilities. If the prior is right, "no change"
-has less than 10 % in at most 1 of 9 histories without one (Markov's inequality); what happens is measured in
-``benchmarks/trend_power.py``: 0 to 1.5 %.
+because the change adds τ²hhᵀ to the covariance (Sherman and Morrison, and the matrix determinant lemma). Bayes' rule
+over none (½), a step (¼, evenly over its places) and drift (¼) gives the probabilities. If the prior is right, "no
+change" has less than 10 % in at most 1 of 9 histories without a change (Markov's inequality). The share measured by
+``benchmarks/trend_power.py`` is 0 to 1.5 %.
 
-The search is for one step or drift at a time. After a step, it searches on either side again.
+One step or drift is searched at a time. After a step, both sides are searched again.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from tdhil.estimation import normal_quantile
 FloatArray = NDArray[np.float64]
 
 ALARM: Final = 0.1
-"""A change is named where "no change" has less than this."""
+"""Limit for a change: it is reported if the probability of "no change" is below this."""
 LEAST: Final = 4
-"""Results that a history must have; fewer can be compared in pairs."""
+"""Least number of results in a history. Fewer can be compared in pairs."""
 
 _SPREAD: Final = ((0.5, 0.10), (0.7, 0.20), (1.0, 0.40), (1.4, 0.15), (2.0, 0.10), (2.8, 0.05))     # κ, its prior
 _SIZES: Final = (2.0, 4.0, 8.0, 16.0, 32.0)            # τ in units of the median σ_k, each as likely
@@ -58,10 +58,11 @@ _PRIOR: Final = {"none": 0.5, "step": 0.25, "drift": 0.25}
 
 @dataclass(frozen=True)
 class Measured:
-    """One result: ``low`` to ``high`` at ``confidence``, repeatability alone.
+    """One result: ``low`` to ``high`` at ``confidence`` is the repeatability alone.
 
-    ``scale_rel_sd``: standard uncertainty of the torque scale, 0 for quantities without torque; ``drive``: the drive
-    with this scale; None if unknown, which equals no other. ``time``: any measure of time, rising.
+    ``scale_rel_sd``: relative standard uncertainty of the torque scale, 0 for quantities without torque. ``drive``: the
+    drive with this scale; None: unknown, which counts as different from any other. ``time``: any rising measure of
+    time.
     """
 
     value: float
@@ -77,8 +78,8 @@ class Measured:
 class Difference:
     """Difference of two results. ``change`` with its interval is a share of the first if ``relative``, else absolute.
 
-    ``probability``: that the true change has the sign that was found. ``shared_scale``: the torque scale is the same in
-    both and cancels.
+    ``probability``: that the true change has the sign of ``change``. ``shared_scale``: the torque scale is the same in
+    both results and cancels.
     """
 
     change: float
@@ -109,8 +110,8 @@ def difference(before: Measured, after: Measured, confidence: float = 0.95) -> D
 
 @dataclass(frozen=True)
 class ChangePoint:
-    """A step between result ``at - 1`` and result ``at``. ``probability`` of any step in the examined
-    stretch; ``here``: probability of this place, given a step. ``change`` as in `Difference`.
+    """A step between result ``at - 1`` and result ``at``. ``probability``: that of any step in the examined stretch;
+    ``here``: probability of this place, given a step. ``change`` as in `Difference`.
     """
 
     at: int
@@ -160,7 +161,7 @@ def history(results: Sequence[Measured], confidence: float = 0.95) -> History:
 
 
 def _on_scale(one: Measured, relative: bool) -> tuple[float, float]:
-    """Logarithm of the value with its sd, or the value itself with its."""
+    """Return the logarithm of the value with its standard deviation, or the value itself with its own."""
     if not one.low <= one.high or not 0.0 < one.confidence < 1.0:
         raise ValueError(f"no interval: {one.low:g} to {one.high:g} at {one.confidence:g}")
     quantile = normal_quantile(one.confidence)
@@ -170,7 +171,7 @@ def _on_scale(one: Measured, relative: bool) -> tuple[float, float]:
 
 
 def _shared(results: Sequence[Measured], relative: bool) -> FloatArray:
-    """Covariance of what drives' torque scales do."""
+    """Return the covariance that the drives' torque scales cause."""
     found = np.zeros((len(results), len(results)))
     for i, one in enumerate(results):
         for j, other in enumerate(results):
@@ -185,7 +186,7 @@ class _ChangeEvidence:
     none: float
     step: float
     drift: float
-    places: FloatArray          # of a step, if there is one: before result 1, 2, …
+    places: FloatArray          # probability of each place of a step: before result 1, 2, …
     step_size: FloatArray
     step_sd: FloatArray
     drift_size: float
@@ -215,7 +216,7 @@ def _evidence(x: FloatArray, sd: FloatArray, shared: FloatArray, time: FloatArra
         ratios.append(top + np.log(np.exp(log_ratio - top).mean(axis=0)))
         means.append(b / a)
         variances.append(1.0 / a)
-    # p(x | model), κ averaged over; all of them by the same factor
+    # p(x | model), averaged over κ; all of them multiplied by the same factor
     base = max(weights)
     none = sum(math.exp(one - base) for one in weights)
     by_spread = np.array([weight - base + ratio for weight, ratio in zip(weights, ratios, strict=True)])
@@ -227,7 +228,7 @@ def _evidence(x: FloatArray, sd: FloatArray, shared: FloatArray, time: FloatArra
     p_steps = _PRIOR["step"] * each[:-1] / (n - 1.0)
     p_drift = _PRIOR["drift"] * float(each[-1])
     whole = p_none + float(p_steps.sum()) + p_drift
-    posterior = np.exp(by_spread - log_each)                   # of κ, for each shape
+    posterior = np.exp(by_spread - log_each)                   # posterior of κ, for each shape
     mean = np.sum(posterior * np.array(means), axis=0)
     second = np.sum(posterior * (np.array(variances) + np.array(means) ** 2), axis=0)
     deviation = np.sqrt(np.maximum(second - mean**2, 0.0))
@@ -241,7 +242,7 @@ def _evidence(x: FloatArray, sd: FloatArray, shared: FloatArray, time: FloatArra
 def _steps(
     x: FloatArray, sd: FloatArray, shared: FloatArray, time: FloatArray, first: int, confidence: float, relative: bool
 ) -> list[ChangePoint]:
-    """The steps of one stretch, in their order; ``first``: number of its first result."""
+    """Return the steps of one stretch, in their order. ``first``: number of its first result."""
     if len(x) < LEAST:
         return []
     found = _evidence(x, sd, shared, time)

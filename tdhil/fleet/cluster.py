@@ -1,7 +1,8 @@
-"""The same tasks on a Dask cluster that is there already: `--scheduler tcp://host:8786` (extra `cluster`).
+"""The same tasks on an existing Dask cluster: `--scheduler tcp://host:8786` (extra `cluster`).
 
-A worker of Dask doesn't do a task itself: it keeps a `Pool` of one process beside it, with the same limits, tries and
-losses as on one machine. So no log can kill Dask's worker, and what kills that from outside costs a task only its turn.
+A worker of Dask doesn't execute a task itself. It keeps a `Pool` of one process, with the same limits, tries and losses
+as on one machine. So no log can end Dask's worker. If the worker is killed from outside, its task is only submitted
+again.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ from tdhil.version import __version__
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-_ASKED: Final = ("numpy", "scipy")      # their digits are in the rows
-_AHEAD: Final = 4                       # tasks for each thread of the cluster
+_ASKED: Final = ("numpy", "scipy")      # packages that affect the last digits of the rows
+_AHEAD: Final = 4                       # number of submitted tasks for each thread of the cluster
 _RESUBMIT: Final = 5
-_PATIENCE_S: Final = 60.0               # without a single worker
+_PATIENCE_S: Final = 60.0               # longest time without any worker
 _LOOK_S: Final = 10.0
-_ASK_S: Final = 0.5                     # interval of asking the caller whether to stop
+_ASK_S: Final = 0.5                     # interval between two calls of ``stop``
 _here = threading.local()
 
 
 def versions() -> dict[str, str]:
-    """Return what a worker must have in common with its host, by name."""
+    """Return the versions that a worker and its host must have in common, by name."""
     found = {"python": ".".join(platform.python_version_tuple()[:2]), "tdhil": __version__}
     for name in _ASKED:
         try:
@@ -43,7 +44,7 @@ def versions() -> dict[str, str]:
 
 
 def guarded(function: Callable[[Task], Result], task: Task, limits: TaskLimits) -> Result | Loss:
-    """One task, in the process that this thread of a Dask worker keeps."""
+    """Execute one task, in the process that this thread of a Dask worker keeps."""
     pool = getattr(_here, "pool", None)
     if pool is None or _here.made_for != (function, limits):
         if pool is not None:
@@ -58,8 +59,8 @@ def run_on_cluster(
     function: Callable[[Task], Result], tasks: Iterable[Task], address: str, limits: TaskLimits,
     stop: Callable[[], bool] | None = None,
 ) -> Iterator[tuple[Task, Result | Loss]]:
-    """Every task with its result, as `Pool.run` gives it. Raises UsageError before the start where the scheduler can't
-    be reached or its workers don't fit, and TdhilError where all of them have gone.
+    """Yield every task with its result, as `Pool.run` does. Raises UsageError before the start if the scheduler can't
+    be reached or its workers don't fit, and TdhilError if all workers have gone.
     """
     distributed = _distributed()
     try:
@@ -96,8 +97,9 @@ def _results(
             try:
                 result: Result | Loss = future.result(timeout=_LOOK_S)
             except (TimeoutError, CancelledError):
-                # Done by a worker that died with it before it was fetched. Waiting for Dask to do it again has no end
-                # where that closed its last worker; here `_done` says so.
+                # A worker finished this task, and ended before the result was fetched. Dask repeats the task, but if it
+                # closed its last worker the wait has no end. The task is submitted again, and `_done` reports missing
+                # workers.
                 future.cancel()
                 submit(task, tries)
                 continue
@@ -116,7 +118,9 @@ def _results(
 
 
 def _done(distributed: Any, client: Any, futures: list[Any], stop: Callable[[], bool] | None) -> list[Any]:
-    """Those that are done, at least one; none where it is to stop. TdhilError: there has been no worker for long."""
+    """Return the finished tasks, at least one; none after a request to stop. Raises TdhilError after a long time
+    without workers.
+    """
     empty_s = 0.0
     wait_s = _LOOK_S if stop is None else _ASK_S
     while stop is None or not stop():
@@ -133,7 +137,7 @@ def _done(distributed: Any, client: Any, futures: list[Any], stop: Callable[[], 
 
 
 def _check(client: Any, address: str) -> int:
-    """How many tasks the cluster does at once. UsageError where a worker doesn't fit."""
+    """Return the number of tasks that the cluster executes at once. Raises UsageError for a worker that doesn't fit."""
     wanted = versions()
     try:
         theirs = client.run(versions, on_error="return")

@@ -1,4 +1,4 @@
-"""Many logs, one table: what is found under some folders, done by a pool or a cluster, and what came of it."""
+"""Many logs, one table: the logs under some folders, identified by a pool or a cluster, and the results."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ _GOOD: Final = ("valid", "valid_wide")
 
 @dataclass(frozen=True)
 class FleetRequest:
-    """``roots``: folders, files, or URLs of them; ``out``: the table. ``jobs``: processes at once on this machine.
+    """Request for a fleet. ``roots``: folders, files, or URLs of them; ``out``: the table. ``jobs``: number of
+    processes on this machine.
 
-    ``scheduler``: a Dask cluster's address instead. ``cache``: keep recordings that were read beside the table;
-    ``again``: do all of them anew; ``retry_failed``: those that failed.
+    ``scheduler``: address of a Dask cluster to use instead. ``cache``: keep recordings that were read beside the table;
+    ``again``: identify all logs anew; ``retry_failed``: identify the failed ones anew.
     """
 
     roots: tuple[str, ...]
@@ -48,8 +49,9 @@ class FleetRequest:
 
 @dataclass(frozen=True)
 class FleetSummary:
-    """Result of a fleet, rows by log. ``done_before``: rows that existed before; ``live``: logs that are being written;
-    ``bare_traces``: CSV files without a sidecar; ``slowest``: log and CPU time in s; ``left``: logs still to do.
+    """Result of a fleet, rows by log. ``done_before``: number of rows that existed before; ``live``: of logs that are
+    being written; ``bare_traces``: of CSV files without a sidecar; ``slowest``: log and CPU time in s; ``left``: number
+    of logs still to do.
     """
 
     rows: tuple[FleetRow, ...]
@@ -91,9 +93,9 @@ class FleetSummary:
 
     @property
     def exit_code(self) -> int:
-        """0: every log has a result; 3: some have none, or aren't done; 10: none has.
+        """Exit code. 0: every log has a result; 3: some have none, or are not done; 10: no log has a result.
 
-        The log of a run that was refused before motion is whole, and has no result to give.
+        The log of a run that was refused before motion is complete although it has no result.
         """
         bad = sum(row.failed and not row.no_motion for row in self.rows)
         if self.rows and all(row.failed for row in self.rows):
@@ -102,13 +104,13 @@ class FleetSummary:
 
 
 class Progress(Protocol):
-    """Told how it goes."""
+    """Receiver of the progress."""
 
     def start(self, total: int, done: int) -> None:
         """Start the progress of ``total`` logs, of which ``done`` are done."""
 
     def done(self, row: FleetRow) -> None:
-        """One more."""
+        """Count one finished log."""
 
 
 class _Silent:
@@ -123,12 +125,13 @@ def run_fleet(
     function: Callable[[LogTask], Done] = identify_log,
     stop: Callable[[], bool] | None = None,
 ) -> FleetSummary:
-    """Identify all that isn't done yet, and write the table.
+    """Identify all logs that are not done yet, and write the table.
 
-    Ctrl-C ends it early, and so does ``stop``, which is asked several times a second: what is done is in the table
-    then, `FleetSummary.interrupted` says so, and the same again does the rest. It may be called in any thread.
+    Ctrl-C ends it early, and so does ``stop``, which is called several times a second. Then the finished rows are in
+    the table, `FleetSummary.interrupted` is True, and the same request does the rest. It may be called in any thread.
 
-    Raises UsageError (nothing there, a file that isn't ours, a cluster that doesn't fit) and LogBroken (disk full).
+    Raises UsageError (no log found, a file that is not a table of a fleet, a cluster that doesn't fit) and LogBroken
+    (disk full).
     """
     check_table_path(request.out, request.folder)
     began = time.monotonic()
@@ -185,7 +188,9 @@ def _results(
 
 
 def _lost(task: LogTask, loss: Loss) -> Done:
-    """The row of a log that hangs or ends its process: with its content's hash, so that it isn't tried for ever."""
+    """Return the row of a log that hangs or ends its process. It has the hash of the content, so that the log isn't
+    tried again.
+    """
     facts: dict[str, Any] = {}
     if "://" not in task.log:
         with suppress(OSError):
@@ -199,10 +204,10 @@ Stamp = tuple[int, int] | None
 def _known(
     request: FleetRequest, journal: Journal, logs: Sequence[str]
 ) -> tuple[dict[str, FleetRow], list[tuple[LogTask, Stamp]]]:
-    """Rows that are there already, by log, and what is left to do.
+    """Return the existing rows by log, and the tasks left to do.
 
-    A file that was not touched since is known by size and time; another one by its content, where there are results
-    that it could be one of.
+    A file that was not changed since is recognised by size and time. Another file is recognised by its content, if
+    there are results to compare with.
     """
     cache = None
     if request.cache:
@@ -236,9 +241,9 @@ def _row(request: FleetRequest, journal: Journal, log: str, stamp: Stamp) -> Fle
 
 
 def _stamp(log: str) -> Stamp:
-    """Size in bytes and time of the last change in ns, of a trace also of what stands beside it.
+    """Return size in bytes and time of the last change in ns. For a trace, files in the same folder are included.
 
-    Of a URL, instead of the time, what its file system tells the one content from another by.
+    For a URL, a number by which its file system distinguishes contents replaces the time.
     """
     if "://" in log:
         with suppress(OSError, TdhilError):
@@ -260,12 +265,12 @@ def _stamp(log: str) -> Stamp:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Looking for logs
+# Search for logs
 
 
 @dataclass(frozen=True)
 class FoundLogs:
-    """Logs in their order; those that are being written; traces of which nothing is known."""
+    """Logs in their order; logs that are being written; traces without a sidecar."""
 
     logs: tuple[str, ...]
     live: tuple[str, ...]
@@ -273,10 +278,11 @@ class FoundLogs:
 
 
 def find_logs(roots: Sequence[str]) -> FoundLogs:
-    """Every .mcap, and every .csv with a sidecar, below the folders; a file that is named itself whatever it ends in.
+    """Return every .mcap, and every .csv with a sidecar, below the folders. A file that is named itself may have any
+    ending.
 
-    Raises UsageError for a root that isn't there. What can't be listed is left out with a row of its own later: a file
-    that can't be read stays in the list.
+    Raises UsageError for a root that does not exist. A folder that can't be listed is left out. A file that can't be
+    read stays in the list and gets a row with its error later.
     """
     logs: set[str] = set()
     live: set[str] = set()
@@ -315,7 +321,7 @@ def _sort_in(path: Path, logs: set[str], live: set[str], bare: set[str], *, name
 
     with suppress(OSError):
         if not stat.S_ISREG(path.stat().st_mode):
-            return                                     # a pipe would be waited on for ever
+            return                                     # reading from a pipe would wait for ever
     if path.suffix.lower() == ".csv" and not sidecar_of(path).is_file() and not named:
         bare.add(str(path))
     elif is_live(path):
@@ -325,7 +331,7 @@ def _sort_in(path: Path, logs: set[str], live: set[str], bare: set[str], *, name
 
 
 def _remote(root: str) -> list[str]:
-    """The logs below a URL that fsspec can list."""
+    """Return the logs below a URL that fsspec can list."""
     system, inside = remote(root)
     try:
         with told_of(root):

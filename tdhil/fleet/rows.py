@@ -1,4 +1,4 @@
-"""One row a log: flat, typed, with units in the names; what a table of any kind is made of."""
+"""One row for each log: flat, typed, with units in the names. A table of any kind consists of these rows."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from tdhil.recording import ABORTED
 from tdhil.version import __version__
 
 ROW_FORMAT: Final = 3
-"""Grows when rows of before can't stand beside new ones."""
+"""Format number. It grows when older rows can't be in one table with new ones."""
 
 UNREAD: Final = "unread"
-"""Verdict of a log that gave no result at all; `error_kind` says why."""
+"""Verdict of a log without any result; `error_kind` states the reason."""
 
 
 @dataclass(frozen=True)
 class FleetSettings:
-    """Settings for every log; None: as each run had it (`tdhil.identify`)."""
+    """Settings for every log; None: as in each run (`tdhil.identify`)."""
 
     model: str | None = None
     confidence: float | None = None
@@ -34,8 +34,8 @@ class FleetSettings:
 
 
 def _at(*places: str) -> Any:
-    """Declare a column by its place in the result document, such as ``inertia_kg_m2.low``: the first that says
-    something.
+    """Declare a column by its places in the result document, such as ``inertia_kg_m2.low``. The first place with a
+    value counts.
     """
     return field(default=None, metadata={"places": places})
 
@@ -57,7 +57,7 @@ class FleetRow:
     reason: str | None = _at("reason")
     error_kind: str | None = None
     error_text: str | None = None
-    rig: str | None = _at("rig.name")    # the file's name is no identity: every folder may have its rig.yaml
+    rig: str | None = _at("rig.name")    # the file's name identifies no rig: every folder may have a rig.yaml
     date: str | None = _at("date")
     inertia_kg_m2: float | None = _at("inertia_kg_m2.value")
     inertia_low_kg_m2: float | None = _at("inertia_kg_m2.low")
@@ -107,7 +107,7 @@ class FleetRow:
     aborted_stage: str | None = None
     aborted_by: str | None = _at("ended.kind")
     simulated: bool | None = _at("simulated")
-    rehearsed_faults: str | None = None      # scripted in the simulated drive: no history of the rig
+    rehearsed_faults: str | None = None      # faults scripted in the simulated drive: not part of the rig's history
     drive_name: str | None = _at("drive.name")
     drive_vendor: int | None = _at("drive.vendor")
     drive_product: int | None = _at("drive.product")
@@ -138,7 +138,7 @@ class FleetRow:
 
     @property
     def part_text(self) -> str | None:
-        """Which part of a run its result is from, in words; None where that is all of it."""
+        """Part of the run on which the result is based, in words; None for the whole run."""
         if self.aborted_stage is not None or self.aborted_by is not None:
             stage = f" in stage {self.aborted_stage}" if self.aborted_stage is not None else ""
             return f"aborted{stage}" + (f" ({self.aborted_by})" if self.aborted_by is not None else "")
@@ -149,17 +149,17 @@ COLUMNS: Final[Mapping[str, type]] = {
     one.name: next(kind for kind in (bool, int, float, str) if str(one.type).startswith(kind.__name__))
     for one in fields(FleetRow)
 }
-"""Each column's type; all but the log, the verdict and the settings may be empty."""
+"""Type of each column. All columns except log, verdict and settings may be empty."""
 
 
 PLACES: Final[Mapping[str, tuple[str, ...]]] = {
     one.name: one.metadata["places"] for one in fields(FleetRow) if "places" in one.metadata
 }
-"""Places in the result document of the columns that are taken from it as they are."""
+"""Places in the result document of the columns that are copied unchanged."""
 
 
 def counted(count: int, noun: str) -> str:
-    """Write "1 log", "2 logs"."""
+    """Return "1 log", "2 logs"."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
@@ -170,7 +170,7 @@ def row_key(sha256: str, settings: FleetSettings) -> str:
 
 
 def row_from_json(content: Mapping[str, Any]) -> FleetRow:
-    """A row as `dataclasses.asdict` laid it out. Raises ValueError for anything else."""
+    """Return a row from the output of `dataclasses.asdict`. Raises ValueError for anything else."""
     if not set(content) <= set(COLUMNS) or not {"log", "verdict"} <= set(content):
         raise ValueError("not a row of a fleet's table")
     for name, value in content.items():
@@ -192,7 +192,8 @@ def row_of(
     stored: Mapping[str, Any] | None = None,
     **facts: Any,
 ) -> FleetRow:
-    """The row of a result document (``tdhil replay --json``); ``stored``: the document that the run left in its log.
+    """Return the row of a result document (``tdhil replay --json``). ``stored``: the document that the run left in its
+    log.
 
     ``facts``: other fields by name, such as ``sha256`` and ``torque_scale_rel_sd``.
     """
@@ -217,7 +218,7 @@ def row_of(
 
 
 def _find(document: Mapping[str, Any], places: tuple[str, ...]) -> Any:
-    """Return the first value that says something, else the last one; None where a place does not exist."""
+    """Return the first value that is not empty, else the last one; None if a place does not exist."""
     value: Any = None
     for place in places:
         value = document
@@ -234,7 +235,7 @@ def _find(document: Mapping[str, Any], places: tuple[str, ...]) -> Any:
 
 
 def failure_row(log: str, kind: str, text: str, settings: FleetSettings, **facts: Any) -> FleetRow:
-    """The row of a log that gave nothing; ``kind`` is the error's class, ``text`` what it said."""
+    """Return the row of a log without a result. ``kind``: class of the error; ``text``: its message."""
     return FleetRow(
         log=log, verdict=UNREAD, error_kind=kind, error_text=" ".join(text.split())[:1000],
         settings=json.dumps(settings.asked(), sort_keys=True), **facts,
@@ -242,7 +243,7 @@ def failure_row(log: str, kind: str, text: str, settings: FleetSettings, **facts
 
 
 def _stored(document: Mapping[str, Any] | None) -> tuple[str, float | None] | None:
-    """Verdict and inertia of the run's own result; a log may say anything."""
+    """Return verdict and inertia of the run's own result. The log's content is untrusted."""
     if not isinstance(document, Mapping) or not isinstance(document.get("verdict"), str):
         return None
     inertia = document.get("inertia_kg_m2")
@@ -252,7 +253,7 @@ def _stored(document: Mapping[str, Any] | None) -> tuple[str, float | None] | No
 
 
 def _differs(was: tuple[str, float | None], now: tuple[str, float | None]) -> bool:
-    """Another verdict, or another number by more than what processors' sums differ."""
+    """Return whether the verdict differs, or the number by more than the rounding of another processor."""
     if was[0] != now[0] or (was[1] is None) != (now[1] is None):
         return True
     return was[1] is not None and now[1] is not None and not math.isclose(was[1], now[1], rel_tol=1e-8)

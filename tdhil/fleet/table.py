@@ -1,4 +1,4 @@
-"""Storage of rows: a journal as they come, and the table, Parquet, CSV or SQLite by its ending."""
+"""Storage of rows: a journal of finished rows, and the table, whose ending selects Parquet, CSV or SQLite."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _SQLITE: Final = {str: "TEXT", float: "REAL", int: "INTEGER", bool: "INTEGER"}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The journal: one line a row as soon as it is there, so that an end at any moment costs what was in hand
+# The journal: one line for each row, written at once, so that an end at any moment loses only the tasks under way
 
 
 class Journal(AbstractContextManager["Journal"]):
-    """Lines of JSON in a folder beside the table. One host writes it at a time; a line that was cut is not there.
+    """Lines of JSON in a folder beside the table. One host writes it at a time. An incomplete line is ignored.
 
-    Raises UsageError where another host has it, LogUnopened and LogBroken where the disk refuses.
+    Raises UsageError if another host has it, LogUnopened and LogBroken for errors of the disk.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -49,7 +49,7 @@ class Journal(AbstractContextManager["Journal"]):
         self._read()
 
     def add(self, row: FleetRow, key: str | None, stamp: tuple[int, int] | None) -> None:
-        """One row that is done; ``key``: what it hangs on; ``stamp``: size and time of change of its file."""
+        """Add a finished row. ``key``: key of the result; ``stamp``: size and time of change of its file."""
         line = json.dumps({"key": key, "stamp": stamp, "row": asdict(row)}) + "\n"
         try:
             self._file.write(line.encode())
@@ -82,7 +82,7 @@ class Journal(AbstractContextManager["Journal"]):
                 self._learn(row_from_json(found["row"]), found["key"], found["stamp"])
         self._file.seek(0, os.SEEK_END)
         if self._file.tell() > end:
-            self._file.truncate(end)                               # a line that a kill has cut
+            self._file.truncate(end)                               # an incomplete line after a kill
             self._file.seek(0, os.SEEK_END)
 
     def _hold(self) -> None:
@@ -107,7 +107,7 @@ class Journal(AbstractContextManager["Journal"]):
 
 
 def check_table_path(path: Path, folder: Path) -> None:
-    """UsageError for an ending that isn't known, a library that is missing, or a file that isn't a fleet's."""
+    """Check the path. Raises UsageError for an unknown ending, a missing library, or a file that isn't a fleet's."""
     _writer(path)
     if path.suffix == ".parquet":
         load_duckdb()
@@ -117,7 +117,7 @@ def check_table_path(path: Path, folder: Path) -> None:
 
 
 def write_table(rows: Sequence[FleetRow], path: Path) -> None:
-    """All rows at once; nothing stands at ``path`` before all of them do. Raises LogBroken, UsageError."""
+    """Write all rows at once. ``path`` is replaced only when the table is complete. Raises LogBroken, UsageError."""
     write = _writer(path)
     part = path.with_name(f".{path.name}.part")
     part.unlink(missing_ok=True)
@@ -133,7 +133,7 @@ def write_table(rows: Sequence[FleetRow], path: Path) -> None:
 
 
 def read_table(path: Path) -> list[FleetRow]:
-    """The rows of a table that `write_table` wrote. Raises UsageError."""
+    """Return the rows of a table that `write_table` wrote. Raises UsageError."""
     readers: dict[str, Callable[[Path], Iterable[Mapping[str, Any]]]] = {
         ".parquet": _read_parquet, ".csv": _read_csv, ".sqlite": _read_sqlite,
     }
@@ -159,12 +159,14 @@ def _writer(path: Path) -> Callable[[list[dict[str, Any]], Path], None]:
 
 
 def _plain(value: Any) -> Any:
-    """A file's name that isn't UTF-8 has no place in a table."""
+    """Replace characters of a file's name that are not UTF-8."""
     return value.encode("utf-8", "replace").decode() if isinstance(value, str) else value
 
 
 def load_duckdb(where: str = "--out", otherwise: str = "end it in .csv or .sqlite") -> Any:
-    """DuckDB, which reads and writes Parquet. Raises UsageError where it isn't installed; ``otherwise``: than that."""
+    """Return DuckDB, which reads and writes Parquet. Raises UsageError if it isn't installed; ``otherwise``: the
+    alternative.
+    """
     try:
         return importlib.import_module("duckdb")
     except ImportError as error:
@@ -207,7 +209,7 @@ def _write_csv(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def _cell(value: Any) -> str:
-    """Numbers as Python writes them: read back, they are the same to the last bit."""
+    """Return a value as text. Floats are written so that they read back the same to the last bit."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):

@@ -1,4 +1,4 @@
-"""One log in, one row out: the same function for the pool, a cluster, and any other caller."""
+"""Identification of one log into one row: the same function for the pool, a cluster, and any other caller."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ _BLOCK: Final = 2**20
 
 @dataclass(frozen=True)
 class LogTask:
-    """``log``: a path, or a URL that fsspec can open; ``cache``: a folder for recordings that were read, or None."""
+    """One log to identify. ``log``: a path, or a URL that fsspec can open; ``cache``: a folder for recordings that were
+    read, or None.
+    """
 
     log: str
     settings: FleetSettings = field(default_factory=FleetSettings)
@@ -36,7 +38,9 @@ class LogTask:
 
 @dataclass(frozen=True)
 class Done:
-    """A task's row, and what differs from one time to the next: CPU time in s, and was the recording in the cache?"""
+    """Row of a task, with facts that differ between calls. ``cpu_s``: CPU time, s; ``cached``: the recording was in the
+    cache.
+    """
 
     row: FleetRow
     cpu_s: float = 0.0
@@ -44,7 +48,7 @@ class Done:
 
 
 def identify_log(task: LogTask) -> Done:
-    """Identify one log. Raises nothing that hangs on the file: what can't be read is a row with its error."""
+    """Identify one log. Raises no error of the file: a file that can't be read gives a row with its error."""
     import time
 
     began = time.process_time()
@@ -60,14 +64,14 @@ def identify_log(task: LogTask) -> Done:
 
 
 def _text(error: Exception) -> str:
-    """Return the error's text for a row; for an error of our tree without the place, which the row has."""
+    """Return the error's text for a row. For a TdhilError it is without the place, which the row has."""
     if isinstance(error, TdhilError):
         return error.what if not error.next_step else f"{error.what}. {error.next_step}"
     if isinstance(error, OSError):
         return f"can't be read: {error.strerror or error}"
     if isinstance(error, MemoryError):
         return "needs more memory than it may take"
-    # A mistake of ours that this file brings to light; the other logs are not to suffer for it.
+    # A defect of tdhil that this file shows. The other logs continue.
     return f"internal error, please report it with this log: {error}"
 
 
@@ -102,20 +106,20 @@ def _row(task: LogTask, path: Path, facts: Mapping[str, Any]) -> tuple[FleetRow,
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Reading: a log of ours, or a trace with what is known of it beside it
+# Reading: a tdhil log, or a trace with its sidecar
 
 
 class Sidecar(DataModel):
-    """trace.yaml beside trace.csv: the options of ``tdhil replay`` for a trace, and whose it is."""
+    """trace.yaml beside trace.csv: the options of ``tdhil replay`` for a trace, and its rig."""
 
-    rig: str | None = Field(default=None, max_length=200, description="whose trace it is")
+    rig: str | None = Field(default=None, max_length=200, description="rig of the trace")
     date: str | None = Field(default=None, max_length=40, description="when it was recorded, ISO 8601")
     columns: tuple[str, ...] | None = Field(default=None, description="such as time=t_s, speed=n_rpm:rpm")
     excitation: str | None = Field(default=None, description="an excitation.yaml in the same folder")
-    rated_torque_nm: float | None = Field(default=None, gt=0, description="N·m; what torque in % is a share of")
+    rated_torque_nm: float | None = Field(default=None, gt=0, description="N·m; 100 % torque")
     torque_limit_nm: float | None = Field(default=None, gt=0, description="N·m; the drive's torque limit")
     gear_ratio: float | None = Field(default=None, gt=0, description="ω_motor/ω_main")
-    torque_scale_rel_sd: float | None = Field(default=None, ge=0, lt=1, description="how right the torque is, 1 sd")
+    torque_scale_rel_sd: float | None = Field(default=None, ge=0, lt=1, description="standard uncertainty of the scale")
     speed_lag_s: float | None = Field(default=None, ge=0, description="s; filter on the reported speed")
     speed_lag_sd_s: float | None = Field(default=None, ge=0, description="s; its standard deviation")
     torque_lag_s: float | None = Field(default=None, ge=0, description="s; filter on the reported torque")
@@ -128,7 +132,7 @@ def sidecar_of(trace: Path) -> Path:
 
 
 def read_any(path: Path) -> RunRecord:
-    """A log of ours, or a trace with its sidecar. Raises TdhilError."""
+    """Return the record of a tdhil log, or of a trace with its sidecar. Raises TdhilError."""
     from tdhil.session import is_log, read
 
     if is_log(path):
@@ -166,14 +170,14 @@ def _known(trace: Path) -> Sidecar:
 
 
 def content_hash(path: Path) -> str:
-    """SHA-256 of the file; of a trace in CSV, of what stands beside it too. Raises OSError."""
+    """Return the SHA-256 of the file; for a trace in CSV, with its sidecar and excitation. Raises OSError."""
     sum_ = hashlib.sha256()
     _add(sum_, path)
     side = sidecar_of(path)
     if path.suffix.lower() == ".csv" and side.is_file():
         sum_.update(b"\0sidecar\0")
         _add(sum_, side)
-        with suppress(TdhilError):             # who reads it says what is wrong with it
+        with suppress(TdhilError):             # the reader of the file reports its errors
             named = _known(path).excitation
             if named is not None and path.with_name(Path(named).name).is_file():
                 sum_.update(b"\0excitation\0")
@@ -189,7 +193,9 @@ def _add(sum_: Any, path: Path) -> None:
 
 @contextmanager
 def local_copy(log: str) -> Iterator[Path]:
-    """The file as a path of this machine: a URL's content in a temporary file for as long as it is needed."""
+    """Yield the file as a path of this machine. The content of a URL is in a temporary file until the end
+    of the block.
+    """
     if "://" not in log:
         yield Path(log)
         return
@@ -203,7 +209,7 @@ def local_copy(log: str) -> Iterator[Path]:
 
 
 def remote(url: str) -> tuple[Any, str]:
-    """The file system behind a URL, of fsspec, and the path there. Raises UsageError where a library is missing."""
+    """Return fsspec's file system of a URL, and the path there. Raises UsageError if a library is missing."""
     from importlib import import_module
 
     try:
@@ -252,7 +258,7 @@ def _from_cache(kept: Path) -> RunRecord | None:
 
 
 def _into_cache(kept: Path, record: RunRecord) -> None:
-    """A cache that can't be written is none: the row doesn't hang on it."""
+    """Write a record to the cache. An error is ignored, because the row does not depend on the cache."""
     from tdhil.recording import pack_recording
 
     beside = {

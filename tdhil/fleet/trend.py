@@ -1,4 +1,4 @@
-"""One rig over time, and some runs side by side: what the rows and results say about a change, as plain data."""
+"""One rig over time, and a comparison of some runs: changes in rows and results, as plain data."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tdhil.fleet.rows import FleetRow, FleetSettings, counted, row_of
 from tdhil.fleet.task import content_hash, read_any
 
 _GOOD: Final = ("valid", "valid_wide")
-_SHOWN: Final = 5       # logs by name in a note
+_SHOWN: Final = 5       # number of logs that a note names
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ QUANTITIES: Final = (
 
 
 def measured(row: FleetRow, quantity: Quantity, time: float = 0.0) -> Measured | None:
-    """A row's value with its repeatability; None where it has none."""
+    """Return a row's value with its repeatability; None if the row has no value."""
     value, low, high = (getattr(row, name) for name in (quantity.column, quantity.low, quantity.high))
     if value is None or low is None or high is None or not low < high:
         return None
-    # Friction and lags are stated at the confidence of the run's own settings, which is J's.
+    # Friction and lags have the confidence of the run's own settings, like J.
     scale = (row.torque_scale_rel_sd or 0.0) if quantity.scaled else 0.0
     return Measured(value, low, high, row.confidence or 0.95, scale, scale_of(row), time)
 
@@ -59,15 +59,15 @@ def drive_of(row: FleetRow) -> str | None:
 
 
 def series_of(row: FleetRow) -> tuple[str | None, str | None]:
-    """Return the drive and its profile. Within one name, only runs with the same two are one series.
+    """Return the drive and its profile. Within one name, only runs with the same drive and profile are one series.
 
-    Another profile may read the torque in another unit, and its lags are others.
+    Another profile may read the torque in another unit, and its lags may differ.
     """
     return drive_of(row), row.profile
 
 
 def scale_of(row: FleetRow) -> str | None:
-    """Which torque scale it is: the drive's, since its torque calibration. Another one stays in a difference."""
+    """Return the torque scale: the drive, and its torque calibration. Between two scales it does not cancel."""
     drive = drive_of(row)
     return drive if drive is None or row.torque_calibration is None else f"{drive} calibrated {row.torque_calibration}"
 
@@ -109,7 +109,7 @@ def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str
         notes.append("simulated runs and real ones are mixed")
     drives = {drive_of(row) for _, row in kept}
     series = {series_of(row) for _, row in kept}
-    if len(series) > 1:         # two benches of one name, or another drive or profile on this one: never one series
+    if len(series) > 1:         # one series has one bench, one drive and one profile
         newest = series_of(kept[-1][1])
         others = [row for _, row in kept if series_of(row) != newest]
         kept = [(time_s, row) for time_s, row in kept if series_of(row) == newest]
@@ -176,7 +176,7 @@ def _trend_text(found: History, document: Mapping[str, Any], unit: str) -> str:
 
 
 def _probable(share: float) -> str:
-    """``93 % probable``; what isn't quite certain is not rounded to 100 %."""
+    """Return ``93 % probable``. A probability below 1 is never rounded to 100 %."""
     return "over 99.9 % probable" if share > 0.999 else f"{100.0 * share:.3g} % probable"
 
 
@@ -206,12 +206,12 @@ def _time_s(row: FleetRow) -> float | None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Some runs side by side
+# Comparison of some runs
 
 
 @dataclass(frozen=True)
 class Compared:
-    """One log as it is compared: its row, its result document, and what it was run with, by name."""
+    """One log in a comparison: its row, its result document, and the settings of its run by name."""
 
     row: FleetRow
     document: Mapping[str, Any]
@@ -275,9 +275,10 @@ def _settings(
 
 
 def compare_document(runs: Sequence[Compared]) -> dict[str, Any]:
-    """Settings side by side, what differs marked; differences from the first; apparent inertia, line by line.
+    """Return the settings of the runs with marked differences, the differences from the first run, and the apparent
+    inertia at each spectral line.
 
-    As ``tdhil compare --json`` prints it. Of each quantity the sentence says whether it differs.
+    ``tdhil compare --json`` prints this document. For each quantity a sentence states whether it differs.
     """
     first, *others = runs
     return {

@@ -1,4 +1,4 @@
-"""The result document of a Recording, made in the same way for a live run and for its replay."""
+"""Result document of a Recording, made in the same way for a live run and for its replay."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def working_confidence_of(run: Mapping[str, Any], confidence: float) -> float:
 
 
 def after_looks(found: Identification, run: Mapping[str, Any], confidence: float) -> Identification:
-    """Return the result with its coverage probability, and with advice how to reach the tolerance."""
+    """Return the result with its coverage probability, and with advice on how to reach the tolerance."""
     stopping = run.get("stopping")
     if not isinstance(stopping, Mapping):
         return found
@@ -90,7 +90,7 @@ def conclude(
     )
     if said:
         identification = replace(identification, warnings=(*said, *identification.warnings))
-    # a run that measured the drive's own impedance stands or falls with that
+    # for a run that measured the drive's own impedance, this result decides
     measured = identification.impedance
     stands = (identification if measured is None else measured).verdict in (Verdict.VALID, Verdict.VALID_WIDE)
     document = result_document(identification, recording, run, log)
@@ -99,7 +99,9 @@ def conclude(
 
 
 def _accepted(acceptance: Mapping[str, Any] | None, *, stands: bool) -> ExitCode:
-    """Return the exit code of the result: not passed, if it contradicts what is expected; else whether it stands."""
+    """Return the exit code: not passed, if the result contradicts the expectation; otherwise by whether the result is
+    valid.
+    """
     from tdhil.report import AcceptanceVerdict
 
     verdict = None if acceptance is None else acceptance["verdict"]
@@ -109,7 +111,7 @@ def _accepted(acceptance: Mapping[str, Any] | None, *, stands: bool) -> ExitCode
 
 
 def _dated(found: Identification, day: str) -> Identification:
-    """With the day of the torque calibration in the budget's line."""
+    """Return the result with the day of the torque calibration in the budget's line."""
     if not day:
         return found
     advice = found.advice

@@ -40,7 +40,7 @@ def confirm_motion(
     pause_display: Callable[[], None],
     unverified: Sequence[str] = (),
 ) -> None:
-    """Return if the shaft may be moved; raises PreflightRefused (exit 4) if not.
+    """Return if the shaft may be moved. Raises PreflightRefused (exit 4) if not.
 
     A simulated peer needs no confirmation. ``--yes`` replaces the prompt, not the limits.
     """
@@ -74,7 +74,7 @@ def confirm_speed(
     pause_display: Callable[[], None],
     gear_ratio: float = 1.0,
 ) -> None:
-    """Return if the operator sees the shaft turn as fast as the drive reports; PreflightRefused (exit 4) if not.
+    """Return if the operator sees the shaft turn at the reported speed. Raises PreflightRefused (exit 4) if not.
 
     Cycles continue while the prompt waits. ``--yes`` does not answer this question.
     """
@@ -116,7 +116,7 @@ def confirm_speed(
 
 
 def require_terminal(what: str) -> None:
-    """Raise PreflightRefused (exit 4) where no operator can confirm ``what`` at a terminal."""
+    """Raise PreflightRefused (exit 4) if no operator can confirm ``what`` at a terminal."""
     if sys.stdin is None or not sys.stdin.isatty():
         raise PreflightRefused(f"no operator can confirm {what}", where="no terminal",
                                next_step="Run it at a terminal. --yes does not answer this question",
@@ -124,9 +124,9 @@ def require_terminal(what: str) -> None:
 
 
 def confirm_mounted(console: Console, later: str) -> None:
-    """Return once the operator confirms that the body is on the shaft; PreflightRefused (exit 4) if not.
+    """Return when the operator confirms that the body is on the shaft. Raises PreflightRefused (exit 4) if not.
 
-    No drive is open meanwhile. ``later``: the command that calibrates from a second run of another time.
+    No drive is open meanwhile. ``later``: the command that calibrates from a second run at another time.
     """
     require_terminal("that the body is mounted")
     _forget_what_was_typed()
@@ -211,7 +211,7 @@ def _line() -> str:
 
 
 def _meanwhile(idle: Idle, ask: Callable[[], T]) -> T:
-    """Return what ``ask`` returns, or raise what it raises. It runs in a thread; idle cycles continue meanwhile."""
+    """Return the result of ``ask``, or raise its exception. It runs in a thread; idle cycles continue meanwhile."""
     answer: Future[T] = Future()
 
     def work() -> None:
@@ -228,7 +228,7 @@ def _meanwhile(idle: Idle, ask: Callable[[], T]) -> T:
 
 
 class TerminalOperator:
-    """The operator at the terminal: sees the run there, types the confirmation, watches the shaft."""
+    """The operator at the terminal, who sees the run there, types the confirmation, and watches the shaft."""
 
     def __init__(self, console: Console, *, yes: bool = False, gear_ratio: float = 1.0) -> None:
         self._console = console
@@ -269,7 +269,9 @@ class TerminalOperator:
 
 
 class CallbackOperator(TerminalOperator):
-    """The same, but a function of the caller confirms motion. It receives the summary of the motion as text."""
+    """The operator at the terminal, but a function of the caller confirms motion. It receives the summary of the
+    motion.
+    """
 
     def __init__(self, console: Console, ask: Callable[[str], bool], *, gear_ratio: float = 1.0) -> None:
         super().__init__(console, gear_ratio=gear_ratio)

@@ -1,6 +1,6 @@
 """One drive, one holder: a lock on the drive's address. Every program that may move the shaft takes it.
 
-The lock (flock) belongs to an open file, so the system releases it when the process ends, for whatever reason. The file
+The lock (flock) belongs to an open file, so the system releases it when the process ends, for any reason. The file
 names the holder. It lies in one folder for all users and services of this computer; a folder per user would give two
 users two locks. A locked file can be removed, and the next process would then lock another one. So on Linux an abstract
 socket name in the kernel is taken too, which can't be removed. Stopping takes no lock.
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from tdhil.config import RunOptions
 
 FOLDERS = ("/run/lock", "/dev/shm", "/tmp")
-"""Candidates. The first one in which every user may create files is used."""
+"""Candidate folders. The first one in which every user may create files is used."""
 PATIENCE_S = 0.3
 """Time for which taking the lock is retried, s. A process that only reads the holder has the lock for a moment."""
 _LONGEST = 4096

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from tdhil.soft_torque import EvaluationCase, SpeedProgram
 
 
-SPIN_UP_S = 2.5             # assumed J: the torque limit would take so long through the speed window
-VISCOUS_SHARE = 0.2         # assumed friction at the highest speed, of the torque limit, …
-COULOMB_SHARE = 0.15        # … and at standstill
-BEFORE_ACQUIRE_S = 90.0     # stages 1 to 4, about
+SPIN_UP_S = 2.5             # assumed J: time in which the torque limit passes the speed window
+VISCOUS_SHARE = 0.2         # assumed friction at the highest speed, as a share of the torque limit
+COULOMB_SHARE = 0.15        # assumed friction at standstill, as a share of the torque limit
+BEFORE_ACQUIRE_S = 90.0     # approximate duration of stages 1 to 4
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tdhil.soft_torque import DrillString, EvaluationCase, Interval
 
 SAME_STRING = 1e-6
-_CONFIDENCE = 0.95        # of the interval of the torque ratio
+_CONFIDENCE = 0.95        # confidence of the interval of the torque ratio
 _TUNE_AGAIN = "tdhil tune soft-torque result.json --string string.yaml --json > tune.json"
 
 

@@ -27,7 +27,7 @@ def kept_connection(options: RunOptions, connection: Connection) -> dict[str, An
 
 
 def connection_of_kept(plain: Mapping[str, Any]) -> tuple[RunOptions, Connection]:
-    """Return options and connection as the run had them. Raises DataFileError, KeyError, TypeError or ValueError."""
+    """Return options and connection of the run. Raises DataFileError, KeyError, TypeError or ValueError."""
     bus = bus_named(str(plain["drive"]))
     profile = parse_profile(str(plain["profile_text"]), str(plain["profile"]))
     settings = {name: Setting(value, _SOURCE, Origin.RIG_FILE) for name, value in dict(plain["line"]).items()}

@@ -1,4 +1,4 @@
-"""Places for a run's files: never over an older log, a log that another run writes, or a foreign file."""
+"""Places for a run's files. An older log, a log that another run writes, and a foreign file are never overwritten."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class LogPlace:
     def __init__(self, wanted: Path) -> None:
         self.wanted = wanted
         self.path = wanted
-        self.older: Path | None = None         # where an older log was moved to
+        self.older: Path | None = None         # new path of an older log that was moved
         self.live = False                      # another run is writing ``wanted``
         self.motion = False                    # set when motion is confirmed
-        self.moved = ""                        # message if the file was moved or removed; empty: it was not
-        self._descriptor: int | None = None    # of the file, while it may have to be found again
+        self.moved = ""                        # message if the file was moved or removed; else empty
+        self._descriptor: int | None = None    # descriptor of the file, while the file may have to be found again
 
     def open(self, wanted: Path) -> IO[bytes]:
         """Open the file, locked against other runs. Raises OSError, and UsageError for a foreign file."""

@@ -61,7 +61,7 @@ def require_accepted(profile: Profile, accepted: Collection[str]) -> None:
 
 
 def accepted_lines(profile: Profile, accepted: Collection[str]) -> tuple[str, ...]:
-    """Return the accepted entries that are not verified, a line each."""
+    """Return the accepted entries that are not verified, one line each."""
     return tuple(
         f"{name} ({entry.confidence}): {entry.source}"
         for name, entry in doubtful(profile)

@@ -40,7 +40,7 @@ class PaceMeasured:
 
     @property
     def text(self) -> str:
-        """Return it as sentences for a page."""
+        """Return the result as sentences for a page."""
         half_ms = 500.0 / self.rate_hz
         seen = (f"{self.late} of {self.cycles} cycles were late by half a period ({half_ms:.3g} ms) or more; the"
                 f" longest delay was {1e3 * self.worst_s:.2g} ms")
@@ -50,12 +50,12 @@ class PaceMeasured:
                 "may end because it is late. End other programs, or run in stepped time.")
 
     def plain(self) -> dict[str, Any]:
-        """Return it as plain data."""
+        """Return the result as plain data."""
         return {**asdict(self), "holds": self.holds, "text": self.text}
 
 
 def measure_pace(options: RunOptions, connection: Connection, rig: Rig | None) -> PaceMeasured:
-    """Run cycles of the disabled embedded drive by the clock. ``options`` ask for a simulated rig in real time."""
+    """Run cycles of the disabled embedded drive by the clock. ``options`` request a simulated rig in real time."""
     peer: PeerPlan = plan_peer(options, connection)
     limits = require_limits(simulated_default_rig(suited(rig, peer.plant)))
     data = None if rig is None else rig.drive_data

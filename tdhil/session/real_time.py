@@ -31,7 +31,7 @@ _CAP_IPC_LOCK = 14                           # linux/capability.h
 
 @dataclass(frozen=True)
 class Raised:
-    """The outcome of the request: which of both was granted, and in words why not."""
+    """Result of the request: granted priority and memory lock, and the reasons for a refusal."""
 
     priority: int = 0                        # SCHED_FIFO; 0: an ordinary thread
     memory_locked: bool = False
@@ -44,7 +44,7 @@ class Raised:
 
 @contextmanager
 def real_time_priority(wanted: bool, *, stepped: bool = False) -> Iterator[Raised]:
-    """Apply it around the run, in the thread that drives it, and undo it afterwards. Raises nothing."""
+    """Apply the priority around the run, in the thread that drives it, and undo it afterwards. Raises nothing."""
     if not wanted:
         yield Raised()
         return
@@ -96,7 +96,7 @@ def _lower_thread() -> None:
 
 
 def _lower_where_it_runs_away() -> None:
-    """Set RLIMIT_RTTIME: the kernel sends SIGXCPU to a real-time thread that computes that long without a pause."""
+    """Set RLIMIT_RTTIME: the kernel sends SIGXCPU to a real-time thread that computes for this time without a pause."""
     with suppress(OSError, ValueError, AttributeError, ImportError):   # no main thread, or no such limit
         import resource
 
@@ -111,7 +111,7 @@ def _lock_memory() -> str:
         return limit
     try:
         libc = _libc()
-        # On fault: pages that are never touched, such as the far end of a thread's stack, take no memory.
+        # On fault: pages that are never used, such as the far end of a thread's stack, take no memory.
         failed = libc.mlockall(_CURRENT | _FUTURE | _ON_FAULT)
     except (OSError, AttributeError) as error:
         return str(error)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def log_of_calibration(record: RunRecord) -> dict[str, Any]:
-    """Log, name, hash and date of a recording, for the document of a calibration."""
+    """Return log, name, hash and date of a recording, for the document of a calibration."""
     return {"log": record.log, "name": Path(record.log).name, "sha256": sha256_of_log(record),
             "date": record.configuration.get("started")}
 
@@ -30,9 +30,10 @@ def find_by_reference(
     record: RunRecord, trace: Path, columns: Sequence[str] | None, at: str, reference_rel_sd: float | None,
     confidence: float,
 ) -> dict[str, Any]:
-    """Document of the calibration. ``columns``: of the trace, as `QUANTITY=NAME:UNIT`; ``at``: the sensor's shaft.
+    """Return the document of the calibration by a reference sensor.
 
-    Raises UsageError and CsvUnusable for a trace that is not usable, NothingRecorded for a log without motion.
+    ``columns``: columns of the trace, as `QUANTITY=NAME:UNIT`; ``at``: the sensor's shaft. Raises UsageError and
+    CsvUnusable for a trace that is not usable, NothingRecorded for a log without motion.
     """
     from tdhil.calibration import ASSUMED_REFERENCE_REL_SD, TorqueRecord, calibrate_reference
     from tdhil.recording import REFERENCE_FLAG, TIME_AND_TORQUE, parse_columns, read_reference
@@ -83,7 +84,7 @@ _STEP = 1e-4
 
 
 def known_pipe_of(file: StringFile, gear_ratio: float) -> KnownPipe:
-    """Impedance and travel time of the string's one section at the motor shaft, with its tolerances.
+    """Return impedance and travel time of the string's one section at the motor shaft, with its tolerances.
 
     Raises ValueError for more than one section, or one without a length.
     """
@@ -96,7 +97,7 @@ def known_pipe_of(file: StringFile, gear_ratio: float) -> KnownPipe:
     line = line_of(section)
 
     def sensitivity(name: str) -> tuple[float, float]:
-        """Relative sensitivities of ζ and T to one size of the pipe's body."""
+        """Return the relative sensitivities of ζ and T to one size of the pipe's body."""
         size = float(getattr(section, name))
         ends = [line_of(section.model_copy(update={name: size * (1.0 + sign * _STEP)})) for sign in (1.0, -1.0)]
         impedance, delay = ([value(one) for one in ends] for value in (_impedance_of, _delay_of))
@@ -130,7 +131,9 @@ def _delay_of(line: WaveLine) -> float:
 
 
 def find_by_known_pipe(record: RunRecord, path: Path, confidence: float) -> dict[str, Any]:
-    """Document of the calibration by the pipe in ``path`` (string.yaml). Raises UsageError for another string."""
+    """Return the document of the calibration by the pipe in ``path`` (string.yaml). Raises UsageError for another
+    string.
+    """
     from profiles import load_model
     from tdhil.calibration import calibrate_known_pipe
     from tdhil.estimation import Refused, measure_string

@@ -1,4 +1,4 @@
-"""The verdict on a rehearsed fault: the reaction that the fault table requires, what was seen, pass or fail.
+"""The verdict on a rehearsed fault: the reaction that the fault table requires, the observation, pass or fail.
 
 A rehearsal runs on the embedded simulator only, so the true inertia is known. `REQUIRED` is the one place of the
 required reactions of all faults that can be scripted; docs/reference/faults.md is made from it.
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RequiredReaction:
-    """Requirement of a row of the fault table. ``codes``: exit codes with which the run may end.
+    """Requirement of a row of the fault table. ``codes``: permitted exit codes of the run.
 
-    ``or_covered``: the run may also go on, if the interval of its result covers the true inertia.
+    ``or_covered``: the run may also continue, if the interval of its result covers the true inertia.
     """
 
     reaction: str
@@ -48,7 +48,7 @@ _SHORT: Final = re.compile(rf"\b(?:{'|'.join(_LONG)})\b")
 
 
 ANY_STOP: Final = (4, 5, 6, 7, 8, 9)
-"""Exit codes of a run that a report which lies has ended: whichever check notices it first names it."""
+"""Exit codes of a run that a wrong report has ended. The check that detects the report first determines the code."""
 
 REQUIRED: Final[Mapping[int, RequiredReaction]] = {
     12: RequiredReaction("WD", (8,)),
@@ -124,7 +124,7 @@ class RehearsalVerdict(StrEnum):
 _KEPT_CODES = frozenset({
     ExitCode.INTERNAL, ExitCode.PARTIAL, ExitCode.STOP_NOT_CONFIRMED, ExitCode.INTERRUPTED, ExitCode.TERMINATED,
 })
-"""Exit codes that a failed rehearsal does not replace: they say more than it does."""
+"""Exit codes that a failed rehearsal does not replace, because they state more."""
 
 
 @dataclass(frozen=True)
@@ -140,18 +140,18 @@ class RehearsedFault:
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """The verdict on all faults of one run, and what was seen."""
+    """Verdict on all faults of one run, and the observation."""
 
     verdict: RehearsalVerdict
     seen: str
     faults: tuple[RehearsedFault, ...]
 
     def plain(self) -> dict[str, Any]:
-        """Return it as plain data for the log and the document."""
+        """Return the rehearsal as plain data for the log and the document."""
         return {**asdict(self), "faults": [{**asdict(one), "codes": list(one.codes)} for one in self.faults]}
 
     def exit_code(self, code: int) -> int:
-        """Return the exit code of the run: its own, or `NOT_PASSED` in its place."""
+        """Return the exit code of the run: its own, or `NOT_PASSED` instead."""
         return code_with(self.plain(), code)
 
     @property
@@ -160,7 +160,7 @@ class Rehearsal:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """Return it as lines for a terminal."""
+        """Return the rehearsal as lines for a terminal."""
         return (
             with_code(f"rehearsal: {self.verdict}", self._code),
             *(f"{one.fault}: {one.verdict}; required ({row_name(one.row)}): {one.required}" for one in self.faults),
@@ -169,12 +169,12 @@ class Rehearsal:
 
 
 def row_name(row: int) -> str:
-    """Return ``row 33``, or that the fault table has none."""
+    """Return ``row 33``, or a text for a fault without a row."""
     return f"row {row}" if row else "no row of its own"
 
 
 def code_with(rehearsal: Mapping[str, Any] | None, code: int) -> int:
-    """Return the exit code of a run with this rehearsal. A code that says more than the rehearsal stays."""
+    """Return the exit code of a run with this rehearsal. A code that states more than the rehearsal stays."""
     failed = rehearsal is not None and rehearsal.get("verdict") == RehearsalVerdict.FAIL
     return int(ExitCode.NOT_PASSED) if failed and code not in _KEPT_CODES else code
 
@@ -237,7 +237,7 @@ def _code(outcome: RunOutcome) -> int:
 
 
 def _true_inertia(peer: PeerPlan) -> float | None:
-    """Return the inertia of a simulated rigid shaft, kg·m²; None for any other: J then means a part of it."""
+    """Return the inertia of a simulated rigid shaft, kg·m²; None for any other plant, of which J is only a part."""
     plant = None if peer.plant is None else peer.plant.plant
     if plant is None or plant.kind != "rigid":
         return None

@@ -30,10 +30,10 @@ _LONG_NAMES = {
 
 @dataclass(frozen=True)
 class RunRecord:
-    """One run or one trace. ``configuration``: of the run, as in its log; ``log``: the file.
+    """One run or one trace. ``configuration``: that of the run, as in its log; ``log``: the file.
 
     ``assumed``: assumptions in reading a foreign trace, None for a tdhil log; ``problems``: parts of the file that were
-    skipped, a line each; ``stored_result``: the result document that the run itself wrote to its log;
+    skipped, one line each; ``stored_result``: the result document that the run itself wrote to its log;
     ``virtual_string``: one row per cycle, with the columns of `tdhil.recording.VIRTUAL_COLUMNS`.
     """
 
@@ -63,7 +63,7 @@ class RunRecord:
         return replace(self, configuration={**self.configuration, **said})
 
     def require_motion(self) -> None:
-        """Raise NothingRecorded if the run was refused or ended in setup. The error repeats what ended the run.
+        """Raise NothingRecorded if the run was refused or ended in setup. The error repeats the cause of the run's end.
 
         It has that run's exit code, except for codes that describe a process and not a run. Raises NothingRecoverable
         for a log that was cut off before its first sample.

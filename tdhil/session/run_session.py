@@ -126,7 +126,7 @@ class RunSession:
         return not (self._place.motion or stopped)
 
     def move(self, stop: StopRequest | None = None) -> RunOutcome:
-        """Connect, five stages, stop, close. Raises the error that prevents opening the drive.
+        """Connect, run the five stages, stop, close. Raises the error that prevents opening the drive.
 
         ``stop``: a request from elsewhere. Signals set it too, if this is the main thread.
         """
@@ -204,7 +204,7 @@ class RunSession:
             self.log.configure(rehearsal=self.rehearsal.plain())
 
     def close(self) -> None:
-        """Finish the log. Raises LogError; the file has its final name also then."""
+        """Finish the log. Raises LogError; the file gets its final name also in this case."""
         try:
             self.log.close()
             self._place.follow()
@@ -224,7 +224,7 @@ class RunSession:
         self._tell_older()
 
     def _tell_older(self) -> None:
-        """Report once where an older log is now. Wait until this is certain: a refused run returns the name."""
+        """Report once the new place of an older log. Wait until this is certain: a refused run returns the name."""
         older = self._place.older
         if not self._older_told and older is not None and older.exists():
             self._older_told = True

@@ -18,9 +18,11 @@ if TYPE_CHECKING:
     from tdhil.calibration import CountedTurns, SpeedCalibration
 
 SECTION: Final = "speed_calibration"
-"""Key of the speed calibration in the file, beside a torque calibration or alone."""
+"""Key of the speed calibration in the file. The file may also contain a torque calibration."""
 TURNS_SD, SECONDS_SD = 0.25, 0.3
-"""Standard uncertainties of a count by eye: a quarter of a turn, and of a stopwatch by hand at both ends, s."""
+"""Standard uncertainties: of a count of turns by eye, a quarter of a turn, and of a stopwatch by hand at
+both ends, s.
+"""
 SPEED_REL_SD = 0.001
 """Assumed relative standard uncertainty of a mean speed that is read from a display."""
 
@@ -29,7 +31,8 @@ SPEED_REL_SD = 0.001
 class TurnsCount:
     """A count as the operator states it, turns at the motor or main shaft. None: not stated.
 
-    ``seconds``: by the clock; else the time between ``start_s`` and ``end_s``, which are times of the log.
+    ``seconds``: duration by the clock; otherwise the time between ``start_s`` and ``end_s``, which are times of the
+    log.
     """
 
     turns: float
@@ -43,7 +46,9 @@ class TurnsCount:
 
 
 def speed_by_position(record: RunRecord, wanted: float, confidence: float) -> SpeedCalibration:
-    """Factor from a log whose drive reports a position. Raises UsageError where it holds none."""
+    """Return the calibration factor from a log whose drive reports a position. Raises UsageError for a log
+    without one.
+    """
     from tdhil.calibration import calibrate_by_position
     from tdhil.estimation import angle_ratios
     from tdhil.recording import before_abort
@@ -62,9 +67,9 @@ def speed_by_position(record: RunRecord, wanted: float, confidence: float) -> Sp
 def speed_by_turns(
     count: TurnsCount, record: RunRecord | None, ratio: float, wanted: float, confidence: float
 ) -> tuple[CountedTurns, SpeedCalibration]:
-    """Factor from counted turns. ``ratio``: turns of the motor per counted turn.
+    """Return the calibration factor from counted turns. ``ratio``: turns of the motor per counted turn.
 
-    The mean reported speed is stated, or taken from ``record``. Raises UsageError for what does not fit.
+    The mean reported speed is stated, or taken from ``record``. Raises UsageError for data that do not fit together.
     """
     from tdhil.calibration import CountedTurns, calibrate_by_turns
 
@@ -109,7 +114,8 @@ def _reported(record: RunRecord, start_s: float, end_s: float) -> tuple[float, f
 def add_speed_calibration(document: Mapping[str, Any], path: Path) -> bool:
     """Put the section into the file; a torque calibration in it is kept. Return True if the drive was compared.
 
-    Raises UsageError for a file that is no calibration, has a speed calibration already, or is of another drive.
+    Raises UsageError for a file that is not a calibration, has a speed calibration already, or belongs to another
+    drive.
     """
     check_speed_place(path)
     if not path.exists():

@@ -32,7 +32,7 @@ def _numbers(names: tuple[str, ...]) -> set[int]:
 
 
 def _others() -> list[int]:
-    """Return the numbers of all other signals that now would end this process or raise in it (`Ending`)."""
+    """Return the numbers of all other signals that would now end this process or raise in it (`Ending`)."""
     known = _numbers((*_NAMES, *_UNHEARD, *_HARMLESS, *_OUT_OF_REACH))
     return sorted(int(one) for one in signal.valid_signals() if one not in known and _ends(signal.getsignal(one)))
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tdhil.recording import Recording
 
 KEPT: Final = "torque_calibration"
-"""Key of the log's configuration."""
+"""Key of the calibration in the log's configuration."""
 VALID_DAYS: Final = 365.0
 """Validity of a calibration in days, unless rig.yaml states another."""
 _LARGEST_FILE = 1 << 20
@@ -25,7 +25,7 @@ _AGAIN = "Make one with: tdhil calibrate torque without.mcap with.mcap --added J
 
 
 def load_calibration(path: Path) -> dict[str, Any]:
-    """The document of a calibration. Raises UsageError for a file that is none."""
+    """Return the document of a calibration. Raises UsageError for a file that is not one."""
     from tdhil.calibration import CalibrationUnusable, StoredCalibration
 
     if not path.is_file():
@@ -43,7 +43,7 @@ def load_calibration(path: Path) -> dict[str, Any]:
 
 
 def save_calibration(document: Mapping[str, Any], path: Path) -> None:
-    """Write the document of a calibration that stands, never over a file. Raises UsageError."""
+    """Write the document of a valid calibration, never over a file. Raises UsageError."""
     try:
         with path.open("x", encoding="utf-8") as file:
             json.dump(document, file, ensure_ascii=False, indent=2, allow_nan=False)
@@ -56,7 +56,7 @@ def save_calibration(document: Mapping[str, Any], path: Path) -> None:
 
 
 def calibration_of_rig(rig: Rig | None) -> dict[str, Any] | None:
-    """The calibration that rig.yaml names, for the log. Raises UsageError for a file that is none."""
+    """Return the calibration that rig.yaml names, for the log. Raises UsageError for a file that is not one."""
     if rig is None or rig.drive_data.torque_calibration is None:
         return None
     document = load_calibration(rig.folder / rig.drive_data.torque_calibration)
@@ -64,7 +64,9 @@ def calibration_of_rig(rig: Rig | None) -> dict[str, Any] | None:
 
 
 def refuse_another_drive(run: Mapping[str, Any], identity: Mapping[str, Any]) -> None:
-    """Before motion: the calibration in the log's configuration is of this drive. Raises PreflightRefused."""
+    """Check before motion that the calibration in the log's configuration belongs to this drive. Raises
+    PreflightRefused.
+    """
     found = stored_of(run)
     if found is None:
         return
@@ -75,7 +77,7 @@ def refuse_another_drive(run: Mapping[str, Any], identity: Mapping[str, Any]) ->
 
 
 def stored_of(run: Mapping[str, Any]) -> StoredCalibration | None:
-    """The calibration of a log's configuration; None for none, or what is none."""
+    """Return the calibration of a log's configuration; None without a valid one."""
     from tdhil.calibration import CalibrationUnusable, StoredCalibration
 
     document = run.get(KEPT)
@@ -95,9 +97,11 @@ def other_drive(document: Mapping[str, Any], drive: Mapping[str, Any], settings:
 
 def with_calibration(run: Mapping[str, Any], recording: Recording, document: Mapping[str, Any], where: str,
                      sha256: str = "") -> dict[str, Any]:
-    """The configuration with another calibration, for a replay. Raises UsageError where it is of another drive.
+    """Return the configuration with another calibration, for a replay. Raises UsageError if it belongs to another
+    drive.
 
-    ``sha256``: of the log. The noise of a log that the calibration comes from is in the calibration factor too.
+    ``sha256``: hash of the log. If the calibration comes from this log, the log's noise is in the calibration factor
+    too.
     """
     from tdhil.calibration import OWN_LOG
 
@@ -118,13 +122,15 @@ def with_calibration(run: Mapping[str, Any], recording: Recording, document: Map
 
 
 def without_calibration(run: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration with torque in the drive's own unit."""
+    """Return the configuration with torque in the drive's own unit."""
     return {name: value for name, value in run.items() if name != KEPT}
 
 
 @dataclass(frozen=True)
 class AppliedCalibration:
-    """``recording`` in calibrated N·m; ``day``: of the calibration, '' where none was applied."""
+    """A recording with its calibration. ``recording`` in calibrated N·m; ``day``: date of the calibration, '' if none
+    was applied.
+    """
 
     recording: Recording
     day: str = ""
@@ -154,7 +160,7 @@ def apply_calibration(recording: Recording, run: Mapping[str, Any]) -> AppliedCa
 
 
 def drive_settings(run: Mapping[str, Any], recording: Recording | None = None) -> dict[str, Any]:
-    """Return what the drive's unit of torque depends on, as far as the log states it."""
+    """Return the settings on which the drive's unit of torque depends, as far as the log states them."""
     bench, profile = _part(run.get("bench")), _part(run.get("profile"))
     found = {"profile": profile.get("name"),
              "rated_torque_nm": _part(bench.get("drive_data")).get("rated_torque_nm")}
@@ -164,7 +170,7 @@ def drive_settings(run: Mapping[str, Any], recording: Recording | None = None) -
 
 
 def drive_identity(run: Mapping[str, Any], _recording: Recording | None = None) -> dict[str, Any]:
-    """Name and numbers of the drive; empty for a trace."""
+    """Return name and numbers of the drive; empty for a trace."""
     identity = _part(run.get("identity"))
     return {name: identity[name] for name in ("name", "vendor", "product", "serial") if name in identity}
 

@@ -19,7 +19,7 @@ from tdhil.runner import ExcitationRequest, MachineLimits
 
 
 TORQUE_SHARE, PROBE_SHARE = 0.5, 0.25
-"""Shares of the simulated drive's torque limit. This limit also stands for the make-up torque of the joints."""
+"""Shares of the simulated drive's torque limit. This limit also replaces the make-up torque of the joints."""
 TIME_S = 1800.0
 QUICK_STOP_RAD_S2 = 1.0
 RAMP_S = 40.0
@@ -27,7 +27,9 @@ RAMP_S = 40.0
 
 
 def suited(rig: Rig | None, plant: Any) -> Rig | None:
-    """Return ``rig``; it gets limits for a string if ``plant`` (`sim_bus.params.RigParams`) has one and it has none."""
+    """Return ``rig``. If ``plant`` (`sim_bus.params.RigParams`) has a string and ``rig`` no limits, it gets limits for
+    it.
+    """
     if plant is None or (rig is not None and rig.limits is not None):
         return rig
     from sim_bus.plant import PLANTS
@@ -56,10 +58,10 @@ def suited(rig: Rig | None, plant: Any) -> Rig | None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 ASSUMED_TORQUE_SCALE_REL_SD = 0.03
-"""Assumed standard uncertainty of a real drive's torque scale if none is stated: inverters know it to some percent."""
+"""Assumed standard uncertainty of a real drive's torque scale if none is stated: inverters know it to a few percent."""
 
 UNKNOWN_LAG_SD_SHARE = 0.1
-"""Standard deviation of a lag that is stated without one."""
+"""Standard deviation, as a share, of a lag that is stated without one."""
 
 
 def bench_of(identity: Identity, rig: Rig | None) -> Rig:

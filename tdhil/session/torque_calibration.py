@@ -1,4 +1,4 @@
-"""A torque calibration from recordings: are they of one drive, whole and rigid, and what do they give together?"""
+"""A torque calibration from recordings: check that they are of one drive, complete and rigid, and combine them."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 ASSUMED_BODY_REL_SD = 0.002
 """Assumed relative standard uncertainty of a body: a turned disc, diameter known to 0.05 % and mass to 0.1 %."""
 SETTINGS_ALIKE = 1e-6
-"""Two logs' settings of the drive are the same within this share."""
+"""Largest relative difference at which the drive's settings in two logs count as equal."""
 
 
 @dataclass(frozen=True)
 class CalibrationRun:
-    """A recording with the body that was on the shaft. ``added_kg_m2`` as it was given, at the ``at`` shaft.
+    """A recording with the body that was on the shaft. ``added_kg_m2``: its inertia as stated, at the ``at`` shaft.
 
-    ``added_sd_kg_m2``: None where it was not stated.
+    ``added_sd_kg_m2``: its standard uncertainty; None if not stated.
     """
 
     record: RunRecord
@@ -42,7 +42,7 @@ class CalibrationRun:
 
 @dataclass(frozen=True)
 class CalibrationFound:
-    """``calibration`` with what the document and the report say of it. ``identified``: of each run by itself."""
+    """A calibration with data for document and report. ``identified``: result of each run by itself."""
 
     calibration: TorqueCalibration
     runs: tuple[CalibrationRun, ...]
@@ -72,9 +72,9 @@ def _names(runs: Sequence[CalibrationRun]) -> list[str]:
 
 
 def find_calibration(runs: Sequence[CalibrationRun], at: str, confidence: float = 0.95) -> CalibrationFound:
-    """Result of all runs together. ``at``: the shaft that the bodies' inertia is given at, motor or main.
+    """Return the result of all runs together. ``at``: shaft to which the bodies' inertia refers, motor or main.
 
-    Raises UsageError for recordings that can't belong together, and NothingRecorded where one has no motion.
+    Raises UsageError for recordings that can't belong together, and NothingRecorded for one without motion.
     """
     from tdhil.calibration import BodyRun, CalibrationCase, calibrate_torque
 
@@ -130,7 +130,7 @@ def document_of_calibration(found: CalibrationFound) -> dict[str, Any]:
 def find_plan(
     record: RunRecord, wanted: float, added_sd_share: float = ASSUMED_BODY_REL_SD, sizes: Sequence[float] = ()
 ) -> tuple[float, float, tuple[RunPlan, ...]]:
-    """J (kg·m², in the drive's unit), minutes of stage 5, and which bodies would do. Raises UsageError without J."""
+    """Return J (kg·m², in the drive's unit), minutes of stage 5, and suitable bodies. Raises UsageError without J."""
     from tdhil.calibration import plan_bodies
     from tdhil.estimation import Refused, identify_together
 
@@ -201,7 +201,7 @@ def _not_stated(runs: Sequence[CalibrationRun]) -> Sequence[str]:
 
 
 def _refusal(runs: Sequence[CalibrationRun], identified: Sequence[Identification]) -> TorqueCalibration | None:
-    """A run that can't be used, by name; None where all can be."""
+    """Return the refusal of a run that can't be used, by name; None if all can be used."""
     from tdhil.calibration import TorqueCalibration
     from tdhil.estimation import Verdict
     from tdhil.recording import aborted_stage
@@ -227,7 +227,9 @@ def _refusal(runs: Sequence[CalibrationRun], identified: Sequence[Identification
 
 
 def _joint(recordings: Sequence[Recording], identified: Sequence[Identification]) -> tuple[Any, ...]:
-    """J of each run, covariance, that with known filters, degrees of freedom, the test, and: fitted together?"""
+    """Return J of each run, covariance, covariance with known filters, degrees of freedom, the test, and whether the
+    runs were fitted together.
+    """
     from tdhil.estimation import Refused, identify_together, normal_quantile
 
     if all(found.model.startswith("rigid") for found in identified):
@@ -267,7 +269,7 @@ _LARGEST_NM = 1e9
 
 
 def read_pairs(path: Path) -> TorquePairs:
-    """Pairs of reference and reported torque from a CSV. Raises UsageError, with the line of what can't be used."""
+    """Return pairs of reference and reported torque from a CSV. Raises UsageError with the line of a wrong value."""
     import csv
 
     from tdhil.calibration import TorquePairs

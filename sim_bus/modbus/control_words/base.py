@@ -1,9 +1,9 @@
 """Common part of all families: a control word comes in, the power side executes it, a status word goes out.
 
-Each family uses the one power state machine of `sim_bus.cia402`: PROFIdrive's is the same with other names, and the
-start and stop commands of simpler drives are paths through it. A family only translates: its own bits into commands,
-and states into its own bits. The bits' meaning comes from the manuals, not from the profile; the profile only states
-how the user has wired the drive (`Wiring`).
+All families use the power state machine of `sim_bus.cia402`: PROFIdrive's is the same with other names, and the start
+and stop commands of simpler drives are paths through it. A family only converts its own bits into commands, and states
+into its own bits. The meaning of the bits comes from the manuals, not from the profile. The profile only states how the
+user has configured the drive (`Wiring`).
 """
 
 from collections.abc import Callable
@@ -23,47 +23,47 @@ AT_SETPOINT_RAD_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """Setup of the drive by its user, where the family permits a choice."""
+    """Configuration of the drive by its user, if the family permits a choice."""
 
     torque_bits: int = 0
-    """Bits of the control word that select torque; 0: the word doesn't select."""
+    """Bits of the control word that select torque; 0: the word does not select the mode."""
     mode_register: bool = False
-    """A register selects torque; where bits do too, both have to."""
+    """True if a register selects torque. If bits select it too, both must select torque."""
     reverse_bits: int = 0
     switch_while_enabled: bool = True
     brakes_in_torque: bool = True
-    """False: a quick stop in torque mode takes the torque away."""
+    """False: a quick stop in torque mode switches the torque off."""
     holds_after_quick_stop: bool = False
     ramps: bool = False
-    """A speed setpoint passes the drive's ramp generator."""
+    """True if a speed setpoint passes the drive's ramp generator."""
     status_address: int = 0
-    """Some families have several status registers, of different bits."""
+    """Address of the status register. Some families have several status registers with different bits."""
 
 
 @dataclass(frozen=True, slots=True)
 class Extra:
-    """A register of the family beside those of the profile."""
+    """A register of the family in addition to those of the profile."""
 
     read: Callable[[], int]
     write: Callable[[int], None] | None = None
 
 
 class ControlWords:
-    """A family. `write` takes a control word, `status` gives the status word."""
+    """A family. `write` takes a control word, `status` returns the status word."""
 
     shutdown_option = 1
     """605Bh of the power side: down a ramp, then ready."""
     disable_option = 0
-    """605Ch: taking the enable away lets the shaft coast."""
+    """605Ch: without the enable the shaft coasts."""
 
     def __init__(self, application: Application, wiring: Wiring) -> None:
         self.application = application
         self.wiring = wiring
         self.word = 0
         self.reversed = False
-        """The speed setpoint is meant backwards."""
+        """True if the speed setpoint is for reverse rotation."""
         self.listens = True
-        """Setpoints count."""
+        """True if setpoints act."""
         self.register_says_torque = False
         self._word_says_torque = False
         application.settings.shutdown_option = self.shutdown_option
@@ -71,50 +71,50 @@ class ControlWords:
         self.set_quick_stop()
 
     def write(self, word: int) -> None:
-        """The host wrote the control word."""
+        """Take the control word from the host."""
         before, self.word = self.word, word
         self.obey(before, word)
 
     def obey(self, before: int, word: int) -> None:
-        """The family's own part of `write`."""
+        """Do the family's own part of `write`."""
         raise NotImplementedError
 
     def status(self) -> int:
-        """The status word."""
+        """Return the status word."""
         raise NotImplementedError
 
     def host_lost(self) -> None:
-        """The drive has stopped by itself: the word that stands there still must not start it again."""
+        """React to a stop by the drive itself: the present control word must not start the drive again."""
 
     def extras(self) -> dict[int, Extra]:
-        """Registers of the family's own, by address."""
+        """Return the family's own registers by address."""
         return {}
 
     # -- for the families ----------------------------------------------------------------------------------
 
     def order(self, command: DeviceCommand, *, reset: bool = False) -> None:
-        """A command to the power side."""
+        """Send a command to the power side."""
         self.set_quick_stop()
         self.application.write_controlword(_WORDS[command] | (FAULT_RESET if reset else 0))
 
     def select(self, word: int) -> None:
-        """Speed or torque, and the direction, where the control word says so."""
+        """Select speed or torque, and the direction, if the control word selects them."""
         self.reversed = bool(word & self.wiring.reverse_bits)
         if self.wiring.torque_bits:
             self._word_says_torque = word & self.wiring.torque_bits == self.wiring.torque_bits
             self._choose()
 
     def select_by_register(self, torque: bool) -> None:
-        """The mode register was written; `may_switch` has been asked."""
+        """Take the mode register's value. The caller has checked `may_switch`."""
         self.register_says_torque = torque
         self._choose()
 
     def may_switch(self, torque: bool) -> bool:
-        """The mode register may be written so now."""
+        """Return whether the mode register may have this value now."""
         return self.wiring.switch_while_enabled or not self.application.energised or torque is self.register_says_torque
 
     def _choose(self) -> None:
-        """Torque where everything that selects says so; no change while enabled on drives that don't allow it."""
+        """Select torque if all selectors request it. Drives that don't allow it keep the mode while enabled."""
         wiring = self.wiring
         said = [self._word_says_torque] * bool(wiring.torque_bits) + [self.register_says_torque] * wiring.mode_register
         speed = OperationMode.PROFILE_VELOCITY if self.wiring.ramps else OperationMode.CYCLIC_VELOCITY
@@ -124,7 +124,7 @@ class ControlWords:
             self.set_quick_stop()
 
     def set_quick_stop(self) -> None:
-        """The power side's option code for a quick stop, as the drive is wired and regulates now."""
+        """Set the power side's option code for a quick stop, by the configuration and the present mode."""
         if self.torque and not self.wiring.brakes_in_torque:
             self.application.settings.quick_stop_option = 0
         else:
@@ -132,7 +132,7 @@ class ControlWords:
 
     @property
     def torque(self) -> bool:
-        """Torque is regulated, or would be."""
+        """True in torque mode, enabled or not."""
         return self.application.mode is OperationMode.CYCLIC_TORQUE
 
     @property
@@ -142,31 +142,31 @@ class ControlWords:
 
     @property
     def faulted(self) -> bool:
-        """True in fault, or on the way there."""
+        """True in fault and in fault reaction."""
         return self.state in {State.FAULT, State.FAULT_REACTION}
 
     @property
     def follows(self) -> bool:
-        """Setpoints act: enabled, and no stop under way."""
+        """True if setpoints act: enabled, and no stop under way."""
         return self.state is State.ENABLED and not self.application.stopping
 
     @property
     def backwards(self) -> bool:
-        """The shaft turns backwards, as far as the drive can see."""
+        """True if the shaft turns backwards, by the drive's own speed signal."""
         return self.application.inverter.control.filtered_rad_s < -0.01
 
     @property
     def at_setpoint(self) -> bool:
-        """Speed control has arrived."""
+        """True if speed control has reached the setpoint."""
         control = self.application.inverter.control
         return self.follows and not self.torque and abs(control.reference - control.filtered_rad_s) < AT_SETPOINT_RAD_S
 
 
 class StartStop(ControlWords):
-    """A family whose word says run or stop by level.
+    """A family whose word requests run or stop by level.
 
-    After the drive has stopped by itself a run command must be seen to go before it counts again; manuals say so of
-    most such drives (start on an edge), and it is the safe reading of the others.
+    After a stop by the drive itself, a run command acts only after it was withdrawn once. Manuals state this for most
+    of these drives (start on an edge), and for the others it is the safe interpretation.
     """
 
     def __init__(self, application: Application, wiring: Wiring) -> None:
@@ -177,7 +177,7 @@ class StartStop(ControlWords):
         self._blocked = True
 
     def run(self) -> None:
-        """Start, or go on."""
+        """Start, or continue."""
         if self._blocked or self.faulted:
             return
         if self.state is not State.ENABLED:
@@ -185,12 +185,12 @@ class StartStop(ControlWords):
         self.order(DeviceCommand.ENABLE)
 
     def ramp_stop(self) -> None:
-        """Down a ramp, then no torque."""
+        """Brake down a ramp, then switch the torque off."""
         self._blocked = False
         self.order(DeviceCommand.SHUTDOWN)
 
     def quick_stop(self) -> None:
-        """Down the quick-stop ramp, then no torque."""
+        """Brake down the quick-stop ramp, then switch the torque off."""
         self._blocked = False
         self.order(DeviceCommand.QUICK_STOP)
 
@@ -200,6 +200,6 @@ class StartStop(ControlWords):
         self.order(DeviceCommand.DISABLE_VOLTAGE)
 
     def reset(self) -> None:
-        """Out of fault."""
+        """Leave the fault state."""
         self.order(DeviceCommand.DISABLE_VOLTAGE)
         self.order(DeviceCommand.DISABLE_VOLTAGE, reset=True)

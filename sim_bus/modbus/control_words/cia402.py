@@ -6,10 +6,10 @@ _OF_THE_MODE = 0x3000
 
 
 class Cia402Words(ControlWords):
-    """Controlword and statusword as in `sim_bus.cia402`; the power side speaks them by itself.
+    """Controlword and statusword as in `sim_bus.cia402`, whose power side uses them directly.
 
-    Option codes are the standard's defaults: shutdown coasts, disabling operation goes down the ramp. Whether the drive
-    holds after a quick stop is the profile's. Bits 4 to 6 (ramp generator of velocity mode) are not looked at.
+    Option codes are the standard's defaults: shutdown coasts, disable operation brakes down the ramp. The profile
+    states whether the drive holds after a quick stop. Bits 4 to 6 (ramp generator of velocity mode) are ignored.
     """
 
     shutdown_option = 0
@@ -21,5 +21,5 @@ class Cia402Words(ControlWords):
         self.application.write_controlword(word)
 
     def status(self) -> int:
-        """Without bits 12 and 13: what they mean belongs to the profile modes, and velocity mode leaves them at 0."""
+        """Return the word without bits 12 and 13: they belong to the profile modes, and in velocity mode they are 0."""
         return self.application.statusword() & ~_OF_THE_MODE

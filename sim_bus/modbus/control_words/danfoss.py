@@ -10,9 +10,9 @@ Status word::
     0 control ready · 1 drive ready · 2 not coasting · 3 trip · 7 warning · 8 at the reference
     9 bus control · 10 no limit acts · 11 in operation
 
-The facts at hand name the registers but not these bits; they are as every edition of the guides has them (run is 047Ch,
-stop 043Ch, running shows 0F07h), which is to be checked in the manual of the drive. DC braking, jog, hold and the
-choice of set-ups are not simulated.
+The available sources name the registers but not these bits. The bits are as in all editions of the guides (run is
+047Ch, stop 043Ch, running shows 0F07h); check them in the manual of the drive. DC braking, jog, hold and the choice of
+set-ups are not simulated.
 """
 
 from sim_bus.cia402 import State

@@ -4,9 +4,9 @@ Command 2000h: bits 1..0 are 01 stop, 10 run, 00 nothing (11 jog is not simulate
 backwards, 11 change. 2002h: bit 0 external fault, bit 1 reset, rising.
 
 Status, by register: 2101h bits 1..0 00 stopped, 01 slowing down, 10 standing by, 11 running; 4..3 direction, 00
-forwards and 11 backwards; 8 frequency and 10 operation come from the bus. It has no fault bit: 2100h tells the code
-(58 = CE10, the time-out; else 49, external fault). 2226h bits 1..0 01 forwards, 10 backwards; 3..2 01 ready, 10 fault;
-4 output on; 5 alarm. The stop is the ramp stop, and any quick stop is the same at the rate of the quick-stop parameter.
+forwards and 11 backwards; 8 frequency and 10 operation come from the bus. It has no fault bit: 2100h has the code (58 =
+CE10, the time-out; else 49, external fault). 2226h bits 1..0 01 forwards, 10 backwards; 3..2 01 ready, 10 fault; 4
+output on; 5 alarm. The stop is the ramp stop. A quick stop is the same, at the rate of the quick-stop parameter.
 """
 
 from sim_bus.cia402 import State

@@ -16,9 +16,9 @@ Status word (function diagram 9352)::
     PROFIdrive 11 no limit acts · 13 motor not too hot · 14 forwards · 15 power unit not overloaded
     ABB        11 EXT2 · 12 run enable from outside
 
-The sources leave open what bits 1 and 2 are while the drive brakes: here bit 2 goes with the setpoint, which no longer
-acts, and bit 1 goes on ABB (OFF1 active) and stays on PROFIdrive. Bits 4 to 6 of the control word are not looked at: no
-ramp is simulated.
+The sources do not define bits 1 and 2 while the drive brakes. Here bit 2 is cleared with the setpoint, which no longer
+acts; bit 1 is cleared on ABB (OFF1 active) and stays set on PROFIdrive. Bits 4 to 6 of the control word are ignored,
+because no ramp is simulated.
 """
 
 from sim_bus.cia402 import DeviceCommand, State
@@ -34,7 +34,7 @@ class ProfidriveWords(ControlWords):
     def obey(self, before: int, word: int) -> None:
         self.listens = bool(word & _BUS)
         if not self.listens:
-            self.word = before                 # what was commanded goes on
+            self.word = before                 # the last command stays active
             return
         self.select(word)
         self._off_bits(before, word)
@@ -61,7 +61,7 @@ class ProfidriveWords(ControlWords):
         )
 
     def common(self, *, ready_while_braking: bool) -> int:
-        """Bits 0 to 9."""
+        """Return bits 0 to 9."""
         state = self.state
         switched_on = state in {State.SWITCHED_ON, State.ENABLED, State.QUICK_STOP}
         braking = state is State.QUICK_STOP or self.application.stopping
@@ -86,7 +86,7 @@ class AbbWords(ProfidriveWords):
     def obey(self, before: int, word: int) -> None:
         self.listens = bool(word & _BUS)
         if self.listens:
-            if self.wiring.torque_bits == _EXT2:       # the user has made EXT2 torque
+            if self.wiring.torque_bits == _EXT2:       # the user has assigned torque to EXT2
                 self.select(word)
             self._off_bits(before, word)
         elif word & (_OFF1 | _OFF2 | _OFF3) != _OFF1 | _OFF2 | _OFF3:

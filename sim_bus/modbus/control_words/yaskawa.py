@@ -5,12 +5,12 @@ Operation command 0001h::
     0 run forwards, or run · 1 run backwards, or backwards (H5-12 = 0, or 1)
     2 external fault · 3 fault reset, rising · 4 and up multi-function inputs
 
-Without bit 0 or 1 the drive stops down its ramp. A fast stop over the bus is a multi-function input that the user
-has assigned, so any quick stop here is the ramp stop, at the rate of the quick-stop parameter.
+Without bit 0 or 1 the drive stops down its ramp. A fast stop over the bus is a multi-function input that the user has
+assigned. So any quick stop here is the ramp stop, at the rate of the quick-stop parameter.
 
-Status, by register: 002Ch 0 run · 1 zero speed · 2 speed agree · 6 ready · 14 fault · 15 communication time-out, which
-the facts at hand have; 0020h 0 run · 1 backwards · 2 ready · 3 fault and 004Bh (U1-12) 0 run · 1 zero speed · 2
-backwards · 4 speed agree · 5 ready · 6 alarm · 7 fault, from memory: to be checked in the manual.
+Status, by register: 002Ch 0 run · 1 zero speed · 2 speed agree · 6 ready · 14 fault · 15 communication time-out, from
+the available sources. From memory, to be checked in the manual: 0020h 0 run · 1 backwards · 2 ready · 3 fault; 004Bh
+(U1-12) 0 run · 1 zero speed · 2 backwards · 4 speed agree · 5 ready · 6 alarm · 7 fault.
 """
 
 from sim_bus.cia402 import State
@@ -23,7 +23,7 @@ class YaskawaWords(StartStop):
     def obey(self, before: int, word: int) -> None:
         self.select(word)
         self.reversed = bool(word & 2)
-        if word & ~before & 8 and not word & 3:      # no reset while a run command stands
+        if word & ~before & 8 and not word & 3:      # no reset during a run command
             self.reset()
         if word & 4:
             self.application.fault()
@@ -33,7 +33,7 @@ class YaskawaWords(StartStop):
             self.ramp_stop()
 
     def ramp_stop(self) -> None:
-        # One deceleration for all stops: the quick stop's.
+        # One deceleration for all stops: that of the quick stop.
         self.application.settings.decel_rad_s2 = self.application.settings.quick_stop_rad_s2
         super().ramp_stop()
 

@@ -1,7 +1,7 @@
 """Dry friction of one shaft: a file for each model, with its equation, units and source.
 
-Each has the same two functions, of a `ShaftParams` and its state, under a torque ``drive`` that is constant over the
-step::
+Each model has the same two functions of a `ShaftParams` and its state, under a torque ``drive`` that is constant over
+the step::
 
     advance(shaft, speed, bristle, drive, dt) -> (speed, bristle, travel)      rad/s, rad, rad
     torque(shaft, speed, bristle, drive)      -> N·m against motion, viscous friction not in it
@@ -32,16 +32,18 @@ _TORQUE: dict[str, Callable[[ShaftParams, float, float, float], float]] = {
 
 
 def advance_of(shaft: ShaftParams) -> Advance:
-    """The function that moves this shaft on; without dry friction it is Coulomb's, with F_c = 0."""
+    """Return the solver of this shaft. Without dry friction it is Coulomb's, with F_c = 0."""
     return _ADVANCE[shaft.friction] if shaft.coulomb_nm > 0.0 else coulomb.advance
 
 
 def advance(shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
-    """(speed, bristle, travel) after ``dt_s`` under the constant torque ``drive``."""
+    """Return (speed, bristle, travel) after ``dt_s`` under the constant torque ``drive``."""
     return advance_of(shaft)(shaft, speed, bristle, drive, dt_s)
 
 
 def torque(shaft: ShaftParams, speed: float, bristle: float, drive: float = 0.0) -> float:
-    """Dry friction in N·m, as it acts against motion; where the model sticks, at rest it balances ``drive``."""
+    """Return the dry friction against motion, N·m. At standstill the friction of a model that sticks balances
+    ``drive``.
+    """
     of_model = _TORQUE[shaft.friction] if shaft.coulomb_nm > 0.0 else coulomb.torque
     return of_model(shaft, speed, bristle, drive)

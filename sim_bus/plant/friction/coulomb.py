@@ -15,10 +15,11 @@ Between two zeros of ω the equation is linear, so that a step is exact: with x 
     ω(h) = ω0 + (u − s F_c − B ω0) · (1 − e^−x)/B                      (→ h/J for B → 0)
 
 ω passes zero at t0 = (J/B) ln(1 − ω0 B/(u − s F_c)) (→ −ω0 J/(u − s F_c)). There the shaft sticks if
-|u| ≤ F_c, otherwise the rest of the step goes on from zero to the side of u. Hence no chatter.
+|u| ≤ F_c. Otherwise the rest of the step continues from zero in the direction of u. So there is no chatter.
 
-The travel is the momentum's balance, B ∫ω dt = (u − s F_c) h − J (ω(h) − ω0); where friction takes little in a step
-(x ≤ 0.02) that is a difference of nearly equal numbers, and the mean of both speeds is taken (relative error x²/12).
+The travel follows from the momentum balance, B ∫ω dt = (u − s F_c) h − J (ω(h) − ω0). If viscous friction is small in a
+step (x ≤ 0.02), this is a difference of nearly equal numbers, and the mean of both speeds is used (relative error
+x²/12).
 """
 
 from math import copysign, expm1, log1p
@@ -26,12 +27,13 @@ from math import copysign, expm1, log1p
 from sim_bus.plant.friction.shaft import ShaftParams
 
 TINY = 1e-15
-"""Below this share an exponential is its first term to the last bit, and quotients would underflow."""
+"""Smallest share of viscous friction in a step. Below it the exponential equals its first term, and quotients would
+underflow."""
 LIGHTLY_DAMPED = 0.02
 
 
 def advance(shaft: ShaftParams, speed: float, _bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
-    """(speed, 0, travel) after ``dt_s`` under the constant torque ``drive``."""
+    """Return (speed, 0, travel) after ``dt_s`` under the constant torque ``drive``."""
     dry = shaft.coulomb_nm
     if speed == 0.0:
         if -dry <= drive <= dry:
@@ -62,7 +64,7 @@ def advance(shaft: ShaftParams, speed: float, _bristle: float, drive: float, dt_
 
 
 def torque(shaft: ShaftParams, speed: float, _bristle: float, drive: float) -> float:
-    """Dry friction, N·m, against motion; at rest it balances ``drive``."""
+    """Return the dry friction against motion, N·m. At standstill it balances ``drive``."""
     if speed == 0.0:
         return max(-shaft.coulomb_nm, min(shaft.coulomb_nm, drive))
     return copysign(shaft.coulomb_nm, speed)

@@ -6,16 +6,17 @@ r"""Dahl friction: a bristle that bends before it slips.
 
     z rad, ω rad/s, σ N·m/rad, F_c and T_f N·m
 
-Source: the paper, section 2.2.3, its sgn read inside the bracket; P. R. Dahl (1968).
+Source: the paper, section 2.2.3, with its sgn inside the bracket; P. R. Dahl (1968).
 
 Over a piece of constant ω, with s = sgn ω, z_c = F_c/σ and a = |ω| h / z_c,
 
     z(h) = s z_c + (z0 − s z_c) e^−a        mean z = s z_c + (z0 − s z_c)(1 − e^−a)/a
 
-both exact however fast the bristle relaxes (|z| ≤ z_c stays true). The mean friction torque drives the linear
-equation of the shaft; ω is taken at mid-piece, found by two passes (second order). Pieces in which ω changes sign are
-cut at the zero, because the target s z_c changes sign there. The two passes converge while the bristle's spring is
-slow against the piece; σ h²/J ≤ 0.005 keeps them exact to 1e-4, a stiffer one gets more pieces.
+Both are exact for any relaxation rate of the bristle (|z| ≤ z_c stays true). The mean friction torque is the input of
+the linear equation of the shaft; ω is the speed at mid-piece, which two passes find (second order). Pieces in which ω
+changes sign are divided at the zero, because the target s z_c changes sign there. The two passes converge while the
+bristle's spring is slow compared with the piece; σ h²/J ≤ 0.005 keeps them exact to 1e-4. A stiffer bristle gets more
+pieces.
 """
 
 from math import ceil, copysign, exp, expm1, sqrt
@@ -27,7 +28,7 @@ _SLOW = 0.005
 
 
 def advance(shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
-    """(speed, bristle, travel) after ``dt_s`` under the constant torque ``drive``."""
+    """Return (speed, bristle, travel) after ``dt_s`` under the constant torque ``drive``."""
     stiff = shaft.dahl_stiffness_nm_rad * dt_s * dt_s
     if stiff > _SLOW * shaft.inertia_kg_m2:
         count = ceil(sqrt(stiff / _SLOW / shaft.inertia_kg_m2)) + 1
@@ -47,12 +48,12 @@ def advance(shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s
 
 
 def torque(shaft: ShaftParams, _speed: float, bristle: float, _drive: float) -> float:
-    """Dry friction, N·m."""
+    """Return the dry friction, N·m."""
     return shaft.dahl_stiffness_nm_rad * bristle
 
 
 def _piece(shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float]:
-    """(speed, bristle) after ``dt_s`` in which the speed keeps its sign."""
+    """Return (speed, bristle) after ``dt_s`` in which the speed keeps its sign."""
     stiffness = shaft.dahl_stiffness_nm_rad
     limit = shaft.coulomb_nm / stiffness
     viscous, inertia = shaft.viscous_nm_s_rad, shaft.inertia_kg_m2

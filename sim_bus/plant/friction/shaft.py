@@ -1,4 +1,4 @@
-"""One inertia: its moment, its friction, its constant load. A rig has one, or one at each end of a string."""
+"""One inertia: moment, friction, constant load. A rig has one, or one at each end of a string."""
 
 from typing import Literal, Self
 
@@ -8,27 +8,27 @@ from profiles import NonNegative, Positive, Validated, refuse_if
 
 
 class ShaftParams(Validated):
-    """One inertia with viscous friction and one model of dry friction; parameters of other models are not looked at.
+    """One inertia with viscous friction and one model of dry friction. Parameters of other models are ignored.
 
-    ``coulomb_nm`` of 0 switches dry friction off, whatever the model.
+    ``coulomb_nm`` of 0 switches dry friction off in any model.
     """
 
     inertia_kg_m2: Positive = 104.0
     viscous_nm_s_rad: NonNegative = 8.0
     coulomb_nm: NonNegative = 60.0
-    """F_c, dry friction of a shaft that slides."""
+    """F_c, dry friction of a sliding shaft, N·m."""
     friction: Literal["coulomb", "stribeck", "dahl", "lugre"] = "coulomb"
     static_nm: NonNegative = 80.0
-    """F_s, breakaway torque; Stribeck and LuGre."""
+    """F_s, breakaway torque, N·m; Stribeck and LuGre."""
     stribeck_speed_rad_s: Positive = 0.1
-    """ω_s, over which friction falls from F_s to F_c; Stribeck and LuGre."""
+    """ω_s, speed over which friction falls from F_s to F_c, rad/s; Stribeck and LuGre."""
     dahl_stiffness_nm_rad: Positive = 5000.0
     lugre_stiffness_nm_rad: Positive = 20000.0
-    """σ0, of the bristle."""
+    """σ0, stiffness of the bristle, N·m/rad."""
     lugre_damping_nm_s_rad: NonNegative = 500.0
-    """σ1, of the bristle while it bends; σ2 is ``viscous_nm_s_rad``."""
+    """σ1, damping of the bristle while it bends, N·m·s/rad; σ2 is ``viscous_nm_s_rad``."""
     load_nm: float = 0.0
-    """A constant load, against positive speed."""
+    """Constant load against positive speed, N·m."""
 
     @model_validator(mode="after")
     def _breakaway_is_not_below_sliding(self) -> Self:
@@ -42,4 +42,4 @@ class MotorEnd(ShaftParams):
     """The inertia on the motor's shaft."""
 
     added_inertia_kg_m2: NonNegative = 0.0
-    """A body of known inertia that is bolted to the shaft, beside ``inertia_kg_m2``."""
+    """Inertia of a known body that is bolted to the shaft, in addition to ``inertia_kg_m2``."""

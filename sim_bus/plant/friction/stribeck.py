@@ -11,13 +11,14 @@ Source: R. Stribeck (1902) for the falling branch, L. C. Bo and D. Pavelescu (19
 exponent (here 2), B. Armstrong-Hélouvry (1991) for its use in control. With torques of some kN·m and ω_s of some rad/s
 it is the usual torque on a bit, whose falling branch feeds stick-slip (E. M. Navarro-López and R. Suárez, 2004).
 
-J dω/dt = f(ω) is smooth between two zeros of ω, and scalar: ω runs monotonically towards zero speed or a balance of
+J dω/dt = f(ω) is smooth between two zeros of ω, and scalar: ω changes monotonically towards zero speed or a balance of
 torques. A step follows its tangent, λ = f'(ω0)/J, exactly (exponential Rosenbrock–Euler, second order):
 
     ω(h) = ω0 + f(ω0)/J · (e^(λh) − 1)/λ        zero at t0 = ln(1 − ω0 λ J/f(ω0))/λ
 
-It is cut so that ω changes by at most ω_s/50 where friction bends and a falling branch (λ > 0) grows by at most e^½:
-one or a few pieces per step of 2 ms on a rig of some kg·m², two hundred where a light shaft breaks away.
+The step is divided so that ω changes by at most ω_s/50 where friction is nonlinear, and a falling branch (λ > 0) grows
+by at most e^½: one or a few pieces per step of 2 ms on a rig of some kg·m², two hundred when a light shaft breaks
+away.
 """
 
 from math import copysign, exp, expm1, log1p
@@ -26,19 +27,19 @@ from sim_bus.plant.friction.shaft import ShaftParams
 
 _SHORT = 1e-3
 _FINE = 0.02
-"""Change of speed within one piece, in units of ω_s."""
+"""Largest change of speed within one piece, in units of ω_s."""
 _BENT = 3.0
-"""Beyond this many ω_s friction is Coulomb's to 1e-4 of F_s − F_c."""
+"""Speed in units of ω_s beyond which friction is Coulomb's to 1e-4 of F_s − F_c."""
 
 
 def sliding(shaft: ShaftParams, speed: float) -> float:
-    """Torque against sliding at ``speed``, N·m, positive."""
+    """Return the friction torque of a shaft that slides at ``speed``, N·m, positive."""
     falls = shaft.static_nm - shaft.coulomb_nm
     return shaft.coulomb_nm + falls * exp(-((speed / shaft.stribeck_speed_rad_s) ** 2))
 
 
 def advance(shaft: ShaftParams, speed: float, _bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
-    """(speed, 0, travel) after ``dt_s`` under the constant torque ``drive``."""
+    """Return (speed, 0, travel) after ``dt_s`` under the constant torque ``drive``."""
     static, width = shaft.static_nm, shaft.stribeck_speed_rad_s
     viscous, inertia, coulomb = shaft.viscous_nm_s_rad, shaft.inertia_kg_m2, shaft.coulomb_nm
     left, travel = dt_s, 0.0
@@ -62,7 +63,7 @@ def advance(shaft: ShaftParams, speed: float, _bristle: float, drive: float, dt_
         if abs(growth) > _SHORT:
             gain = expm1(growth) / rate
             mean = (gain - piece) / (rate * piece)
-        else:      # the series' first terms: the quotients would lose their digits
+        else:      # first terms of the series: the quotients would lose digits
             gain = piece * (1.0 + growth * (0.5 + growth * (1.0 / 6.0 + growth / 24.0)))
             mean = piece * (0.5 + growth * (1.0 / 6.0 + growth / 24.0))
         acceleration = net / inertia
@@ -81,7 +82,7 @@ def advance(shaft: ShaftParams, speed: float, _bristle: float, drive: float, dt_
 
 
 def torque(shaft: ShaftParams, speed: float, _bristle: float, drive: float) -> float:
-    """Dry friction, N·m, against motion; at rest it balances ``drive``."""
+    """Return the dry friction against motion, N·m. At standstill it balances ``drive``."""
     if speed == 0.0:
         return max(-shaft.static_nm, min(shaft.static_nm, drive))
     return copysign(sliding(shaft, speed), speed)
