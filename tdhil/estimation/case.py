@@ -10,16 +10,11 @@ import numpy as np
 from tdhil.estimation.friction_levels import Levels, ViscousConstraint
 from tdhil.estimation.result import (
     REJECT_P,
-    BudgetLine,
-    Compliant,
     Estimate,
-    FrictionPoint,
-    LinePoint,
+    ModelResult,
     Options,
     PaperEstimate,
     Refusal,
-    ResidualTest,
-    SecondOpinion,
     TorqueRatio,
     rejects,
 )
@@ -96,8 +91,8 @@ class ResponseCurve(Protocol):
 _NONE, _WORDLESS = Refusal("", ""), ModelWords()
 
 
-@dataclass(frozen=True)
-class Finding:
+@dataclass(frozen=True, kw_only=True)
+class Finding(ModelResult):
     """Result of one route for a case, in the same form for every route. `conclude` adds the verdict.
 
     ``inertia``: bounded estimate; None if the residuals contradict the model (no other value is then given), or if the
@@ -110,27 +105,14 @@ class Finding:
     oscillation; () for the lines of the case.
     """
 
-    model: str = "none"
     words: ModelWords = _WORDLESS
-    residual: ResidualTest | None = None
     refusal: Refusal = _NONE
     inertia: Estimate | None = None
     conditions: tuple[str, ...] = ()
-    viscous_nm_s_rad: Estimate | None = None
-    coulomb_nm: Estimate | None = None
-    speed_lag_s: Estimate | None = None
-    torque_lag_s: Estimate | None = None
-    skew_s: Estimate | None = None
     bent: bool = False
-    compliant: Compliant | None = None
-    budget: tuple[BudgetLine, ...] = ()
-    lines: tuple[LinePoint, ...] = ()
-    warnings: tuple[str, ...] = ()
     samples_used: int | None = None
     preface: str = ""
     remark: str = ""
-    second_opinions: tuple[SecondOpinion, ...] = ()
-    friction_curve: tuple[FrictionPoint, ...] = ()
     reading_kg_m2: float = 0.0
     advice: str = ""
     contradiction: Refusal = _NONE
@@ -148,8 +130,8 @@ class Finding:
         J.
         """
         return Finding(
-            self.model, self.words, self.residual, lines=self.lines, samples_used=self.samples_used,
-            warnings=self.warnings, contradiction=contradiction,
+            model=self.model, words=self.words, residual=self.residual, lines=self.lines,
+            samples_used=self.samples_used, warnings=self.warnings, contradiction=contradiction,
         )
 
     @property

@@ -30,30 +30,12 @@ def conclude(case: Case, finding: Finding) -> Identification:
         else:
             reason = f"{said}; what was recorded before can't tell: {reason}"
             advice = "mend what ended the run, and run it again"
-    return Identification(
-        verdict=verdict,
-        model=finding.model,
-        reason=reason,
-        advice=advice,
-        entry=entry,
-        inertia=inertia,
-        viscous_nm_s_rad=finding.viscous_nm_s_rad,
-        coulomb_nm=finding.coulomb_nm,
-        speed_lag_s=finding.speed_lag_s,
-        torque_lag_s=finding.torque_lag_s,
-        skew_s=finding.skew_s,
-        paper=case.paper,
-        residual=finding.residual,
-        periods_used=case.periods_used,
-        samples_used=case.samples_used if finding.samples_used is None else finding.samples_used,
-        warnings=warnings,
-        budget=finding.budget,
-        second_opinions=finding.second_opinions,
-        friction_curve=finding.friction_curve,
-        compliant=finding.compliant,
-        lines=finding.lines,
-        torque_ratios=case.torque_ratios,
-    )
+    return Identification(**finding.quantities() | {
+        "verdict": verdict, "reason": reason, "advice": advice, "entry": entry, "inertia": inertia,
+        "warnings": warnings, "paper": case.paper, "torque_ratios": case.torque_ratios,
+        "periods_used": case.periods_used,
+        "samples_used": case.samples_used if finding.samples_used is None else finding.samples_used,
+    })
 
 
 def _inertia(case: Case, finding: Finding) -> InertiaEstimate | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
 from importlib import import_module
 from statistics import NormalDist
@@ -450,33 +450,44 @@ class Refused(Exception):
         self.refusal = Refusal(reason, advice, entry)
 
 
-@dataclass(frozen=True)
-class Identification:
-    """Result of an identification. Estimates are None if the verdict is a refusal or the model does not have the
-    quantity.
+@dataclass(frozen=True, kw_only=True)
+class ModelResult:
+    """Quantities of one model, which a route finds and the identification reports.
+
+    An estimate is None if the model does not have the quantity, or if the data contradict the model.
     """
 
-    verdict: Verdict
-    model: str                                  # the selected model: paper, rigid+lags, two-mass, string,
-    reason: str                                 # one sentence: why this verdict and this model
-    advice: str                                 # one sentence: what would improve it
-    inertia: InertiaEstimate | None
-    viscous_nm_s_rad: Estimate | None
-    coulomb_nm: Estimate | None                 # constant load included
-    speed_lag_s: Estimate | None
-    torque_lag_s: Estimate | None
-    skew_s: Estimate | None
-    paper: PaperEstimate | None
+    model: str = "none"                                 # paper, rigid+lags, two-mass, string, before-echo
+    viscous_nm_s_rad: Estimate | None = None
+    coulomb_nm: Estimate | None = None                  # constant load included
+    speed_lag_s: Estimate | None = None
+    torque_lag_s: Estimate | None = None
+    skew_s: Estimate | None = None
     residual: ResidualTest | None = None
-    periods_used: int = 0
-    samples_used: int = 0
     warnings: tuple[str, ...] = ()
     budget: tuple[BudgetLine, ...] = ()
     second_opinions: tuple[SecondOpinion, ...] = ()
     friction_curve: tuple[FrictionPoint, ...] = ()      # in order of speed; empty with fewer than three speeds
     compliant: Compliant | None = None                  # for the models two-mass and string; ``inertia`` is then J_r
-    impedance: DriveImpedance | None = None             # of a run that measured the drive's impedance
     lines: tuple[LinePoint, ...] = ()                   # in order of frequency; for the figure of the report
+
+    def quantities(self) -> dict[str, Any]:
+        """Return the fields of this class by name."""
+        return {one.name: getattr(self, one.name) for one in fields(ModelResult)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identification(ModelResult):
+    """Result of an identification: the selected model with its verdict. ``inertia``: None if it is a refusal."""
+
+    verdict: Verdict
+    reason: str                                 # one sentence: why this verdict and this model
+    advice: str                                 # one sentence: what would improve it
+    inertia: InertiaEstimate | None = None
+    paper: PaperEstimate | None = None
+    periods_used: int = 0
+    samples_used: int = 0
+    impedance: DriveImpedance | None = None             # of a run that measured the drive's impedance
     torque_ratios: tuple[TorqueRatio, ...] = ()         # of each torque signal; empty without a known setpoint
     frequency_response: FrequencyResponse | None = None     # of a periodic excitation with two or more periods
     entry: MessageCode = MessageCode.NOT_IDENTIFIABLE   # entry of verdict, reason and advice in the table of messages

@@ -15,8 +15,8 @@ from tdhil.estimation.result import BudgetLine, Refusal
 from tdhil.recording.recording import Recording, Stage
 
 WORDS = ModelWords("a shaft", "look elsewhere", "excite more")
-FOUND = Finding("shaft", WORDS, ResidualTest(3.0, 3.0, 0.4), inertia=Estimate(100.0, 99.0, 101.0),
-                budget=(BudgetLine("noise", 1.0, ""),))
+FOUND = Finding(model="shaft", words=WORDS, residual=ResidualTest(3.0, 3.0, 0.4),
+                inertia=Estimate(100.0, 99.0, 101.0), budget=(BudgetLine("noise", 1.0, ""),))
 REJECTED = replace(FOUND, inertia=None, residual=ResidualTest(90.0, 3.0, 1e-9), remark=", and no other does better")
 STAGE = Stage("acquire", 0.0, 1.0, "aborted", "the bus is gone")
 

@@ -75,10 +75,8 @@ def full():
 
 def bare():
     """A refusal with nothing but its reason."""
-    nothing = dict.fromkeys(
-        ("inertia", "viscous_nm_s_rad", "coulomb_nm", "speed_lag_s", "torque_lag_s", "skew_s", "paper")
-    )
-    return Identification(Verdict.NOT_IDENTIFIABLE, "none", "12 samples are no record", "record for longer", **nothing)
+    return Identification(
+        verdict=Verdict.NOT_IDENTIFIABLE, reason="12 samples are no record", advice="record for longer")
 
 
 def open_sided():

@@ -529,7 +529,8 @@ def identify_compliant(
             return (rigid if plain_lags and _turns_as_one(chosen.fit) else None) or _UNSEEN
         if contradicted is None:
             name = name_of(chosen.fit, case.options.model)
-            return (None if is_string else rigid) or Finding(name, _words(name), chosen.fit.residual)
+            return (None if is_string else rigid) or Finding(
+                model=name, words=_words(name), residual=chosen.fit.residual)
         words = replace(contradicted.words, if_rejected=_LOOK_FOR)
         return replace(contradicted, words=words, remark=", and two masses or a string do no better")
     if told.inertia.bounded or _told(told.shaft.total_inertia):
@@ -573,7 +574,7 @@ def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Fi
         finding = replace(finding, remark=", much better than the lags of a rigid shaft do")
     if chosen.impedance_ratio is not None:
         # a J that does not stand gets no further figures, as for residuals that contradict the model
-        return Finding(name, finding.words, fit.residual, lines=finding.lines, curve=finding.curve,
+        return Finding(model=name, words=finding.words, residual=fit.residual, lines=finding.lines, curve=finding.curve,
                        contradiction=_pipe_contradiction(chosen.impedance_ratio))
     if told.inertia.bounded:
         words = replace(finding.words, if_wide=_WHICH) if told.by_model else finding.words

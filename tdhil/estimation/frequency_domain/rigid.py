@@ -287,8 +287,8 @@ def rigid_finding(
         return _OPEN
     as_paper = not shaft_model(case.options.model).lags
     lines = fitted_points(result.fitted, case.options.confidence)
-    bare = Finding(case.options.model if as_paper else RIGID, _words(result, as_paper, what), result.residual,
-                   lines=lines, warnings=_caveats(result, as_paper, case.recording.winds_up),
+    bare = Finding(model=case.options.model if as_paper else RIGID, words=_words(result, as_paper, what),
+                   residual=result.residual, lines=lines, warnings=_caveats(result, as_paper, case.recording.winds_up),
                    curve=ModelCurve(result.fitted, case.options.confidence, result.residual))
     if bare.rejected:
         return bare

@@ -248,7 +248,7 @@ def _finding(solved: Solved, case: Case) -> Finding:
     if solved.residual is None:
         raise Refused("the record has too few frequencies to test the model that J comes from", ADVICE,
                       entry=MessageCode.TOO_FEW_LINES)
-    bare = Finding(MODEL, words, solved.residual, warnings=_caveats(solved), reject_p=DOUBT_P)
+    bare = Finding(model=MODEL, words=words, residual=solved.residual, warnings=_caveats(solved), reject_p=DOUBT_P)
     if bare.rejected:
         return bare
     scale = torque_scale_line(solved.inertia.value, case.recording.torque_scale_rel_sd, case.options.confidence)
