@@ -73,7 +73,7 @@ class Backlog:
         return True
 
     def keep_up(self, time_s: float) -> None:
-        """In stepped time, after the cycle of control time ``time_s``: wait while the file is `LAG_S` behind it."""
+        """Wait while the file is `LAG_S` behind control time ``time_s``. For stepped time, after each cycle."""
         behind_s = time_s - self.saved_s
         if behind_s < WAKE_S:
             return
