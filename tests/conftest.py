@@ -46,6 +46,7 @@ gc.disable()        # until everything is collected
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
+ROOT = Path(__file__).parents[1]
 GROUPS = "one_worker"
 """Where a worker of pytest-xdist finds the file's name in which it writes what its `one_worker` items belong to."""
 
@@ -93,25 +94,45 @@ def pytest_xdist_make_scheduler(config, log):      # type: ignore[no-untyped-def
     return ByMarker(config, log) if config.getvalue("dist") == "load" else None
 
 
-def heavy_ones(items: list[pytest.Item]) -> set[str]:
-    """Return the node-IDs of the heavy cases. ``heavy(but_first=n)``: all cases of the test but its first n."""
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Rewrite the asserts of this worker's share of the test files, which is a third of a first run's collection.
+
+    Every worker collects every file, and at the same pace: none would find in the cache what another has rewritten.
+    """
+    given = getattr(session.config, "workerinput", None)
+    if given is None or sys.dont_write_bytecode:
+        return
+    from _pytest.assertion import rewrite
+
+    state = session.config.stash[rewrite.assertstate_key]
+    files = sorted(file for one in session.config.args for file in (ROOT / one).rglob("test_*.py"))
+    for file in files[int(given["workerid"].removeprefix("gw"))::given["workercount"]]:
+        folder = rewrite.get_cache_dir(file)
+        cached = folder / (file.stem + rewrite.PYC_TAIL)
+        if rewrite.try_makedirs(folder) and rewrite._read_pyc(file, cached) is None:
+            stat, code = rewrite._rewrite_test(file, session.config)
+            rewrite._write_pyc(state, code, stat, cached)
+
+
+def cases_of(items: list[pytest.Item], name: str) -> set[str]:
+    """Return the node-IDs under the marker ``name``. ``name(but_first=n)``: all cases of the test but its first n."""
     seen: Counter[str] = Counter()
-    heavy = set()
+    found = set()
     for item in items:
         function = item.nodeid.partition("[")[0]
         seen[function] += 1
-        if any(seen[function] > mark.kwargs.get("but_first", 0) for mark in item.iter_markers("heavy")):
-            heavy.add(item.nodeid)
-    return heavy
+        if any(seen[function] > mark.kwargs.get("but_first", 0) for mark in item.iter_markers(name)):
+            found.add(item.nodeid)
+    return found
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if not config.getoption("--long"):
         only, too = config.getoption("--heavy"), config.getoption("--all-but-long")
-        heavy = heavy_ones(items)
+        heavy, longest = cases_of(items, "heavy"), cases_of(items, "long")
         chosen = [
-            item for item in items
-            if item.get_closest_marker("long") is None and (too or (item.nodeid in heavy) is only)
+            item for item in items if item.nodeid not in longest and (too or (item.nodeid in heavy) is only)
         ]
         if len(chosen) < len(items):
             kept = set(chosen)

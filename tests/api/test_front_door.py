@@ -51,6 +51,7 @@ def test_every_name_that_it_promises_is_there():
         _ = tdhil.nothing
 
 
+@pytest.mark.long(but_first=2)
 @pytest.mark.heavy
 @pytest.mark.parametrize("first", ["tdhil", "tdhil.runner", "tdhil.runner.guard", "tdhil.api"])
 def test_run_is_called_whatever_was_loaded_before(first):

@@ -60,6 +60,7 @@ def test_bodies_that_were_exchanged(tmp_path):
     assert found.factor is None and "exchanged" in found.reason
 
 
+@pytest.mark.long(but_first=1)
 @pytest.mark.heavy
 @pytest.mark.parametrize(("said", "at", "advice"), [(55.0 * 16.0, "motor", "--at main"), (55.0, "main", "--at motor")])
 def test_an_inertia_given_at_the_wrong_shaft(tmp_path, said, at, advice):
@@ -77,6 +78,7 @@ def test_an_inertia_given_at_the_main_shaft(tmp_path):
     assert find_calibration(geared, "main").calibration.factor.value == pytest.approx(FACTOR, rel=0.02)
 
 
+@pytest.mark.long(but_first=1)
 @pytest.mark.heavy
 @pytest.mark.parametrize("changed", [{"speed_lag": 0.30}, {"torque_lag": 0.25}, {"skew": 0.05}])
 def test_a_filter_that_changed_between_the_runs(tmp_path, changed):
@@ -118,6 +120,7 @@ def test_a_run_that_was_aborted(tmp_path):
     assert "ends before the run" in find_calibration([without, cut], "motor").calibration.reason
 
 
+@pytest.mark.long(but_first=1)
 @pytest.mark.heavy
 @pytest.mark.parametrize("slip_nm_s_rad", [60.0, 300.0])
 def test_a_body_that_slips_on_the_shaft(tmp_path, slip_nm_s_rad):

@@ -138,8 +138,8 @@ def test_signals_work_after_a_run_of_a_calibration(tmp_path, monkeypatch, more):
 @pytest.mark.heavy
 def test_both_runs_of_the_simulated_rig_give_the_calibration(tmp_path, capsys):
     log = tmp_path / "run.mcap"
-    assert main(["identify", "--simulate", "--simulated-torque-scale", "1.05", "--seed", "1", "--log", str(log),
-                 *CALIBRATE, "--added-sd", "0.1"]) == 0
+    assert main(["identify", "--simulate", "--simulated-torque-scale", "1.05", "--seed", "1", "--rate", "50",
+                 "--log", str(log), *CALIBRATE, "--added-sd", "0.1"]) == 0
     factor = json.loads((tmp_path / "run-calibration.json").read_text())["calibration_factor"]
     assert factor["low"] <= 1.0 / 1.05 <= factor["high"]
     said = capsys.readouterr()

@@ -133,7 +133,7 @@ def test_a_rigid_shaft_holds_no_string(tmp_path):
     assert found["calibration_factor"] is None and found["advice"] and found["verdict"] == "not_identifiable"
 
 
-@pytest.mark.parametrize("runs", [pytest.param(4, marks=pytest.mark.heavy), pytest.param(40, marks=pytest.mark.long)])
+@pytest.mark.parametrize("runs", [pytest.param(2, marks=pytest.mark.heavy), pytest.param(40, marks=pytest.mark.long)])
 def test_the_interval_covers_strings_whose_true_sizes_are_drawn_from_the_tolerances(runs):
     cases = [study_case(seed) for seed in range(runs)]
     answered = [case for case in cases if not isinstance(case, str)]

@@ -234,6 +234,7 @@ def test_in_a_process_of_its_own_signals_are_ignored_from_the_end_on():
             signal.signal(number, handler)
 
 
+@pytest.mark.heavy
 def test_a_burst_of_signals_up_to_the_very_end_changes_nothing(tmp_path):
     """Through the stop, while the log closes, and in the interpreter's own end."""
     log = tmp_path / "run.mcap"

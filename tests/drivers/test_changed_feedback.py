@@ -49,6 +49,7 @@ REMAPPED = ((0x1800, 1, DISABLED | 0x181), (0x1A00, 0, 0), (0x1A00, 2, 0x6074001
 """The demanded torque in place of the reported one: a frame of the same length."""
 
 
+@pytest.mark.long(but_first=3)
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("writes", "where", "words"), [
     (REMAPPED, "1A00h:2", ("TPDO1 mapping", "60770010h", "60740010h")),

@@ -91,7 +91,7 @@ def test_torque_drives_speed_of_its_own_sign(torque_run, sign):
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("speed", [5.0, -3.0, 12.5])
+@pytest.mark.parametrize("speed", [5.0, -3.0, pytest.param(12.5, marks=pytest.mark.long)])
 def test_the_steady_speed_is_the_one_commanded(run, speed):
     run.ready()
     run.enable()

@@ -40,6 +40,7 @@ def test_the_stop_is_not_taken_for_motion(one_recording):
     assert not any("of 10 periods" in warning for warning in found.warnings)
 
 
+@pytest.mark.long(but_first=2)
 @pytest.mark.heavy
 @pytest.mark.parametrize("before_end_s", [3.0, 33.0, 71.0, 140.0])
 def test_whatever_follows_the_abort_the_result_is_the_same(one_recording, before_end_s):

@@ -197,8 +197,9 @@ SELECTED = {(0.0, "in between"), (0.15, "alike"), (0.5, "anyhow")}
 @pytest.mark.parametrize(("noise", "rate_hz", "shifted"), [
     pytest.param(
         noise, rate_hz, shifted,
-        # At the higher rate each noise is met once, and each way of shifting; CI has all of them.
-        marks=() if (rate_hz == 10.0 and noise == 0.15) or (noise, shifted) in SELECTED else pytest.mark.heavy,
+        # At the higher rate each noise is met once, and each way of shifting, in CI; all of them with --long.
+        marks=() if rate_hz == 10.0 and noise == 0.15
+        else pytest.mark.heavy if (noise, shifted) in SELECTED else pytest.mark.long,
     )
     for noise in (0.0, 0.15, 0.5) for rate_hz in (10.0, 100.0) for shifted in ("alike", "anyhow", "in between")
 ])

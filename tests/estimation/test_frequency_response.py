@@ -191,6 +191,7 @@ def test_the_values_are_those_of_the_table_of_lines(linear):
         assert line.residual_sd == pytest.approx(point.residual_sd, rel=1e-6)
 
 
+@pytest.mark.heavy
 def test_thinned_samples_give_the_same_harmonics():
     quick = with_torque(closed_form(noise=0.0, rate_hz=2000.0), lambda t, _: np.cos(2.0 * np.pi * 0.7 * t))
     seen = {one.harmonic: one for one in respond(quick).distortion.harmonics}

@@ -50,7 +50,7 @@ def true_friction(plant, speed):
     return plant.coulomb_nm + plant.viscous_nm_s_rad * speed + (extra if plant.friction == "stribeck" else 0.0)
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize(("plant", "bends"), [(Params(), False), (STRIBECK, True)])
 def test_points_cover_and_the_bend_is_told(plant, bends):
     covered = points = bent = 0
@@ -80,6 +80,7 @@ def test_the_spread_of_the_slope_is_of_the_size_that_the_bend_makes():
     assert 0.4 * worst < found < 2.5 * worst
 
 
+@pytest.mark.long
 @pytest.mark.heavy
 def test_on_a_whole_run_every_point_covers_and_a_straight_line_is_left_straight():
     covered = points = bent = 0

@@ -117,6 +117,7 @@ def bent(recording, friction, speed_lag=0.40, torque_lag=0.15):
     return replace(recording, torque_nm=torque)
 
 
+@pytest.mark.long(but_first=1)
 @pytest.mark.heavy
 @pytest.mark.parametrize("friction", [
     lambda w: 25.0 * np.exp(-((w / 1.7) ** 2)), lambda w: 0.7 * w**2, lambda w: 40.0 * np.exp(-((w / 4.0) ** 2)),

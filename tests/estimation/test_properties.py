@@ -22,7 +22,7 @@ def plain():
 
 
 @pytest.mark.heavy
-@few
+@settings(few, max_examples=3)
 @given(scale=st.floats(1e-3, 1e3))
 def test_torque_scale_scales_what_has_torque_in_it(plain, scale):
     recording = closed_form()
@@ -36,7 +36,7 @@ def test_torque_scale_scales_what_has_torque_in_it(plain, scale):
 
 
 @pytest.mark.heavy
-@few
+@settings(few, max_examples=3)
 @given(shift=st.floats(-1e5, 1e5))
 def test_the_clock_may_start_anywhere(plain, shift):
     found = identify(closed_form(start=shift))
@@ -75,7 +75,7 @@ def test_rotation_may_be_either_way(plain):
 
 
 @pytest.mark.heavy
-@settings(few, max_examples=8)
+@settings(few, max_examples=4)
 @given(
     # J/B stays clear of what a lag may be (2 s): below, a lag and the shaft can change places, and J is refused
     inertia=st.floats(60.0, 500.0),

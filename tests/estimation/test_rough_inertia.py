@@ -29,6 +29,7 @@ def ramp(inertia=104.0, viscous=8.0, coulomb=60.0, speed_lag=0.4, torque_lag=0.1
     return time, seen, np.round(lagged(torque, torque_lag) + 2.0 * rng.standard_normal(len(time)))
 
 
+@pytest.mark.long(but_first=4)
 @pytest.mark.heavy
 @pytest.mark.parametrize("down", [False, True])
 @pytest.mark.parametrize("lags", [(0.4, 0.15), (0.0, 0.0), (0.5, 0.0), (0.15, 0.5)])

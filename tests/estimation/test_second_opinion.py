@@ -88,7 +88,7 @@ def test_disagreement_by_chance_comes_once_in_a_hundred_runs(usual):
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("runs", [20, pytest.param(60, marks=pytest.mark.long)])
+@pytest.mark.parametrize("runs", [8, pytest.param(60, marks=pytest.mark.long)])
 def test_without_knowing_the_lags_it_is_wider_and_still_covers(runs):
     recordings = usual_runs()[:runs]
     known = [opinions_of(r)[0].inertia_kg_m2 for r in recordings]

@@ -44,6 +44,7 @@ def test_a_scale_that_changes_is_found_behind_the_drives_filter(recorded, factor
     assert float(found.reason.split()[1]) == pytest.approx(AT_S, abs=0.3)
 
 
+@pytest.mark.heavy
 def test_such_a_run_has_no_inertia(recorded):
     found = identify(rescaled(recorded, 0.5))
     assert found.entry is MessageCode.SPEED_JUMPED
@@ -64,5 +65,9 @@ def test_speed_mode_a_gap_and_an_open_side_say_nothing(recorded):
     none = np.full(len(changed.time_s), np.nan)
     assert jump_contradiction(replace(changed, commanded_torque_nm=none), PLANT.motor, PLANT.motor) is None
     assert MOST < 1.0
-    rigid = replace(changed, winds_up=False)
+
+
+@pytest.mark.heavy
+def test_a_rigid_shaft_is_not_asked(recorded):
+    rigid = replace(rescaled(recorded, 2.0), winds_up=False)
     assert identify(rigid).entry is not MessageCode.SPEED_JUMPED

@@ -58,6 +58,7 @@ def test_resonances_are_where_the_impedance_has_its_pole_and_its_zero(share):
     assert abs(at[2]) < 1e-6 * at[3]
 
 
+@pytest.mark.heavy
 def test_auto_finds_the_string():
     pipe = Pipe()
     found = identify(run(pipe, [4], noise=MILD, lag_prior=KNOWN, settle=8)[0])
@@ -90,6 +91,7 @@ def test_a_pipe_that_is_known_is_held_to_and_one_that_is_wrong_is_told():
     assert wrong.inertia.low <= plant.motor <= wrong.inertia.high
 
 
+@pytest.mark.long(but_first=1)
 @pytest.mark.heavy
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_a_torque_scale_that_the_pipe_contradicts_leaves_no_inertia(factor):
@@ -117,6 +119,7 @@ def test_waves_on_the_bench_meet_the_bench_s_own_impedance():
         assert seen / late == pytest.approx(pipe.impedance(hz), rel=0.01)
 
 
+@pytest.mark.long(but_first=1)
 @pytest.mark.heavy
 @pytest.mark.parametrize("seed", (2, 17))
 def test_a_string_must_gain_more_than_chance_gives(seed):

@@ -133,6 +133,7 @@ def test_what_stands_clear_beyond_the_lags_counts():
     assert inertia.high - inertia.low < 0.025 * 104.0
 
 
+@pytest.mark.long(but_first=2)
 @pytest.mark.heavy
 @pytest.mark.parametrize("said", [0.5, 0.005, None])
 def test_the_wide_band_is_left_where_the_model_is_doubtful_in_it_or_untested(monkeypatch, said):
@@ -362,6 +363,7 @@ HOPELESS = [(constant_speed, "constant"), (coasting, "coast"), (no_torque, "torq
             (turned_round, ""), (at_the_limit, "limit")]
 
 
+@pytest.mark.long(but_first=4)
 @pytest.mark.heavy
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("spoil", "said"), HOPELESS, ids=lambda value: getattr(value, "__name__", ""))

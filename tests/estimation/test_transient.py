@@ -81,6 +81,7 @@ def test_a_line_at_the_very_swing_is_told_by_all_the_others():
     assert all(line.periods[0] > 6.0 for line in others)
 
 
+@pytest.mark.long(but_first=2)
 @pytest.mark.heavy
 @pytest.mark.parametrize("seed", range(4))
 def test_their_scatter_says_how_far_off_they_are(seed):

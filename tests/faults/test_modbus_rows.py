@@ -85,9 +85,14 @@ IN_STAGES = [(*case, "speed") for case in ENDS] + [(*case, "acquire") for case i
     "exception 1", "silence", "every reply cut short")]
 
 
+AT_ONCE = ("exception 1", "exception 2 for good", "silence", "every reply cut short")
+"""In the README's command; the others are CI's. tests/drivers/test_modbus_wrongs.py has each of them, without a run."""
+
+
 @pytest.mark.parametrize(
     ("row", "name", "becomes", "requests", "code", "words", "stage"), [
-        pytest.param(*case, id=f"{case[1]} in {case[-1]}", marks=pytest.mark.heavy if case[-1] == "acquire" else ())
+        pytest.param(*case, id=f"{case[1]} in {case[-1]}",
+                     marks=() if case[1] in AT_ONCE and case[-1] == "speed" else pytest.mark.heavy)
         for case in IN_STAGES
     ],
 )
@@ -116,7 +121,7 @@ SURVIVES = [
 # tests/drivers/test_modbus_drive.py has all five of them, cycle by cycle.
 @pytest.mark.parametrize(("row", "name", "becomes", "requests"), [
     pytest.param(*case, id=case[1],
-                 marks=() if case[1] == "one late reply" else pytest.mark.heavy)
+                 marks=pytest.mark.heavy if case[1] == "one late reply" else pytest.mark.long)
     for case in SURVIVES
 ])
 def test_it_is_survived(row, name, becomes, requests, line, monkeypatch, tmp_path, seen):

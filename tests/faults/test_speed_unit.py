@@ -212,6 +212,7 @@ def assert_stopped_in_time(rig):
     assert rig.last_rad_s < 0.05
 
 
+@pytest.mark.long(but_first=5)
 @pytest.mark.heavy
 @pytest.mark.parametrize(("bus", "factor"), [
     (canopen, 10.0), (canopen, 2.0 * math.pi), (canopen, 3.0), (canopen, 2.0), (modbus, 10.0), (modbus, 2.0),
@@ -321,7 +322,7 @@ def test_a_simulated_drive_without_an_angle_goes_on_with_a_note(made, bus):
     assert any("not checked" in text for _, text in rig.log.events)
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @both
 def test_a_right_unit_is_seen_to_be_right_without_a_pause(made, bus):
     rig, plain = made(bus, 1.0), made(bus, 1.0, NO_ANGLE[bus])
@@ -341,6 +342,7 @@ ANGLES = {
 }
 
 
+@pytest.mark.long(but_first=3)
 @pytest.mark.heavy
 @pytest.mark.parametrize("kind", ANGLES)
 @pytest.mark.parametrize("factor", [1.0, 10.0])

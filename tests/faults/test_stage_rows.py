@@ -43,6 +43,7 @@ def test_a_fault_that_never_comes_is_said(drive, first, never, code, rehearse, s
     seen(81, said, None, run.assert_log_whole(), run.done.code)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(
     ("drive", "when"), [
         ("canopen", "hold+2s"), ("modbus", "acquire+5s"),

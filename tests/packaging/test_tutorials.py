@@ -1,4 +1,7 @@
-"""The tutorials can be followed to the letter: their commands are taken out of the pages and run, in order."""
+"""The tutorials can be followed to the letter: their commands are taken out of the pages and run, in order.
+
+A run of theirs has 50 cycles a second here, a fifth of the drive's usual rate, and of what there is to compute.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +24,8 @@ FOLDER = ROOT / "docs" / "tutorials"
 PAGES = sorted(path.name for path in FOLDER.glob("*.md") if path.name != "README.md")
 BLOCK = re.compile(r"^(?:<!-- (run[^\n]*) -->\n)?```sh\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 PATIENCE_S = 300.0
+IN_OTHERS = "read-a-result.md"
+"""Its two commands, a simulated run and a replay as JSON, are those of the pages on a first run."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,18 @@ def steps(page: str) -> list[Step]:
             assert code, f"{page}: the block has no mark of how to run it: {text}"
             found.append(Step(text, int(code[1] or 0)))
     return found
+
+
+def slower(folder: Path) -> Path:
+    """Make a folder with a `tdhil` that runs at 50 Hz whatever it identifies."""
+    program = folder / "bin" / "tdhil"
+    program.parent.mkdir()
+    program.write_text(f"""#!/bin/sh
+if [ "$1" = identify ]; then set -- "$@" --rate 50; fi
+exec '{Path(sys.executable).parent / "tdhil"}' "$@"
+""")
+    program.chmod(0o755)
+    return program.parent
 
 
 @contextlib.contextmanager
@@ -69,12 +86,15 @@ def test_there_are_tutorials_with_commands():
 
 @pytest.mark.heavy
 @pytest.mark.one_worker("tutorials")             # two of them use the same port
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize("page", [
+    pytest.param(page, marks=pytest.mark.long if page == IN_OTHERS else ()) for page in PAGES
+])
 def test_a_tutorial_can_be_followed_to_the_letter(page, tmp_path):
     pytest.importorskip("matplotlib", reason="matplotlib is not installed (pip install '.[report]')")
     pytest.importorskip("uvicorn", reason="uvicorn is not installed (pip install '.[service]')")
     environment = clean_environment()
-    environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{environment.get('PATH', os.defpath)}"
+    programs = (slower(tmp_path), Path(sys.executable).parent, environment.get("PATH", os.defpath))
+    environment["PATH"] = os.pathsep.join(map(str, programs))
     with contextlib.ExitStack() as second_terminal:
         for step in steps(page):
             if step.ready is not None:

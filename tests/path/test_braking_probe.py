@@ -59,6 +59,7 @@ def regulates_torque(monkeypatch):
     return lambda: speeds["fast"]
 
 
+@pytest.mark.long(but_first=3)
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", VENDORS)
 def test_over_modbus(name, regulates_torque, monkeypatch, tmp_path):

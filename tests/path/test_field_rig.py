@@ -15,7 +15,7 @@ RATE_HZ = 100
 # amplitude that the torque limit allows, and the noise of the reported speed (6 % of the variance of α) then takes as
 # much off the slope: in torque mode, without that loop, the motion is twice as large.
 TONES = [
-    pytest.param(0.1, "speed", 107.0, marks=pytest.mark.heavy),       # speed mode and a tone: `both_buses`, `slow_line`
+    pytest.param(0.1, "speed", 107.0, marks=pytest.mark.long),       # speed mode and a tone: `both_buses`, `slow_line`
     pytest.param(0.3, "speed", 118.0, marks=pytest.mark.long),
     pytest.param(0.5, "speed", 137.0, marks=pytest.mark.long),
     (1.0, "torque", 186.0),
@@ -54,7 +54,7 @@ def test_the_default_excitation_finds_the_inertia(tmp_path, seed):
 
 
 @pytest.mark.parametrize("seed", [
-    pytest.param(1, marks=pytest.mark.heavy), pytest.param(2, marks=pytest.mark.long),
+    pytest.param(1, marks=pytest.mark.long), pytest.param(2, marks=pytest.mark.long),
 ])
 def test_a_rig_whose_friction_bends_over_speed_is_identified(tmp_path, seed):
     """Stribeck's bell reaches well into the speed window: straight friction is contradicted, the inertia found."""

@@ -23,6 +23,7 @@ QUICK = ("--seed", 1)
 TORQUE, SPEED = load_profile("generic/cia402"), load_profile("danfoss/fc302")
 
 
+@pytest.mark.long(but_first=6)
 @pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize(("arguments", "option"), [
     (("--max-time", 60), "--max-time 1"),

@@ -55,6 +55,7 @@ def test_the_log_has_every_offset_and_none_is_left_when_the_stop_begins(measured
     assert not np.any(offsets[[sample.time_s > acquire.end_s for _, sample in cycles]])
 
 
+@pytest.mark.long(but_first=3)
 @pytest.mark.heavy
 @pytest.mark.parametrize(("fault", "code", "words"), [
     ("frozen-feedback@acquire+25s", 5, "frozen"), ("feedback-lost@acquire+25s", 5, "no feedback"),

@@ -157,6 +157,7 @@ class Full(ErrorFrames):
         raise can.CanOperationError("No buffer space available", 105)
 
 
+@pytest.mark.long(but_first=2)
 @pytest.mark.heavy
 @pytest.mark.parametrize("command", ["scan", "doctor", "identify"])
 @pytest.mark.parametrize("bus", [ErrorFrames, Full])

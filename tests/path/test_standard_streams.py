@@ -62,7 +62,8 @@ def run(monkeypatch, stdout, *arguments, stderr=None):
     return code, "" if stderr is not None else err.getvalue()
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.long(but_first=3)
+@pytest.mark.heavy
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "koi8-r"])
 @pytest.mark.parametrize("arguments", [(), ("--json",)])
 def test_an_encoding_that_lacks_our_signs(log, monkeypatch, encoding, arguments):

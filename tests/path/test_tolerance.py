@@ -36,6 +36,7 @@ def test_it_acquires_until_the_interval_is_as_tight_as_asked(tmp_path):
     assert replayed.document == document
 
 
+@pytest.mark.long
 @pytest.mark.heavy
 def test_out_of_reach_is_said_before_motion_with_what_would_help(tmp_path):
     done = identify(tmp_path, "--simulate", *QUICK, "--seed", 1, "--tolerance", "0.02%", "--max-time", "150s")

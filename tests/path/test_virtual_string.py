@@ -102,7 +102,7 @@ def test_the_drives_own_loop_does_what_tune_says_of_its_gains(files):
     Shaft.read(files / "shaft.csv").assert_at_rest()
 
 
-@pytest.mark.heavy
+@pytest.mark.long
 def test_a_reported_torque_of_nine_tenths_of_the_commanded_one_is_not_as_predicted(files):
     """The loop itself does not use the reported torque, so all else goes as tune says."""
     done = evaluate(files, "--fault", "torque-scale=0.9")
@@ -113,6 +113,7 @@ def test_a_reported_torque_of_nine_tenths_of_the_commanded_one_is_not_as_predict
     assert (again.code, again.document) == (9, done.document)
 
 
+@pytest.mark.long(but_first=3)
 @pytest.mark.heavy
 @pytest.mark.parametrize(("fault", "code"), [
     ("frozen-feedback", 5), ("internal-limit", 7), ("drive-fault", 6), ("feedback-lost", 5), ("load-lost", 7),

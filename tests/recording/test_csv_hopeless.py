@@ -193,6 +193,7 @@ def test_the_sound_trace_is_identified(tmp_path, excitation):
     assert said == ()
 
 
+@pytest.mark.long(but_first=10)
 @pytest.mark.heavy
 @pytest.mark.parametrize("spoil", SPOILT, ids=lambda spoil: spoil.__name__)
 def test_a_spoilt_trace_gives_no_number(tmp_path, excitation, spoil):

@@ -29,6 +29,7 @@ def measured():
     return run_line(drive(seed=3), OFFSET)
 
 
+@pytest.mark.heavy
 def test_it_goes_through_its_stages_and_finds_the_gains(measured):
     assert measured.outcome.cause is None
     assert [(one.name, one.outcome) for one in measured.outcome.stages] == [

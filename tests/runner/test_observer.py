@@ -114,6 +114,7 @@ def healthy(rig, wrong, rel_error, frequency_hz, seed):
     assert bench.observer.moved and bench.observer.unseen_s == 0.0
 
 
+@pytest.mark.long(but_first=16)
 @pytest.mark.heavy(but_first=3)
 @pytest.mark.parametrize("speed_lag_s", [0.1, 0.3, 0.45, 0.5])
 @pytest.mark.parametrize("coulomb", [100.0, 371.0, 500.0])

@@ -46,7 +46,9 @@ def moved(string: DrillString, torques: list[float], dt_s: float = DT) -> tuple[
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("end", ENDS)
-@pytest.mark.parametrize("hz", [0.05, 0.2, 0.45, 0.7, 1.1, 2.0, 5.0])
+@pytest.mark.parametrize("hz", [
+    0.2, 1.1, 5.0, *(pytest.param(hz, marks=pytest.mark.long) for hz in (0.05, 0.45, 0.7, 2.0)),
+])
 def test_a_sine_meets_the_analytic_impedance(end: str, hz: float) -> None:
     params = SMOOTH.model_copy(update={"bottom_end": end})
     count = round(1.0 / hz / DT)

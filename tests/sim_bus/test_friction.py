@@ -109,6 +109,7 @@ CASES = {
 }
 
 
+@pytest.mark.long(but_first=8)
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("dt_s", [0.002, 0.0005])
 @pytest.mark.parametrize("name", CASES)
@@ -135,6 +136,7 @@ def test_a_shaft_ten_thousand_times_lighter_is_still_followed(words: dict[str, o
     assert deviation(Params(inertia_kg_m2=0.01, **words), 0.002, SHORT) < bound  # type: ignore[arg-type]
 
 
+@pytest.mark.long(but_first=9)
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("inertia", [0.01, 1.0, 104.0])
 @pytest.mark.parametrize("words", [

@@ -127,6 +127,7 @@ def test_an_interval_of_draws_says_where_its_end_is_not_known():
     assert (low, high) == (0.0, 10.0)
 
 
+@pytest.mark.heavy
 def test_the_operators_map_agrees_with_a_chain_in_time():
     """Softer gains leave more green; cells that are clearly stable or clearly stick do so in another simulator."""
     laws = {"stiff": STIFF, "soft": SOFT_035}

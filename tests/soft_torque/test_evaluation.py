@@ -120,7 +120,8 @@ def rows(turns_from_rpm, trials, *, damping=0.2, hertz=0.13, **more):
     return table
 
 
-@pytest.mark.heavy(but_first=2)
+@pytest.mark.long(but_first=3)
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("seed", range(8))
 def test_two_modes_that_are_alike_are_told_apart_in_noise(seed):
     # As a = 0.25 of the reference case has them, with what the loop's own disturbances leave of the speed.

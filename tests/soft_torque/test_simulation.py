@@ -93,6 +93,7 @@ def poles_of(samples, step_s, order):
     return np.log(values.astype(complex)) / step_s
 
 
+@pytest.mark.long(but_first=3)
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", TABLE)
 def test_modes_in_time_are_the_poles(name):
@@ -112,6 +113,7 @@ def test_modes_in_time_are_the_poles(name):
         assert -seen.real / abs(seen) == pytest.approx(mode.damping, abs=0.012 if mode.damping > 0.4 else 0.005)
 
 
+@pytest.mark.long(but_first=2)
 @pytest.mark.heavy
 @pytest.mark.parametrize("law", [STIFF, SOFT_025, HALF], ids=["stiff", "soft", "half"])
 def test_sections_in_time_against_the_chain(law):

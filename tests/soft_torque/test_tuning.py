@@ -124,6 +124,7 @@ def measured_lags(along=(0.0, 0.0)):
     return (*(np.array([0.021, 0.012]) + np.asarray(along) @ SPREAD).tolist(),)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("kind", [
     "soft", *(pytest.param(one, marks=pytest.mark.heavy) for one in ("present", "compensated")),
 ])
@@ -166,6 +167,7 @@ def test_a_mode_that_goes_up_is_still_the_lowest():
     assert least_damping(light, drive, law, HELD) == pytest.approx(0.48, abs=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.heavy
 def test_the_cure_speed_over_the_interval_is_what_two_hundred_draws_of_j_give(tuned):
     """Simulated for each draw: 95 % lie between what the ends give, to the resolution of 1 rpm."""

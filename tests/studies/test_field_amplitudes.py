@@ -45,6 +45,7 @@ def test_the_bus_agrees_with_the_linear_loop(swept):
     assert np.all(column(swept, "share_at_limit") == 0.0)
 
 
+@pytest.mark.long
 def test_figure20_falls_then_rises():
     outcome = ran("figure20")
     assert column(outcome, "kp_nm_s_rad")[[0, -1]].tolist() == [150.0, 1500.0]
@@ -58,6 +59,7 @@ def test_figure20_falls_then_rises():
     assert holds(outcome, "best balance").holds is False
 
 
+@pytest.mark.long
 def test_figure21_is_least_at_the_lowest_i_and_says_why_it_does_not_rise_throughout():
     outcome = ran("figure21")
     assert column(outcome, "ki_nm_rad")[[0, -1]].tolist() == [200.0, 2500.0]

@@ -6,7 +6,7 @@ from tdhil.cli.study import SimulatedFieldBench
 from tdhil.studies.field.settings import SlopeSettings
 from tdhil.studies.field.slopes import FieldSlopes
 
-pytestmark = [pytest.mark.one_worker, pytest.mark.heavy]
+pytestmark = [pytest.mark.one_worker, pytest.mark.long]
 
 PUBLISHED = {0.1: 105.379, 0.3: 116.557, 0.5: 135.622, 1.0: 185.757}
 INERTIA = 104.0

@@ -60,6 +60,7 @@ def test_table7_meets_its_bound_and_the_published_ranks(table7):
     assert [factor["rank"] for factor in table7.document["factors"]] == [1, 2, 3, 4]
 
 
+@pytest.mark.long
 def test_table6_meets_its_bound_and_the_published_ranks(table6):
     assert rms(inertias(table6), L16_RUNS) <= 1.1
     rank = {factor["name"]: factor["rank"] for factor in table6.document["factors"]}
@@ -67,6 +68,7 @@ def test_table6_meets_its_bound_and_the_published_ranks(table6):
     assert {rank["kp_nm_s_rad"], rank["ki_nm_rad"]} == {4, 5}
 
 
+@pytest.mark.long
 def test_both_agree_with_the_first_reconstruction(table6, table7):
     assert np.allclose(inertias(table7), L9_REFERENCE, atol=0.02)
     assert np.allclose(inertias(table6), L16_REFERENCE, atol=0.06)
@@ -79,6 +81,7 @@ def test_the_data_file_says_what_the_paper_prints(name, printed, runs):
     assert np.allclose(design.runs_kg_m2, runs, atol=0.011)
 
 
+@pytest.mark.long
 def test_runs_stand_in_array_order_with_their_factors(table6, table7):
     first, last = table6.document["runs"][0], table6.document["runs"][-1]
     assert [first[name] for name in TABLE6] == pytest.approx([0.1, 2500, 1500, 0.5, np.pi / 2])
@@ -86,6 +89,7 @@ def test_runs_stand_in_array_order_with_their_factors(table6, table7):
     assert [table7.document["runs"][5][name] for name in TABLE7] == [50, 100, 100, 1e-4]
 
 
+@pytest.mark.long
 def test_without_the_start_up_the_bias_nearly_vanishes(table6, table7):
     assert np.allclose(column(table7.tables[0], "without_start_up_kg_m2"), 900.0, atol=0.04)
     settled = np.array(column(table6.tables[0], "without_start_up_kg_m2"))
@@ -94,6 +98,7 @@ def test_without_the_start_up_the_bias_nearly_vanishes(table6, table7):
     assert np.all(np.abs(settled[reversing] - 900.0) < 1.7)
 
 
+@pytest.mark.long
 def test_the_closed_form_explains_the_bias(table6, table7):
     for outcome, within in ((table6, 1.7), (table7, 1.9)):
         closed = np.array(column(outcome.tables[0], "closed_form_kg_m2"))
@@ -116,6 +121,7 @@ def test_the_closed_form_by_hand():
     assert closed_form_inertia(changed(run, signal="chirp")) is None
 
 
+@pytest.mark.long
 def test_what_is_said_about_the_tables(table6, table7):
     assert holding(table6, "single runs") is True
     assert holding(table6, "A > D > E") is True
@@ -137,6 +143,7 @@ def test_the_noise_of_table_7_changes_nothing(table7):
     assert np.all(np.abs(silent - inertias(table7)) < 0.02)
 
 
+@pytest.mark.long
 def test_the_effect_table_carries_both(table6):
     table = table6.tables[1]
     ours = [row for row in table.rows if row[1] == "here"]
@@ -146,6 +153,7 @@ def test_the_effect_table_carries_both(table6):
     assert theirs[0][2:7] == (885.592, 891.87, 895.08, 895.258, 9.666)
 
 
+@pytest.mark.long
 def test_cost_is_reported_beside_simulated_time(table6, table7):
     assert table6.simulated_s == pytest.approx(16 * 25.0)
     assert table7.simulated_s == pytest.approx(2 * 9 * 20.0)      # each run also without noise
@@ -174,6 +182,7 @@ def test_a_design_of_ones_own_has_no_published_columns():
     assert "published_runs_kg_m2" not in outcome.document
 
 
+@pytest.mark.long
 def test_pictures(table6):
     figure_class = pytest.importorskip("matplotlib.figure").Figure
     figure = figure_class(figsize=(8, 5))

@@ -1,4 +1,8 @@
-"""The contract of every Drive (tests/drivers/test_drive_contract.py), on a real SocketCAN interface."""
+"""Of the contract of every Drive (tests/drivers/test_drive_contract.py), what a socket of the kernel could break.
+
+That is the order, the time and the content of the frames, and what is left in the drive behind them. The rest of the
+contract is the driver's own, whatever carries its frames: the benches of tests/drivers prove it.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,18 @@ import pytest
 
 from sim_bus.params import RigParams
 from tests.drivers.drive_benches import Run
-from tests.drivers.test_drive_contract import *  # noqa: F403
-from tests.drivers.test_drive_contract import other_mode
+from tests.drivers.test_drive_contract import (  # noqa: F401  (collected here)
+    other_mode,
+    test_a_quick_stop_brakes_on_the_ramp_and_holds,
+    test_counters,
+    test_nothing_is_sent_behind_the_loops_back,
+    test_samples_are_one_period_apart,
+    test_settings_are_given_back,
+    test_the_frames_on_the_bus_carry_the_setpoints,
+    test_the_frames_on_the_bus_say_what_the_samples_say,
+    test_the_tap_sees_every_frame_in_order,
+    test_the_whole_order,
+)
 from tests.vcan.vcan_bench import VcanBench
 
 

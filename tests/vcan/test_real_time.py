@@ -1,4 +1,4 @@
-"""Ten runs in real time, at the rate that each of them chooses, against simulated drives in processes of their own.
+"""Four runs in real time, at the rate that each of them chooses, against simulated drives in processes of their own.
 
 A guest beside the other tests is a slow and a busy computer: late frames, bursts and stalls are to be expected. What
 must hold on any computer: a run gives J, covered by its interval or with none, or it ends with 5 and says that this
@@ -30,7 +30,7 @@ from tdhil.runner.stages import speed
 from tests.path.path_runs import INERTIA, PLAIN, Peer, identify, peer, wait_for
 from tests.vcan.vcan_runs import root_s_ip, run
 
-RUNS = 10
+RUNS = 4
 FURTHER = ("vcan8",)
 SHORT = ("--mode", "speed", "--excitation", "sine", "--frequency", 1, "--periods", 12, "--offset", 5)
 """Twelve seconds of excitation at one mean speed."""
