@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from tdhil.config import Rig, RunOptions
     from tdhil.errors import ExitCode
     from tdhil.estimation import FrequencyResponse, Identification, InertiaEstimate, Verdict
+    from tdhil.recording import LiveInertia
     from tdhil.session import OperatorInterface, RunRequest
 
 __all__ = [
@@ -245,6 +246,7 @@ def run(
     *,
     confirm: Callable[[str], bool] | None = None,
     stop: StopRequest | None = None,
+    on_inertia: Callable[[LiveInertia], object] | None = None,
     **options: Any,
 ) -> RunRecord:
     """Run the five stages and the stop, and give what was recorded; the log is closed then, and the shaft at rest.
@@ -253,6 +255,9 @@ def run(
     it is typed at the terminal, and refused where there is none. A simulated drive needs none. ``options``: those of
     motion, result, control loop, overrides and log, such as ``log``, ``mode``, ``tolerance``, ``max_time_s``,
     ``operator``, ``note``, ``no_watchdog``; ``help(tdhil.run)`` lists them, the page on rig.yaml describes them.
+    ``on_inertia`` is called after periods of the excitation with J so far, in a thread of its own:
+    ``inertia_kg_m2``, ``low_kg_m2``, ``high_kg_m2``, ``p_value`` and more. Each interval covers by itself; stopping the
+    run when one is narrow lowers the coverage, which ``tolerance`` accounts for.
     Ctrl-C is a stop, as on the command line, where this is the main thread; in another one give a ``stop``, and
     ``ask()`` it: signals are not looked at there.
 
@@ -270,7 +275,7 @@ def run(
     request = RunRequest.of(chosen, connection, peer, drive.rig, overrides=Overrides.of(asked),
                             operator=details.operator, note=details.note,
                             real_time_priority=bool(details.real_time_priority), expect=details.expect)
-    session = RunSession(request, _operator_interface(request, confirm))
+    session = RunSession(request, _operator_interface(request, confirm, on_inertia))
     try:
         outcome = session.move(stop)
     except BaseException:
@@ -302,11 +307,13 @@ def _peer(drive: DriveHandle, asked: Mapping[str, Any]) -> tuple[RunOptions, Con
     return options, connection, with_faults(plan_peer(options, connection), drive.faults, connection.drive)
 
 
-def _operator_interface(request: RunRequest, confirm: Callable[[str], bool] | None) -> OperatorInterface:
+def _operator_interface(
+    request: RunRequest, confirm: Callable[[str], bool] | None, on_inertia: Callable[[LiveInertia], object] | None
+) -> OperatorInterface:
     from tdhil.report import stderr_console
     from tdhil.session import CallbackOperator, TerminalOperator
 
     gear_ratio = 1.0 if request.rig is None else request.rig.gear.ratio
     if confirm is None:
-        return TerminalOperator(stderr_console(), gear_ratio=gear_ratio)
-    return CallbackOperator(stderr_console(), confirm, gear_ratio=gear_ratio)
+        return TerminalOperator(stderr_console(), gear_ratio=gear_ratio, on_inertia=on_inertia)
+    return CallbackOperator(stderr_console(), confirm, gear_ratio=gear_ratio, on_inertia=on_inertia)

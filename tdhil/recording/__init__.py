@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from profiles import lazy_names
 
 if TYPE_CHECKING:
+    from tdhil.recording.builder import RecordingBuilder as RecordingBuilder, RecordingPart as RecordingPart
     from tdhil.recording.csv import (
         Bench as Bench, REFERENCE_FLAG as REFERENCE_FLAG, ReferenceTrace as ReferenceTrace,
         TIME_AND_TORQUE as TIME_AND_TORQUE, USUAL as USUAL, parse_columns as parse_columns,
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
     )
     from tdhil.recording.log_format import (
         CAN as CAN, CHANNELS as CHANNELS, CLASSES as CLASSES, COMMAND as COMMAND, EXCITATION as EXCITATION,
-        FRAME_CHANNELS as FRAME_CHANNELS, RAW_FRAMES as RAW_FRAMES, SAMPLE as SAMPLE,
+        FRAME_CHANNELS as FRAME_CHANNELS, LiveInertia as LiveInertia, RAW_FRAMES as RAW_FRAMES, SAMPLE as SAMPLE,
         VIRTUAL_COLUMNS as VIRTUAL_COLUMNS, VIRTUAL_STRING as VIRTUAL_STRING,
         schema_name as schema_name,
     )
@@ -35,12 +36,13 @@ if TYPE_CHECKING:
     from tdhil.recording.salvage import Salvage as Salvage, examine as examine, write_copy as write_copy
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
+        "builder": "RecordingBuilder RecordingPart",
         "csv": (
             "Bench USUAL parse_columns read_recording REFERENCE_FLAG ReferenceTrace TIME_AND_TORQUE "
             "read_reference"
         ),
-        "log_format": "CAN CHANNELS CLASSES COMMAND EXCITATION FRAME_CHANNELS RAW_FRAMES SAMPLE VIRTUAL_COLUMNS "
-                      "VIRTUAL_STRING schema_name",
+        "log_format": "CAN CHANNELS CLASSES COMMAND EXCITATION FRAME_CHANNELS LiveInertia RAW_FRAMES SAMPLE "
+                      "VIRTUAL_COLUMNS VIRTUAL_STRING schema_name",
         "log_reader": "read_cycles read_frames read_run",
         "log_tail": "LogChunks LoggedMessage LogNews LogTail messages_in",
         "log_writer": "RunWriter",

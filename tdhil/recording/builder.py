@@ -3,7 +3,7 @@
 import math
 from array import array
 from collections.abc import Sequence
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
 from typing import Any, Final, get_args, get_origin, get_type_hints
@@ -77,6 +77,29 @@ _COLLECTED: Final = frozenset({
 })
 FACTS: Final = frozenset(field.name for field in fields(Recording)) - _COLLECTED
 """Members of a Recording that are known once and written into the configuration: gear ratio, lag prior,"""
+
+
+@dataclass(frozen=True)
+class RecordingPart:
+    """A piece of a growing Recording, for a builder in another process. It begins with sample ``begin``."""
+
+    begin: int
+    begin_position: int
+    values: "array[float]"
+    setpoints: "array[float]"
+    flags: bytes
+    positions_at: "array[int]"
+    positions: "array[float]"
+    excitation: Excitation | None
+    levels: tuple[Level, ...]
+    ramps: tuple[Ramp, ...]
+    stages: tuple[Stage, ...]
+    facts: dict[str, Any]
+
+    @property
+    def end(self) -> int:
+        """Return the sample with which the next part begins."""
+        return self.begin + len(self.flags)
 
 
 class RecordingBuilder:
@@ -168,6 +191,28 @@ class RecordingBuilder:
     def facts(self) -> dict[str, Any]:
         """Return the facts of the run so far, for `RunWriter.configuration`."""
         return dict(self._facts)
+
+    def part(self, after: RecordingPart | None = None) -> RecordingPart:
+        """What came after an earlier part, or all; a copy of these samples only, so it costs little in a cycle."""
+        begin = 0 if after is None else after.end
+        begin_position = 0 if after is None else after.begin_position + len(after.positions)
+        return RecordingPart(
+            begin, begin_position, self._values[3 * begin:], self._setpoints[2 * begin:], bytes(self._flags[begin:]),
+            self._positions_at[begin_position:], self._positions[begin_position:],
+            self._excitation, self._levels, self._ramps, tuple(self._stages), dict(self._facts),
+        )
+
+    def join(self, part: RecordingPart) -> None:
+        """Add the next part of another builder. Raises ValueError if one is missing."""
+        if part.begin != len(self) or part.begin_position != len(self._positions):
+            raise ValueError(f"the part begins with sample {part.begin} instead of {len(self)}")
+        self._values.extend(part.values)
+        self._setpoints.extend(part.setpoints)
+        self._flags += part.flags
+        self._positions_at.extend(part.positions_at)
+        self._positions.extend(part.positions)
+        self._excitation, self._levels, self._ramps = part.excitation, part.levels, part.ramps
+        self._stages, self._facts = list(part.stages), part.facts
 
     def recording(self, *, complete: bool = True) -> Recording:
         """Return the Recording so far, as a copy; collecting may continue."""

@@ -16,12 +16,14 @@
   11  /virtual_string  VirtualString  every cycle of a virtual string, at its main shaft
   12  /frames          Frames         the frames of any other bus, in place of /can
   13  /frf             Response       the frequency response of the result, for viewers; never read back
+  14  /live_inertia    LiveInertia    J after a period of the excitation; the last one is the result's
 ====  ===============  =============  =====================================================================
 
 A message's log time is the epoch handed in at the start plus its control time, in nanoseconds.
 """
 
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from types import NoneType, UnionType
@@ -57,6 +59,41 @@ class Event:
     kind: str
     text: str
     traceback: str = ""
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The interim answer of a run: J and its interval from the periods so far.
+
+
+@dataclass(frozen=True)
+class LiveInertia:
+    """J at the motor shaft from all samples up to ``time_s`` (control time), identified as at the end of the run.
+
+    ``periods``: evaluated so far. ``verdict`` and ``reason`` are those of a result. Without a number the estimates are
+    None. ``low`` to ``high`` is the repeatability, ``low_total`` to ``high_total`` includes the torque scale.
+    ``tolerance`` and ``least_left_s``, the least time until stage 5 may end on it: None without `--tolerance`.
+    """
+
+    time_s: float
+    periods: int
+    confidence: float
+    verdict: str
+    reason: str
+    inertia_kg_m2: float | None = None
+    low_kg_m2: float | None = None
+    high_kg_m2: float | None = None
+    low_total_kg_m2: float | None = None
+    high_total_kg_m2: float | None = None
+    p_value: float | None = None
+    tolerance: float | None = None
+    least_left_s: float | None = None
+
+    @property
+    def relative_half_width(self) -> float:
+        """Return half the width of the repeatability, as a share of J; infinite without a number."""
+        if self.inertia_kg_m2 is None or self.low_kg_m2 is None or self.high_kg_m2 is None:
+            return math.inf
+        return 0.5 * (self.high_kg_m2 - self.low_kg_m2) / self.inertia_kg_m2
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -192,6 +229,7 @@ MODBUS: Final = 10
 VIRTUAL_STRING: Final = 11
 OTHER_FRAMES: Final = 12
 FRF: Final = 13
+LIVE_INERTIA: Final = 14
 
 VIRTUAL_COLUMNS: Final = (
     "time_s", "phase", "set_rad_s", "top_rad_s", "innovation_rad_s", "string_nm", "drive_nm", "share", "bit_rad_s",
@@ -219,6 +257,7 @@ CHANNELS: Final = {
     VIRTUAL_STRING: ("/virtual_string", "VirtualString"),
     OTHER_FRAMES: ("/frames", "Frames"),
     FRF: ("/frf", "Response"),
+    LIVE_INERTIA: ("/live_inertia", "LiveInertia"),
 }
 FRAME_CHANNELS: Final = {topic: number for number, (topic, message) in CHANNELS.items() if message == "Frames"}
 """Channels of raw frames by topic. A log has messages on only one of them."""
@@ -271,6 +310,7 @@ MESSAGES: Final = {
     "Text": {"json": "string"},
     "VirtualString": dict.fromkeys(VIRTUAL_COLUMNS, "double"),
     "Response": dict.fromkeys(FRF_COLUMNS, "double*") | {"distortion_detected": "bool"},
+    "LiveInertia": fields_of(LiveInertia),
 }
 CLASSES: Final[dict[str, Any]] = message_classes(PACKAGE, ENUMS, MESSAGES) | {"Log": LOG_CLASS}
 

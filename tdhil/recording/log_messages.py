@@ -21,6 +21,7 @@ from tdhil.recording.log_format import (
     EXCITATION,
     FRF,
     FRF_COLUMNS,
+    LIVE_INERTIA,
     MODES,
     RESULT,
     STAGE,
@@ -28,6 +29,7 @@ from tdhil.recording.log_format import (
     VIRTUAL_COLUMNS,
     VIRTUAL_STRING,
     Event,
+    LiveInertia,
 )
 from tdhil.recording.recording import Excitation, Level, Ramp, Stage
 
@@ -184,6 +186,12 @@ def response_message(found: Mapping[str, Any]) -> Cold:
     content: dict[str, Any] = {name: [value(line, name) for line in found["lines"]] for name in FRF_COLUMNS}
     content["distortion_detected"] = bool(found["distortion"]["detected"])
     return Cold(FRF, None, _bytes("Response", content), flush=False)
+
+
+def inertia_message(found: LiveInertia) -> Cold:
+    """A `LiveInertia`; at once in the file, since pages wait for it."""
+    content = {name: value for name, value in asdict(found).items() if value is not None}
+    return Cold(LIVE_INERTIA, None, _bytes("LiveInertia", content | {"reason": _clean(found.reason)}), flush=True)
 
 
 def _text(channel: int, content: Mapping[str, Any]) -> Cold:

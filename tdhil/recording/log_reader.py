@@ -224,7 +224,7 @@ _CENTURY_NS: Final = 946_684_800 * 10**9       # 2000-01-01
 RARE: Final = 20_000                   # most stages, events and problems
 RARE_BYTES: Final = 64 * 2**20         # bytes of everything except samples, commands and frames
 BATCH: Final = 2 * 2**20               # bytes of chunks read at once; a longer chunk is read message by message
-_UNREAD: Final = frozenset({log_format.FRF, log_format.LOG}) | log_format.RAW_FRAMES
+_UNREAD: Final = frozenset({log_format.FRF, log_format.LIVE_INERTIA, log_format.LOG}) | log_format.RAW_FRAMES
 _EVERY_CYCLE: Final = frozenset({log_format.SAMPLE, log_format.COMMAND})
 
 

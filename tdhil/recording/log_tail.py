@@ -21,7 +21,7 @@ from google.protobuf.message import DecodeError
 from tdhil.recording import log_format
 from tdhil.recording.builder import structure
 from tdhil.recording.chunk_table import NO_COMMAND, ChunkTable
-from tdhil.recording.log_format import CHANNELS, CLASSES, Event
+from tdhil.recording.log_format import CHANNELS, CLASSES, Event, LiveInertia
 from tdhil.recording.mcap_container import MAGIC
 from tdhil.recording.mcap_recovery import CHUNK, CHUNK_LIMIT, DATA_END, Contents, chunk_head, contents, read_at
 from tdhil.recording.recording import FloatArray, Stage
@@ -51,6 +51,7 @@ class LogNews:
     samples: FloatArray = field(default_factory=_nothing)
     events: tuple[Event, ...] = ()
     stages: tuple[Stage, ...] = ()
+    inertias: tuple[LiveInertia, ...] = ()
     configuration: dict[str, Any] | None = None
     result: dict[str, Any] | None = None
     epoch_ns: int = 0
@@ -109,6 +110,7 @@ class LogTail:
             np.concatenate(samples) if samples else _nothing(),
             tuple(event for one in decoded for event in one.events),
             tuple(stage for one in decoded for stage in one.stages),
+            tuple(found for one in decoded for found in one.inertias),
             next((one.configuration for one in reversed(decoded) if one.configuration is not None), None),
             next((one.result for one in reversed(decoded) if one.result is not None), None),
             next((one.epoch_ns for one in decoded if one.epoch_ns), 0),
@@ -160,6 +162,7 @@ class LogTail:
         block, _, messages, _ = found
         events: list[Event] = []
         stages: list[Stage] = []
+        inertias: list[LiveInertia] = []
         texts: dict[int, dict[str, Any]] = {}
         for message in messages:
             with suppress(DecodeError, ValueError, TypeError, KeyError, RecursionError):
@@ -168,12 +171,14 @@ class LogTail:
                     events.append(structure(Event, decoded))
                 elif message.number == log_format.STAGE:
                     stages.append(structure(Stage, decoded))
+                elif message.number == log_format.LIVE_INERTIA:
+                    inertias.append(structure(LiveInertia, decoded))
                 elif message.number in (log_format.CONFIGURATION, log_format.RESULT):
                     plain = json.loads(decoded.json)
                     if isinstance(plain, dict):
                         texts[message.number] = plain
         epoch_ns = 0 if block is None else block.first_log_time_ns - round(float(block.values[0, 0]) * 1e9)
         return LogNews(
-            _nothing() if block is None else block.values, tuple(events), tuple(stages),
+            _nothing() if block is None else block.values, tuple(events), tuple(stages), tuple(inertias),
             texts.get(log_format.CONFIGURATION), texts.get(log_format.RESULT), max(0, epoch_ns),
         )

@@ -22,7 +22,7 @@ from typing import Any, Final, Self
 from drivers import Command, RawFrame, Sample
 from tdhil.errors import LogBroken, LogError, LogRefused, LogUnopened
 from tdhil.recording import log_messages
-from tdhil.recording.log_format import CAN, CLASSES, COMMAND, EVENT, LOG, SAMPLE, Event, log_payload
+from tdhil.recording.log_format import CAN, CLASSES, COMMAND, EVENT, LOG, SAMPLE, Event, LiveInertia, log_payload
 from tdhil.recording.log_messages import Cold, event_message, pack_command, pack_frames, pack_sample
 from tdhil.recording.mcap_container import Container, LogGone, RawFile
 from tdhil.recording.recording import Excitation, Level, Ramp, Stage
@@ -424,6 +424,10 @@ class RunWriter:
         self._rare(log_messages.result_message(result))
         if (response := result.get("frequency_response")) is not None:
             self._rare(log_messages.response_message(response))
+
+    def inertia(self, found: LiveInertia) -> None:
+        """An interim answer; may be called again."""
+        self._rare(log_messages.inertia_message(found))
 
     def close(self, timeout_s: float = 30.0) -> None:
         """Write all waiting records and finish the file; idempotent. Raises `LogBroken` if the log is not complete."""

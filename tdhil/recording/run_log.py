@@ -14,8 +14,8 @@ import numpy as np
 
 from drivers import Command, FrameTap, Sample, TdhilError
 from tdhil.errors import ExitCode, Interrupted, code_of, exit_code
-from tdhil.recording.builder import RecordingBuilder
-from tdhil.recording.log_format import FAILURE, INTERRUPTED, VIRTUAL_COLUMNS, Event
+from tdhil.recording.builder import RecordingBuilder, RecordingPart
+from tdhil.recording.log_format import FAILURE, INTERRUPTED, VIRTUAL_COLUMNS, Event, LiveInertia
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.recording import Excitation, FloatArray, Level, Ramp, Recording, Stage
 
@@ -174,6 +174,10 @@ class RunLog:
         self._run |= run
         self._writer.configuration(self._run, self._builder.facts)
 
+    def inertia(self, found: LiveInertia) -> None:
+        """An interim answer."""
+        self._writer.inertia(found)
+
     def result(self, document: Mapping[str, Any]) -> None:
         """Log the result document."""
         self._writer.result(document)
@@ -181,6 +185,10 @@ class RunLog:
     def recording(self, *, complete: bool) -> Recording:
         """Return the Recording so far."""
         return self._builder.recording(complete=complete)
+
+    def part(self, after: RecordingPart | None = None) -> RecordingPart:
+        """What was recorded after an earlier part, or all."""
+        return self._builder.part(after)
 
     def close(self) -> None:
         """Finish the file."""

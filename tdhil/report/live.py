@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -21,7 +21,7 @@ from rich.text import Text
 
 from drivers import Command, Outcome, Preflight, Sample
 from profiles import visible
-from tdhil.recording import Stage
+from tdhil.recording import LiveInertia, Stage
 from tdhil.report.card import minutes
 from tdhil.report.document import SIMULATED
 
@@ -172,6 +172,7 @@ class LiveView:
     elapsed_s: float = 0.0             # of the current stage, s of control time
     last: tuple[Command, Sample] | None = None
     simulated: bool = False
+    inertias: tuple[LiveInertia, ...] = ()
     taken: bool = False                # True if a cycle has taken the terminal since the last pause
     end: str = ""
 
@@ -182,8 +183,12 @@ class LiveDisplay:
     This class does not write. The thread of `Painter` does, from a view that does not change after it was passed.
     """
 
-    def __init__(self, console: Console, show_preflight: bool) -> None:
+    def __init__(
+        self, console: Console, show_preflight: bool, on_inertia: Callable[[LiveInertia], object] | None = None
+    ) -> None:
+        """``on_inertia`` receives J during the run, in the thread that draws."""
         self._console = console
+        self._on_inertia = on_inertia
         self._show_preflight = show_preflight
         self._painter = Painter()
         self._view = LiveView(expected_s=dict(_EXPECTED_S))
@@ -254,6 +259,18 @@ class LiveDisplay:
         self._view = replace(self._view, last=(command, sample), elapsed_s=elapsed_s, taken=True)
         self._show()
 
+    @property
+    def follows_inertia(self) -> bool:
+        """Return whether J is wanted during the run: by a terminal or a function."""
+        return self._console.is_terminal or self._on_inertia is not None
+
+    def inertia(self, found: LiveInertia) -> None:
+        """J from the periods so far."""
+        self._view = replace(self._view, inertias=(*self._view.inertias, found)[-MOST_INERTIAS:])
+        if self._on_inertia is not None:
+            self._painter.line(lambda: self._hand_over(found))
+        self._show()
+
     def stage_ended(self, stage: Stage) -> None:
         self._view = replace(self._view, ended={**self._view.ended, stage.name: stage})
         if not self._console.is_terminal:
@@ -272,6 +289,19 @@ class LiveDisplay:
             self._print(f"{self._prefix()}{end}")
         else:
             self._show()
+
+    def _hand_over(self, found: LiveInertia) -> None:
+        """Call the function of the caller. An error of it ends the calls, not the run."""
+        call, self._on_inertia = self._on_inertia, None
+        if call is None:
+            return
+        try:
+            call(found)
+        except Exception as error:
+            text = f"on_inertia is not called any more: {type(error).__name__}: {error}"
+            self._console.print(text, style="yellow", markup=False)
+            return
+        self._on_inertia = call
 
     def _prefix(self) -> str:
         return f"{SIMULATED} " if self._view.simulated else ""
@@ -335,9 +365,67 @@ def picture(view: LiveView) -> RenderableType:
             f"{command.mode.value} mode  {minutes(left_s)} left"
         )
         parts.append(Text(text, no_wrap=True, overflow="ellipsis"))
+    if view.inertias and not view.end:
+        parts += inertia_rows(view.inertias)
     if view.simulated:
         parts.insert(0, Text(f"{SIMULATED} drive and rig: nothing real turns", style="magenta"))
     return Group(*parts)
+
+
+MOST_INERTIAS = 200
+_SHOWN = 6                # answers on a terminal of 24 lines
+_CELLS = 36               # of an interval's bar
+
+
+def inertia_rows(inertias: Sequence[LiveInertia]) -> list[RenderableType]:
+    """J's interval over time, a line for each of some answers: the first, and the latest."""
+    known = [one for one in inertias if one.inertia_kg_m2 is not None]
+    last = inertias[-1]
+    if not known:
+        return [Text(f"J is not known yet: {last.reason}", "dim", no_wrap=True, overflow="ellipsis")]
+    shown = known if len(known) <= _SHOWN else [known[0], *known[1 - _SHOWN:]]
+    low = min(one.low_kg_m2 for one in shown if one.low_kg_m2 is not None)
+    high = max(one.high_kg_m2 for one in shown if one.high_kg_m2 is not None)
+    title = Text(f"J, kg·m², {100.0 * last.confidence:.4g} % interval (repeatability)", "dim")
+    grid = Table.grid(padding=(0, 1))
+    for width in (7, _CELLS, 9, None):
+        grid.add_column(width=width, no_wrap=True)
+    grid.columns[0].justify = "right"
+    grid.add_row("", Text(f"{low:.4g}{f'{high:.4g}':>{_CELLS - len(f'{low:.4g}')}}", "dim"), "", "")
+    for one in shown:
+        style = "bold" if one is shown[-1] else ""
+        grid.add_row(
+            Text(minutes(one.time_s), "dim"), Text(_bar(one, low, high), style),
+            Text(f"{one.inertia_kg_m2:.4g}", style), Text(f"±{100.0 * one.relative_half_width:.2g} %", style),
+        )
+    return [title, grid, Text(_said(last), "dim", no_wrap=True, overflow="ellipsis")]
+
+
+def _bar(one: LiveInertia, low: float, high: float) -> str:
+    """Return the interval between both ends of the scale, with J in it."""
+    def cell(value: float | None) -> int:
+        share = 0.5 if value is None or high <= low else (value - low) / (high - low)
+        return min(_CELLS - 1, max(0, round(share * (_CELLS - 1))))
+
+    begin, middle, end = cell(one.low_kg_m2), cell(one.inertia_kg_m2), cell(one.high_kg_m2)
+    cells = [" "] * begin + ["─"] * (end - begin + 1)
+    cells[begin], cells[end] = "├", "┤"
+    cells[middle] = "●"
+    return "".join(cells)
+
+
+def _said(last: LiveInertia) -> str:
+    """Return a line on the latest answer."""
+    parts = [f"{last.periods} periods"]
+    if last.p_value is not None:
+        parts.append(f"p {last.p_value:.2g}")
+    if last.inertia_kg_m2 is None:
+        parts = [f"now: {last.reason}"]
+    if last.tolerance is not None and last.least_left_s is not None:
+        parts.append(f"at least {minutes(last.least_left_s)} to ±{100.0 * last.tolerance:.3g} %")
+    else:
+        parts.append("to stop at an interval, use --tolerance")
+    return ", ".join(parts)
 
 
 def preflight_table(preflight: Preflight) -> Table:

@@ -10,6 +10,10 @@ if TYPE_CHECKING:
     )
     from tdhil.runner.five_stages import Runner as Runner
     from tdhil.runner.guard import Guard as Guard
+    from tdhil.runner.interim import (
+        FollowsInertia as FollowsInertia, Identify as Identify, Interim as Interim, interim_answer as interim_answer,
+        live_inertia as live_inertia,
+    )
     from tdhil.runner.planning import (
         NOTHING_TO_EXPECT as NOTHING_TO_EXPECT, NOT_PREDICTED as NOT_PREDICTED, Planned as Planned,
         plan_acquisition as plan_acquisition, refuse_hopeless as refuse_hopeless,
@@ -34,6 +38,7 @@ else:
         "design": "DesignKnowledge assumed_noise interval_confidence",
         "five_stages": "Runner",
         "guard": "Guard",
+        "interim": "FollowsInertia Identify Interim interim_answer live_inertia",
         "planning": "NOTHING_TO_EXPECT NOT_PREDICTED Planned plan_acquisition refuse_hopeless refuse_undersampled"
         " refuse_uninformative",
         "preconditions": "precondition_warnings refuse_by_plan",

@@ -10,8 +10,9 @@ from typing import Any
 
 from tdhil.estimation import normal_quantile
 from tdhil.recording import Recording
-from tdhil.runner.design import LOOKS, MARGIN, MOST_BEHIND, Look, Stopping, interval_of, look
+from tdhil.runner.design import LOOKS, MARGIN, MOST_BEHIND, Look, Stopping, look
 from tdhil.runner.excitation import Plan
+from tdhil.runner.interim import Identify, counted_periods, identify_plainly, live_inertia
 
 Snapshot = Callable[[], Recording]
 LEAST_EXTENSION = 2       # periods at each mean speed: fewer do not justify the way back
@@ -55,13 +56,18 @@ class Enough:
     snapshot: Snapshot
     note: Callable[[Decision], None]
     decisions: list[Decision] = field(default_factory=list)
+    identify: Identify = identify_plainly
+
+    def working(self) -> float:
+        """Return the confidence of the interval with which the run would end now."""
+        return self.decisions[-1].working_confidence if self.decisions else self.stopping.working(0)
 
     def question(self, spent_s: float) -> Callable[[], Decision]:
         """Return one interim analysis for any thread or process. The samples are taken now."""
         recording, rule = self.snapshot(), self.stopping
         left_s = rule.allowed_s - spent_s
         seen = self.decisions[-1].seen if self.decisions else 0
-        return partial(decide, recording, rule, self.plan, left_s, len(self.decisions), seen)
+        return partial(decide, recording, rule, self.plan, left_s, len(self.decisions), seen, self.identify)
 
     def decided(self, decision: Decision) -> None:
         """Keep a decision and pass it on."""
@@ -69,13 +75,16 @@ class Enough:
         self.note(decision)
 
 
-def decide(recording: Recording, rule: Stopping, plan: Plan, left_s: float, looks: int, seen: int) -> Decision:
+def decide(
+    recording: Recording, rule: Stopping, plan: Plan, left_s: float, looks: int, seen: int,
+    identify: Identify = identify_plainly,
+) -> Decision:
     """Return the decision after ``looks`` extensions, ``seen`` checked intervals, and ``left_s`` seconds left. Pure."""
     segments = len(plan.segments)
     periods = [one.reference.period_s for one in plan.segments]
     room = max(0, math.floor((left_s - plan.extension_s(0)) / sum(periods) + 1e-9)) if looks < LOOKS else 0
     room_at_last = max(0, math.floor(left_s / max(periods) + 1e-9)) if looks < LOOKS and segments > 1 else 0
-    counted = _counted(recording)
+    counted = counted_periods(recording.excitation)
     room_at_last = min(room_at_last, math.floor(_AT_LAST_SHARE * counted))
     most = (counted + segments * room) / counted if counted else 1.0
     most_at_last = (counted + room_at_last) / counted if counted else 1.0
@@ -95,7 +104,7 @@ def decide(recording: Recording, rule: Stopping, plan: Plan, left_s: float, look
 
     found = None if rule.by_interval else looked(seen)
     if found is None:
-        return _by_interval_alone(recording, rule, counted / segments, room, seen)
+        return _by_interval_alone(recording, rule, counted / segments, room, seen, identify)
     asked, now = f"±{100.0 * rule.tolerance:.3g} %", f"±{100.0 * found.half_width_now:.3g} %"
     if found.half_width_now > rule.tolerance / MARGIN:
         extension, where = more(found)
@@ -105,7 +114,7 @@ def decide(recording: Recording, rule: Stopping, plan: Plan, left_s: float, look
             return Decision(extension, why, found, seen, rule.working(seen), at_last=found.at_last)
         why = f"the scatter gives {now} instead of {asked}, and the remaining time would change little"
         return Decision(0, why, found, seen, rule.working(seen))
-    width = interval_of(recording, rule.working(seen))
+    width = interval_of(recording, rule.working(seen), identify)
     interval = f"the interval is ±{100.0 * width:.3g} %" if math.isfinite(width) else "there is no interval"
     if width <= rule.tolerance:
         return Decision(0, f"{interval}: within the requested {asked}", found, seen, rule.working(seen), width)
@@ -124,14 +133,16 @@ def decide(recording: Recording, rule: Stopping, plan: Plan, left_s: float, look
     return Decision(extension, why, found, seen + 1, rule.working(seen + 1), width, again.at_last)
 
 
-def _by_interval_alone(recording: Recording, rule: Stopping, periods: float, room: int, seen: int) -> Decision:
+def _by_interval_alone(
+    recording: Recording, rule: Stopping, periods: float, room: int, seen: int, identify: Identify
+) -> Decision:
     """Decide by the interval alone, if a rigid shaft with linear friction does not explain the scatter.
 
     With nonlinear friction or an oscillating shaft there may still be an interval. Each check costs a share of the
     confidence. ``periods``: at each mean speed.
     """
     working = rule.working(seen)
-    width = interval_of(recording, working)
+    width = interval_of(recording, working, identify)
     if not math.isfinite(width):
         return Decision(0, "the acquired data give no interval and no prediction", None, seen, working)
     asked, now = f"±{100.0 * rule.tolerance:.3g} %", f"the interval is ±{100.0 * width:.3g} %"
@@ -147,9 +158,6 @@ def _by_interval_alone(recording: Recording, rule: Stopping, periods: float, roo
     return Decision(more, why, None, seen + 1, rule.working(seen + 1), width)
 
 
-def _counted(recording: Recording) -> int:
-    """Return the whole periods after settling, of all segments."""
-    excitation = recording.excitation
-    return 0 if excitation is None else sum(
-        max(0, round((one.end_s - one.start_s) / one.period_s) - one.settle_periods) for one in excitation.segments
-    )
+def interval_of(recording: Recording, confidence: float, identify: Identify) -> float:
+    """Return the relative half-width of the interval with which the run would end; infinite if there is none."""
+    return live_inertia(identify(recording, confidence), recording, confidence).relative_half_width

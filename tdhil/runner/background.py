@@ -131,14 +131,18 @@ class Background(Generic[T]):
     """A computation that starts at once. Nothing has to wait for it: neither a stop nor the end of the process.
 
     If ``worker_process`` can't do it, a thread does, and ``instead`` states why. While a thread computes, the control
-    loop gets the interpreter sooner than usual, also after the work was dropped.
+    loop gets the interpreter sooner than usual, also after the work was dropped. Without ``or_thread``, `result` raises
+    Gone instead.
     """
 
-    def __init__(self, work: Callable[[], T], worker_process: WorkerProcess | None = None) -> None:
+    def __init__(
+        self, work: Callable[[], T], worker_process: WorkerProcess | None = None, *, or_thread: bool = True
+    ) -> None:
         self.ended = Event()
         self.instead = ""
         self._work = work
         self._worker_process = worker_process
+        self._or_thread = or_thread
         self._dropped = False
         self._found: list[T] = []
         self._failure: BaseException | None = None
@@ -170,7 +174,7 @@ class Background(Generic[T]):
             try:
                 return self._worker_process.ask(self._work)
             except Gone as gone:
-                if self._dropped:
+                if self._dropped or not self._or_thread:
                     raise
                 self.instead = str(gone)
         with _in_a_thread(self):

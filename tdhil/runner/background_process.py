@@ -26,7 +26,7 @@ def serve() -> None:
     os.dup2(nowhere, 1)
     os.close(nowhere)
 
-    from tdhil.runner import adaptive_duration, stage_planner  # noqa: F401
+    from tdhil.runner import adaptive_duration, interim, stage_planner  # noqa: F401
     from tdhil.runner.preconditions import quieten
 
     quieten()

@@ -20,6 +20,7 @@ from tdhil.runner.background import WorkerProcess, begin
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import PlanRefused
 from tdhil.runner.guard import Guard
+from tdhil.runner.interim import Identify, identify_plainly
 from tdhil.runner.planning import refuse_undersampled
 from tdhil.runner.preconditions import (
     choose_mode,
@@ -58,7 +59,9 @@ class Runner:
         reset_fault: bool = False,
         say: Say = _nothing,
         confirm_speed: ConfirmSpeed = refuse_unconfirmed_speed,
+        identify: Callable[[], Identify] = lambda: identify_plainly,
     ) -> None:
+        """``identify`` is called before stage 5, when the log has the identity of the drive."""
         self._drive = drive
         self._make_task = make_task
         self._reset_fault = reset_fault
@@ -68,6 +71,7 @@ class Runner:
         self._display = display
         self._confirm = confirm
         self._confirm_speed = confirm_speed
+        self._identify = identify
         self._book = StageBook(drive, log, display, say)
         self._stop: StopSequence | None = None
         self._before_echo = False
@@ -150,7 +154,7 @@ class Runner:
         loop.guard.observer.torque_offset_nm = torque_offset_nm
         return Run(
             task, mode, loop, preflight, torque_offset_nm, prior, self._book, self._log, self._display, self._say,
-            self._confirm, self._confirm_speed, self._armed, end_setup,
+            self._confirm, self._confirm_speed, self._armed, end_setup, self._identify,
         )
 
     def _check_drive(self, task: Task) -> Preflight:

@@ -15,6 +15,7 @@ from tdhil.recording import Excitation, LagPrior, Ramp, RunLog
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.guard import Guard
+from tdhil.runner.interim import Identify, InertiaWatch
 from tdhil.runner.planning import Planned, request_of
 from tdhil.runner.preconditions import no_torque, with_timing
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
@@ -94,7 +95,7 @@ class Run:
     """One run with a prepared drive: what its stages need. Stage 1 has begun.
 
     ``prior``: knowledge of the reporting lags at standstill. ``armed`` receives the stop sequence, which is due from
-    then on. ``end_setup`` ends stage 1.
+    then on. ``end_setup`` ends stage 1. ``identify`` returns the function that identifies the recording.
     """
 
     task: Task
@@ -111,6 +112,7 @@ class Run:
     confirm_speed: ConfirmSpeed
     armed: Callable[[StopSequence], None]
     end_setup: Callable[[], None]
+    identify: Callable[[], Identify]
 
     @property
     def limits(self) -> MachineLimits:
@@ -272,10 +274,17 @@ def acquire(
     planner: StagePlanner,
 ) -> None:
     """Run stage 5: the planned excitation, for a fixed time or until J is known to the tolerance."""
+    identify = run.identify()
+    enough = planner.enough(planned, identify)
+    asked = run.task.request
+    watch = InertiaWatch(
+        run.loop, run.log, run.display, identify, asked.confidence,
+        None if enough is None else enough.working, None if enough is None else asked.tolerance,
+    )
     with run.book.stage("acquire", planned.duration_s + END_S):
         run_plan(
             run.loop, run.limits, planned.plan, control, run.assumptions, _announcer(run, turning, drifted),
-            planner.enough(planned), run.speed_resolution_rad_s,
+            enough, run.speed_resolution_rad_s, watch,
         )
 
 

@@ -17,6 +17,7 @@ from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.design import DesignKnowledge, NoiseDensity, assumed_noise, measured_noise
 from tdhil.runner.excitation import MotionLimits, Plan, PlanRefused, RigGuess, SwingPlan, tells_before_echo
 from tdhil.runner.guard import LIGHTEN, Guard
+from tdhil.runner.interim import Identify
 from tdhil.runner.planning import Planned, as_followed, plan_acquisition
 from tdhil.runner.settings import ExcitationRequest
 from tdhil.runner.stages import RampCourse, SpeedResult
@@ -107,7 +108,7 @@ class StagePlanner:
             self._log.configure(stopping=planned.stopping.plain() | {"decisions": []})
         return planned
 
-    def enough(self, planned: Planned) -> Enough | None:
+    def enough(self, planned: Planned, identify: Identify) -> Enough | None:
         """Return the stopping decision for a given tolerance. Each decision is logged before it is carried out."""
         rule = planned.stopping
         if rule is None:
@@ -120,7 +121,7 @@ class StagePlanner:
             self._tell(decision.why)
 
         assert isinstance(planned.plan, Plan)
-        return Enough(rule, planned.plan, lambda: self._log.recording(complete=True), note)
+        return Enough(rule, planned.plan, lambda: self._log.recording(complete=True), note, identify=identify)
 
     def _note_following(self, plan: Plan | SwingPlan) -> None:
         """Log the data that identification needs for the effect of a stepped, slowly sampled setpoint on J."""

@@ -25,7 +25,7 @@ from tdhil.service.run_state import Check, Confirmation, NotSo, State, Status, W
 from tdhil.service.store import Store, write_json
 
 if TYPE_CHECKING:
-    from tdhil.recording import RunLog, Stage
+    from tdhil.recording import LiveInertia, RunLog, Stage
     from tdhil.runner import Display, Idle, StopRequest, Task
 
 CODE_S: Final = 60.0
@@ -122,6 +122,7 @@ class Watcher:
     def __init__(self, board: Board, stop: StopRequest | None = None) -> None:
         self._board, self._stop = board, stop
         self._looking = False          # waiting for the drive's answer to a stop
+        self.viewed = False            # whether J is wanted during the run
         self._remarks: deque[str] = deque()
         self.log: RunLog | None = None
 
@@ -175,6 +176,14 @@ class Watcher:
         ):
             self._looking = False
             self._board.stop_seen()
+
+    @property
+    def follows_inertia(self) -> bool:
+        """Return whether J is wanted during the run: always in real time, in stepped time if a page shows the run."""
+        return self.viewed
+
+    def inertia(self, found: LiveInertia) -> None:
+        """J is in the log, which the pages read."""
 
     def planned(self, plan: Any) -> None:
         expected_s = float(plan.duration_s) + 5.0

@@ -9,6 +9,7 @@ import asyncio
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -16,14 +17,16 @@ from typing import Any, Final
 import anyio
 import numpy as np
 
+from tdhil.errors import TdhilError
 from tdhil.recording import LogNews, LogTail
-from tdhil.service.run_state import Status
+from tdhil.service.run_state import State, Status
 
 EVERY_S: Final = 0.1
 HEARTBEAT_S: Final = 0.5
 SPACING_S: Final = 0.04                # control time between two displayed samples
 MOST: Final = 12_000                   # samples kept for late viewers; above it, every other one is dropped
 EVENTS: Final = 500
+INERTIAS: Final = 2000                 # interim answers kept for late viewers
 WAITING: Final = 100                   # messages for one viewer, some ten seconds' worth
 
 Viewer = asyncio.Queue[dict[str, Any] | None]
@@ -36,6 +39,7 @@ class LivePicture:
         self.samples = np.empty((0, 3))
         self.events: list[dict[str, Any]] = []
         self.stages: list[dict[str, Any]] = []
+        self.inertias: list[dict[str, Any]] = []
         self.limits: dict[str, float | None] | None = None
         self.simulated: bool | None = None
         self.stepped = False
@@ -62,6 +66,9 @@ class LivePicture:
         if news.stages:
             shown["stages"] = [asdict(one) for one in news.stages]
             self.stages += shown["stages"]
+        if news.inertias:
+            shown["inertias"] = [asdict(one) for one in news.inertias]
+            self.inertias = (self.inertias + shown["inertias"])[-INERTIAS:]
         if news.configuration is not None:
             run = news.configuration.get("run", {})
             self.stepped = run.get("stepped") is True
@@ -72,7 +79,8 @@ class LivePicture:
 
     def whole(self) -> dict[str, Any]:
         """Return everything so far, for a new viewer."""
-        return {"samples": columns(self.samples), "events": self.events, "stages": self.stages, "limits": self.limits}
+        return {"samples": columns(self.samples), "events": self.events, "stages": self.stages,
+                "inertias": self.inertias, "limits": self.limits}
 
     def age_s(self, wall_s: float, mono_s: float) -> float | None:
         """Return the age of the latest sample, s; in stepped time, which runs ahead of the clock, since its arrival."""
@@ -101,8 +109,12 @@ def columns(samples: np.ndarray[Any, Any]) -> list[list[float | None]]:
 class Feed:
     """The feed of one run. `watch` returns a queue that starts with everything so far; None in it: connect again."""
 
-    def __init__(self, path: Path, status: Callable[[], Status]) -> None:
+    def __init__(
+        self, path: Path, status: Callable[[], Status], tell_viewed: Callable[[], None] = lambda: None
+    ) -> None:
+        """``tell_viewed`` tells the run once that a page shows it. It raises TdhilError if the run is not there."""
         self._tail = LogTail(path)
+        self._tell_viewed, self._viewed = tell_viewed, False
         self._read_status = status
         self.picture = LivePicture()
         self.status: Status | None = None
@@ -141,6 +153,10 @@ class Feed:
             status = self._read_status()
         except Exception:              # being written, or deleted: the next check shows it
             status = None
+        if status is not None and status.state is State.MOVING and not self._viewed:
+            with suppress(TdhilError):
+                self._tell_viewed()
+                self._viewed = True
         return self._tail.read(), status
 
     def _dated(self, message: dict[str, Any]) -> dict[str, Any]:

@@ -129,6 +129,11 @@ def ask(folder: Path, request: Mapping[str, Any], *, timeout_s: float = 2.0) -> 
     return found
 
 
+def tell_viewed(folder: Path) -> None:
+    """Tell the run that a page shows it. Raises as `ask` does."""
+    ask(folder, {"do": "viewed"})
+
+
 def _line(peer: socket.socket) -> bytes:
     found = b""
     while not found.endswith(b"\n") and len(found) < LONGEST and (more := peer.recv(4096)):

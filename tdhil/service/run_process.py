@@ -99,6 +99,9 @@ class RunProcess:
                                        next_step="A simulated rig needs no code. A real one shows it after preflight")
             confirming.take(str(asked.get("code", "")), asked.get("binding"), who, str(asked.get("lease") or ""))
             return {"status": self.board.status.plain()}
+        if what == "viewed":
+            self.watcher.viewed = True
+            return {}
         if what == "code":
             confirming = self.operator_interface.confirming
             waiting = confirming is not None and confirming.confirmed_by is None and confirming.void is None
@@ -143,6 +146,7 @@ class RunProcess:
         self.stop.check(next_step="Nothing has moved")
         self.board.to(State.PREFLIGHT)
         self._asked = asked = run_request(rig, self.request.options, left_in=self.store.folder)
+        self.watcher.viewed |= not asked.peer.stepped      # in real time the worker process has the time
         if asked.peer.stepped:
             with suppress(OSError):
                 os.nice(NICE)

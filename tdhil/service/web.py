@@ -35,6 +35,7 @@ from tdhil.service.foxglove import PROTOCOLS, Relay, Running
 from tdhil.service.live_feed import Feed
 from tdhil.service.middleware import RequestGuard, error_response, off, status_of, told_of
 from tdhil.service.page_routes import Pages
+from tdhil.service.run_channel import tell_viewed
 from tdhil.service.run_state import NotLoggedIn, NotThere
 from tdhil.service.schemas import API, SOCKETS
 from tdhil.service.site import Site
@@ -174,7 +175,8 @@ class Web(Site):
             await socket.send_denial_response(error_response(error))
             return
         await socket.accept()
-        feed = self.feeds.of(run, lambda: Feed(folder / "run.mcap", lambda: self.store.status(run)))
+        feed = self.feeds.of(run, lambda: Feed(
+            folder / "run.mcap", lambda: self.store.status(run), lambda: tell_viewed(folder)))
         queue = feed.watch()
         try:
             async with anyio.create_task_group() as both:

@@ -9,10 +9,10 @@ from typing import Any
 from profiles import CodedText
 from tdhil.config import ASKED_AGAIN
 from tdhil.errors import ExitCode, MessageCode, UsageError
-from tdhil.estimation import Identification, Verdict
+from tdhil.estimation import Identification, Options, Verdict
 from tdhil.recording import Recording
 from tdhil.session.rehearsal import code_with
-from tdhil.session.stored_calibration import apply_calibration
+from tdhil.session.stored_calibration import AppliedCalibration, apply_calibration
 
 TORQUE_SCALE = "torque scale"
 """Source in the uncertainty budget that a torque calibration reduces."""
@@ -60,6 +60,29 @@ class Conclusion:
     exit_code: ExitCode
 
 
+def _options(run: Mapping[str, Any], log: str) -> Options:
+    """Return what the run's configuration requests of identification. Raises UsageError if it can't be."""
+    asked = run.get("identify", {})
+    known = {one.name: one.default if asked.get(one.name) is None else asked[one.name] for one in ASKED_AGAIN}
+    try:
+        return Options(**known)
+    except (TypeError, ValueError) as error:
+        flags = " or ".join(one.flag for one in ASKED_AGAIN)
+        raise UsageError(str(error), where=log, next_step=f"Give {flags} again") from error
+
+
+def identified(run: Mapping[str, Any], applied: AppliedCalibration, confidence: float) -> Identification:
+    """Return the identification with the run's options."""
+    from tdhil.estimation import identify
+
+    return identify(applied.recording, replace(_options(run, "the run"), confidence=confidence))
+
+
+def identified_so_far(run: Mapping[str, Any], recording: Recording, confidence: float) -> Identification:
+    """Return the identification during a run, with its options and its calibration: as `conclude` identifies."""
+    return identified(run, apply_calibration(recording, run), confidence)
+
+
 def conclude(
     recording: Recording, run: Mapping[str, Any], log: str, warnings: Sequence[str] | None = None
 ) -> Conclusion:
@@ -67,21 +90,14 @@ def conclude(
 
     ``warnings``: assumptions in reading a foreign trace; None for a tdhil log.
     """
-    from tdhil.estimation import Options, Verdict, identify
     from tdhil.report import result_document
     from tdhil.runner import precondition_warnings, speed_warnings, stage_warnings
 
-    asked = run.get("identify", {})
-    known = {one.name: one.default if asked.get(one.name) is None else asked[one.name] for one in ASKED_AGAIN}
-    try:
-        options = Options(**known)
-    except (TypeError, ValueError) as error:
-        flags = " or ".join(one.flag for one in ASKED_AGAIN)
-        raise UsageError(str(error), where=log, next_step=f"Give {flags} again") from error
+    options = _options(run, log)
     working = working_confidence_of(run, options.confidence)
     applied = apply_calibration(recording, run)
     recording = applied.recording
-    identification = after_looks(identify(recording, replace(options, confidence=working)), run, options.confidence)
+    identification = after_looks(identified(run, applied, working), run, options.confidence)
     identification = _dated(identification, applied.day)
     said = (
         *(CodedText(one, MessageCode.TRACE_ASSUMPTION) for one in warnings or ()),

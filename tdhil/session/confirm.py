@@ -16,6 +16,7 @@ from rich.console import Console
 from drivers import ACCEPTED_BY, ANY_CLIENT, NOTHING_STOPS_IT, Preflight, PreflightRefused
 from profiles import MessageCode, visible
 from profiles.quantities import RPM
+from tdhil.recording import LiveInertia
 from tdhil.report import LiveDisplay, minutes
 from tdhil.runner import Display, ExcitationRequest, Idle, MachineLimits, Task
 
@@ -230,11 +231,15 @@ def _meanwhile(idle: Idle, ask: Callable[[], T]) -> T:
 class TerminalOperator:
     """The operator at the terminal, who sees the run there, types the confirmation, and watches the shaft."""
 
-    def __init__(self, console: Console, *, yes: bool = False, gear_ratio: float = 1.0) -> None:
+    def __init__(
+        self, console: Console, *, yes: bool = False, gear_ratio: float = 1.0,
+        on_inertia: Callable[[LiveInertia], object] | None = None,
+    ) -> None:
+        """``on_inertia`` receives J during the run."""
         self._console = console
         self._yes = yes
         self._gear_ratio = gear_ratio
-        self._display = LiveDisplay(console, show_preflight=False)
+        self._display = LiveDisplay(console, show_preflight=False, on_inertia=on_inertia)
         self._watching = False
 
     @contextmanager
@@ -273,8 +278,11 @@ class CallbackOperator(TerminalOperator):
     motion.
     """
 
-    def __init__(self, console: Console, ask: Callable[[str], bool], *, gear_ratio: float = 1.0) -> None:
-        super().__init__(console, gear_ratio=gear_ratio)
+    def __init__(
+        self, console: Console, ask: Callable[[str], bool], *, gear_ratio: float = 1.0,
+        on_inertia: Callable[[LiveInertia], object] | None = None,
+    ) -> None:
+        super().__init__(console, gear_ratio=gear_ratio, on_inertia=on_inertia)
         self._ask = ask
 
     def confirm(self, task: Task, preflight: Preflight, idle: Idle, unverified: tuple[str, ...]) -> None:

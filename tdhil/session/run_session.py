@@ -11,14 +11,25 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from tdhil.buses import Connection, PeerPlan
 from tdhil.config import Expectation, Overrides, Rig, RunOptions, expectations_of, require_name
 from tdhil.errors import ExitCode, LogError, TdhilError
-from tdhil.recording import FRAME_CHANNELS, RunLog, RunWriter
-from tdhil.runner import Display, ExcitationRequest, Idle, Runner, RunOutcome, StopRequest, Task
+from tdhil.recording import FRAME_CHANNELS, Recording, RunLog, RunWriter
+from tdhil.runner import (
+    Display,
+    ExcitationRequest,
+    Identify,
+    Idle,
+    Runner,
+    RunOutcome,
+    StopRequest,
+    Task,
+    live_inertia,
+)
 from tdhil.session.dry_run import refuse_hopeless
 from tdhil.session.log_files import LogPlace
 from tdhil.session.open_drive import opened_drive
@@ -161,6 +172,7 @@ class RunSession:
                 reset_fault=request.overrides.reset_fault,
                 say=operator_interface.say,
                 confirm_speed=operator_interface.confirm_speed,
+                identify=self._identify,
             ).run()
         if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
             self._judge()
@@ -169,6 +181,12 @@ class RunSession:
                 log.event(drive.clock.now_s(), "fault", f"--fault {fault} was not triggered")
             operator_interface.warn(f"tdhil: --fault {fault} was not triggered: the run ended before its time")
         return outcome
+
+    def _identify(self) -> Identify:
+        """Return the function that identifies the recording during the run, as `conclude` does at its end."""
+        from tdhil.session.conclusion import identified_so_far
+
+        return partial(identified_so_far, self.log.run)
 
     def conclude(self) -> Conclusion | EvaluationConclusion:
         """Identify from the recording, or evaluate the virtual string, and write the result to the log."""
@@ -181,6 +199,7 @@ class RunSession:
             found = conclude_evaluation(self.log.virtual_string, recording, run, path)
         else:
             found = conclude(recording, run, path)
+            self._tell_last(found, recording)
         self._judge(found.document, int(found.exit_code))
         if self.rehearsal is not None:
             from tdhil.report import rehearsal_of
@@ -191,6 +210,13 @@ class RunSession:
         with suppress(LogError):  # a log failure must not lose the result; `close` reports it
             self.log.result(found.document)
         return found
+
+    def _tell_last(self, found: Conclusion, recording: Recording) -> None:
+        """Write J of the result as the last one of the run."""
+        if recording.excitation is not None:
+            confidence = float(self.log.run["identify"]["confidence"])
+            with suppress(LogError):
+                self.log.inertia(live_inertia(found.identification, recording, confidence))
 
     def _judge(self, document: Mapping[str, Any] | None = None, code: int | None = None) -> None:
         """Judge the rehearsed faults, if any, and write the verdict to the log."""

@@ -4,6 +4,7 @@ import pytest
 
 from profiles.quantities import TIME
 from tdhil.cli.arguments import amount, share
+from tdhil.recording import LogTail
 from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import QUICK, Shaft, identify, tdhil
 
@@ -31,6 +32,14 @@ def test_it_acquires_until_the_interval_is_as_tight_as_asked(tmp_path):
     assert stopping["decisions"][-1]["periods"] == 0
     assert stopping["decisions"][-1]["working_confidence"] > 0.95      # what looking costs
     Shaft.read(trace).assert_at_rest()
+
+    tail, inertias = LogTail(done.log), []
+    while not inertias or not tail.closed:
+        inertias += tail.read().inertias
+    last = inertias[-1]                # on the run page: the result's own
+    for name in ("low", "high", "low_total", "high_total"):
+        assert getattr(last, f"{name}_kg_m2") == pytest.approx(inertia[name], rel=1e-9)
+    assert (last.inertia_kg_m2, last.confidence) == (pytest.approx(inertia["value"], rel=1e-9), 0.95)
 
     replayed = tdhil("replay", "--json", done.log)
     assert replayed.document == document

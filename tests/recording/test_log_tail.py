@@ -9,7 +9,7 @@ import pytest
 
 from drivers import Command, Mode, PowerState, Sample
 from tdhil.recording import LogTail, RunWriter, Stage, log_tail, read_run
-from tdhil.recording.log_format import Event
+from tdhil.recording.log_format import Event, LiveInertia
 
 COMMAND = Command(Mode.SPEED, 1.0, 0.0)
 
@@ -97,3 +97,15 @@ def test_who_comes_late_gets_it_in_pieces(tmp_path, monkeypatch):
     assert first.more
     samples, *_ = collected(tail)
     assert len(first.samples) + len(samples) == 200
+
+
+def test_interim_answers_are_read_as_they_were_written(tmp_path):
+    known = LiveInertia(77.0, 5, 0.95, "valid", "because", 104.2, 103.1, 105.3, 100.0, 108.4, 0.41, 0.01, 0.0)
+    unknown = LiveInertia(57.0, 3, 0.95, "not_identifiable", "2 periods")
+    writer = RunWriter(tmp_path / "run.mcap", epoch_ns=10**18, block=True)
+    writer.sample(sample(1))
+    for one in (unknown, known):
+        writer.inertia(one)
+    writer.close()
+    assert LogTail(tmp_path / "run.mcap").read().inertias == (unknown, known)
+    assert read_run(tmp_path / "run.mcap").problems == ()

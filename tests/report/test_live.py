@@ -1,16 +1,18 @@
 """The live display: what it shows, and that a terminal that takes nothing never holds the control loop up."""
 
+import io
 import os
 import pty
 import re
 import threading
 
 import pytest
-from rich.console import Console
+from rich.console import Console, Group
 
 from drivers.drive import Command, Mode, PowerState, Sample
+from tdhil.recording import LiveInertia
 from tdhil.recording.recording import Stage
-from tdhil.report.live import MOST_LINES, LiveDisplay, Painter
+from tdhil.report.live import MOST_LINES, LiveDisplay, Painter, inertia_rows
 
 COMMAND = Command(Mode.SPEED, 3.0, 0.0)
 
@@ -225,3 +227,62 @@ def test_of_pictures_the_latest_and_of_lines_so_many():
 
 def test_nothing_to_wait_for_before_the_first_job():
     assert Painter().flush(0.0)
+
+
+# -- J during the run -------------------------------------------------------------------------------------------
+
+
+def answers(**more):
+    """Ten intervals that become narrower."""
+    return [
+        LiveInertia(60.0 + 20.0 * k, 3 + k, 0.95, "valid", "", 104.0, 104.0 - 4.0 / (k + 1), 104.0 + 3.0 / (k + 1),
+                    100.0, 108.0, 0.41, **more)
+        for k in range(10)
+    ]
+
+
+def drawn(inertias):
+    console = Console(file=io.StringIO(), width=80)
+    console.print(Group(*inertia_rows(inertias)))
+    return console.file.getvalue().splitlines()
+
+
+def test_the_intervals_of_j_are_drawn_to_one_scale_in_80_columns():
+    title, scale, *bars, said = drawn(answers())
+    assert "95 % interval (repeatability)" in title
+    assert scale.split() == ["100", "107"]
+    assert len(bars) == 6                      # the first, and the latest five
+    widths = [bar.index("┤") - bar.index("├") for bar in bars]
+    assert widths == sorted(widths, reverse=True)
+    assert all("●" in bar and "±" in bar for bar in bars)
+    assert bars[-1].split()[-3:] == ["104", "±0.34", "%"]
+    assert "12 periods, p 0.41" in said
+    assert "--tolerance" in said
+    assert max(map(len, drawn(answers(tolerance=0.01, least_left_s=39.0)))) <= 80
+    assert "at least 39 s to ±1 %" in drawn(answers(tolerance=0.01, least_left_s=39.0))[-1]
+
+
+def test_without_a_number_the_reason_is_shown():
+    unknown = LiveInertia(80.0, 2, 0.95, "not_identifiable", "too few periods")
+    assert drawn([unknown]) == ["J is not known yet: too few periods"]
+    assert "now: too few periods" in drawn([answers()[0], unknown])[-1]
+
+
+def test_a_function_gets_each_answer_and_its_error_ends_no_run():
+    console, got = Console(file=io.StringIO(), width=80), []
+
+    def take(found):
+        got.append(found)
+        if len(got) == 2:
+            raise RuntimeError("mine")
+
+    assert not LiveDisplay(console, show_preflight=False).follows_inertia
+    display = LiveDisplay(console, show_preflight=False, on_inertia=take)
+    assert display.follows_inertia
+    for one in answers():
+        display.inertia(one)
+    assert display._painter.flush(30.0)
+    display.say("goes on")
+    assert display._painter.flush(30.0)
+    assert got == answers()[:2]
+    assert "on_inertia is not called any more: RuntimeError: mine" in console.file.getvalue()

@@ -16,7 +16,8 @@ from drivers.clock import SteppedClock
 from drivers.drive import Command, Counters, DriveLimits, Identity, Mode, PowerState, Preflight, Sample
 from sim_bus.inverter import Inverter, Regulation
 from sim_bus.params import DriveParams, RigParams
-from tdhil.recording.builder import RecordingBuilder
+from tdhil.recording.builder import RecordingBuilder, RecordingPart
+from tdhil.recording.log_format import LiveInertia
 from tdhil.recording.recording import Recording
 from tdhil.runner.five_stages import Runner
 from tdhil.runner.settings import ExcitationRequest, MachineLimits, StopRequest
@@ -177,6 +178,7 @@ class BuilderLog:
         self.builder = RecordingBuilder()
         self.events: list[tuple[str, str]] = []
         self.run: dict[str, Any] = {}
+        self.inertias: list[LiveInertia] = []
 
     def cycle(self, command: Command, sample: Sample) -> None:
         self.builder.add(sample)
@@ -199,6 +201,12 @@ class BuilderLog:
 
     def configure(self, **run: Any) -> None:
         self.run |= run
+
+    def inertia(self, found: LiveInertia) -> None:
+        self.inertias.append(found)
+
+    def part(self, after: RecordingPart | None = None) -> RecordingPart:
+        return self.builder.part(after)
 
     def recording(self, *, complete: bool) -> Recording:
         return self.builder.recording(complete=complete)

@@ -5,14 +5,18 @@ from __future__ import annotations
 import asyncio
 import json
 import time
+from dataclasses import asdict
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
-from tdhil.recording import LogNews
-from tdhil.service.live_feed import MOST, SPACING_S, LivePicture
+from drivers import CommunicationLost
+from tdhil.recording import LiveInertia, LogNews
+from tdhil.service.live_feed import MOST, SPACING_S, Feed, LivePicture
+from tdhil.service.run_state import State
 from tdhil.service.schemas import API
 from tests.recording.test_log_tail import write
 from tests.service.conftest import URL
@@ -58,6 +62,29 @@ def test_what_is_no_number_is_none_in_json():
     shown = picture.take(LogNews(np.array([[0.0, np.nan, np.inf]])), 0.0)
     assert json.dumps(shown, allow_nan=False)
     assert shown["samples"] == [[0.0], [None], [None]]
+
+
+def test_j_during_the_run_comes_with_every_digit_and_late_viewers_get_all_of_it():
+    picture, found = LivePicture(), [LiveInertia(20.0 * k, k, 0.95, "valid", "", 104.0 + 1e-12 * k) for k in (1, 2)]
+    for one in found:
+        assert picture.take(LogNews(inertias=(one,)), 0.0)["inertias"] == [asdict(one)]
+    assert json.loads(json.dumps(picture.whole()))["inertias"] == [asdict(one) for one in found]
+
+
+def test_a_moving_run_is_told_once_that_a_page_shows_it(tmp_path):
+    told, state = [], ["preflight"]
+
+    def tell():
+        told.append(state[0])
+        if len(told) == 1:
+            raise CommunicationLost("not yet")
+
+    feed = Feed(tmp_path / "run.mcap", lambda: SimpleNamespace(state=State(state[0])), tell)
+    feed._look()
+    state[0] = "moving"
+    for _ in range(4):
+        feed._look()
+    assert told == ["moving", "moving"]
 
 
 def test_a_viewer_gets_all_of_it_from_the_start(service):

@@ -13,6 +13,6 @@ from tdhil.runner.design.prediction import (
 )
 from tdhil.runner.design.stopping_rule import (
     LOOKS as LOOKS, MARGIN as MARGIN, MOST_BEHIND as MOST_BEHIND, Look as Look, Stopping as Stopping,
-    interval_confidence as interval_confidence, interval_of as interval_of, least_scale as least_scale,
-    look as look, working_confidence as working_confidence,
+    interval_confidence as interval_confidence, least_scale as least_scale, look as look,
+    working_confidence as working_confidence,
 )

@@ -40,8 +40,6 @@ from typing import Any
 import numpy as np
 
 from tdhil.estimation import (
-    Options,
-    identify,
     measure_levels,
     period_lines,
     pooled_lines,
@@ -285,12 +283,6 @@ def _look(
         return Look(periods, now, scale, then, True, at_last=True)
     scale, then, enough = least_scale(lambda x: now if x == 1.0 else width(x), tolerance, most_scale)
     return Look(periods, now, scale, then, enough)
-
-
-def interval_of(recording: Recording, confidence: float) -> float:
-    """Return the relative half-width of the interval with which the run would end; infinite if there is none."""
-    found = identify(recording, Options(confidence=confidence)).inertia
-    return math.inf if found is None else 0.5 * (found.high - found.low) / found.value
 
 
 def evidence_of(recording: Recording) -> Evidence | None:

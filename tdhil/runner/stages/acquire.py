@@ -16,6 +16,7 @@ from tdhil.runner.adaptive_duration import Decision, Enough
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import CALM_S, Plan, PlannedSegment, RigGuess, SpeedChange, SwingPlan
 from tdhil.runner.guard import kept_within
+from tdhil.runner.interim import InertiaWatch
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
 from tdhil.runner.stages.hold import MeanSpeedControl
 
@@ -63,8 +64,10 @@ class Follower:
         mode: Mode,
         control: MeanSpeedControl | None,
         dither_rad_s: Callable[[float], float] | None = None,
+        after_cycle: Callable[[], None] | None = None,
     ) -> None:
         self._loop = loop
+        self._after_cycle = after_cycle
         self._dither_rad_s = dither_rad_s
         self._limits = limits
         self._mode = mode
@@ -100,6 +103,8 @@ class Follower:
         setpoint = speed_rad_s + (0.0 if self._dither_rad_s is None else self._dither_rad_s(self.time_s))
         wanted = kept_within(setpoint, lowest, limits.speed_max_rad_s)
         self.saw(loop.cycle(Command(self._mode, wanted, torque_nm)), wanted)
+        if self._after_cycle is not None:
+            self._after_cycle()
 
     def saw(self, sample: Sample, wanted_rad_s: float) -> None:
         """Note the reported speed after a cycle with this setpoint."""
@@ -114,17 +119,21 @@ def run_acquire(
     announce: Announce,
     enough: Enough | None = None,
     speed_resolution_rad_s: float = 0.0,
+    watch: InertiaWatch | None = None,
 ) -> None:
     """Run every segment of the plan, with its transitions. ``announce`` receives the excitation as it grows.
 
     A segment is announced with its planned end when it begins, so that a log which ends in it can be read. With
     ``enough`` the plan is a pilot: after it the last segment continues during the interim analysis. If more is needed,
     that many periods follow at its mean speed and then, unless that is enough, at the others after settling.
-    In speed mode a coarse ``speed_resolution_rad_s`` is dithered (`dither`).
+    In speed mode a coarse ``speed_resolution_rad_s`` is dithered (`dither`). ``watch`` shows J after periods.
     """
     begun_s = loop.now_s
     dither_rad_s = _dither_of(plan, speed_resolution_rad_s, begun_s)
-    course = _SegmentCourse(loop, plan, Follower(loop, limits, Mode(plan.mode), control, dither_rad_s), announce)
+    after_cycle = None if watch is None else watch.look
+    follower = Follower(loop, limits, Mode(plan.mode), control, dither_rad_s, after_cycle)
+    course = _SegmentCourse(loop, plan, follower, announce, watch)
+    course.expect(plan.duration_s)
     for index in range(len(plan.segments)):
         course.go_to(index)
     while enough is not None:
@@ -132,6 +141,8 @@ def run_acquire(
         enough.decided(decision)
         if decision.periods == 0:
             break
+        period_s = plan.segments[-1].reference.period_s
+        course.expect(decision.periods * period_s if decision.at_last else plan.extension_s(decision.periods))
         course.go_on(decision.periods)
         for index in () if decision.at_last else course.others():
             course.go_to(index, decision.periods)
@@ -149,12 +160,19 @@ def _dither_of(plan: Plan, resolution_rad_s: float, begun_s: float) -> Callable[
 class _SegmentCourse:
     """The progress of stage 5: finished segments, and the present one."""
 
-    def __init__(self, loop: ControlLoop, plan: Plan, follower: Follower, announce: Announce) -> None:
-        self._loop, self._plan, self._follower, self._announce = loop, plan, follower, announce
+    def __init__(
+        self, loop: ControlLoop, plan: Plan, follower: Follower, announce: Announce, watch: InertiaWatch | None
+    ) -> None:
+        self._loop, self._plan, self._follower, self._announce, self._watch = loop, plan, follower, announce, watch
         self._done: list[Segment] = []
         self._index = 0
         self._segment: PlannedSegment = plan.segments[0]
         self._start_s = 0.0
+        self._end_s = 0.0              # of all planned segments, about
+
+    def expect(self, duration_s: float) -> None:
+        """Note how long the planned segments take, s."""
+        self._end_s = self._loop.now_s + duration_s
 
     @property
     def excitation(self) -> Excitation:
@@ -169,9 +187,9 @@ class _SegmentCourse:
         transition = self._plan.transition(follower.wanted_rad_s, index)
         follower.follow(transition.reference, transition.duration_s)
         self._tell(segment.recorded(follower.time_s + self._loop.period_s))
-        self._start_s = follower.follow(segment.reference.reference, segment.duration_s)
+        self._start_s = follower.time_s + self._loop.period_s
         self._index, self._segment = index, segment
-        self._done.append(self._recorded())
+        self._run_periods(0)
 
     def ask(self, work: Callable[[], Decision]) -> Decision:
         """Announce what has been run, then continue the segment during the interim analysis (real time)."""
@@ -182,14 +200,26 @@ class _SegmentCourse:
     def go_on(self, periods: int) -> None:
         """Run more periods at the present mean speed."""
         self._done.pop()
-        segment = self._segment = replace(self._segment, periods=self._segment.periods + periods)
+        already = self._segment.periods
+        segment = self._segment = replace(self._segment, periods=already + periods)
         self._tell(segment.recorded(self._start_s))
-        self._follower.follow_until(segment.reference.reference, self._start_s, self._start_s + segment.duration_s)
-        self._done.append(self._recorded())
+        self._run_periods(already)
 
     def others(self) -> list[int]:
         """Return the other mean speeds, the previous one first."""
         return [index for index in reversed(range(len(self._plan.segments))) if index != self._index]
+
+    def _run_periods(self, already: int) -> None:
+        """Run the present segment from its period ``already`` to its end. Let J be looked at after periods."""
+        segment, start_s, follower = self._segment, self._start_s, self._follower
+        period_s = segment.reference.period_s
+        for number in range(already + 1, segment.periods + 1):
+            end_s = start_s + number * period_s
+            follower.follow_until(segment.reference.reference, start_s, max(end_s, start_s + self._loop.period_s))
+            if self._watch is not None and segment.settle_periods < number < segment.periods:
+                motion = Excitation(self._plan.kind, self._plan.mode, (*self._done, self._recorded()))
+                self._watch.period_ended(motion, max(0.0, self._end_s - follower.time_s))
+        self._done.append(self._recorded())
 
     def _tell(self, planned: Segment) -> None:
         self._announce(Excitation(self._plan.kind, self._plan.mode, (*self._done, planned)))
@@ -260,9 +290,10 @@ def run_plan(
     announce: Announce,
     enough: Enough | None,
     speed_resolution_rad_s: float,
+    watch: InertiaWatch | None = None,
 ) -> None:
     """Run a plan of either family, whatever the excitation. Raises what the bench raises."""
     if isinstance(plan, SwingPlan):
         run_swings(loop, limits, plan, control, assumptions, announce)
     else:
-        run_acquire(loop, limits, plan, control, announce, enough, speed_resolution_rad_s)
+        run_acquire(loop, limits, plan, control, announce, enough, speed_resolution_rad_s, watch)

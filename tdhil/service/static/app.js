@@ -376,12 +376,71 @@
 
   // -- live
 
+  /** Draw J's interval over time: inner band without, outer band with the torque scale; dashed: --tolerance about the last J. */
+  function inertiaPlot(where) {
+    const style = () => getComputedStyle(document.documentElement);
+    let plot = null, known = [];
+    const data = () => ["time_s", "high_total_kg_m2", "low_total_kg_m2", "high_kg_m2", "low_kg_m2", "inertia_kg_m2"].map((name) => known.map((one) => one[name]));
+    const draw = () => {
+      if (plot) plot.destroy();
+      const ink = style().getPropertyValue("--dim").trim(), line = style().getPropertyValue("--line").trim(), colour = style().getPropertyValue("--c2").trim();
+      const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line } };
+      const edge = (width) => ({ stroke: colour, width, points: { show: false } });
+      plot = new uPlot({
+        width: where.clientWidth || 320, height: 190, legend: { show: false }, cursor: { show: false },
+        scales: { x: { time: false, range: (self, low, high) => (high > low ? [low, high] : [(low || 0) - 5, (low || 0) + 5]) } },
+        axes: [{ ...axis, size: 34, values: (self, ticks) => ticks.map((one) => `${one} s`) }, { ...axis, size: 52 }],
+        series: [{}, edge(0), edge(0), edge(1), edge(1), { stroke: colour, width: 2, points: { show: true, size: 7, fill: colour } }],
+        bands: [{ series: [1, 2], fill: `${colour}22` }, { series: [3, 4], fill: `${colour}44` }],
+        hooks: { draw: [(self) => {
+          const last = known[known.length - 1];
+          if (!last || !last.tolerance) return;
+          const c = self.ctx;
+          c.save();
+          c.strokeStyle = style().getPropertyValue("--limit").trim();
+          c.lineWidth = 1.5 * devicePixelRatio;
+          c.setLineDash([6 * devicePixelRatio, 4 * devicePixelRatio]);
+          for (const sign of [-1, 1]) {
+            const y = self.valToPos(last.inertia_kg_m2 * (1 + sign * last.tolerance), "y", true);
+            if (y < self.bbox.top || y > self.bbox.top + self.bbox.height) continue;
+            c.beginPath(); c.moveTo(self.bbox.left, y); c.lineTo(self.bbox.left + self.bbox.width, y); c.stroke();
+          }
+          c.restore();
+        }] },
+      }, data(), where);
+    };
+    new ResizeObserver(() => plot && plot.setSize({ width: where.clientWidth || 320, height: 190 })).observe(where);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => plot && draw());
+    return (all) => {
+      known = all.filter((one) => one.inertia_kg_m2 !== null);
+      if (!plot) draw(); else plot.setData(data());
+    };
+  }
+
   function livePage() {
     const run = document.body.dataset.run, watched = document.body.dataset.motion === "watched";
     const samples = [[], [], []];
     let status = null, message = 0, age = null, timeS = null, dirty = false, asking = null, undelivered = false, unseen = null;
     let wentOn = new URL(document.referrer || location.href).pathname.startsWith("/start/");     // opened for a run, not for its record
     const charts = window.tdhil.motion(run);
+
+    let inertias = [], drawInertia = null;
+    /** Show J from the periods so far: the latest as figures, all of them as a graph. */
+    function inertiaNow() {
+      const last = inertias[inertias.length - 1], known = inertias.filter((one) => one.inertia_kg_m2 !== null).pop();
+      byId("inertia").hidden = !known;
+      byId("inertia-now").textContent = known ? withUnit(interval(known.inertia_kg_m2, known.low_kg_m2, known.high_kg_m2)) : "–";
+      const told = [`${last.periods} periods`];
+      if (known) told.push(percent((known.high_kg_m2 - known.low_kg_m2) / 2 / known.inertia_kg_m2));
+      if (last.p_value !== null) told.push(`p = ${number(last.p_value, 2)}`);
+      if (last.tolerance !== null && last.least_left_s !== null) told.push(`at least ${span(last.least_left_s)} to ±${Number((100 * last.tolerance).toPrecision(3))} %`);
+      if (last.inertia_kg_m2 === null) told.push(last.reason);
+      byId("inertia-said").textContent = told.join(", ");
+      byId("inertia-row").hidden = false;
+      if (!known) return;
+      drawInertia ||= inertiaPlot(byId("plot-inertia"));
+      drawInertia(inertias);
+    }
 
     function take(found) {
       message = Date.now();
@@ -392,6 +451,8 @@
       if (found.samples) { found.samples.forEach((column, k) => { for (const one of column) samples[k].push(one); }); dirty = true; }
       for (const one of found.events || []) event(one);
       for (const one of found.stages || []) done[one.name] = one;
+      if (found.type === "hello") inertias = [];
+      if (found.inertias && found.inertias.length) { inertias.push(...found.inertias); inertiaNow(); }
       if (found.limits) charts.limit(found.limits);
       if (found.status) { status = found.status; state(); }
       if (found.stages || found.status) stages();
