@@ -26,7 +26,7 @@ from tdhil.runner.control_loop import ControlLoop
 CORE_SHARE = 0.05
 """Largest share of a core that the answers take, in real time."""
 
-STEPPED_S = 20.0
+STEPPED_S = 40.0
 """Least control time between two answers in stepped time, s. One takes up to 1 s of a core: `CORE_SHARE` of it."""
 
 LEAST_PERIODS = 3
