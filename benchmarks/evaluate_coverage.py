@@ -111,8 +111,8 @@ def judged(number: int) -> dict[str, Any]:
     found = evaluate(np.array(rows), case, program)
     seen = found.damping_interval
     return row | {
-        "outcome": found.outcome.value, "reason": found.why, "critical_rpm":
-        None if found.critical_rpm is None else found.critical_rpm.value,
+        "outcome": found.outcome.value, "reason": found.why, "unknown_nm": found.unknown_rms_nm,
+        "critical_rpm": None if found.critical_rpm is None else found.critical_rpm.value,
         "damping": None if seen is None else [seen.value, seen.low, seen.high]}
 
 
