@@ -1,6 +1,6 @@
 """Coverage of the damping that `tdhil evaluate` measures, and its wrong verdicts, on rigs from 30 to 3,000 kg·m².
 
-    python benchmarks/evaluate_coverage.py --rigs 100 --out evaluate.jsonl       # half a minute of CPU a rig
+    python benchmarks/evaluate_coverage.py --rigs 100 --out evaluate.jsonl       # ten seconds of CPU a rig
     python benchmarks/evaluate_coverage.py --first 40 --rigs 20 --out evaluate.jsonl
 
 ``--out`` keeps each rig as one line of JSON. Rigs that are in the file already are not repeated, and the figures at the
