@@ -60,7 +60,7 @@ BLOCK_S = 0.5             # s; a block whose mean speed is compared with the tar
 BLOCKS = 4                # blocks in a row that must be at the target
 APPROACH_S = 10.0
 """Two such times, the last and one that ended as many times `APPROACH_APART` earlier, show how a speed approaches."""
-APPROACH_APART = 3
+APPROACH_APART = 3        # times of `APPROACH_S` from the first of the two to the last
 LEAST_APPROACH = 1.05     # ratio of the two errors; below it the error stands
 NEAR_SHARE = 0.25         # ratio of the error to the set speed, above which the speed is elsewhere and not on its way
 SLOWEST_S = 20.0
