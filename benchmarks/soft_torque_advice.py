@@ -1,6 +1,6 @@
 """The advice of `tdhil tune` on random rigs and strings, judged by an independent simulator under bit noise.
 
-    python benchmarks/soft_torque_advice.py                # 200 rigs, about an hour and a half of one core
+    python benchmarks/soft_torque_advice.py                # 200 rigs, about 50 minutes of one core
     python benchmarks/soft_torque_advice.py --first 40 --rigs 20 --out advice.jsonl
 
 ``--out`` keeps each rig as one line of JSON. Rigs that are in the file already are not repeated, and the figures at the

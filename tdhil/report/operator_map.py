@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 Part = Mapping[str, Any]
 
 HOW_TO_READ = (
-    "Find the bit torque on the left and the set speed below. Green: the bit turns, and comes free if it was stuck. "
+    "Find the bit torque or the weight on bit on the left, and the set speed below. "
+    "Green: the bit turns, and comes free if it was stuck. "
     "Yellow: the bit goes on turning, but does not come free once it is stuck: start at a speed in green, then slow "
     "down. Red: the bit sticks and slips.")
 _COLOURS = {"stable": "#7fbf7f", "at risk": "#f2d16b", "stick-slip": "#d9695f"}
@@ -24,6 +25,7 @@ _COLOURS = {"stable": "#7fbf7f", "at risk": "#f2d16b", "stick-slip": "#d9695f"}
 def map_document(found: OperatorMap) -> dict[str, Any]:
     """Return the map as plain data: a row for each bit torque, a cell for each set speed."""
     return {"speeds_rpm": list(found.speeds_rpm), "bit_torques_nm": list(found.bit_torques_nm),
+            "weights_on_bit_kn": None if found.weights_on_bit_kn is None else list(found.weights_on_bit_kn),
             "states": {kind: [list(row) for row in rows] for kind, rows in found.states.items()},
             "how_to_read": HOW_TO_READ}
 
@@ -32,16 +34,21 @@ def map_section(document: Part, bit: str) -> ReportSection:
     """Return figure and table of the map."""
     kinds = list(document["states"])
     width = 0.8 / len(kinds)
+    weights = document.get("weights_on_bit_kn")
+    said = [f"{torque / 1e3:.2g} kN·m" + ("" if weights is None else f", {weights[k]:.3g} kN")
+            for k, torque in enumerate(document["bit_torques_nm"])]
+    title = "bit torque" if weights is None else "bit torque, weight on bit"
     rows = tuple(
-        (f"{torque / 1e3:.2g} kN·m", *(_row_words(document["states"][kind][k], document["speeds_rpm"])
+        (said[k], *(_row_words(document["states"][kind][k], document["speeds_rpm"])
                                       for kind in kinds))
-        for k, torque in enumerate(document["bit_torques_nm"]))
+        for k in range(len(said)))
     return ReportSection("The operator's map", (
         Picture(partial(draw_map, document=document), 2.9, HOW_TO_READ),
-        Table((Column("bit torque", 0.2), *(Column(kind, width) for kind in kinds)), rows),
+        Table((Column(title, 0.2), *(Column(kind, width) for kind in kinds)), rows),
         Text(f"Simulated every {document['speeds_rpm'][1] - document['speeds_rpm'][0]:.0f} rpm under bit noise, string "
              f"and J as stated. The bit is that of string.yaml ({bit}), with its torque scaled. The bit torque is that "
-             "of a bit that turns fast."),
+             "of a bit that turns fast." + ("" if weights is None else " Weight on bit: the bit torque over "
+             "torque_per_weight_nm_kn of string.yaml.")),
     ))
 
 
@@ -67,6 +74,10 @@ def draw_map(figure: FigureBase, document: Part) -> None:
         axes.set(xlabel=f"{kind}: set speed, rpm", xlim=(speeds[0] - 0.5 * step, speeds[-1] + 0.5 * step),
                  ylim=(torques[0] - 0.5 * rise, torques[-1] + 0.5 * rise))
     every[0].set_ylabel("bit torque, kN·m")
+    weights = document.get("weights_on_bit_kn")
+    if weights is not None:      # the same axis, in the unit that the driller sets
+        every[0].set_yticks(torques, [f"{weight:.3g}" for weight in weights])
+        every[0].set_ylabel("weight on bit, kN")
 
 
 __all__ = ["HOW_TO_READ", "draw_map", "map_document", "map_section"]

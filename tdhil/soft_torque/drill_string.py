@@ -144,6 +144,10 @@ class BottomEnd(DataModel):
         default=None, description="N·m, root mean square of the bit's random torque; default 8 % of coulomb_nm"
     )
     noise_correlation_s: Annotated[float, Field(gt=0.0, le=60.0)] = NOISE_CORRELATION_S
+    torque_per_weight_nm_kn: Annotated[float, Field(gt=0.0, le=1e4)] | None = Field(
+        default=None, description="N·m of coulomb_nm for each kN of weight on bit; the operator's map then has the "
+        "weight on bit"
+    )
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
@@ -270,6 +274,8 @@ class BitFriction:
     noise_nm: float = 0.0
     """Root mean square of the torque's random part."""
     noise_correlation_s: float = NOISE_CORRELATION_S
+    torque_per_weight_nm_kn: float | None = None
+    """Coulomb torque for each kN of weight on bit."""
 
     def describe(self) -> str:
         """Return the bit in half a line, for every figure that depends on it."""
@@ -383,7 +389,8 @@ def string_of(file: StringFile) -> DrillString:
         static = bottom.static_nm if bottom.static_nm is not None else bottom.coulomb_nm
         speed = bottom.stribeck_speed_rad_s if bottom.stribeck_speed_rad_s is not None else inf
         noise = BIT_NOISE_SHARE * bottom.coulomb_nm if bottom.noise_nm is None else bottom.noise_nm
-        bit = BitFriction(bottom.coulomb_nm, static, speed, noise, bottom.noise_correlation_s)
+        bit = BitFriction(bottom.coulomb_nm, static, speed, noise, bottom.noise_correlation_s,
+                          bottom.torque_per_weight_nm_kn)
     sections = (*file.sections, *bottom.sections)
     lines = tuple(line_of(section) for section in sections)
     return DrillString(lines, bottom.inertia_kg_m2, bottom.viscous_nm_s_rad, bit, file.name,

@@ -51,6 +51,8 @@ SLIDING_BLUR_RAD_S = 0.05
 """Over which the top's own dry friction changes its sign."""
 LARGEST_GROWTH = 0.05
 """Of the bit's speed in one part of a tick, along a falling branch of its friction."""
+LEAST_GROWTH = 1e-300
+"""Added to an exponent, so that none is exactly zero where it is divided by."""
 NOISE_BLOCK = 500
 """Ticks of bit noise that are drawn at once."""
 
@@ -218,7 +220,8 @@ def simulate(
     kept: list[tuple[float, Array, Array, Array, Array]] = []
     first: Array = np.full(now.size, np.inf)
     last: Array = np.full(now.size, -1.0)
-    turned = pipe.bit_rad_s > 0.0
+    waits = pipe.bit_rad_s > 0.0      # has turned, and not stood still since
+    stood = np.zeros(now.size, dtype=bool)
     arrived = False
     for tick in range(count):
         if tick >= held_ticks and not arrived:
@@ -228,10 +231,12 @@ def simulate(
         pipe.tick(top_wave, None if noise is None else noise.at(tick))
         bit_speed = pipe.bit_rad_s
         still = bit_speed == 0.0
-        if still.any():
-            last[still] = tick + 1.0
-            first[still & turned & ~np.isfinite(first)] = tick + 1.0
-        turned |= ~still
+        np.putmask(last, still, tick + 1.0)
+        stands = still & waits
+        if stands.any():
+            first[stands] = tick + 1.0
+            stood |= stands
+        waits = ~(still | stood)
         if tick % every == 0:
             kept.append(((tick + 1) * grid.tick_s, set_speed, mean_top, bit_speed.reshape(shape), top.torque_nm))
     times, sets, tops, bits, torques = zip(*kept, strict=True)
@@ -273,16 +278,21 @@ def _columns(values: Sequence[Sequence[float]], repeats: int) -> Array:
 
 
 class _Waves:
-    """The rings: what was sent into each segment at its ends, and comes out of it after its ticks."""
+    """The rings: what was sent into each segment at its ends, and comes out of it after its ticks.
+
+    One row a tick: first what went down into each segment, then what went up.
+    """
 
     def __init__(self, grids: Sequence[Grid], repeats: int) -> None:
         cases = len(grids) * repeats
-        self._ticks = np.array(grids[0].ticks)
-        self._size = int(self._ticks.max())
-        segments = len(self._ticks)
-        self._down = np.zeros((self._size, segments, cases))
-        self._up = np.zeros((self._size, segments, cases))
-        self._rows = np.arange(segments)
+        ticks = np.array(grids[0].ticks)
+        self._size = int(ticks.max())
+        self._count = count = len(ticks)
+        self._sent = np.zeros((self._size, 2 * count, cases))
+        # where in all rows together that which arrives now was sent
+        slots = (np.arange(self._size)[:, None] - np.tile(ticks, 2)) % self._size
+        self._arriving_at = slots * (2 * count) + np.arange(2 * count)
+        self._every = self._sent.reshape(-1, cases)
         self._now = 0
         self._impedance = _columns([grid.impedance_nm_s_rad for grid in grids], repeats)
         self._drag = _columns([grid.drag_nm_s_rad for grid in grids], repeats)
@@ -303,12 +313,12 @@ class _Waves:
         side = np.sign(speed)
         below: Array = np.zeros_like(torque)
         self._moving[:] = speed != 0.0
-        for row in range(len(self._ticks) - 1, -1, -1):
+        for row in range(self._count - 1, -1, -1):
             own, impedance = self._drag[row] * speed + self._coulomb[row] * side, self._impedance[row]
             torque = torque + 0.5 * (own + below)
             below = own
-            self._down[:, row] = torque + impedance * speed
-            self._up[:, row] = impedance * speed - torque
+            self._sent[:, row] = torque + impedance * speed
+            self._sent[:, self._count + row] = impedance * speed - torque
 
     def top_torque(self, top_speed: Array) -> Array:
         """τ just below the rotor."""
@@ -318,13 +328,13 @@ class _Waves:
 
     def at_top(self) -> Array:
         """Return the wave that leaves the upper end of the topmost segment now."""
-        arriving: Array = self._up[(self._now - self._ticks[0]) % self._size, 0]
+        arriving: Array = self._every[self._arriving_at[self._now, self._count]]
         return arriving
 
     def arriving(self) -> tuple[Array, Array]:
         """Return the waves that leave every segment now, at its lower and at its upper end."""
-        slots = (self._now - self._ticks) % self._size
-        return self._down[slots, self._rows], self._up[slots, self._rows]
+        arriving = self._every.take(self._arriving_at[self._now], axis=0)
+        return arriving[: self._count], arriving[self._count :]
 
     def send(self, down: Array, up: Array, from_top: Array, from_bit: Array) -> None:
         """Through every node, and one tick on."""
@@ -335,12 +345,12 @@ class _Waves:
             self._moving = np.abs(driven) > least
             driven = np.where(self._moving, driven - np.copysign(self._kinetic, driven), 0.0)
         speed = driven * self._over
-        slot = self._now % self._size
-        self._down[slot, 0] = from_top
-        self._up[slot, -1] = from_bit
-        self._down[slot, 1:] = self._twice_below * speed - b
-        self._up[slot, :-1] = self._twice_above * speed - a
-        self._now += 1
+        sent = self._sent[self._now]
+        sent[0] = from_top
+        sent[-1] = from_bit
+        np.subtract(self._twice_below * speed, b, out=sent[1 : self._count])
+        np.subtract(self._twice_above * speed, a, out=sent[self._count : -1])
+        self._now = (self._now + 1) % self._size
 
 
 class PipeSimulation:
@@ -395,43 +405,42 @@ class _Top:
         self._size = size = 4 + self._lags
         ticks = np.array([grid.tick_s for grid in grids])
         self._impedance = np.array([grid.impedance_nm_s_rad[0] for grid in grids])[:, None]
-        # right factors: (states + inputs) → states
-        step = np.array([_top_step(*loop, grid, self._lags)[:size].T for loop, grid in zip(loops, grids, strict=True)])
-        step[:, :, 3] /= ticks[:, None]      # ∫ω dt over the tick becomes its mean
-        step[:, 3] = 0.0                     # and begins anew with each
-        self._step, self._of_inputs = np.ascontiguousarray(step[:, :size]), step[:, None, size:]
+        # left factors: (states + inputs) → states
+        step = np.array([_top_step(*loop, grid, self._lags)[:size] for loop, grid in zip(loops, grids, strict=True)])
+        step[:, 3] /= ticks[:, None]         # ∫ω dt over the tick becomes its mean
+        step[:, :, 3] = 0.0                  # and begins anew with each
+        self._step = np.ascontiguousarray(step)
         self._dry = np.array([drive.coulomb_nm + 0.5 * grid.coulomb_nm[0]
                               for (drive, _), grid in zip(loops, grids, strict=True)])[:, None]
         self._own_dry = np.array([drive.coulomb_nm for drive, _ in loops])[:, None]
         self._viscous = np.array([drive.viscous_nm_s_rad for drive, _ in loops])[:, None]
-        self._state = np.zeros((len(loops), speeds, size))
+        self._state = np.zeros((len(loops), size + 3, speeds))
+        """States, then the inputs of the tick: wave, dry friction, set speed."""
 
     @property
     def torque_nm(self) -> Array:
         """On the rotor."""
-        torque: Array = self._state[:, :, 3 + self._lags].copy()
+        torque: Array = self._state[:, 3 + self._lags].copy()
         return torque
 
     def begin(self, speed: Array, string_torque_nm: Array) -> None:
         """Turning at the set speed, the torque in balance."""
         torque = string_torque_nm + self._viscous * speed + self._own_dry * np.clip(
             speed / SLIDING_BLUR_RAD_S, -1.0, 1.0)
-        self._state[:, :, 0] = self._state[:, :, 2] = speed
-        self._state[:, :, 1] = torque
-        self._state[:, :, 4:] = torque[:, :, None]
+        self._state[:, 0] = self._state[:, 2] = speed
+        self._state[:, 1] = torque
+        self._state[:, 4 : self._size] = torque[:, None, :]
 
     def step(self, arriving: Array, set_speed: Array) -> tuple[Array, Array]:
         """(wave that goes down, mean speed)."""
-        state = self._state
+        state, size = self._state, self._size
         wave = arriving.reshape(set_speed.shape)
-        friction = -self._dry * np.clip(state[:, :, 0] / SLIDING_BLUR_RAD_S, -1.0, 1.0)
-        of = self._of_inputs
-        after = state @ self._step
-        after += wave[:, :, None] * of[:, :, 0]
-        after += friction[:, :, None] * of[:, :, 1]
-        after += set_speed[:, :, None] * of[:, :, 2]
-        self._state = after
-        mean = after[:, :, 3]
+        state[:, size] = wave
+        state[:, size + 1] = -self._dry * np.minimum(np.maximum(state[:, 0] / SLIDING_BLUR_RAD_S, -1.0), 1.0)
+        state[:, size + 2] = set_speed
+        after = self._step @ state
+        state[:, :size] = after
+        mean: Array = after[:, 3]
         return (2.0 * self._impedance * mean - wave).ravel(), mean
 
 
@@ -495,6 +504,11 @@ class _Bit:
         self._part_s = self._tick_s / self._parts
         self._pace = self._part_s / self._inertia
         self._bends = bool(np.any(self._falls > 0.0))
+        self._slower = np.minimum(-self._viscous * self._pace, -1e-9)
+        self._steeper = 2.0 * self._pace / self._width**2
+        self._curve = -1.0 / self._width**2
+        self._twice_over_parts = self._impedance / self._parts
+        self._rests_harder = any(more > own for more, own in zip(along_static, along, strict=True))
 
     def rubbing(self, speed: Array) -> Array:
         """T_f of the bit alone, without its sign."""
@@ -503,32 +517,35 @@ class _Bit:
     def release(self) -> None:
         """Remove the dry friction of the bit."""
         self._coulomb, self._falls = self._wall.copy(), np.zeros_like(self._falls)
-        self.static_nm, self._bends = self._wall.copy(), False
+        self.static_nm, self._bends, self._rests_harder = self._wall.copy(), False, False
 
     def _bent(self, speed: Array) -> Array:
         if not self._bends:
             return np.zeros_like(speed)
-        over: Array = self._falls * np.exp(-((speed / self._width) ** 2))
+        over: Array = self._falls * np.exp(speed * speed * self._curve)
         return over
 
     def step(self, arriving: Array, speed: Array, noise_nm: Array | None = None) -> tuple[Array, Array]:
         """(wave that goes up, speed after the tick)."""
-        travel = np.zeros_like(speed)
         driven = arriving if noise_nm is None else arriving - noise_nm
-        slower = -self._viscous * self._pace
-        for _ in range(self._parts):
-            side = np.where(speed != 0.0, np.sign(speed), np.sign(driven))
-            holds = (speed == 0.0) & (np.abs(driven) <= self.static_nm)
+        travel = speed
+        for part in range(self._parts):
+            toward = np.where(speed != 0.0, speed, driven)      # its sign is that of the motion
             bent = self._bent(speed)
-            net = driven - side * (self._coulomb + bent) - self._viscous * speed
-            growth = slower + 2.0 * bent * np.abs(speed) / self._width**2 * self._pace if self._bends else slower
-            growth = np.where(np.abs(growth) < 1e-9, 1e-9, growth)
+            net = driven - np.copysign(self._coulomb + bent, toward) - self._viscous * speed
+            growth = self._slower
+            if self._bends:
+                growth = growth + bent * np.abs(speed) * self._steeper
+                growth += LEAST_GROWTH
             end = speed + net * self._pace * np.expm1(growth) / growth
-            end[holds | (end * side < 0.0)] = 0.0
-            travel += speed + end
+            # a bit that stands and is not torn loose would be driven back by its own friction
+            stops = end * toward < 0.0
+            if self._rests_harder:
+                stops |= (speed == 0.0) & (np.abs(driven) <= self.static_nm)
+            np.putmask(end, stops, 0.0)
+            travel = travel + end if part == self._parts - 1 else travel + 2.0 * end
             speed = end
-        mean = travel / (2.0 * self._parts)
-        return 2.0 * self._impedance * mean - arriving, speed
+        return travel * self._twice_over_parts - arriving, speed
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -44,6 +44,8 @@ class OperatorMap:
     bit_torques_nm: tuple[float, ...]
     """Coulomb torque: that of a bit that turns fast."""
     states: dict[str, tuple[tuple[State, ...], ...]]
+    weights_on_bit_kn: tuple[float, ...] | None = None
+    """Weight on bit of each bit torque, for a bit whose torque for each kN is stated; else None."""
 
 
 def operator_map(tuning: Tuning) -> OperatorMap | None:
@@ -68,10 +70,13 @@ def operator_map(tuning: Tuning) -> OperatorMap | None:
     turns, comes_free = (
         np.asarray(np.all(ends_turning(strings_of, loops, how, speeds, search, seeds).reshape(shape), axis=2))
         for how in _STARTS)
+    torques = tuple(share * bit.coulomb_nm for share in MAP_TORQUE_SHARES)
+    per_weight = bit.torque_per_weight_nm_kn
     return OperatorMap(
-        MAP_SPEEDS_RPM, tuple(share * bit.coulomb_nm for share in MAP_TORQUE_SHARES),
+        MAP_SPEEDS_RPM, torques,
         {kind: tuple(_row(turns[k, row].tolist(), comes_free[k, row].tolist()) for row in range(len(strings)))
-         for k, kind in enumerate(laws)})
+         for k, kind in enumerate(laws)},
+        None if per_weight is None else tuple(torque / per_weight for torque in torques))
 
 
 def _row(turns: Sequence[bool], comes_free: Sequence[bool]) -> tuple[State, ...]:

@@ -34,7 +34,7 @@ from profiles import MessageCode, TdhilError
 from tdhil.soft_torque.controller import SpeedController, TopDrive, reflection_at
 from tdhil.soft_torque.drill_string import DrillString
 from tdhil.soft_torque.tuned_figures import in_squares, string_modes_hz
-from tdhil.soft_torque.uncertainty import Interval
+from tdhil.soft_torque.uncertainty import Interval, student_factor
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -408,14 +408,12 @@ def _period(cycles: Array) -> Interval | None:
     """Mean of the cycles with its 95 % interval; None where they are no one oscillation."""
     if len(cycles) < LEAST_CYCLES:
         return None
-    from scipy.stats import t
-
     middle = float(np.median(cycles))
     alike = cycles[np.abs(cycles - middle) < MOST_PERIOD_SCATTER * middle]
     if len(alike) < max(LEAST_CYCLES, 0.6 * len(cycles)):
         return None
     mean = float(alike.mean())
-    half = float(t.ppf(0.975, len(alike) - 1)) * float(alike.std(ddof=1)) / sqrt(len(alike))
+    half = student_factor(len(alike) - 1) * float(alike.std(ddof=1)) / sqrt(len(alike))
     return Interval(mean, mean - half, mean + half)
 
 

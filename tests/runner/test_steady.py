@@ -1,10 +1,11 @@
 """When a speed counts as steady, and what is read off it."""
 
+import numpy as np
 import pytest
 
 from drivers.drive import Command, Mode, PowerState, Sample
 from drivers.errors import CommunicationLost, LimitHit
-from tdhil.runner.stages.steady import steady_level, trace, wait_until_steady
+from tdhil.runner.stages.steady import approaching_s, steady_level, trace, wait_until_steady
 from tests.runner.fake_drive import FakeDrive
 
 
@@ -64,3 +65,28 @@ def test_lost_feedback_ends_the_wait(world):
     here.drive.misbehave = lambda drive, seen: seen._replace(fresh=False)
     with pytest.raises(CommunicationLost):
         wait_until_steady(here.bench, Command(Mode.SPEED, 4.0, 0.0), 4.0, 0.05, timeout_s=60.0)
+
+
+def test_a_loop_with_little_integral_gain_is_named_with_its_time_constant(world):
+    """P 300, I 2: friction leaves a standing error, and the loop would creep at the end of a run just as long."""
+    here = world(FakeDrive(follow_s=1e9))
+    here.turn(4.0)
+    first = here.drive.cycles
+    here.drive.misbehave = lambda drive, seen: seen._replace(
+        speed_rad_s=4.0 - 0.3 * np.exp(-(drive.cycles - first) * here.bench.period_s / 150.0))
+    with pytest.raises(LimitHit, match=r"time constant of 1(4|5)\d s") as refused:
+        wait_until_steady(here.bench, Command(Mode.SPEED, 4.0, 0.0), 4.0, 0.05, timeout_s=60.0)
+    assert "Raise the integral gain about 7 times" in refused.value.next_step or "8 times" in refused.value.next_step
+    assert "minutes to bring the shaft to standstill" in refused.value.next_step
+
+
+@pytest.mark.parametrize("course", [
+    np.full(120, 2.7), 2.7 - 0.001 * np.arange(120), 0.02 * np.arange(120), 3.0 + 0.2 * (-1.0) ** np.arange(120)])
+def test_a_speed_that_stays_away_from_its_setpoint_is_no_slow_approach(course):
+    assert approaching_s(course, 3.0) is None
+
+
+def test_the_time_constant_of_an_approach_from_either_side():
+    decay = 0.3 * np.exp(-0.5 * np.arange(120) / 80.0)
+    assert approaching_s(3.0 - decay, 3.0) == pytest.approx(80.0, rel=1e-6)
+    assert approaching_s(3.0 + decay, 3.0) == pytest.approx(80.0, rel=1e-6)

@@ -132,9 +132,12 @@ def test_the_operators_map_agrees_with_a_chain_in_time():
     """Softer gains leave more green; cells that are clearly stable or clearly stick do so in another simulator."""
     laws = {"stiff": STIFF, "soft": SOFT_035}
     tuned = tuple(Tuned(kind, law) for kind, law in laws.items())
-    case = TuneCase(STRING, DRIVE, Interval(1500.0, 1440.0, 1560.0))
+    string = string_with(torque_per_weight_nm_kn=25.0)
+    assert string.bit == replace(STRING.bit, torque_per_weight_nm_kn=25.0)
+    case = TuneCase(string, DRIVE, Interval(1500.0, 1440.0, 1560.0))
     found = operator_map(Tuning(case, (0.1299,), tuned, Search(), Advice("soft", "stiff", keep=False), ()))
     row = found.bit_torques_nm.index(2500.0)
+    assert found.weights_on_bit_kn[row] == pytest.approx(100.0)
     stable = {kind: [state == "stable" for state in rows[row]] for kind, rows in found.states.items()}
     assert sum(stable["soft"]) > sum(stable["stiff"]) + 4
     assert found.states["stiff"][row][0] == "stick-slip" and "at risk" in found.states["stiff"][row]

@@ -58,6 +58,13 @@ def steady_level(samples: Sequence[Sample]) -> SteadyLevel:
 
 BLOCK_S = 0.5             # s; a block whose mean speed is compared with the target
 BLOCKS = 4                # blocks in a row that must be at the target
+APPROACH_S = 10.0
+"""Two such times, the last and one that ended as many times `APPROACH_APART` earlier, show how a speed approaches."""
+APPROACH_APART = 3        # times of `APPROACH_S` from the first of the two to the last
+LEAST_APPROACH = 1.05     # ratio of the two errors; below it the error stands
+NEAR_SHARE = 0.25         # ratio of the error to the set speed, above which the speed is elsewhere and not on its way
+SLOWEST_S = 20.0
+"""Time constant with which a speed loop should remove a standing error: three of them are the time it is given here."""
 
 
 def wait_until_steady(
@@ -68,16 +75,26 @@ def wait_until_steady(
     Raises LimitHit if that takes longer than ``timeout_s``.
     """
     seen: list[Sample] = []
+    means: list[float] = []
     good = 0
     for _ in range(max(BLOCKS, round(timeout_s / BLOCK_S))):
         block = loop.hold(command, BLOCK_S)
         seen += block
         mean = sum(sample.speed_rad_s for sample in block) / len(block)
+        means.append(mean)
         good = good + 1 if abs(mean - target_rad_s) <= tolerance_rad_s else 0
         if good >= BLOCKS:
             return seen
     torque_nm = sum(sample.torque_nm for sample in block) / len(block)
     torque, helps = loop.guard.torque_told(torque_nm, block[-1].limit_active)
+    approach_s = approaching_s(means, target_rad_s)
+    if approach_s is not None:
+        torque += f". The speed approaches its setpoint with a time constant of {approach_s:.0f} s"
+        helps = (
+            "The integral gain of the drive's speed loop is small for its proportional gain. tdhil does not continue,"
+            " because this loop would also take minutes to bring the shaft to standstill. Raise the integral gain about"
+            f" {max(2.0, approach_s / SLOWEST_S):.0f} times, or shorten the loop's reset time as much"
+        )
     raise LimitHit(
         f"the speed did not settle at {target_rad_s:.3f} rad/s within {timeout_s:g} s (last {mean:.3f} rad/s);"
         f" {torque}",
@@ -85,6 +102,22 @@ def wait_until_steady(
         next_step=helps,
         entry=MessageCode.NOT_SETTLED,
     )
+
+
+def approaching_s(means_rad_s: Sequence[float], target_rad_s: float) -> float | None:
+    """Return the time constant with which block means approach a target; None if they do something else.
+
+    A speed loop removes the standing error that friction causes with the time constant (P + B)/I.
+    """
+    count = round(APPROACH_S / BLOCK_S)
+    if len(means_rad_s) < (APPROACH_APART + 1) * count:
+        return None
+    errors = (target_rad_s - np.array(means_rad_s[-(APPROACH_APART + 1) * count :])).reshape(-1, count).mean(axis=1)
+    before, last = float(errors[0]), float(errors[-1])
+    falls = bool(np.all(np.diff(np.abs(errors)) < 0.0)) and before * last > 0.0
+    if not falls or abs(before) > NEAR_SHARE * abs(target_rad_s) or before / last < LEAST_APPROACH:
+        return None
+    return APPROACH_APART * APPROACH_S / math.log(before / last)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
