@@ -193,7 +193,7 @@ class RecordingBuilder:
         return dict(self._facts)
 
     def part(self, after: RecordingPart | None = None) -> RecordingPart:
-        """What came after an earlier part, or all; a copy of these samples only, so it costs little in a cycle."""
+        """Return a copy of the samples after an earlier part, or of all. It costs little in a cycle."""
         begin = 0 if after is None else after.end
         begin_position = 0 if after is None else after.begin_position + len(after.positions)
         return RecordingPart(

@@ -187,7 +187,7 @@ class RunLog:
         return self._builder.recording(complete=complete)
 
     def part(self, after: RecordingPart | None = None) -> RecordingPart:
-        """What was recorded after an earlier part, or all."""
+        """Return the record after an earlier part, or the whole record."""
         return self._builder.part(after)
 
     def close(self) -> None:

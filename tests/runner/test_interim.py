@@ -229,7 +229,7 @@ def test_it_is_asked_after_whole_periods_and_the_setpoints_are_the_same(world):
 
 
 @pytest.mark.heavy
-def test_the_live_answer_is_the_final_one_on_the_same_samples(monkeypatch):
+def test_the_live_answer_is_the_final_one_on_the_same_samples():
     """The samples are those of the log up to then, and J is what a replay of so much of the log gives."""
     log, viewer, lengths = BuilderLog(), Viewer(), []
     task = Task(RIG_LIMITS, ExcitationRequest(periods=5), {"torque_scale_rel_sd": 0.02})

@@ -210,7 +210,7 @@ class _SegmentCourse:
         return [index for index in reversed(range(len(self._plan.segments))) if index != self._index]
 
     def _run_periods(self, already: int) -> None:
-        """Run the present segment from its period ``already`` to its end. Let J be looked at after periods."""
+        """Run the present segment from its period ``already`` to its end. The watch may ask for J after periods."""
         segment, start_s, follower = self._segment, self._start_s, self._follower
         period_s = segment.reference.period_s
         for number in range(already + 1, segment.periods + 1):
