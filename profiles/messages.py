@@ -545,6 +545,10 @@ class MessageCode(Enum):
         440, "No name for the rig of a real drive",
         "Results are kept and compared by the rig's name and its drive. A real drive does not move without a name.",
         "Write the key name into rig.yaml. tdhil rig new asks for it.")
+    VERIFICATION_REFUSED = (
+        441, "The steps of the set speed cannot run on this rig",
+        "The tuning, the limits or the shaft do not fit together.",
+        "Correct what the message names.")
 
     # --- 5xx: communication ------------------------------------------------------------------------------------------
     COMMUNICATION_LOST = (
@@ -683,6 +687,10 @@ class MessageCode(Enum):
         711, "The loop of the virtual string is unstable",
         "The lags of the rig are not those of the result.",
         "Identify again, and tune with the new result.")
+    STEP_OVERSHOOTS = (
+        712, "A step of the set speed overshoots far more than predicted",
+        "The gains in the drive are not those that were tuned, or the shaft is not the identified one.",
+        "Compare the gains in the drive with the tuned ones, and lower P.")
 
     # --- 8xx: stop not confirmed -------------------------------------------------------------------------------------
     STOP_NOT_CONFIRMED = (

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from profiles.quantities import RPM
 from tdhil.cli.results import print_json
 from tdhil.config import Rig, RunOptions
-from tdhil.session import BEFORE_ACQUIRE_S, Figure, plan_course, plan_document, plan_dry
+from tdhil.session import BEFORE_ACQUIRE_S, Figure, plan_course, plan_document, plan_dry, plan_dry_steps
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from profiles import Profile
     from tdhil.runner import MachineLimits, Planned
     from tdhil.soft_torque import EvaluationCase
+    from tdhil.speed_loop import StepCase
 
 
 def dry_run(options: RunOptions, rig: Rig | None, simulated: bool, profile: Profile) -> int:
@@ -42,6 +43,35 @@ def dry_run(options: RunOptions, rig: Rig | None, simulated: bool, profile: Prof
     show(planned, figures, limits, console)
     for key, text, source in rig.conversions if rig is not None else ():
         console.print(f"{key}: {text}  ({source})", markup=False)
+    return 0
+
+
+def dry_run_steps(
+    options: RunOptions, rig: Rig | None, case: StepCase, simulated: bool, rate_hz: float
+) -> int:
+    """Print the largest steps of a verification; exit code 0. Raises what a run would raise before motion."""
+    program, limits = plan_dry_steps(case, rig, simulated, rate_hz)
+    plain = {
+        "dry_run": True, "gains": case.kind, "rate_hz": rate_hz, "pairs": program.pairs,
+        "step_rad_s": program.step_rad_s, "low_rad_s": program.low_rad_s, "high_rad_s": program.high_rad_s,
+        "step_torque_nm": case.gains.gain_nm_s_rad * program.step_rad_s, "duration_s": program.duration_s,
+        "limits": {"speed_min_rad_s": limits.speed_min_rad_s, "speed_max_rad_s": limits.speed_max_rad_s,
+                   "torque_nm": limits.torque_nm, "time_s": limits.time_s},
+        "tdhil": __version__,
+    }
+    if options.json:
+        print_json(plain)
+        return 0
+    from tdhil.report import SIMULATED, PlainConsole
+
+    console = PlainConsole()
+    if simulated:
+        console.print(f"{SIMULATED}: the embedded rig, with its own limits if rig.yaml has none", style="magenta")
+    console.print(
+        f"{program.pairs} pairs of steps of at most {program.step_rad_s:.3g} rad/s ({plain['step_torque_nm']:.0f} N·m) "
+        f"between {program.low_rad_s:.3g} and {program.high_rad_s:.3g} rad/s, {program.duration_s:.0f} s; limits "
+        f"{limits.speed_min_rad_s:g} to {limits.speed_max_rad_s:g} rad/s, {limits.torque_nm:g} N·m, "
+        f"{limits.time_s:g} s. A run first measures friction, and then plans again.", soft_wrap=True)
     return 0
 
 

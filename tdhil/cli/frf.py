@@ -18,7 +18,7 @@ from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.errors import ExitCode, MessageCode, UsageError
-from tdhil.session import is_evaluation, require_file
+from tdhil.session import is_evaluation, is_verification, require_file
 
 if TYPE_CHECKING:
     from tdhil.api import Result
@@ -57,9 +57,10 @@ def run(namespace: argparse.Namespace) -> int:
     found: list[Result] = []
     for path in logs:
         recorded = read_recorded(namespace, path)
-        if is_evaluation(recorded.configuration):
-            raise UsageError("contains a virtual string, which has no frequency response", where=str(path),
-                             next_step="Name the log of an identification", entry=MessageCode.WRONG_KIND_OF_FILE)
+        if is_evaluation(recorded.configuration) or is_verification(recorded.configuration):
+            raise UsageError("contains a virtual string or single steps, which have no frequency response",
+                             where=str(path), next_step="Name the log of an identification",
+                             entry=MessageCode.WRONG_KIND_OF_FILE)
         recorded.require_motion()
         for problem in recorded.problems:
             stderr_console().print(f"tdhil: {path}: {problem}", style="yellow", markup=False, soft_wrap=True)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from tdhil.runner import RunOutcome
     from tdhil.session import Ending, Rehearsal, RunRequest, RunSession
     from tdhil.soft_torque import EvaluationCase
+    from tdhil.speed_loop import StepCase
 
 
 def list_faults() -> int:
@@ -85,15 +86,16 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def run_with(
-    namespace: argparse.Namespace, evaluation: EvaluationCase | None = None, logs: list[Path] | None = None
+    namespace: argparse.Namespace, evaluation: EvaluationCase | None = None, logs: list[Path] | None = None,
+    steps: StepCase | None = None,
 ) -> int:
-    """Run the command, with a virtual string in stage 5 if ``evaluation`` is given.
+    """Run the command, in stage 5 with a virtual string or with steps of the set speed if one of them is given.
 
     ``logs``: receives the path of the run's log; the process then continues after the run.
 
     Raises TdhilError before the drive is accessed; after that every error becomes an exit code.
     """
-    from tdhil.cli.dry_run import dry_run, dry_run_course, say_before
+    from tdhil.cli.dry_run import dry_run, dry_run_course, dry_run_steps, say_before
     from tdhil.report import stderr_console
     from tdhil.session import RunRequest, check_unverified, connection_of, plan_peer, suited, with_faults
 
@@ -117,6 +119,10 @@ def run_with(
             bench = suited(rig, plan_peer(options, connection).plant)
             rate_hz = options.rate_hz or connection.profile.usual_rate_hz
             return dry_run_course(options, bench, evaluation, simulated, rate_hz)
+        if steps is not None:
+            bench = suited(rig, plan_peer(options, connection).plant)
+            return dry_run_steps(options, bench, steps, simulated,
+                                 options.rate_hz or connection.profile.usual_rate_hz)
         return dry_run(options, rig, simulated, connection.profile)
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
     show_settings(console, options, connection, peer, rig)
@@ -124,9 +130,9 @@ def run_with(
     request = RunRequest.of(
         options, connection, peer, rig, overrides=Overrides.of(vars(namespace)), operator=details.operator,
         note=details.note, real_time_priority=bool(details.real_time_priority), evaluation=evaluation,
-        expect=details.expect,
+        steps=steps, expect=details.expect,
     )
-    if evaluation is None:
+    if evaluation is None and steps is None:
         with console.status("planning …") if console.is_terminal else nullcontext():
             said = say_before(options, rig, connection.profile, simulated)
         if said is not None:

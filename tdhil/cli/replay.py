@@ -14,8 +14,10 @@ from tdhil.config import OPTION, expectations_in, expectations_of
 from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.session import (
     conclude_evaluation,
+    conclude_verification,
     is_evaluation,
     is_log,
+    is_verification,
     load_calibration,
     read,
     require_file,
@@ -24,7 +26,7 @@ from tdhil.session import (
 )
 
 if TYPE_CHECKING:
-    from tdhil.session import RunRecord
+    from tdhil.session import EvaluationConclusion, RunRecord, VerificationConclusion
 
 _TRACE_ONLY = (
     "columns", "excitation", "rated_torque", "torque_limit", "gear", "torque_scale_sd",
@@ -81,7 +83,9 @@ def run(namespace: argparse.Namespace) -> int:
 
         check_report_path(namespace.report, path)
     recorded = _expecting(namespace, read_recorded(namespace, path).with_said(_said(namespace)))
-    return _evaluation(namespace, recorded) if is_evaluation(recorded.configuration) else _identify(namespace, recorded)
+    if is_evaluation(recorded.configuration) or is_verification(recorded.configuration):
+        return _evaluation(namespace, recorded)
+    return _identify(namespace, recorded)
 
 
 def read_recorded(namespace: argparse.Namespace, path: Path) -> RunRecord:
@@ -111,16 +115,22 @@ def read_recorded(namespace: argparse.Namespace, path: Path) -> RunRecord:
 
 
 def _evaluation(namespace: argparse.Namespace, recorded: RunRecord) -> int:
-    """Evaluate the virtual string of this log, and print the result."""
+    """Evaluate the virtual string or the steps of this log, and print the result."""
     from tdhil.report import stderr_console
 
+    steps = is_verification(recorded.configuration)
     for name in settings_in(namespace):
-        raise UsageError("is for a run that identifies; this log contains a virtual string", where=OPTION[name].flag)
+        what = "steps of tdhil tune verify" if steps else "a virtual string"
+        raise UsageError(f"is for a run that identifies; this log contains {what}", where=OPTION[name].flag)
     recorded.require_motion()
-    assert recorded.virtual_string is not None
-    found = conclude_evaluation(
-        recorded.virtual_string, recorded.recording, recorded.configuration, recorded.log
-    )
+    if steps:
+        found: VerificationConclusion | EvaluationConclusion = conclude_verification(
+            recorded.recording, recorded.configuration, recorded.log)
+    else:
+        assert recorded.virtual_string is not None
+        found = conclude_evaluation(
+            recorded.virtual_string, recorded.recording, recorded.configuration, recorded.log
+        )
     for problem in recorded.problems:
         stderr_console().print(f"tdhil: {recorded.log}: {problem}", style="yellow", markup=False)
     try:

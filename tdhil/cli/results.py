@@ -22,9 +22,11 @@ def save_report(
     ``virtual_string``: its cycles, if the run has one.
     """
     if path is not None:
-        from tdhil.report import write_evaluation_report, write_report
+        from tdhil.report import write_evaluation_report, write_report, write_verification_report
 
-        if _is_evaluation(document) and virtual_string is not None:
+        if _is_verification(document):
+            written = write_verification_report(document, path)
+        elif _is_evaluation(document) and virtual_string is not None:
             written = write_evaluation_report(document, virtual_string, path)
         else:
             written = write_report(document, recording, path)
@@ -44,6 +46,8 @@ def print_result(document: Mapping[str, Any], as_json: bool) -> None:
 
     if _is_evaluation(document):
         from tdhil.report import print_evaluation as show
+    elif _is_verification(document):
+        from tdhil.report import print_verification as show
     else:
         from tdhil.report import print_card as show
     try:
@@ -59,3 +63,7 @@ def print_result(document: Mapping[str, Any], as_json: bool) -> None:
 
 def _is_evaluation(document: Mapping[str, Any]) -> bool:
     return document.get("kind") == "evaluation"
+
+
+def _is_verification(document: Mapping[str, Any]) -> bool:
+    return document.get("kind") == "verification"

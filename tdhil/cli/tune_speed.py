@@ -276,4 +276,4 @@ def _tuned_for(
             warnings.append(f"{profile.name}: {profile.speed_controller.note}")
     return LoopTunedFor(str(namespace.result), bool(result.get("simulated")), str(result.get("model")),
                         None if profile is None else profile.name, float(result["gear_ratio"]), lags_from, settings,
-                        tuple(warnings))
+                        tuple(warnings), _range_or_none(result.get("speed_lag_s")))

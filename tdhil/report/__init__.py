@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from tdhil.report.document import (
         SIMULATED as SIMULATED, rehearsal_of as rehearsal_of, result_document as result_document, text_of as text_of,
     )
+    from tdhil.report.verification import (
+        print_verification as print_verification, verification_document as verification_document,
+        verification_report as verification_report, write_verification_report as write_verification_report,
+    )
     from tdhil.report.evaluation import (
         evaluation_document as evaluation_document, evaluation_report as evaluation_report,
         print_evaluation as print_evaluation, write_evaluation_report as write_evaluation_report,
@@ -68,6 +72,7 @@ else:
         "card": "card_html card_text inertia_text minutes print_card rounded with_interval",
         "console": "PlainConsole stderr_console",
         "document": "SIMULATED rehearsal_of result_document text_of",
+        "verification": "print_verification verification_document verification_report write_verification_report",
         "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",
         "frequency_response": "draw_bode draw_faults draw_responses print_responses response_sentences save_responses",
         "html": "ShownPicture check_report_path pictures_in write_report",

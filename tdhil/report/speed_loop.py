@@ -29,6 +29,7 @@ from tdhil.speed_loop import (
     LoopDesign,
     LoopRow,
     MeasuredShaft,
+    Range,
     deviation_from_model,
     loop_at_lines,
     loop_curve,
@@ -77,6 +78,8 @@ class LoopTunedFor:
     settings: Mapping[str, tuple[DriveSetting, ...]] = field(default_factory=dict)
     """Settings in the drive's own parameters, by the row's kind."""
     warnings: tuple[str, ...] = ()
+    reported_speed_lag_s: Range | None = None
+    """Lag of the reported speed, for tune verify; None: unknown."""
 
 
 def loop_document(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: LoopTunedFor) -> dict[str, Any]:
@@ -94,6 +97,8 @@ def loop_document(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: Lo
                   else asdict(part) for name, part in vars(plant).items()} | {
             "total_inertia_kg_m2": plant.believed.total_inertia_kg_m2, "lags_from": tuned_for.lags_from,
         },
+        "reported_speed_lag_s": None if tuned_for.reported_speed_lag_s is None else asdict(
+            tuned_for.reported_speed_lag_s),
         "required": {"phase_deg": case.phase_deg, "gain_db": case.gain_db, "bandwidth_hz": case.bandwidth_hz},
         "controllers": [_controller(row, design, tuned_for.settings.get(row.kind, ())) for row in design.rows],
         "bandwidth_without_notch_hz": design.without_notch_hz,

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     )
     from tdhil.runner.speed_check import speed_warnings as speed_warnings
     from tdhil.runner.stage_log import stage_warnings as stage_warnings
-    from tdhil.runner.stages import course_of as course_of
+    from tdhil.runner.stages import course_of as course_of, plan_steps_before as plan_steps_before
     from tdhil.runner.stop import not_confirmed as not_confirmed
     from tdhil.runner.task import (
         Display as Display, Idle as Idle, RunOutcome as RunOutcome, STAGES as STAGES, Task as Task,
@@ -45,7 +45,7 @@ else:
         "settings": "ControlAssumptions ExcitationRequest MachineLimits StopRequest",
         "speed_check": "speed_warnings",
         "stage_log": "stage_warnings",
-        "stages": "course_of",
+        "stages": "course_of plan_steps_before",
         "stop": "not_confirmed",
         "task": "Display Idle RunOutcome STAGES Task",
     })

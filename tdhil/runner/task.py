@@ -15,6 +15,7 @@ if TYPE_CHECKING:       # code that only reads logs does not need these modules
     from tdhil.runner.excitation import Plan, SwingPlan
     from tdhil.runner.stop import StopReport
     from tdhil.soft_torque import EvaluationCase
+    from tdhil.speed_loop import StepCase
 
 STAGES = ("setup", "speed", "torque", "hold", "acquire")
 
@@ -60,6 +61,7 @@ class Task:
     facts: Mapping[str, Any] = field(default_factory=dict)
     assumptions: ControlAssumptions = field(default_factory=ControlAssumptions)
     evaluation: EvaluationCase | None = None       # a virtual string in stage 5, in place of an excitation
+    steps: StepCase | None = None                  # small steps of the set speed in stage 5, in place of an excitation
 
     @property
     def string_at_motor_nm_s_rad(self) -> float:

@@ -19,10 +19,12 @@ if TYPE_CHECKING:
     )
     from tdhil.session.dry_run import (
         BEFORE_ACQUIRE_S as BEFORE_ACQUIRE_S, Figure as Figure, plan_course as plan_course,
+        plan_dry_steps as plan_dry_steps,
         plan_document as plan_document, plan_dry as plan_dry,
     )
     from tdhil.session.evaluation import (
-        conclude_evaluation as conclude_evaluation, evaluation_case as evaluation_case, is_evaluation as is_evaluation,
+        EvaluationConclusion as EvaluationConclusion, conclude_evaluation as conclude_evaluation,
+        evaluation_case as evaluation_case, is_evaluation as is_evaluation,
         load_tuning as load_tuning,
     )
     from tdhil.session.kept import connection_of_kept as connection_of_kept, kept_connection as kept_connection
@@ -55,6 +57,11 @@ if TYPE_CHECKING:
         OperatorInterface as OperatorInterface, RunRequest as RunRequest,
         RunSession as RunSession,
     )
+    from tdhil.session.verification import (
+        VerificationConclusion as VerificationConclusion, conclude_verification as conclude_verification,
+        is_verification as is_verification,
+        load_step_case as load_step_case,
+    )
     from tdhil.session.speed_calibration import (
         SECONDS_SD as SECONDS_SD, SPEED_REL_SD as SPEED_REL_SD, TURNS_SD as TURNS_SD, TurnsCount as TurnsCount,
         add_speed_calibration as add_speed_calibration, check_speed_place as check_speed_place,
@@ -81,8 +88,9 @@ else:
         "confirm": "confirm_mounted require_terminal CallbackOperator TerminalOperator motion_summary",
         "connection": "connection_of simulated_connection",
         "drive_lock": "DriveHeld Holder address_of hold holder_of holders",
-        "dry_run": "BEFORE_ACQUIRE_S Figure plan_course plan_document plan_dry",
-        "evaluation": "conclude_evaluation evaluation_case is_evaluation load_tuning",
+        "dry_run": "BEFORE_ACQUIRE_S Figure plan_course plan_document plan_dry plan_dry_steps",
+        "evaluation": "EvaluationConclusion conclude_evaluation evaluation_case is_evaluation load_tuning",
+        "verification": "VerificationConclusion conclude_verification is_verification load_step_case",
         "kept": "connection_of_kept kept_connection",
         "log_files": "check_different_files check_log_path is_live make_room",
         "open_drive": "opened_drive plan_peer with_faults",

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from tdhil.runner import DesignKnowledge, MachineLimits, Planned, excitation
     from tdhil.runner.excitation import RigGuess
     from tdhil.soft_torque import EvaluationCase, SpeedProgram
+    from tdhil.speed_loop import StepCase, StepProgram
 
 
 SPIN_UP_S = 2.5             # assumed J: time in which the torque limit passes the speed window
@@ -79,6 +80,19 @@ def plan_course(
     limits = machine_limits(bench_of(Identity(0, 0, 0, 0, "", simulated), rig))
     assumptions = ControlAssumptions().at_period(1.0 / rate_hz)
     return course_of(case, limits, 1.0 / rate_hz, Guard.foresight_s(assumptions)), limits
+
+
+def plan_dry_steps(
+    case: StepCase, rig: Rig | None, simulated: bool, rate_hz: float
+) -> tuple[StepProgram, MachineLimits]:
+    """Return the largest steps of a verification, and the machine's limits. Raises an error if they do not fit.
+
+    Friction and the resolution of the reported speed are not known before the run.
+    """
+    from tdhil.runner import plan_steps_before
+
+    limits = machine_limits(bench_of(Identity(0, 0, 0, 0, "", simulated), rig))
+    return plan_steps_before(case, limits, 1.0 / rate_hz, 0.0), limits
 
 
 def plan_document(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits) -> dict[str, Any]:

@@ -45,7 +45,9 @@ if TYPE_CHECKING:
     from drivers import Identity, Preflight
     from tdhil.session.conclusion import Conclusion
     from tdhil.session.evaluation import EvaluationConclusion
+    from tdhil.session.verification import VerificationConclusion
     from tdhil.soft_torque import EvaluationCase
+    from tdhil.speed_loop import StepCase
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,8 @@ class RunRequest:
     real_time_priority: bool = False
     evaluation: EvaluationCase | None = None
     """Virtual string in stage 5, in place of an excitation."""
+    steps: StepCase | None = None
+    """Small steps of the set speed in stage 5, in place of an excitation."""
     acceptance: tuple[Expectation, ...] = ()
     """Expected values that decide whether the result is accepted."""
 
@@ -69,13 +73,13 @@ class RunRequest:
     def of(
         cls, options: RunOptions, connection: Connection, peer: PeerPlan, rig: Rig | None, *, overrides: Overrides,
         operator: str | None = None, note: str | None = None, real_time_priority: bool = False,
-        evaluation: EvaluationCase | None = None, expect: Sequence[str] = (),
+        evaluation: EvaluationCase | None = None, steps: StepCase | None = None, expect: Sequence[str] = (),
     ) -> RunRequest:
         """Return the request, with limits that suit the plant. Raises PreflightRefused for motion beyond the limits."""
         bench = suited(rig, peer.plant)
-        if evaluation is None:
+        if evaluation is None and steps is None:
             refuse_hopeless(options, bench, connection.profile)
-        return cls(options, connection, peer, bench, overrides, operator, note, real_time_priority, evaluation,
+        return cls(options, connection, peer, bench, overrides, operator, note, real_time_priority, evaluation, steps,
                    expectations_of({} if bench is None else bench.acceptance, expect))
 
 
@@ -188,15 +192,18 @@ class RunSession:
 
         return partial(identified_so_far, self.log.run)
 
-    def conclude(self) -> Conclusion | EvaluationConclusion:
-        """Identify from the recording, or evaluate the virtual string, and write the result to the log."""
+    def conclude(self) -> Conclusion | EvaluationConclusion | VerificationConclusion:
+        """Identify, evaluate the virtual string or compare the steps, from the recording, and log the result."""
         from tdhil.session.conclusion import conclude
         from tdhil.session.evaluation import conclude_evaluation, is_evaluation
+        from tdhil.session.verification import conclude_verification, is_verification
 
         recording, run, path = self.log.recording(complete=True), self.log.run, str(self.path)
-        found: Conclusion | EvaluationConclusion
+        found: Conclusion | EvaluationConclusion | VerificationConclusion
         if is_evaluation(run):
             found = conclude_evaluation(self.log.virtual_string, recording, run, path)
+        elif is_verification(run):
+            found = conclude_verification(recording, run, path)
         else:
             found = conclude(recording, run, path)
             self._tell_last(found, recording)
@@ -223,7 +230,7 @@ class RunSession:
         request, outcome = self._request, self._outcome
         if not request.peer.faults or outcome is None:
             return
-        other = request.evaluation is not None or request.options.impedance
+        other = request.evaluation is not None or request.steps is not None or request.options.impedance
         self.rehearsal = judge_rehearsal(request.peer, request.connection.drive, outcome, document, code,
                                          other_program=bool(other))
         with suppress(LogError):
@@ -286,7 +293,9 @@ class RunSession:
         asked = excitation_request(request.options, bench)
         if request.evaluation is not None:
             asked = ExcitationRequest(mode="speed" if request.evaluation.own_loop else "torque")
-        return Task(limits, asked, facts(bench), evaluation=request.evaluation)
+        if request.steps is not None:
+            asked = ExcitationRequest(mode="speed", reference_filter_s=asked.reference_filter_s)
+        return Task(limits, asked, facts(bench), evaluation=request.evaluation, steps=request.steps)
 
 
 def configuration(request: RunRequest) -> dict[str, Any]:
@@ -329,10 +338,17 @@ def load_what_the_end_needs(report: bool) -> None:
         Verdict,  # noqa: F401
         identify,  # noqa: F401
     )
-    from tdhil.report import card_text, evaluation_document, result_document, write_report  # noqa: F401
-    from tdhil.session import conclusion, evaluation  # noqa: F401
+    from tdhil.report import (  # noqa: F401
+        card_text,
+        evaluation_document,
+        result_document,
+        verification_document,
+        write_report,
+    )
+    from tdhil.session import conclusion, evaluation, verification  # noqa: F401
+    from tdhil.speed_loop import verify_steps  # noqa: F401
 
     with Console(file=io.StringIO()).status(""):
         pass      # rich loads its spinners at first use
     if report:
-        from tdhil.report import draw_run, evaluation_report, require_extra  # noqa: F401
+        from tdhil.report import draw_run, evaluation_report, require_extra, verification_report  # noqa: F401

@@ -1,4 +1,4 @@
-"""The drive's own speed loop: its margins, its step response, and P and I from J's interval; pure numbers."""
+"""The drive's own speed loop: its margins and step response, P and I from J's interval, measured steps; arithmetic."""
 
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,11 @@ if TYPE_CHECKING:
         LoopCurve as LoopCurve, MeasuredShaft as MeasuredShaft, deviation_from_model as deviation_from_model,
         loop_at_lines as loop_at_lines, loop_curve as loop_curve, measured_shaft as measured_shaft,
     )
+    from tdhil.speed_loop.verification import (
+        LEAST_PAIRS as LEAST_PAIRS, StepCase as StepCase, StepOutcome as StepOutcome, StepProgram as StepProgram,
+        StepRow as StepRow, StepVerification as StepVerification, step_case_of as step_case_of,
+        step_length_s as step_length_s, step_pairs as step_pairs, verify_steps as verify_steps,
+    )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "loop": "LoopPlant NotchFilter PiGains SpeedLoopMargins SpringLoad frequency_grid loop_response "
@@ -29,4 +34,6 @@ else:
         "step": "StepFigures is_stable_loop step_figures step_responses",
         "design": "LoopDesign LoopRow LoopTuningRefused Range SpeedLoopCase UncertainPlant design_speed_loop",
         "preview": "LoopCurve MeasuredShaft deviation_from_model loop_at_lines loop_curve measured_shaft",
+        "verification": "LEAST_PAIRS StepCase StepOutcome StepProgram StepRow StepVerification step_case_of "
+                        "step_length_s step_pairs verify_steps",
     })

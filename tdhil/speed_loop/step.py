@@ -106,21 +106,29 @@ def is_stable_loop(plant: LoopPlant, gains: PiGains) -> bool:
 
 def step_responses(plants: Sequence[LoopPlant], gains: PiGains, duration_s: float) -> tuple[Reals, Reals]:
     """Return times (N,) and the speed of each plant (plant, N) after a unit step of the set speed."""
+    speeds = loop_responses([closed_loop(plant, gains) for plant in plants], [duration_s] * len(plants))
+    return np.linspace(0.0, duration_s, _STEPS + 1), speeds
+
+
+def loop_responses(loops: Sequence[tuple[Reals, Reals, Reals]], durations_s: Sequence[float]) -> Reals:
+    """Return the response (loop, N) of each closed loop (A, B, C) to a unit step, each over its own duration."""
     from scipy.linalg import expm
 
-    time_s = np.linspace(0.0, duration_s, _STEPS + 1)
-    speeds = np.zeros((len(plants), _STEPS + 1))
-    for row, plant in enumerate(plants):
-        a, b, c = closed_loop(plant, gains)
-        whole = np.zeros((len(a) + 1, len(a) + 1))
-        whole[:-1, :-1], whole[:-1, -1] = a, b
-        move = expm(whole * (duration_s / _STEPS))
-        state = np.zeros(len(a) + 1)
-        state[-1] = 1.0
+    speeds = np.zeros((len(loops), _STEPS + 1))
+    for size in {len(a) for a, _, _ in loops}:
+        rows = [row for row, loop in enumerate(loops) if len(loop[0]) == size]
+        whole = np.zeros((len(rows), size + 1, size + 1))
+        for at, row in enumerate(rows):
+            a, b, _ = loops[row]
+            whole[at, :-1, :-1], whole[at, :-1, -1] = a, b
+            whole[at] *= durations_s[row] / _STEPS
+        move, out = expm(whole), np.array([loops[row][2] for row in rows])
+        state = np.zeros((len(rows), size + 1, 1))
+        state[:, -1] = 1.0
         for at in range(1, _STEPS + 1):
             state = move @ state
-            speeds[row, at] = c @ state[:-1]
-    return time_s, speeds
+            speeds[rows, at] = (out * state[:, :-1, 0]).sum(axis=1)
+    return speeds
 
 
 def step_figures(time_s: Reals, speed: Reals) -> StepFigures:

@@ -8,6 +8,10 @@ from tdhil.runner.stages.impedance import (
 )
 from tdhil.runner.stages.setup import measure_offsets as measure_offsets, probe_sign as probe_sign
 from tdhil.runner.stages.speed import RampCourse as RampCourse, SpeedResult as SpeedResult, run_speed as run_speed
+from tdhil.runner.stages.speed_steps import (
+    STEPS_RESERVE_S as STEPS_RESERVE_S, plan_steps as plan_steps, plan_steps_before as plan_steps_before,
+    refuse_other_shaft as refuse_other_shaft, run_steps as run_steps,
+)
 from tdhil.runner.stages.torque import TorqueResult as TorqueResult, run_torque as run_torque
 from tdhil.runner.stages.virtual_string import (
     course_of as course_of, go_to as go_to, refuse_other_rig as refuse_other_rig,

@@ -80,15 +80,19 @@ def course_of(case: EvaluationCase, limits: MachineLimits, period_s: float, fore
 
 def refuse_other_rig(case: EvaluationCase, model: RigGuess) -> None:
     """Raise PreflightRefused if the turning shaft can't be the one of the result."""
-    ratio = model.inertia_kg_m2 / case.rig.inertia_kg_m2
-    open_by = 1.0 + max(SAME_RIG, 3.0 * model.inertia_rel_error)
-    if not 1.0 / open_by <= ratio <= open_by:
+    if differs_from(case.rig.inertia_kg_m2, model):
         raise PreflightRefused(
             f"the result says {case.rig.inertia_kg_m2:.4g} kg·m² at the motor, and this shaft has about "
             f"{model.inertia_kg_m2:.4g}",
             where="--controller and --result", next_step="Identify this rig, then tune with that result",
             entry=MessageCode.VIRTUAL_STRING_REFUSED,
         )
+
+
+def differs_from(inertia_kg_m2: float, model: RigGuess) -> bool:
+    """Return whether stage 2's rough inertia excludes this one."""
+    open_by = 1.0 + max(SAME_RIG, 3.0 * model.inertia_rel_error)
+    return not 1.0 / open_by <= model.inertia_kg_m2 / inertia_kg_m2 <= open_by
 
 
 def go_to(

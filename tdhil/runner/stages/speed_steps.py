@@ -1,0 +1,116 @@
+"""Stages 4 and 5 of `tdhil tune verify`: small steps of the set speed, up and down, in the drive's own speed loop.
+
+The step follows from the limits: its torque is a share of what friction leaves of the torque limit, its size a share of
+the speed window. The guard watches every cycle as always. Besides, a speed that overshoots far more than predicted ends
+the run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drivers import Command, LimitHit, Mode, PreflightRefused
+from profiles import MessageCode
+from tdhil.runner.control_loop import ControlLoop
+from tdhil.runner.excitation import RigGuess
+from tdhil.runner.settings import MachineLimits
+from tdhil.runner.stages.virtual_string import differs_from
+from tdhil.speed_loop import LEAST_PAIRS, StepCase, StepProgram, step_length_s
+
+PAIRS = 24
+"""Counted pairs of steps: twice as many narrow the intervals by a third."""
+TORQUE_SHARE = 0.45
+"""Share of the torque that friction leaves below the limit, for a step; noise and overshoot need the rest."""
+SPEED_SHARE = 0.25
+"""Largest step, as a share of the speed window."""
+LEAST_COUNTS = 2
+"""Least step, in counts of the reported speed."""
+STEPS_RESERVE_S, BEFORE_S = 20.0, 100.0
+"""Seconds of the time limit that are reserved for the stop, and for stages 1 to 4."""
+OVERSHOOTS = 3.0
+"""Permitted overshoot, as a multiple of the predicted one, plus `OVERSHOOT_SHARE` of the step."""
+OVERSHOOT_SHARE = 0.5
+"""Share of the step."""
+STRANGE_COUNTS, STRANGE_SDS = 8.0, 6.0
+"""Deviation that rounding and noise of the reported speed explain, in counts and in standard deviations."""
+
+
+def plan_steps(
+    case: StepCase, limits: MachineLimits, period_s: float, resolution_rad_s: float, left_s: float,
+    friction_nm: float = 0.0,
+) -> StepProgram:
+    """Return the steps within the limits. Raises PreflightRefused if there is no room for them.
+
+    ``left_s``: time that is left for them; ``friction_nm``: steady torque at the mean speed, 0 before it is known.
+    """
+    if limits.load != "none":
+        raise _refused(f"steps of the set speed are requested, but load is {limits.load}", "load in rig.yaml",
+                       "Verify the gains without the string")
+    width = limits.speed_max_rad_s - limits.speed_min_rad_s
+    torque_nm = TORQUE_SHARE * (limits.torque_nm - abs(friction_nm))
+    step = min(SPEED_SHARE * width, torque_nm / case.gains.gain_nm_s_rad)
+    if resolution_rad_s > 0.0:
+        counts = int(step / resolution_rad_s)
+        if counts < LEAST_COUNTS:
+            raise _refused(
+                f"the limits permit a step of {step:.3g} rad/s, and one count of the reported speed is"
+                f" {resolution_rad_s:.3g} rad/s (at least {LEAST_COUNTS} counts are needed)",
+                "limits.torque_nm in rig.yaml", "Raise it within the machine's limits, or tune for a lower --bandwidth")
+        step = counts * resolution_rad_s
+    half_s = max(2, round(step_length_s(case) / period_s)) * period_s
+    pairs = min(PAIRS, int(left_s / (2.0 * half_s)) - 1)
+    if pairs < LEAST_PAIRS:
+        raise _refused(
+            f"{LEAST_PAIRS} pairs of steps take {2.0 * half_s * (LEAST_PAIRS + 1):.0f} s, and the time limit leaves"
+            f" {max(0.0, left_s):.0f} s", "limits.time_s in rig.yaml", "Raise it")
+    low = limits.speed_min_rad_s + 0.5 * (width - step)
+    return StepProgram(low, low + step, half_s, pairs, resolution_rad_s)
+
+
+def plan_steps_before(
+    case: StepCase, limits: MachineLimits, period_s: float, resolution_rad_s: float
+) -> StepProgram:
+    """Return the largest steps that the limits permit, before motion. Raises PreflightRefused if none fit."""
+    return plan_steps(case, limits, period_s, resolution_rad_s, limits.time_s - BEFORE_S - STEPS_RESERVE_S)
+
+
+def refuse_other_shaft(case: StepCase, model: RigGuess) -> None:
+    """Raise PreflightRefused if the turning shaft can't be the one that was tuned for."""
+    tuned = case.plant.believed.total_inertia_kg_m2
+    if differs_from(tuned, model):
+        raise _refused(
+            f"the gains were tuned for {tuned:.4g} kg·m² at the motor, and this shaft has about"
+            f" {model.inertia_kg_m2:.4g}", case.source or "tune.json", "Identify this rig, then tune with that result")
+
+
+def _refused(what: str, where: str, next_step: str) -> PreflightRefused:
+    return PreflightRefused(what, where=where, next_step=next_step, entry=MessageCode.VERIFICATION_REFUSED)
+
+
+def run_steps(
+    loop: ControlLoop, case: StepCase, program: StepProgram, resolution_rad_s: float, noise_rad_s: float,
+    keep: Callable[[list[float]], None],
+) -> None:
+    """Run all steps, from steady rotation at the lower speed; ``keep`` receives the times of the halves so far.
+
+    ``noise_rad_s``: standard deviation of the reported speed. Raises LimitHit, and what the bench raises.
+    """
+    starts: list[float] = []
+    allowed = (OVERSHOOTS * case.overshoot_share.high + OVERSHOOT_SHARE) * program.step_rad_s + max(
+        STRANGE_COUNTS * resolution_rad_s, STRANGE_SDS * noise_rad_s)
+    cycles = loop.cycles(program.half_s)
+    for pair in range(program.pairs + 1):
+        for speed in program.speeds_rad_s(pair):
+            for at in range(cycles):
+                sample = loop.cycle(Command(Mode.SPEED, speed, 0.0))
+                if at == 0:
+                    starts.append(sample.time_s)
+                if not program.low_rad_s - allowed <= sample.speed_rad_s <= program.high_rad_s + allowed:
+                    raise LimitHit(
+                        f"speed {sample.speed_rad_s:.3f} rad/s after a step from {program.low_rad_s:.3f} to"
+                        f" {program.high_rad_s:.3f} rad/s: the overshoot is above the limit of {allowed:.3g} rad/s",
+                        where=f"step at {sample.time_s:.1f} s",
+                        next_step="The shaft was stopped. Compare the gains in the drive with the tuned ones, and lower"
+                        " P",
+                        entry=MessageCode.STEP_OVERSHOOTS)
+        keep(starts)

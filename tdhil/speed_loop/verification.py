@@ -1,0 +1,441 @@
+r"""Small steps of the set speed beside the prediction of `tdhil tune speed`: what the drive's gains really are.
+
+The lag of the reported speed is often longer than the rise time. Therefore a model of loop and report is fitted to the
+mean of all steps, and the figures are those of the fitted loop, without the lag of the report.
+
+**Fit.** P and I are free. The others have the result's intervals as prior knowledge (standard deviation =
+half-width/1.96): J, friction, the lags of the loop together, the resonance, the lag of the reported speed, and the
+delay of the setpoint. An up step and the down step after it make one pair; half their difference is free of offset and
+slow drift. The scatter between pairs gives the covariance of the noise, whatever its spectrum.
+
+**Rows.** Overshoot, rise and settling beside their predicted intervals; P and I beside the typed values. The intervals
+hold together with 95 %: each has 1 − 0.05/5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from enum import StrEnum
+from math import ceil, exp, inf, sqrt
+from typing import Any
+
+import numpy as np
+
+from tdhil.speed_loop.design import LEAST_SPLIT, Range, UncertainPlant
+from tdhil.speed_loop.loop import LoopPlant, NotchFilter, PiGains, Reals
+from tdhil.speed_loop.step import closed_loop, loop_responses, step_figures
+
+CONFIDENCE = 0.95
+"""Coverage of all rows together."""
+LIKE_SHARE = 0.3
+"""Change of P or of I that a comparison must be able to show; otherwise the verdict is cannot_tell."""
+UNLIKE_RMS = 0.03
+"""Root mean square of the misfit, share of the step, from which the response is not that of such a loop."""
+UNLIKE_P = 0.01
+"""Probability below which the misfit is no noise."""
+DELAY_CYCLES, DELAY_SD_CYCLES = 1.0, 0.6
+"""Delay of a setpoint until the drive applies it, and its standard deviation: it acts within two cycles."""
+NORMAL_95 = 1.96
+"""Half-width of a 95 % interval, in standard deviations of a normal distribution."""
+REPORT_WIDER = 3.0
+"""Factor on the half-width of the reported lag. The steps show this lag well, and a result of tones may know only its
+difference from the lag of the torque."""
+LEAST_PAIRS = 8
+"""Pairs of steps below which their scatter is too uncertain."""
+SETTLED_LAGS, SETTLED_TIMES = 5.0, 2.0
+"""Length of a step: so many lags of the reported speed, and so many predicted settling times."""
+
+_GOLDEN = 0.5 * (sqrt(5.0) - 1.0)
+"""Its multiples, modulo 1, fill an interval evenly."""
+_DRAWS = 200
+"""Random draws of the fitted loop, for the intervals of its figures."""
+_SHUFFLES = 300
+"""Random draws of the pairs, for the misfit."""
+_ROUNDS = 12
+"""Iterations of the fit."""
+_LARGEST_MOVE = 0.4
+"""Largest change of ln P and ln I in an iteration."""
+_SPAN = 30.0
+"""Length of the fitted step response, in units of J/P."""
+_SLOPE = 1e-4
+"""Relative step of the derivatives."""
+
+
+class StepOutcome(StrEnum):
+    """Verdict of a verification."""
+
+    AGREES = "agrees"
+    DIFFERS = "differs"
+    CANNOT_TELL = "cannot_tell"
+
+
+@dataclass(frozen=True)
+class StepCase:
+    """Prediction that steps are compared with, at the motor shaft."""
+
+    kind: str
+    """tuned or present: the gains that are in the drive."""
+    plant: UncertainPlant
+    gains: PiGains
+    overshoot_share: Range
+    rise_s: Range
+    settling_s: Range
+    reported_lag_s: Range
+    """Time constant of the reported speed."""
+    source: str = ""
+    """The tuning's file."""
+
+    def plain(self) -> dict[str, Any]:
+        """Return plain data for the log; `step_case_of` reads it."""
+        return asdict(self)
+
+
+def step_case_of(plain: Mapping[str, Any]) -> StepCase:
+    """Return the case that `StepCase.plain` wrote. Raises KeyError or TypeError."""
+    said = plain["plant"]
+
+    def range_of(part: Mapping[str, Any] | None) -> Range | None:
+        return None if part is None else Range(*(float(part[name]) for name in ("value", "low", "high")))
+
+    def ranged(part: Mapping[str, Any]) -> Range:
+        found = range_of(part)
+        if found is None:
+            raise TypeError("a value is missing")
+        return found
+
+    gains = plain["gains"]
+    notch = gains.get("notch")
+    plant = UncertainPlant(
+        ranged(said["inertia_kg_m2"]), ranged(said["viscous_nm_s_rad"]), tuple(map(ranged, said["lags_s"])),
+        ranged(said["dead_time_s"]), *(range_of(said.get(name)) for name in
+                                       ("antiresonance_hz", "resonance_hz", "damping_nm_s_rad")))
+    law = PiGains(float(gains["gain_nm_s_rad"]), float(gains["integral_nm_rad"]),
+                  None if notch is None else NotchFilter(**notch))
+    overshoot, rise, settling, lag = (
+        ranged(plain[name]) for name in ("overshoot_share", "rise_s", "settling_s", "reported_lag_s"))
+    return StepCase(str(plain["kind"]), plant, law, overshoot, rise, settling, lag, str(plain.get("source", "")))
+
+
+@dataclass(frozen=True)
+class StepProgram:
+    """Set speeds of a verification: up and down between two speeds, so many times."""
+
+    low_rad_s: float
+    high_rad_s: float
+    half_s: float
+    """Length of each step."""
+    pairs: int
+    """Counted pairs of an up step and a down step; one pair before them is not counted."""
+    dither_rad_s: float = 0.0
+    """A count of the reported speed: the pairs are offset by parts of it, so that its rounding averages out."""
+
+    def speeds_rad_s(self, pair: int) -> tuple[float, float]:
+        """Return the upper and the lower set speed of a pair."""
+        offset = self.dither_rad_s * ((pair * _GOLDEN) % 1.0 - 0.5)
+        return self.high_rad_s + offset, self.low_rad_s + offset
+
+    @property
+    def step_rad_s(self) -> float:
+        """Size of each step."""
+        return self.high_rad_s - self.low_rad_s
+
+    @property
+    def duration_s(self) -> float:
+        """Length of all steps."""
+        return 2.0 * self.half_s * (self.pairs + 1)
+
+
+def step_length_s(case: StepCase) -> float:
+    """Return the time after which the report of a step has settled."""
+    return SETTLED_TIMES * case.settling_s.high + SETTLED_LAGS * case.reported_lag_s.high
+
+
+@dataclass(frozen=True)
+class StepRow:
+    """One compared quantity. ``within``: both intervals have a common part."""
+
+    name: str
+    measured: Range
+    predicted: Range
+
+    @property
+    def within(self) -> bool:
+        """Return whether measured and predicted interval overlap."""
+        return self.measured.low <= self.predicted.high and self.predicted.low <= self.measured.high
+
+
+@dataclass(frozen=True)
+class StepVerification:
+    """Result of a verification. ``response``: mean of all steps as reported, as fitted and as predicted, (N,)."""
+
+    outcome: StepOutcome
+    reason: str
+    rows: tuple[StepRow, ...]
+    pairs: int
+    misfit_rms: float
+    """Share of the step."""
+    misfit_p: float
+    time_s: Reals
+    reported: Reals
+    fitted: Reals
+    predicted: Reals
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The model: loop and report over time.
+
+
+class _LoopModel:
+    """Reported response of the loop, by its parameters; prior mean 0 and sd 1 of all but ln P and ln I."""
+
+    def __init__(self, case: StepCase, period_s: float, count: int, half_s: float, timing_sd_s: float,
+                 reference_filter_s: float) -> None:
+        self.case, self.period_s, self.count = case, period_s, count
+        self._apart = round(half_s / period_s)
+        self._reference_filter_s = reference_filter_s
+        self._delay_s = DELAY_CYCLES * period_s, DELAY_SD_CYCLES * period_s + timing_sd_s
+        plant = case.plant
+        lags = (*plant.lags_s, plant.dead_time_s)
+        total = sum(lag.value for lag in lags)
+        self._lags_sd = sum(lag.high - lag.low for lag in lags) / (2.0 * NORMAL_95 * total) if total > 0.0 else 0.0
+        self.size = 10
+        """ln P, ln I, J, B, lags of the loop, lag of the report, delay, antiresonance, resonance, damping."""
+
+    def loop(self, theta: Reals) -> tuple[LoopPlant, PiGains]:
+        """Return plant and gains."""
+        case, plant = self.case, self.case.plant
+        believed = plant.believed
+        inertia = _moved(plant.inertia_kg_m2, theta[2])
+        scale = exp(self._lags_sd * float(np.clip(theta[4], -6.0, 6.0)))
+        spring = believed.spring
+        if spring is not None and plant.antiresonance_hz is not None and plant.resonance_hz is not None:
+            low = _moved(plant.antiresonance_hz, theta[7])
+            spring = replace(
+                spring, antiresonance_hz=low, resonance_hz=max(_moved(plant.resonance_hz, theta[8]), LEAST_SPLIT * low),
+                damping_nm_s_rad=0.0 if plant.damping_nm_s_rad is None else max(
+                    0.0, _shifted(plant.damping_nm_s_rad, theta[9])))
+        found = LoopPlant(inertia, max(0.0, _shifted(plant.viscous_nm_s_rad, theta[3])),
+                          tuple(scale * lag for lag in believed.lags_s), scale * believed.dead_time_s, spring)
+        gains = replace(case.gains, gain_nm_s_rad=case.gains.gain_nm_s_rad * exp(theta[0]),
+                        integral_nm_rad=case.gains.integral_nm_rad * exp(theta[1]))
+        return found, gains
+
+    def reported(self, theta: Reals) -> Reals:
+        """Return the reported response (N,) to alternating steps, as share of the step."""
+        from scipy.linalg import expm
+
+        plant, gains = self.loop(theta)
+        a, b, c = closed_loop(plant, gains)
+        lag_s = max(0.0, _shifted(self.case.reported_lag_s, REPORT_WIDER * float(theta[5])))
+        for tau in (lag_s, self._reference_filter_s):
+            if tau > 0.0:
+                a, b, c = _behind(a, b, c, tau)
+        delay_s = max(0.0, self._delay_s[0] + self._delay_s[1] * float(theta[6]))
+        size, length = len(a), self.count + self._apart
+        whole = np.zeros((size + 1, size + 1))
+        whole[:-1, :-1], whole[:-1, -1] = a, b
+        first = ceil(delay_s / self.period_s - 1e-9)
+        out = np.zeros(length)
+        state = np.zeros(size + 1)
+        state[-1] = 1.0
+        state = expm(whole * (first * self.period_s - delay_s)) @ state
+        move = expm(whole * self.period_s)
+        for at in range(first, length):
+            out[at] = c @ state[:-1]
+            state = move @ state
+            if not abs(out[at]) < 1e6:          # unstable
+                out[at:] = 1e6
+                break
+        return np.asarray(out[:self.count] + 1.0 - out[self._apart:], dtype=np.float64)
+
+
+def _moved(part: Range, by: float) -> float:
+    """Return the value, moved by so many of its relative standard deviations."""
+    if part.value <= 0.0:
+        return part.value
+    return part.value * exp((part.high - part.low) / (2.0 * NORMAL_95 * part.value) * float(np.clip(by, -6.0, 6.0)))
+
+
+def _shifted(part: Range, by: float) -> float:
+    return part.value + (part.high - part.low) / (2.0 * NORMAL_95) * by
+
+
+def _behind(a: Reals, b: Reals, c: Reals, tau_s: float) -> tuple[Reals, Reals, Reals]:
+    """Put a first-order lag behind a system."""
+    size = len(a)
+    joined = np.zeros((size + 1, size + 1))
+    joined[:size, :size], joined[size, :size], joined[size, size] = a, c / tau_s, -1.0 / tau_s
+    return joined, np.append(b, 0.0), np.append(np.zeros(size), 1.0)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# From the samples to the rows.
+
+
+def step_pairs(
+    time_s: Reals, speed_rad_s: Reals, starts_s: Sequence[float], program: StepProgram, period_s: float
+) -> Reals:
+    """Return the response in each pair (pair, N), as share of the step; ``starts_s``: of all halves, up first."""
+    count = max(1, round(program.half_s / period_s) - 1)
+    grid = period_s * np.arange(count)
+    halves = [np.interp(start + grid, time_s, speed_rad_s) for start in starts_s]
+    whole = len(halves) // 2
+    pairs = [0.5 * ((halves[2 * k] - halves[2 * k + 1]) / program.step_rad_s + 1.0) for k in range(1, whole)]
+    return np.array(pairs).reshape(-1, count)
+
+
+def verify_steps(
+    case: StepCase, pairs: Reals, program: StepProgram, period_s: float, *, limited: bool = False,
+    timing_sd_s: float = 0.0, reference_filter_s: float = 0.0,
+) -> StepVerification:
+    """Compare the response of the pairs (pair, N) with the prediction. ``limited``: the torque limit acted.
+
+    ``timing_sd_s``: standard uncertainty of the sample times; ``reference_filter_s``: known filter of the set speed.
+    """
+    number, count = pairs.shape
+    model = _LoopModel(case, period_s, count, program.half_s, timing_sd_s, reference_filter_s)
+    mean: Reals = np.asarray(pairs.mean(axis=0), dtype=np.float64) if number else np.zeros(count)
+    time_s: Reals = np.asarray(period_s * np.arange(count), dtype=np.float64)
+    start = np.zeros(model.size)
+    expected = model.reported(start)
+    if number < LEAST_PAIRS:
+        return StepVerification(StepOutcome.CANNOT_TELL, f"the log has {number} pairs of steps, and {LEAST_PAIRS} are "
+                                "needed", (), number, inf, 0.0, time_s, mean, expected, expected)
+    scatter = pairs - mean
+    sd = sqrt(float((scatter**2).sum()) / ((number - 1) * count) / number)
+    sd = max(sd, 1e-9)
+    theta, slopes = _fitted(model, mean, sd)
+    prior = np.diag(np.r_[0.0, 0.0, np.ones(model.size - 2)])
+    inverse = np.linalg.inv(slopes.T @ slopes / sd**2 + prior)
+    moves = scatter @ slopes @ inverse / sd**2
+    covariance = moves.T @ moves / (number * (number - 1)) + inverse @ prior @ inverse
+    fitted = model.reported(theta)
+    misfit = mean - fitted
+    rms, chance = float(np.sqrt(np.mean(misfit**2))), _chance(scatter, slopes, inverse, sd, misfit)
+    rows = _rows(model, theta, covariance, number)
+    outcome, reason = _judged(rows, rms, chance, limited=limited)
+    return StepVerification(outcome, reason, rows, number, rms, chance, time_s, mean, fitted, expected)
+
+
+def _fitted(model: _LoopModel, mean: Reals, sd: float) -> tuple[Reals, Reals]:
+    """Return the parameters, and the derivatives of the response there (N, parameter)."""
+    theta = np.zeros(model.size)
+    now = model.reported(theta)
+
+    def cost(response: Reals, at: Reals) -> float:
+        return float(((mean - response) ** 2).sum()) / sd**2 + float((at[2:] ** 2).sum())
+
+    prior = np.r_[0.0, 0.0, np.ones(model.size - 2)]
+    slopes = _slopes(model, theta, now)
+    for _ in range(_ROUNDS):
+        hessian = slopes.T @ slopes / sd**2 + np.diag(prior)
+        move = np.linalg.solve(hessian, slopes.T @ (mean - now) / sd**2 - prior * theta)
+        move *= min(1.0, _LARGEST_MOVE / max(1e-12, float(np.max(np.abs(move[:2])))))
+        before = cost(now, theta)
+        for share in (1.0, 0.5, 0.25, 0.1, 0.03):
+            tried = theta + share * move
+            there = model.reported(tried)
+            if cost(there, tried) < before:
+                break
+        else:
+            break
+        theta, now = tried, there
+        slopes = _slopes(model, theta, now)
+        if before - cost(now, theta) < 1e-3:
+            break
+    return theta, slopes
+
+
+def _slopes(model: _LoopModel, theta: Reals, now: Reals) -> Reals:
+    columns = []
+    for k in range(model.size):
+        step = _SLOPE if k < 2 else 100.0 * _SLOPE
+        moved = theta.copy()
+        moved[k] += step
+        columns.append((model.reported(moved) - now) / step)
+    return np.array(columns).T
+
+
+def _chance(scatter: Reals, slopes: Reals, inverse: Reals, sd: float, misfit: Reals) -> float:
+    """Return the probability of so large a misfit by noise alone, from random signs of the pairs' scatter."""
+    number = len(scatter)
+    rng = np.random.default_rng(0)
+    signs = rng.choice((-1.0, 1.0), (_SHUFFLES, number))
+    noise = signs @ scatter / sqrt(number * (number - 1))
+    left = noise - noise @ slopes @ inverse @ slopes.T / sd**2
+    return float(np.mean((left**2).sum(axis=1) >= float((misfit**2).sum())))
+
+
+def _rows(model: _LoopModel, theta: Reals, covariance: Reals, number: int) -> tuple[StepRow, ...]:
+    from scipy.stats import t
+
+    case = model.case
+    names = ("overshoot_share", "rise_s", "settling_s", "gain_nm_s_rad", "integral_nm_rad")
+    factor = float(t.ppf(0.5 + 0.5 * (1.0 - (1.0 - CONFIDENCE) / len(names)), number - 1))
+    typed = (case.gains.gain_nm_s_rad, case.gains.integral_nm_rad)
+    gains = []
+    for k, value in enumerate(typed):
+        half = factor * sqrt(float(covariance[k, k]))
+        found = value * exp(theta[k])
+        gains.append(StepRow(names[3 + k], Range(found, found * exp(-min(half, 50.0)), found * exp(min(half, 50.0))),
+                             Range(value, value, value)))
+    rng = np.random.default_rng(1)
+    root = np.linalg.cholesky(covariance + 1e-15 * np.eye(len(theta)))
+    draws = [theta, *(theta + root @ one for one in rng.standard_normal((_DRAWS, len(theta))))]
+    figures = _figures(model, draws)
+    rows = []
+    for k, name in enumerate(names[:3]):
+        values = figures[:, k]
+        predicted: Range = getattr(case, name)
+        if not np.all(np.isfinite(values)):
+            rows.append(StepRow(name, Range(float(values[0]), float(np.min(values)), inf), predicted))
+            continue
+        share = 0.5 * (1.0 - CONFIDENCE) / len(names)
+        low, high = np.quantile(values[1:], (share, 1.0 - share))
+        rows.append(StepRow(name, Range(float(values[0]), min(float(low), float(values[0])),
+                                        max(float(high), float(values[0]))), predicted))
+    return (*rows, *gains)
+
+
+def _figures(model: _LoopModel, draws: list[Reals]) -> Reals:
+    """Return overshoot, rise and settling of each draw (draw, 3)."""
+    loops = [model.loop(theta) for theta in draws]
+    spans = [_SPAN * plant.total_inertia_kg_m2 / gains.gain_nm_s_rad for plant, gains in loops]
+    speeds = loop_responses([closed_loop(plant, gains) for plant, gains in loops], spans)
+    found = [step_figures(np.linspace(0.0, span, len(speed)), speed) for span, speed in zip(spans, speeds, strict=True)]
+    return np.array([(one.overshoot_share, one.rise_s, one.settling_s) for one in found])
+
+
+_WORDS = {"overshoot_share": "overshoot", "rise_s": "rise time", "settling_s": "settling time", "gain_nm_s_rad": "P",
+          "integral_nm_rad": "I"}
+
+
+def _judged(rows: tuple[StepRow, ...], rms: float, chance: float, *, limited: bool) -> tuple[StepOutcome, str]:
+    """Return the verdict by the intervals, and its reason."""
+    if limited:
+        return StepOutcome.CANNOT_TELL, "an internal limit of the drive acted during the steps"
+    if rms > UNLIKE_RMS and chance < UNLIKE_P:
+        return StepOutcome.DIFFERS, (
+            f"the response differs from that of any P and I on this shaft by {100 * rms:.1f} % of the step (rms): a "
+            "ramp, a filter or another resonance acts")
+    gains = rows[3:]
+    off = [row for row in rows if not row.within]
+    if off:
+        said = [_WORDS[row.name] + (f" is {row.measured.value / row.predicted.value:.2f} times the typed value"
+                                    if row in gains else " is outside its predicted interval") for row in off]
+        return StepOutcome.DIFFERS, "; ".join(said)
+    open_by = [row for row in gains if not _is_sharp(row)]
+    if open_by:
+        wide = open_by[0]
+        return StepOutcome.CANNOT_TELL, (
+            f"{_WORDS[wide.name]} is known from {wide.measured.low / wide.predicted.value:.2f} to "
+            f"{wide.measured.high / wide.predicted.value:.2f} times the typed value: an error of "
+            f"{100 * LIKE_SHARE:.0f} % would not be seen")
+    return StepOutcome.AGREES, "all measured intervals meet the predicted ones"
+
+
+def _is_sharp(row: StepRow) -> bool:
+    """Return whether the interval of a gain excludes an error of `LIKE_SHARE`."""
+    ratio = row.measured.low / row.predicted.value, row.measured.high / row.predicted.value
+    return ratio[0] > 1.0 - LIKE_SHARE and ratio[1] < 1.0 + LIKE_SHARE

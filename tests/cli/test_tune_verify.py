@@ -1,0 +1,73 @@
+"""`tdhil tune verify` from the document of `tune speed`: refusals, the plan, and a whole run on the simulator."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from tdhil.cli.main import main
+from tdhil.errors import ExitCode
+from tests.cli.test_tune import estimate
+from tests.cli.test_tune_speed import result
+
+
+@pytest.fixture
+def tuned(tmp_path, capsys):
+    """Return the document of `tune speed` for the embedded rig, and its file."""
+    found, path = tmp_path / "result.json", tmp_path / "tune.json"
+    found.write_text(json.dumps(result(
+        gear_ratio=1.0, inertia_kg_m2=estimate(104.0, 100.0, 108.0), viscous_nm_s_rad=estimate(8.0, 7.6, 8.4),
+        frequency_response=None)), encoding="utf-8")
+    assert main(["tune", "speed", str(found), "--inner-lags", "20ms", "10ms", "--dead-time", "2ms", "--bandwidth",
+                 "2", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    path.write_text(json.dumps(document), encoding="utf-8")
+    return document, path
+
+
+def test_the_plan_stays_within_the_limits_and_moves_nothing(tuned, capsys):
+    _, path = tuned
+    assert main(["tune", "verify", str(path), "--simulate", "--dry-run", "--json"]) == 0
+    plan = json.loads(capsys.readouterr().out)
+    limits = plan["limits"]
+    assert limits["speed_min_rad_s"] < plan["low_rad_s"] < plan["high_rad_s"] < limits["speed_max_rad_s"]
+    assert plan["step_torque_nm"] < plan["limits"]["torque_nm"] and plan["duration_s"] < plan["limits"]["time_s"]
+
+
+@pytest.mark.parametrize(("change", "words", "message"), [
+    ({"controllers": []}, (), "it contains no tuned gains"),
+    ({}, ("--use", "present"), "it contains no present gains"),
+    ({"reported_speed_lag_s": None}, (), "has no lag of the reported speed"),
+    ({"plant": {}}, (), "is not a tuning that tdhil tune speed wrote"),
+])
+def test_a_file_that_tells_too_little_is_refused_before_motion(tuned, capsys, tmp_path, change, words, message):
+    document, path = tuned
+    path.write_text(json.dumps(document | change), encoding="utf-8")
+    code = main(["tune", "verify", str(path), "--simulate", "--log", str(tmp_path / "v.mcap"), *words])
+    assert code == ExitCode.USAGE and message in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "v.mcap").exists()
+
+
+@pytest.mark.heavy
+def test_a_run_finds_the_gain_that_was_typed_wrongly_and_its_replay_says_the_same(tuned, capsys, tmp_path):
+    document, path = tuned
+    gains = document["controllers"][-1]
+    plant, log, page = tmp_path / "plant.yaml", tmp_path / "v.mcap", tmp_path / "v.html"
+    plant.write_text(f"drive:\n  speed_gain_nm_s_rad: {0.7 * gains['gain_nm_s_rad']}\n"
+                     f"  speed_integral_gain_nm_rad: {gains['integral_nm_rad']}\n", encoding="utf-8")
+    code = main(["tune", "verify", str(path), "--simulate", "--plant", str(plant), "--seed", "5", "--log", str(log),
+                 "--json"])
+    live = json.loads(capsys.readouterr().out)
+    assert code == ExitCode.NOT_PASSED and live["verdict"] == "differs"
+    gain = next(row for row in live["rows"] if row["name"] == "gain_nm_s_rad")
+    assert gain["measured"]["low"] < 0.7 * gains["gain_nm_s_rad"] < gain["measured"]["high"]
+    pytest.importorskip("matplotlib")
+    assert main(["replay", str(log), "--json", "--report", str(page)]) == code
+    again = json.loads(capsys.readouterr().out)
+    assert {name: again[name] for name in ("rows", "reason", "response")} == {
+        name: live[name] for name in ("rows", "reason", "response")}
+    text = page.read_text(encoding="utf-8")
+    assert "SIMULATED" in text and text.count("<svg") == 1
+    assert main(["replay", str(log)]) == code
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80

@@ -1,0 +1,120 @@
+"""Steps beside their prediction: the responses are computed by python-control, their lag and noise by this file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tdhil.speed_loop import (
+    PiGains,
+    Range,
+    SpeedLoopCase,
+    StepCase,
+    StepOutcome,
+    StepProgram,
+    UncertainPlant,
+    design_speed_loop,
+    step_case_of,
+    step_length_s,
+    step_pairs,
+    verify_steps,
+)
+from tests.speed_loop.by_control import step as by_control
+
+PERIOD_S = 0.02
+PLANT = UncertainPlant(Range(104.0, 99.7, 108.1), Range(8.0, 7.6, 8.4),
+                       (Range(0.02, 0.018, 0.022), Range(0.01, 0.009, 0.011)), Range(0.003, 0.0015, 0.0045))
+ROW = design_speed_loop(SpeedLoopCase(PLANT, bandwidth_hz=2.0)).tuned
+CASE = StepCase("tuned", PLANT, ROW.gains, ROW.overshoot_share, ROW.rise_s, ROW.settling_s, Range(0.3, 0.29, 0.31),
+                "tune.json")
+PROGRAM = StepProgram(4.0, 4.2, round(step_length_s(CASE) / PERIOD_S) * PERIOD_S, 16)
+PARAMETERS = pytest.mark.parametrize(("proportional", "integral"), [(1.3, 1.0), (0.7, 0.7)])
+
+
+def responses(gains: PiGains, noise: float = 0.02, lag_s: float = 0.3, ramp_s: float = 0.0, seed: int = 1):
+    """Reported response in each pair: the true plant, a first-order lag, a cycle of delay, an optional ramp, noise."""
+    rng = np.random.default_rng(seed)
+    fine = 0.002
+    time_s = fine * np.arange(round(2.0 * PROGRAM.half_s / fine))
+    speed = by_control(PLANT.believed, gains, time_s)
+    if ramp_s:
+        width = round(ramp_s / fine)
+        speed = np.convolve(np.r_[np.zeros(width), speed], np.ones(width) / width)[width:][:len(time_s)]
+    lagged = np.zeros_like(speed)
+    for k in range(1, len(speed)):
+        lagged[k] = lagged[k - 1] + (1.0 - np.exp(-fine / lag_s)) * (0.5 * (speed[k] + speed[k - 1]) - lagged[k - 1])
+    every = round(PERIOD_S / fine)
+    seen = np.r_[0.0, lagged[::every]][:-1]
+    count = round(PROGRAM.half_s / PERIOD_S) - 1
+    one = seen[:count] + 1.0 - seen[round(PROGRAM.half_s / PERIOD_S):][:count]
+    return one + noise * rng.standard_normal((PROGRAM.pairs, count)) / np.sqrt(2.0)
+
+
+def found(pairs, **said):
+    return verify_steps(CASE, pairs, PROGRAM, PERIOD_S, **said)
+
+
+def test_typed_gains_agree_and_their_intervals_cover_the_truth():
+    result = found(responses(CASE.gains))
+    assert result.outcome is StepOutcome.AGREES, result.reason
+    rows = {row.name: row for row in result.rows}
+    for name, true in (("gain_nm_s_rad", CASE.gains.gain_nm_s_rad), ("integral_nm_rad", CASE.gains.integral_nm_rad),
+                       ("overshoot_share", ROW.overshoot_share.value), ("rise_s", ROW.rise_s.value)):
+        assert rows[name].measured.low <= true <= rows[name].measured.high, name
+    assert rows["gain_nm_s_rad"].measured.high < 1.25 * CASE.gains.gain_nm_s_rad
+
+
+@pytest.mark.heavy(but_first=1)
+@PARAMETERS
+def test_gains_typed_wrongly_by_30_percent_differ_and_are_named(proportional, integral):
+    wrong = PiGains(proportional * CASE.gains.gain_nm_s_rad, integral * CASE.gains.integral_nm_rad)
+    result = found(responses(wrong))
+    assert result.outcome is StepOutcome.DIFFERS
+    assert "P is" in result.reason or "I is" in result.reason
+    gain = result.rows[3].measured
+    assert gain.low <= wrong.gain_nm_s_rad <= gain.high
+
+
+def test_noise_that_hides_30_percent_is_not_called_agreement():
+    assert found(responses(CASE.gains, noise=0.6)).outcome is StepOutcome.CANNOT_TELL
+
+
+@pytest.mark.heavy
+def test_a_ramp_of_the_set_speed_is_no_agreement():
+    assert found(responses(CASE.gains, noise=0.002, ramp_s=1.0)).outcome is StepOutcome.DIFFERS
+
+
+def test_a_response_of_no_gains_at_all_is_named():
+    pairs = responses(CASE.gains, noise=0.002)
+    vibration = 0.08 * np.sin(2.0 * np.pi * 3.0 * PERIOD_S * np.arange(pairs.shape[1]))
+    result = found(pairs + vibration)
+    assert result.outcome is StepOutcome.DIFFERS and "a ramp, a filter or another resonance" in result.reason
+
+
+def test_a_limit_that_acted_or_too_few_pairs_tell_nothing():
+    pairs = responses(CASE.gains)
+    assert found(pairs, limited=True).outcome is StepOutcome.CANNOT_TELL
+    assert found(pairs[:5]).outcome is StepOutcome.CANNOT_TELL
+    assert found(pairs[:0]).outcome is StepOutcome.CANNOT_TELL
+
+
+def test_the_case_comes_back_from_the_log():
+    assert step_case_of(json.loads(json.dumps(CASE.plain()))) == CASE
+    with pytest.raises((KeyError, TypeError)):
+        step_case_of({"plant": {}})
+
+
+def test_pairs_are_free_of_offset_and_drift_and_the_first_is_dropped():
+    program = replace(PROGRAM, dither_rad_s=0.01)
+    time_s = PERIOD_S * np.arange(round(program.duration_s / PERIOD_S) + 1)
+    half = np.floor(time_s / program.half_s + 1e-9).astype(int)
+    uppers = np.array([program.speeds_rad_s(pair) for pair in range(program.pairs + 1)]).reshape(-1)
+    assert np.ptp(uppers[::2]) > 0.8 * 0.01                 # the parts of a count are spread
+    speed = uppers[np.minimum(half, len(uppers) - 1)] + 0.3 + 1e-4 * time_s
+    starts = [program.half_s * k for k in range(2 * (program.pairs + 1))]
+    pairs = step_pairs(time_s, speed, starts, program, PERIOD_S)
+    assert len(pairs) == program.pairs
+    np.testing.assert_allclose(pairs, 1.0 - 0.5 * 1e-4 * program.half_s / program.step_rad_s, atol=1e-9)
