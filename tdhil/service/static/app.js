@@ -28,6 +28,13 @@
 
   class Refused extends Error {}
 
+  const STARTED = "tdhil-started";
+  /** Go to the live page of a run that was started here. It becomes the result, also if the run has ended by then. */
+  function follow(run) {
+    try { sessionStorage.setItem(STARTED, run); } catch (error) { /* as of a run that was started elsewhere */ }
+    location.assign(`/runs/${run}/live`);
+  }
+
   const may = (role) => (document.body.dataset.roles || "").split(" ").includes(role);
 
   /** Return the present token for a change: another page may have logged in again meanwhile. */
@@ -363,7 +370,7 @@
           const text = JSON.stringify(options);         // the same request twice starts one run
           if (key === null || keyFor !== text) { key = crypto.randomUUID(); keyFor = text; }
           const run = await call("POST", `/rigs/${encodeURIComponent(rig)}/runs`, options, { "Idempotency-Key": key });
-          location.assign(`/runs/${run.id}/live`);
+          follow(run.id);
         }
       } catch (error) {
         refuse(error instanceof Refused ? error.message : "No answer from tdhil serve.", error.fields);
@@ -421,7 +428,8 @@
     const run = document.body.dataset.run, watched = document.body.dataset.motion === "watched";
     const samples = [[], [], []];
     let status = null, message = 0, age = null, timeS = null, dirty = false, asking = null, undelivered = false, unseen = null;
-    let wentOn = new URL(document.referrer || location.href).pathname.startsWith("/start/");     // opened for a run, not for its record
+    let wentOn = false;                                // true if the page was opened for the run, not for its record
+    try { wentOn = sessionStorage.getItem(STARTED) === run; } catch (error) { /* then a run that ended at once is not followed */ }
     const charts = window.tdhil.motion(run);
 
     let inertias = [], drawInertia = null;
@@ -495,7 +503,11 @@
       byId("state").className = status.state === "stop_not_confirmed" ? "alarm" : "";
       const over = ENDED.includes(status.state);
       if (!over) wentOn = true;
-      if (status.state === "done" && wentOn) { location.replace(`/runs/${run}`); return; }      // the page becomes the result
+      if (status.state === "done" && wentOn) {                     // the page becomes the result, once
+        try { sessionStorage.removeItem(STARTED); } catch (error) { /* nothing was kept */ }
+        location.replace(`/runs/${run}`);
+        return;
+      }
       byId("ended").hidden = !over;
       byId("stop").disabled = over;
       const confirm = status.state === "awaiting_confirmation" && status.confirmation;

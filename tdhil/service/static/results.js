@@ -1,7 +1,7 @@
 // Results: one run, a comparison, a rig over time, many logs. As in app.js, data from elsewhere are inserted as text.
 "use strict";
 (() => {
-  const { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inSpeedUnit, inertia, interval, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, waiting, when, zone } = window.tdhil;
+  const { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, follow, inSpeedUnit, inertia, interval, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, waiting, when, zone } = window.tdhil;
 
   // -- one run
 
@@ -375,7 +375,7 @@
       if (!await paced()) { button.disabled = false; return; }
       try {
         const run = await call("POST", `/rigs/${encodeURIComponent(rig)}/runs`, { fault: [text], note: `rehearsal: ${text}`, real_time: form.elements.real_time.checked }, { "Idempotency-Key": crypto.randomUUID() });
-        location.assign(`/runs/${run.id}/live`);
+        follow(run.id);
       } catch (error) {
         show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
         byId("said").scrollIntoView({ block: "center" });
