@@ -406,4 +406,4 @@ def test_the_old_call_means_soft_torque(tmp_path, capsys):
     assert main(["tune", "--string", str(STRING_YAML), str(path)]) == 11      # options first, as before
     with pytest.raises(SystemExit):
         main(["tune", "--help"])
-    assert "speed|soft-torque" in capsys.readouterr().out
+    assert "speed|verify|soft-torque" in capsys.readouterr().out
