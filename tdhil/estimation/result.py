@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from profiles import MessageCode
+from profiles import MessageCode, TdhilError
 from tdhil.config import MODELS
 from tdhil.recording import FloatArray
 
@@ -385,13 +385,13 @@ class FrequencyResponse:
     def to_xarray(self) -> xarray.Dataset:
         """Return the lines along ``hertz``, each quantity with its unit (extra `notebook`).
 
-        Raises ImportError without xarray, with the command that installs it.
+        Raises TdhilError without xarray, with the command that installs it.
         """
         try:
             library = import_module("xarray")
         except ImportError as error:
-            error.add_note("Install it with: pip install '.[notebook]'")
-            raise
+            raise TdhilError("xarray is not installed", next_step="Install it with: pip install '.[notebook]'",
+                             entry=MessageCode.PACKAGE_MISSING) from error
         columns = response_columns(self)
         hertz = columns.pop("hertz")
         units = {name: unit_of(name) for name in columns}

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import replace
 
 import control
 import numpy as np
 import pytest
 
+from profiles import MessageCode, TdhilError
 from tdhil.estimation import Options, identify, response_columns, unit_of, usable_samples
 from tdhil.estimation.case import Case
 from tdhil.estimation.frequency_domain.frequency_response import _pooled, measure_response
@@ -90,6 +92,13 @@ def test_xarray_has_the_lines_with_their_units(linear):
     assert np.allclose(g, linear.response, rtol=1e-15)
     assert found.attrs["distortion_detected"] == 0
     assert set(found.data_vars) | {"hertz"} == set(response_columns(linear))
+
+
+def test_a_missing_xarray_is_an_error_with_what_to_install(linear, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(TdhilError, match="xarray is not installed") as raised:
+        linear.to_xarray()
+    assert "pip install" in raised.value.next_step and raised.value.entry is MessageCode.PACKAGE_MISSING
 
 
 def test_the_model_is_drawn_through_the_lines_with_its_band(linear):
