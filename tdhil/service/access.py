@@ -1,9 +1,9 @@
 """Identity and rights of a client: by a session cookie, by a machine's token, or on this computer itself.
 
-All of it is answered from memory: no request, and above all no stop, waits for a file here.
+All data is in memory: no request, and above all no stop, waits for a file here.
 
 * Without accounts, on loopback: every user of this computer has every role.
-* With accounts: a login is required. When it ends, its page may still stop, and nothing else.
+* With accounts: a login is required. After its end, the page of that login may still stop a run, and nothing else.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Principal:
-    """A client. ``name`` appears in the audit; ``session``: of a login, '' for a token and on this computer.
+    """A client. ``name`` appears in the audit; ``session``: id of its login, '' for a token and on this computer.
 
-    ``known``: by a password or a token. ``csrf``: the token that a change must contain, '' if none.
+    ``known``: identified by a password or a token. ``csrf``: the token that a change must contain, '' if none.
     """
 
     name: str
@@ -70,7 +70,7 @@ NOBODY: Final = Principal("nobody", frozenset(), may_stop=False)
 
 @dataclass(frozen=True)
 class Session:
-    """A login: ``since`` is that of the password it was made with; times as of `time.time`."""
+    """A login. ``since``: time when its password was set; times in s, as of `time.time`."""
 
     user: str
     since: str
@@ -79,10 +79,10 @@ class Session:
 
 
 class Tries:
-    """Limits of password tries in a minute: from one address 5 for one name, and 20 for all names.
+    """Limits of password tries in a minute. One address has 5 tries for one name, and 20 for all names.
 
-    For one name 30 from all addresses that never logged in with it. So an attacker elsewhere never blocks a login from
-    a known address, but may block one from a new address while the attack lasts.
+    All addresses that never logged in with a name have 30 tries together for it. So an attacker elsewhere never blocks
+    a login from a known address, but may block one from a new address while the attack lasts.
     """
 
     WINDOW_S: Final = 60.0
@@ -96,7 +96,7 @@ class Tries:
         self._lock = threading.Lock()
 
     def begin(self, name: str, address: str) -> None:
-        """Count one try, before its password is checked. Raises TooManyTries."""
+        """Count one password try before the check of the password. Raises TooManyTries."""
         with self._lock:
             now_s = self._clock()
             if len(self._tried) > self._MOST:
@@ -112,7 +112,7 @@ class Tries:
                 one.append(now_s)
 
     def good(self, name: str, address: str) -> None:
-        """Note a correct password."""
+        """Record a correct password."""
         with self._lock:
             if len(self._good) > self._MOST:
                 self._good.clear()
@@ -121,10 +121,10 @@ class Tries:
 
 
 class RequestPace:
-    """How many runs that show a code may be requested: by one user, and from one address.
+    """Limits of requested runs that show a code, for one user and for one address.
 
-    A run takes three wrong codes. So a user has at most 120 tries a day for one of a million codes, and each run that
-    was requested is on the terminal at the rig and in the audit.
+    A run accepts three wrong codes. So a user has at most 120 tries a day for one of a million codes. Each requested
+    run appears on the terminal at the rig and in the audit.
     """
 
     LIMITS: Final = ((600.0, 10, 30), (86_400.0, 40, 120))
@@ -137,7 +137,7 @@ class RequestPace:
         self._lock = threading.Lock()
 
     def begin(self, who: str, address: str, rig: str) -> None:
-        """Count one request. Raises TooManyRuns for a request above the limit, and does not count it."""
+        """Count one request. Raises TooManyRuns above the limit; such a request is not counted."""
         with self._lock:
             now_s = self._clock()
             longest_s = self.LIMITS[-1][0]
@@ -195,7 +195,7 @@ class Access:
             self.refresh()
 
     def refresh(self, *, first: bool = False) -> None:
-        """Read the accounts if they were changed. If they can't be read, the former ones stay in force."""
+        """Read the accounts if they have changed. If they can't be read, the former accounts stay in force."""
         try:
             before, found = self.accounts.changed()
         except TdhilError as error:
@@ -208,10 +208,10 @@ class Access:
             for what, name in _differences(before, found):
                 self.changed(what, name)
 
-    # -- who asks ----------------------------------------------------------------------------------------------------
+    # -- the client --------------------------------------------------------------------------------------------------
 
     def who(self, connection: HTTPConnection) -> Principal:
-        """Return the client, without touching a file. An unknown token gives no rights, also on this computer."""
+        """Return the client, without access to a file. An unknown token gives no rights, also on this computer."""
         accounts = self.accounts.known
         if (token := token_in(connection)) is not None:
             if (found := accounts.of_token(token)) is None:
@@ -237,14 +237,14 @@ class Access:
         return Principal(user.name, roles, known=True, session=name[:16], csrf=csrf_of(cookie))
 
     async def authenticate(self, connection: HTTPConnection) -> tuple[AuthCredentials, Principal]:
-        """For starlette's AuthenticationMiddleware."""
+        """Authenticate a client, as starlette's AuthenticationMiddleware requires."""
         who = self.who(connection)
         return AuthCredentials(sorted(who.roles)), who
 
     # -- login -------------------------------------------------------------------------------------------------------
 
     def log_in(self, name: str, password: str, address: str) -> tuple[str, Principal]:
-        """Return the cookie's value and its client. Slow on purpose. Raises TooManyTries and NotLoggedIn."""
+        """Return the cookie's value and its client. The hash takes 0.3 s. Raises TooManyTries and NotLoggedIn."""
         self.tries.begin(name, address)
         user = self.accounts.known.users.get(name)
         good = matches(password, None if user is None else user.password)
@@ -261,14 +261,14 @@ class Access:
         return cookie, self._of_session(cookie, self.accounts.known)
 
     def log_out(self, connection: HTTPConnection) -> None:
-        """End the session now, also for the time after a restart."""
+        """End the session now. It stays ended after a restart of the service."""
         if (cookie := _cookie(connection, COOKIE)) is not None:
             with self._lock:
                 self._sessions = {one: it for one, it in self._sessions.items() if one != _hash(cookie)}
             self._save()
 
     def ends_s(self, who: Principal) -> float | None:
-        """Return the end of the client's session, as of `time.time`; None without one."""
+        """Return the end of the client's session, s, as of `time.time`; None without a session."""
         return next((it.ends_s for one, it in self._sessions.items() if who.session and one.startswith(who.session)),
                     None)
 
@@ -282,7 +282,7 @@ class Access:
 
 
 def principal(connection: HTTPConnection) -> Principal:
-    """Return the client that the middleware found."""
+    """Return the client that the middleware identified."""
     found: Principal = connection.scope.get("user", NOBODY)
     return found
 
@@ -296,9 +296,9 @@ def set_cookies(response: Response, connection: HTTPConnection, cookie: str | No
 
 
 def csrf_of(cookie: str) -> str:
-    """Return the token that a page of this session sends with each change. Its script reads it in a separate cookie.
+    """Return the token that a page of this session sends with each change. The page's script reads it from a cookie.
 
-    So a page from before a new login has the new token, and its stop is accepted.
+    So a page that was opened before a new login sends the new token, and its stop is accepted.
     """
     return hmac.new(cookie.encode(), b"csrf", hashlib.sha256).hexdigest()[:32]
 
@@ -342,7 +342,7 @@ def token_in(connection: HTTPConnection) -> str | None:
 
 
 def address_of(connection: HTTPConnection) -> str:
-    """Return the address for the rate limit; for IPv6 the network, which belongs to one customer."""
+    """Return the address for the rate limit; for IPv6 the network, since one customer has a whole network."""
     host = "?" if connection.client is None else connection.client.host
     with suppress(ValueError):
         address = ipaddress.ip_address(host.partition("%")[0])

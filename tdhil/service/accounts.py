@@ -30,7 +30,7 @@ ROLES: Final[tuple[Role, ...]] = get_args(Role)
 FILE: Final = "accounts.json"
 NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]{0,31}")
 _RESERVED: Final = frozenset({"local", "service", "somebody", "nobody", "terminal"})
-"""Names that the audit uses for others than users."""
+"""Reserved names: the audit uses them for entries that are not from users."""
 SHORTEST: Final = 10
 """Shortest password, characters."""
 LONGEST: Final = 200
@@ -40,13 +40,13 @@ TOKEN: Final = "tdhil_"
 
 
 def role_at_least(role: Role) -> frozenset[str]:
-    """Return the role and those below it."""
+    """Return the role and all roles below it."""
     return frozenset(ROLES[: ROLES.index(role) + 1])
 
 
 @dataclass(frozen=True)
 class User:
-    """A user. ``password``: from `scrypt`; ``since``: when it was set; sessions from before that end."""
+    """A user. ``password``: hash from `scrypt`; ``since``: time when it was set. Earlier sessions are invalid."""
 
     name: str
     role: Role
@@ -56,7 +56,7 @@ class User:
 
 @dataclass(frozen=True)
 class Token:
-    """A machine's token. ``sha256`` of the token, which was shown once."""
+    """A machine's token. ``sha256``: hash of the token; the token itself was shown once."""
 
     name: str
     role: Role
@@ -87,7 +87,7 @@ def scrypt(password: str) -> str:
 
 
 def matches(password: str, kept: str | None) -> bool:
-    """Return whether the password is right. An unknown name takes as long, so that the time reveals no names."""
+    """Return whether the password is correct. An unknown name takes as long, so that the time reveals no names."""
     nobody = f"scrypt${_N}${_R}${_P}${bytes(16).hex()}${bytes(_BYTES).hex()}"
     kind, n, r, p, salt, key = (kept or nobody).split("$")
     found = _derive(password[:LONGEST], bytes.fromhex(salt), int(n), int(r), int(p))
@@ -121,7 +121,7 @@ def _require_name(name: str) -> None:
 
 
 class AccountsFile:
-    """The accounts file, for any thread and any process. A change holds a lock."""
+    """The accounts file; any thread and any process may use it. A change holds a lock."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / FILE
@@ -131,11 +131,11 @@ class AccountsFile:
 
     @property
     def known(self) -> Accounts:
-        """Return the accounts as read last; no file is touched."""
+        """Return the accounts of the last reading, without access to the file."""
         return self._known
 
     def read(self) -> Accounts:
-        """Return the accounts of the present file. Raises UsageError if it can't be read; `known` stays unchanged."""
+        """Read the accounts from the present file. Raises UsageError if it can't be read; `known` stays unchanged."""
         with self._lock:
             try:
                 looked = self.path.stat()
@@ -143,7 +143,7 @@ class AccountsFile:
                 if stamp != self._stamp:
                     self._known, self._stamp = _accounts_of(self.path.read_bytes()), stamp
             except (FileNotFoundError, NotADirectoryError):
-                if self._stamp is not None:        # it existed before: deleting the file does not remove the users
+                if self._stamp is not None:        # the file existed before: its deletion does not remove the users
                     raise UsageError("the accounts file has disappeared", where=str(self.path),
                                      next_step="Restore it") from None
             except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
@@ -157,7 +157,7 @@ class AccountsFile:
             return self._known, self.read()
 
     def add_user(self, name: str, role: Role, password: str) -> User:
-        """Add a user. Raises UsageError."""
+        """Add a user. Raises UsageError for an unacceptable name or password."""
         _require_name(name)
         require_password(password, name)
         made = User(name, role, scrypt(password), now())
@@ -188,7 +188,7 @@ class AccountsFile:
             self._write(replace(accounts, users=left))
 
     def add_token(self, name: str, role: Role) -> str:
-        """Add a token. Return it; only its hash is stored. Raises UsageError."""
+        """Add a token and return it. Only its hash is stored. Raises UsageError."""
         _require_name(name)
         token = TOKEN + secrets.token_urlsafe(32)
         made = Token(name, role, hashlib.sha256(token.encode()).hexdigest(), now())
@@ -228,7 +228,7 @@ class AccountsFile:
                     "users": {name: _plain(one) for name, one in sorted(accounts.users.items())},
                     "tokens": {name: _plain(one) for name, one in sorted(accounts.tokens.items())},
                 }, mode=0o600)
-                if os.geteuid() == 0:      # written by root: the service's own user must be able to read them
+                if os.geteuid() == 0:      # written by root: the service's own user must be able to read it
                     owner = self.path.parent.stat()
                     for path in (self.path, self.path.with_suffix(".lock")):
                         os.chown(path, owner.st_uid, owner.st_gid)

@@ -1,4 +1,4 @@
-"""Documents that were computed from ended runs, kept in memory: the same question has the same answer."""
+"""Cache of documents computed from ended runs: the same request gets the same document."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from pathlib import Path
 from typing import Any, Final
 
 MOST: Final = 64
-"""Documents that are kept; a comparison of eight runs is some 100 kB."""
+"""Largest number of cached documents; a comparison of eight runs has about 100 kB."""
 
 
 class KeptAnswers:
-    """The latest documents of `plan`, `trend` and `compare`. Each depends on its question and the files in it alone."""
+    """Cache of the latest documents of `plan`, `trend` and `compare`. Each depends on its request and files only."""
 
     def __init__(self, runs: Path) -> None:
         self._runs = runs
         self._kept: OrderedDict[str, dict[str, Any]] = OrderedDict()
 
     def key(self, what: str, asked: Mapping[str, Any]) -> str | None:
-        """Return the key of a question, with its logs and its rig file; None if its answer is not kept."""
+        """Return the cache key of a request, its logs and its rig file; None if its document is not cached."""
         if what not in ("trend", "compare", "plan"):
             return None
         runs: Sequence[str] = asked["runs"] if what == "compare" else ()
@@ -33,14 +33,14 @@ class KeptAnswers:
         return json.dumps([what, asked, logs, files], sort_keys=True)
 
     def get(self, key: str | None) -> dict[str, Any] | None:
-        """Return a kept document, and keep it longer."""
+        """Return a cached document and mark it as used last; None if it is not cached."""
         if key is None or key not in self._kept:
             return None
         self._kept.move_to_end(key)
         return self._kept[key]
 
     def put(self, key: str | None, document: dict[str, Any]) -> None:
-        """Keep a document; the oldest one is dropped."""
+        """Add a document to the cache. Above `MOST` documents, the least recently used one is removed."""
         if key is not None:
             self._kept[key] = document
             while len(self._kept) > MOST:

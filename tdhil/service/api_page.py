@@ -1,4 +1,4 @@
-"""The page /docs: the OpenAPI document of the service as a readable page, with nothing from another host."""
+"""The page /docs: the OpenAPI document of the service as a readable page. It loads nothing from another host."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class ApiSchema:
 
 @dataclass(frozen=True)
 class ApiPage:
-    """All of the page."""
+    """Content of the page /docs."""
 
     version: str
     routes: tuple[ApiRoute, ...]
@@ -65,7 +65,7 @@ class ApiPage:
 
 @lru_cache(maxsize=1)
 def api_page() -> ApiPage:
-    """Return the page of this version."""
+    """Return the page for this version of the service."""
     from tdhil.service.schemas import document
 
     found = document()
@@ -114,7 +114,7 @@ def _fields(schema: Part) -> Iterator[ApiField]:
 
 
 def _kind(schema: Part) -> tuple[str, str]:
-    """Return the kind of a value in words, and the schema that it names."""
+    """Return the type of a value in words, and the name of its schema."""
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
         return name, name

@@ -1,6 +1,6 @@
-"""The operator of a run in the service: keeps the run's status, watches the run, and requests the code.
+"""Operator interface of a run in the service: keeps the run's status, watches the run, and requests the code.
 
-Nothing here delays the control loop: it takes notes, and a thread writes them to disk.
+Nothing here delays the control loop: changes are kept in memory, and a thread writes them to disk.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
     from tdhil.runner import Display, Idle, StopRequest, Task
 
 CODE_S: Final = 60.0
-"""Time for which a code is valid, once, s."""
+"""Time for which a code is valid, s. It can be used once."""
 TRIES: Final = 3
 LEASE_S: Final = 5.0
 """Time for which a watched run continues without its page, s. The page renews the lease every second."""
 SILENT_S: Final = 2.0
-"""Time without a message of the page after which the run's status shows it, s."""
+"""Time without a message of the page after which the run's status reports this, s."""
 LEASE_LOOK_S: Final = 0.05
 WATCH: Final = "watch"
-"""Event kind in the log: whether a watched run is watched."""
+"""Kind of the log event that records whether a watched run is watched."""
 WATCHED: Final = {
     None: "its page is open", "hidden": "its page is hidden", "closed": "its page was closed or reloaded",
     "silent": "its page sends nothing",
@@ -65,7 +65,7 @@ class Board:
         return self._status
 
     def change(self, step: Callable[[Status], Status]) -> None:
-        """Apply a step; ignore an impossible one. A display error never ends a run."""
+        """Apply a change of the status; ignore an impossible one. A display error never ends a run."""
         with self._lock, suppress(NotSo):
             self._status = step(self._status)
         self._wake.set()
@@ -81,12 +81,12 @@ class Board:
         self.change(lambda status: replace(status, stop=replace(status.stop, **known)))
 
     def stop_seen(self) -> None:
-        """Note when the drive first answered a stop; a later stop leaves that time as it is."""
+        """Record when the drive first reacted to a stop. A later stop does not change that time."""
         at = now()
         self.change(lambda status: replace(status, stop=replace(status.stop, seen=status.stop.seen or at)))
 
     def close(self) -> None:
-        """Wait until all of it is written, or can't be."""
+        """Wait up to 10 s until the status is written, or writing has failed. Release the reserved disk space."""
         self._end = True
         self._wake.set()
         self._thread.join(10.0)
@@ -100,7 +100,7 @@ class Board:
             status = self._status
             try:
                 self._store.save(status)
-            except OSError as error:           # a full disk: the log ends the run, not this
+            except OSError as error:           # a full disk: the log ends the run, not the status
                 tell(f"the run's status can't be written: {error}")
                 if self._end:
                     return
@@ -117,17 +117,17 @@ def tell(text: str) -> None:
 
 
 class Watcher:
-    """Follows the run. The control loop calls `cycle`, which sets two flags and writes waiting remarks to the log."""
+    """Display of the run. The control loop calls `cycle`, which sets flags and writes waiting remarks to the log."""
 
     def __init__(self, board: Board, stop: StopRequest | None = None) -> None:
         self._board, self._stop = board, stop
-        self._looking = False          # waiting for the drive's answer to a stop
-        self.viewed = False            # whether J is wanted during the run
+        self._looking = False          # waiting for the drive's reaction to a stop
+        self.viewed = False            # whether J is estimated during the run
         self._remarks: deque[str] = deque()
         self.log: RunLog | None = None
 
     def asked_to_stop(self, who: str) -> None:
-        """Note a requested stop, and later the first sample of the braking drive."""
+        """Record a requested stop. `cycle` later records the first sample of the braking drive."""
         self._looking = True
         at = now()
 
@@ -179,11 +179,11 @@ class Watcher:
 
     @property
     def follows_inertia(self) -> bool:
-        """Return whether J is wanted during the run: always in real time, in stepped time if a page shows the run."""
+        """Whether J is estimated during the run: always in real time, in stepped time if a page shows the run."""
         return self.viewed
 
     def inertia(self, found: LiveInertia) -> None:
-        """J is in the log, which the pages read."""
+        """Do nothing: J is in the log, and the pages read the log."""
 
     def planned(self, plan: Any) -> None:
         expected_s = float(plan.duration_s) + 5.0
@@ -223,7 +223,7 @@ class Confirming:
         return self._until_s - self._clock()
 
     def look(self) -> bool:
-        """Return whether it is confirmed. Raises PreflightRefused once it can't be any more."""
+        """Return whether the run is confirmed. Raises PreflightRefused if the code is void or has expired."""
         with self._lock:
             if self.confirmed_by is not None:
                 return True
@@ -238,7 +238,7 @@ class Confirming:
             return False
 
     def take(self, code: str, binding: str | None, who: str, lease_key: str = "") -> None:
-        """Check a code. Raises PreflightRefused for a wrong one; after `TRIES` wrong codes it is void."""
+        """Check an entered code. Raises PreflightRefused for a wrong one. `TRIES` wrong codes make the code void."""
         self.look()
         with self._lock:
             if self.confirmed_by is not None:
@@ -250,7 +250,7 @@ class Confirming:
                                        entry=MessageCode.CODE_REFUSED)
             try:
                 self._still_so()
-            except TdhilError as error:                # changed, or no longer readable
+            except TdhilError as error:                # the rig's file has changed or can't be read
                 self.void = PreflightRefused(error.what, where=error.where, next_step=error.next_step,
                                              entry=MessageCode.CHANGED_MEANWHILE)
                 raise self.void from error
@@ -279,10 +279,10 @@ def _same(one: str, other: str) -> bool:
 
 
 class Lease:
-    """Keeps a watched run going while the page that confirmed it reports every second that it is visible.
+    """Lets a watched run continue while the page that confirmed it reports every second that it is visible.
 
-    It uses its own clock and thread: neither control time nor the web affects it. ``change`` receives each change,
-    ``lost`` is called once, at the end; ``needed`` returns whether a shaft may still move.
+    It uses its own clock and thread: neither control time nor the web affects it. ``change`` receives each change.
+    ``lost`` is called once, when the lease is lost. ``needed`` returns whether a shaft may still move.
     """
 
     def __init__(
@@ -297,11 +297,11 @@ class Lease:
         change(self.watch)
 
     def start(self) -> None:
-        """Check the clock from now on, until `end`."""
+        """Start the check of the page's silence, until `end`."""
         threading.Thread(target=self._hold, name="lease", daemon=True).start()
 
     def end(self) -> None:
-        """End the lease: nothing moves any more."""
+        """End the lease, when nothing moves any more."""
         self._end.set()
 
     def renew(self, key: str, who: str, *, new_key: str = "", gone: str = "") -> Watch:
@@ -319,7 +319,7 @@ class Lease:
                 raise PreflightRefused("another page watches this run", where="lease",
                                        next_step="Stop works from every page", entry=MessageCode.CODE_REFUSED)
             if gone:
-                if self.watch.how != "closed":         # closing hides it too, and either may come first
+                if self.watch.how != "closed":         # a closed page is hidden, too; either message may arrive first
                     self._know(gone=self.watch.gone or now(), how=gone)
                 return self.watch
             self._heard_s = self._clock()
@@ -354,15 +354,15 @@ class Lease:
 
 
 class ServiceOperator:
-    """The operator who enters the code shown at the rig. A simulated drive needs no code, unless its rig is watched:
-    then everything is as for a real drive.
+    """Interface to the operator, who enters the code shown at the rig. A simulated drive needs no code.
+    A watched rig is treated as a real drive, also if it is simulated.
     """
 
     def __init__(
         self, board: Board, watcher: Watcher, folder: Path, bind: Callable[[Preflight], Confirming], *,
         watched: bool = False, unwatched: Callable[[Watch], None] = lambda watch: None,
     ) -> None:
-        """``unwatched`` makes the run brake."""
+        """Make the interface. ``unwatched``: called when the lease is lost; it brakes the run."""
         self._board, self._watcher, self._folder, self._bind = board, watcher, folder, bind
         self._watched, self._unwatched = watched, unwatched
         self.confirming: Confirming | None = None
@@ -389,7 +389,7 @@ class ServiceOperator:
         self.confirming = confirming
         self._board.to(State.AWAITING, confirmation=Confirmation(confirming.binding, text, expires))
         while not confirming.look():
-            idle()                     # meanwhile the drive's watchdog is fed, and a stop is detected
+            idle()                     # meanwhile the drive's watchdog is served, and a stop is detected
         if self._watched:
             self.lease = Lease(
                 confirming.lease_key, confirming.confirmed_by or "", change=self._note_watch, lost=self._unwatched,

@@ -1,8 +1,8 @@
-"""The audit: who requested, confirmed, stopped and downloaded what, and when. A chain of lines, sealed with a key.
+"""The audit: requests, confirmations, stops and downloads, with user and time. A chain of lines, sealed with a key.
 
 ::
 
-    audit/<year>-<month>.jsonl     a line each, with the hash of the line before and its own
+    audit/<year>-<month>.jsonl     one line per entry, with the hash of the line before and its own hash
     audit/head.json                number and hash of the last line, sealed
     audit.key                      the key, and the anchor: number and hash of the last line; mode 0600
 
@@ -43,7 +43,7 @@ _HEAD: Final = re.compile(r"([0-9]{1,12}):([0-9a-f]{64})")
 
 @dataclass(frozen=True)
 class Entry:
-    """One line. ``details`` is plain data."""
+    """One line of the audit. ``details``: data that JSON can express."""
 
     number: int
     at: str
@@ -58,7 +58,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Broken:
-    """The place where the chain is broken: the file, its line (from 1), and why."""
+    """Place where the chain is broken: the file, its line (from 1), and the reason."""
 
     file: str
     line: int
@@ -77,7 +77,7 @@ class ChainHead:
 
     @staticmethod
     def of(text: str) -> ChainHead:
-        """Read ``NUMBER:HASH``, as it is exported. Raises UsageError."""
+        """Parse an exported head, ``NUMBER:HASH``. Raises UsageError."""
         found = _HEAD.fullmatch(text.strip())
         if found is None:
             raise UsageError("is not a head of an audit", where=f"head {text[:80]!r}",
@@ -87,7 +87,7 @@ class ChainHead:
 
 @dataclass(frozen=True)
 class _Seal:
-    """The key and the anchor. ``plain``: number of lines older than the key, which have a hash without it."""
+    """The key and the anchor. ``plain``: number of lines older than the key; their hashes are made without it."""
 
     key: bytes
     made: str
@@ -126,7 +126,7 @@ class Audit:
     def note(
         self, who: str, what: str, *, run: str | None = None, rig: str | None = None, **details: Any
     ) -> None:
-        """Add a line, on the disk when this returns. Raises OSError."""
+        """Add a line. It is on the disk when this returns. Raises OSError."""
         with self._lock:
             self._add(self._sealed(), who, what, run, rig, details)
 
@@ -138,7 +138,7 @@ class Audit:
         return found if found is not None and found.number > 0 else None
 
     def made(self) -> str | None:
-        """Return when the key was made; None without one. If it is later than the first line, the key was replaced."""
+        """Return when the key was made; None without a key. A time after the first line means: the key was replaced."""
         seal = self._seal or self._read()
         return None if seal is None else seal.made
 

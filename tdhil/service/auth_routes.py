@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 
 def routes(site: Site) -> list[Route]:
-    """Return the routes."""
+    """Return the routes of logins, users and tokens."""
     return [
         api(site, "me", me),
         api(site, "login", login),
@@ -66,7 +66,7 @@ async def login(site: Site, request: Request, body: Any) -> Response:
 
 
 async def _slowly(site: Site, request: Request, name: str, password: str) -> tuple[str, Principal]:
-    """Check a password. Raises NotLoggedIn and TooManyTries."""
+    """Check a password in a thread, since this is slow. Raises NotLoggedIn and TooManyTries."""
     address = address_of(request)
     if site.logins.statistics().tasks_waiting >= 10:
         raise TooManyTries(10.0)

@@ -21,9 +21,9 @@ _ENDED: Final = frozenset({"done", "refused", "stopped", "failed", "stop_not_con
 
 
 class ServiceError(TdhilError):
-    """A refusal by the service: ``kind`` and ``exit_code`` from its error tree, HTTP ``status``.
+    """Refusal by the service: ``kind`` and ``exit_code`` from its error tree, HTTP ``status``.
 
-    ``holder``: the run that holds the rig, if that is the reason.
+    ``holder``: the run that holds the rig, if this is the reason of the refusal.
     """
 
     def __init__(self, status: int, body: Mapping[str, Any]) -> None:
@@ -38,14 +38,14 @@ class ServiceError(TdhilError):
 
 
 class _NowhereElse(urllib.request.HTTPRedirectHandler):
-    """Follow no redirect: the token goes to no other server."""
+    """HTTP handler that follows no redirect, so that the token goes to no other server."""
 
     def redirect_request(self, *_: Any) -> None:
         return None
 
 
 class Client:
-    """One service. Replies are the documents of its API (``/api/v1/openapi.json`` describes them).
+    """Client of one service. Replies are the documents of its API (``/api/v1/openapi.json`` describes them).
 
     ``token``: of `tdhil serve tokens add`; it is sent over TLS only. ``ca``: certificates to trust (a PEM file; None:
     those of the system). Raises ServiceError for a refusal, CommunicationLost if the service can't be reached, and
@@ -73,7 +73,7 @@ class Client:
         self._opener = urllib.request.build_opener(*handlers)
 
     def me(self) -> dict[str, Any]:
-        """Return this client as the service identifies it: ``name`` and ``roles``."""
+        """Return this client's ``name`` and ``roles`` in the service."""
         return self._object("GET", "/me")
 
     def rigs(self) -> list[dict[str, Any]]:
@@ -96,7 +96,7 @@ class Client:
         return found
 
     def plan(self, rig: str, **options: Any) -> dict[str, Any]:
-        """Return the plan of a run with these options, and its expected result. Nothing is connected."""
+        """Return the plan of a run with these options, and its expected result. No drive is connected."""
         return self._object("POST", f"/rigs/{quote(rig, safe='')}/plan", options)
 
     def start(self, rig: str, *, key: str | None = None, **options: Any) -> dict[str, Any]:
@@ -114,7 +114,7 @@ class Client:
         return self._object("GET", f"/runs/{quote(run, safe='')}")
 
     def confirm(self, run: str, code: str, binding: str | None = None) -> dict[str, Any]:
-        """Confirm motion with the six digits that are shown at the rig."""
+        """Confirm motion with the six-digit code that is shown at the rig."""
         return self._object("POST", f"/runs/{quote(run, safe='')}/confirm", {"code": code, "binding": binding})
 
     def stop(self, run: str) -> dict[str, Any]:
@@ -122,11 +122,11 @@ class Client:
         return self._object("POST", f"/runs/{quote(run, safe='')}/stop", {})
 
     def stop_rig(self, rig: str) -> dict[str, Any]:
-        """Stop the rig's present run. Without a run, ``tdhil stop`` acts on its drive."""
+        """Stop the rig's present run. Without a run, stop the rig's drive, as ``tdhil stop`` does."""
         return self._object("POST", f"/rigs/{quote(rig, safe='')}/stop", {})
 
     def replay(self, run: str, **asked: Any) -> dict[str, Any]:
-        """Identify again with another ``model``, ``tolerance`` or ``confidence``; return when it is done."""
+        """Identify a run again with another ``model``, ``tolerance`` or ``confidence``. Return when it is done."""
         found = self._object("POST", f"/runs/{quote(run, safe='')}/replays", asked)
         while found["state"] == "waiting":
             time.sleep(0.2)
@@ -134,7 +134,7 @@ class Client:
         return found
 
     def fleet(self, folder: str = "", *, below: str = "", **settings: Any) -> dict[str, Any]:
-        """Identify many logs again, the service's own runs or a folder of ``--logs``; return when it has ended.
+        """Identify many logs again: the service's own runs, or a folder of ``--logs``. Return when the work has ended.
 
         ``settings``: ``model``, ``tolerance``, ``confidence``. The same request again continues with the rest.
         """
@@ -177,7 +177,7 @@ class Client:
         return target
 
     def audit(self, limit: int = 200, *, head: str | None = None) -> dict[str, Any]:
-        """Return the latest lines, and whether the chain is intact. ``head``: an exported head to check against."""
+        """Return the latest audit lines, and whether the chain is intact. ``head``: an exported head to check."""
         asked = {"limit": limit} if head is None else {"limit": limit, "head": head}
         return self._object("GET", f"/audit?{urlencode(asked)}")
 

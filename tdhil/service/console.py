@@ -1,6 +1,6 @@
-"""The rig's own console: shows the code of a waiting run to the operator at the rig.
+"""Console at the rig: shows the code of a waiting run to the operator at the rig.
 
-The code comes over the run's socket, which belongs to one user of this computer. HTTP never delivers it.
+The code is read from the run's socket, which belongs to one user of this computer. HTTP never delivers it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ NEWEST: Final = 50
 
 
 class Console:
-    """Shows each code once. ``say`` takes a text."""
+    """Console that shows each code once. ``say`` prints a text."""
 
     def __init__(self, store: Store, say: Callable[[str], None]) -> None:
         self._store, self._say = store, say
@@ -52,7 +52,7 @@ class Console:
     def look(self) -> None:
         """Show the codes of waiting runs, and report the outcome of earlier ones."""
         for run in islice(self._store.ids(), NEWEST):
-            with suppress(Exception):          # being created, or deleted
+            with suppress(Exception):          # the run is being created or deleted
                 self._look_at(run)
 
     def _look_at(self, run: str) -> None:

@@ -1,10 +1,10 @@
-"""The door of the service: accept connections, limit them, and always let one more in.
+"""Admission of connections: accept them, limit their number, and always accept one more.
 
-An idle connection costs one descriptor and a few hundred bytes here. It reaches the HTTP server with its first complete
-header (plain HTTP), or with its first byte (TLS). So thousands of idle connections do not block a Stop:
+An idle connection needs one descriptor and a few hundred bytes here. It is passed to the HTTP server with its first
+complete header (plain HTTP), or with its first byte (TLS). So thousands of idle connections do not block a Stop:
 
-* There is a limit for connections that wait, and one for connections that are served; of one address and of all.
-* If a limit is reached, the oldest idle connection is closed, and the new one is let in.
+* Waiting connections and served connections have a limit each, for one address and for all addresses.
+* If a limit is reached, the oldest idle connection is closed, and the new one is accepted.
 * A header, or the rest of a request, takes at most `HEADERS_S`.
 * Half of the process's descriptors stay free of connections: a Stop needs some for sockets and files of its own.
 """
@@ -25,28 +25,28 @@ if TYPE_CHECKING:
     import ssl
 
 HEADERS_S: Final = 10.0
-"""Longest time for a header, for a TLS handshake, and for the rest of a request. A slow radio link takes 1 s."""
+"""Longest time for a header, a TLS handshake, and the rest of a request, s. A slow radio link takes 1 s."""
 LOOK_S: Final = 0.5
 """Interval between two checks for connections that have taken too long, s."""
 AT_ONCE: Final = 64
-"""Connections accepted in one turn of the event loop: some 5 ms of work, then others get theirs."""
+"""Connections accepted in one turn of the event loop: about 5 ms of work. Then other work continues."""
 BACKLOG: Final = 4096
-"""Connections that the kernel keeps until they are accepted. With fewer, a burst makes a Stop wait 1 s for TCP."""
+"""Connections that the kernel queues for acceptance. With fewer, a burst makes a Stop wait 1 s for TCP."""
 HEADER_LIMIT: Final = 32 * 1024
-"""Bytes of a header, as of the HTTP server behind."""
+"""Largest header, bytes; the HTTP server has the same limit."""
 MOST_DESCRIPTORS: Final = 65_536
-"""Most descriptors to use, even if the system grants more."""
+"""Largest number of descriptors to use, even if the system grants more."""
 MOST: Final = 4096
-"""Connections of each kind, however many descriptors there are."""
+"""Largest number of connections of each kind, for any number of descriptors."""
 PAUSE_S: Final = 0.05
-"""Pause after the system had no descriptor and nothing could be closed."""
+"""Pause if the system has no descriptor and no connection can be closed, s."""
 NO_DESCRIPTOR: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Room:
-    """How many connections may wait, and how many may be served: in total, and of one address."""
+    """Limits of waiting and of served connections, in total and for one address."""
 
     waiting: int
     waiting_of_one: int
@@ -55,13 +55,13 @@ class Room:
 
     @staticmethod
     def of(descriptors: int) -> Room:
-        """Take half of the descriptors, half of that for each kind, and a quarter of a kind for one address."""
+        """Use half of the descriptors: half of them for each kind, and a quarter of a kind for one address."""
         each = max(4, min(MOST, descriptors // 4))
         return Room(each, max(2, each // 4), each, max(2, each // 4))
 
 
 def raise_limit() -> int:
-    """Raise the limit of open files as far as the system grants it. Return the limit that holds."""
+    """Raise the limit of open files as far as the system grants it. Return the limit now in force."""
     import resource
 
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -74,7 +74,7 @@ def raise_limit() -> int:
 
 
 class Seldom:
-    """Prints a line at most once a second. The next line gives the number of lines left out."""
+    """Printer of at most one line a second. The next line states the number of omitted lines."""
 
     EVERY_S: Final = 1.0
 
@@ -84,7 +84,7 @@ class Seldom:
         self._left_out = 0
 
     def __call__(self, text: str, *values: object) -> None:
-        """Say it with the values in their places, or count it."""
+        """Print the line with its values, or count it as omitted."""
         now_s = self._clock()
         if now_s < self._next_s:
             self._left_out += 1
@@ -104,12 +104,12 @@ class _Waiting:
     header: bytes = b""
 
     def __post_init__(self) -> None:
-        self.number = self.peer.fileno()       # given a socket, a selector makes a text of it each time
+        self.number = self.peer.fileno()       # a selector formats a socket as text at each call
 
 
 @dataclass(eq=False)
 class _Served:
-    """A connection that the HTTP server has. ``idle_s``: since when no request of it is answered."""
+    """A connection at the HTTP server. ``idle_s``: time since which it has no request; None during a request."""
 
     peer: socket.socket
     address: str
@@ -120,7 +120,7 @@ class _Served:
 
     @property
     def gone(self) -> bool:
-        """Return whether its descriptor is free again."""
+        """Whether the connection is closed and its descriptor is free again."""
         return self.peer.fileno() == -1
 
     @property
@@ -137,7 +137,7 @@ class _Served:
         return 1 if self.protocol.scope["method"] in ("GET", "HEAD") else 2
 
     def close(self) -> None:
-        """Close it at once. Data in transit are lost."""
+        """Close the connection at once. Data in transit are lost."""
         if self.transport is not None:
             self.transport.abort()
         elif self.task is not None:
@@ -145,7 +145,7 @@ class _Served:
 
 
 class Door:
-    """Accepts on one listening socket, in the event loop's thread."""
+    """Admission of connections at one listening socket, in the event loop's thread."""
 
     def __init__(
         self, listening: socket.socket, room: Room, say: Say, *, tls: ssl.SSLContext | None = None,
@@ -168,11 +168,11 @@ class Door:
 
     @property
     def served(self) -> int:
-        """Number of connections that the HTTP server has."""
+        """Number of connections at the HTTP server."""
         return sum(not one.gone for one in self._served)
 
     def open(self, protocol: Callable[[], Any]) -> None:
-        """Accept from now on. ``protocol``: makes the HTTP server's end of a connection. Called in the event loop."""
+        """Start to accept. ``protocol`` makes the HTTP server's end of a connection. Call it in the event loop."""
         self._protocol, self._loop = protocol, asyncio.get_running_loop()
         self._listening.setblocking(False)
         self._listening.listen(BACKLOG)
@@ -182,7 +182,7 @@ class Door:
         self._look_again = self._loop.call_later(LOOK_S, self._look)
 
     def close(self) -> None:
-        """Accept no more, and drop waiting connections. The HTTP server keeps those that are served."""
+        """Accept no more connections, and close the waiting ones. The HTTP server keeps the served ones."""
         if not self._open:
             return
         self._open = False
@@ -255,7 +255,7 @@ class Door:
             self._hear(key.data)
 
     def _hear(self, one: _Waiting) -> None:
-        """Read a part of the header. With TLS the first byte is enough, and stays unread."""
+        """Read a part of the header. With TLS the first byte is enough; it is left in the socket."""
         if self._tls is None:
             try:
                 piece = one.peer.recv(HEADER_LIMIT)
@@ -308,14 +308,14 @@ class Door:
             self._served_of.pop(one.address, None)
 
     def _close_one(self, among: dict[_Served, None]) -> bool:
-        """Close the oldest of the lowest rank, unless one is closed already. Return whether an open one was closed."""
+        """Close the oldest connection of the lowest rank, unless one is gone. Return whether an open one was closed."""
         if gone := [one for one in among if one.gone]:
             for one in gone:
                 self._remove(one)
             return False
         if not among:
             return False
-        first = min(among, key=lambda one: one.rank)   # the oldest of them: a dict keeps its order, and min the first
+        first = min(among, key=lambda one: one.rank)   # the oldest: a dict keeps its order, min returns the first
         first.close()
         self._remove(first)
         return True

@@ -18,7 +18,7 @@ from tdhil.service.store import read_json
 
 
 def stop(path: Path, identity: tuple[int, ...]) -> dict[str, Any]:
-    """Stop the drive first. Then read its identity. Raises nothing: a failure is in ``error``."""
+    """Stop the drive first, then read its identity. Raises nothing: a failure is in the key ``error``."""
     from tdhil.session import connection_of_kept
 
     clock = MonotonicClock()
@@ -41,7 +41,7 @@ def stop(path: Path, identity: tuple[int, ...]) -> dict[str, Any]:
 
 
 def main(arguments: list[str]) -> int:
-    """Stop the drive of the arguments. Return the exit code."""
+    """Stop the drive that the arguments name. Return the exit code."""
     identity = tuple(int(one) for one in arguments[1].split(",")) if len(arguments) > 1 else ()
     found = stop(Path(arguments[0]), identity)
     print(json.dumps(found, ensure_ascii=False))  # noqa: T201

@@ -1,4 +1,4 @@
-"""The routes of a run's files: log, report, result, samples, pictures. A download stands in the audit."""
+"""The routes of a run's files: log, report, result, samples, pictures. The audit records each download."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 REPORT_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox allow-downloads"
 PICTURE_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; sandbox"
-"""Content security policies: a report and a picture carry their own style, and run no script."""
+"""Content security policies of a report and of a picture: both contain their own style, and run no script."""
 
 
 def routes(site: Site) -> list[Route]:
-    """Return the routes."""
+    """Return the routes of a run's files."""
     return [
         api(site, "log", log),
         api(site, "report", report),
@@ -41,19 +41,19 @@ def routes(site: Site) -> list[Route]:
 
 
 async def log(site: Site, request: Request, body: None) -> Response:
-    """Return the log, also while it grows."""
+    """Return the log, also during the run."""
     return await _file(site, request, "run.mcap", "application/octet-stream")
 
 
 async def report(site: Site, request: Request, body: None) -> Response:
-    """Return the report, to be shown."""
+    """Return the report, for display in the browser."""
     response = await _file(site, request, "report.html", "text/html", shown=True)
     response.headers["content-security-policy"] = REPORT_POLICY
     return response
 
 
 async def report_pdf(site: Site, request: Request, body: None) -> Response:
-    """Return the report on A4, made at the first request."""
+    """Return the report as PDF on A4 pages. It is made at the first request."""
     run = request.path_params["run"]
     folder = await off(lambda: site.store.place(run))
     if not (folder / "report.pdf").exists() and (folder / "result.json").exists():
@@ -67,7 +67,7 @@ async def result(site: Site, request: Request, body: None) -> Response:
 
 
 async def samples(site: Site, request: Request, body: None) -> Response:
-    """Return the samples as CSV, made at the first request."""
+    """Return the samples as CSV. The file is made at the first request."""
     run = request.path_params["run"]
     folder = await off(lambda: site.store.place(run))
     if not (folder / "samples.csv").exists() and (folder / "run.mcap").exists():
@@ -105,7 +105,7 @@ async def _shown(site: Site, run: str) -> tuple[ShownPicture, ...]:
 
 
 async def _file(site: Site, request: Request, name: str, media: str, *, shown: bool = False) -> Response:
-    """Return a file of the run, as a download (or ``shown``). Raises NotThere."""
+    """Return a file of the run as a download; with ``shown``, for display. Raises NotThere."""
     run, who = request.path_params["run"], principal(request).name
     path = (await off(lambda: site.store.place(run))) / name
     if not path.is_file():
@@ -122,7 +122,7 @@ async def _file(site: Site, request: Request, name: str, media: str, *, shown: b
 
 
 def _as_it_is(path: Path) -> Iterator[bytes]:
-    """Yield a growing file up to its present end."""
+    """Yield the content of a growing file up to its present end."""
     left = path.stat().st_size
     with path.open("rb") as file:
         while left > 0 and (piece := file.read(min(left, 2**16))):

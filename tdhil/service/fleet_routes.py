@@ -1,4 +1,4 @@
-"""The routes of fleets: many logs identified again."""
+"""The routes of fleet requests: many logs identified again."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def routes(site: Site) -> list[Route]:
-    """Return the routes. ``fleet_folders`` comes before ``fleet``, whose path it matches too."""
+    """Return the routes. ``fleet_folders`` comes before ``fleet``, since the path of ``fleet`` matches it, too."""
     return [
         api(site, "fleets", fleets),
         api(site, "fleet_folders", fleet_folders),

@@ -1,9 +1,9 @@
-"""Many logs identified again from a page: one process at a time, at the lowest priority, held while a shaft turns.
+"""Identification of many logs again, requested on a page. One process at a time, at the lowest priority.
 
 ``python -m tdhil.service.fleets FOLDER`` is that process: `tdhil.fleet` with the request.json in the folder. It writes
-its progress to stdout, one line of JSON each. A line on its stdin allows it to continue or holds it. The end of stdin
-ends it, so that no computation stays behind if the web fails. Finished work is kept: the same request again does the
-rest.
+its progress to stdout as lines of JSON. A line on its stdin lets it continue, or holds it while a shaft turns. The end
+of stdin ends it, so that no computation remains if the web fails. Finished rows are kept: the same request again
+computes the rest.
 
 ::
 
@@ -43,7 +43,7 @@ LOOK_S: Final = 0.3
 
 @dataclass(frozen=True)
 class FleetView:
-    """The state of a fleet request. ``held``: it waits until no shaft turns; ``left_s``: an estimate.
+    """State of a fleet request. ``held``: it waits until no shaft turns; ``left_s``: estimated remaining time, s.
 
     ``summary`` is the document of `tdhil fleet --json`.
     """
@@ -78,7 +78,7 @@ class _Going:
 
 
 class Fleets:
-    """All fleet requests, for any thread. ``folders``: permitted folders of logs, by their names in a request."""
+    """All fleet requests, for use by any thread. ``folders``: permitted folders of logs, by name in a request."""
 
     def __init__(self, store: Store, folders: Mapping[str, Path], turning: Callable[[], bool]) -> None:
         self.folders = {RUNS: store.folder, **folders}
@@ -103,7 +103,7 @@ class Fleets:
         return found
 
     def ask(self, folder: str, below: str, settings: Mapping[str, Any], who: str) -> FleetView:
-        """Start, or continue an earlier request. Raises UsageError, and Conflict while another one runs."""
+        """Start a request, or continue an earlier one. Raises UsageError, and Conflict while another request runs."""
         self._check(folder, below)
         plain = {"folder": folder, "below": below, "settings": dict(settings)}
         fleet = hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:12]
@@ -130,7 +130,7 @@ class Fleets:
         return view
 
     def stop(self, fleet: str) -> FleetView:
-        """End it soon; finished rows are kept. Raises NotThere."""
+        """Request the end of a fleet request. Finished rows are kept. Raises NotThere."""
         view = self.get(fleet)
         going = self._going
         if going is not None and going.view.id == fleet:
@@ -138,7 +138,7 @@ class Fleets:
         return view
 
     def rows(self, fleet: str, start: int, limit: int) -> list[dict[str, Any]]:
-        """Return rows of the table (`tdhil.fleet.FleetRow`); while it runs, only those since its start.
+        """Return rows of the table (`tdhil.fleet.FleetRow`). During the computation: only the rows since its start.
 
         Raises NotThere and UsageError.
         """
@@ -213,7 +213,7 @@ class Fleets:
             return None
 
     def _gate(self, going: _Going) -> None:
-        """Allow or hold the process. It finishes work in progress: about a second per process, at nice 19."""
+        """Hold the process while a shaft turns. It still finishes its present logs: about 1 s each, at nice 19."""
         told = None
         assert going.process.stdin is not None
         while True:
@@ -265,11 +265,11 @@ class Fleets:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# In the process
+# Code of the separate process
 
 
 class _Teller:
-    """Writes progress to stdout, and waits while it is held."""
+    """Writer of the progress to stdout. It waits while the process is held."""
 
     def __init__(self) -> None:
         self._out = os.fdopen(os.dup(1), "w")
@@ -278,7 +278,7 @@ class _Teller:
         threading.Thread(target=self._hear, daemon=True).start()
 
     def say(self, **plain: Any) -> None:
-        with suppress(BrokenPipeError):    # the web has ended: stdin has too, which ends this process
+        with suppress(BrokenPipeError):    # the web has ended; the end of stdin ends this process
             self._out.write(json.dumps(plain) + "\n")
             self._out.flush()
 

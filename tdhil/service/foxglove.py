@@ -1,9 +1,9 @@
 """The Foxglove WebSocket protocol, read only: the log of a rig's run as it grows, for Foxglove and Lichtblick.
 
-A viewer receives the log's own bytes under the log's own schemas. Each channel starts at the beginning of the run,
-whenever it is subscribed to. Every viewer reads the file at its own pace, so no viewer delays another and none needs a
-queue. A viewer that is late by more than `LATE_S` gets no more messages of every cycle until it has caught up, and a
-status with the number left out. Source: github.com/foxglove/ws-protocol, docs/spec.md.
+A viewer receives the log's own bytes under the log's own schemas. Each channel starts at the beginning of the run, also
+after a late subscription. Each viewer reads the file at its own pace: no viewer delays another or needs a queue. If a
+viewer is late by more than `LATE_S`, the messages of every cycle are left out until it has caught up. A status states
+their number. Source: github.com/foxglove/ws-protocol, docs/spec.md.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from tdhil.recording import (
 )
 
 PROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""The sub-protocols. The part used here is the same in both."""
+"""Accepted WebSocket sub-protocols. The part used here is the same in both."""
 EVERY_S: Final = 0.1
 LOOK_S: Final = 1.0
-"""Interval of the check whether a silent run is still the rig's run, s."""
+"""Interval of the check whether a run without new data is still the rig's run, s."""
 LATE_S: Final = 10.0
 FIRST_S: Final = 60.0
-"""Time allowed for the part of the log from before the subscription, s."""
+"""Time allowed to send the part of the log before the subscription, s."""
 _EACH_CYCLE: Final = frozenset({SAMPLE, COMMAND, VIRTUAL_STRING}) | RAW_FRAMES
 _DATA: Final = Struct("<BIQ")              # opcode 1, subscription, log time in ns; then the message
 _INFO, _WARNING, _ERROR = 0, 1, 2
@@ -60,16 +60,16 @@ class _ChannelReader:
     """Reader of channels that were subscribed together. It joins the other readers once it has caught up."""
 
     tail: LogTail
-    wanted: dict[int, int]                 # channel: subscription
-    until_s: float                         # monotonic; a reader that is late after this is too slow
+    wanted: dict[int, int]                 # subscription by channel number
+    until_s: float                         # monotonic clock; a reader that is late after this time is too slow
     left_out: int = 0
 
 
 @dataclass
 class Relay:
-    """The messages to one viewer of one rig. ``current``: the rig's run, looked up in a thread.
+    """Connection to one viewer of one rig. ``current`` returns the rig's run; it is called in a thread.
 
-    ``simulated``: whether the rig is simulated, until a run states it.
+    ``simulated``: whether the rig is simulated; used until a run states it.
     """
 
     rig: str
@@ -83,7 +83,7 @@ class Relay:
     _readers: list[_ChannelReader] = field(default_factory=list)
 
     async def hear(self, said: str | bytes) -> None:
-        """Handle a message of the viewer: subscribe or unsubscribe. Everything else is refused with a text."""
+        """Handle a message of the viewer: subscribe or unsubscribe. Any other message is refused with a text."""
         try:
             asked: Any = json.loads(said) if isinstance(said, str) else {"op": "a binary message"}
             if asked["op"] == "subscribe":
@@ -97,7 +97,7 @@ class Relay:
             await self._status(_ERROR, "this is not a message of the protocol")
 
     async def run(self) -> None:
-        """Send, until it is cancelled."""
+        """Send messages until the task is cancelled."""
         running = await anyio.to_thread.run_sync(self.current)
         await self._introduce(running)
         while True:
@@ -108,7 +108,7 @@ class Relay:
             await self._say({"op": "removeStatus", "statusIds": [_WAITS]})
             await self._introduce(running)
 
-    # -- what the viewer wants ---------------------------------------------------------------------------------------
+    # -- requests of the viewer --------------------------------------------------------------------------------------
 
     async def _subscribe(self, subscription: int, channel: int) -> None:
         if channel not in CHANNELS or not 0 <= subscription < 2**32:
@@ -126,10 +126,10 @@ class Relay:
             for reader in self._readers:
                 reader.wanted.pop(channel, None)
 
-    # -- messages to it ---------------------------------------------------------------------------------------------
+    # -- messages to the viewer --------------------------------------------------------------------------------------
 
     async def _introduce(self, running: Running | None) -> None:
-        """Send name and channels. Each run is a new session, so that a viewer starts again with it."""
+        """Send name and channels. Each run is a new session, so that a viewer starts anew with each run."""
         simulated = " SIMULATED" if (self.simulated if running is None else running.simulated) else ""
         run = None if running is None else running.run
         metadata = {"rig": self.rig, "run": run or "", "simulated": str(bool(simulated)).lower()}
@@ -147,7 +147,7 @@ class Relay:
             await anyio.sleep(5.0 * EVERY_S)
 
     async def _follow(self, running: Running) -> None:
-        """Send the run's log until it is closed, or until the rig has another run and nothing is left to read."""
+        """Send the run's log until it is closed, or until the rig has another run and all data are sent."""
         self._readers, self._new = [], set(self._wanted)
         looked_s, gone = self.clock(), False
         while True:
@@ -168,7 +168,7 @@ class Relay:
                 await anyio.sleep(EVERY_S)
 
     async def _forward(self, reader: _ChannelReader) -> bool:
-        """Send new messages of its channels. Return whether more can be read at once."""
+        """Send new messages of the reader's channels. Return whether more can be read at once."""
         looked_s = self.clock()
         came: LogChunks = await anyio.to_thread.run_sync(reader.tail.read_chunks)
         for chunk in came.chunks:

@@ -1,4 +1,4 @@
-"""The live data of a run for pages: its log, read as it grows, and its status. Nothing here reaches the run.
+"""Live data of a run for pages: its log, read as it grows, and its status. The run itself is not affected.
 
 There is one feed per run, for any number of viewers. A viewer that is too slow is disconnected, and connects again.
 """
@@ -33,7 +33,7 @@ Viewer = asyncio.Queue[dict[str, Any] | None]
 
 
 class LivePicture:
-    """The run so far, thinned for drawing. Pure."""
+    """Data of the run so far, thinned for display. A pure data structure."""
 
     def __init__(self) -> None:
         self.samples = np.empty((0, 3))
@@ -45,7 +45,7 @@ class LivePicture:
         self.stepped = False
         self.epoch_ns = 0
         self.last_s: float | None = None
-        self.arrived_s: float | None = None      # monotonic
+        self.arrived_s: float | None = None      # monotonic clock, s
         self._spacing_s = SPACING_S
         self._next_s = -math.inf
 
@@ -78,12 +78,12 @@ class LivePicture:
         return shown
 
     def whole(self) -> dict[str, Any]:
-        """Return everything so far, for a new viewer."""
+        """Return all data so far, for a new viewer."""
         return {"samples": columns(self.samples), "events": self.events, "stages": self.stages,
                 "inertias": self.inertias, "limits": self.limits}
 
     def age_s(self, wall_s: float, mono_s: float) -> float | None:
-        """Return the age of the latest sample, s; in stepped time, which runs ahead of the clock, since its arrival."""
+        """Return the age of the latest sample, s; in stepped time, which runs ahead, the time since its arrival."""
         if self.last_s is None or self.arrived_s is None:
             return None
         if self.stepped or not self.epoch_ns:
@@ -107,12 +107,12 @@ def columns(samples: np.ndarray[Any, Any]) -> list[list[float | None]]:
 
 
 class Feed:
-    """The feed of one run. `watch` returns a queue that starts with everything so far; None in it: connect again."""
+    """Feed of one run. `watch` returns a queue that starts with all data so far. None in it means: connect again."""
 
     def __init__(
         self, path: Path, status: Callable[[], Status], tell_viewed: Callable[[], None] = lambda: None
     ) -> None:
-        """``tell_viewed`` tells the run once that a page shows it. It raises TdhilError if the run is not there."""
+        """Make a feed. ``tell_viewed`` reports to the run, once, that a page shows it. It may raise TdhilError."""
         self._tail = LogTail(path)
         self._tell_viewed, self._viewed = tell_viewed, False
         self._read_status = status
@@ -151,7 +151,7 @@ class Feed:
     def _look(self) -> tuple[LogNews, Status | None]:
         try:
             status = self._read_status()
-        except Exception:              # being written, or deleted: the next check shows it
+        except Exception:              # the run is being written or deleted: the next check decides
             status = None
         if status is not None and status.state is State.MOVING and not self._viewed:
             with suppress(TdhilError):
@@ -175,7 +175,7 @@ class Feed:
 
 
 class Feeds:
-    """The feeds that have viewers, and the latest ones that had."""
+    """Feeds that have viewers, and the feeds that had viewers last."""
 
     def __init__(self, most: int = 20) -> None:
         self._feeds: dict[str, Feed] = {}

@@ -1,4 +1,4 @@
-"""Between HTTP and the service: permitted hosts and origins, checked bodies, and errors as HTTP replies."""
+"""Layer between HTTP and the service: permitted hosts and origins, checked bodies, and errors as HTTP replies."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _BROKEN_HINT: Final = "See the terminal of tdhil serve"
 
 
 class RequestGuard:
-    """First check: a known host, no page of another site, and the headers of every reply."""
+    """First check of a request: known host, no page of another site. It also sets the headers of every reply."""
 
     def __init__(self, app: ASGIApp, hosts: frozenset[str], viewers: frozenset[str] = frozenset()) -> None:
         self._app, self._hosts, self._viewers = app, hosts, viewers
@@ -73,7 +73,7 @@ class RequestGuard:
             return NotAllowed("this host name does not belong to the service", where=f"host {host[:100]}",
                               next_step=f"Use {', '.join(sorted(self._hosts))}")
         if connection.scope["type"] == "websocket" and token_in(connection) is not None:
-            return None                # no page sends a token by itself, and without it nothing else counts
+            return None                # a page sends no token by itself; only the token gives rights here
         origin = connection.headers.get("origin")
         if origin in self._viewers and connection.scope["type"] == "websocket" and "/foxglove/" in connection.url.path:
             return None
@@ -107,7 +107,7 @@ async def _with_headers(send: Send, message: Message) -> None:
 
 
 def status_of(error: BaseException) -> int:
-    """Return the HTTP status of an error of the tree."""
+    """Return the HTTP status of an error in the error tree."""
     if isinstance(error, HTTPException):
         return int(error.status_code)
     for kind, status in (
@@ -123,7 +123,7 @@ def status_of(error: BaseException) -> int:
 
 
 def told_of(error: BaseException) -> ErrorView:
-    """Return the body of an error."""
+    """Return the reply's body for an error."""
     if isinstance(error, RunRefused):
         return ErrorView(error.told)
     if isinstance(error, HTTPException):
@@ -142,7 +142,7 @@ def _field_of(name: str, text: str) -> FieldError:
 
 
 def error_response(error: BaseException, status: int | None = None, headers: Mapping[str, str] = _NONE) -> Response:
-    """Return the whole reply. ``status``: if it differs from the error's own."""
+    """Return the whole reply to an error. ``status`` replaces the error's own HTTP status."""
     headers = {**headers, **({"www-authenticate": "Bearer"} if isinstance(error, NotLoggedIn) else {})}
     if isinstance(error, TooManyTries):
         headers["retry-after"] = f"{error.wait_s:.0f}"
@@ -189,6 +189,6 @@ def _no_number(name: str) -> Any:
 
 
 async def off(work: Callable[[], T]) -> T:
-    """Run it in a thread: files may be slow."""
+    """Run a function in a thread, since files may be slow. Return its result."""
     found: T = await anyio.to_thread.run_sync(work)
     return found

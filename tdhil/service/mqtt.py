@@ -1,13 +1,13 @@
-"""States and results of the rigs for other systems, over MQTT. tdhil subscribes to nothing: no command comes in here.
+"""States and results of the rigs for other systems, over MQTT. tdhil subscribes to nothing and accepts no command.
 
 ::
 
-    <prefix>/status                  online; offline when the service has ended; the broker then sets it itself
+    <prefix>/status                  online or offline; the broker sets offline if it loses the service
     <prefix>/rigs/<rig>/state        state of the rig, and state and stage of its run
     <prefix>/rigs/<rig>/result       its latest result, as in the list of runs
 
 JSON, retained, QoS 1. Only the latest message counts, so nothing is queued: after a lost connection all topics are sent
-again. It has its own threads; nothing else waits for it.
+again. The publisher has its own threads; nothing else waits for it.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Broker:
 
     @staticmethod
     def of(url: str, environment: Mapping[str, str] = os.environ) -> Broker:
-        """Parse ``mqtt[s]://[user@]host[:port][/prefix]``. Raises UsageError, and never shows a possible password."""
+        """Parse ``mqtt[s]://[user@]host[:port][/prefix]``. Raises UsageError; its text contains no password."""
         try:
             parts = urlsplit(url)
             port, host = parts.port, parts.hostname
@@ -94,7 +94,7 @@ def _password(environment: Mapping[str, str]) -> str | None:
 
 
 class Publisher:
-    """Publishes the values of ``look`` to a broker, topic by topic, whenever they change; from `start` to `close`.
+    """Publisher of the values of ``look`` to a broker: each topic when its value changes, from `start` to `close`.
 
     Raises UsageError if the extra is missing, or a TLS file can't be read.
     """
@@ -106,7 +106,7 @@ class Publisher:
         self._broker, self._look, self._say = broker, look, say
         self._told: dict[str, str] = {}
         self._connected, self._end = threading.Event(), threading.Event()
-        self._silent = False               # the lost connection was reported
+        self._silent = False               # whether the lost connection was reported
         self._client = self._make()
         self._thread = threading.Thread(target=self._run, name="mqtt", daemon=True)
 
@@ -128,7 +128,7 @@ class Publisher:
                                  where=f"{CA_FILE} {self._broker.ca_file}",
                                  entry=MessageCode.SERVICE_OPTION_WRONG) from None
         found.on_connect = self._on_connect
-        # paho gives no reason: an untrusted certificate looks the same.
+        # paho gives no reason: an untrusted certificate causes the same call.
         why = "can't be reached" + (", or its certificate isn't trusted" if self._broker.tls else "")
         found.on_connect_fail = lambda client, data: self._away(why)
         found.on_disconnect = lambda client, data, flags, reason, properties: self._away(str(reason))
@@ -143,7 +143,7 @@ class Publisher:
         self._thread.start()
 
     def close(self) -> None:
-        """Publish "offline" if the broker is connected, within a second."""
+        """Publish "offline" if the broker is connected. This takes at most 1 s."""
         self._end.set()
         if self._connected.is_set():
             with suppress(RuntimeError, ValueError):
@@ -167,7 +167,7 @@ class Publisher:
             self._silent = True
             self._say(f"MQTT: {self._broker}: {why}; tdhil tries again. Runs are not affected")
 
-    # -- in its own --------------------------------------------------------------------------------------------------
+    # -- in the publisher's own thread -------------------------------------------------------------------------------
 
     def _run(self) -> None:
         said = ""
@@ -176,7 +176,7 @@ class Publisher:
                 try:
                     self._tell()
                     trouble = ""
-                except Exception as error:     # of one poll: the next one reports
+                except Exception as error:     # one poll failed: the next poll reports again
                     trouble = f"MQTT: {type(error).__name__}: {error}"
                 if trouble not in ("", said):
                     self._say(trouble)

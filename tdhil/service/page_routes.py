@@ -1,4 +1,4 @@
-"""The pages: templates with the views of the API, and the page for the login."""
+"""The pages of the service: templates with the views of the API, and the login page."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 HERE: Final = Path(str(files("tdhil.service")))
 _OF_HERE: Final = re.compile(r"/(?![/\\])[\x21-\x5b\x5d-\x7e]*")
-"""Addresses to which a login may redirect."""
+"""Pattern of addresses to which a login may redirect: paths of this service only."""
 
 
 class Pages:
-    """The templates of the pages."""
+    """Templates and routes of the pages."""
 
     def __init__(self, site: Site) -> None:
         self._site = site
@@ -42,7 +42,7 @@ class Pages:
         self._templates.globals["form_options"] = form_options
 
     def render(self, request: Request, template: str, here: str, status: int = 200, **known: Any) -> Response:
-        """Return a page. ``here``: the entry of the menu that it belongs to."""
+        """Return a page. ``here``: the page's entry in the menu."""
         text = self._templates.get_template(template).render(
             here=here, who=principal(request), login=self._site.access.login, **known)
         return HTMLResponse(text, status)

@@ -36,7 +36,7 @@ LARGEST_KG_M2: Final = 1e9
 
 
 def routes(site: Site) -> list[Route]:
-    """Return the routes."""
+    """Return the routes of the rigs."""
     return [
         api(site, "rigs", rigs),
         api(site, "rig", rig),
@@ -86,7 +86,7 @@ def _file_view(found: RigFile) -> RigFileView:
 
 
 async def plan(site: Site, request: Request, body: dict[str, Any]) -> PlanView:
-    """Plan a run. Nothing is connected."""
+    """Plan a run. No drive is connected."""
     found = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
     options = options_of(body)
     _, connection = await off(lambda: found.way(options))
@@ -96,7 +96,7 @@ async def plan(site: Site, request: Request, body: dict[str, Any]) -> PlanView:
 
 
 async def pace(site: Site, request: Request, body: None) -> PaceView:
-    """Measure whether this computer sustains the rate of a simulated rig by the clock. Raises NotAllowed."""
+    """Measure whether this computer sustains a simulated rig's cycle rate in real time. Raises NotAllowed."""
     found = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
     if not found.simulated:
         raise NotAllowed("only a simulated rig is measured from here", where=f"rig {found.id}",

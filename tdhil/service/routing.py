@@ -1,6 +1,6 @@
-"""Starlette's route for a declared route of the API (`schemas.ROUTES`) and its handler.
+"""Starlette route from a declared route of the API (`schemas.ROUTES`) and its handler.
 
-The declaration states method, path, role, body and answers. A handler is a function of the site, the request and its
+The declaration states method, path, role, body and replies. A handler is a function of the site, the request and its
 checked body. It returns a view, a status with a view, or a whole reply.
 """
 
@@ -25,7 +25,7 @@ DECLARED: Final = {one.name: one for one in schemas.ROUTES}
 
 
 def api(site: Site, name: str, handler: Handler, *, base: str = API) -> Route:
-    """Return the route that is declared with this name. It checks role and body, then calls ``handler``."""
+    """Return the route declared with this name. It checks role and body, then calls ``handler``."""
     declared = DECLARED[name]
     first = next(iter(declared.answers))
 
@@ -36,7 +36,7 @@ def api(site: Site, name: str, handler: Handler, *, base: str = API) -> Route:
             found = await handler(site, request, await body_of(request, declared))
         except TdhilError as error:
             return error_response(error)
-        except ClientDisconnect:               # during the request: no reply can reach the client
+        except ClientDisconnect:               # disconnected during the request: no reply can reach the client
             return Response(status_code=400)
         if isinstance(found, Response):
             return found

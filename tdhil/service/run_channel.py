@@ -1,7 +1,7 @@
-"""Between web and run: a Unix socket in the run's folder, a line of JSON each way; and the lock of a living run.
+"""Channel between web and run: a Unix socket in the run's folder, and the lock of a run that is alive.
 
-The socket belongs to one user (mode 0600). The run's process holds the lock while it lives. The web takes the lock
-before the process starts, and passes it on, so that a living run never looks dead.
+Request and reply are a line of JSON each. The socket belongs to one user (mode 0600). The run's process holds the lock
+while it is alive. The web takes the lock before the process starts, and passes it on. So a run never appears dead.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from tdhil.service.run_state import Told
 SOCKET: Final = "control.sock"
 LOCK: Final = "alive.lock"
 STOP_FILE: Final = "stop.json"
-"""Stop request from before the run's process listens."""
+"""Name of the file with a stop request that was made before the run's process listens."""
 LONGEST: Final = 64 * 1024
-_PATH_LIMIT: Final = 100               # of a socket's path; the system has 108
+_PATH_LIMIT: Final = 100               # longest path of a socket, bytes; the system's limit is 108
 Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
 class RunRefused(TdhilError):
-    """A refusal by the run; ``told`` is its own error."""
+    """Refusal by the run. ``told``: the error that the run reported."""
 
     def __init__(self, told: Told) -> None:
         super().__init__(told.what, where=told.where, next_step=told.next_step)
@@ -104,13 +104,13 @@ class ChannelListener:
             try:
                 asked = json.loads(_line(peer))
                 answer: Mapping[str, Any] = self._answer(asked if isinstance(asked, dict) else {})
-            except Exception as error:         # whatever arrived: the run continues
+            except Exception as error:         # any error of a request: the run continues
                 answer = {"error": Told.of(error).__dict__}
             peer.sendall(json.dumps(answer).encode() + b"\n")
 
 
 def ask(folder: Path, request: Mapping[str, Any], *, timeout_s: float = 2.0) -> dict[str, Any]:
-    """Return the run's answer. Raises RunRefused with its error, and CommunicationLost without a timely answer."""
+    """Send a request and return the run's reply. Raises RunRefused with its error, and CommunicationLost."""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as peer:
             peer.settimeout(timeout_s)
@@ -130,7 +130,7 @@ def ask(folder: Path, request: Mapping[str, Any], *, timeout_s: float = 2.0) -> 
 
 
 def tell_viewed(folder: Path) -> None:
-    """Tell the run that a page shows it. Raises as `ask` does."""
+    """Report to the run that a page shows it. Raises RunRefused and CommunicationLost."""
     ask(folder, {"do": "viewed"})
 
 
@@ -143,7 +143,7 @@ def _line(peer: socket.socket) -> bytes:
 
 @contextmanager
 def _short(path: Path) -> Iterator[str]:
-    """Yield the path, or if it is too long for a socket, a path through the open folder."""
+    """Yield the path of a socket. A path that is too long is replaced by one through the open folder."""
     if len(os.fsencode(path)) < _PATH_LIMIT:
         yield str(path)
         return
@@ -155,7 +155,7 @@ def _short(path: Path) -> Iterator[str]:
 
 
 def take_life(folder: Path) -> int:
-    """Return a descriptor that holds the run's lock, for its process to inherit; the caller closes its own."""
+    """Take the run's lock. Return its descriptor for the run's process to inherit; the caller closes its own copy."""
     import fcntl
 
     descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -168,7 +168,7 @@ def take_life(folder: Path) -> int:
 
 
 def lives(folder: Path) -> bool:
-    """Return whether the run's process lives; True if that is unknown (such as without a free descriptor)."""
+    """Return whether the run's process is alive; True if this is unknown (such as without a free descriptor)."""
     import fcntl
 
     try:
@@ -187,7 +187,7 @@ def lives(folder: Path) -> bool:
 
 
 def stands_still(pid: int) -> bool:
-    """Return whether the process is suspended, by SIGSTOP or a debugger. False if that is unknown."""
+    """Return whether the process is suspended, by SIGSTOP or a debugger; False if this is unknown."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][:1] in ("T", "t")
     except OSError:
@@ -195,7 +195,7 @@ def stands_still(pid: int) -> bool:
 
 
 def send_signal(pid: int, folder: Path, number: int) -> bool:
-    """Send a signal to the run's process through a descriptor, so that it reaches no other process of that number."""
+    """Send a signal to the run's process by a descriptor, so that no other process with the same number receives it."""
     if sys.platform != "linux":
         return False
     try:
@@ -203,7 +203,7 @@ def send_signal(pid: int, folder: Path, number: int) -> bool:
     except OSError:
         return False
     try:
-        if not lives(folder):              # after the descriptor was made: it is this run's process or none
+        if not lives(folder):              # checked after the descriptor was made: it is this run's process or none
             return False
         signal.pidfd_send_signal(descriptor, number)
         return True

@@ -1,9 +1,9 @@
-"""The process of one run: the same Runner as on the command line, its log, and a socket to confirm, stop or read
-status.
+"""The process of one run: the Runner of the command line, the log, and a socket.
+The socket accepts confirmation and stop, and reports the status.
 
 ``python -m tdhil.service.run_process FOLDER`` with the run's folder, which contains request.json. It is a session of
-its own: a failure of the web does not affect it. SIGTERM is a stop here as for `tdhil identify`, besides the socket.
-The control loop never waits for a file or a socket: it takes notes, and a thread writes them to disk.
+its own: a failure of the web does not affect it. SIGTERM is a stop, as for `tdhil identify`. The control loop never
+waits for a file or a socket: changes are kept in memory, and a thread writes them to disk.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ if TYPE_CHECKING:
     from tdhil.session import Rehearsal
 
 NICE: Final = 5
-"""Nice value of a simulated run in stepped time, which takes all the processor time it can get."""
+"""Nice value of a simulated run in stepped time, since it uses all available processor time."""
 UNWATCHED: Final = "nobody watched"
-"""Origin of the stop of a watched run whose page was closed."""
+"""Origin of a stop because no page watched the run."""
 
 
 class RunProcess:
-    """One run from its request to its result; `serve` runs all of it."""
+    """One run from its request to its result; `serve` executes it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder.resolve()
@@ -65,7 +65,7 @@ class RunProcess:
         )
 
     def serve(self) -> int:
-        """Run it. Return the exit code, as of `tdhil identify`."""
+        """Execute the run. Return the exit code of `tdhil identify`."""
         from tdhil.session import stop_on_signals
 
         with stop_on_signals(self.stop), ChannelListener(self.folder, self.answer):
@@ -81,7 +81,7 @@ class RunProcess:
     # -- the socket ----------------------------------------------------------------------------------------------
 
     def answer(self, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """Answer one request. Called in a thread of the socket."""
+        """Return the reply to one request. Called in a thread of the socket."""
         what, who = asked.get("do"), str(asked.get("by", "somebody"))[:80]
         if what == "stop":
             self._stop(f"{visible(who)} requested a stop", who)
@@ -142,7 +142,7 @@ class RunProcess:
         os.chdir(self.folder)
         path = Path(self.request.rig_file)
         rig = read_rig(path)
-        refuse_changed(path, self.request.rig_sha256)      # after reading: so the read file is the requested one
+        refuse_changed(path, self.request.rig_sha256)      # after reading, so that the read file is the requested one
         self.stop.check(next_step="Nothing has moved")
         self.board.to(State.PREFLIGHT)
         self._asked = asked = run_request(rig, self.request.options, left_in=self.store.folder)
@@ -155,7 +155,7 @@ class RunProcess:
             write_json(self.folder / "plan.json", self._plan)
             self.board.know(expected_half_width=self._plan["expected_half_width"],
                             expected_s={**EXPECTED_S, "acquire": self._plan["duration_s"] + 5.0})
-        if not asked.peer.embedded:        # before its bus is opened: a later stop goes to this drive only
+        if not asked.peer.embedded:        # written before the bus is opened: a later stop goes to this drive only
             write_json(self.folder / CONNECTION_FILE, kept_connection(asked.options, asked.connection))
         report = has_extra()
         self.stop.check(next_step="Nothing has moved")
@@ -190,7 +190,7 @@ class RunProcess:
         try:
             row = row_of(self.request.id, document, settings=FleetSettings(), torque_scale_rel_sd=torque_scale_rel_sd)
             write_json(self.folder / "row.json", asdict(replace(row, rig=self.request.rig)))
-        except Exception as error:             # the result is valid without it
+        except Exception as error:             # the result is valid without this row
             tell(f"the history can't be written: {error}")
 
     def _report(self, document: Mapping[str, Any], recording: Any) -> None:
@@ -221,7 +221,7 @@ class RunProcess:
         return ended_with
 
     def _conclude_part(self) -> None:
-        """Write the result of the motion before the end, as `tdhil replay` of the log does. The run has ended."""
+        """Write the result of an ended run's partial motion, as `tdhil replay` of the log does."""
         from tdhil.errors import TdhilError
         from tdhil.report import has_extra
         from tdhil.session import conclude, is_evaluation, read
@@ -233,7 +233,7 @@ class RunProcess:
                 return
             found = conclude(record.recording, record.configuration, "run.mcap", record.assumed)
         except TdhilError:
-            return                             # nothing to identify from; the error of the run says why
+            return                             # no data to identify from; the error of the run states why
         except Exception as error:
             tell(f"the part of the run can't be identified: {error}")
             return
@@ -243,7 +243,7 @@ class RunProcess:
             self._report(found.document, record.recording)
 
     def _failed(self, error: BaseException) -> int:
-        """End after an error before or after the motion. The Runner itself never raises."""
+        """End the run after an error before or after the motion. The Runner itself never raises."""
         import traceback
 
         from tdhil.errors import TdhilError, exit_code
@@ -267,13 +267,13 @@ class RunProcess:
 
 
 def _cut_short(code: int, stop_confirmed: bool | None) -> State:
-    """Return the end state of a run without a result. On a terminal a log that broke off is `partial`."""
+    """Return the end state of a run without a result. On the command line, a log that broke off is `partial`."""
     state = end_of(code, stop_confirmed=stop_confirmed)
     return State.FAILED if state is State.DONE else state
 
 
 def main(arguments: list[str]) -> int:
-    """Run the run of this folder. Return the exit code."""
+    """Execute the run of this folder. Return the exit code."""
     return RunProcess(Path(arguments[0])).serve()
 
 

@@ -44,7 +44,7 @@ LONGEST_SEARCH: Final = 200
 
 
 def routes(site: Site) -> list[Route]:
-    """Return the routes. ``compare`` comes before ``run``, whose path it matches too."""
+    """Return the routes. ``compare`` comes before ``run``, since the path of ``run`` matches it, too."""
     return [
         api(site, "runs", runs),
         api(site, "compare", compare),
@@ -87,7 +87,7 @@ async def compare(site: Site, request: Request, body: None) -> CompareView:
 
 
 def _asked_at(site: Site, which: list[str], comparison: dict[str, Any]) -> dict[str, Any]:
-    """Return the comparison with the time of each run that every page shows: when it was requested."""
+    """Return the comparison with the time of each run's request, as on every page."""
     times = [site.store.request(one).asked for one in which]
     return {
         **comparison,
@@ -103,7 +103,7 @@ async def run(site: Site, request: Request, body: None) -> RunView:
 
 
 async def confirm(site: Site, request: Request, body: ConfirmBody) -> RunView:
-    """Confirm motion with the code that the rig's terminal shows."""
+    """Confirm motion with the code from the terminal at the rig."""
     which, who = request.path_params["run"], principal(request).name
     code = body.code.replace(" ", "")
     _require_key(body.lease, "lease")
@@ -144,11 +144,11 @@ async def sign_off(site: Site, request: Request, body: SignOffBody) -> RunView:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Replays: the run identified again.
+# Replays: a run is identified again.
 
 
 def settings_of(body: ReplayBody | FleetBody) -> dict[str, Any]:
-    """Return the settings of an identification. Raises UsageError for values that no run would accept."""
+    """Return the settings of an identification. Raises UsageError for values outside the limits of a run."""
     given = {one.name: getattr(body, one.name) for one in ASKED_AGAIN}
     found = options_of(given)
     resolve(found, None)
@@ -172,7 +172,7 @@ async def ask_replay(site: Site, request: Request, body: ReplayBody) -> tuple[in
 
 
 def _answers(made: ReplayView, asked: Mapping[str, Any]) -> bool:
-    """Return whether this replay has these settings and is from this version: the result would be the same."""
+    """Return whether this replay has these settings and this version, so that its result would be the same."""
     return made.asked == asked and made.result is not None and made.result.get("tdhil") == __version__
 
 
@@ -191,7 +191,7 @@ def _new_replay(site: Site, which: str, asked: dict[str, Any], who: str) -> Repl
 
 
 async def _replay_later(site: Site, which: str, view: ReplayView) -> None:
-    """Run a replay once no shaft of this service may turn."""
+    """Execute a replay as soon as no shaft of this service may turn."""
     while await off(site.supervisor.turning):
         await anyio.sleep(0.5)
     try:

@@ -1,4 +1,4 @@
-"""The states of a run in the service: which state may follow which, and the data of each. Pure.
+"""The states of a run in the service: permitted order, and data of each state. Pure data, no files.
 
 ::
 
@@ -6,7 +6,7 @@
                                                                              ↘ refused | stopped | failed
     whenever the run's process or the drive is lost:                           interrupted | stop_not_confirmed
 
-There is no queue of motions, no pause and no way back: an ended run stays ended.
+There is no queue of motions and no pause. An ended run stays ended.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ MAY_TURN = frozenset({State.MOVING, State.STOPPING})
 
 
 class NotSo(ValueError):
-    """A state that can't follow the one before: an error in this program."""
+    """Error in this program: a state that can't follow the state before."""
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,9 @@ class Told:
 
 @dataclass(frozen=True)
 class Stop:
-    """The progress of a stop: each time as ISO 8601 in UTC, None until it is reached.
+    """Progress of a stop: each time as ISO 8601 in UTC, None until it is reached.
 
-    ``seen``: the drive was in quick stop, or had been commanded to zero speed.
+    ``seen``: time at which the drive was in quick stop, or was commanded to zero speed.
     """
 
     asked: str | None = None
@@ -108,7 +108,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Confirmation:
-    """The requested confirmation: ``binding`` is the SHA-256 of everything that the code is valid for."""
+    """Requested confirmation. ``binding``: SHA-256 of all data that the code confirms."""
 
     binding: str
     text: str
@@ -117,10 +117,10 @@ class Confirmation:
 
 @dataclass(frozen=True)
 class Watch:
-    """The watching user of a run that stops when it is not watched.
+    """The user who watches a run that stops when it is not watched.
 
-    ``gone``: since when its page is not visible, as reported by the page or its silence (``how``: hidden, closed,
-    silent); None while it is visible. ``lost``: when this lasted too long, and the run was stopped.
+    ``gone``: time since which the page is not visible; None while it is visible. ``how``: hidden or closed, as reported
+    by the page, or silent. ``lost``: time at which the run was stopped, because the page was not visible for too long.
     """
 
     by: str
@@ -132,7 +132,7 @@ class Watch:
 
 @dataclass(frozen=True)
 class Entered:
-    """A state (`moving` with its stage) and its start."""
+    """A state and the time of its start; `moving` has its stage."""
 
     state: State
     at: str
@@ -148,7 +148,7 @@ class Status:
     history: tuple[Entered, ...]
     simulated: bool | None = None
     pid: int | None = None
-    expected_s: Mapping[str, float] = field(default_factory=dict)     # of each stage, control time
+    expected_s: Mapping[str, float] = field(default_factory=dict)     # of each stage, s of control time
     preflight: tuple[Check, ...] = ()
     identity: str = ""
     identity_numbers: tuple[int, ...] = ()     # vendor, product, revision, serial; zeros where the drive has none
@@ -176,7 +176,7 @@ class Status:
 
     @property
     def at(self) -> str:
-        """When the state began."""
+        """Time at which the state began."""
         return self.history[-1].at
 
     @property
@@ -184,13 +184,13 @@ class Status:
         return self.state in ENDED
 
     def to(self, state: State, at: str, stage: str | None = None, **known: Any) -> Status:
-        """Return the status after this step. Raises NotSo if it can't follow."""
+        """Return the status in this next state. Raises NotSo if the state can't follow."""
         if state not in FOLLOWS[self.state]:
             raise NotSo(f"{self.id}: {state} after {self.state}")
         return replace(self, history=(*self.history, Entered(state, at, stage)), **known)
 
     def plain(self) -> dict[str, Any]:
-        """Return it as plain data for JSON."""
+        """Return the status as plain data for JSON."""
         return {**asdict(self), "state": self.state.value, "stage": self.stage, "at": self.at}
 
     @staticmethod
@@ -224,7 +224,7 @@ def end_of(exit_code: int, *, stop_confirmed: bool | None) -> State:
 
 
 def way_to(status: Status, end: State, at: str, **known: Any) -> Status:
-    """Return the status at its end, with the unreported states in between."""
+    """Return the status in its end state, with the states between that were not reported."""
     if end not in FOLLOWS[status.state]:
         for between in (State.STOPPING, State.IDENTIFYING):
             if between in FOLLOWS[status.state]:
@@ -240,12 +240,12 @@ def now() -> str:
 
 
 def iso(time_s: float) -> str:
-    """Return a time as of `time.time` in the same format."""
+    """Return a time, s as of `time.time`, as ISO 8601 in UTC, to the millisecond."""
     return datetime.fromtimestamp(time_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Refusals of the service, in the one tree.
+# Refusals of the service, as a part of the error tree.
 #
 # ::
 #
@@ -271,7 +271,7 @@ class NotThere(TdhilError):
 
 
 class NotAllowed(TdhilError):
-    """Refusal for this client or origin, or over HTTP in general."""
+    """Refusal of a request from this client or origin, or of any request over HTTP."""
 
     entry = MessageCode.NOT_ALLOWED
 
@@ -316,7 +316,7 @@ class NotReacting(CommunicationLost):
 
 
 class Conflict(PreflightRefused):
-    """Conflict: another run uses the rig, or the run is past that state. ``holder``: in words."""
+    """Refusal: another run uses the rig, or the run is no longer in that state. ``holder``: the other run, in words."""
 
     entry = MessageCode.CONFLICT
 

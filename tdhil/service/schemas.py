@@ -1,6 +1,6 @@
 """The types of the service's replies, and the document that describes them (OpenAPI 3.1).
 
-There is one table of routes: the web serves it, and the document is made from it. `role` states the least role. On
+The web and the document use the same table of routes. `role` states the least role. On
 loopback without accounts, every client has every role.
 """
 
@@ -27,7 +27,7 @@ from tdhil.version import __version__
 
 @dataclass(frozen=True)
 class RigView:
-    """A rig. ``state``: whether a run may be started, and if not why; ``holder``: its present user, in words."""
+    """A rig. ``state``: whether a run may be started, or the reason why not; ``holder``: its present user, in words."""
 
     id: str
     name: str
@@ -69,7 +69,7 @@ class ReplayView:
 
 @dataclass(frozen=True)
 class RunView:
-    """A run with all data except its samples. ``result``: as of `tdhil identify --json`; ``files``: to download."""
+    """A run without its samples. ``result``: document of `tdhil identify --json`; ``files``: names for downloads."""
 
     id: str
     rig: str
@@ -113,7 +113,7 @@ class PlanView:
 
 @dataclass(frozen=True)
 class PaceView:
-    """Answer whether this computer sustains a simulated rig's cycle rate by the clock: ``holds``, and ``text``."""
+    """Measurement whether this computer sustains a simulated rig's cycle rate in real time: ``holds`` and ``text``."""
 
     rig: str
     pace: dict[str, Any]
@@ -144,7 +144,7 @@ class CalibrationView:
 
 @dataclass(frozen=True)
 class PictureView:
-    """A picture of the report; ``caption`` says what it shows."""
+    """A picture of the report. ``caption``: description of the picture."""
 
     number: int
     heading: str
@@ -153,7 +153,7 @@ class PictureView:
 
 @dataclass(frozen=True)
 class FaultView:
-    """A fault to rehearse, written ``NAME@STAGE+2s=VALUE``. ``row`` of docs/reference/faults.md; 0: it has none.
+    """A fault to rehearse, written ``NAME@STAGE+2s=VALUE``. ``row``: its row in docs/reference/faults.md; 0: none.
 
     ``value``: the default value if none is given; ``takes``: the meaning of the value, '' if there is none.
     ``from_start``: it has no start time and lasts for the whole run. ``required``: the reaction that the row requires.
@@ -180,7 +180,7 @@ class StoppedView:
 
 @dataclass(frozen=True)
 class LeaseView:
-    """The watching user of a watched run. Without a message of the page the lease ends after ``lease_s``."""
+    """The user who watches a run. Without a message of the page, the lease ends after ``lease_s``."""
 
     run: str
     watch: Watch
@@ -189,7 +189,7 @@ class LeaseView:
 
 @dataclass(frozen=True)
 class AuditView:
-    """The latest lines, the newest first; ``broken``: the place where the chain is broken.
+    """The latest audit lines, the newest first. ``broken``: the place where the chain is broken.
 
     ``head``: the last line as NUMBER:HASH, to keep on another computer and send as ``head`` later; None if the chain's
     end is broken. ``key_made``: when the chain's key was made.
@@ -203,7 +203,7 @@ class AuditView:
 
 @dataclass(frozen=True)
 class HealthView:
-    """The health of the service. ``live``: runs that have not ended; empty for a client that is not logged in."""
+    """Health of the service. ``live``: runs that have not ended; empty for a client that is not logged in."""
 
     status: Literal["ok"]
     version: str
@@ -213,7 +213,7 @@ class HealthView:
 
 @dataclass(frozen=True)
 class MeView:
-    """The client as the service identifies it. ``ends``: end of the login."""
+    """The identified client. ``ends``: end of its login."""
 
     name: str
     roles: list[Role]
@@ -249,7 +249,7 @@ class TokenView:
 
 @dataclass(frozen=True)
 class FieldError:
-    """One wrong value of a request: the option, its label on the form, and what is wrong."""
+    """One wrong value of a request: the option, its label on the form, and the reason."""
 
     option: str
     label: str
@@ -265,7 +265,7 @@ class ErrorView:
     fields: list[FieldError] | None = None
 
 
-# -- what is sent ---------------------------------------------------------------------------------------------------
+# -- request bodies -------------------------------------------------------------------------------------------------
 
 
 class Body:
@@ -276,9 +276,9 @@ class Body:
 
 @dataclass(frozen=True)
 class ConfirmBody(Body):
-    """The six digits; ``binding``: the hash that was shown with the plan, if the sender has it.
+    """The six digits of the code. ``binding``: the hash that was shown with the plan, if the sender has it.
 
-    ``lease``: for a watched rig a random key of 16 to 200 characters, which only its sender knows and renews.
+    ``lease``: for a watched rig a random key of 16 to 200 characters. Only its sender has and renews it.
     """
 
     code: str
@@ -288,7 +288,7 @@ class ConfirmBody(Body):
 
 @dataclass(frozen=True)
 class LeaseBody(Body):
-    """The page with this key is visible; ``gone``: it is hidden or closed. ``new_key`` replaces the old key."""
+    """Message that the page with this key is visible; ``gone``: hidden or closed. ``new_key`` replaces the key."""
 
     key: str
     new_key: str | None = None
@@ -297,14 +297,14 @@ class LeaseBody(Body):
 
 @dataclass(frozen=True)
 class SignOffBody(Body):
-    """The statement of a user who saw the shaft at standstill."""
+    """Statement of a user that the shaft is at standstill."""
 
     note: str
 
 
 @dataclass(frozen=True)
 class ReplayBody(Body):
-    """Settings of a replay. None: as in the run. A share is a number, or a text such as ``1%``."""
+    """Settings of a replay. None: the setting of the run. A relative value is a number, or a text such as ``1%``."""
 
     model: str | None = None
     tolerance: float | str | None = None
@@ -313,9 +313,9 @@ class ReplayBody(Body):
 
 @dataclass(frozen=True)
 class CalibrationBody(Body):
-    """Two runs of the rig, and the inertia of the body of the second, kg·m², at the ``at`` shaft.
+    """Two runs of the rig: without and with an added body. Inertia of the body, kg·m², at the ``at`` shaft.
 
-    ``added_sd_kg_m2``: its standard uncertainty; None: assumed.
+    ``added_sd_kg_m2``: standard uncertainty of this inertia; None: a default.
     """
 
     without: str
@@ -327,7 +327,7 @@ class CalibrationBody(Body):
 
 @dataclass(frozen=True)
 class RigFileBody(Body):
-    """The whole new file; ``sha256``: hash of the file that it replaces."""
+    """The whole new rig file. ``sha256``: hash of the file that it replaces."""
 
     text: str
     sha256: str
@@ -375,9 +375,9 @@ class TokenBody(Body):
 
 @dataclass(frozen=True)
 class FleetBody(Body):
-    """Logs to identify again, and settings; None: as in each run.
+    """Logs to identify again, and settings; None: the setting of each run.
 
-    ``folder`` of `/fleets/folders`, '' for the service's own runs; ``below``: a folder inside it.
+    ``folder``: a name from `/fleets/folders`, '' for the service's own runs; ``below``: a folder inside it.
     """
 
     folder: str = ""
@@ -393,14 +393,14 @@ class Nothing:
 
 
 OPTIONS: Final = "Options"
-"""The body of a requested run: an object with the command line's options."""
+"""Body of a request for a run: an object with the command line's options."""
 
 
 @dataclass(frozen=True)
 class Route:
-    """One route of the service. ``answers``: by HTTP status, a type of above, or a media type for a file.
+    """One route of the service. ``answers``: by HTTP status, a type of this module, or the media type of a file.
 
-    ``role``: the least role; None: every client, also without a login. A known client may always stop.
+    ``role``: the least role; None: every client, also without a login. A known client may always stop a run.
     """
 
     method: Literal["GET", "POST"]
@@ -532,17 +532,17 @@ SOCKETS: Final = (
     Socket("/foxglove/{rig}", "foxglove", "The log of the rig's run as it grows, for Foxglove and Lichtblick", "viewer",
            PROTOCOLS),
 )
-"""WebSockets, also available at the root."""
+"""WebSockets, below the API and also at the root."""
 
 
 @cache
 def adapter(kind: Any) -> TypeAdapter[Any]:
-    """Return pydantic's adapter of a type of above."""
+    """Return pydantic's adapter for a type of this module."""
     return TypeAdapter(kind)
 
 
 def plain(value: Any, kind: Any) -> Any:
-    """Return a value as plain data for JSON."""
+    """Return a value of this type as plain data for JSON."""
     return adapter(kind).dump_python(value, mode="json")
 
 

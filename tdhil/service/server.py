@@ -1,4 +1,4 @@
-"""`tdhil serve`: the web on one port, until it is ended."""
+"""`tdhil serve`: the web service on one port, until SIGINT or SIGTERM."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 NEEDED = ("starlette", "uvicorn", "websockets", "prometheus_client", "jinja2")
 HOST, PORT = "127.0.0.1", 8420
 ON_ITS_WAY = 64 * 1024
-"""Bytes per connection that the system buffers beyond what it can send now. With more, a keep-alive ping would wait
-behind all of that on a slow line, and the viewer would be disconnected before it reads the ping."""
+"""Bytes of unsent data that the system buffers per connection. On a slow line a larger buffer would delay a keep-alive
+ping, and the viewer would be disconnected before it reads the ping."""
 SILENT_S = 60.0
-"""Time without an answer after which a viewer counts as disconnected, s."""
+"""Time without a reply after which a viewer counts as disconnected, s."""
 Say = Callable[[str], None]
 
 
@@ -70,7 +70,7 @@ def _no_password() -> str:
 
 
 def require_way(host: str, *, tls: bool, accounts: bool) -> None:
-    """Raise UsageError unless an address beyond this computer, or a service with users, has TLS and a login."""
+    """Raise UsageError if an address beyond this computer, or a service with users, has no TLS or no login."""
     if _loopback(host) and not accounts:
         return
     if not tls:
@@ -200,16 +200,16 @@ def serve(
 
 
 def require_folder(data: Path) -> None:
-    """Raise UsageError if the folder does not exist: it is probably misspelt."""
+    """Raise UsageError if the folder does not exist: its name is probably misspelt."""
     if not data.is_dir():
         raise UsageError("this folder does not exist", where=f"--data {data}", next_step="Name the service's folder",
                          entry=MessageCode.FILE_NOT_FOUND)
 
 
 def check_idle(data: Path, say: Say) -> int:
-    """Return whether the program may be replaced now, as an exit code. The code is 4, with the reasons, if a run of
-    this folder is alive, if a stop is neither confirmed nor signed off, or if any tdhil of this computer holds a drive.
-    It reads files and locks, and uses neither the web nor a drive. Raises UsageError if the folder does not exist.
+    """Return as an exit code whether the program may be replaced now. The code is 4 if a run of this folder is alive,
+    if a stop is neither confirmed nor signed off, or if any tdhil of this computer holds a drive. The reasons are
+    printed. Only files and locks are read, no web and no drive. Raises UsageError if the folder does not exist.
     """
     from tdhil.service.run_channel import lives
     from tdhil.service.run_state import State
@@ -241,16 +241,16 @@ def _uvicorn(
         app, log_level="warning", access_log=False, http="h11", ws="websockets-sansio",
         ws_max_size=4096, ws_ping_interval=10.0, ws_ping_timeout=SILENT_S, timeout_graceful_shutdown=2, lifespan="on",
         server_header=False, date_header=True,
-        h11_max_incomplete_event_size=2 * HEADER_LIMIT, proxy_headers=False,      # the client is the connected address
+        h11_max_incomplete_event_size=2 * HEADER_LIMIT, proxy_headers=False,      # address of the connection
         ssl_certfile=None if tls is None else tls.cert, ssl_keyfile=None if tls is None else tls.key,
     )
     if tls is not None:
         config.load()
-        config.ssl = tls.context()             # the checked one, with the ciphers of Python
+        config.ssl = tls.context()             # the checked context, with the ciphers of Python
     door = Door(listening, room, say, tls=config.ssl if tls is not None else None)
 
     class Server(uvicorn.Server):  # type: ignore[misc]
-        """uvicorn behind tdhil's `Door`: it accepts no connection itself."""
+        """uvicorn server that accepts no connection itself: tdhil's `Door` does."""
 
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
             await super().startup(sockets=[])

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def routes(site: Site) -> list[Route]:
-    """Return the routes. Health and metrics are also at the root, where monitoring expects them."""
+    """Return the routes. Health and metrics are also at the root, where monitoring systems expect them."""
     return [
         api(site, "audit", audit),
         api(site, "health", health),
@@ -37,7 +37,7 @@ def routes(site: Site) -> list[Route]:
 
 
 async def audit(site: Site, request: Request, body: None) -> AuditView:
-    """Return the newest lines of the audit, and whether its chain is whole."""
+    """Return the newest lines of the audit, and whether its chain is intact."""
     limit = request.query_params.get("limit", "200")
     if not limit.isdecimal() or not 1 <= int(limit) <= 5000:
         raise UsageError("must be 1 to 5000", where="limit", entry=MessageCode.REQUEST_WRONG)
@@ -54,7 +54,7 @@ async def audit(site: Site, request: Request, body: None) -> AuditView:
 
 
 async def health(site: Site, request: Request, body: None) -> HealthView:
-    """Return the health. Only a known client sees the live runs."""
+    """Return the health of the service. Only an identified client gets the live runs."""
     rigs = await off(site.supervisor.rigs.all)
     live = site.supervisor.live() if principal(request).roles else []
     return HealthView("ok", __version__, live, len(rigs))

@@ -1,4 +1,4 @@
-"""The service behind the web: what every route is given. It answers in plain views, and knows no HTTP."""
+"""The service behind the web, as each route uses it. It returns plain views, and is independent of HTTP."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ from tdhil.service.supervisor import Supervisor
 
 T = TypeVar("T")
 STOPS: Final = 16
-"""Number of simultaneous stops, each in its own thread, which is started in advance."""
+"""Largest number of simultaneous stops. Each has its own thread, which is started in advance."""
 LEASES: Final = 8
-"""Number of threads for leases of watched runs, beside the web's other threads."""
+"""Number of threads for leases of watched runs, in addition to the web's other threads."""
 
 
 TREND_RUNS: Final = 1000
-"""Number of runs that a trend goes back."""
+"""Number of latest runs in a trend."""
 
 
 def _local(asked: str) -> str:
-    """Return a time in UTC as local time with its zone, as every text of a trend shows it."""
+    """Return a time in UTC as local time with its zone, the format of each text of a trend."""
     return datetime.fromisoformat(asked).astimezone().isoformat(timespec="seconds")
 
 
@@ -62,7 +62,7 @@ class Metrics:
 
 
 class Site:
-    """The parts of one service around its supervisor. ``access``: roles and logins.
+    """All parts of one service. ``access``: roles and logins.
 
     ``logs``: folders, by name, whose logs may be identified again.
     """
@@ -79,14 +79,14 @@ class Site:
         self.metrics = Metrics()
         self.relays = 0
         self.leases = anyio.CapacityLimiter(LEASES)
-        self.logins = anyio.CapacityLimiter(1)         # passwords too: each takes 32 MB
+        self.logins = anyio.CapacityLimiter(1)         # limit of simultaneous password checks: each takes 32 MB
         self.waiting_replays: dict[tuple[str, str], ReplayView] = {}
         self.replay_names = threading.Lock()
         self.tasks: set[asyncio.Task[None]] = set()
         self._stops = ThreadPoolExecutor(STOPS, "stop")
         self._answers = KeptAnswers(self.store.runs)
         self._works = anyio.CapacityLimiter(1)         # computations that a page waits for, one at a time
-        self._replays = anyio.CapacityLimiter(1)       # slow ones, so that no plan waits behind them
+        self._replays = anyio.CapacityLimiter(1)       # slow computations, so that no plan waits for them
 
     def begin_stops(self) -> None:
         """Start the threads for stops: on a busy computer, a thread may take 200 ms to start."""
@@ -100,7 +100,7 @@ class Site:
         return await asyncio.get_running_loop().run_in_executor(self._stops, stop)
 
     async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """Compute a task, one at a time. Return its document, kept from before if it can't differ. Raises Refused."""
+        """Compute a task, one at a time. Return its document; from the cache if it can't differ. Raises Refused."""
         key = self._answers.key(what, asked)
         if (kept := self._answers.get(key)) is not None:
             return kept
@@ -112,7 +112,7 @@ class Site:
         return found
 
     def rig_view(self, rig: RigFile) -> RigView:
-        """Return a rig, with its present user and its last run."""
+        """Return the view of a rig, with its present user and its last run."""
         if rig.rig is None:
             return RigView(rig.id, rig.id, "unusable", False, "never", rig.problem)
         try:
@@ -138,7 +138,7 @@ class Site:
         )
 
     def list_runs(self, rig: str | None, state: str | None, limit: int, text: str = "") -> list[Summary]:
-        """Return runs from the index; from the files if it is not available or out of date, as for a live run."""
+        """Return runs from the index; from the files if the index is missing or out of date, as for a live run."""
         live = self.supervisor.ahead_of_the_index()
         now_live = []
         for run in live:
@@ -154,13 +154,13 @@ class Site:
         return sorted(found, key=lambda one: one.id, reverse=True)[:limit]
 
     def trend_rows(self, rig: str) -> list[dict[str, Any]]:
-        """Return the rows of a rig's history, each with the time that every page shows: when the run was requested."""
+        """Return the rows of a rig's history, each with the time of the run's request, as on every page."""
         runs = self.list_runs(rig, "done", TREND_RUNS)
         return [{**row, "date": _local(one.asked)} for one in runs
                 if (row := read_json(self.store.place(one.id) / "row.json")) is not None]
 
     def trends_around(self, rig: str, run: str) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-        """Return the rig's trend without this run, and with it."""
+        """Return the rig's trend without this run, and the trend with it."""
         rows = self.trend_rows(rig)
         before = [one for one in rows if one.get("log") != run]
         first, second = (
@@ -176,7 +176,7 @@ class Site:
         return [one for _, one in sorted((made | waiting).items())]
 
     def run_view(self, run: str, status: Status | None = None) -> RunView:
-        """Return a run without its samples. ``status``: if the run itself has just reported it. Raises NotThere."""
+        """Return the view of a run. ``status``: the status that the run itself has just reported. Raises NotThere."""
         request, folder = self.store.request(run), self.store.place(run)
         status = status or self.store.status(run)
         rig_name = request.rig

@@ -1,6 +1,6 @@
-"""A run from a request over HTTP: the options of the command line, as an object, on a rig's own file.
+"""Request of a run over HTTP: an object with options of the command line, and a rig's file.
 
-Only the rig's file states the drive's address and type: nothing over HTTP names a bus, a host, a device or a file.
+Only the rig's file states the drive's address and type. No HTTP request can name a bus, a host, a device or a file.
 Options that only an operator at the shaft can decide are refused.
 """
 
@@ -51,7 +51,7 @@ _NAMES: Final = {one.flag.removeprefix("--").replace("-", "_"): one.name for one
 
 
 def options_of(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options by name. Raises NotAllowed with the option, and ValuesWrong with every wrong value."""
+    """Return the options by name. Raises NotAllowed with the option, or ValuesWrong with all wrong values."""
     found: dict[str, Any] = {}
     wrong: list[tuple[str, str]] = []
     for given, value in asked.items():
@@ -80,13 +80,13 @@ def options_of(asked: Mapping[str, Any]) -> dict[str, Any]:
 
 
 SMALLEST: Final = 1e-5
-"""A lower limit below it only says that the value must be positive."""
+"""A lower limit below this value only means that the value must be positive. It is not printed."""
 LARGEST: Final = 1e15
-"""An upper limit above it is that of the number's kind, and not worth a word."""
+"""An upper limit above this value only comes from the number's type. It is not printed."""
 
 
 def _limits_in_words(name: str, value: Any) -> str:
-    """Return which limits a number exceeds, in the unit of the form's field; '' if none."""
+    """Return as text which limits a number exceeds, in the unit of the form's field; '' if none."""
     option = OPTION.get(name)
     if option is None or not option.limits or isinstance(value, bool) or not isinstance(value, int | float):
         return ""
@@ -110,7 +110,7 @@ def _limits_in_words(name: str, value: Any) -> str:
 
 
 class ValuesWrong(UsageError):
-    """All values of a request that cannot be used. ``fields``: option and message of each."""
+    """Refusal of all wrong values of a request. ``fields``: option and message of each."""
 
     entry = MessageCode.REQUEST_WRONG
 
@@ -121,7 +121,7 @@ class ValuesWrong(UsageError):
 
 
 def _value(option: Option, value: Any) -> Any:
-    """Return the value as the command line would parse it. rig.yaml's own checks follow later."""
+    """Parse a value as on the command line. The checks of rig.yaml follow later."""
     where = option.name
     if option.unit is not None:
         if isinstance(value, str):
@@ -172,7 +172,7 @@ def option_schema(option: Option) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class RigFile:
-    """One rig of the site, from its present file. ``problem``: why it can't be used, '' if it can."""
+    """One rig of the site, from its present file. ``problem``: why the file can't be used, '' if it can."""
 
     id: str
     path: Path
@@ -189,7 +189,7 @@ class RigFile:
         return "never" if self.rig is None else self.rig.service.motion
 
     def way(self, asked: Mapping[str, Any] | None = None) -> tuple[RunOptions, Connection]:
-        """Return its options and the connection to its drive. Raises UsageError and DataFileError."""
+        """Return the rig's options and the connection to its drive. Raises UsageError and DataFileError."""
         if self.rig is None:
             raise UsageError(self.problem, next_step="Correct the rig's file")
         cli = _taken(asked or {})
@@ -198,7 +198,7 @@ class RigFile:
 
     @property
     def simulated(self) -> bool:
-        """Return whether the embedded simulator is meant. A rig with an unusable file counts as real."""
+        """Whether the rig uses the embedded simulator. A rig with an unusable file counts as real."""
         try:
             options, connection = self.way()
         except (UsageError, DataFileError):
@@ -207,7 +207,7 @@ class RigFile:
 
     @property
     def address(self) -> str | None:
-        """Return the drive's address, as `tdhil.session.hold` locks it; None if it is simulated or unknown."""
+        """Address of the drive, as `tdhil.session.hold` locks it; None for a simulated or unknown drive."""
         try:
             options, connection = self.way()
         except (UsageError, DataFileError):
@@ -216,7 +216,7 @@ class RigFile:
 
 
 class Rigs:
-    """The rig files of a folder, read again when they change; the built-in ones if it has none."""
+    """The rig files of a folder, read again when they change. Without rig files: the built-in rigs."""
 
     def __init__(self, folder: Path | None) -> None:
         self.folder = folder
@@ -228,7 +228,7 @@ class Rigs:
 
     @property
     def left_out(self) -> list[str]:
-        """Return YAML files whose names are not valid for a rig."""
+        """Return the YAML files whose names are not valid for a rig."""
         found = () if self.folder is None else self.folder.glob("*.y*ml")
         return sorted(one.name for one in found if one.suffix != ".yaml" or not RIG_ID.fullmatch(one.stem))
 
@@ -270,7 +270,7 @@ EDITABLE: Final = frozenset({
     "name", "limits", "gear", "load", "make_up_torque_nm", "torque_ramp_nm_s", "drive_data", "expected",
     "reference_inertia_kg_m2", "accept_unverified", "rate_hz",
 })
-"""Keys of a rig's file that HTTP may change: not the drive's address, nor its type, nor the rules of motion."""
+"""Keys of a rig's file that HTTP may change. The drive's address and type, and the rules of motion, are no part."""
 
 
 def edited(old: str, text: str, name: str) -> tuple[str, ...]:
@@ -305,7 +305,7 @@ def require_unwatched(rig: RigFile) -> None:
 
 
 def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None = None) -> RunRequest:
-    """Return the request that the command line would make, by the same functions in the same order.
+    """Make the request of a run, by the functions of the command line in the same order.
 
     Raises UsageError, DataFileError and PreflightRefused.
     """
@@ -329,7 +329,7 @@ def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None 
 
 
 def plan_of(rig: RigFile, asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the plan, its assumptions and its expected result. Nothing is connected. Raises as `run_request`."""
+    """Return the plan, its assumptions and its expected result. No drive is connected. Raises as `run_request`."""
     from tdhil.session import plan_document, plan_dry
 
     options, connection = rig.way(asked)
@@ -339,7 +339,7 @@ def plan_of(rig: RigFile, asked: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def binding_of(request: RunRequest, rig_sha256: str, preflight: Any, plan: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of all that a confirmation is valid for: rig file, profile, options, preflight, plan."""
+    """Return the SHA-256 of the data that a code confirms: rig file, profile, options, preflight, plan."""
     plain = {
         "rig": rig_sha256,
         "profile": request.connection.profile.model_dump(mode="json", by_alias=True),
@@ -352,7 +352,7 @@ def binding_of(request: RunRequest, rig_sha256: str, preflight: Any, plan: Mappi
 
 
 def is_as_it_was(path: Path, sha256: str) -> bool:
-    """Return whether the rig's file still exists with the content of this hash."""
+    """Return whether the rig's file still exists and has this hash."""
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest() == sha256
     except OSError:

@@ -1,4 +1,4 @@
-"""The service's data in files. The index beside them can be deleted, and is then made again.
+"""The service's data in files. The index only repeats them: if it is deleted, it is made again.
 
 ::
 
@@ -29,19 +29,19 @@ ID: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[0-9a-f]{6}")
 """Id of a run: date, time (UTC), and a random part."""
 _FILE_LIMIT: Final = 16 * 2**20
 RESERVE: Final = 2**16
-"""Disk space reserved for the final status of a run, bytes."""
+"""Disk space reserved for the final status of a run, bytes. It is used when the disk is full."""
 CONNECTION_FILE: Final = "connection.json"
-"""File in a run's folder: the address of its drive, for a later stop (`tdhil.session.kept`)."""
+"""File in a run's folder with the address of its drive, for a later stop (`tdhil.session.kept`)."""
 _RESERVE, _USED = ".reserve", ".state.json"
 
 
 def write_whole(path: Path, data: bytes, mode: int | None = None) -> None:
-    """Write a file atomically, also against loss of power; ``mode``: its permissions. Raises OSError."""
+    """Write a file atomically, safe against loss of power. ``mode``: permissions of the file. Raises OSError."""
     beside = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}")
     try:
         with beside.open("wb") as file:
             if mode is not None:
-                os.fchmod(file.fileno(), mode)     # while it is empty
+                os.fchmod(file.fileno(), mode)     # set while the file is empty
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
@@ -53,7 +53,7 @@ def write_whole(path: Path, data: bytes, mode: int | None = None) -> None:
 
 
 def write_json(path: Path, plain: Mapping[str, Any], mode: int | None = None) -> None:
-    """Write a JSON object atomically."""
+    """Write a JSON object atomically. ``mode``: permissions of the file. Raises OSError."""
     write_whole(path, json.dumps(plain, ensure_ascii=False, indent=1, allow_nan=False).encode() + b"\n", mode)
 
 
@@ -67,7 +67,7 @@ def read_json(path: Path) -> dict[str, Any] | None:
 
 
 def _sync_folder(folder: Path) -> None:
-    with suppress(OSError):                # not every file system supports it
+    with suppress(OSError):                # not every file system supports fsync of a folder
         descriptor = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(descriptor)
@@ -80,7 +80,7 @@ def _sync_folder(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class StoredRequest:
-    """The request of a run; request.json. ``options`` as received, ``motion`` as in the rig's file."""
+    """Request of a run, file request.json. ``options`` as received, ``motion`` as in the rig's file."""
 
     id: str
     rig: str
@@ -95,7 +95,7 @@ class StoredRequest:
 
     @property
     def rehearsal(self) -> bool:
-        """Return whether faults of the simulated drive are rehearsed: the result is no history of the rig."""
+        """Whether faults of the simulated drive are rehearsed. Such a result is no part of the rig's history."""
         return bool(self.options.get("fault"))
 
     @staticmethod
@@ -116,11 +116,11 @@ class Summary:
     simulated: bool = True
     verdict: str | None = None
     inertia_kg_m2: float | None = None
-    low_kg_m2: float | None = None         # the interval to quote, torque scale included
+    low_kg_m2: float | None = None         # coverage interval to quote, with the torque scale's uncertainty
     high_kg_m2: float | None = None
     repeatability_rel: float | None = None
     exit_code: int | None = None
-    rehearsal: bool = False                # of a fault on the simulated drive
+    rehearsal: bool = False                # whether a fault of the simulated drive was rehearsed
     operator: str | None = None
     note: str | None = None
 
@@ -131,11 +131,11 @@ class Summary:
 
 
 SEARCHED: Final = ("id", "rig", "state", "asked", "asked_by", "verdict", "operator", "note")
-"""Columns of `Summary` that a search looks into."""
+"""Columns of `Summary` in which a search finds text."""
 
 
 def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any] | None) -> Summary:
-    """Return the row of a run from its files."""
+    """Return a run's row of the list from the contents of its files."""
     inertia = (result or {}).get("inertia_kg_m2") or {}
     return Summary(
         request.id, request.rig, status.state.value, request.asked, request.asked_by,
@@ -194,7 +194,7 @@ class Store:
             raise NotThere("the run has no request", where=f"run {run}") from None
 
     def status(self, run: str) -> Status:
-        """Return the status in its file; ``interrupted`` if the file can't be read."""
+        """Return the status from the run's file; ``interrupted`` if the file can't be read."""
         folder = self.place(run)
         plain = read_json(folder / _USED) or read_json(folder / "state.json")
         try:
@@ -216,14 +216,14 @@ class Store:
                 yield self.summary(run)
 
     def begin(self, request: StoredRequest) -> Status:
-        """Write the request. Raises OSError."""
+        """Write the request and the first status of a run. Return the status. Raises OSError."""
         status = Status.begun(request.id, request.rig, request.asked)
         write_json(self.runs / request.id / "request.json", asdict(request))
         self.save(status)
         return status
 
     def save(self, status: Status) -> None:
-        """Write the status; on a full disk into the reserved space. Raises OSError if that is missing, too."""
+        """Write the status; on a full disk, into the reserved space. Raises OSError without reserved space."""
         folder, plain = self.runs / status.id, status.plain()
         try:
             write_json(folder / "state.json", plain)
@@ -232,7 +232,7 @@ class Store:
             text = json.dumps(plain, ensure_ascii=False).encode().ljust(RESERVE)
             if kept is None or len(text) > RESERVE:
                 raise
-            with kept.open("r+b") as file:         # in place: this needs no new disk space
+            with kept.open("r+b") as file:         # written in place: this needs no new disk space
                 file.write(text)
                 file.flush()
                 os.fsync(file.fileno())
@@ -246,12 +246,12 @@ class Store:
             (self.runs / run / _RESERVE).write_bytes(b" " * RESERVE)
 
     def release(self, run: str) -> None:
-        """Free the reserved space."""
+        """Free the reserved disk space."""
         with suppress(OSError):
             (self.runs / run / _RESERVE).unlink(missing_ok=True)
 
     def signed_off(self, run: str) -> dict[str, Any] | None:
-        """Return who signed off a stop that was not confirmed."""
+        """Return who signed off a stop that was not confirmed, when, and the note; None if no user did."""
         return read_json(self.place(run) / "signed_off.json")
 
     def sign_off(self, run: str, who: str, note: str) -> None:
@@ -273,7 +273,7 @@ _VERSION: Final = 3
 
 
 class Index:
-    """index.sqlite, with a rollback journal: files beside it may be lost in a copy. For any thread."""
+    """Index of runs, for any thread. index.sqlite has a rollback journal, since a copy may lose files beside it."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -288,7 +288,7 @@ class Index:
     def find(
         self, *, rig: str | None = None, state: str | None = None, text: str = "", limit: int = 100
     ) -> list[Summary]:
-        """Return matching rows, the newest first; ``text``: as of `Summary.contains`. Raises sqlite3.Error."""
+        """Return matching rows, the newest first. ``text``: words for `Summary.contains`. Raises sqlite3.Error."""
         where = [f"{name} = ?" for name, value in (("rig", rig), ("state", state)) if value is not None]
         values = [value for value in (rig, state) if value is not None]
         for word in text.split():
@@ -303,7 +303,7 @@ class Index:
         return [Summary(**{**one, **{name: bool(one[name]) for name in ("simulated", "rehearsal")}}) for one in found]
 
     def rebuild(self) -> int:
-        """Make it again from the files. Return the number of runs."""
+        """Make the index again from the files. Return the number of runs."""
         with self._lock:
             self._path.unlink(missing_ok=True)
             with closing(self._open(filled=False)) as base, base:

@@ -1,7 +1,7 @@
-"""Supervises the runs of one service: starts each as a process, finds them again, and handles those that died.
+"""Supervisor of the runs of one service: starts each as a process, finds it after a restart, handles its failure.
 
-It opens no drive's bus. Its data on a run are in the run's folder; the run's lock shows whether the run is alive. So a
-web that was killed finds everything again after a restart, and nothing moves by that.
+It opens no drive's bus. Its data on a run are in the run's folder. The run's lock shows whether the run is alive. So
+after a restart, a web that was killed finds all runs again. A restart moves nothing.
 """
 
 from __future__ import annotations
@@ -51,27 +51,27 @@ from tdhil.session import Holder, holder_of, holders
 LOOK_S: Final = 0.2
 """Interval of the check whether a run is alive, s."""
 INDEX_LOOKS: Final = 10
-"""Number of checks after which a failed index entry is tried again."""
+"""Number of checks between two tries to write a failed index entry."""
 STOP_S: Final = 60.0
 """Longest duration of `tdhil stop` for a shaft that keeps turning, s."""
 KEYS: Final = 500
-"""Number of newest runs whose Idempotency-Key is known."""
+"""Number of newest runs that are searched for an Idempotency-Key."""
 SIMULATED_STOP: Final = "no real shaft turns: the simulated drive ended with its run"
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Asked:
-    """A requested run. ``new``: it was not requested before with the same key."""
+    """A requested run. ``new``: False if an earlier request had the same key."""
 
     request: StoredRequest
     new: bool
 
 
 class Jobs:
-    """Small jobs, done one after the other in one thread, which is started in advance.
+    """Queue of small jobs. One thread, started in advance, does them one after the other.
 
-    `add` waits for nothing. A new thread per job would be too slow: it takes 200 ms to start on a busy computer, and
+    `add` never waits. A new thread per job would be too slow: it takes 200 ms to start on a busy computer, and
     the reply to a Stop would wait for it.
     """
 
@@ -80,11 +80,11 @@ class Jobs:
         threading.Thread(target=self._work, args=(self._jobs, say), name=name, daemon=True).start()
 
     def add(self, job: Callable[[], None]) -> None:
-        """Add a job after the earlier ones."""
+        """Add a job at the end of the queue."""
         self._jobs.put(job)
 
     def finish(self, within_s: float) -> bool:
-        """Wait until all jobs are done. Return whether they are."""
+        """Wait at most ``within_s`` for all jobs. Return whether they are done."""
         done = threading.Event()
         self._jobs.put(done.set)
         return done.wait(within_s)
@@ -94,12 +94,12 @@ class Jobs:
         while True:
             try:
                 jobs.get()()
-            except Exception as error:         # of one job: the others are still done
+            except Exception as error:         # one job failed: the others are still done
                 say(f"{type(error).__name__}: {error}")
 
 
 class Supervisor:
-    """The supervisor of all runs, for any thread. ``say`` prints a line on the terminal of `tdhil serve`."""
+    """Supervisor of all runs, for any thread. ``say`` prints a line on the terminal of `tdhil serve`."""
 
     def __init__(
         self, store: Store, rigs: Rigs, audit: Audit, index: Index, *, say: Say = lambda text: None,
@@ -116,21 +116,21 @@ class Supervisor:
         self._stops: dict[str, tuple[str, str]] = {}   # (who, when) requested the stop of a suspended run
         self._unconfirmed: dict[str, Status] = {}      # runs whose stop was not confirmed
         self._unindexed: set[str] = set()
-        self._to_index: set[str] = set()               # those that have just ended
+        self._to_index: set[str] = set()               # runs that have just ended
         self._braking = False
         self.pace = RequestPace()
-        self.not_at_rest: list[str] = []               # of the runs that `brake` stopped
+        self.not_at_rest: list[str] = []               # runs stopped by `brake`, standstill not confirmed
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
         self._begun: list[threading.Thread] = []
         self._notes = Jobs("audit", say)
-        self._indexing = Jobs("index", say)            # separate: it may be locked for long
+        self._indexing = Jobs("index", say)            # separate: the index may be locked for long
         self._being_indexed: set[str] = set()
 
     # -- begin and end of the service ----------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Find the runs that are alive, handle those that died, and keep checking."""
+        """Find the runs that are alive, handle those whose process is gone, and start the periodic check."""
         for run in self.store.ids():
             with suppress(Exception):
                 status = self.store.status(run)
@@ -139,12 +139,12 @@ class Supervisor:
                 elif status.state is State.STOP_NOT_CONFIRMED:
                     self._unconfirmed[run] = status
         self._in_background(self._begin_audit)
-        self._in_background(self._rebuild_index)       # entries that a killed web did not write
+        self._in_background(self._rebuild_index)       # with entries that a killed web did not write
         self._thread = threading.Thread(target=self._look, name="runs", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Stop supervising. Runs continue."""
+        """End the supervision. Runs continue."""
         self._end.set()
         if self._thread is not None:
             self._thread.join(5.0)
@@ -154,11 +154,11 @@ class Supervisor:
         self._indexing.finish(5.0)
 
     def brake(self, who: str, within_s: float = STOP_S) -> bool:
-        """Start no more runs, stop all, and wait until they have ended. Return whether they have.
+        """Refuse new runs, stop all runs, and wait until they have ended. Return whether they have.
 
         `not_at_rest` lists the runs without a confirmed standstill, ended or not.
         """
-        with self._asking:             # a run that is being started is started first, and is then stopped, too
+        with self._asking:             # a start in progress is finished first; then this run is stopped, too
             self._braking = True
         stopping = self.live()
         for run in stopping:
@@ -204,7 +204,7 @@ class Supervisor:
         options = options_of(asked)
         rig = self.rigs.get(rig_id)
         require_motion(rig)
-        rig.way(options)               # contradicting options are reported now, not by the run
+        rig.way(options)               # contradictions between options are reported now, not by the run
         with self._asking:
             if key is not None and (before := self._by_key(rig_id, key, who)) is not None:
                 if dict(before.options) != options:
@@ -215,7 +215,7 @@ class Supervisor:
                 raise Conflict("the service is ending", next_step="Start tdhil serve again")
             self.refuse_busy(rig)
             simulated = rig.simulated
-            if not simulated or rig.motion == "watched":           # it shows a code
+            if not simulated or rig.motion == "watched":           # such a run shows a code
                 self.pace.begin(who, address, rig.id)
             request = self._write_down(StoredRequest("", rig.id, str(rig.path.resolve()), rig.sha256, options, who,
                                                      now(), simulated, rig.motion, key))
@@ -267,11 +267,11 @@ class Supervisor:
 
     @staticmethod
     def holder(rig: RigFile) -> Holder | None:
-        """Return the holder of the lock on the rig's drive."""
+        """Return the program that holds the lock on the rig's drive; None without one."""
         return holder_of(rig.address)
 
     def certainly_idle(self, rig: RigFile) -> bool:
-        """Return whether certainly no tdhil of this computer moves the rig's real drive, and no sign-off is open."""
+        """Return whether no tdhil of this computer can move the rig's real drive, and no sign-off is missing."""
         address = rig.address
         return address is not None and holder_of(address) is None and self.blocked(rig.id) is None
 
@@ -282,7 +282,7 @@ class Supervisor:
         return None if found is None else found.id
 
     def confirm(self, run: str, code: str, binding: str | None, who: str, lease: str | None = None) -> Status:
-        """Pass on the code. Raises NotThere, and Conflict (nothing to confirm; wrong code; void code).
+        """Send the code to the run. Raises NotThere, and Conflict (nothing to confirm; wrong code; void code).
 
         ``lease``: the key of a page that will renew it, for a watched rig.
         """
@@ -301,7 +301,7 @@ class Supervisor:
         return Status.of_plain(found["status"])
 
     def renew(self, run: str, key: str, who: str, *, new_key: str | None, gone: str | None) -> Watch:
-        """Pass on that the page of a watched run is visible or goes. Raises NotThere, Conflict, CommunicationLost."""
+        """Report to a watched run that its page is visible or gone. Raises NotThere, Conflict, CommunicationLost."""
         asked = {"do": "lease", "key": key, "new_key": new_key, "gone": gone, "by": who}
         try:
             return Watch(**ask(self.store.place(run), asked)["watch"])
@@ -309,11 +309,11 @@ class Supervisor:
             raise Conflict(error.what, where=error.where, next_step=error.next_step) from error
 
     def stop(self, run: str, who: str) -> Status:
-        """Stop a run over its socket; if that does not answer, with SIGTERM. Both return at once.
+        """Stop a run over its socket; without a reply, with SIGTERM. Both return at once.
 
         A suspended process (SIGSTOP, a debugger) can't stop the shaft, and must not continue later. It is killed, and
         its drive is stopped as for any run whose process was lost (decision 0022). Raises NotReacting then, NotThere,
-        and CommunicationLost if neither reached it.
+        and CommunicationLost if neither reached the run.
         """
         folder = self.store.place(run)
         wish = {"do": "stop", "by": who}
@@ -324,7 +324,7 @@ class Supervisor:
                 if (status := self.store.status(run)).ended:
                     return status
                 self._kill_frozen(status, who)
-                # Its process may be starting. It reads this file once it listens, so one of both finds the other.
+                # The run's process may be starting. It reads this file once it listens, so one of both ways reaches it.
                 write_json(folder / STOP_FILE, {"by": who, "at": now()})
                 found = ask(folder, wish, timeout_s=1.0)
             status = Status.of_plain(found["status"])
@@ -356,7 +356,7 @@ class Supervisor:
             next_step="Check that the shaft comes to standstill. If it turns, use the hard-wired stop")
 
     def stop_drive(self, rig: RigFile, who: str) -> tuple[int, str]:
-        """Run `tdhil stop` on a rig without a run of this service. Return its exit code and a text.
+        """Run `tdhil stop` on a rig without a run of this service. Return the exit code and a text.
 
         If a run blocks the rig, the drive of that run is stopped, on the run's own connection.
         """
@@ -372,7 +372,7 @@ class Supervisor:
     def _stop_drive_of(self, request: StoredRequest, status: Status) -> tuple[bool, str]:
         """Stop the drive of a run on the run's own connection. Return whether standstill was confirmed, and a text.
 
-        It is never confirmed if the rig's file has changed since: then it is unknown which shaft that was.
+        It is never confirmed if the rig's file has changed since: then it is unknown which shaft was stopped.
         """
         if request.simulated:
             return True, SIMULATED_STOP
@@ -399,12 +399,12 @@ class Supervisor:
         self.note(who, "signed off", run, status.rig, note=note)
 
     def edit_rig(self, rig_id: str, text: str, sha256: str, who: str) -> RigFile:
-        """Replace the rig's file of this hash by the text; the old one is kept.
+        """Replace the rig's file with this hash by the text. A copy of the old file is kept.
 
         Raises NotThere; UsageError, DataFileError and NotAllowed for an unacceptable text; Conflict if the file has
         changed or the rig is in use; LogError if it can't be written.
         """
-        with self._asking:                     # so that no run starts meanwhile
+        with self._asking:                     # no run can start meanwhile
             rig = self.rigs.get(rig_id)
             if self.rigs.built_in:
                 raise UsageError("this rig is part of tdhil and can't be changed", where=f"rig {rig_id}",
@@ -428,7 +428,7 @@ class Supervisor:
         self.note(who, "rig file edited", None, rig_id, keys=list(keys), before=sha256, after=found.sha256)
         return found
 
-    # -- looking after them ----------------------------------------------------------------------------------------
+    # -- supervision of the runs ---------------------------------------------------------------------------------
 
     def _by_key(self, rig: str, key: str, who: str) -> StoredRequest | None:
         for run in self.store.ids()[:KEYS]:
@@ -460,7 +460,7 @@ class Supervisor:
             for run in self.live():
                 try:
                     self._look_at(run)
-                except Exception as error:     # of one run: the others are still supervised
+                except Exception as error:     # the check of one run failed: the others are still supervised
                     self.say(f"run {run}: {type(error).__name__}: {error}")
 
     def _look_at(self, run: str) -> None:
@@ -469,10 +469,10 @@ class Supervisor:
         status = self.store.status(run)
         if status.ended:
             if alive and run in self._children and self._children[run].poll() is None:
-                return                         # it has written its final status, and is about to end
+                return                         # the run has written its final status, and its process is about to end
             self._settle(run, status)
         elif not alive:
-            status = self.store.status(run)    # it may have ended between the two checks
+            status = self.store.status(run)    # the run may have ended between the two checks
             if status.ended:
                 self._settle(run, status)
             elif run not in self._lost:        # in a thread: a silent drive delays nothing else
@@ -495,7 +495,7 @@ class Supervisor:
         self.note("service", f"ended: {status.state}", run, status.rig, exit_code=status.exit_code, **watched)
 
     def _died(self, run: str, status: Status) -> Status:
-        """Handle a run whose process is gone: first stop the drive, then the rest."""
+        """Handle a run whose process is gone: stop its drive first, then save the status and recover the log."""
         request = self.store.request(run)
         self.say(f"run {run}: its process is gone; stopping the drive")
         seen, said = self._stop_drive_of(request, status)
@@ -515,7 +515,7 @@ class Supervisor:
         return status
 
     def _save(self, status: Status) -> None:
-        """Save the status, however long it takes: while the disk is full, the rig stays blocked."""
+        """Save the status, with retries until it is saved. While the disk is full, the rig stays blocked."""
         told = False
         while not self._end.is_set():
             try:
@@ -573,11 +573,11 @@ class Supervisor:
             self.say(f"the audit can't be written: {error}")
 
     def _index(self, run: str) -> None:
-        self._being_indexed.discard(run)       # first: later changes are indexed once more
+        self._being_indexed.discard(run)       # removed first, so that later changes are indexed once more
         try:
             self.index.put(self.store.summary(run))
             self._unindexed.discard(run)
-        except Exception as error:             # locked, or a full disk: the files are complete; retry
+        except Exception as error:             # a locked index or a full disk: the files are complete; retry
             if run not in self._unindexed:
                 self.say(f"the index can't be written and is retried: {error}")
             self._unindexed.add(run)

@@ -1,7 +1,7 @@
 """The web: the API, the live sockets and the pages, on one port. It opens no drive's bus and moves nothing itself.
 
-A stop never waits for a computation, a download or the index: it has its own threads. What a route needs is in
-`site`; its handler stands in the module of its subject; `schemas.ROUTES` declares path, role and answers.
+A stop never waits for a computation, a download or the index: it has its own threads. `site` has the data for all
+routes. The handler of a route is in the module of its subject. `schemas.ROUTES` declares path, role and replies.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ from tdhil.service.supervisor import Supervisor
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 SUBJECTS: Final = (rig_routes, run_routes, file_routes, fleet_routes, auth_routes, service_routes)
 _GONE: Final = suppress(WebSocketDisconnect, RuntimeError)
-"""Used around messages to a socket: its other end may disconnect at any time."""
+"""Context for messages to a socket, whose other end may disconnect at any time."""
 
 
 class Web(Site):
-    """The application around one supervisor. ``hosts``: accepted host names.
+    """Web application of one supervisor. ``hosts``: accepted host names.
 
-    ``viewers``: origins (``http://localhost:8080``) whose pages may read logs by the Foxglove protocol, and no more.
+    ``viewers``: origins (``http://localhost:8080``) whose pages may only read logs by the Foxglove protocol.
     ``access``, ``logs``: as in `Site`.
     """
 
@@ -73,7 +73,7 @@ class Web(Site):
     @asynccontextmanager
     async def _lifespan(self, app: Starlette) -> Any:
         self.begin_stops()
-        await off(service_routes.openapi_text)         # takes 0.4 s: now, not while a stop waits
+        await off(service_routes.openapi_text)         # takes 0.4 s: done now, so that no stop waits for it
         await anyio.to_thread.run_sync(self.access.start)
         await anyio.to_thread.run_sync(self.supervisor.start)
         try:
@@ -103,7 +103,7 @@ class Web(Site):
             error = NotThere("this address does not exist", where=path[:100], next_step=listed)
         if path.startswith(API) or request.method != "GET":
             return error_response(error, status, headers)
-        if isinstance(error, NotLoggedIn) and self.access.login:       # a page
+        if isinstance(error, NotLoggedIn) and self.access.login:       # reply to a browser, which gets a page
             there = f"{request.url.path}?{request.url.query}" if request.url.query else request.url.path
             return RedirectResponse(f"/login?{urlencode({'next': there})}", 303)
         told = told_of(error).error
@@ -146,7 +146,7 @@ class Web(Site):
 
         async def guarded(socket: WebSocket) -> None:
             if role not in self.access.who(socket).roles:
-                await socket.accept()          # only then does a page receive the reason
+                await socket.accept()          # a page receives the reason only after this
                 await allowed(socket)
                 return
             async with anyio.create_task_group() as both:
@@ -191,7 +191,7 @@ class Web(Site):
 
     @staticmethod
     async def _listen(socket: WebSocket, scope: anyio.CancelScope) -> None:
-        """Ignore what a viewer sends. Wait until it disconnects."""
+        """Ignore messages of a viewer. Wait until it disconnects."""
         with _GONE:
             while True:
                 message = await socket.receive()

@@ -1,8 +1,8 @@
 """Messages to another system over HTTP: a run has ended or failed, or a rig's results have changed.
 
-One POST of a JSON object for each event, from a thread of its own: nothing else waits for it. With a secret the header
-``X-Tdhil-Signature`` holds ``sha256=`` and the HMAC-SHA256 of the body. tdhil follows no redirect, and reads nothing
-from the answer but its status. What ended before the service started is not sent.
+Each event is one POST of a JSON object, from a separate thread: nothing else waits for it. With a secret the header
+``X-Tdhil-Signature`` holds ``sha256=`` and the HMAC-SHA256 of the body. tdhil follows no redirect, and reads only the
+status of the reply. Runs that ended before the service started are not sent.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 EVERY_S: Final = 1.0
 """Polling interval, s."""
 TIMEOUT_S: Final = 10.0
-"""Longest wait for a connection and for its answer, s."""
+"""Longest wait for a connection and for the reply, s."""
 TRIES_S: Final = (0.0, 5.0, 60.0)
-"""Delay before each try to send a message, s; after the last one it is dropped and reported."""
+"""Delay before each try to send a message, s. After the last failed try, the message is dropped and reported."""
 RUNS: Final = 100
-"""Number of the latest runs that a poll looks at."""
+"""Number of latest runs that a poll checks."""
 SECRET_FILE: Final = "TDHIL_WEBHOOK_SECRET_FILE"
 SIGNATURE: Final = "X-Tdhil-Signature"
 _GOOD: Final = (State.DONE.value, State.STOPPED.value)
@@ -50,7 +50,7 @@ class Webhook:
 
     @staticmethod
     def of(url: str, environment: Mapping[str, str] = os.environ) -> Webhook:
-        """Check an address. Raises UsageError, and never shows a possible password."""
+        """Parse and check an address. Raises UsageError; its text contains no password."""
         try:
             parts = urlsplit(url)
             good = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
@@ -100,9 +100,9 @@ def _secret(environment: Mapping[str, str]) -> bytes | None:
 
 
 class Notifier:
-    """Sends a message for each run that ends, and for each change of a rig that it shows; from `start` to `close`.
+    """Sender of a message for each ended run, and for each change of a rig in its results, from `start` to `close`.
 
-    ``runs``: the latest runs; ``trends``: a rig's trend without a run, and with it, as `tdhil trend --json` prints it.
+    ``runs`` returns the latest runs; ``trends`` a rig's trend without and with a run, as `tdhil trend --json` does.
     """
 
     def __init__(
@@ -116,13 +116,13 @@ class Notifier:
         self._thread = threading.Thread(target=self._run, name="webhook", daemon=True)
 
     def start(self) -> None:
-        """Start. What has ended until now is not sent."""
+        """Start to send. Runs that ended before are not sent."""
         self._since = now()
         self._say(f"Webhook: ended runs and changes are sent to {self._webhook}")
         self._thread.start()
 
     def close(self) -> None:
-        """End; a message that is being sent may be lost."""
+        """End. A message that is being sent may be lost."""
         self._end.set()
 
     def _run(self) -> None:
@@ -132,7 +132,7 @@ class Notifier:
                 for body in self.news():
                     self._deliver(body)
                 trouble = ""
-            except Exception as error:         # of one poll: the next one reports
+            except Exception as error:         # one poll failed: the next poll reports again
                 trouble = f"Webhook: {type(error).__name__}: {error}"
             if trouble not in ("", said):
                 self._say(trouble)
@@ -163,7 +163,7 @@ class Notifier:
 
 
 def message_of(run: Summary) -> dict[str, Any]:
-    """Return the message on an ended run: its row of the list of runs, and whether it ended as requested."""
+    """Return the message on an ended run: data of its row, and whether it ended as requested."""
     return {
         "event": "run.ended" if run.state in _GOOD else "run.failed", "run": run.id, "rig": run.rig, "state": run.state,
         "asked": run.asked, "ended": run.ended, "simulated": run.simulated, "rehearsal": run.rehearsal,
@@ -173,7 +173,7 @@ def message_of(run: Summary) -> dict[str, Any]:
 
 
 def changes_of(run: Summary, before: Trend, after: Trend) -> Iterator[dict[str, Any]]:
-    """Yield a message for each quantity of the rig that has a change, or a drift, only with this run."""
+    """Yield a message for each quantity of the rig that has a new change or drift with this run."""
     known = {one["column"]: one for one in before.get("quantities", ())}
     for quantity in after.get("quantities", ()):
         earlier = known.get(quantity["column"], {})

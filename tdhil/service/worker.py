@@ -1,6 +1,6 @@
-"""Computations beside the web: ``python -m tdhil.service.worker plan|replay|…``, with a request on stdin.
+"""Computations for the web: ``python -m tdhil.service.worker plan|replay|…``, with a request on stdin.
 
-It is a process of its own, at a lower priority than every run: neither a page nor a stop waits for it.
+They run in a separate process, at a lower priority than every run: neither a page nor a stop waits for them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tdhil.errors import UsageError
 from tdhil.numerics import prepare
 from tdhil.service.run_state import Told
 
-NICE: Final = {"plan": 5, "trend": 5, "pace": 0}      # a page waits for it; a run by the clock has 0 too
+NICE: Final = {"plan": 5, "trend": 5, "pace": 0}      # a page waits for these; a run in real time has 0, too
 USUAL_NICE: Final = 19
 
 
@@ -29,7 +29,7 @@ def plan(asked: dict[str, Any]) -> dict[str, Any]:
 
 
 def pace(asked: dict[str, Any]) -> dict[str, Any]:
-    """Return whether this computer sustains the cycle rate of a simulated rig by the clock."""
+    """Measure whether this computer sustains a simulated rig's cycle rate in real time."""
     from tdhil.config import CLOCKS
     from tdhil.service.start_request import read_rig
     from tdhil.session import measure_pace
@@ -39,7 +39,7 @@ def pace(asked: dict[str, Any]) -> dict[str, Any]:
 
 
 def replay(asked: dict[str, Any]) -> dict[str, Any]:
-    """Identify the log again, with another model, tolerance or confidence."""
+    """Identify a run's log again, with another model, tolerance or confidence."""
     from tdhil.api import identify
     from tdhil.config import ASKED_AGAIN
     from tdhil.session import read
@@ -67,7 +67,7 @@ def report(asked: dict[str, Any]) -> dict[str, Any]:
 
 
 def samples(asked: dict[str, Any]) -> dict[str, Any]:
-    """Write the run's samples as samples.csv, by `tdhil export`."""
+    """Write the run's samples as samples.csv, as `tdhil export` does."""
     os.chdir(asked["folder"])
     beside = Path(f".{os.getpid()}-samples.csv")
     command = [sys.executable, "-m", "tdhil", "export", "run.mcap", "--to", "csv", "-o", str(beside)]
@@ -82,7 +82,7 @@ def samples(asked: dict[str, Any]) -> dict[str, Any]:
 
 
 def recover(asked: dict[str, Any]) -> dict[str, Any]:
-    """Write a clean copy of a cut log, and identify from it; no document if that fails."""
+    """Write a clean copy of a log that broke off, and identify from it. No document if this fails."""
     from tdhil.errors import LogError
     from tdhil.recording import examine, write_copy
 
@@ -128,13 +128,13 @@ WORK: Final = {
 
 
 def main(arguments: list[str]) -> int:
-    """Do one task. Return 0; an error is in the answer."""
+    """Compute one task. Return 0; the reply on stdout contains the result or the error."""
     with suppress(OSError, AttributeError):
         os.nice(NICE.get(arguments[0], USUAL_NICE))
-    with suppress(OSError):                    # if memory runs out, this ends before the web or any run
+    with suppress(OSError):                    # without memory, the system ends this process first
         Path("/proc/self/oom_score_adj").write_text("500")
     out = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)                          # output of libraries is not part of the answer
+    os.dup2(2, 1)                          # output of libraries goes to stderr, not into the reply
     try:
         answer = WORK[arguments[0]](json.load(sys.stdin))
     except Exception as error:
