@@ -1,7 +1,7 @@
 """Identification of the moment of inertia of an inverter-driven machine, with its 95 % coverage interval.
 
-The names below are the stable Python API; the command line goes the same ways. They are loaded when they are used, so
-that ``import tdhil`` costs nothing.
+The names below are the stable Python API; the command line uses the same functions. They are loaded at their first
+use, so that ``import tdhil`` is fast.
 """
 
 from importlib import import_module

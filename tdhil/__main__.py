@@ -1,4 +1,4 @@
-"""`tdhil` in a shell, and `python -m tdhil`: as little as can be before Ctrl-C is understood."""
+"""Start of `tdhil` and of `python -m tdhil`. Ctrl-C is handled after as few imports as possible."""
 
 import sys
 from typing import NoReturn
@@ -7,7 +7,7 @@ from tdhil.numerics import prepare
 
 
 def console() -> NoReturn:
-    """Run the command. Ctrl-C while it is still being imported ends it without a traceback, too."""
+    """Run the command. Ctrl-C during its import also ends it without a traceback."""
     prepare()
     try:
         from tdhil.cli.main import console as run

@@ -9,7 +9,7 @@
     with tdhil.simulate(seed=7) as drive:
         recording = tdhil.run(drive, tdhil.Multisine())
 
-Everything here raises `tdhil.TdhilError` and its kind, each with what happened, where, and what to do next.
+All functions raise `tdhil.TdhilError` or a subclass, with what happened, where, and what to do next.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ __all__ = [
 class Motion:
     """Request for stage 5: any excitation of `tdhil.config.registry`, by name. None: chosen to fit the rig.
 
-    The classes below are those that ship. ``amplitude_rad_s``: greatest deviation of the speed from its mean;
-    ``offset_rad_s``: mean speed; ``periods``: at each mean speed, or ways up and down.
+    The classes below are part of tdhil. ``amplitude_rad_s``: greatest deviation of the speed from its mean;
+    ``offset_rad_s``: mean speed; ``periods``: number at each mean speed, or number of ways up and down.
     """
 
     kind: str
@@ -69,10 +69,10 @@ class Motion:
 
 @dataclass(frozen=True)
 class Multisine(Motion):
-    """Several tones at once, of a low crest factor: the default. None: chosen to fit the rig.
+    """Several tones at once, with a low crest factor: the default. None: chosen to fit the rig.
 
-    ``frequency_hz``: the lowest line; ``amplitude_rad_s``: peak of the speed; ``offset_rad_s``: mean speed;
-    ``periods``: at each mean speed, those that settle included.
+    ``frequency_hz``: lowest excited frequency; ``amplitude_rad_s``: peak of the speed; ``offset_rad_s``: mean speed;
+    ``periods``: number at each mean speed, including those for settling.
     """
 
     kind: str = field(default="multisine", init=False)
@@ -94,7 +94,7 @@ class Step(Multisine):
 
 @dataclass(frozen=True)
 class Pulses(Motion):
-    """Torque pulses between steady speeds: no line, no period."""
+    """Torque pulses between steady speeds, without spectral lines and without a period."""
 
     kind: str = field(default="pulses", init=False)
     frequency_hz: None = field(default=None, init=False)
@@ -102,20 +102,20 @@ class Pulses(Motion):
 
 @dataclass(frozen=True)
 class CoastDown(Pulses):
-    """Without torque from one speed to another, and back up under power. Never with a drill string."""
+    """Coast-down without torque from one speed to another, and acceleration back. Never with a drill string."""
 
     kind: str = field(default="coast-down", init=False)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Identifying
+# Identification
 
 
 @dataclass(frozen=True)
 class Result:
     """The identification of one recording. It is displayed as the card in a terminal and in a notebook.
 
-    ``exit_code``: how ``tdhil replay`` would end on a whole run, 0 where there is a number to quote, 9 where not.
+    ``exit_code``: exit code of ``tdhil replay`` for a whole run; 0 if J can be quoted, 9 if not.
     """
 
     identification: Identification
@@ -140,18 +140,18 @@ class Result:
 
     @property
     def frf(self) -> FrequencyResponse | None:
-        """Return the frequency response ω/T at every excited line; None without a periodic excitation.
+        """Return the frequency response ω/T at every excited frequency; None without a periodic excitation.
 
         ``frf.to_frd()`` is for ``control.FRD``, ``frf.to_xarray()`` for a notebook.
         """
         return self.identification.frequency_response
 
     def to_dict(self) -> dict[str, Any]:
-        """The JSON document of ``tdhil identify --json``, exactly."""
+        """Return the JSON document of ``tdhil identify --json``, without any change."""
         return dict(self.document)
 
     def save_report(self, path: str | Path) -> Path:
-        """Write the report, HTML or PDF by its name, and say where it went. Raises UsageError (extra `report`)."""
+        """Write the report, HTML or PDF by its name, and return its path. Raises UsageError (extra `report`)."""
         from tdhil.report import check_report_path, write_report
 
         check_report_path(Path(path), Path(self.record.log), "save_report")
@@ -179,11 +179,11 @@ class Result:
 @with_keywords(OF_THE_RESULT)
 @ByKeyword()
 def identify(recorded: RunRecord, **options: Any) -> Result:
-    """Identify J and all that comes with it from a recording; the same as ``tdhil replay``, digit for digit.
+    """Identify J and all other results from a recording. The results have the same digits as ``tdhil replay``.
 
-    ``options``: ``model`` of the shaft, ``confidence`` of the intervals, ``tolerance``: the relative half-width that is
-    enough for ``valid``; the page on rig.yaml describes them. None: as the run had it. Raises UsageError for values
-    that can't be, and NothingRecorded where the run in a log ended before anything moved.
+    ``options``: ``model`` of the shaft, ``confidence`` of the intervals, ``tolerance``: the largest relative
+    half-width for ``valid``; the page on rig.yaml describes them. None: the value of the run. Raises UsageError for
+    impossible values, and NothingRecorded if the run ended before any motion.
     """
     from tdhil.session import conclude
 
@@ -194,12 +194,12 @@ def identify(recorded: RunRecord, **options: Any) -> Result:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Moving
+# Motion
 
 
 @dataclass(frozen=True)
 class DriveHandle:
-    """Which drive, on which bus, with which rig. Nothing is open: each `run` opens it, and closes it at rest."""
+    """A drive, its bus and its rig. No connection is open: each `run` opens one, and closes it at standstill."""
 
     rig: Rig | None
     options: Mapping[str, Any]
@@ -208,10 +208,10 @@ class DriveHandle:
 
 @contextmanager
 def open_drive(rig: str | Path, **options: Any) -> Iterator[DriveHandle]:
-    """The drive of a rig.yaml. ``options``: those of the command line by their names in rig.yaml, such as
+    """Yield the drive of a rig.yaml. ``options``: options of the command line by their names in rig.yaml, such as
     ``interface``, ``channel``, ``node``, ``host``, ``unit``, ``profile``, ``rate_hz``.
 
-    Raises DataFileError with every problem and its line, and UsageError for options that can't be.
+    Raises DataFileError with every problem and its line, and UsageError for impossible options.
     """
     from tdhil.config import load_rig
 
@@ -224,10 +224,10 @@ def open_drive(rig: str | Path, **options: Any) -> Iterator[DriveHandle]:
 @with_keywords(OF_THE_SIMULATOR)
 @contextmanager
 def simulate(*, rig: str | Path | None = None, **options: Any) -> Iterator[DriveHandle]:
-    """The embedded simulated drive and rig, in stepped time unless ``real_time``; CANopen unless ``drive``.
+    """Yield the embedded simulated drive and rig: in stepped time unless ``real_time``, CANopen unless ``drive``.
 
-    ``options``: those of the drive and of the simulated rig, such as ``seed``, ``plant`` (a plant.yaml) and ``faults``
-    (a list, as of ``--fault``); the page on rig.yaml describes them.
+    ``options``: options of the drive and of the simulated rig, such as ``seed``, ``plant`` (a plant.yaml) and
+    ``faults`` (a list, as for ``--fault``); the page on rig.yaml describes them.
     """
     from tdhil.config import load_rig
 
@@ -249,20 +249,20 @@ def run(
     on_inertia: Callable[[LiveInertia], object] | None = None,
     **options: Any,
 ) -> RunRecord:
-    """Run the five stages and the stop, and give what was recorded; the log is closed then, and the shaft at rest.
+    """Run the five stages and the stop, and return the recording. Then the log is closed and the shaft at standstill.
 
-    ``confirm`` is asked once before a real shaft moves, with what will move in words; anything but True refuses. None:
-    it is typed at the terminal, and refused where there is none. A simulated drive needs none. ``options``: those of
-    motion, result, control loop, overrides and log, such as ``log``, ``mode``, ``tolerance``, ``max_time_s``,
-    ``operator``, ``note``, ``no_watchdog``; ``help(tdhil.run)`` lists them, the page on rig.yaml describes them.
-    ``on_inertia`` is called after periods of the excitation with J so far, in a thread of its own:
-    ``inertia_kg_m2``, ``low_kg_m2``, ``high_kg_m2``, ``p_value`` and more. Each interval covers by itself; stopping the
-    run when one is narrow lowers the coverage, which ``tolerance`` accounts for.
-    Ctrl-C is a stop, as on the command line, where this is the main thread; in another one give a ``stop``, and
-    ``ask()`` it: signals are not looked at there.
+    ``confirm`` is called once before a real shaft moves, with a description of the motion. Only True confirms. None:
+    the operator types it at the terminal; without a terminal, the run is refused. A simulated drive needs none.
+    ``options``: those of motion, result, control loop, overrides and log, such as ``log``, ``mode``, ``tolerance``,
+    ``max_time_s``, ``operator``, ``note``, ``no_watchdog``; ``help(tdhil.run)`` lists them, the page on rig.yaml
+    describes them. ``on_inertia`` is called after periods of the excitation with the present J, in a separate thread:
+    ``inertia_kg_m2``, ``low_kg_m2``, ``high_kg_m2``, ``p_value`` and more. The coverage of each interval holds for
+    that interval alone. A stop at the first narrow interval lowers the coverage; ``tolerance`` accounts for this.
+    In the main thread, Ctrl-C is a stop, as on the command line. In another thread, signals are not handled: pass a
+    ``stop`` and call its ``ask()``.
 
-    Raises what ended the run, with the log's name as a note, once the shaft has been taken care of; StopNotConfirmed
-    where it was not seen at rest: use the hard-wired stop then.
+    Raises the error that ended the run, with the log's name as a note, after the stop of the shaft. Raises
+    StopNotConfirmed if standstill was not confirmed: use the hard-wired stop then.
     """
     from tdhil.runner import not_confirmed
     from tdhil.session import RunRequest, RunSession
@@ -289,14 +289,14 @@ def run(
     else:
         session.close()
     if outcome.stop is not None and not outcome.stop.confirmed:
-        raise not_confirmed(outcome.stop) from cause       # the loudest there is, whatever came first
+        raise not_confirmed(outcome.stop) from cause       # the most serious error comes first
     if cause is not None:
         raise cause
     return RunRecord(recording, configuration, str(session.path))
 
 
 def _peer(drive: DriveHandle, asked: Mapping[str, Any]) -> tuple[RunOptions, Connection, PeerPlan]:
-    """Return what would be opened, after the command line's checks. Raises UsageError and DataFileError."""
+    """Return options, connection and drive of a run, all checked. Raises UsageError and DataFileError."""
     from tdhil.config import resolve
     from tdhil.session import check_log_path, check_unverified, connection_of, plan_peer, with_faults
 

@@ -1,4 +1,4 @@
-"""How each error ends: the exit code, for people's scripts and for the tests.
+"""Exit code of each error, for scripts of users and for the tests.
 
 ::
 
@@ -11,22 +11,22 @@
     ├── DriveFault                  EMCY 7305h in motion; state machine stuck                    6
     │   ├── ModeNotConfirmed        6061h did not follow 6060h in time                           6
     │   └── ReportsContradict       reported speed and reported torque cannot both be true       6
-    ├── LimitHit                    speed left its window; torque or time limit reached          7
-    ├── StopNotConfirmed            the shaft was not seen at rest after the stop sequence       8
-    ├── CommandRejected             a NaN setpoint; never reached the bus, and a mistake of ours 1
+    ├── LimitHit                    speed outside its window; torque or time limit reached       7
+    ├── StopNotConfirmed            standstill was not confirmed after the stop sequence         8
+    ├── CommandRejected             a NaN setpoint, an error in tdhil; it was not transmitted    1
     ├── LogError                    in `tdhil.errors`: each brings its own `exit_code`
     │   ├── LogUnopened             no such folder                                               2
-    │   ├── LogBroken               the disk ran full in mid-run; the shaft was stopped          3
-    │   ├── LogRefused              too little space to begin with; nothing moved                4
-    │   └── NothingRecoverable      not one message of the file can be read                     10
-    ├── TuningRefused               `tdhil tune`: such gains would make the string swing        11
+    │   ├── LogBroken               the disk became full during the run; the shaft was stopped   3
+    │   ├── LogRefused              too little disk space before the run; nothing moved          4
+    │   └── NothingRecoverable      no message of the file can be read                          10
+    ├── TuningRefused               `tdhil tune`: the requested gains can't be recommended      11
     ├── LoopTuningRefused           `tdhil tune speed`: no gains keep the margins               11
     └── Interrupted                 Ctrl-C (130); SIGTERM, SIGHUP, SIGQUIT, SIGTSTP (143); signal n (128 + n)
 
-Codes 3 (partial result) and 9 (not identifiable, model rejected) belong to results, which are no errors; a log that
-broke off ends with 3 as well, since what it holds can be replayed.
-Each error has an entry in the table of messages (`profiles.messages`), whose code is shown behind its text.
-A class or an instance may carry an attribute ``exit_code``, which goes before this table.
+Codes 3 (partial result) and 9 (not identifiable, model rejected) belong to results, which are no errors. A log that
+broke off has code 3, too, since its content can be replayed.
+Each error has an entry in the table of messages (`profiles.messages`). The code of the entry is shown after the text.
+An attribute ``exit_code`` of a class or an instance takes precedence over this table.
 """
 
 import errno
@@ -45,14 +45,14 @@ from drivers import (
 from profiles import MessageCode
 
 SIGNALS, HIGHEST_SIGNAL = 128, 64
-"""An exit code above the first says which signal ended the process."""
+"""Exit code 128 + n: signal n ended the process; n is at most 64."""
 
 
 class ExitCode(IntEnum):
-    """How the process ends."""
+    """Exit code of the process."""
 
     OK = 0
-    INTERNAL = 1                # internal error: a mistake in this program
+    INTERNAL = 1                # internal error: an error in this program
     USAGE = 2                   # usage or configuration
     PARTIAL = 3                 # partial result
     REFUSED = 4                 # preflight refused: nothing has moved
@@ -69,7 +69,7 @@ class ExitCode(IntEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> "ExitCode | None":
-        """128 + n for any other signal that ended a run, as shells have it."""
+        """Return code 128 + n for any other signal n that ended a run, as shells do."""
         if not (isinstance(value, int) and SIGNALS < value <= SIGNALS + HIGHEST_SIGNAL):
             return None
         member = int.__new__(cls, value)
@@ -78,15 +78,15 @@ class ExitCode(IntEnum):
 
 
 class UsageError(TdhilError):
-    """The command line asks for something that can't be, or for two things that exclude each other."""
+    """Refusal: the command line requests something impossible, or two things that exclude each other."""
 
     entry = MessageCode.USAGE
 
 
 class Interrupted(TdhilError):
-    """The operator or the system ended the program; raised after the shaft was stopped.
+    """The operator or the system ended the program. It is raised after the stop of the shaft.
 
-    ``why``: the cause, if more is known than the name of a signal.
+    ``why``: the cause, if more than the name of a signal is known.
     """
 
     entry = MessageCode.INTERRUPTED
@@ -98,7 +98,7 @@ class Interrupted(TdhilError):
 
     @property
     def exit_code(self) -> ExitCode:
-        """130 for Ctrl-C, 143 for those that ask a program to end, 128 + n for any other."""
+        """Exit code: 130 for Ctrl-C, 143 for signals that request the end of a program, 128 + n for other signals n."""
         if _signal_name(self.signal) in _ASK_TO_END:
             return ExitCode.TERMINATED
         return ExitCode(SIGNALS + self.signal)
@@ -108,7 +108,7 @@ _ASK_TO_END = ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGBREAK")
 
 
 def _signal_name(number: int) -> str:
-    """Its name; real-time signals have none."""
+    """Return the name of a signal; "signal n" for real-time signals, which have no name."""
     try:
         return signal.Signals(number).name
     except ValueError:
@@ -129,7 +129,7 @@ _VALUES = frozenset(int(code) for code in ExitCode)
 
 
 def exit_code(error: BaseException) -> ExitCode:
-    """The exit code for ``error``: its own attribute, else that of its nearest class in the table, else 1."""
+    """Return the exit code of ``error``: its own attribute, else that of its nearest class in the table, else 1."""
     own = getattr(error, "exit_code", None)
     if isinstance(own, int) and (own in _VALUES or isinstance(own, ExitCode)):
         return ExitCode(own)
@@ -140,22 +140,22 @@ def exit_code(error: BaseException) -> ExitCode:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What can be wrong with a log, below the root of the tree in `drivers.errors`.
+# Errors of a log, below the root of the error tree in `drivers.errors`.
 #
 # ::
 #
-#     LogError                    empty, not MCAP, not a run of ours                               as the command says
+#     LogError                    empty, not MCAP, not a run of tdhil                              by the command
 #     ├── LogUnopened             no such folder, no right to write there; nothing has moved       exit 2
-#     ├── LogRefused              too little space on the disk to begin with; nothing has moved    exit 4
-#     ├── LogBroken               the disk failed or ran full in mid-run: the shaft was stopped    exit 3
-#     ├── NothingRecoverable      of this file nothing can be read back                            exit 10
-#     └── NothingRecorded         the run was refused, or ended in setup: nothing to identify      exit as the run's
+#     ├── LogRefused              too little space on the disk before the run; nothing has moved   exit 4
+#     ├── LogBroken               disk failure or full disk during the run; the shaft was stopped  exit 3
+#     ├── NothingRecoverable      no message of the file can be read                               exit 10
+#     └── NothingRecorded         the run was refused, or ended in setup: nothing to identify      exit of the run
 #
-# A run whose log broke off is a partial result, not an internal error: what had been written by then replays.
+# A run whose log broke off is a partial result, not an internal error: the written part can be replayed.
 
 
 class LogError(TdhilError):
-    """The log can't be written (disk full, no such folder) or can't be read (empty, not MCAP, not a run of ours)."""
+    """The log can't be written (disk full, no such folder) or can't be read (empty, not MCAP, not a run of tdhil)."""
 
     entry = MessageCode.LOG_PROBLEM
 
@@ -169,7 +169,7 @@ class LogUnopened(LogError):
 
 
 class LogRefused(LogError):
-    """The disk is too full for a run to be begun."""
+    """The disk has too little space for the start of a run."""
 
     entry = MessageCode.LOG_DISK_FULL
 
@@ -177,7 +177,7 @@ class LogRefused(LogError):
 
 
 class LogBroken(LogError):
-    """The log ended before its run did."""
+    """The log ended before its run."""
 
     entry = MessageCode.LOG_BROKEN
 
@@ -185,7 +185,7 @@ class LogBroken(LogError):
 
 
 class NothingRecoverable(LogError):
-    """A log of which nothing can be read."""
+    """No message of the log can be read."""
 
     entry = MessageCode.NOTHING_RECOVERABLE
 
@@ -193,7 +193,7 @@ class NothingRecoverable(LogError):
 
 
 class NothingRecorded(LogError):
-    """A log of a run that ended before there was anything to identify from; it ends as that run did."""
+    """The run in the log ended before it recorded data for an identification. The exit code is that of the run."""
 
     entry = MessageCode.NOTHING_RECORDED
 
@@ -203,7 +203,7 @@ class NothingRecorded(LogError):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What can be wrong with a trace in CSV, below `LogError` and so below the root of the tree.
+# Errors of a trace in CSV, below `LogError` and so below the root of the error tree.
 #
 # ::
 #
@@ -221,7 +221,7 @@ class CsvMisnamed(LogError):
 
 
 class CsvUnusable(LogError):
-    """Nothing of the file can be used as a trace: another export is needed."""
+    """The file can't be used as a trace: another export is needed."""
 
     entry = MessageCode.CSV_UNUSABLE
 
@@ -238,7 +238,7 @@ def code_of(error: BaseException) -> str:
 
 
 def error_document(error: BaseException) -> dict[str, str]:
-    """Return what a JSON document states of an error: ``kind``, ``message`` and ``code``."""
+    """Return the entry of a JSON document for an error: ``kind``, ``message`` and ``code``."""
     return {"kind": type(error).__name__, "message": str(error), "code": code_of(error)}
 
 
@@ -246,12 +246,12 @@ _THE_SYSTEM_S = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOSPC, errno.ENOME
 
 
 def of_the_system(error: BaseException) -> bool:
-    """Tell an error of the computer's state (open files, disk, memory, a lost terminal) from a mistake of tdhil."""
+    """Return whether an error comes from the computer's state (open files, disk, memory, terminal), not from tdhil."""
     return isinstance(error, OSError) and error.errno in _THE_SYSTEM_S
 
 
 def shown(text: str) -> str:
-    """``text`` for a message: printable, on one line, at most 40 characters."""
+    """Return ``text`` for a message: printable, on one line, at most 40 characters."""
     clean = "".join(sign if sign.isprintable() else "·" for sign in text[:41])
     return clean if len(text) <= 40 else clean[:39] + "…"
 

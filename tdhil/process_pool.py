@@ -1,15 +1,15 @@
-"""A pool of processes that outlives what its tasks do to it.
+"""A pool of worker processes that continues if a task ends or blocks its process.
 
-Each process is a Python in a process group of its own, so that a Ctrl-C in the terminal reaches only the host; tasks
-come one at a time over its stdin, answers go over its stdout, nothing else is shared: it can be killed at any moment.
-The end of its stdin ends it, also in the middle of a task, however the host came to its own.
+Each worker process is a Python in a process group of its own, so that Ctrl-C in the terminal reaches only the host.
+It receives one task at a time over stdin and sends the result over stdout. It shares nothing else, so it can be killed
+at any time. The end of its stdin ends it, also during a task, for any end of the host.
 
-A task has a limit of time, which the host keeps by killing, and one of memory, which the process keeps itself. What
-ends its process or hangs is tried once more, after all others, and then set aside as a `Loss`. Where something from
-outside killed the process (SIGKILL, SIGTERM), that isn't held against the task until it happens `_KILLS` times.
+A task has a time limit: the host kills the process. It also has a memory limit, which the process sets itself. A task
+that ends its process or exceeds its time is tried once more, after all others, and then becomes a `Loss`. A process
+that was killed from outside (SIGKILL, SIGTERM) counts against its task only after `_KILLS` times.
 
-Not `concurrent.futures` (one dead process breaks the pool, and every task in it; after an interruption it does all
-that waits) and not joblib (the same): tried with a log that kills its process among twenty, they finished 7 and none.
+`concurrent.futures` is not used: one dead process breaks its pool and all tasks, and after an interruption it computes
+all waiting tasks. joblib does the same. With twenty logs, one of which kills its process, they finished 7 and none.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ _LENGTH: Final = Struct("<Q")
 _TRIES: Final = 2
 _KILLS: Final = 5
 _ASK_S: Final = 0.2             # interval of the check for a stop, s
-_START_S: Final = 60.0          # a process may take to begin, on a machine that is busy
-_STARTS: Final = 3              # processes in a row that end before they take a task: something is wrong with all
+_START_S: Final = 60.0          # longest time for the start of a process, on a busy machine, s
+_STARTS: Final = 3              # consecutive processes that end before a task: the fault is not a task's
 
 
 @dataclass(frozen=True)
 class TaskLimits:
-    """``time_s``: wall time; ``memory_bytes``: on top of what a fresh process has, where the system can limit it. None:
-    as much as it takes.
+    """Limits of a task. ``time_s``: wall time. ``memory_bytes``: additional memory above that of a new process, if the
+    system supports a limit. None: no limit.
     """
 
     time_s: float | None = 120.0
@@ -60,7 +60,7 @@ class TaskLimits:
 
 @dataclass(frozen=True)
 class Loss:
-    """A task that got no answer; ``kind``: TimeLimit, ProcessDied; ``text`` in words."""
+    """Reason why a task has no result. ``kind``: TimeLimit or ProcessDied; ``text``: in words."""
 
     kind: str
     text: str
@@ -79,7 +79,7 @@ def usable_cores() -> int:
 
 
 class Pool(Generic[Task, Result]):
-    """``jobs`` processes that call ``function``, a function of a module, passed by name. They start when needed."""
+    """Pool of ``jobs`` worker processes that call ``function``, a function of a module. They start when needed."""
 
     def __init__(self, function: Callable[[Task], Result], jobs: int, limits: TaskLimits) -> None:
         self._function = function
@@ -92,7 +92,7 @@ class Pool(Generic[Task, Result]):
     ) -> Iterator[tuple[Task, Result | Loss]]:
         """Yield each task with its result or its loss, in the order of completion.
 
-        ``stop`` is called several times a second: True ends the run at once, without the tasks in work.
+        ``stop`` is called several times a second: True ends the run at once, and tasks in progress are dropped.
         Raises TdhilError if no process can be started, and each error of ``function``. A caller that stops
         early must call `close`.
         """
@@ -118,7 +118,7 @@ class Pool(Generic[Task, Result]):
                 ready = {key.data for key, _ in answers.select(wait_s)}
                 now_s = time.monotonic()
                 for worker in ready.difference(busy):
-                    answers.unregister(worker.stdout)      # an idle one that has ended
+                    answers.unregister(worker.stdout)      # an idle process that has ended
                     self._workers.remove(worker)
                     worker.kill()
                 for worker in busy:
@@ -149,7 +149,7 @@ class Pool(Generic[Task, Result]):
                         yield job.task, loss
 
     def _feed(self, fresh: Iterator[Task], again: deque[_Job[Task]], answers: DefaultSelector) -> bool:
-        """A task for each idle process, more processes while there are tasks; False: there is none left."""
+        """Give each idle process a task. Start more processes while tasks remain. Return False without a task."""
         while True:
             worker = next((one for one in self._workers if one.job is None), None)
             if worker is None and len(self._workers) >= self._jobs:
@@ -167,11 +167,11 @@ class Pool(Generic[Task, Result]):
             worker.give(self._function, job, self._limits.time_s)
 
     def pids(self) -> list[int]:
-        """The processes that are there now."""
+        """Return the ids of the present worker processes."""
         return [worker.pid for worker in self._workers]
 
     def close(self) -> None:
-        """End all processes at once, without what they have in hand."""
+        """End all worker processes at once. Tasks in progress are dropped."""
         while self._workers:
             self._workers.pop().kill()
 
@@ -182,12 +182,12 @@ class Pool(Generic[Task, Result]):
         self.close()
 
 
-_PART: Final = object()         # not all of an answer is there yet
+_PART: Final = object()         # the result has not arrived completely
 _DEAD: Final = object()
 
 
 class _Worker:
-    """One process, idle or with one task in hand."""
+    """One worker process, idle or with one task."""
 
     def __init__(self, limits: TaskLimits) -> None:
         self.job: _Job[Any] | None = None
@@ -209,20 +209,20 @@ class _Worker:
         time_s = math.inf if limit_s is None else limit_s
         self.job, self._time_s = job, time_s
         self.deadline_s = time.monotonic() + (time_s if self.awake else max(time_s, _START_S))
-        with suppress(BrokenPipeError):        # dead: the end of its stdout says so, too
+        with suppress(BrokenPipeError):        # an ended process is found by the end of its stdout
             data = pickle.dumps((function, job.task))
             self._stdin.write(_LENGTH.pack(len(data)) + data)
             self._stdin.flush()
 
     def take(self) -> Any:
-        """The answer, or that it is not all there, or that none comes. Raises what the function raised."""
+        """Return the result; `_PART` if incomplete, `_DEAD` if the process has ended. Raises the function's error."""
         assert isinstance(self.stdout, io.BufferedReader)
         more = self.stdout.read1(2**16)
         if not more:
             return _DEAD
         self._buffer += more
         data = self._whole()
-        if data is not None and not self.awake:        # its first word is that it is there; more may have come with it
+        if data is not None and not self.awake:        # message: ready; more may have come with it
             self.awake, self.deadline_s = True, time.monotonic() + self._time_s
             data = self._whole()
         if data is None:
@@ -233,7 +233,7 @@ class _Worker:
         return answer
 
     def _whole(self) -> bytes | None:
-        """The first of what has come, where all of it is there."""
+        """Return the first message in the buffer; None if it is incomplete."""
         if len(self._buffer) < _LENGTH.size:
             return None
         end = _LENGTH.size + _LENGTH.unpack_from(self._buffer)[0]
@@ -244,12 +244,12 @@ class _Worker:
         return data
 
     def bury(self, late: bool, limits: TaskLimits) -> tuple[Loss, bool]:
-        """Return a text on its end, and whether it was killed from outside."""
+        """Return the reason of the process's end, and whether it was killed from outside."""
         if late:
             self.kill()
             return Loss("TimeLimit", f"no result within {limits.time_s:g} s, in each of {_TRIES} tries"), False
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(5.0)            # it has closed its stdout: it is ending
+            self._process.wait(5.0)            # it has closed its stdout, so it is about to end
         self.kill()
         code = self._process.returncode
         outside = code in (-int(getattr(signal, "SIGKILL", 9)), -int(signal.SIGTERM))
@@ -261,7 +261,7 @@ class _Worker:
         self._process.kill()
         self._process.wait()
         for pipe in (self._stdin, self.stdout):
-            with suppress(OSError):            # half a task may still wait to be written
+            with suppress(OSError):            # a part of a task may be unwritten
                 pipe.close()
 
 
@@ -273,23 +273,23 @@ def _signal_name(number: int) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# In a worker
+# Code of a worker process
 
 
 def serve(memory_bytes: int | None) -> None:
-    """One task after the other, until the host closes the pipe or is gone."""
+    """Compute one task after the other, until the host closes the pipe or ends."""
     prepare()
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)                               # other output is not an answer
+    os.dup2(2, 1)                               # other output goes to stderr
     limited = memory_bytes is None
     tasks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(sys.stdin.buffer, tasks), daemon=True).start()
     with suppress(BrokenPipeError):
-        answers.write(_LENGTH.pack(0))         # it is there
+        answers.write(_LENGTH.pack(0))         # message: ready
         answers.flush()
         while True:
             function, task = pickle.loads(tasks.get())
-            if memory_bytes is not None and not limited:       # after the function has loaded its modules
+            if memory_bytes is not None and not limited:       # set after the function has loaded its modules
                 _limit_memory(memory_bytes)
                 limited = True
             try:
@@ -302,7 +302,7 @@ def serve(memory_bytes: int | None) -> None:
 
 
 def _listen(stdin: io.BufferedReader, tasks: queue.SimpleQueue[bytes]) -> None:
-    """Tasks as they come; the end of the host is the end of this process, also in the middle of a task."""
+    """Put received tasks into the queue. The end of the host ends this process, also during a task."""
     while True:
         head = stdin.read(_LENGTH.size)
         if len(head) < _LENGTH.size:
@@ -311,8 +311,8 @@ def _listen(stdin: io.BufferedReader, tasks: queue.SimpleQueue[bytes]) -> None:
 
 
 def _limit_memory(memory_bytes: int) -> None:
-    """Limit further address space; above it Python raises MemoryError. No effect if the system has no such
-    limit.
+    """Limit the additional address space, bytes. Above the limit, Python raises MemoryError. Without effect if the
+    system has no such limit.
     """
     try:
         import resource

@@ -1,3 +1,3 @@
-"""Which tdhil this is."""
+"""Version of tdhil."""
 
 __version__ = "0.1.0"
