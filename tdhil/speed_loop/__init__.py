@@ -1,4 +1,4 @@
-"""The drive's own speed loop: its margins and step response, P and I from J's interval, measured steps; arithmetic."""
+"""Speed loop in the drive: margins, step response, P and I from J's interval, measured steps. Pure computation."""
 
 from typing import TYPE_CHECKING
 

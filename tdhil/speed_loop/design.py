@@ -1,14 +1,14 @@
-r"""P, I and a notch that keep their margins on every plant of the uncertainty box.
+r"""P, I and a notch filter that keep the margins for every plant within the uncertainty intervals.
 
 **Rule.** I = P²/(4 J) with the total J: a rigid shaft without lags is then critically damped (T_I = P/I = 4 J/P), and
-the integral part costs 14° of phase. P is the one free number: the largest that keeps phase margin and gain margin on
-all corners, or the one with the requested bandwidth.
+the integral part costs 14° of phase. P is the only free number: the largest P that keeps phase margin and gain margin
+at all corners, or the P with the requested bandwidth.
 
 **Corners.** J, friction, lags (all together), antiresonance, resonance and the spring's damping, each at both ends of
 its 95 % interval. `benchmarks/speed_loop_margins.py` measures how often the true loop keeps the margins.
 
-**Notch.** Where the shaft has a resonance, notches of several widths and depths at that frequency are tried. One is
-offered if the largest bandwidth grows by `NOTCH_GAIN` or more, or if nothing else fits.
+**Notch.** If the shaft has a resonance, notches of several widths and depths at that frequency are tried. A notch is
+offered if it multiplies the largest bandwidth by `NOTCH_GAIN` or more, or if no gains fit without it.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ from tdhil.speed_loop.step import StepFigures, is_stable_loop, step_figures, ste
 LOOP_TUNING_REFUSED = 11
 """Exit code: no gains keep the margins, or the requested bandwidth leaves too little."""
 INTEGRAL_RATIO = 4.0
-"""T_I P/J: 4 is critical damping."""
+"""T_I P/J; 4 gives critical damping."""
 NOTCH_GAIN = 1.25
-"""Factor on the bandwidth from which a notch is worth its filter."""
+"""Smallest ratio of the bandwidths with and without a notch for which a notch is offered."""
 NOTCHES = tuple((depth * width, width) for width in (0.4, 1.0) for depth in (0.1, 0.3))
-"""Damping of numerator and denominator of the notches that are tried."""
+"""Damping of numerator and denominator of each notch that is tried."""
 LEAST_SPLIT = 1.02
-"""Resonance over antiresonance, at least: closer, and there is no load."""
+"""Smallest ratio of resonance to antiresonance. Below it, the load has practically no inertia."""
 _GAINS = np.geomspace(3.0, 1e-3, 70)
-"""P that are tried, in units of J/Στ, from the largest down."""
+"""Values of P that are tried, in units of J/Στ, the largest first."""
 _HALVINGS = 8
-"""Tolerance of the factor between two of them: P is found to 0.1 %."""
+"""Halvings of the interval between two tried values: P is found within 0.1 %."""
 _FINER_HALVINGS = 48
 _AT_ONCE = 8
-"""Corners whose margins are computed together: the first that fails ends the test."""
+"""Number of corners whose margins are computed together. The test ends with the first group that fails."""
 _STEP_SPAN = 30.0
 """Length of a step response, in units of J/P."""
 
 
 class LoopTuningRefused(TdhilError):
-    """Refusal: no gains keep the margins for this machine. The message states what was found."""
+    """Refusal: no gains keep the margins for this machine. The message states the margins found."""
 
     entry = MessageCode.TUNING_REFUSED
 
@@ -73,27 +73,27 @@ class Range:
 
     @property
     def ends(self) -> tuple[float, ...]:
-        """Both ends; one if they are equal."""
+        """Both ends of the interval; one value if they are equal."""
         return (self.low,) if self.low == self.high else (self.low, self.high)
 
 
 @dataclass(frozen=True)
 class UncertainPlant:
-    """Loop with the interval of each of its quantities, at the motor shaft."""
+    """Shaft and lags of the loop, each quantity with its interval, at the motor shaft."""
 
     inertia_kg_m2: Range
-    """J, or J_r of a shaft with a spring."""
+    """J of a rigid shaft, J_r of a shaft with a spring."""
     viscous_nm_s_rad: Range
     lags_s: tuple[Range, ...]
     dead_time_s: Range
     antiresonance_hz: Range | None = None
-    """A rigid shaft has None, here and in the next two."""
+    """Antiresonance, Hz. For a rigid shaft, antiresonance, resonance and damping are None."""
     resonance_hz: Range | None = None
     damping_nm_s_rad: Range | None = None
 
     @property
     def believed(self) -> LoopPlant:
-        """Everything at its value."""
+        """Plant with the nominal value of every quantity."""
         spring = None
         if self.antiresonance_hz is not None and self.resonance_hz is not None:
             spring = _spring(self.antiresonance_hz.value, self.resonance_hz.value,
@@ -102,7 +102,7 @@ class UncertainPlant:
                          tuple(lag.value for lag in self.lags_s), self.dead_time_s.value, spring)
 
     def corners(self) -> tuple[LoopPlant, ...]:
-        """All corners of the box; the lags move together."""
+        """Return the plants at all combinations of interval ends. All lags are at the same end."""
         lags = ((tuple(lag.low for lag in self.lags_s), self.dead_time_s.low),
                 (tuple(lag.high for lag in self.lags_s), self.dead_time_s.high))
         springs: list[SpringLoad | None] = [None]
@@ -125,53 +125,53 @@ class SpeedLoopCase:
 
     plant: UncertainPlant
     phase_deg: float = 45.0
-    """Phase margin on every corner; so is the gain margin."""
+    """Required phase margin at every corner, degrees; ``gain_db``: required gain margin, dB."""
     gain_db: float = 8.0
     bandwidth_hz: float | None = None
-    """Requested bandwidth; None: the largest that fits."""
+    """Requested bandwidth, Hz; None: the largest with the required margins."""
     present: PiGains | None = None
     try_notch: bool = True
 
 
 @dataclass(frozen=True)
 class LoopRow:
-    """Gains, and what follows from them."""
+    """Gains, and margins and step response with these gains."""
 
     kind: str
-    """present or tuned."""
+    """``present`` or ``tuned``."""
     gains: PiGains
     believed: SpeedLoopMargins
     worst: SpeedLoopMargins
-    """The least of each margin over all corners; the greatest peak of the sensitivity."""
+    """Smallest value of each margin over all corners; greatest peak of the sensitivity."""
     bandwidth_hz: Range
     overshoot_share: Range
     rise_s: Range
     settling_s: Range
     time_s: Reals = field(repr=False)
     speed: Reals = field(repr=False)
-    """Response to a unit step of the set speed, all as believed."""
+    """Response of the nominal plant to a unit step of the speed setpoint."""
     lowest: Reals = field(repr=False)
     highest: Reals = field(repr=False)
 
 
 @dataclass(frozen=True)
 class LoopDesign:
-    """The result."""
+    """Result of a tuning of the speed loop."""
 
     case: SpeedLoopCase
     rows: tuple[LoopRow, ...]
-    """The present gains if they are known, then the tuned ones."""
+    """Row of the present gains, if they are known, then row of the tuned gains."""
     without_notch_hz: float | None
-    """Largest bandwidth without the notch, for gains with one; None: no gains fit without it."""
+    """Largest bandwidth without the notch, Hz, if the gains have one; None: no gains keep the margins without it."""
 
     @property
     def tuned(self) -> LoopRow:
-        """The gains to type in."""
+        """Row of the gains to enter into the drive."""
         return self.rows[-1]
 
 
 class _GainSearch:
-    """The loops of all corners without their controller, on one grid."""
+    """Loops of the nominal plant and of all corners, without controller, on one frequency grid."""
 
     def __init__(self, case: SpeedLoopCase) -> None:
         self.case = case
@@ -190,19 +190,19 @@ class _GainSearch:
         return PiGains(proportional, proportional**2 / (INTEGRAL_RATIO * self.total), notch)
 
     def margins(self, gains: PiGains) -> tuple[SpeedLoopMargins, ...]:
-        """The believed plant's, then each corner's."""
+        """Return the margins of the nominal plant, then of each corner."""
         return margins_of(self.without * controller_response(gains, self.s), self.filters, self.omega)
 
     def at_believed(self, gains: PiGains) -> SpeedLoopMargins:
-        """The believed plant's alone."""
+        """Return the margins of the nominal plant."""
         return margins_of(self.without[:1] * controller_response(gains, self.s), self.filters[:1], self.omega)[0]
 
     def bandwidth_hz(self, gains: PiGains) -> float:
-        """The believed plant's."""
+        """Return the bandwidth of the nominal plant, Hz."""
         return self.at_believed(gains).bandwidth_hz
 
     def fits(self, gains: PiGains) -> bool:
-        """True if all corners keep the margins."""
+        """Return whether all corners keep the margins."""
         asked = self.case.phase_deg, self.case.gain_db
         if not self.at_believed(gains).keeps(*asked):
             return False
@@ -210,12 +210,12 @@ class _GainSearch:
         for number, some in enumerate(self._batches):
             if not all(one.keeps(*asked) for one in margins_of(self.without[some] * law, self.filters[some],
                                                                self.omega)):
-                self._batches.insert(0, self._batches.pop(number))      # what fails now will fail next time
+                self._batches.insert(0, self._batches.pop(number))      # this group will probably fail first next time
                 return False
         return True
 
     def largest(self, notch: NotchFilter | None) -> PiGains | None:
-        """Return the largest gains that fit; None without any."""
+        """Return the largest gains that keep the margins; None if no gains do."""
         above = None
         for proportional in _GAINS * self.unit:
             if self.fits(self.gains(float(proportional), notch)):
@@ -234,7 +234,7 @@ class _GainSearch:
         return self.gains(fits, notch)
 
     def with_bandwidth(self, hertz: float, notch: NotchFilter | None) -> PiGains:
-        """Return the gains whose believed bandwidth is ``hertz``."""
+        """Return the gains whose bandwidth on the nominal plant is ``hertz``."""
         low, high = float(_GAINS[-1]) * self.unit * 1e-2, float(_GAINS[0]) * self.unit * 1e2
         for _ in range(_FINER_HALVINGS):
             middle = sqrt(low * high)
@@ -253,7 +253,7 @@ class _GainSearch:
 
 
 def design_speed_loop(case: SpeedLoopCase) -> LoopDesign:
-    """Return the gains. Raises LoopTuningRefused if none keep the margins, or the requested bandwidth does not."""
+    """Tune the speed loop. Raises LoopTuningRefused if no gains, or none with the requested bandwidth, fit."""
     search = _GainSearch(case)
     plain = search.largest(None)
     without_hz = None if plain is None else search.bandwidth_hz(plain)
@@ -275,7 +275,7 @@ def design_speed_loop(case: SpeedLoopCase) -> LoopDesign:
 
 
 def _best(search: _GainSearch, plain: PiGains | None, without_hz: float | None) -> PiGains | None:
-    """Return the largest gains, with a notch if it is worth it."""
+    """Return the largest gains; with a notch if it raises the bandwidth by `NOTCH_GAIN`."""
     offered = [(search.bandwidth_hz(gains), gains) for notch in search.notches()
                if (gains := search.largest(notch)) is not None]
     if not offered:
@@ -299,7 +299,7 @@ def _requested(search: _GainSearch, largest: PiGains, hertz: float) -> PiGains:
 
 
 def worst_of(margins: tuple[SpeedLoopMargins, ...]) -> SpeedLoopMargins:
-    """Return the worst of each figure."""
+    """Return the least favourable value of each margin."""
     return SpeedLoopMargins(
         all(one.stable for one in margins), min(one.phase_deg for one in margins), min(one.gain_db for one in margins),
         min(one.bandwidth_hz for one in margins), max(one.peak_sensitivity for one in margins),
@@ -324,7 +324,7 @@ def _row(kind: str, search: _GainSearch, gains: PiGains) -> LoopRow:
 
 
 def _spread(figures: list[StepFigures], name: str, whole: bool) -> Range:
-    """Return a figure's range; infinite if a corner is unstable."""
+    """Return the range of a figure over all corners; infinite if a corner is unstable."""
     values = [float(getattr(one, name)) for one in figures]
     if not whole or not all(isfinite(value) for value in values):
         return Range(inf, min(values, default=inf), inf)

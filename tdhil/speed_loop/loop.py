@@ -10,13 +10,13 @@ r"""Open loop of a drive's speed controller, and its margins.
 
     J, J_r, J_L kg·m², B and P N·m·s/rad, I N·m/rad, k N·m/rad, c N·m·s/rad, τ and d s; all at the motor shaft.
 
-The spring is given by its antiresonance ω_a and resonance ω_r, which the frequency response shows directly:
+Antiresonance ω_a and resonance ω_r describe the spring. The frequency response shows both directly:
 k = J_r (ω_r² − ω_a²), J_L = k/ω_a².
 
-**Margins.** The phase margin is the least distance of the phase from −180° where |L| = 1. The gain margin is the least
-distance of |L| from 1, in dB and in both directions, where the phase is −180°. **Stability** is by the argument of
-1 + L, which ends at 0 only if no pole lies to the right (Nyquist's criterion). A loop that a *lower* gain makes
-unstable is called conditionally stable: a torque limit lowers the gain for a while.
+**Margins.** The phase margin is the smallest distance of the phase from −180° where |L| = 1. The gain margin is the
+smallest distance of |L| from 1, in dB and in both directions, where the phase is −180°. **Stability** follows from the
+argument of 1 + L, which ends at 0 only if no pole has a positive real part (Nyquist's criterion). A loop that a
+*lower* gain makes unstable is called conditionally stable: a torque limit lowers the gain for a while.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 _POINTS_A_DECADE = 80
-"""Settings of the common grid of frequencies."""
+"""Number of points per decade of the common frequency grid."""
 _AROUND = 100
-"""Further points around each resonance and antiresonance."""
+"""Number of additional points around each resonance and antiresonance."""
 _LOWEST, _HIGHEST = 2e-4, 30.0
-"""Ends of the grid, in units of the reciprocal total lag: below, the integral alone acts; above, |L| is far below 1."""
+"""Ends of the grid, in units of the reciprocal total lag. Below, only the integral acts; above, |L| is far below 1."""
 _LEAST_LAG = 0.02
-"""Share of the longest total lag below which a shorter one, or none, does not raise the upper end."""
+"""Smallest total lag that raises the upper end of the grid, as a share of the longest total lag."""
 _BELOW_GAINS = 0.02
 """Lower end of the grid, in units of P/J and I/P."""
 
 
 @dataclass(frozen=True)
 class SpringLoad:
-    """The load behind a spring, by what the motor's frequency response shows of it."""
+    """Load behind a spring, described by quantities of the motor's frequency response."""
 
     antiresonance_hz: float
     resonance_hz: float
     damping_nm_s_rad: float = 0.0
-    """c, in the spring."""
+    """Damping c of the spring."""
 
 
 @dataclass(frozen=True)
@@ -63,35 +63,35 @@ class LoopPlant:
     lags_s: tuple[float, ...] = ()
     """First-order lags inside the loop. The first is the filter of the measured speed; the others delay the torque."""
     dead_time_s: float = 0.0
-    """Sampling and computing."""
+    """Dead time of sampling and computation."""
     spring: SpringLoad | None = None
 
     @property
     def total_lag_s(self) -> float:
-        """Στ, the dead time included."""
+        """Total lag Στ, including the dead time."""
         return sum(self.lags_s) + self.dead_time_s
 
     @property
     def stiffness_nm_rad(self) -> float:
-        """k; 0 for a rigid shaft."""
+        """Stiffness k of the spring; 0 for a rigid shaft."""
         if self.spring is None:
             return 0.0
         return self.inertia_kg_m2 * (2.0 * pi) ** 2 * (self.spring.resonance_hz**2 - self.spring.antiresonance_hz**2)
 
     @property
     def load_kg_m2(self) -> float:
-        """J_L; 0 for a rigid shaft."""
+        """Inertia J_L of the load behind the spring; 0 for a rigid shaft."""
         if self.spring is None:
             return 0.0
         return self.stiffness_nm_rad / (2.0 * pi * self.spring.antiresonance_hz) ** 2
 
     @property
     def total_inertia_kg_m2(self) -> float:
-        """J, or J_r + J_L."""
+        """Total inertia: J of a rigid shaft, J_r + J_L of a shaft with a spring."""
         return self.inertia_kg_m2 + self.load_kg_m2
 
     def shaft(self, s: Complexes) -> Complexes:
-        """G(s) = ω/T."""
+        """Return the shaft's transfer function G(s) = ω/T."""
         inertia, viscous, spring = self.inertia_kg_m2, self.viscous_nm_s_rad, self.spring
         if spring is None:
             return np.asarray(1.0 / (inertia * s + viscous), dtype=np.complex128)
@@ -101,11 +101,11 @@ class LoopPlant:
         return np.asarray(((load * s + c) * s + k) / under, dtype=np.complex128)
 
     def speed_filter(self, s: Complexes) -> Complexes:
-        """Return the filter of the measured speed, the first of the lags."""
+        """Return the transfer function of the speed filter, which is the first lag."""
         return np.asarray(1.0 / (1.0 + (self.lags_s[0] if self.lags_s else 0.0) * s), dtype=np.complex128)
 
     def without_controller(self, s: Complexes) -> Complexes:
-        """H(s) e^(−d s) G(s)."""
+        """Return the open loop without controller, H(s) e^(−d s) G(s)."""
         through = self.shaft(s) * np.exp(-self.dead_time_s * s)
         for lag in self.lags_s:
             through = through / (1.0 + lag * s)
@@ -114,16 +114,16 @@ class LoopPlant:
 
 @dataclass(frozen=True)
 class NotchFilter:
-    """Filter of the torque setpoint that takes gain away around one frequency."""
+    """Filter of the torque setpoint that lowers the gain around one frequency."""
 
     hertz: float
     numerator_damping: float
-    """ζ_z."""
+    """Numerator damping ζ_z."""
     denominator_damping: float
-    """ζ_p; the gain at the middle is ζ_z/ζ_p."""
+    """Denominator damping ζ_p. The gain at the centre frequency is ζ_z/ζ_p."""
 
     def at(self, s: Complexes) -> Complexes:
-        """N(s)."""
+        """Return the transfer function N(s)."""
         omega = 2.0 * pi * self.hertz
         over = s * s + 2.0 * self.numerator_damping * omega * s + omega**2
         return np.asarray(over / (s * s + 2.0 * self.denominator_damping * omega * s + omega**2), dtype=np.complex128)
@@ -131,12 +131,12 @@ class NotchFilter:
 
 @dataclass(frozen=True)
 class PiGains:
-    """Gains at the motor shaft."""
+    """Gains of the speed controller, at the motor shaft."""
 
     gain_nm_s_rad: float
-    """P."""
+    """Proportional gain P."""
     integral_nm_rad: float
-    """I."""
+    """Integral gain I."""
     notch: NotchFilter | None = None
 
 
@@ -146,25 +146,25 @@ class SpeedLoopMargins:
 
     stable: bool
     phase_deg: float
-    """Infinite if |L| is 1 nowhere."""
+    """Phase margin; infinite if |L| is nowhere 1."""
     gain_db: float
-    """Infinite if the phase is −180° nowhere."""
+    """Gain margin; infinite if the phase is nowhere −180°."""
     bandwidth_hz: float
-    """Up to which the motor's speed follows the set speed, within 3 dB; 0 for not at all."""
+    """Frequency up to which the motor's speed follows the setpoint within 3 dB; 0 if it never does."""
     peak_sensitivity: float
-    """M_s, the greatest |1/(1 + L)|."""
+    """Peak sensitivity M_s, the greatest |1/(1 + L)|."""
     conditional: bool
-    """A lower gain makes the loop unstable."""
+    """Whether a lower gain makes the loop unstable."""
 
     def keeps(self, phase_deg: float, gain_db: float) -> bool:
-        """True if the loop is stable, not conditionally, with at least these margins."""
+        """Return whether the loop is stable, not conditionally stable, and has at least these margins."""
         return (self.stable and not self.conditional and self.phase_deg >= phase_deg and self.gain_db >= gain_db)
 
 
 def frequency_grid(plants: Sequence[LoopPlant], slowest: PiGains | None = None) -> Reals:
-    """Return angular frequencies, rad/s, on which the margins of all these plants show.
+    """Return angular frequencies, rad/s, that are sufficient for the margins of all these plants.
 
-    ``slowest``: gains that may be far slower than the lags.
+    ``slowest``: gains whose loop may be far slower than the lags.
     """
     lags = [plant.total_lag_s for plant in plants]
     low, high = _LOWEST / max(lags), _HIGHEST / max(min(lags), _LEAST_LAG * max(lags))
@@ -183,13 +183,13 @@ def frequency_grid(plants: Sequence[LoopPlant], slowest: PiGains | None = None) 
 
 
 def loop_response(plant: LoopPlant, gains: PiGains, omega_rad_s: Reals) -> Complexes:
-    """Return L(jω)."""
+    """Return the open loop L(jω)."""
     s: Complexes = np.asarray(1j * omega_rad_s, dtype=np.complex128)
     return controller_response(gains, s) * plant.without_controller(s)
 
 
 def controller_response(gains: PiGains, s: Complexes) -> Complexes:
-    """Return (P + I/s) N(s)."""
+    """Return the controller's transfer function (P + I/s) N(s)."""
     found: Complexes = np.asarray(gains.gain_nm_s_rad + gains.integral_nm_rad / s, dtype=np.complex128)
     return found if gains.notch is None else found * gains.notch.at(s)
 
@@ -197,20 +197,20 @@ def controller_response(gains: PiGains, s: Complexes) -> Complexes:
 def speed_loop_margins(
     plants: Sequence[LoopPlant], gains: PiGains, omega_rad_s: Reals | None = None
 ) -> tuple[SpeedLoopMargins, ...]:
-    """Return the margins of each plant under these gains."""
+    """Return the margins of each plant with these gains."""
     omega = frequency_grid(plants, gains) if omega_rad_s is None else omega_rad_s
     filters = np.array([plant.speed_filter(np.asarray(1j * omega)) for plant in plants])
     return margins_of(np.array([loop_response(plant, gains, omega) for plant in plants]), filters, omega)
 
 
 def margins_of(loops: Complexes, filters: Complexes, omega_rad_s: Reals) -> tuple[SpeedLoopMargins, ...]:
-    """Return the margins of open loops (loop, frequency) that share a grid, by straight lines between its points.
+    """Return the margins of open loops (loop, frequency) on one grid, with linear interpolation between its points.
 
-    ``filters``: the speed filter of each loop, which stands in the feedback.
+    ``filters``: the speed filter of each loop, which is in the feedback path.
     """
     log_gain = np.log(np.abs(loops))
     phase = np.unwrap(np.angle(loops), axis=1)
-    phase -= 2.0 * pi * np.round((phase[:, :1] + 0.75 * pi) / (2.0 * pi))     # begins between −1.75π and 0.25π
+    phase -= 2.0 * pi * np.round((phase[:, :1] + 0.75 * pi) / (2.0 * pi))     # starts between −1.75π and 0.25π
     after = np.unwrap(np.angle(1.0 + loops), axis=1)
     after += 2.0 * pi * np.round((phase[:, :1] - after[:, :1]) / (2.0 * pi))   # 1 + L is as L where |L| is large
     stable = np.abs(after[:, -1]) < pi
@@ -241,7 +241,7 @@ def margins_of(loops: Complexes, filters: Complexes, omega_rad_s: Reals) -> tupl
 
 
 def _crossings(values: Reals) -> tuple[NDArray[np.int64], Reals]:
-    """Return the points before each change of sign, and the share of the way to the next point."""
+    """Return the index before each change of sign, and the crossing's share of the way to the next point."""
     at = np.flatnonzero((values[:-1] > 0.0) != (values[1:] > 0.0))
     share = values[at] / (values[at] - values[at + 1])
     return at, share

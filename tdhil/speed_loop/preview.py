@@ -1,4 +1,4 @@
-"""Loop and sensitivity over frequency, with the band of all corners, and the loop at the measured lines."""
+"""Open loop and sensitivity over frequency with the band of all corners, and the loop at the excited frequencies."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ _CURVE_POINTS = 140
 
 @dataclass(frozen=True)
 class LoopCurve:
-    """|L|, phase and |S| over frequency, all as believed, and the least and greatest over all corners."""
+    """|L|, phase and |S| over frequency: nominal plant, and smallest and greatest value over all corners."""
 
     hertz: Reals
     gain: tuple[Reals, Reals, Reals]
-    """Believed, least and greatest value, here and in the next two."""
+    """|L|. Each tuple has the nominal, smallest and greatest value, also for ``phase_deg`` and ``sensitivity``."""
     phase_deg: tuple[Reals, Reals, Reals]
     sensitivity: tuple[Reals, Reals, Reals]
 
 
 @dataclass(frozen=True)
 class MeasuredShaft:
-    """ω/T of the shaft itself at the excited lines: the response as reported, without the lags of the reports."""
+    """ω/T of the shaft at the excited frequencies: the reported response, without the reporting lags."""
 
     hertz: Reals
     response: Complexes
     half_rel: Reals
-    """Half-width of the 95 % interval, relative in magnitude and rad in phase; infinite if it is open."""
+    """Half-width of the 95 % interval: relative in magnitude, rad in phase; infinite for an unbounded interval."""
 
 
 def curve_range_hz(design: LoopDesign, lowest_hz: float | None = None) -> tuple[float, float]:
-    """Return the ends of the frequencies to show; ``lowest_hz`` is among them."""
+    """Return lowest and highest frequency to show, Hz. The range contains ``lowest_hz``."""
     bandwidths = [row.bandwidth_hz.value for row in design.rows if row.bandwidth_hz.value > 0.0]
     spring = design.case.plant.believed.spring
     marks = [] if spring is None else [0.5 * spring.antiresonance_hz, 2.0 * spring.resonance_hz]
@@ -45,7 +45,7 @@ def curve_range_hz(design: LoopDesign, lowest_hz: float | None = None) -> tuple[
 
 
 def loop_curve(design: LoopDesign, gains: PiGains, lowest_hz: float | None = None) -> LoopCurve:
-    """Return the curves of these gains on the plant of the design, from ``lowest_hz`` or a tenth of the bandwidth."""
+    """Return the curves of these gains for the design's plant, from ``lowest_hz`` or from a tenth of the bandwidth."""
     low, high = curve_range_hz(design, lowest_hz)
     hertz = np.geomspace(low, high, _CURVE_POINTS)
     spring = design.case.plant.believed.spring
@@ -67,7 +67,7 @@ def measured_shaft(
     hertz: Sequence[float], reported: Sequence[complex], half_rel: Sequence[float],
     speed_lag_s: float, torque_lag_s: float, skew_s: float,
 ) -> MeasuredShaft:
-    """Take the lags of the reports out of ω/T as reported: T/ω is Z (1 + τ_w s)/(1 + τ_T s) e^(−d s)."""
+    """Remove the reporting lags from the reported ω/T. The reported T/ω is Z (1 + τ_w s)/(1 + τ_T s) e^(−d s)."""
     s = 2j * pi * np.asarray(hertz)
     undone = (1.0 + speed_lag_s * s) / (1.0 + torque_lag_s * s) * np.exp(-skew_s * s)
     return MeasuredShaft(np.asarray(hertz, dtype=np.float64), np.asarray(reported) * undone,
@@ -75,7 +75,7 @@ def measured_shaft(
 
 
 def loop_at_lines(design: LoopDesign, gains: PiGains, shaft: MeasuredShaft) -> Complexes:
-    """Return L at the measured lines: controller and lags as believed, the shaft as measured."""
+    """Return L at the excited frequencies, from nominal controller and lags and the measured shaft."""
     believed = design.case.plant.believed
     s: Complexes = np.asarray(2j * pi * shaft.hertz, dtype=np.complex128)
     others = believed.without_controller(s) / believed.shaft(s)
@@ -83,6 +83,6 @@ def loop_at_lines(design: LoopDesign, gains: PiGains, shaft: MeasuredShaft) -> C
 
 
 def deviation_from_model(design: LoopDesign, shaft: MeasuredShaft) -> Reals:
-    """Return |G measured / G believed − 1| at each line."""
+    """Return |G measured / G nominal − 1| at each excited frequency."""
     s: Complexes = np.asarray(2j * pi * shaft.hertz, dtype=np.complex128)
     return np.abs(shaft.response / design.case.plant.believed.shaft(s) - 1.0)

@@ -1,7 +1,8 @@
-r"""Response of the motor's speed to a step of the set speed, and its figures.
+r"""Response of the motor's speed to a step of the speed setpoint, and its figures.
 
-State equations of controller, notch, dead time (Padé approximation of second order), lags and shaft in series, with the
-speed filter in the feedback. The first lag of `LoopPlant.lags_s` filters the speed; the others act on the torque.
+The model has the state equations of controller, notch, dead time (Padé approximation of second order), lags and shaft
+in series, with the speed filter in the feedback. The first lag of `LoopPlant.lags_s` filters the speed;
+the others act on the torque.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from tdhil.speed_loop.loop import LoopPlant, PiGains, Reals
 _SYSTEM = tuple[Reals, Reals, Reals, float]
 """A, B, C and D of a system with one input and one output."""
 SETTLED_SHARE = 0.05
-"""Band about the new set speed in which the speed counts as settled, share of the step."""
+"""Band about the new setpoint in which the speed counts as settled, as a share of the step."""
 _STEPS = 1500
 
 
@@ -27,9 +28,9 @@ class StepFigures:
 
     overshoot_share: float
     rise_s: float
-    """From 10 to 90 % of the step; infinite if it is not reached."""
+    """Time from 10 to 90 % of the step; infinite if 90 % is not reached."""
     settling_s: float
-    """Until the speed stays within `SETTLED_SHARE`; infinite if it does not."""
+    """Time until the speed stays within `SETTLED_SHARE`; infinite if it does not."""
 
 
 def _series(first: _SYSTEM, second: _SYSTEM) -> _SYSTEM:
@@ -52,7 +53,7 @@ def _lag(tau_s: float) -> _SYSTEM:
 
 
 def _second_order(over: tuple[float, float, float], under: tuple[float, float]) -> _SYSTEM:
-    """(n₂ s² + n₁ s + n₀)/(s² + d₁ s + d₀), its states scaled by √d₀."""
+    """Return the system (n₂ s² + n₁ s + n₀)/(s² + d₁ s + d₀), with states scaled by √d₀."""
     (n2, n1, n0), (d1, d0) = over, under
     omega = d0**0.5
     a = np.array([[0.0, omega], [-omega, -d1]])
@@ -87,7 +88,7 @@ def _controller(gains: PiGains) -> _SYSTEM:
 
 
 def closed_loop(plant: LoopPlant, gains: PiGains) -> tuple[Reals, Reals, Reals]:
-    """Return A, B and C from set speed to the motor's speed."""
+    """Return A, B and C of the closed loop, from speed setpoint to the motor's speed."""
     forward = _series(_controller(gains), _dead_time(plant.dead_time_s))
     for lag in plant.lags_s[1:]:
         forward = _series(forward, _lag(lag))
@@ -99,19 +100,19 @@ def closed_loop(plant: LoopPlant, gains: PiGains) -> tuple[Reals, Reals, Reals]:
 
 
 def is_stable_loop(plant: LoopPlant, gains: PiGains) -> bool:
-    """Return whether all poles of the closed loop lie to the left."""
+    """Return whether all poles of the closed loop have a negative real part."""
     a, _, _ = closed_loop(plant, gains)
     return bool(np.max(np.linalg.eigvals(a).real) < 0.0)
 
 
 def step_responses(plants: Sequence[LoopPlant], gains: PiGains, duration_s: float) -> tuple[Reals, Reals]:
-    """Return times (N,) and the speed of each plant (plant, N) after a unit step of the set speed."""
+    """Return times (N,), s, and the speed of each plant (plant, N) after a unit step of the speed setpoint."""
     speeds = loop_responses([closed_loop(plant, gains) for plant in plants], [duration_s] * len(plants))
     return np.linspace(0.0, duration_s, _STEPS + 1), speeds
 
 
 def loop_responses(loops: Sequence[tuple[Reals, Reals, Reals]], durations_s: Sequence[float]) -> Reals:
-    """Return the response (loop, N) of each closed loop (A, B, C) to a unit step, each over its own duration."""
+    """Return the response (loop, N) of each closed loop (A, B, C) to a unit step, over the duration of each loop."""
     from scipy.linalg import expm
 
     speeds = np.zeros((len(loops), _STEPS + 1))

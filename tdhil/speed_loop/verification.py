@@ -1,15 +1,15 @@
-r"""Small steps of the set speed beside the prediction of `tdhil tune speed`: what the drive's gains really are.
+r"""Comparison of small steps of the speed setpoint with the prediction of `tdhil tune speed`. It finds the real gains.
 
 The lag of the reported speed is often longer than the rise time. Therefore a model of loop and report is fitted to the
 mean of all steps, and the figures are those of the fitted loop, without the lag of the report.
 
-**Fit.** P and I are free. The others have the result's intervals as prior knowledge (standard deviation =
+**Fit.** P and I are free. All other quantities have the result's intervals as prior knowledge (standard deviation =
 half-width/1.96): J, friction, the lags of the loop together, the resonance, the lag of the reported speed, and the
 delay of the setpoint. An up step and the down step after it make one pair; half their difference is free of offset and
 slow drift. The scatter between pairs gives the covariance of the noise, whatever its spectrum.
 
-**Rows.** Overshoot, rise and settling beside their predicted intervals; P and I beside the typed values. The intervals
-hold together with 95 %: each has 1 − 0.05/5.
+**Rows.** Overshoot, rise and settling are compared with their predicted intervals; P and I with the typed values. The
+joint coverage of all intervals is 95 %: each has 1 − 0.05/5.
 """
 
 from __future__ import annotations
@@ -27,35 +27,35 @@ from tdhil.speed_loop.loop import LoopPlant, NotchFilter, PiGains, Reals
 from tdhil.speed_loop.step import closed_loop, loop_responses, step_figures
 
 CONFIDENCE = 0.95
-"""Coverage of all rows together."""
+"""Joint coverage of all rows."""
 LIKE_SHARE = 0.3
-"""Change of P or of I that a comparison must be able to show; otherwise the verdict is cannot_tell."""
+"""Relative change of P or I that a comparison must be able to detect; otherwise the verdict is cannot_tell."""
 UNLIKE_RMS = 0.03
-"""Root mean square of the misfit, share of the step, from which the response is not that of such a loop."""
+"""Root mean square of the misfit, share of the step, above which the response does not fit the loop's model."""
 UNLIKE_P = 0.01
-"""Probability below which the misfit is no noise."""
+"""Probability below which noise does not explain the misfit."""
 DELAY_CYCLES, DELAY_SD_CYCLES = 1.0, 0.6
-"""Delay of a setpoint until the drive applies it, and its standard deviation: it acts within two cycles."""
+"""Delay until the drive applies a setpoint, and its standard deviation, cycles: it acts within two cycles."""
 NORMAL_95 = 1.96
 """Half-width of a 95 % interval, in standard deviations of a normal distribution."""
 REPORT_WIDER = 3.0
-"""Factor on the half-width of the reported lag. The steps show this lag well, and a result of tones may know only its
-difference from the lag of the torque."""
+"""Factor on the half-width of the reported lag. The steps determine this lag well. A result of tones may contain only
+its difference from the lag of the torque."""
 LEAST_PAIRS = 8
-"""Pairs of steps below which their scatter is too uncertain."""
+"""Smallest number of pairs of steps. With fewer, their scatter is too uncertain."""
 SETTLED_LAGS, SETTLED_TIMES = 5.0, 2.0
-"""Length of a step: so many lags of the reported speed, and so many predicted settling times."""
+"""Length of a step: number of lags of the reported speed, plus number of predicted settling times."""
 
 _GOLDEN = 0.5 * (sqrt(5.0) - 1.0)
-"""Its multiples, modulo 1, fill an interval evenly."""
+"""Golden ratio − 1. Its multiples, modulo 1, fill an interval evenly."""
 _DRAWS = 200
-"""Random draws of the fitted loop, for the intervals of its figures."""
+"""Number of random draws of the fitted loop, for the intervals of its figures."""
 _SHUFFLES = 300
-"""Random draws of the pairs, for the misfit."""
+"""Number of random sign changes of the pairs, for the probability of the misfit."""
 _ROUNDS = 12
-"""Iterations of the fit."""
+"""Number of iterations of the fit."""
 _LARGEST_MOVE = 0.4
-"""Largest change of ln P and ln I in an iteration."""
+"""Largest change of ln P and ln I in one iteration."""
 _SPAN = 30.0
 """Length of the fitted step response, in units of J/P."""
 _SLOPE = 1e-4
@@ -72,10 +72,10 @@ class StepOutcome(StrEnum):
 
 @dataclass(frozen=True)
 class StepCase:
-    """Prediction that steps are compared with, at the motor shaft."""
+    """Prediction with which steps are compared, at the motor shaft."""
 
     kind: str
-    """tuned or present: the gains that are in the drive."""
+    """``tuned`` or ``present``: the gains that are in the drive."""
     plant: UncertainPlant
     gains: PiGains
     overshoot_share: Range
@@ -84,10 +84,10 @@ class StepCase:
     reported_lag_s: Range
     """Time constant of the reported speed."""
     source: str = ""
-    """The tuning's file."""
+    """File of the tuning."""
 
     def plain(self) -> dict[str, Any]:
-        """Return plain data for the log; `step_case_of` reads it."""
+        """Return the case as plain data for the log; `step_case_of` reads it."""
         return asdict(self)
 
 
@@ -119,19 +119,19 @@ def step_case_of(plain: Mapping[str, Any]) -> StepCase:
 
 @dataclass(frozen=True)
 class StepProgram:
-    """Set speeds of a verification: up and down between two speeds, so many times."""
+    """Speed setpoints of a verification: repeated steps up and down between two speeds."""
 
     low_rad_s: float
     high_rad_s: float
     half_s: float
-    """Length of each step."""
+    """Duration of each step."""
     pairs: int
-    """Counted pairs of an up step and a down step; one pair before them is not counted."""
+    """Number of evaluated pairs of an up step and a down step. One more pair before them is not evaluated."""
     dither_rad_s: float = 0.0
-    """A count of the reported speed: the pairs are offset by parts of it, so that its rounding averages out."""
+    """Resolution of the reported speed. Pairs are offset by fractions of it, so that the rounding averages out."""
 
     def speeds_rad_s(self, pair: int) -> tuple[float, float]:
-        """Return the upper and the lower set speed of a pair."""
+        """Return the upper and the lower speed setpoint of a pair."""
         offset = self.dither_rad_s * ((pair * _GOLDEN) % 1.0 - 0.5)
         return self.high_rad_s + offset, self.low_rad_s + offset
 
@@ -142,18 +142,18 @@ class StepProgram:
 
     @property
     def duration_s(self) -> float:
-        """Length of all steps."""
+        """Duration of all steps, including the pair that is not evaluated."""
         return 2.0 * self.half_s * (self.pairs + 1)
 
 
 def step_length_s(case: StepCase) -> float:
-    """Return the time after which the report of a step has settled."""
+    """Return the time after which the reported speed of a step has settled, s."""
     return SETTLED_TIMES * case.settling_s.high + SETTLED_LAGS * case.reported_lag_s.high
 
 
 @dataclass(frozen=True)
 class StepRow:
-    """One compared quantity. ``within``: both intervals have a common part."""
+    """One compared quantity. ``within``: the intervals overlap."""
 
     name: str
     measured: Range
@@ -161,7 +161,7 @@ class StepRow:
 
     @property
     def within(self) -> bool:
-        """Return whether measured and predicted interval overlap."""
+        """Whether measured and predicted interval overlap."""
         return self.measured.low <= self.predicted.high and self.predicted.low <= self.measured.high
 
 
@@ -174,7 +174,7 @@ class StepVerification:
     rows: tuple[StepRow, ...]
     pairs: int
     misfit_rms: float
-    """Share of the step."""
+    """Root mean square of the misfit, as a share of the step."""
     misfit_p: float
     time_s: Reals
     reported: Reals
@@ -183,11 +183,11 @@ class StepVerification:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The model: loop and report over time.
+# Model of the loop and of its reported speed over time.
 
 
 class _LoopModel:
-    """Reported response of the loop, by its parameters; prior mean 0 and sd 1 of all but ln P and ln I."""
+    """Model of the reported response. All parameters but ln P and ln I have prior mean 0 and standard deviation 1."""
 
     def __init__(self, case: StepCase, period_s: float, count: int, half_s: float, timing_sd_s: float,
                  reference_filter_s: float) -> None:
@@ -200,10 +200,10 @@ class _LoopModel:
         total = sum(lag.value for lag in lags)
         self._lags_sd = sum(lag.high - lag.low for lag in lags) / (2.0 * NORMAL_95 * total) if total > 0.0 else 0.0
         self.size = 10
-        """ln P, ln I, J, B, lags of the loop, lag of the report, delay, antiresonance, resonance, damping."""
+        """Parameters: ln P, ln I, J, B, lags of the loop, reporting lag, delay, antiresonance, resonance, damping."""
 
     def loop(self, theta: Reals) -> tuple[LoopPlant, PiGains]:
-        """Return plant and gains."""
+        """Return plant and gains for these parameters."""
         case, plant = self.case, self.case.plant
         believed = plant.believed
         inertia = _moved(plant.inertia_kg_m2, theta[2])
@@ -222,7 +222,7 @@ class _LoopModel:
         return found, gains
 
     def reported(self, theta: Reals) -> Reals:
-        """Return the reported response (N,) to alternating steps, as share of the step."""
+        """Return the reported response (N,) to alternating steps, as a share of the step."""
         from scipy.linalg import expm
 
         plant, gains = self.loop(theta)
@@ -251,7 +251,7 @@ class _LoopModel:
 
 
 def _moved(part: Range, by: float) -> float:
-    """Return the value, moved by so many of its relative standard deviations."""
+    """Return the value changed by ``by`` relative standard deviations."""
     if part.value <= 0.0:
         return part.value
     return part.value * exp((part.high - part.low) / (2.0 * NORMAL_95 * part.value) * float(np.clip(by, -6.0, 6.0)))
@@ -262,7 +262,7 @@ def _shifted(part: Range, by: float) -> float:
 
 
 def _behind(a: Reals, b: Reals, c: Reals, tau_s: float) -> tuple[Reals, Reals, Reals]:
-    """Put a first-order lag behind a system."""
+    """Return the system (A, B, C) with a first-order lag at its output."""
     size = len(a)
     joined = np.zeros((size + 1, size + 1))
     joined[:size, :size], joined[size, :size], joined[size, size] = a, c / tau_s, -1.0 / tau_s
@@ -270,13 +270,13 @@ def _behind(a: Reals, b: Reals, c: Reals, tau_s: float) -> tuple[Reals, Reals, R
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# From the samples to the rows.
+# Evaluation of the samples.
 
 
 def step_pairs(
     time_s: Reals, speed_rad_s: Reals, starts_s: Sequence[float], program: StepProgram, period_s: float
 ) -> Reals:
-    """Return the response in each pair (pair, N), as share of the step; ``starts_s``: of all halves, up first."""
+    """Return the response of each pair (pair, N), as a share of the step. ``starts_s``: of all steps, up first."""
     count = max(1, round(program.half_s / period_s) - 1)
     grid = period_s * np.arange(count)
     halves = [np.interp(start + grid, time_s, speed_rad_s) for start in starts_s]
@@ -319,7 +319,7 @@ def verify_steps(
 
 
 def _fitted(model: _LoopModel, mean: Reals, sd: float) -> tuple[Reals, Reals]:
-    """Return the parameters, and the derivatives of the response there (N, parameter)."""
+    """Fit the parameters. Return them and the derivatives of the response (N, parameter)."""
     theta = np.zeros(model.size)
     now = model.reported(theta)
 
@@ -358,7 +358,7 @@ def _slopes(model: _LoopModel, theta: Reals, now: Reals) -> Reals:
 
 
 def _chance(scatter: Reals, slopes: Reals, inverse: Reals, sd: float, misfit: Reals) -> float:
-    """Return the probability of so large a misfit by noise alone, from random signs of the pairs' scatter."""
+    """Return the probability that noise alone gives this misfit, from random signs of the pairs' scatter."""
     number = len(scatter)
     rng = np.random.default_rng(0)
     signs = rng.choice((-1.0, 1.0), (_SHUFFLES, number))
@@ -399,7 +399,7 @@ def _rows(model: _LoopModel, theta: Reals, covariance: Reals, number: int) -> tu
 
 
 def _figures(model: _LoopModel, draws: list[Reals]) -> Reals:
-    """Return overshoot, rise and settling of each draw (draw, 3)."""
+    """Return overshoot, rise time, s, and settling time, s, of each draw (draw, 3)."""
     loops = [model.loop(theta) for theta in draws]
     spans = [_SPAN * plant.total_inertia_kg_m2 / gains.gain_nm_s_rad for plant, gains in loops]
     speeds = loop_responses([closed_loop(plant, gains) for plant, gains in loops], spans)
@@ -412,7 +412,7 @@ _WORDS = {"overshoot_share": "overshoot", "rise_s": "rise time", "settling_s": "
 
 
 def _judged(rows: tuple[StepRow, ...], rms: float, chance: float, *, limited: bool) -> tuple[StepOutcome, str]:
-    """Return the verdict by the intervals, and its reason."""
+    """Return the verdict from the intervals, and its reason."""
     if limited:
         return StepOutcome.CANNOT_TELL, "an internal limit of the drive acted during the steps"
     if rms > UNLIKE_RMS and chance < UNLIKE_P:
