@@ -185,7 +185,7 @@ class LogBroken(LogError):
 
 
 class NothingRecoverable(LogError):
-    """No message of the log can be read."""
+    """The log has no readable message."""
 
     entry = MessageCode.NOTHING_RECOVERABLE
 

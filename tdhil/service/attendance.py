@@ -179,7 +179,7 @@ class Watcher:
 
     @property
     def follows_inertia(self) -> bool:
-        """Whether J is estimated during the run: always in real time, in stepped time if a page shows the run."""
+        """Return whether J is estimated during the run: in real time always, else if a page shows the run."""
         return self.viewed
 
     def inertia(self, found: LiveInertia) -> None:

@@ -120,7 +120,7 @@ class _Served:
 
     @property
     def gone(self) -> bool:
-        """Whether the connection is closed and its descriptor is free again."""
+        """Return whether the connection is closed and its descriptor is free again."""
         return self.peer.fileno() == -1
 
     @property

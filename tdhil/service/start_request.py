@@ -198,7 +198,7 @@ class RigFile:
 
     @property
     def simulated(self) -> bool:
-        """Whether the rig uses the embedded simulator. A rig with an unusable file counts as real."""
+        """Return whether the rig uses the embedded simulator. A rig with an unusable file counts as real."""
         try:
             options, connection = self.way()
         except (UsageError, DataFileError):
@@ -207,7 +207,7 @@ class RigFile:
 
     @property
     def address(self) -> str | None:
-        """Address of the drive, as `tdhil.session.hold` locks it; None for a simulated or unknown drive."""
+        """Return the drive's address, as `tdhil.session.hold` locks it; None for a simulated or unknown drive."""
         try:
             options, connection = self.way()
         except (UsageError, DataFileError):

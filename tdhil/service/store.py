@@ -95,7 +95,7 @@ class StoredRequest:
 
     @property
     def rehearsal(self) -> bool:
-        """Whether faults of the simulated drive are rehearsed. Such a result is no part of the rig's history."""
+        """Return whether faults of the simulated drive are rehearsed. Such a result is no part of the rig's history."""
         return bool(self.options.get("fault"))
 
     @staticmethod

@@ -154,7 +154,7 @@ class SpeedLoopMargins:
     peak_sensitivity: float
     """Peak sensitivity M_s, the greatest |1/(1 + L)|."""
     conditional: bool
-    """Whether a lower gain makes the loop unstable."""
+    """True if a lower gain makes the loop unstable."""
 
     def keeps(self, phase_deg: float, gain_db: float) -> bool:
         """Return whether the loop is stable, not conditionally stable, and has at least these margins."""

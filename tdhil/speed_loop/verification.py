@@ -161,7 +161,7 @@ class StepRow:
 
     @property
     def within(self) -> bool:
-        """Whether measured and predicted interval overlap."""
+        """Return whether measured and predicted interval overlap."""
         return self.measured.low <= self.predicted.high and self.predicted.low <= self.measured.high
 
 
