@@ -2,7 +2,7 @@
 
 ::
 
-    <prefix>/status                  online or offline; the broker sets offline if it loses the service
+    <prefix>/status                  online; offline when the service has ended, or the broker has lost it
     <prefix>/rigs/<rig>/state        state of the rig, and state and stage of its run
     <prefix>/rigs/<rig>/result       its latest result, as in the list of runs
 

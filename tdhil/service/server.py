@@ -241,7 +241,7 @@ def _uvicorn(
         app, log_level="warning", access_log=False, http="h11", ws="websockets-sansio",
         ws_max_size=4096, ws_ping_interval=10.0, ws_ping_timeout=SILENT_S, timeout_graceful_shutdown=2, lifespan="on",
         server_header=False, date_header=True,
-        h11_max_incomplete_event_size=2 * HEADER_LIMIT, proxy_headers=False,      # address of the connection
+        h11_max_incomplete_event_size=2 * HEADER_LIMIT, proxy_headers=False,      # client address: the connection's
         ssl_certfile=None if tls is None else tls.cert, ssl_keyfile=None if tls is None else tls.key,
     )
     if tls is not None:
