@@ -289,7 +289,7 @@ def run(
     else:
         session.close()
     if outcome.stop is not None and not outcome.stop.confirmed:
-        raise not_confirmed(outcome.stop) from cause       # the most serious error comes first
+        raise not_confirmed(outcome.stop) from cause       # the most serious error, so it takes precedence
     if cause is not None:
         raise cause
     return RunRecord(recording, configuration, str(session.path))

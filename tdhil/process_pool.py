@@ -79,7 +79,7 @@ def usable_cores() -> int:
 
 
 class Pool(Generic[Task, Result]):
-    """Pool of ``jobs`` worker processes that call ``function``, a function of a module. They start when needed."""
+    """Pool of ``jobs`` processes that call ``function``, a module's function passed by name. They start when needed."""
 
     def __init__(self, function: Callable[[Task], Result], jobs: int, limits: TaskLimits) -> None:
         self._function = function
