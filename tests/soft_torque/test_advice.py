@@ -35,7 +35,7 @@ J = Interval(1500.0, 1440.0, 1560.0)
 
 @pytest.fixture(scope="module")
 def beside_good_gains():
-    """Tuning beside good present gains: a = 0.35 at 0.84 f₁. They cure at 46 rpm; gains with most damping at 57 rpm."""
+    """Tuning with good present gains: a = 0.35 at 0.84 f₁. They cure at 46 rpm, the best damped ones at 57 or more."""
     return tune(TuneCase(STRING, DRIVE, J, present=SOFT_035, draws=6))
 
 
