@@ -1,4 +1,4 @@
-"""Soft torque: drill string, speed controllers, their margins, damping and critical speeds; pure numbers."""
+"""Soft torque: drill string, speed controllers, margins, damping and critical speeds. Computation only, no bus."""
 
 from typing import TYPE_CHECKING
 

@@ -1,12 +1,13 @@
-r"""Which gains are worth simulating: all of a grid, ranked by how steep a falling bit friction they bear.
+r"""Candidate gains on a grid, ranked by the steepness of the falling bit friction with which they stay stable.
 
-**Grid.** P = ζ/a, I = (φω)² (J − J_c), J_c = share · J: softness a, frequency factor φ and share are free.
+**Grid.** P = ζ/a, I = (φω)² (J − J_c), J_c = share · J. Softness a, frequency factor φ and share are free.
 
-**Rank.** At the lowest mode the bit sees Re Z_b (`stability`). A bit that swings by A about its mean speed Ω takes in
-as much energy as a slope of −σ_e does, σ_e = −(2/A) mean(T_f(Ω + A sin φ) sin φ) (describing function; any text on
-nonlinear control). Where σ_e < Re Z_b for every A up to Ω no swing grows until the bit stops. The lowest such Ω ranks
-like the critical speeds that are simulated, and costs no simulation. The linear stability limit is a lower bound of
-it. A bit that isn't stated is replaced by one of the reference case: only the order counts.
+**Rank.** At the lowest mode, the bit is loaded by Re Z_b (`stability`). A bit that oscillates with amplitude A about
+its mean speed Ω takes in as much energy as a friction slope of −σ_e, with σ_e = −(2/A) mean(T_f(Ω + A sin φ) sin φ)
+(describing function; any text on nonlinear control). If σ_e < Re Z_b for every A up to Ω, no oscillation grows until
+the bit stops. The lowest such Ω has the same order as the simulated critical speeds, and needs no simulation. The
+linear stability limit is a lower bound of it. If no bit is stated, the bit of the reference case is used, because only
+the order is needed.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ FREQUENCY_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15)
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
 """Compensated shares of J."""
 SUPPOSED_BIT = BitFriction(2500.0, 5000.0, 2.5)
-"""Only to rank, where no bit is stated."""
+"""Bit of the reference case. It is used for the ranking only, if no bit is stated."""
 _PHASES = (np.arange(48) + 0.5) * 2.0 * np.pi / 48
 _SPEEDS = np.linspace(0.5, 14.0, 200)
 """Mean speeds, in Stribeck speeds."""
@@ -39,7 +40,7 @@ _SPEEDS = np.linspace(0.5, 14.0, 200)
 
 @dataclass(frozen=True)
 class Candidate:
-    """Gains and how they were made."""
+    """Gains, and the softness, frequency factor and compensated share from which they were computed."""
 
     softness: float
     frequency_factor: float
@@ -51,7 +52,7 @@ def candidates(
     string: DrillString, inertia_kg_m2: float, mode_hz: float, shares: Sequence[float],
     softnesses: Sequence[float] = SOFTNESSES, factors: Sequence[float] = FREQUENCY_FACTORS,
 ) -> list[Candidate]:
-    """Return the grid."""
+    """Return the controllers at all points of the grid."""
     return [
         Candidate(softness, factor, share, gains(string, inertia_kg_m2, mode_hz, softness, factor, share))
         for share in shares for factor in factors for softness in softnesses
@@ -61,14 +62,14 @@ def candidates(
 def gains(
     string: DrillString, inertia_kg_m2: float, mode_hz: float, softness: float, factor: float, share: float = 0.0
 ) -> SpeedController:
-    """P = ζ/a, I = (φω)² (J − J_c), J_c = share · J."""
+    """Return the gains P = ζ/a, I = (φω)² (J − J_c), J_c = share · J."""
     left = (1.0 - share) * inertia_kg_m2
     return SpeedController(string.impedance_nm_s_rad / softness, (2.0 * pi * factor * mode_hz) ** 2 * left,
                            share * inertia_kg_m2)
 
 
 def ranked_speeds(truths: Sequence[Truth], laws: Sequence[SpeedController]) -> Reals:
-    """Return the estimated critical speed, rad/s, of every law on every truth: (laws, truths). Ranks, not promises."""
+    """Return the estimated critical speeds, rad/s, as an array (laws, truths). Use them for ranking only."""
     found = np.empty((len(laws), len(truths)))
     for column, truth in enumerate(truths):
         string = truth.string
@@ -76,7 +77,7 @@ def ranked_speeds(truths: Sequence[Truth], laws: Sequence[SpeedController]) -> R
         omega = bit_grid(string)
         s: Complex = np.asarray(1j * omega, dtype=np.complex128)
         chain = chain_of(string, s)
-        low = omega < 1.6 * pi / string.echo_s      # the second mode with the top held is never below
+        low = omega < 1.6 * pi / string.echo_s      # the second mode with the top held is always above this
         for row, law in enumerate(laws):
             seen = bit_impedance(string, impedance(truth.drive, law, s), s, chain)
             slope = steepest_slope(omega[low], seen[low])
@@ -85,7 +86,7 @@ def ranked_speeds(truths: Sequence[Truth], laws: Sequence[SpeedController]) -> R
 
 
 def free_speed(bit: BitFriction, slope_nm_s_rad: float) -> float:
-    """Return the lowest mean speed, rad/s, above which no swing up to that speed takes in more than that slope does."""
+    """Return the lowest mean speed Ω, rad/s, above which σ_e stays below ``slope_nm_s_rad`` for every amplitude."""
     falls = bit.static_nm - bit.coulomb_nm
     if falls <= 0.0:
         return 0.0
@@ -95,7 +96,7 @@ def free_speed(bit: BitFriction, slope_nm_s_rad: float) -> float:
 
 @cache
 def _slopes() -> Reals:
-    """Largest σ_e over all amplitudes up to the mean speed, for `_SPEEDS`, in units of (F_s − F_c)/ω_s."""
+    """Return the largest σ_e over all amplitudes up to the mean speed, for `_SPEEDS`, in units of (F_s − F_c)/ω_s."""
     shares = np.linspace(0.05, 1.0, 24)
     amplitude = _SPEEDS[:, None] * shares
     speed = _SPEEDS[:, None, None] + amplitude[:, :, None] * np.sin(_PHASES)

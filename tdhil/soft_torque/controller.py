@@ -6,18 +6,19 @@ r"""Impedance of a top drive under a speed controller, at the top of the string.
 
     J kg·m², B and P N·m·s/rad, I N·m/rad, τ s; all at one shaft. At the motor: divide by i², i = ω_motor/ω_main.
 
-**Derivation.** The drive turns at ω and the string takes τ from it: J dω/dt = T − Bω − τ. The controller is
-told the set speed Ω and makes T = H [P (Ω − ω) + I ∫(Ω − ω) + J_c dω/dt]: the last term gives back part of what
-accelerating the rotor takes, from a derivative that has to be filtered, by τ_c. With Ω at rest −τ/ω is Z. H holds the
-lags *inside* the loop: speed filter, torque loop, sampling. What the drive reports to a bus is smoothed once
-more, which is no part of it unless the loop is closed over that bus.
+**Derivation.** The drive turns at ω, and the string takes the torque τ from it: J dω/dt = T − Bω − τ. From the set
+speed Ω the controller makes T = H [P (Ω − ω) + I ∫(Ω − ω) + J_c dω/dt]. The last term compensates part of the torque
+that accelerates the rotor. It uses a derivative, which needs the filter τ_c. For a constant Ω, Z = −τ/ω. H contains
+the lags *inside* the loop: speed filter, torque loop, sampling. The values that the drive reports over a bus are
+filtered once more. That filter is not part of H, unless the loop is closed over the bus.
 
-**Reflection.** A wave that comes up brings b = ζω − τ, and a = τ + ζω goes down again. With τ = −Zω that is
-a = (ζ − Z) ω and b = (ζ + Z) ω: |r| = |a/b| = |Z − ζ|/|Z + ζ|, below 1 where Re Z > 0. At the angular frequency ω0 at
-which I = ω0² (J − J_c), rotor and I cancel (H = 1) and Z = P + B, so that P = ζ/a gives r = (1 − a)/(1 + a).
+**Reflection.** The wave b = ζω − τ comes up, and the wave a = τ + ζω goes down. With τ = −Zω, a = (ζ − Z) ω and
+b = (ζ + Z) ω. So |r| = |a/b| = |Z − ζ|/|Z + ζ|, which is below 1 if Re Z > 0. At the angular frequency ω0 with
+I = ω0² (J − J_c), rotor and integral cancel (H = 1), and Z = P + B. Therefore P = ζ/a gives r = (1 − a)/(1 + a).
 
-**Passive at low frequency.** With H ≈ 1 − s Στ, Re Z(jω → 0) = P + B − I Στ: positive for Στ < (P + B)/I only. With the
-tuned gains and without B that is a < ζ/(ω0² (J − J_c) Στ): softer than that, and the lags feed slow swings.
+**Passive at low frequency.** With H ≈ 1 − s Στ, Re Z(jω → 0) = P + B − I Στ. It is positive only if Στ < (P + B)/I.
+With the tuned gains and without B this means a < ζ/(ω0² (J − J_c) Στ). With a softer controller, the lags put energy
+into slow oscillations.
 """
 
 from __future__ import annotations
@@ -32,50 +33,50 @@ from tdhil.soft_torque.drill_string import Complex, DrillString
 from tdhil.soft_torque.roots import count_right_of, roots_in
 
 DERIVATIVE_FILTER_S = 0.05
-"""τ_c: a derivative of a measured speed needs a filter; the loop's own lags come on top."""
+"""Time constant τ_c, s, of the filter for the derivative of the measured speed. The loop's own lags are added to it."""
 
 
 @dataclass(frozen=True)
 class TopDrive:
-    """The machine, at the main shaft."""
+    """Inertia, friction and lags of the top drive, at the main shaft."""
 
     inertia_kg_m2: float
     viscous_nm_s_rad: float = 0.0
     coulomb_nm: float = 0.0
     inner_lags_s: tuple[float, ...] = ()
-    """First-order lags inside the speed loop."""
+    """Time constants of the first-order lags inside the speed loop."""
 
     @property
     def total_lag_s(self) -> float:
-        """Στ."""
+        """Sum of the lags Στ, s."""
         return sum(self.inner_lags_s)
 
     def with_inertia(self, inertia_kg_m2: float) -> TopDrive:
-        """The same with another J."""
+        """Return this drive with another J."""
         return replace(self, inertia_kg_m2=inertia_kg_m2)
 
 
 @dataclass(frozen=True)
 class SpeedController:
-    """Gains, at the main shaft."""
+    """Gains of the speed controller, at the main shaft."""
 
     gain_nm_s_rad: float
-    """P."""
+    """Proportional gain P."""
     integral_nm_rad: float
-    """I."""
+    """Integral gain I."""
     compensated_kg_m2: float = 0.0
-    """J_c."""
+    """Compensated inertia J_c."""
     derivative_filter_s: float = DERIVATIVE_FILTER_S
 
     def at_shaft(self, ratio: float) -> SpeedController:
-        """The gains at a shaft that turns ``ratio`` times as fast: all divided by ratio²."""
+        """Return the gains at a shaft that turns ``ratio`` times as fast: all are divided by ratio²."""
         square = ratio * ratio
         return replace(self, gain_nm_s_rad=self.gain_nm_s_rad / square, integral_nm_rad=self.integral_nm_rad / square,
                        compensated_kg_m2=self.compensated_kg_m2 / square)
 
 
 def inner_lags(drive: TopDrive, s: Complex) -> Complex:
-    """H(s)."""
+    """Return H(s), the frequency response of all lags inside the loop."""
     through = np.ones_like(np.asarray(s, dtype=np.complex128))
     for lag in drive.inner_lags_s:
         through = through / (1.0 + lag * s)
@@ -83,55 +84,56 @@ def inner_lags(drive: TopDrive, s: Complex) -> Complex:
 
 
 def control_law(controller: SpeedController, s: Complex) -> Complex:
-    """P + I/s − J_c s/(1 + τ_c s)."""
+    """Return P + I/s − J_c s/(1 + τ_c s), the controller without lags, N·m·s/rad."""
     back = controller.compensated_kg_m2 * s / (1.0 + controller.derivative_filter_s * s)
     return controller.gain_nm_s_rad + controller.integral_nm_rad / s - back
 
 
 def impedance(drive: TopDrive, controller: SpeedController, s: Complex) -> Complex:
-    """Z(s), N·m·s/rad."""
+    """Return the impedance Z(s) of the top drive under its controller, N·m·s/rad."""
     s = np.asarray(s, dtype=np.complex128)
     return drive.inertia_kg_m2 * s + drive.viscous_nm_s_rad + inner_lags(drive, s) * control_law(controller, s)
 
 
 def reflection(impedance_nm_s_rad: Complex, string_nm_s_rad: float) -> Complex:
-    """The share that goes back, (Z − ζ)/(Z + ζ)."""
+    """Return the reflection coefficient (Z − ζ)/(Z + ζ)."""
     return (impedance_nm_s_rad - string_nm_s_rad) / (impedance_nm_s_rad + string_nm_s_rad)
 
 
 def reflection_at(drive: TopDrive, controller: SpeedController, string: DrillString, hertz: NDArray[np.float64]
                   ) -> NDArray[np.float64]:
-    """|r(f)| at the top of the string."""
+    """Return the magnitude |r(f)| of the reflection coefficient at the top of the string."""
     along = 2j * pi * np.asarray(hertz, dtype=float)
     return np.abs(reflection(impedance(drive, controller, along), string.impedance_nm_s_rad))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The whole: top drive and string as one. Z ω = −τ and τ = Z_s ω, so that motions of their own are where Z + Z_s = 0.
-# Multiplied by every denominator there is, F(s) = s Π(1 + τ_k s) (1 + τ_c s) [Z ω_top + τ_top] is analytic everywhere,
-# and its roots are the poles, with none added but those of numerator and denominator that cancel (none does).
+# Closed system of top drive and string. Z ω = −τ and τ = Z_s ω, so the poles are the roots of Z + Z_s = 0.
+# F(s) = s Π(1 + τ_k s) (1 + τ_c s) [Z ω_top + τ_top] is this sum multiplied by every denominator. It is analytic
+# everywhere, and its roots are the poles. A root that is not a pole would need a numerator and a denominator that
+# cancel; none do.
 
 
 @dataclass(frozen=True)
 class NaturalMode:
-    """One natural motion."""
+    """One natural mode: a pole of the closed system."""
 
     pole_rad_s: complex
 
     @property
     def frequency_hz(self) -> float:
-        """|s|/2π."""
+        """Natural frequency |s|/2π, Hz."""
         return abs(self.pole_rad_s) / (2.0 * pi)
 
     @property
     def damping(self) -> float:
-        """Damping ratio, −Re s/|s|; below 0: it grows."""
+        """Damping ratio −Re s/|s|. Below 0 the oscillation grows."""
         return -self.pole_rad_s.real / abs(self.pole_rad_s)
 
 
 @dataclass(frozen=True)
 class ClosedSystem:
-    """Top drive, controller and string; the string alone with its top held where ``controller`` is None."""
+    """Closed system of top drive, controller and string. If ``controller`` is None: the string with its top held."""
 
     string: DrillString
     drive: TopDrive | None = None
@@ -140,7 +142,7 @@ class ClosedSystem:
     """True: the bit is stuck. False: it turns."""
 
     def characteristic(self, s: Complex) -> Complex:
-        """F(s), whose roots are the poles."""
+        """Return the characteristic function F(s), whose roots are the poles."""
         s = np.asarray(s, dtype=np.complex128)
         speed, torque = self.string.at_top(s, stuck=self.stuck)
         if self.drive is None or self.controller is None:
@@ -156,7 +158,7 @@ class ClosedSystem:
         return lags * filtered * s * rotor + law * speed
 
     def modes(self, below_hz: float) -> tuple[NaturalMode, ...]:
-        """Return every oscillating mode up to |s| = 2π ``below_hz``, by frequency; damping of up to 0.98."""
+        """Return all oscillating modes up to ``below_hz`` with a damping ratio of up to 0.98, sorted by frequency."""
         reach = 2.0 * pi * below_hz
         found = roots_in(self.characteristic, complex(-reach, 0.02 * reach), complex(0.25 * reach, reach), self._pace)
         swinging = [NaturalMode(pole) for pole in found if abs(pole) <= reach]
@@ -169,16 +171,16 @@ class ClosedSystem:
 
     @property
     def _pace(self) -> float:
-        """A fiftieth of the distance between neighbouring modes, π/T."""
+        """Step of the search for roots, rad/s: a fiftieth of the distance π/T between neighbouring modes."""
         return 2.0 * pi / (50.0 * self.string.echo_s)
 
     def reach_rad_s(self) -> float:
-        """How far up the imaginary axis an unstable pole is looked for.
+        """Return the highest frequency, rad/s, up to which unstable poles are searched.
 
-        Beyond it |controller's part of Z| ≤ P + I/ω + J_c ω/√(1 + (τ_c ω)²), behind the lags, is less than a twentieth
-        of the rotor's J ω, and ζ less than a tenth: a wave comes back with at most 4 · 0.05/(0.9² · 10) = 2.5 % more
-        energy than it brought, and falling; the mud takes more than that from any string that is long enough to stick
-        (reference case: 10 % an echo).
+        Above it the controller's part of Z, |Z_c| ≤ P + I/ω + J_c ω/√(1 + (τ_c ω)²) behind the lags, is less than a
+        twentieth of the rotor's J ω, and ζ is less than a tenth of it. A reflected wave then has at most
+        4 · 0.05/(0.9² · 10) = 2.5 % more energy than the arriving one, and less at higher frequencies. In any string
+        that is long enough for stick-slip, the mud takes more energy than that (reference case: 10 % an echo).
         """
         assert self.drive is not None and self.controller is not None
         drive, controller = self.drive, self.controller
@@ -197,22 +199,23 @@ class ClosedSystem:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Margins of the drive's own loop, the string hanging on it: L = H·law/(J s + B + Z_s), cut at the torque.
+# Margins of the drive's speed loop with the string coupled: L = H·law/(J s + B + Z_s), opened at the torque.
 
 
 @dataclass(frozen=True)
 class Margins:
-    """Margins of the loop of the bare drive."""
+    """Margins of the speed loop: phase of the bare drive, modulus with the string coupled."""
 
     phase_deg: float | None
-    """Without a string, at the crossover; None: the gain is below 1 everywhere."""
+    """Phase margin without a string, at the crossover. None: the gain is below 1 everywhere."""
     crossover_rad_s: float | None
     modulus: float
-    """Least distance of L(jω) from −1, the string on it: 1 is nothing to fear, 0.5 a gain of 2 either way."""
+    """Least distance of L(jω) from −1 with the string coupled (modulus margin). 1 is ample. 0.5 allows a gain factor
+    of 2, up or down."""
 
 
 def margins(drive: TopDrive, controller: SpeedController, string: DrillString | None) -> Margins:
-    """Phase margin of the bare drive and least distance from −1 with the string on it."""
+    """Return the phase margin of the bare drive, and the least distance from −1 with the string coupled."""
     omega = np.geomspace(1e-3, 3e3, 6000)
     s: Complex = np.asarray(1j * omega, dtype=np.complex128)
     law = inner_lags(drive, s) * control_law(controller, s)
@@ -238,10 +241,11 @@ def phase_lag_rad(drive: TopDrive, omega: float) -> float:
 
 
 def stiff_controller(drive: TopDrive, phase_margin_deg: float, integral_share: float = 0.1) -> SpeedController:
-    """The stiffest PI that keeps the phase margin, I/P = ω_c/10: what a drive's own commissioning aims at.
+    """Return the stiffest PI controller that keeps the phase margin, with I/P = ω_c/10.
 
-    Phase of the loop at ω_c: −90° + arctan(B/(J ω_c)) − arctan(0.1) − Σ arctan(τ_k ω_c) = −180° + margin; it falls with
-    ω_c, so that bisection finds it. P from |L| = 1. Raises ValueError where no lag limits it.
+    The usual commissioning of a drive aims at such a controller. Phase of the loop at the crossover ω_c:
+    −90° + arctan(B/(J ω_c)) − arctan(0.1) − Σ arctan(τ_k ω_c) = −180° + margin. The phase falls with ω_c, so bisection
+    finds ω_c. P follows from |L| = 1. Raises ValueError if no lag limits the gain, or if no gain has this margin.
     """
     if drive.total_lag_s <= 0.0:
         raise ValueError("with no lag inside the loop there is no stiffest controller")
@@ -270,14 +274,14 @@ def tuned_controller(
     string: DrillString, inertia_kg_m2: float, softness: float, mode_hz: float, compensated_share: float = 0.0,
     derivative_filter_s: float = DERIVATIVE_FILTER_S,
 ) -> SpeedController:
-    """P = ζ/a, I = ω² (J − J_c), for the J that is believed; ``softness`` is a."""
+    """Return P = ζ/a, I = ω² (J − J_c) for the estimated J. ``softness`` is a."""
     compensated = compensated_share * inertia_kg_m2
     integral = (2.0 * pi * mode_hz) ** 2 * (inertia_kg_m2 - compensated)
     return SpeedController(string.impedance_nm_s_rad / softness, integral, compensated, derivative_filter_s)
 
 
 def softest_allowed(string: DrillString, drive: TopDrive, mode_hz: float, compensated_share: float = 0.0) -> float:
-    """ζ/(ω² (J − J_c) Στ): a beyond it makes Re Z negative at low frequencies; infinite without lags."""
+    """Return ζ/(ω² (J − J_c) Στ). A larger a makes Re Z negative at low frequencies. Infinite without lags."""
     integral = (2.0 * pi * mode_hz) ** 2 * drive.inertia_kg_m2 * (1.0 - compensated_share)
     lag = drive.total_lag_s
     return string.impedance_nm_s_rad / (integral * lag) if lag * integral > 0.0 else float("inf")

@@ -1,8 +1,8 @@
-"""Gains over the depth of the well: tuned at each depth, and checked halfway between.
+"""Gain schedule over the depth of the well: tuned at each depth, and checked halfway between two depths.
 
-As the well gets deeper the topmost section of the string gets longer. The drive, or its operator, interpolates P, I and
-J_c linearly between the rows. Halfway between two rows the interpolated gains are held against margins and simulated
-under bit noise, as the rows themselves are.
+As the well gets deeper, the topmost section of the string gets longer. The drive, or its operator, interpolates P, I
+and J_c linearly between the rows. Halfway between two rows, the interpolated gains are checked like those of a row:
+against the required margins, and by a simulation under bit noise.
 """
 
 from __future__ import annotations
@@ -27,43 +27,43 @@ ScheduledKind = Literal["soft", "compensated"]
 
 @dataclass(frozen=True)
 class DepthRow:
-    """Gains at one depth. Refused: ``controller`` is None and ``refusal`` says why."""
+    """Gains at one depth. If they are refused, ``controller`` is None and ``refusal`` gives the reason."""
 
     depth_m: float
     """Length of the whole string."""
     mode_hz: float
-    """Lowest, with the top held."""
+    """Frequency of the lowest mode with the top held."""
     controller: SpeedController | None
     refusal: str = ""
     softness: float | None = None
     frequency_factor: float | None = None
-    """a and φ; None: the gains are interpolated."""
+    """Frequency factor φ. None, as for ``softness`` (a): the gains are interpolated."""
     worst: LoopMargins | None = None
-    """The least of each margin over all sampled truths."""
+    """Least value of each margin over all sampled truths."""
     failed: tuple[str, ...] = ()
-    """Margins that are thinner than required on a sampled truth, with their numbers."""
+    """Margins that are below the required ones on a sampled truth, with their values."""
     cure: DrawnValues | None = None
     """Critical speed under bit noise, rpm."""
     compared: DrawnValues | None = None
-    """The same with the present gains, or with the stiff loop."""
+    """Critical speed under bit noise with the present gains, or with the stiff controller, rpm."""
 
 
 @dataclass(frozen=True)
 class DepthSchedule:
-    """Rows from the shallowest to the deepest."""
+    """Gain schedule: rows from the shallowest depth to the deepest."""
 
     kind: ScheduledKind
     compared_with: str
-    """present, or stiff."""
+    """Controller to which the critical speeds are compared: present, or stiff."""
     rows: tuple[DepthRow, ...]
     between: tuple[DepthRow, ...]
-    """Halfway between two rows that both have gains, with the interpolated ones."""
+    """Rows with the interpolated gains, each halfway between two rows that both have gains."""
 
 
 def at_depth(string: DrillString, depth_m: float) -> DrillString:
-    """Return the string that reaches so deep: its topmost section gets longer or shorter.
+    """Return the string with a total length of ``depth_m``: its topmost section gets longer or shorter.
 
-    Raises ValueError where what hangs below that section is longer.
+    Raises ValueError if the sections below the topmost one are longer than ``depth_m``.
     """
     first, *rest = string.lines
     length_m = depth_m - sum(line.length_m for line in rest)
@@ -76,9 +76,9 @@ def schedule(
     case: TuneCase, depths_m: Sequence[float], kind: ScheduledKind, *, simulated: bool = True,
     told: Callable[[str], None] = lambda text: None,
 ) -> DepthSchedule:
-    """Tune at each depth, and check what interpolation makes of it. Raises as `at_depth` and `tune` do.
+    """Tune at each depth, and check the interpolated gains. Raises the errors of `at_depth` and `tune`.
 
-    ``simulated`` False, or no bit: without critical speeds.
+    If ``simulated`` is False or no bit is stated, no critical speeds are computed. ``told`` receives progress texts.
     """
     rows, between = [], []
     for depth_m in depths_m:
@@ -106,7 +106,7 @@ def _row(case: TuneCase, depth_m: float, kind: ScheduledKind, simulated: bool) -
 
 
 def _judged(case: TuneCase, row: DepthRow, simulated: bool, samples: TruthMargins | None = None) -> DepthRow:
-    """Return the row with its margins and critical speeds."""
+    """Return the row with its margins, and its critical speeds if they are simulated."""
     assert row.controller is not None
     samples = samples or TruthMargins(case)
     worst = samples.every(row.controller)

@@ -1,30 +1,31 @@
-r"""Drill string of string.yaml as a load of the top drive: exact transmission lines, section by section.
+r"""Drill string of string.yaml as the load of the top drive: exact transmission lines, section by section.
 
 ::
 
     one metre of pipe    m = ρ I_p  kg·m,   y = 1/(G I_p)  rad/(N·m²),   d  N·m·s/rad per m    I_p = π (OD⁴ − ID⁴)/32
 
-    −∂τ/∂x = m ∂ω/∂t + d ω        −∂ω/∂x = y ∂τ/∂t          x downwards; τ N·m is what is handed down
+    −∂τ/∂x = m ∂ω/∂t + d ω        −∂ω/∂x = y ∂τ/∂t          x downwards; τ N·m is the torque passed downwards
 
-**Derivation.** In Laplace's s both together give ω'' = γ² ω with γ² = (m s + d) y s: two waves e^∓γx, in which τ = ±Z ω
-with Z = (m s + d)/γ. Without drag Z is real, the characteristic impedance ζ = √(m/y) = I_p √(Gρ), and the waves run
-at c = 1/√(m y) = √(G/ρ). Fitted to both ends of a section of length L they give
+**Derivation.** In the Laplace domain, both equations together give ω'' = γ² ω with γ² = (m s + d) y s. The solutions
+are two waves e^∓γx, in which τ = ±Z ω with Z = (m s + d)/γ. Without drag, Z is real: the characteristic impedance
+ζ = √(m/y) = I_p √(Gρ). The waves travel at c = 1/√(m y) = √(G/ρ). For both ends of a section of length L they give
 
     ⎡ω⎤       ⎡ cosh γL      y s S ⎤ ⎡ω⎤
     ⎢ ⎥     = ⎢                    ⎥ ⎢ ⎥          S = sinh(γL)/γ
     ⎣τ⎦ top   ⎣ (m s + d) S  cosh γL⎦ ⎣τ⎦ bottom
 
-whose determinant is 1. cosh and S are even in γ, so that each entry is a power series in s: there are no branch cuts
-and no poles anywhere, which finding roots rests on. Sections one below another are products of their matrices. At the
-bottom τ = (s J_L + B_b) ω while it turns, ω = 0 while it is stuck; hence (ω, τ) at the top up to one common factor, and
+The determinant of this matrix is 1. cosh and S are even in γ, so each entry is a power series in s. It has no branch
+cuts and no poles; the search for roots depends on this. The matrix of several sections is the product of their
+matrices. At the bottom, τ = (s J_L + B_b) ω while the bit turns, and ω = 0 while it is stuck. This gives (ω, τ) at the
+top up to one common factor, and
 
     Z_s(s) = τ/ω        k = 1/Σ y L        T = Σ L/c        the echo of a change at the top comes back after 2T
 
-**Tool joints** are short against every wave that matters: over the length of a joint of pipe the inertia per metre and
-the compliance per metre are means, weighted by the share of length. (Waves: any text on lines, as S. L. Chen and
-M. Géradin (1995) for strings.)
+**Tool joints** are much shorter than every wavelength of interest. So the inertia per metre and the compliance per
+metre are means over a joint of pipe, weighted by the share of length. (Waves: any text on transmission lines;
+S. L. Chen and M. Géradin (1995) for drill strings.)
 
-Everything here is at the shaft that the string hangs on, the main shaft.
+All quantities are at the main shaft, from which the string hangs.
 """
 
 from __future__ import annotations
@@ -46,29 +47,32 @@ Complex = NDArray[np.complex128]
 STEEL_SHEAR_MODULUS_PA = 79.3e9
 STEEL_DENSITY_KG_M3 = 7850.0
 MUD_DRAG_NM_S_RAD_M = 0.005
-"""Viscous drag of mud on 5 inch pipe, of the order that simulations use; not measured."""
+"""Viscous drag of mud on 5 inch pipe, N·m·s/rad per metre: the order of magnitude in simulations; not measured."""
 WALL_FRICTION_KINETIC, WALL_FRICTION_STATIC = 0.2, 0.3
-"""Friction coefficients of steel on rock or casing in mud, of the order that torque-and-drag programs use; not measured
-on this well."""
+"""Friction coefficients of steel on rock or casing in mud: the order of magnitude in torque-and-drag programs; not
+measured on this well."""
 SHEAR_RANGE_PA = (61e9, 80e9)
 """Range of the shear modulus G of a steel string, Pa: 79 to 80 GPa by the handbook; U. J. Aarsnes and R. Shor (2018)
 fitted 61 GPa for pipe and 67 GPa for collars to field data, tool joints and connections included."""
 STATED_SHEAR_TOLERANCE = 0.05
-"""Relative, of a G that was stated because it was fitted."""
+"""Relative tolerance of a stated shear modulus G. A stated G is taken as fitted to field data."""
 LENGTH_TOLERANCE = 0.01
-"""Relative: a stand of 28 m on a string of 3,000 m."""
+"""Relative tolerance of the length: one stand of 28 m on a string of 3,000 m."""
 WORN_POLAR_SHARE = 0.85
-"""Polar moment of area of pipe with 80 % of its wall left (API RP 7G, premium class), over that of new pipe."""
+"""Polar moment of area of pipe with 80 % of its wall left (API RP 7G, premium class), divided by that of new pipe."""
 DRAG_FACTOR = 2.5
-"""Up or down: the mud's drag is a guess in every string file."""
+"""Tolerance of the mud's drag as a factor, up or down. The drag is a guess in every string file."""
 BOTTOM_TOLERANCE = 0.10
+"""Relative tolerance of the inertia at the bottom."""
 BIT_TORQUE_TOLERANCE, STRIBECK_FACTOR, NOISE_FACTOR = 0.15, 1.25, 1.5
-"""Tolerances of a stated bit, relative and as factors up or down. They are assumptions, as the bit itself is."""
+"""Tolerances of a stated bit: torque (relative), Stribeck speed and noise (factors, up or down). They are assumptions,
+like the bit itself."""
 BIT_NOISE_SHARE = 0.08
-"""Root mean square of the bit's random torque over its Coulomb torque: an assumption, 200 N·m on a bit of 2,500 N·m.
-A log of steady drilling gives the value of a real bit."""
+"""Root mean square of the bit's random torque, divided by its Coulomb torque. It is an assumption: 200 N·m for a bit of
+2,500 N·m. A log of steady drilling gives the value of a real bit."""
 NOISE_CORRELATION_S = 0.2
-"""Correlation time of the bit's random torque, s: an assumption; above the string's lowest modes it hardly matters."""
+"""Correlation time of the bit's random torque, s. It is an assumption. If the noise reaches frequencies above the
+string's lowest modes, the value has little influence."""
 
 _Share = Annotated[float, Field(ge=0.0, le=0.9)]
 _Length = Annotated[float, Field(gt=0.0, le=20_000.0)]
@@ -78,7 +82,7 @@ _PositiveNumber = Annotated[float, Field(gt=0.0, le=1e12)]
 
 
 class ToolJoints(DataModel):
-    """The thick ends of the joints of pipe, as a mean over the section."""
+    """Tool joints: the thick ends of the joints of pipe, averaged over the section."""
 
     length_share: float = Field(gt=0.0, lt=1.0, description="share of the section's length that is tool joint")
     outer_diameter_m: _Diameter
@@ -86,12 +90,12 @@ class ToolJoints(DataModel):
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """A bore wider than the joint."""
+        """Report a bore that is not smaller than the outer diameter."""
         return _bore(values)
 
 
 class PipeSection(DataModel):
-    """One uniform stretch of pipe or collar."""
+    """One uniform section of pipe or collar."""
 
     length_m: _Length | None = Field(default=None, description="m; or stiffness_nm_rad")
     stiffness_nm_rad: _PositiveNumber | None = Field(
@@ -115,7 +119,7 @@ class PipeSection(DataModel):
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """A bore wider than the pipe; a length said twice, or not at all."""
+        """Report a bore that is not smaller than the outer diameter, and a length that is stated twice or missing."""
         length, stiffness = values.get("length_m", ...), values.get("stiffness_nm_rad", ...)
         found = _bore(values)
         if length is None and stiffness is None:
@@ -126,9 +130,10 @@ class PipeSection(DataModel):
 
 
 class BottomEnd(DataModel):
-    """The bottom end: an inertia, or sections of a bottom-hole assembly, and the bit's friction.
+    """Bottom end of the string: an inertia, or sections of a bottom-hole assembly, and the bit's friction.
 
-    The words are plant.yaml's. Without ``coulomb_nm`` no bit is stated, and nothing is said of critical speeds.
+    The keys are the same as in plant.yaml. Without ``coulomb_nm`` no bit is stated, and no critical speeds are
+    computed.
     """
 
     inertia_kg_m2: _NotNegative = Field(default=0.0, description="kg·m²; collars and bit as one")
@@ -151,7 +156,7 @@ class BottomEnd(DataModel):
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """Nothing that turns; half a friction law; one that rises."""
+        """Report a bottom without inertia, an incomplete friction law, and a static torque below the Coulomb torque."""
         found: list[Finding] = []
         if values.get("inertia_kg_m2") == 0.0 and values.get("sections", ...) == ():
             found.append(("", "needs inertia_kg_m2, or sections of a bottom-hole assembly"))
@@ -169,7 +174,7 @@ class BottomEnd(DataModel):
 
 
 class ToleranceFile(DataModel):
-    """How far string and bit may differ from what string.yaml states; each relative, 0.1 is 10 %."""
+    """Tolerances of string and bit about the values in string.yaml. Each is relative: 0.1 is 10 %."""
 
     length: _Share = LENGTH_TOLERANCE
     shear_modulus: _Share | None = Field(
@@ -188,7 +193,7 @@ class ToleranceFile(DataModel):
 
 
 class StringFile(DataModel):
-    """string.yaml."""
+    """Content of string.yaml."""
 
     name: str | None = Field(default=None, min_length=1, max_length=200)
     sections: Annotated[tuple[PipeSection, ...], Field(min_length=1)]
@@ -207,49 +212,50 @@ def _bore(values: Mapping[str, Any]) -> list[Finding]:
 
 @dataclass(frozen=True)
 class WaveLine:
-    """A uniform stretch as the waves see it."""
+    """Uniform section as a transmission line of torsional waves."""
 
     length_m: float
     inertia_kg_m: float
-    """m, per metre: kg·m²/m."""
+    """Inertia m per metre, kg·m²/m."""
     compliance_rad_nm_m: float
-    """y, per metre: rad/(N·m) per m."""
+    """Compliance y per metre, rad/(N·m) per m."""
     drag_nm_s_rad_m: float
+    """Viscous drag d per metre, N·m·s/rad per m."""
     coulomb_nm_m: float = 0.0
     """Kinetic dry friction on the wall of the hole, N·m per metre."""
     static_nm_m: float = 0.0
-    """The same, from standstill."""
+    """Static dry friction on the wall of the hole, N·m per metre."""
 
     @property
     def has_friction(self) -> bool:
-        """Return whether anything along the line takes energy."""
+        """Return whether the line has drag or dry friction."""
         return self.drag_nm_s_rad_m > 0.0 or self.coulomb_nm_m > 0.0
 
     @property
     def impedance_nm_s_rad(self) -> float:
-        """ζ, without drag."""
+        """Characteristic impedance ζ without drag, N·m·s/rad."""
         return sqrt(self.inertia_kg_m / self.compliance_rad_nm_m)
 
     @property
     def speed_m_s(self) -> float:
-        """Speed c of the waves."""
+        """Speed c of the waves, m/s."""
         return 1.0 / sqrt(self.inertia_kg_m * self.compliance_rad_nm_m)
 
     @property
     def delay_s(self) -> float:
-        """Travel time of a wave from end to end."""
+        """Travel time of a wave from end to end, s."""
         return self.length_m / self.speed_m_s
 
 
 @dataclass(frozen=True)
 class StringTolerance:
-    """How far string and bit may differ from what is stated: relative half-widths, and factors up or down."""
+    """Tolerances of string and bit about the stated values: relative half-widths, and factors up or down."""
 
     length: float = LENGTH_TOLERANCE
     shear: tuple[float, float] = (1.0 - STATED_SHEAR_TOLERANCE, 1.0 + STATED_SHEAR_TOLERANCE)
-    """Least and largest G, as factors on the stated one."""
+    """Smallest and largest G, as factors on the stated one."""
     polar: tuple[float, float] = (WORN_POLAR_SHARE, 1.0)
-    """Least and largest polar moment of area, as factors on that of the stated diameters."""
+    """Smallest and largest polar moment of area, as factors on that of the stated diameters."""
     drag_factor: float = DRAG_FACTOR
     bottom_inertia: float = BOTTOM_TOLERANCE
     bit_torque: float = BIT_TORQUE_TOLERANCE
@@ -258,27 +264,28 @@ class StringTolerance:
 
 
 STRING_AS_USUAL = StringTolerance()
+"""Default tolerances of a stated string."""
 IDENTIFIED_STRING = StringTolerance(0.0, (1.0, 1.0), (1.0, 1.0), 2.0, 0.0)
-"""Tolerance of an identified string: k, f and J_L are drawn from their own intervals, the losses from a factor."""
+"""Tolerances of an identified string: k, f and J_L are drawn from their own intervals, the losses from a factor."""
 EXACT_STRING = StringTolerance(0.0, (1.0, 1.0), (1.0, 1.0), 1.0, 0.0, 0.0, 1.0, 1.0)
-"""Tolerance of a string that is known exactly, such as a simulated one."""
+"""Tolerances of a string that is known exactly, such as a simulated one."""
 
 
 @dataclass(frozen=True)
 class BitFriction:
-    """T_f = sgn ω (F_c + (F_s − F_c) e^−(ω/ω_s)²) while it turns, up to F_s while it sticks."""
+    """Friction of the bit: T_f = sgn ω (F_c + (F_s − F_c) e^−(ω/ω_s)²) while it turns, up to F_s while it sticks."""
 
     coulomb_nm: float
     static_nm: float
     stribeck_speed_rad_s: float
     noise_nm: float = 0.0
-    """Root mean square of the torque's random part."""
+    """Root mean square of the random part of the torque, N·m."""
     noise_correlation_s: float = NOISE_CORRELATION_S
     torque_per_weight_nm_kn: float | None = None
-    """Coulomb torque for each kN of weight on bit."""
+    """Coulomb torque per weight on bit, N·m/kN."""
 
     def describe(self) -> str:
-        """Return the bit in half a line, for every figure that depends on it."""
+        """Return a short description of the bit, to stand beside every figure that depends on it."""
         if self.static_nm == self.coulomb_nm:
             return f"Coulomb {self.coulomb_nm:g} N·m"
         return (f"static {self.static_nm:g} N·m, Coulomb {self.coulomb_nm:g} N·m, "
@@ -287,7 +294,7 @@ class BitFriction:
 
 @dataclass(frozen=True)
 class DrillString:
-    """Lines from the top down, and what turns at the lower end of the last."""
+    """Drill string: lines from the top down, and the inertia, friction and bit at the lower end of the last line."""
 
     lines: tuple[WaveLine, ...]
     bottom_inertia_kg_m2: float
@@ -295,34 +302,35 @@ class DrillString:
     bit: BitFriction | None = None
     name: str | None = None
     tolerance: StringTolerance = STRING_AS_USUAL
-    """How far the true string may differ."""
+    """Tolerances of the true string about these values."""
     supposed: bool = False
-    """Its waves and their losses are assumed: an identified spring does not show them."""
+    """True: the waves and their losses are assumed, because an identified spring does not show them."""
 
     @property
     def impedance_nm_s_rad(self) -> float:
-        """ζ that the top drive sees until the first echo: the topmost line's."""
+        """Characteristic impedance ζ of the topmost line, N·m·s/rad: the top drive's load until the first echo."""
         return self.lines[0].impedance_nm_s_rad
 
     @property
     def stiffness_nm_rad(self) -> float:
-        """Stiffness k of the whole as a spring, bottom-hole assembly included."""
+        """Stiffness k of the whole string as a spring, bottom-hole assembly included, N·m/rad."""
         return 1.0 / sum(line.length_m * line.compliance_rad_nm_m for line in self.lines)
 
     @property
     def inertia_kg_m2(self) -> float:
-        """Inertia of everything below the top drive, as if it were stiff."""
+        """Inertia of the whole string below the top drive, as a rigid body, kg·m²."""
         return self.bottom_inertia_kg_m2 + sum(line.length_m * line.inertia_kg_m for line in self.lines)
 
     @property
     def echo_s(self) -> float:
-        """2T: the echo of the bottom comes back after it."""
+        """Round-trip time 2T after which the echo of the bottom arrives at the top, s."""
         return 2.0 * sum(line.delay_s for line in self.lines)
 
     def at_top(self, s: Complex, *, stuck: bool = False) -> tuple[Complex, Complex]:
-        """(speed, torque) at the top for one motion of the bottom, up to a common factor; analytic in all of s.
+        """Return (speed, torque) at the top for one motion of the bottom, up to a common factor. Analytic for every s.
 
-        Turning: the bottom's speed is 1, under its inertia and viscous friction. ``stuck``: its torque is 1.
+        For a turning bit, the speed at the bottom is 1, and its inertia and viscous friction give the torque. If
+        ``stuck``, the speed at the bottom is 0 and the torque is 1.
         """
         s = np.asarray(s, dtype=np.complex128)
         one, none = np.ones_like(s), np.zeros_like(s)
@@ -333,7 +341,7 @@ class DrillString:
         return self.carried_up(s, speed, torque)
 
     def carried_up(self, s: Complex, speed: Complex, torque: Complex) -> tuple[Complex, Complex]:
-        """(speed, torque) at the top that belong to those at the lower end of the last line."""
+        """Return (speed, torque) at the top for the given ones at the lower end of the last line."""
         for line in reversed(self.lines):
             series, shunt = line.compliance_rad_nm_m * s, line.inertia_kg_m * s + line.drag_nm_s_rad_m
             cosh, sinh_over = _cosh_and_sinh_over(series * shunt, line.length_m)
@@ -341,13 +349,13 @@ class DrillString:
         return speed, torque
 
     def impedance_at(self, s: Complex, *, stuck: bool = False) -> Complex:
-        """Z_s = τ/ω at the top, N·m·s/rad."""
+        """Return the string's impedance Z_s = τ/ω at the top, N·m·s/rad."""
         speed, torque = self.at_top(s, stuck=stuck)
         return torque / speed
 
 
 def _cosh_and_sinh_over(square: Complex, length: float) -> tuple[Complex, Complex]:
-    """Cosh γL and sinh(γL)/γ, from γ²."""
+    """Return cosh γL and sinh(γL)/γ for ``square`` = γ²."""
     root = np.sqrt(square)
     product = root * length
     small = np.abs(product) < 1e-4
@@ -357,7 +365,7 @@ def _cosh_and_sinh_over(square: Complex, length: float) -> tuple[Complex, Comple
 
 
 def line_of(section: PipeSection) -> WaveLine:
-    """The section as the waves see it; a length that isn't stated is k's."""
+    """Return the section as a transmission line. A length that is not stated follows from the stiffness k."""
     inertia, compliance = _per_metre(section, section.outer_diameter_m, section.inner_diameter_m)
     joints = section.tool_joints
     if joints is not None:
@@ -382,7 +390,7 @@ def _per_metre(section: PipeSection, outer_m: float, inner_m: float) -> tuple[fl
 
 
 def string_of(file: StringFile) -> DrillString:
-    """Return the string of the file, from the top down."""
+    """Return the drill string that the file describes."""
     bottom = file.bottom
     bit = None
     if bottom.coulomb_nm is not None:
@@ -398,7 +406,7 @@ def string_of(file: StringFile) -> DrillString:
 
 
 def _tolerance_of(file: StringFile, sections: tuple[PipeSection, ...]) -> StringTolerance:
-    """Return the tolerances of the file. Without a stated G, every value that was fitted in the field is possible."""
+    """Return the tolerances of the file. Without a stated G, the range is that of all values fitted to field data."""
     stated = file.tolerance or ToleranceFile()
     shear = tuple(one / STEEL_SHEAR_MODULUS_PA for one in SHEAR_RANGE_PA)
     if stated.shear_modulus is not None:
@@ -411,24 +419,26 @@ def _tolerance_of(file: StringFile, sections: tuple[PipeSection, ...]) -> String
 
 
 def load_string(path: Path) -> DrillString:
-    """Reads string.yaml; `DataFileError` with every problem and its line."""
+    """Read string.yaml. Raises `DataFileError` with every problem and its line."""
     return string_of(load_model(path, StringFile))
 
 
 SPRING_SHARE, SPRING_LOSS = 0.1, 0.03
-"""Assumed inertia of a spring of unknown mass, as a share of its load's inertia, since waves need some; and the damping
-ratio of its first wave. Without damping the stiffest loops would oscillate on waves that no measurement shows."""
+"""Assumptions for a spring of unknown mass: its inertia as a share of the load's inertia, and the damping ratio of its
+first wave. Waves need an inertia. Without damping, the stiffest loops would oscillate on waves that no measurement
+shows."""
 
 
 def spring_and_mass(
     stiffness_nm_rad: float, antiresonance_hz: float, damping_nm_s_rad: float = 0.0, name: str | None = None
 ) -> DrillString:
-    """A load on a spring, as identified, without a bit; with its top held it swings at ``antiresonance_hz``.
+    """Return an identified load on a spring as a string without a bit.
 
-    One light line with K and its share of the load. A mass m on a line with inertia J_s swings as m + J_s/3 on a
-    spring does, to the second order of J_s/m (Rayleigh), and exactly as ωT tan ωT = J_s/m has it; that is used. Of the
-    loss along the line a third counts at the load, where the rest of the spring's ``damping_nm_s_rad`` is put: with the
-    top held it is the same there. (The line's alone damps that swing by 0.010.)
+    With its top held, the load oscillates at ``antiresonance_hz``. The spring is one light line with stiffness k and
+    the inertia J_s, `SPRING_SHARE` of the load. A mass m on such a line oscillates like m + J_s/3 on a massless spring,
+    to second order in J_s/m (Rayleigh). The exact relation ωT tan ωT = J_s/m is used here. With the top held, one third
+    of the line's loss acts at the load. The rest of the spring's ``damping_nm_s_rad`` is placed at the load, where it
+    has the same effect. (The line alone gives this oscillation a damping ratio of 0.010.)
     """
     swing = 2.0 * pi * antiresonance_hz
     load = stiffness_nm_rad / swing**2
@@ -442,7 +452,7 @@ def spring_and_mass(
 
 
 LEAST_PIPE_SHARE = 0.03
-"""Least inertia of a pipe, as a share of the load's: below it k, f and J_L do not determine the characteristic
+"""Least inertia of a pipe, as a share of the load's inertia. Below it, k, f and J_L do not determine the characteristic
 impedance."""
 
 
@@ -450,19 +460,19 @@ def identified_string(
     stiffness_nm_rad: float, antiresonance_hz: float, load_inertia_kg_m2: float, damping_nm_s_rad: float = 0.0,
     name: str | None = None,
 ) -> DrillString | None:
-    """Return the uniform pipe with stiffness k whose load J_L swings at f with its top held; None: no pipe does.
+    """Return the uniform pipe with stiffness k whose load J_L oscillates at f with the top held; None if none exists.
 
-    ωT tan ωT = kT²/J_L with ω = 2πf, that is tan ωT = kT/(ω J_L), gives the travel time T; ζ = kT and J_s = kT². A
-    load that swings as k/ω² does by itself leaves no inertia for the pipe.
+    The travel time T follows from ωT tan ωT = kT²/J_L with ω = 2πf, that is tan ωT = kT/(ω J_L). Then ζ = kT and
+    J_s = kT². If J_L is already k/ω² or nearly so, no inertia is left for the pipe, and the result is None.
     """
     omega = 2.0 * pi * antiresonance_hz
-    light = stiffness_nm_rad / omega**2 - load_inertia_kg_m2      # J_s/3, about
+    light = stiffness_nm_rad / omega**2 - load_inertia_kg_m2      # about J_s/3
     if light < LEAST_PIPE_SHARE / 3.0 * load_inertia_kg_m2:
         return None
     low, high = 1e-6, (0.5 - 1e-9) * pi
     for _ in range(200):
         x = 0.5 * (low + high)
-        # x tan x / x² falls short of k/(ω² J_L) below the root
+        # below the root, (x tan x)/x² is less than k/(ω² J_L)
         low, high = (x, high) if tan(x) / x < stiffness_nm_rad / (omega**2 * load_inertia_kg_m2) else (low, x)
     delay_s = 0.5 * (low + high) / omega
     inertia = stiffness_nm_rad * delay_s**2

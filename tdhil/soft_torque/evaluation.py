@@ -1,4 +1,4 @@
-"""A virtual string on a real drive: what can be asked of it, the course of set speeds, and what its log says. Pure."""
+"""Virtual string on a real drive: checks before the run, the program of set speeds, and the evaluation of its log."""
 
 from __future__ import annotations
 
@@ -21,31 +21,32 @@ from tdhil.soft_torque.virtual_string import COLUMNS, IdentifiedRig, Phase, Spee
 
 LOWEST_RATE_HZ = 20.0
 MOST_CROSSOVER = 0.35
-"""P/J times a cycle: a controller as quick as that swings by the cycle alone."""
+"""Largest P/(J − J_c) times the cycle time. A faster controller oscillates because of the cycle time alone."""
 MOST_LAG_S, MOST_LAG_ERROR_S = 0.5, 0.05
-"""Largest lag of the reported speed and its largest error, s. Beyond them the damping may be the observer's instead of
-the string's."""
+"""Largest lag of the reported speed and its largest error, s. Above them, the measured damping may come from the
+observer instead of the string."""
 LEAST_DRAG_NM_S_RAD_M = 0.001
 """Least drag of the virtual mud, per metre. It takes up the energy that the loop's own errors put into the string."""
 
 BELOW_RPM = (12.0, 10.0, 8.0, 6.0, 4.0)
-"""Below the predicted critical speed, where the bit may be made to stick; the first that the shaft can bear."""
+"""Distances of the first set speed below the predicted critical speed, rpm. The bit shall stick at this speed. The
+first distance that the rig's limits allow is used."""
 ABOVE_RPM, ABOVE_SHARE = 20.0, 0.2
-"""Distance of the ramp's end above the critical speed, rpm and share; the larger of both."""
+"""Distance of the ramp's end above the critical speed, rpm and share. The larger of both is used."""
 ROOM_SHARE = 0.8
-"""Share of the torque limit that the course may need. The rest is for noise and for the observer's corrections."""
+"""Share of the torque limit that the program may need. The rest is for noise and for the observer's corrections."""
 TOLERANCE_RPM, TOLERANCE_DAMPING = 3.0, 0.03
-"""Beyond the predicted intervals that still counts as predicted: as near as this has been seen to come to real strings
-on simulated drives."""
+"""Distance from the predicted interval that still counts as predicted, rpm and damping ratio. Virtual strings on
+simulated drives came as near as this to real strings."""
 
 
 OWN_LOOP_FADE_S, OWN_LOOP_ARMED_S = 15.0, 12.0
 SAME_INERTIA = 0.15
-"""By so much of it the rig's inertia may differ from the one that was tuned for, in the drive's own loop."""
+"""Largest relative difference between the rig's inertia and the inertia of the tuning, with the drive's own loop."""
 
 
 class EvaluationRefused(TdhilError):
-    """A virtual string would not be true on this rig, or can't be turned by it; nothing has moved."""
+    """Refusal before motion: a virtual string on this rig would not be correct, or the rig's limits exclude it."""
 
     entry = MessageCode.VIRTUAL_STRING_REFUSED
 
@@ -54,7 +55,7 @@ class EvaluationRefused(TdhilError):
 
 @dataclass(frozen=True)
 class Prediction:
-    """Prediction by `tune`, at the main shaft."""
+    """Figures that `tune` predicts, at the main shaft."""
 
     kind: str
     cure_rpm: Interval
@@ -64,7 +65,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class RigWindow:
-    """Limits of the rig at the motor: speed, torque, and the time by which its guard looks ahead."""
+    """Limits of the rig at the motor: speed, torque, and the look-ahead time of its guard."""
 
     lowest_rad_s: float
     highest_rad_s: float
@@ -74,21 +75,22 @@ class RigWindow:
 
 @dataclass(frozen=True)
 class EvaluationCase:
-    """Everything but the rig's limits: what is meant, by which controller, on which rig."""
+    """String, intended machine, controller and identified rig of one evaluation. The rig's limits are not included."""
 
     string: DrillString
     meant: TopDrive
+    """Intended machine: the machine for which the gains are made."""
     law: SpeedController
     rig: IdentifiedRig
     prediction: Prediction
     speed_lag_error_s: float = 0.0
-    """Half of the lag's 95 % interval."""
+    """Half-width of the lag's 95 % interval, s."""
     own_loop: bool = False
-    """The drive's own speed loop with these gains, the string's torque through its torque offset."""
+    """True: the drive's own speed loop runs these gains, and the string's torque enters as a torque offset."""
 
     @property
     def scale(self) -> float:
-        """κ: of the meant machine's torque at its main shaft, to the rig's at its motor."""
+        """Factor κ from the intended machine's torque at its main shaft to the rig's torque at its motor."""
         return self.rig.inertia_kg_m2 * self.rig.gear_ratio / self.meant.inertia_kg_m2
 
     def plain(self) -> dict[str, Any]:
@@ -101,7 +103,10 @@ class EvaluationCase:
 
 
 def refuse_untrue(case: EvaluationCase, period_s: float) -> None:
-    """EvaluationRefused where rate, lag or mud don't let the loop be the string's."""
+    """Check the bit, the mud's drag, the cycle rate, the rig's inertia and the lag of the reported speed.
+
+    Raises EvaluationRefused if one of them would make the virtual string incorrect.
+    """
     rate_hz, law = 1.0 / period_s, case.law
     if case.string.bit is None:
         raise EvaluationRefused("no bit is stated: nothing would stick", where="string.yaml, bottom",
@@ -131,14 +136,14 @@ def refuse_untrue(case: EvaluationCase, period_s: float) -> None:
 
 
 def program_for(case: EvaluationCase, window: RigWindow) -> SpeedProgram:
-    """The course for this rig. EvaluationRefused where its speed window or its torque has no room for it."""
+    """Return the program for this rig. Raises EvaluationRefused if it exceeds the speed window or the torque limit."""
     cure, ratio = case.prediction.cure_rpm, case.rig.gear_ratio
     ends = cure.high + max(ABOVE_RPM, ABOVE_SHARE * cure.high)
     below = [cure.low - one for one in BELOW_RPM if cure.low - one > 0.0]
     speeds = np.array([[*below, cure.high, ends]]) * RPM
     trace = simulate(case.string, [(case.meant, case.law)], Begin("stuck", speeds), speeds, 1.0, 24.0, 0.02,
                      2.0 * LONGEST_TICK_S)
-    # at the end of the ramp, and in trials: a bit that breaks away there kicks hardest
+    # A bit that breaks away at the end of the ramp, or in a trial, gives the largest acceleration.
     hardest = float(np.abs(np.gradient(trace.top_rad_s[:, 0, -1] * ratio, trace.time_s)).max())
     top = trace.top_rad_s[:, 0, :-1] * ratio
     rate = np.gradient(top, trace.time_s, axis=0)
@@ -162,18 +167,19 @@ def program_for(case: EvaluationCase, window: RigWindow) -> SpeedProgram:
             f"the virtual string takes up to {peak_nm:.3g} N·m of the motor, and its limit is "
             f"{window.torque_nm:.3g} N·m: it would be cut off", where="limits.torque_nm",
             next_step="Raise it, if machine and drive allow, or take a softer controller (--use)")
-    # Of the meant rotor, in its first second too, which a bit that breaks away kicks.
+    # Torque that moves the intended rotor, including the first second, in which the bit breaks away.
     moving_nm = case.meant.inertia_kg_m2 * float(np.abs(rate).max()) / ratio
     program = SpeedProgram(below[bearable[0]] * RPM, min(ends * RPM, room / ratio), peak_nm=moving_nm)
-    if case.own_loop:      # which has to make up for the string's torque by itself
+    if case.own_loop:      # the drive's own loop has to balance the string's torque itself
         program = replace(program, fade_s=OWN_LOOP_FADE_S, armed_s=OWN_LOOP_ARMED_S, settle_s=OWN_LOOP_ARMED_S)
     return program
 
 
 def _refuse_low(case: EvaluationCase, window: RigWindow, lowest_rad_s: float) -> NoReturn:
-    """Refuse a rig whose top swings too low at every set speed at which the bit shall stick.
+    """Raise EvaluationRefused: the top's speed drops too low at every set speed at which the bit shall stick.
 
-    ``lowest_rad_s``: the lowest speed at the best of them.
+    ``lowest_rad_s``: lowest speed of the motor at the best of these set speeds. 0: at each of them the top is about to
+    turn backwards.
     """
     if lowest_rad_s <= 0.0:
         raise EvaluationRefused(
@@ -189,7 +195,7 @@ def _refuse_low(case: EvaluationCase, window: RigWindow, lowest_rad_s: float) ->
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# From the rows of a log.
+# Evaluation of the rows of a log.
 
 
 class EvaluationOutcome(StrEnum):
@@ -198,15 +204,15 @@ class EvaluationOutcome(StrEnum):
     AS_PREDICTED = "as_predicted"
     DIFFERS = "differs"
     NOT_FOUND = "not_found"
-    """No critical speed: the bit did not stick, or never turned."""
+    """No critical speed was found: the bit did not stick, or never turned."""
     INVALID = "invalid"
-    """What turned was not the string: the torque limit acted, the rig isn't the one that was identified, or the drive's
+    """The motion was not that of the string: the torque limit acted, the rig is not the identified one, or the drive's
     torque signals contradict each other."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Result at one steady set speed, from the bit about to break away."""
+    """Result of one trial at a steady set speed. It starts with the bit about to break away."""
 
     set_rpm: float
     turns: bool
@@ -214,39 +220,46 @@ class Trial:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Speeds and torques of the meant machine's main shaft."""
+    """Result of an evaluation. Speeds and torques are those of the intended machine's main shaft."""
 
     outcome: EvaluationOutcome
     why: str
     critical_rpm: Interval | None
-    """Lowest set speed from which a bit about to break away ends turning, and the bracket: *cure*, as `tune` has it."""
+    """Lowest set speed from which a bit that is about to break away turns in the end, with its bracket (the *cure* of
+    `tune`)."""
     ramp_rpm: float | None
-    """Set speed at which the bit stood still last on the ramp."""
+    """Set speed of the ramp at which the bit stood still for the last time."""
     trials: tuple[Trial, ...]
     sticking_rms_nm: float | None
-    """Of the drive's torque about its mean, while the bit sticks and slips."""
+    """Root mean square of the drive's torque about its mean during stick-slip, N·m."""
     turning_rms_nm: float | None
-    """The same over the last 10 s in which it turns."""
+    """Root mean square of the drive's torque about its mean over the last 10 s of steady rotation, N·m."""
     damping: float | None
-    """The least of the lowest modes', from the decay after the bit is released."""
+    """Least damping ratio of the string's lowest modes, from the decay after the bit is released."""
     damping_interval: Interval | None
-    """The same with its 95 % interval: noise of the decay, its windows, and torque that the observer had to suppose."""
+    """Damping ratio with its 95 % interval. Contributions: noise of the decay, choice of its window, and the unknown
+    torque of the observer."""
     damped_hz: float | None
+    """Frequency of the least damped mode."""
     clamped_cycles: int
+    """Number of cycles in which the torque limit acted."""
     innovation_rms_rad_s: float
     unknown_rms_nm: float
-    """Torque that the observer had to suppose."""
+    """Root mean square of the unknown torque that the observer estimates, N·m."""
     put_in_j: float
+    """Largest energy that the loop's own errors put into the shaft, J."""
 
 
 FOREIGN_SHARE = 0.1
-"""Of the torque that moves the shaft, that may be unknown: more, and the rig isn't the one that was identified."""
+"""Largest unknown torque, as a share of the torque that moves the shaft. Above it, the rig is not the identified
+one."""
 
 
 def evaluate(rows: Array, case: EvaluationCase, program: SpeedProgram, contradiction: str = "") -> Evaluation:
-    """Return the content of a run's log. Raises ValueError for a log without rows.
+    """Return the evaluation of a run's log. Raises ValueError for a log without rows.
 
-    ``contradiction``: how the drive's torque signals contradict each other, if they do; then nothing is as predicted.
+    ``contradiction``: description of a contradiction between the drive's torque signals. If it is not empty, the
+    verdict is invalid.
     """
     if not len(rows):
         raise ValueError("the virtual string was never turned")
@@ -340,22 +353,25 @@ def _trials(rows: Array, program: SpeedProgram, period_s: float) -> tuple[Trial,
 DECAY_EVERY_S, DECAY_ORDER = 0.1, 9
 LEAST_DECAY_S = 8.0
 RESAMPLES, RESAMPLING_SEED = 24, 5
-"""Decays that are made from the fitted one and its own residuals, to see what the residuals move."""
+"""Number of resampled decays, each made from the fitted decay and its residuals, and the seed of their random numbers.
+They show how far the residuals move the result."""
 NOISE_K = 3.0
-"""Half-width in standard deviations of the resamples: two for 95 %, and half as much for what a fit of few swings takes
-of the noise into its modes (decays of known damping in noise, tests/soft_torque/test_evaluation.py)."""
+"""Half-width of the interval in standard deviations of the resamples. Two are for 95 %. One more accounts for a fit of
+few oscillations, which takes part of the noise into its modes (decays of known damping in noise,
+tests/soft_torque/test_evaluation.py)."""
 LEAST_ENERGY = 0.1
-"""Of the strongest of the lowest modes, that another has to have: less is what a fit makes of noise."""
+"""Least energy of a mode, as a share of the strongest of the lowest modes. A fit to noise gives modes with less."""
 OPEN_DAMPING = 0.25
 """Width of the interval above which a damping is not compared with a prediction."""
 
 
 def _decay_with_interval(rows: Array, case: EvaluationCase, period_s: float) -> tuple[Interval, float] | None:
-    """(damping with its 95 % interval, Hz) of the least damped of the lowest modes.
+    """Return (damping with its 95 % interval, frequency in Hz) of the least damped of the lowest modes, or None.
 
-    Three contributions, added in squares. Noise: the fitted decay with its residuals, shifted in time and with either
-    sign, is fitted again. Windows: the decay without its first half second, its first second, its last fifth. Unknown
-    torque: a torque of share f of the net torque, in phase with the speed, changes a damping ratio by f/2.
+    The interval is the root of the sum of squares of three contributions. Noise: the fitted decay plus its residuals,
+    shifted in time and with either sign, is fitted again. Window: the decay is fitted again without its first half
+    second, its first second, or its last fifth. Unknown torque: if it is a share f of the net torque and in phase with
+    the speed, it changes the damping ratio by f/2.
     """
     found = _decay(rows, case, period_s)
     if found is None:
@@ -387,11 +403,12 @@ def _decay_with_interval(rows: Array, case: EvaluationCase, period_s: float) -> 
 def _decay(
     rows: Array, case: EvaluationCase, period_s: float
 ) -> tuple[float, float, Array, Array, NDArray[np.complex128], float] | None:
-    """(damping, Hz, fitted decay, its residual, poles, time step) from the top's speed once the bit is released.
+    """Return (damping, frequency in Hz, fitted decay, residual, poles, time step in s) of the top's speed, or None.
 
-    A matrix pencil (Hua and Sarkar 1990): the speed's rows span as many exponentials as move it, a constant and four
-    pairs here, and how one row becomes the next gives their poles. Two that are alike come out of it with a scatter of
-    0.015 in damping, since it asks nothing of the signal as a whole: so they start a fit of least squares to it.
+    ``rows`` are those after the release of the bit. The method is a matrix pencil (Hua and Sarkar 1990). The windows of
+    the signal span the exponentials that it contains, here a constant and four pairs. The step from one window to the
+    next gives the poles. For two poles close together, the damping scatters by 0.015, because the method does not fit
+    the signal as a whole. Therefore these poles are only the start of a least-squares fit.
     """
     each = max(1, round(DECAY_EVERY_S / period_s))
     speed = rows[:, COLUMNS.index("top_rad_s")]
@@ -417,7 +434,7 @@ def _decay(
 def _least(
     poles: NDArray[np.complex128], values: Array, every_s: float, case: EvaluationCase
 ) -> tuple[float, float] | None:
-    """(damping, Hz) of the least damped pole that is one of the lowest modes, and that is more than noise."""
+    """Return (damping, frequency in Hz) of the least damped pole among the lowest modes with enough energy, or None."""
     held = case.prediction.string_modes_hz
     highest = lowest_modes_below_hz(held)
     if not len(poles):
@@ -435,7 +452,7 @@ def _least(
 
 
 def _design(poles: NDArray[np.complex128], time_s: Array, most_growth: float) -> Array:
-    """A constant, and both phases of every exponential; none grows so fast that it overflows."""
+    """Return the design matrix: a constant, and both phases of every exponential. The growth is limited."""
     wave = np.exp(np.multiply.outer(time_s, np.minimum(poles.real, most_growth) + 1j * poles.imag))
     found: Array = np.column_stack([np.ones_like(time_s), wave.real, wave.imag])
     return found
@@ -449,11 +466,14 @@ def _sizes(poles: NDArray[np.complex128], values: Array, every_s: float) -> Arra
 
 
 def _fitted(poles: NDArray[np.complex128], values: Array, every_s: float) -> NDArray[np.complex128]:
-    """The pairs among the poles, as ``values`` have them by least squares; sizes and a constant follow linearly."""
+    """Return the complex pairs of poles, fitted to ``values`` by least squares.
+
+    Amplitudes and the constant follow linearly in each step.
+    """
     from scipy.optimize import least_squares
 
     time_s: Array = np.asarray(every_s * np.arange(len(values)), dtype=np.float64)
-    most_growth = 5.0 / time_s[-1]            # of what is no decay at all, so that no exponential overflows
+    most_growth = 5.0 / time_s[-1]            # limits growing exponentials, so that none overflows
     pairs = poles[poles.imag > 0.0]
     if not len(pairs):
         return pairs
@@ -470,14 +490,17 @@ def _fitted(poles: NDArray[np.complex128], values: Array, every_s: float) -> NDA
 
 
 def _tolerance(plain: Mapping[str, Any] | None) -> StringTolerance:
-    """Return the tolerances of a log. A log without them is of a string with the usual ones."""
+    """Return the tolerances that a log contains. A log without tolerances gets the default ones."""
     values: dict[str, Any] = {name: tuple(one) if isinstance(one, list) else one
                               for name, one in (plain or {}).items()}
     return StringTolerance(**values)
 
 
 def case_of(plain: Mapping[str, Any]) -> EvaluationCase:
-    """Return the case from the mapping that `EvaluationCase.plain` made. Raises as its types do."""
+    """Return the case from the mapping that `EvaluationCase.plain` made.
+
+    Raises KeyError or TypeError if keys are missing or unknown.
+    """
     from tdhil.soft_torque.drill_string import BitFriction, WaveLine
 
     string, bit = plain["string"], plain["string"]["bit"]

@@ -1,8 +1,8 @@
-r"""Gains in a drive's own parameters, as far as its profile states them. tdhil does not write them to the drive.
+r"""Gains as values of the drive's own parameters, if its profile lists them. tdhil does not write them to the drive.
 
 ::
 
-    N·m·s/rad             P as it is, at the motor shaft
+    N·m·s/rad             P, at the motor shaft
     %/%                   P ω_r/T_r: torque in % of rated torque for a speed error in % of rated speed
     integral time         T_I = P/I
 """
@@ -18,7 +18,7 @@ from tdhil.soft_torque.controller import SpeedController
 
 @dataclass(frozen=True)
 class DriveSetting:
-    """One parameter. ``value`` None: its unit isn't known, or what it is a share of wasn't said; ``why`` says which."""
+    """One parameter of the drive. If its unit or its rated value is unknown, ``value`` is None; ``why`` says which."""
 
     title: str
     value: float | None
@@ -32,7 +32,7 @@ def drive_settings(
     parameters: SpeedControllerParameters | None, at_motor: SpeedController,
     rated_torque_nm: float | None = None, rated_speed_rpm: float | None = None,
 ) -> tuple[DriveSetting, ...]:
-    """Return the values to type in for these motor-shaft gains; () if the profile has no speed controller."""
+    """Return the drive's parameter values for these gains at the motor shaft; () if the profile lists no parameters."""
     if parameters is None:
         return ()
     gain, integral = parameters.gain, parameters.integral

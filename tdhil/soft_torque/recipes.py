@@ -1,8 +1,8 @@
-"""Recipes of controllers: stiff, soft, compensated, broadband; those that keep the margins on every truth, best first.
+"""Recipes for controllers: stiff, soft, compensated, broadband. Each must keep the margins on every truth.
 
-**Soft** compensates nothing: any drive takes it. **Compensated** gives back a part of the rotor's inertia.
-**Broadband** is full compensation and P = ζ as far as lags and margins allow. Where that is no more than a soft
-controller does, it is refused under this name.
+**Soft** compensates no inertia: every drive can run it. **Compensated** compensates a part of the rotor's inertia.
+**Broadband** aims at full compensation and P = ζ, as far as lags and margins allow. If the result is no better than a
+soft controller, broadband is refused.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ from tdhil.soft_torque.tuned_figures import (
 )
 
 RESERVE = 0.8
-"""Of the largest stable share of J, so much is compensated at most."""
+"""Largest compensated share of J, divided by the largest stable share."""
 LAG_RESERVE = 0.9
-"""Of the softest a that the lags allow, so much is taken at most."""
+"""Largest softness a, divided by the largest that the lags allow."""
 BROADBAND_BELOW = 0.8
-"""Mean |r| above which a controller isn't called broadband: a plain soft one has 0.94 on the reference case."""
+"""Mean |r| up to which a controller counts as broadband. A soft controller has 0.94 on the reference case."""
 SEARCH_DRAWS = 6
-"""Truths on which candidates are ranked and finalists are simulated."""
+"""Number of truths on which candidates are ranked and finalists are simulated."""
 FINALISTS, MOST_TRIED = 5, 120
-"""Candidates of one kind that are simulated, and that are held against the margins before it is given up."""
+"""Number of candidates of one kind that are simulated, and the most that are checked against the margins."""
 _WAVES_SUPPOSED = ("what inertia compensation does to the pipe's waves, and whether their losses keep it stable, is "
                    "not known of a spring alone: the pipe has to be named (string.yaml)")
 
@@ -62,7 +62,10 @@ def stiff(case: TuneCase) -> Tuned:
 
 
 def soft(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> list[Tuned]:
-    """Best first; one that is refused if there is none. Raises `TuningRefused` where it was asked for."""
+    """Return soft controllers, best first, or one refused row if none keeps the margins.
+
+    Raises `TuningRefused` if the requested softness is too large or leaves too little margin.
+    """
     softest = softest_allowed(case.string, case.drive, held[0])
     asked = case.softness
     if asked is not None and asked >= softest:
@@ -85,7 +88,11 @@ def soft(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> list[T
 
 
 def compensated(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> list[Tuned]:
-    """Return what `soft` does, with a share of J compensated."""
+    """Return controllers that compensate a share of J, best first, or one refused row if none keeps the margins.
+
+    Raises `TuningRefused` if the requested share is too large, leaves too little margin, or if the string is only an
+    identified spring.
+    """
     asked = case.compensated_share
     if case.string.supposed:
         if asked:
@@ -121,7 +128,7 @@ def compensated(case: TuneCase, held: Sequence[float], samples: TruthMargins) ->
 
 
 def _within_margins(case: TuneCase, grid: Sequence[Candidate], samples: TruthMargins) -> list[Candidate]:
-    """The `FINALISTS` that rank best of those that keep the margins on every truth."""
+    """Return the `FINALISTS` candidates with the best rank among those that keep the margins on every truth."""
     if not grid:
         return []
     speeds = ranked_speeds(samples.truths[:SEARCH_DRAWS], [one.controller for one in grid])
@@ -136,14 +143,14 @@ def _within_margins(case: TuneCase, grid: Sequence[Candidate], samples: TruthMar
 
 
 def _no_margin(case: TuneCase, samples: TruthMargins, law: SpeedController) -> str:
-    """Name the margins that fail on the worst of the truths."""
+    """Return the text that names the failed margins, each with its least value over all truths."""
     worst = samples.every(law)
     return ", ".join(case.required.failed(worst) or ("too soft for these lags",)) + (
         f" over J's interval, string, bit and {_lag_ms(case)} of lag{_no_drag(case)}")
 
 
 def _no_drag(case: TuneCase) -> str:
-    """Words for a string that is stated to lose nothing, if that is why."""
+    """Return the hint that string.yaml states no drag; empty if any section has drag."""
     if any(line.drag_nm_s_rad_m > 0.0 for line in case.string.lines):
         return ""
     return (". string.yaml states no drag (drag_nm_s_rad_m: 0): nothing takes energy out of the pipe's waves. Mud has "
@@ -151,7 +158,7 @@ def _no_drag(case: TuneCase) -> str:
 
 
 def broadband(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> Tuned:
-    """Return the controller that reflects least over `BAND_HZ`, if it is more than a soft one."""
+    """Return the controller with the least mean reflection over `BAND_HZ`, or a refused row if it is not broadband."""
     if case.string.supposed:
         return Tuned("broadband", None, _WAVES_SUPPOSED)
     best: tuple[float, float, float, float] | None = None
@@ -188,9 +195,10 @@ def broadband(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> T
 def largest_stable_share(
     case: TuneCase, softness: float, held_hz: Sequence[float], believed_upper: bool = True
 ) -> float:
-    """The largest share of the believed J that is stable for every J of the interval, to 0.01; 0: none.
+    """Return the largest compensated share of the estimated J that is stable for every J of the interval.
 
-    ``believed_upper``: also if J's upper end were believed.
+    The resolution is 0.01; 0 means that no share is stable. ``believed_upper``: the loop must also be stable with
+    gains that are computed from the upper end of the interval.
     """
     low, high = 0.0, 1.0
     while high - low > 0.01:
@@ -203,9 +211,11 @@ def largest_stable_share(
 def _stable_everywhere(
     case: TuneCase, softness: float, share: float, held: Sequence[float], believed_upper: bool = True
 ) -> bool:
-    """Stable at both ends of J's interval, with the believed J's gains; and if its upper end is believed.
+    """Return whether the loop is stable over J's interval and over each other interval.
 
-    And whatever else is moved to an end of its interval, at J's lower end, which bears least compensation.
+    The gains from the estimated J are checked at both ends of J's interval. ``believed_upper``: the gains from the
+    upper end are checked at the estimated J. Each other parameter is moved to either end of its interval, with J at its
+    lower end, which allows the least compensation.
     """
     inertia = case.inertia_kg_m2
     law = tuned_controller(case.string, inertia.value, softness, held[0], share)

@@ -1,13 +1,13 @@
-r"""Every root of an analytic function in a rectangle: counted by Cauchy's argument principle, then found, none guessed.
+r"""All roots of an analytic function in a rectangle: counted by Cauchy's argument principle, then located.
 
-Round a closed path the argument of f turns by 2π times the number of roots inside. The path is walked in steps of at
-most ``pace``, which whoever asks sets to a small part of the distance between roots: so small that far roots together
-turn the argument by some degrees a step, and a near one by less than 180°. Steps are halved until none turns it by more
-than 60°: so no turn is missed, and none is taken for another by 360°. One that holds several roots is cut in two,
-until each holds one; from there Newton's method finds it, and if it leaves the rectangle, or the function is flat, the
-rectangle is cut further. Rectangles that hold none are dropped.
+Along a closed path the argument of f turns by 2π times the number of roots inside. The path is divided into steps of at
+most ``pace``. The caller sets ``pace`` to a small part of the distance between roots. With such a step, all distant
+roots together turn the argument by some degrees, and a near root turns it by less than 180°. Each step is halved until
+no step turns the argument by more than 60°. So no turn is missed, and none is wrong by 360°. A rectangle with several
+roots is cut in two, until each part holds one root. Newton's method locates this root. If the method leaves the
+rectangle, or if the function is flat, the rectangle is cut further. Rectangles without roots are dropped.
 
-The count guards the result: as many roots are returned as the outer path counted, or `RootsLost` is raised.
+The count guards the result: the number of returned roots equals the count on the outer path, or `RootsLost` is raised.
 """
 
 from __future__ import annotations
@@ -24,17 +24,19 @@ Function = Callable[[Any], NDArray[np.complex128]]
 
 _MOST_TURN = np.pi / 3.0
 _SMALLEST = 1e-7
-"""Of the first rectangle's size: roots nearer to each other than that count as one that is double."""
+"""Smallest size of a rectangle, as a share of the first one's size. Roots nearer to each other count as a double
+root."""
 _INSIDE_OUT = 0.4871
-"""Where a rectangle is cut: not in the middle, where a root of something symmetric may lie."""
+"""Position of the cut, as a share of the rectangle's side. Not the middle: a symmetric function may have a root
+there."""
 
 
 class RootsLost(ArithmeticError):
-    """The function is not analytic there, has a root on the path, or turns too fast to be followed."""
+    """Failed search: the function is not analytic, has a root on the path, or its argument turns too fast."""
 
 
 def count_in(f: Function, low: complex, high: complex, pace: float) -> int:
-    """How many roots the rectangle from ``low`` (left, lower) to ``high`` holds, each as often as it counts."""
+    """Return the number of roots in the rectangle from ``low`` (left, lower) to ``high``, with multiplicity."""
     corners = [low, complex(high.real, low.imag), high, complex(low.real, high.imag), low]
     turned = sum(_turn(f, a, b, pace) for a, b in pairwise(corners))
     count = turned / (2.0 * np.pi)
@@ -44,12 +46,12 @@ def count_in(f: Function, low: complex, high: complex, pace: float) -> int:
 
 
 def count_right_of(f: Function, reach: float, pace: float, most: float, edge: float = 1e-9) -> int:
-    """How many roots lie right of Re s = ``edge``: to ``reach`` from the real axis, and to ``most`` from the other."""
+    """Return the number of roots with Re s > ``edge``, up to |Im s| = ``reach`` and Re s = min(``reach``, ``most``)."""
     return count_in(f, complex(edge, -reach), complex(min(reach, most), reach), pace)
 
 
 def roots_in(f: Function, low: complex, high: complex, pace: float) -> list[complex]:
-    """All roots in the rectangle; a path that runs over a root is moved a little outwards."""
+    """Return all roots in the rectangle. A path that meets a root is moved outwards a little. Raises `RootsLost`."""
     size = abs(high - low)
     for nudge in (0.0, 1e-4, 3.1e-4, 1.7e-3):
         shift = complex(nudge * size, nudge * size)
@@ -99,7 +101,7 @@ def _halves(f: Function, low: complex, high: complex, count: int, pace: float) -
 
 
 def _newton(f: Function, low: complex, high: complex) -> complex | None:
-    """The one root inside, or None where the steps lead out."""
+    """Return the single root inside, or None if Newton's method leaves the rectangle or does not converge."""
     here = 0.5 * (low + high)
     size = abs(high - low)
     step = 1e-6 * max(size, 1e-3)
@@ -120,7 +122,7 @@ def _newton(f: Function, low: complex, high: complex) -> complex | None:
 
 
 def _turn(f: Function, start: complex, end: complex, pace: float) -> float:
-    """Return by how much the argument of f turns on the straight way."""
+    """Return the change of the argument of f, rad, along the straight line from ``start`` to ``end``."""
     at = np.linspace(0.0, 1.0, 9 + ceil(abs(end - start) / pace))
     values = f(start + (end - start) * at)
     for _ in range(40):

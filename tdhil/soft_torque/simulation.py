@@ -1,30 +1,31 @@
-r"""Top drive, string and bit in time: waves along characteristics, many strings, controllers and set speeds at once.
+r"""Simulation of top drive, string and bit in time, for many strings, controllers and set speeds at once.
 
-::
+The string is solved by the method of characteristics::
 
-    a = τ + ζω runs down, b = ζω − τ runs up, each unchanged at speed c along a line
+    a = τ + ζω travels down, b = ζω − τ travels up, each unchanged at speed c along a line
 
-**Nodes.** Lines are cut at nodes a whole number of ticks apart. A wave is a ring of past values: written at one end,
-read at the other m ticks later. Nothing is interpolated, and nothing disperses. At a node the speeds are equal and
-τ_above − τ_below = βω + F sgn ω. β and F are the viscous drag and the dry friction of half of the line above and half
-of the line below:
+**Nodes.** Lines are divided by nodes a whole number of ticks apart. A wave is a ring buffer of past values: written at
+one end, read at the other end m ticks later. There is no interpolation and no numerical dispersion. At a node the
+speeds are equal, and τ_above − τ_below = βω + F sgn ω. β and F are the viscous drag and the dry friction of half of the
+line above and half of the line below:
 
     ω = (a + b − F sgn ω)/(ζ₁ + ζ₂ + β)        a' = 2 ζ₂ ω − b        b' = 2 ζ₁ ω − a
 
-A node at standstill stays there while |a + b| is at most its static friction. A node never adds energy: ½(a² + b²)-wise
-it sends out what came in, less βω² + F|ω|.
+A node at standstill stays there while |a + b| is at most its static friction. A node never adds energy: the power of
+the outgoing waves is that of the arriving waves less βω² + F|ω|.
 
-**Top.** J dω/dt = T + b − (B + ζ + β/2) ω − F_c sgn ω is linear, together with the states of the controller and its
-lags, for a wave that is constant over a tick. Its step is a matrix exponential. It sends down 2ζ (mean ω) − b.
+**Top.** J dω/dt = T + b − (B + ζ + β/2) ω − F_c sgn ω. Together with the states of the controller and its lags, this is
+linear for a wave that is constant over a tick. Its step is a matrix exponential. The top sends down 2ζ (mean ω) − b.
 
-**Bit.** J_L dω/dt = a − (ζ + β/2 + B_b) ω − T_f(ω) − n(t). Each tick follows the tangent of the friction's curve
-exactly (exponential Rosenbrock–Euler), in parts that change little. At zero speed the bit sticks while |a − n| ≤ F_s.
-A bottom without inertia of its own is given that of half a tick of its line, which is shorter by as much.
+**Bit.** J_L dω/dt = a − (ζ + β/2 + B_b) ω − T_f(ω) − n(t). The step is exact for the tangent of the friction curve
+(exponential Rosenbrock–Euler). A tick is divided so that the speed changes little in each part. At zero speed the bit
+sticks while |a − n| ≤ F_s. A bottom without inertia gets the inertia of half a tick of its line, and the line gets
+shorter by half a tick.
 
-**Bit noise.** n is a first-order Gauss–Markov process. Loops with the same seed have the same one, at every set speed.
+**Bit noise.** n is a first-order Gauss–Markov process. Loops with the same seed have the same noise at every set speed.
 
-**Many strings at once.** Each string has its own tick, so that all have the same number of ticks. This holds for
-strings whose travel times differ by one common factor, and which may differ in everything else.
+**Many strings at once.** Each string has its own tick, and all strings have the same number of ticks. The travel times
+of their lines may differ by one common factor only. All other values may differ.
 
 No torque limit is simulated.
 """
@@ -46,15 +47,15 @@ from tdhil.soft_torque.drill_string import DrillString
 LONGEST_TICK_S = 0.006
 SHORTEST_TICK_S = 0.002
 DRAG_EVERY_S = 0.15
-"""Drag is lumped at nodes about so far apart; the echo of a lump is of the order of β/2ζ."""
+"""Approximate travel time between nodes, at which the drag is lumped. A lump reflects about β/2ζ of a wave."""
 SLIDING_BLUR_RAD_S = 0.05
-"""Over which the top's own dry friction changes its sign."""
+"""Speed over which the dry friction of the top changes from zero to its full value."""
 LARGEST_GROWTH = 0.05
-"""Of the bit's speed in one part of a tick, along a falling branch of its friction."""
+"""Largest relative growth of the bit's speed in one part of a tick, on a falling branch of its friction."""
 LEAST_GROWTH = 1e-300
-"""Added to an exponent, so that none is exactly zero where it is divided by."""
+"""Value added to an exponent that is used as a divisor, so that it is never exactly zero."""
 NOISE_BLOCK = 500
-"""Ticks of bit noise that are drawn at once."""
+"""Number of ticks of bit noise that are drawn at once."""
 
 Array = NDArray[np.float64]
 Loop = tuple[TopDrive, SpeedController]
@@ -64,34 +65,38 @@ Strings = DrillString | Sequence[DrillString]
 
 @dataclass(frozen=True)
 class Grid:
-    """A string cut into segments of whole ticks."""
+    """String divided into segments of whole ticks."""
 
     tick_s: float
     ticks: tuple[int, ...]
+    """Travel time of each segment, ticks."""
     impedance_nm_s_rad: tuple[float, ...]
+    """Characteristic impedance of each segment."""
     drag_nm_s_rad: tuple[float, ...]
-    """Of each segment as a whole; so are the next two."""
+    """Total viscous drag of each segment."""
     coulomb_nm: tuple[float, ...]
+    """Total kinetic dry friction of each segment."""
     static_nm: tuple[float, ...]
+    """Total static dry friction of each segment."""
     bottom_inertia_kg_m2: float
     line_ticks: tuple[int, ...]
-    """Of each line."""
+    """Travel time of each line, ticks."""
     line_parts: tuple[int, ...]
-    """Segments of each line."""
+    """Number of segments of each line."""
 
     @property
     def delay_s(self) -> float:
-        """Travel time of a wave from top to bottom."""
+        """Travel time of a wave from top to bottom, s."""
         return self.tick_s * sum(self.ticks)
 
 
 def grid_of(string: DrillString, longest_tick_s: float = LONGEST_TICK_S) -> Grid:
-    """The tick at which all lines together are rounded least, and the segments at it."""
+    """Return the grid with the tick for which rounding changes the travel times of all lines least."""
     delays = np.array([line.delay_s for line in string.lines])
     last = string.lines[-1].impedance_nm_s_rad
 
     def rounded(tick: float) -> tuple[NDArray[np.int64], float]:
-        # where the bit has next to no inertia, half a tick of pipe becomes one
+        # A bit with almost no inertia gets the inertia of half a tick of pipe.
         wanted = delays - np.append(np.zeros(len(delays) - 1), _own_delay_s(string, tick))
         counts = np.maximum(1, np.rint(wanted / tick)).astype(np.int64)
         return counts, float(np.abs(counts * tick - wanted).sum())
@@ -112,9 +117,9 @@ def grid_of(string: DrillString, longest_tick_s: float = LONGEST_TICK_S) -> Grid
 
 
 def grid_like(string: DrillString, model: DrillString, grid: Grid) -> Grid:
-    """The grid of ``model`` for a string with the same lines in other sizes.
+    """Return the grid of ``string``, with the same numbers of ticks and segments as ``grid``, the grid of ``model``.
 
-    Raises ValueError where the travel times differ by more than one common factor.
+    Raises ValueError if the travel times of the lines differ by more than one common factor.
     """
     factors = [line.delay_s / other.delay_s for line, other in zip(string.lines, model.lines, strict=True)]
     if max(factors) > 1.001 * min(factors):
@@ -123,7 +128,7 @@ def grid_like(string: DrillString, model: DrillString, grid: Grid) -> Grid:
 
 
 def _own_delay_s(string: DrillString, tick_s: float) -> float:
-    """Travel time of pipe that counts as inertia of the bit."""
+    """Return the travel time, s, of the pipe that counts as inertia of the bit."""
     return max(0.0, 0.5 * tick_s - string.bottom_inertia_kg_m2 / string.lines[-1].impedance_nm_s_rad)
 
 
@@ -144,34 +149,35 @@ def _cut(string: DrillString, tick_s: float, counts: tuple[int, ...], parts: tup
 
 @dataclass(frozen=True)
 class SimulationTrace:
-    """Kept values: first index time, second the loop, third the set speed."""
+    """Stored signals. The first index is the time, the second the loop, the third the set speed."""
 
     time_s: Array
-    """Of the first loop; another string's time runs faster by the ratio of the travel times."""
+    """Time of the first loop. The time of another loop differs by the ratio of the strings' travel times."""
     set_rad_s: Array
     top_rad_s: Array
     bit_rad_s: Array
     top_torque_nm: Array
-    """The drive's torque on the rotor."""
+    """Torque of the drive on the rotor."""
     first_stuck_s: Array
-    """When the bit stood still for the first time after it had turned; infinite: never."""
+    """Time of the bit's first standstill after it had turned, (loops, speeds). Infinite: never."""
     last_stuck_s: Array
-    """When the bit stood still for the last time; −1: never."""
+    """Time of the bit's last standstill, (loops, speeds). −1: never."""
     end_s: Array
-    """When the simulation ended, for each loop; (loops, 1)."""
+    """End time of the simulation for each loop, (loops, 1)."""
 
 
 @dataclass(frozen=True)
 class Begin:
-    """How it begins.
+    """Initial state of a simulation.
 
-    ``stuck``: the bit about to break away, the string wound up to it and still, the top at full speed, its integral in
-    balance. ``rest``: nothing turns, nothing is wound up. ``turning``: all of it steadily, at one speed.
+    ``stuck``: the bit is about to break away. The string is twisted by the breakaway torque and stands still. The top
+    turns at full speed, and its integral balances the string. ``rest``: everything stands still, without torque.
+    ``turning``: everything turns steadily at one speed.
     """
 
     how: Literal["stuck", "rest", "turning"]
     speed_rad_s: Array
-    """(loops, speeds); of the top."""
+    """Initial speed of the top, (loops, speeds)."""
 
 
 def simulate(
@@ -186,10 +192,11 @@ def simulate(
     hold_s: float = 0.0,
     seeds: Sequence[int] | None = None,
 ) -> SimulationTrace:
-    """Every loop at every set speed: the set speed goes from ``begin``'s to the target along the ramp, after a hold.
+    """Simulate every loop at every set speed, and return the stored signals.
 
-    ``target_rad_s``: (loops, speeds). ``seeds``: of the bit noise, one for each loop; None: no noise. Times are those
-    of the first string. Raises ValueError where a bit isn't stated.
+    After ``hold_s``, the set speed ramps from its value in ``begin`` to ``target_rad_s``, shape (loops, speeds).
+    ``seeds``: seeds of the bit noise, one for each loop; None: no noise. All durations are for the first string.
+    Raises ValueError if a bit is not stated.
     """
     every_string = [strings] * len(loops) if isinstance(strings, DrillString) else list(strings)
     first_string = every_string[0]
@@ -220,7 +227,7 @@ def simulate(
     kept: list[tuple[float, Array, Array, Array, Array]] = []
     first: Array = np.full(now.size, np.inf)
     last: Array = np.full(now.size, -1.0)
-    waits = pipe.bit_rad_s > 0.0      # has turned, and not stood still since
+    waits = pipe.bit_rad_s > 0.0      # True: has turned, and has not stood still since then
     stood = np.zeros(now.size, dtype=bool)
     arrived = False
     for tick in range(count):
@@ -246,7 +253,7 @@ def simulate(
 
 
 class _BitNoise:
-    """n(t) of every case: drawn for each seed, with the size and the correlation time of each string's bit."""
+    """Bit noise n(t) of every case, drawn for each seed, with the rms and the correlation time of each string's bit."""
 
     def __init__(self, strings: Sequence[DrillString], grids: Sequence[Grid], seeds: Sequence[int], repeats: int
                  ) -> None:
@@ -263,7 +270,7 @@ class _BitNoise:
         self._block: Array = np.empty((0, len(own)))
 
     def at(self, tick: int) -> Array:
-        """N·m, during that tick; ticks in their order."""
+        """Return the noise torque during a tick, N·m. Call it for every tick in order."""
         row = tick % NOISE_BLOCK
         if row == 0:
             self._block = np.array([random.standard_normal(NOISE_BLOCK) for random in self._random]).T
@@ -273,14 +280,14 @@ class _BitNoise:
 
 
 def _columns(values: Sequence[Sequence[float]], repeats: int) -> Array:
-    """(segments, cases) from one row a string."""
+    """Return an array (segments, cases) from one row for each string."""
     return np.repeat(np.array(values, dtype=float).T, repeats, axis=1)
 
 
 class _Waves:
-    """The rings: what was sent into each segment at its ends, and comes out of it after its ticks.
+    """Ring buffers of the waves in all segments. A wave enters at one end and leaves at the other after its ticks.
 
-    One row a tick: first what went down into each segment, then what went up.
+    A buffer has one row for each tick: first the waves that went down into each segment, then those that went up.
     """
 
     def __init__(self, grids: Sequence[Grid], repeats: int) -> None:
@@ -289,7 +296,7 @@ class _Waves:
         self._size = int(ticks.max())
         self._count = count = len(ticks)
         self._sent = np.zeros((self._size, 2 * count, cases))
-        # where in all rows together that which arrives now was sent
+        # index, over all rows together, of the waves that arrive now
         slots = (np.arange(self._size)[:, None] - np.tile(ticks, 2)) % self._size
         self._arriving_at = slots * (2 * count) + np.arange(2 * count)
         self._every = self._sent.reshape(-1, cases)
@@ -308,7 +315,7 @@ class _Waves:
         self._moving = np.zeros(self._kinetic.shape, dtype=bool)
 
     def fill(self, bottom_torque_nm: Array, speed: Array) -> None:
-        """One speed all along; torque as the drag at that speed makes it grow upwards."""
+        """Set one speed along the whole string. The torque grows upwards because of drag and friction."""
         torque = bottom_torque_nm.copy()
         side = np.sign(speed)
         below: Array = np.zeros_like(torque)
@@ -321,23 +328,23 @@ class _Waves:
             self._sent[:, self._count + row] = impedance * speed - torque
 
     def top_torque(self, top_speed: Array) -> Array:
-        """τ just below the rotor."""
+        """Return the string's torque τ just below the rotor, N·m."""
         felt = self._impedance[0] + 0.5 * self._drag[0]
         torque: Array = felt * top_speed + 0.5 * self._coulomb[0] * np.sign(top_speed) - self.at_top()
         return torque
 
     def at_top(self) -> Array:
-        """Return the wave that leaves the upper end of the topmost segment now."""
+        """Return the wave that leaves the topmost segment at its upper end now."""
         arriving: Array = self._every[self._arriving_at[self._now, self._count]]
         return arriving
 
     def arriving(self) -> tuple[Array, Array]:
-        """Return the waves that leave every segment now, at its lower and at its upper end."""
+        """Return the waves that leave every segment now: those at the lower ends and those at the upper ends."""
         arriving = self._every.take(self._arriving_at[self._now], axis=0)
         return arriving[: self._count], arriving[self._count :]
 
     def send(self, down: Array, up: Array, from_top: Array, from_bit: Array) -> None:
-        """Through every node, and one tick on."""
+        """Pass the waves through every node, and advance by one tick."""
         a, b = down[:-1], up[1:]
         driven = a + b
         if self._dry:
@@ -354,7 +361,7 @@ class _Waves:
 
 
 class PipeSimulation:
-    """Waves and bit, a tick at a time: whatever hangs below a top drive, simulated or real; one number a case."""
+    """Simulation of string and bit below a top drive, simulated or real, tick by tick. Arrays have one value a case."""
 
     def __init__(self, strings: Sequence[DrillString], grids: Sequence[Grid], repeats: int = 1) -> None:
         self._waves = _Waves(grids, repeats)
@@ -368,63 +375,63 @@ class PipeSimulation:
         return self._bit.static_nm
 
     def wind_up(self, torque_nm: Array) -> None:
-        """Nothing turns, and all of it is wound up to that torque."""
+        """Set the string to standstill, twisted by that torque."""
         self._waves.fill(torque_nm, np.zeros(torque_nm.size))
 
     def turn(self, speed: Array) -> Array:
-        """All of it turns steadily; the torque that this takes at the top."""
+        """Set string and bit to steady rotation at that speed, rad/s. Return the torque at the top, N·m."""
         self.bit_rad_s = speed.copy()
         load = self._bit.rubbing(speed) * np.sign(speed) + self._viscous * speed
         self._waves.fill(load, speed)
         return self.top_torque(speed)
 
     def release(self) -> None:
-        """Off bottom: the bit's dry friction is gone."""
+        """Remove the dry friction of the bit, as when it is lifted off bottom."""
         self._bit.release()
 
     def at_top(self) -> Array:
-        """b, that comes up out of the topmost segment during the coming tick."""
+        """Return the wave b that leaves the topmost segment upwards during the coming tick."""
         return self._waves.at_top()
 
     def top_torque(self, speed: Array) -> Array:
-        """τ just below the rotor, at that speed."""
+        """Return the string's torque τ just below the rotor at that speed, N·m."""
         return self._waves.top_torque(speed)
 
     def tick(self, from_top: Array, noise_nm: Array | None = None) -> None:
-        """One on, with the wave that the top sends down meanwhile."""
+        """Advance by one tick, with the wave that the top sends down during it."""
         arriving_down, arriving_up = self._waves.arriving()
         bit_wave, self.bit_rad_s = self._bit.step(arriving_down[-1], self.bit_rad_s, noise_nm)
         self._waves.send(arriving_down, arriving_up, from_top, bit_wave)
 
 
 class _Top:
-    """Rotor, controller and lags; (loops, speeds, states)."""
+    """Rotor, controller and lags of every loop at every set speed."""
 
     def __init__(self, loops: Sequence[Loop], grids: Sequence[Grid], speeds: int) -> None:
         self._lags = max(1, *(len(drive.inner_lags_s) for drive, _ in loops))
         self._size = size = 4 + self._lags
         ticks = np.array([grid.tick_s for grid in grids])
         self._impedance = np.array([grid.impedance_nm_s_rad[0] for grid in grids])[:, None]
-        # left factors: (states + inputs) → states
+        # matrices that map (states + inputs) to states
         step = np.array([_top_step(*loop, grid, self._lags)[:size] for loop, grid in zip(loops, grids, strict=True)])
-        step[:, 3] /= ticks[:, None]         # ∫ω dt over the tick becomes its mean
-        step[:, :, 3] = 0.0                  # and begins anew with each
+        step[:, 3] /= ticks[:, None]         # the state ∫ω dt becomes the mean speed over the tick
+        step[:, :, 3] = 0.0                  # the integral starts again from zero in each tick
         self._step = np.ascontiguousarray(step)
         self._dry = np.array([drive.coulomb_nm + 0.5 * grid.coulomb_nm[0]
                               for (drive, _), grid in zip(loops, grids, strict=True)])[:, None]
         self._own_dry = np.array([drive.coulomb_nm for drive, _ in loops])[:, None]
         self._viscous = np.array([drive.viscous_nm_s_rad for drive, _ in loops])[:, None]
         self._state = np.zeros((len(loops), size + 3, speeds))
-        """States, then the inputs of the tick: wave, dry friction, set speed."""
+        """States, then the inputs of the tick (wave, dry friction, set speed); (loops, states + inputs, speeds)."""
 
     @property
     def torque_nm(self) -> Array:
-        """On the rotor."""
+        """Torque of the drive on the rotor, N·m."""
         torque: Array = self._state[:, 3 + self._lags].copy()
         return torque
 
     def begin(self, speed: Array, string_torque_nm: Array) -> None:
-        """Turning at the set speed, the torque in balance."""
+        """Set the top to steady rotation at the set speed. The drive's torque balances the string's."""
         torque = string_torque_nm + self._viscous * speed + self._own_dry * np.clip(
             speed / SLIDING_BLUR_RAD_S, -1.0, 1.0)
         self._state[:, 0] = self._state[:, 2] = speed
@@ -432,7 +439,7 @@ class _Top:
         self._state[:, 4 : self._size] = torque[:, None, :]
 
     def step(self, arriving: Array, set_speed: Array) -> tuple[Array, Array]:
-        """(wave that goes down, mean speed)."""
+        """Advance by one tick. Return (wave that goes down, mean speed of the top over the tick)."""
         state, size = self._state, self._size
         wave = arriving.reshape(set_speed.shape)
         state[:, size] = wave
@@ -446,7 +453,10 @@ class _Top:
 
 @lru_cache(maxsize=2048)
 def _top_step(drive: TopDrive, controller: SpeedController, grid: Grid, most_lags: int) -> Array:
-    """Return what a tick makes of ω, ∫e·I, filtered ω, ∫ω dt, lags; and of the inputs wave, dry friction, set speed."""
+    """Return the transition matrix of one tick.
+
+    States: ω, I ∫e dt, filtered ω, ∫ω dt, lags. Inputs: wave, dry friction, set speed.
+    """
     from scipy.linalg import expm
 
     size = 4 + most_lags
@@ -474,7 +484,7 @@ def _top_step(drive: TopDrive, controller: SpeedController, grid: Grid, most_lag
 
 
 class _Bit:
-    """The bottom end, one number a case."""
+    """Bottom end of the string with its bit. Arrays have one value for each case."""
 
     def __init__(self, strings: Sequence[DrillString], grids: Sequence[Grid], repeats: int) -> None:
         def each(values: Sequence[float]) -> Array:
@@ -496,8 +506,8 @@ class _Bit:
             string.bottom_viscous_nm_s_rad + 0.5 * grid.drag_nm_s_rad[-1]
             for string, grid in zip(strings, grids, strict=True)])
         self._tick_s = each([grid.tick_s for grid in grids])
-        # A falling branch steeper than what the line takes grows: in parts of 5 %. One that isn't runs to a balance,
-        # which the tangent's exponential reaches in one step.
+        # If the friction falls more steeply than the line damps, the speed grows: by at most 5 % in one part of a tick.
+        # If not, the speed tends to an equilibrium, which the exponential of the tangent reaches in one step.
         steepest = sqrt(2.0 / e) * self._falls / self._width
         growth = float(np.max(np.maximum(0.0, steepest - self._viscous) / self._inertia * self._tick_s))
         self._parts = int(np.clip(ceil(growth / LARGEST_GROWTH), 1, 25))
@@ -511,7 +521,7 @@ class _Bit:
         self._rests_harder = any(more > own for more, own in zip(along_static, along, strict=True))
 
     def rubbing(self, speed: Array) -> Array:
-        """T_f of the bit alone, without its sign."""
+        """Return the magnitude of the friction torque T_f of the bit alone, N·m."""
         return self._coulomb - self._wall + self._bent(speed)
 
     def release(self) -> None:
@@ -526,11 +536,11 @@ class _Bit:
         return over
 
     def step(self, arriving: Array, speed: Array, noise_nm: Array | None = None) -> tuple[Array, Array]:
-        """(wave that goes up, speed after the tick)."""
+        """Advance by one tick. Return (wave that goes up, speed after the tick)."""
         driven = arriving if noise_nm is None else arriving - noise_nm
         travel = speed
         for part in range(self._parts):
-            toward = np.where(speed != 0.0, speed, driven)      # its sign is that of the motion
+            toward = np.where(speed != 0.0, speed, driven)      # has the sign of the motion
             bent = self._bent(speed)
             net = driven - np.copysign(self._coulomb + bent, toward) - self._viscous * speed
             growth = self._slower
@@ -538,7 +548,7 @@ class _Bit:
                 growth = growth + bent * np.abs(speed) * self._steeper
                 growth += LEAST_GROWTH
             end = speed + net * self._pace * np.expm1(growth) / growth
-            # a bit that stands and is not torn loose would be driven back by its own friction
+            # A reversal means that friction drives the bit back. So the bit stops, or does not break away.
             stops = end * toward < 0.0
             if self._rests_harder:
                 stops |= (speed == 0.0) & (np.abs(driven) <= self.static_nm)
@@ -549,26 +559,26 @@ class _Bit:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Critical speeds. Always say which, and for which bit.
+# Critical speeds. Always state which one (cure or start), and for which bit.
 
 
 RPM = 2.0 * pi / 60.0
-"""rad/s."""
+"""One revolution per minute, rad/s."""
 
 
 @dataclass(frozen=True)
 class CriticalSpeeds:
-    """Critical speeds in rpm of the main shaft, without bit noise; None: none up to the highest that was tried."""
+    """Critical speeds of the main shaft without bit noise, rpm. None: above the highest speed that was tried."""
 
     cure_rpm: float | None
-    """The lowest set speed from which a stuck bit (at breakaway, the top at full set speed) ends turning."""
+    """Lowest set speed at which a stuck bit (about to break away, the top at full set speed) turns in the end."""
     start_rpm: float | None
-    """The lowest set speed at which the bit turns in the end after a ramp from rest."""
+    """Lowest set speed at which the bit turns in the end after a ramp from standstill."""
 
 
 @dataclass(frozen=True)
 class Search:
-    """How critical speeds are looked for."""
+    """Settings of the search for critical speeds."""
 
     highest_rpm: float = 240.0
     lowest_rpm: float = 0.0
@@ -576,7 +586,7 @@ class Search:
     resolution_rpm: float = 1.0
     duration_s: float = 100.0
     calm_s: float = 20.0
-    """At the end of it: the bit turns if it has not stood still for so long."""
+    """Time at the end of a simulation. The bit counts as turning if it does not stand still in this time."""
     start_ramp_rpm_s: float = 5.0
     longest_tick_s: float = LONGEST_TICK_S
 
@@ -592,9 +602,10 @@ Start = Literal["stuck", "rest", "turning"]
 
 
 def lowest_turning(strings: Strings, loops: Sequence[Loop], how: Start, search: Search) -> list[float | None]:
-    """The lowest set speed, to the resolution, at which and above which every one tried ends with a bit that turns.
+    """Return for each loop the lowest set speed, rpm, at and above which the bit turns in the end; None: not found.
 
-    First on a coarse grid, then between the last that sticks and the first above it.
+    The search uses a coarse grid first. Then it refines, down to the resolution, between the highest speed that sticks
+    and the next one above.
     """
     span = search.highest_rpm - search.lowest_rpm
     coarse = np.linspace(search.lowest_rpm, search.highest_rpm, max(1, ceil(span / search.coarse_rpm - 1e-9)) + 1)
@@ -607,14 +618,14 @@ def lowest_turning(strings: Strings, loops: Sequence[Loop], how: Start, search: 
 
 
 FINER = 4
-"""Parts into which a bracket is cut, as often as the resolution asks for it."""
+"""Number of parts into which a bracket is divided in each step, until the resolution is reached."""
 
 
 def _lowest(turn: Callable[[Array], NDArray[np.bool_]], coarse: Array, parts: float) -> Array:
-    """Return for each row the lowest value from which on all turn, to a ``parts``-th of the step; infinite: none.
+    """Return for each row the lowest value from which on all turn; infinite: none. Resolution: step / ``parts``.
 
-    ``coarse``: evenly spaced; rows are loops. Above a row in which nothing turned there is nothing to look for: it goes
-    along, and its result is not used.
+    ``coarse``: evenly spaced values; each row is a loop. A row in which the last value does not turn is refined like
+    the others, and its result is not used.
     """
     first = np.array([_first_of_the_rest(row) for row in turn(coarse)])
     rows = np.arange(len(coarse))
@@ -623,7 +634,7 @@ def _lowest(turn: Callable[[Array], NDArray[np.bool_]], coarse: Array, parts: fl
     while left > 1:
         count = FINER if left > FINER + 1 else left
         between = top[:, None] + step * (np.arange(1, count) / count - 1.0)
-        turns = np.column_stack([turn(between), np.ones(len(top), dtype=bool)])      # the top itself is known to turn
+        turns = np.column_stack([turn(between), np.ones(len(top), dtype=bool)])      # the bracket's upper end turns
         at = np.array([_first_of_the_rest(row) for row in turns])
         top = np.column_stack([between, top])[rows, at]
         step, left = step / count, -(-left // count)
@@ -631,7 +642,7 @@ def _lowest(turn: Callable[[Array], NDArray[np.bool_]], coarse: Array, parts: fl
 
 
 def _first_of_the_rest(turns: NDArray[np.bool_]) -> int:
-    """Return the index from which on all are true; their number if the last is false."""
+    """Return the index from which on all are true. If the last is false, return the length of ``turns``."""
     sticking = np.flatnonzero(~turns)
     return int(sticking[-1]) + 1 if sticking.size else 0
 
@@ -640,7 +651,7 @@ def ends_turning(
     strings: Strings, loops: Sequence[Loop], how: Start, speeds_rpm: Array, search: Search,
     seeds: Sequence[int] | None = None,
 ) -> NDArray[np.bool_]:
-    """Return for each loop and speed whether the bit turns in the end, without a standstill in the calm time."""
+    """Return for each loop and speed whether the bit turns in the end: no standstill within the last ``calm_s``."""
     target = speeds_rpm * RPM
     begin = Begin(how, np.zeros_like(target) if how == "rest" else target)
     ramp = search.start_ramp_rpm_s * RPM
@@ -652,33 +663,33 @@ def ends_turning(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Under bit noise: many strings, each with its own noise, on a grid of speeds that rises by a factor.
+# Critical speeds under bit noise: many strings, each with its own noise, on a geometric grid of speeds.
 
 TICKS_PER_WAY, LONGEST_NOISY_TICK_S = 30.0, 0.03
-"""Of a search over many strings: the tick is a thirtieth of the way down, at most. Cure speeds of the reference case
-are the same at 0.006 and at 0.03 s."""
+"""Limits of the tick in a search over many strings: at most a thirtieth of the travel time down, and at most 0.03 s.
+The cure speeds of the reference case are the same for ticks of 0.006 s and 0.03 s."""
 COARSE_SPEEDS, FINE_PARTS = 7, 16
-"""Speeds of the first grid, and parts of one of its steps that are told apart."""
+"""Number of speeds of the first grid, and number of parts of one of its steps that the search resolves."""
 PERIODS, CALM_PERIODS = 12.0, 3.0
-"""Length of a simulation in periods of the string's lowest mode with the top held, and of its end in which the bit must
-not stand still."""
+"""Length of a simulation, and length of its end in which the bit must not stand still; both in periods of the string's
+lowest mode with the top held."""
 LOWEST_NOISY_RPM, HIGHEST_NOISY_RPM = 10.0, 240.0
 NOISY_RESOLUTION = (HIGHEST_NOISY_RPM / LOWEST_NOISY_RPM) ** (1.0 / ((COARSE_SPEEDS - 1) * FINE_PARTS)) - 1.0
-"""Relative, of a critical speed under noise: 3 %."""
+"""Relative resolution of a critical speed under noise: 3 %."""
 
 
 def coarse_tick_s(string: DrillString) -> float:
-    """Return the longest tick with which critical speeds of that string are found."""
+    """Return the longest tick, s, for the search for critical speeds of that string."""
     return min(LONGEST_NOISY_TICK_S, 0.5 * string.echo_s / TICKS_PER_WAY)
 
 
 def lowest_turning_with_noise(
     strings: Sequence[DrillString], loops: Sequence[Loop], seeds: Sequence[int], how: Start, period_s: float
 ) -> Array:
-    """Return for each loop the lowest set speed, rpm, from which on the bit ends turning; infinite: none.
+    """Return for each loop the lowest set speed, rpm, at and above which the bit turns in the end; infinite: none.
 
-    ``period_s``: of the lowest mode with the top held. Every loop has its own string and seed. Raises ValueError where
-    a bit isn't stated.
+    ``period_s``: period of the lowest mode with the top held. Every loop has its own string and seed. Raises ValueError
+    if a bit is not stated.
     """
     search = Search(duration_s=PERIODS * period_s, calm_s=CALM_PERIODS * period_s,
                     longest_tick_s=coarse_tick_s(strings[0]))

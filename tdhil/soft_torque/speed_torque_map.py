@@ -1,9 +1,9 @@
-"""Set speed × bit torque: where the string turns, where it is at risk, and where the bit sticks and slips.
+"""Operator's map of set speed and bit torque: stable rotation, risk of stick-slip, and stick-slip.
 
-Each cell is simulated under bit noise, twice for each of some seeds: from steady rotation, and from a stuck bit.
-*Stick-slip*: a bit that turned sticks. *At risk*: a bit that turns goes on turning, but one that is stuck, as after a
-connection, does not come free. *Stable*: both end turning. String, J and lags are as stated; the bit's torque and its
-noise are scaled together.
+Each cell is simulated under bit noise, twice for each seed: from steady rotation, and from a stuck bit.
+*Stick-slip*: a turning bit sticks. *At risk*: a turning bit goes on turning, but a stuck bit, for example after a
+connection, does not come free. *Stable*: the bit turns at the end of both simulations. String, J and lags have their
+stated values. The bit's torque and its noise are scaled together.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MAP_SPEEDS_RPM = tuple(float(one) for one in range(20, 221, 20))
 MAP_TORQUE_SHARES = (0.4, 0.6, 0.8, 1.0, 1.2, 1.4)
 """Bit torques of the map, as shares of the stated bit's."""
 MAP_SEEDS = (11, 12, 13)
-"""Seeds of the bit noise. A cell has the worst state of them."""
+"""Seeds of the bit noise. A cell shows the worst state over all seeds."""
 
 _STARTS: tuple[Start, Start] = ("turning", "stuck")
 
@@ -38,18 +38,21 @@ State = Literal["stable", "at risk", "stick-slip"]
 
 @dataclass(frozen=True)
 class OperatorMap:
-    """``states``: for each controller a row a bit torque, in it a state a set speed."""
+    """Operator's map. ``states``: for each controller, a row for each bit torque with a state for each set speed."""
 
     speeds_rpm: tuple[float, ...]
     bit_torques_nm: tuple[float, ...]
-    """Coulomb torque: that of a bit that turns fast."""
+    """Coulomb torque of the bit, which acts while it turns fast."""
     states: dict[str, tuple[tuple[State, ...], ...]]
     weights_on_bit_kn: tuple[float, ...] | None = None
-    """Weight on bit of each bit torque, for a bit whose torque for each kN is stated; else None."""
+    """Weight on bit for each bit torque. None: string.yaml states no torque per weight on bit."""
 
 
 def operator_map(tuning: Tuning) -> OperatorMap | None:
-    """Return the map of the stiff, the present and the advised (else the soft) gains; None without a bit."""
+    """Return the map for the stiff, the present and the advised gains (without advice: the soft ones).
+
+    Returns None if no bit is stated or if critical speeds were not simulated.
+    """
     case = tuning.case
     bit = case.string.bit
     if bit is None or tuning.searched is None:

@@ -1,13 +1,13 @@
-r"""Margins, reserves and the linear stability limit: every number is a crossing of a frequency response.
+r"""Margins, reserves and the linear stability limit. Each is computed from crossings of a frequency response.
 
 ::
 
-    L = H·law/(J s + B + Z_s)        the drive's loop, cut at its torque, with the string on it
+    L = H·law/(J s + B + Z_s)        the drive's loop, opened at its torque, with the string coupled
 
-**Phase and gain margin.** All crossings count: at each ω with |L| = 1 the angle between L and −1, at each ω with
-Im L = 0 and Re L < 0 the factor −1/Re L. A string makes many crossings, and the least of them is the margin. The bit
-turns in one response and is stuck in the other; the smaller margin is reported. (Textbook definitions: K. J. Åström
-and R. M. Murray, Feedback Systems, section 10.3.)
+**Phase and gain margin.** All crossings count. At each ω with |L| = 1, the phase margin is the angle between L and −1.
+At each ω with Im L = 0 and Re L < 0, the gain margin is the factor −1/Re L. A string makes many crossings, and the
+least value is the margin. The bit turns in one response and is stuck in the other; the smaller margin is reported.
+(Textbook definitions: K. J. Åström and R. M. Murray, Feedback Systems, section 10.3.)
 
 **Dead-time reserve.** With one more dead time T the loop is L e^(−sT). A pole is on the imaginary axis where
 L(jω) e^(−jωT) = −1: |L| = 1 and T = (π + arg L mod 2π)/ω. The smallest T of all crossings is the reserve, if the loop
@@ -16,10 +16,11 @@ is stable without it. The loop may be stable again for a larger T; that is no re
 **Lag reserve.** With one more first-order lag τ a pole is on the axis where L/(1 + jωτ) = −1: Re L = −1 and
 τ = −Im L/ω > 0. Again the smallest counts.
 
-**Linear stability limit.** The bit's friction falls with its speed: at the mean speed Ω its slope is −σ(Ω). Seen from
-the bit, pipe and top drive are an impedance Z_b(s), its own inertia and viscous friction included. A pole is on the
-axis where Z_b(jω) = σ: Im Z_b = 0 and σ = Re Z_b. The smallest positive one is the steepest slope that the whole
-bears; steady rotation is unstable at the mean speeds at which the bit's own slope is steeper.
+**Linear stability limit.** The bit's friction falls with its speed: at the mean speed Ω its slope is −σ(Ω). The load of
+the bit is an impedance Z_b(s) of pipe and top drive, with the inertia and viscous friction of the bit included. A pole
+is on the imaginary axis where Z_b(jω) = σ, that is Im Z_b = 0 and σ = Re Z_b. The smallest positive σ is the steepest
+slope for which the system is stable. Steady rotation is unstable at the mean speeds at which the bit's slope is
+steeper.
 """
 
 from __future__ import annotations
@@ -44,43 +45,45 @@ Reals = NDArray[np.float64]
 
 LOWEST_RAD_S = 1e-3
 STEPS_PER_MODE = 60
-"""Frequencies between neighbouring modes of the string, π/T apart."""
+"""Number of frequencies between neighbouring modes of the string, which are π/T apart."""
 STEPS_PER_WIDTH = 3
-"""Frequencies within the half-width of a resonance, d/(2 m) rad/s."""
+"""Number of frequencies within the half-width of a resonance, d/(2 m) rad/s."""
 MOST_FREQUENCIES = 30_000
 REFINEMENT, NEAR = 24, 1.5
+"""Steps into which a step of the grid is divided, and the range |ln |L|| in which this is done."""
 LEAST_GAIN = 0.2
-"""|L| below which no margin of interest is left (14 dB); beyond the last frequency with more nothing is looked at."""
+"""Least |L| of interest. A smaller |L| has a gain margin above 14 dB. The grid ends above the last frequency at which
+|L| is larger."""
 
 
 @dataclass(frozen=True)
 class LoopMargins:
-    """Distance of one loop from instability, the string on it, for a bit that turns and one that is stuck."""
+    """Stability margins of one loop with the string coupled: the smaller ones of a turning and a stuck bit."""
 
     stable: bool
     phase_deg: float
-    """Least over all crossings; 0 where the loop is unstable."""
+    """Phase margin: the least over all crossings. 0: the loop is unstable."""
     gain_db: float
-    """Least factor on L, up or down, in dB; 0 where the loop is unstable."""
+    """Gain margin, dB: the least factor on L, up or down, that makes the loop unstable. 0: the loop is unstable."""
     dead_time_s: float
-    """Smallest further dead time that destabilises; infinite: none does."""
+    """Smallest additional dead time that makes the loop unstable. Infinite: none does."""
     lag_s: float
-    """Smallest further first-order lag that destabilises; infinite: none does."""
+    """Time constant of the smallest additional first-order lag that makes the loop unstable. Infinite: none does."""
     modulus: float
     """Least distance of L(jω) from −1."""
 
 
 @dataclass(frozen=True)
 class RequiredMargins:
-    """Margins that every sampled case has to keep."""
+    """Margins that the loop must have on every sampled truth."""
 
     phase_deg: float = 30.0
     gain_db: float = 6.0
     dead_time_s: float = 0.02
-    """Ten control periods of 2 ms."""
+    """Dead-time reserve: ten control periods of 2 ms."""
 
     def failed(self, margins: LoopMargins) -> tuple[str, ...]:
-        """Return what is thin, each with its number and the limit; () if nothing is."""
+        """Return a text with value and limit for each margin that is too small; () if none is."""
         if not margins.stable:
             return ("unstable",)
         found = []
@@ -96,11 +99,11 @@ class RequiredMargins:
 
 USUAL_MARGINS = RequiredMargins()
 NO_MARGINS = RequiredMargins(0.0, 0.0, 0.0)
-"""Stability alone."""
+"""Required margins of zero: only stability is required."""
 
 
 def least_of(every: Sequence[LoopMargins]) -> LoopMargins:
-    """Return the least of each margin; unstable if one is."""
+    """Return the least of each margin. The result is unstable if any loop is."""
     return LoopMargins(all(one.stable for one in every), *(
         min(getattr(one, name) for one in every)
         for name in ("phase_deg", "gain_db", "dead_time_s", "lag_s", "modulus")))
@@ -108,7 +111,7 @@ def least_of(every: Sequence[LoopMargins]) -> LoopMargins:
 
 @dataclass(frozen=True)
 class StringResponse:
-    """Z_s of one string over one grid of frequencies, for a bit that turns and one that is stuck."""
+    """Impedance Z_s of one string over a grid of frequencies, for a turning bit and for a stuck bit."""
 
     string: DrillString
     omega_rad_s: Reals
@@ -137,8 +140,8 @@ def _grid(string: DrillString, highest_rad_s: float) -> Reals:
 def highest_crossover(drive: TopDrive, law: SpeedController) -> float:
     """Return the frequency, rad/s, above which |L| of the bare drive stays below half of `LEAST_GAIN`.
 
-    The string's own impedance adds to the rotor's: near an antiresonance it may cancel a part of Jω, no more than
-    (the factor of two) half of it at such frequencies.
+    The string's impedance adds to that of the rotor. Near an antiresonance it may cancel a part of Jω. At these
+    frequencies it cancels at most half of it, which gives the factor of two.
     """
     omega = np.geomspace(0.05, 3e3, 2000)
     s: Complex = np.asarray(1j * omega, dtype=np.complex128)
@@ -153,8 +156,8 @@ def loop_margins(
 ) -> LoopMargins:
     """Return the margins of the loop.
 
-    ``response``: Z_s of that string, worked out before. ``stuck`` False leaves the stuck bit out. ``exact``: reserves
-    to a fraction of a millisecond, on a grid that is refined wherever |L| is near 1.
+    ``response``: Z_s of that string, if it was computed before. ``stuck`` False leaves the stuck bit out. ``exact``:
+    the grid is refined wherever |L| is near 1, so the reserves are exact to a fraction of a millisecond.
     """
     top = highest_crossover(drive, law)
     if response is None or response.omega_rad_s[-1] < 0.98 * top:
@@ -183,7 +186,7 @@ def loop_margins(
 
 
 def _refined(omega: Reals, size: Reals) -> Reals:
-    """The grid with `REFINEMENT` steps for one wherever |L| is within `NEAR` (natural logarithm) of 1."""
+    """Return the grid with each step divided into `REFINEMENT` steps wherever |ln |L|| is below `NEAR`."""
     near = np.flatnonzero(np.minimum(np.abs(size[:-1]), np.abs(size[1:])) < NEAR)
     parts = np.arange(1, REFINEMENT) / REFINEMENT
     between = omega[near, None] + (omega[near + 1] - omega[near])[:, None] * parts
@@ -192,10 +195,11 @@ def _refined(omega: Reals, size: Reals) -> Reals:
 
 
 def _encircles_nothing(loop: Complex) -> bool:
-    """Nyquist: rotor and string are passive, so that L has no pole on the right and may not encircle −1.
+    """Return whether L does not encircle −1 (Nyquist criterion).
 
-    The phase of 1 + L begins between −180° and 0 (L has at most one pole at the origin that isn't balanced by losses),
-    and ends at 0 if nothing was encircled, at a multiple of 360° else.
+    Rotor and string are passive, so L has no pole in the right half-plane. The loop is stable if L does not encircle
+    −1. The phase of 1 + L begins between −180° and 0, because L has at most one pole at the origin that is not balanced
+    by losses. It ends at 0 if −1 is not encircled, otherwise at a multiple of 360°.
     """
     end = float(np.unwrap(np.angle(1.0 + loop))[-1])
     return abs(end) < 0.5 * pi
@@ -207,7 +211,7 @@ def is_stable(string: DrillString, drive: TopDrive, law: SpeedController) -> boo
 
 
 def _crossings(omega: Reals, loop: Complex) -> tuple[float, float, float, float, float]:
-    """(phase margin °, gain margin dB, dead time s, lag s, least |1 + L|), each the least of all crossings."""
+    """Return (phase margin °, gain margin dB, dead time s, lag s, least |1 + L|), each the least of all crossings."""
     size = np.log(np.abs(loop))
     at, share = _zeros(size)
     phase = dead = inf
@@ -215,7 +219,7 @@ def _crossings(omega: Reals, loop: Complex) -> tuple[float, float, float, float,
         omega_at = omega[at] + share * (omega[at + 1] - omega[at])
         angle = np.angle(-_between(loop, at, share))
         phase = float(np.degrees(np.min(np.abs(angle))))
-        # a crossing with the phase just above −180° bears little dead time, one just below nearly a whole turn
+        # A crossing with a phase just above −180° allows little dead time. One just below allows almost a whole turn.
         dead = float(np.min(np.mod(angle, 2.0 * pi) / omega_at))
     gain = inf
     at, share = _zeros(loop.imag)
@@ -235,7 +239,7 @@ def _crossings(omega: Reals, loop: Complex) -> tuple[float, float, float, float,
 
 
 def _zeros(values: Reals) -> tuple[NDArray[np.int64], Reals]:
-    """Indices before each change of sign, and the share of the step at which it is."""
+    """Return the index before each change of sign, and the position of the zero as a share of the step."""
     at = np.flatnonzero((values[:-1] < 0.0) != (values[1:] < 0.0))
     span = values[at] - values[at + 1]
     return at, values[at] / np.where(span == 0.0, 1.0, span)
@@ -247,15 +251,15 @@ def _between(values: Complex, at: NDArray[np.int64], share: Reals) -> Complex:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# From the bit.
+# Impedance at the bit.
 
 
 def bit_impedance(
     string: DrillString, top_impedance: Complex, s: Complex, through: tuple[Complex, ...] | None = None
 ) -> Complex:
-    """Return Z_b(s): what the bit's dry friction works on; N·m·s/rad.
+    """Return Z_b(s), N·m·s/rad: the impedance on which the bit's dry friction acts.
 
-    ``top_impedance``: Z(s) of top drive and controller. ``through``: the string's matrix, worked out before.
+    ``top_impedance``: Z(s) of top drive and controller. ``through``: the string's matrix, if it was computed before.
     """
     cosh_down, series, shunt, cosh_up = chain_of(string, s) if through is None else through
     # τ_top = −Z ω_top, with the speed at the bit 1: ω_top = A + Bτ, τ_top = C + Dτ
@@ -264,7 +268,7 @@ def bit_impedance(
 
 
 def chain_of(string: DrillString, s: Complex) -> tuple[Complex, Complex, Complex, Complex]:
-    """Return (A, B, C, D) with ω_top = A ω + B τ and τ_top = C ω + D τ of the bit's end; determinant 1."""
+    """Return (A, B, C, D) with ω_top = A ω + B τ and τ_top = C ω + D τ; ω and τ at the bit; determinant 1."""
     free = _column(string, s, 1.0, 0.0)
     held = _column(string, s, 0.0, 1.0)
     return free[0], held[0], free[1], held[1]
@@ -275,7 +279,7 @@ def _column(string: DrillString, s: Complex, speed: float, torque: float) -> tup
 
 
 def steepest_slope(omega: Reals, from_bit: Complex) -> float:
-    """Return the smallest σ, N·m·s/rad, at which a falling bit friction of slope −σ destabilises; infinite: none."""
+    """Return the smallest σ, N·m·s/rad, for which a bit friction of slope −σ is unstable; infinite: none."""
     at, share = _zeros(from_bit.imag)
     if not at.size:
         return inf
@@ -285,17 +289,17 @@ def steepest_slope(omega: Reals, from_bit: Complex) -> float:
 
 
 def bit_grid(string: DrillString) -> Reals:
-    """Frequencies, rad/s, over which a bit is looked at from: its lowest four modes, and finer at the lowest."""
+    """Return frequencies, rad/s, for the impedance at the bit: the lowest four modes, finer at the lowest."""
     mode = pi / string.echo_s
     return np.concatenate([np.geomspace(0.02 * mode, mode, 160, endpoint=False), np.arange(mode, 8.0 * mode,
                                                                                        mode / 40.0)])
 
 
 def linear_limit_rad_s(bit: BitFriction, slope_nm_s_rad: float) -> float:
-    """Return the mean speed above which the bit's slope is less steep than that; 0: it never is as steep.
+    """Return the mean speed, rad/s, above which the bit's friction is less steep than −``slope_nm_s_rad``.
 
-    The slope of the Gaussian Stribeck law is 2 (F_s − F_c) Ω/ω_s² e^−(Ω/ω_s)², steepest at Ω = ω_s/√2, and falls
-    beyond.
+    0: the friction is never as steep. The magnitude of the slope of the Gaussian Stribeck law is
+    2 (F_s − F_c) Ω/ω_s² e^−(Ω/ω_s)². It is largest at Ω = ω_s/√2 and falls above it.
     """
     falls, width = bit.static_nm - bit.coulomb_nm, bit.stribeck_speed_rad_s
     if falls <= 0.0 or slope_nm_s_rad == inf:
@@ -315,9 +319,9 @@ def linear_limit_rad_s(bit: BitFriction, slope_nm_s_rad: float) -> float:
 
 
 def linear_limit(string: DrillString, drive: TopDrive, law: SpeedController) -> float:
-    """Return the linear stability limit, rad/s at the top: below it steady rotation is unstable.
+    """Return the linear stability limit, rad/s at the top. Below this speed, steady rotation is unstable.
 
-    Raises ValueError where no bit is stated.
+    Raises ValueError if no bit is stated.
     """
     if string.bit is None:
         raise ValueError("no bit is stated")

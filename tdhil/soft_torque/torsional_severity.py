@@ -1,23 +1,23 @@
-r"""Severity of torsional oscillation from recorded torque and speed of the top drive; nothing is moved for it.
+r"""Severity of torsional oscillation from recorded torque and speed of the top drive. No motion is commanded for it.
 
-**Torque of the string.** τ = T − J α at the top of the string. Friction of the top drive is nearly constant, and a
-constant drops out of all that follows. The reports' own lags τ_ω and τ_T are taken back: each spectrum is multiplied
-by 1 + jΩτ below the highest frequency that is used.
+**Torque of the string.** τ = T − J α at the top of the string. The friction of the top drive is nearly constant, and a
+constant has no effect on the results. The lags τ_ω and τ_T of the reported values are corrected: each spectrum is
+multiplied by 1 + jΩτ below the highest frequency that is used.
 
-**Downhole speed.** A line of travel time T and impedance ζ carries a = τ + ζω down and b = ζω − τ up, unchanged. So
+**Downhole speed.** A line with travel time T and impedance ζ carries a = τ + ζω down and b = ζω − τ up, unchanged. So
 
     ω(L, t) = ½ (ω(0, t−T) + ω(0, t+T)) + (τ(0, t−T) − τ(0, t+T))/(2ζ)
     τ(L, t) = ½ (τ(0, t−T) + τ(0, t+T)) + ζ (ω(0, t−T) − ω(0, t+T))/2
 
-section by section down to the bit (d'Alembert; the mud's drag is lumped between parts). It holds for any motion of
-either end, and needs T of record before and after.
+section by section down to the bit (d'Alembert; the mud's drag is lumped between parts). These equations hold for any
+motion of both ends. They need a record of length T before and after the time t.
 
-**Severity index.** Half of peak to peak of the downhole speed over the mean speed, in windows of one period of the
-string's lowest mode: 0 is steady, 1 and more is stick-slip. A window is *stick-slip* if the index reaches
-`STICK_SLIP_INDEX` and the bit nearly stops.
+**Severity index.** Half of the peak-to-peak downhole speed, divided by the mean speed, in windows of one period of the
+string's lowest mode. 0 is steady rotation, 1 and more is stick-slip. A window counts as *stick-slip* if the index
+reaches `STICK_SLIP_INDEX` and the bit nearly stops.
 
-**Reflection.** At the top, a = r b. Where the string itself excites the top, r is the cross spectrum of a and b over
-the spectrum of b, in the band of the oscillation. A soft-torque system makes |r| small there.
+**Reflection.** At the top, a = r b. If the motion of the top is excited by the string, r is the cross spectrum of a and
+b divided by the spectrum of b, in the band of the oscillation. A soft-torque controller makes |r| small in this band.
 """
 
 from __future__ import annotations
@@ -42,37 +42,39 @@ Flags = NDArray[np.bool_]
 STEPS_PER_PERIOD = 80.0
 """Samples of the common grid in one period of the lowest mode."""
 LEAST_SAMPLES_PER_PERIOD = 16.0
-"""Least samples of the record in that period: fewer do not resolve the downhole speed."""
+"""Least number of samples of the record in one period of the lowest mode. Fewer do not resolve the downhole speed."""
 HARMONICS = 8.0
-"""The highest frequency that is used, in lowest modes: the jump of a bit that breaks away needs some harmonics."""
+"""Highest frequency that is used, as a multiple of the lowest mode's. The jump of a bit that breaks away needs some
+harmonics."""
 GAP_PERIODS = 0.1
-"""A gap in the record that is longer, in periods, ends a stretch."""
+"""Longest gap within a gapless part of the record, in periods of the lowest mode."""
 LEAST_PERIODS = 3.0
-"""Length of a stretch that is used, in periods."""
+"""Least length of a gapless part that is used, in periods of the lowest mode."""
 PART_S = 0.3
-"""Travel time of a part of a line, between two places at which the mud's drag is lumped."""
+"""Longest travel time, s, between two places of a line at which the mud's drag is lumped."""
 TURNING_SHARE = 0.5
-"""The top's least speed in a window over its mean there: below it the string is started or stopped."""
+"""Least speed of the top in a window, divided by its mean speed there. Below it, the string is starting or
+stopping."""
 LEAST_SPEED_RAD_S = 0.5
-"""Mean speed of the main shaft, 5 rpm, below which the string does not count as turning."""
+"""Least mean speed of the main shaft, rad/s (5 rpm). Below it, the string does not count as turning."""
 STICK_SLIP_INDEX, STOPPED_SHARE = 0.9, 0.2
-"""Severity index of stick-slip, and the share of the mean speed below which a bit that oscillates as much nearly stops.
-From strings of 1,000 to 6,000 m that were simulated with bit noise (benchmarks/severity_from_surface.py)."""
+"""Least severity index of stick-slip, and the share of the mean speed below which such a bit counts as nearly stopped.
+Source: strings of 1,000 to 6,000 m, simulated with bit noise (benchmarks/severity_from_surface.py)."""
 AT_RISK_INDEX = 0.5
 """Severity index from which a window counts as at risk of stick-slip."""
 HYSTERESIS = 0.3
 """Distance from the mean that a cycle must pass on both sides, as a share of the amplitude."""
 MOST_PERIOD_SCATTER = 0.3
-"""Relative standard deviation of single cycles up to which they are one oscillation."""
+"""Largest relative deviation of a cycle's length from the median. Cycles that deviate more are not counted."""
 LEAST_CYCLES = 3
 SEGMENT_PERIODS, LEAST_SEGMENTS, LEAST_COHERENCE = 4.0, 6, 0.5
-"""Segments of the spectra, in periods; how many there must be; and the coherence of a and b."""
+"""Length of the segments of the spectra in periods, least number of segments, and least coherence of a and b."""
 BAND_SHARE = 0.25
-"""Half-width of the band of the oscillation, of its frequency."""
+"""Half-width of the band of the oscillation, as a share of its frequency."""
 TINY = 1e-30
-"""N⁴·m⁴, for spectra of a record in which nothing moves."""
+"""Least divisor, N⁴·m⁴, for the spectra of a record without motion."""
 REFLECTION_TOLERANCE = 0.1
-"""How far |r| may differ from the expected one beyond its interval: for lags that are not known exactly."""
+"""Largest distance of the expected |r| from the measured interval. It accounts for lags that are not known exactly."""
 
 
 NOT_IDENTIFIABLE = 9
@@ -80,7 +82,7 @@ NOT_IDENTIFIABLE = 9
 
 
 class SeverityRefused(TdhilError):
-    """The record says nothing of the torsional motion below, and the message says why."""
+    """Refusal: the record does not determine the torsional motion of the string. The message gives the reason."""
 
     entry = MessageCode.SEVERITY_REFUSED
 
@@ -89,28 +91,30 @@ class SeverityRefused(TdhilError):
 
 @dataclass(frozen=True)
 class SurfaceRecord:
-    """Torque and speed as the drive reported them, at the main shaft; (N,), times rising."""
+    """Reported torque and speed of the drive, referred to the main shaft; shape (N,), with increasing times."""
 
     time_s: Array
     speed_rad_s: Array
     torque_nm: Array
     speed_lag_s: float = 0.0
+    """First-order time constant of the reported speed."""
     torque_lag_s: float = 0.0
+    """First-order time constant of the reported torque."""
 
 
 @dataclass(frozen=True)
 class StickSlipEpisode:
-    """A stretch of stick-slip; times of the record."""
+    """Episode of stick-slip, in times of the record."""
 
     start_s: float
     end_s: float
     index: float
-    """The largest severity index in it."""
+    """Largest severity index in the episode."""
 
 
 @dataclass(frozen=True)
 class ReflectionCheck:
-    """|r| at the top in the band of the oscillation, and what the gains should give."""
+    """Reflection |r| at the top in the band of the oscillation, measured and expected from the gains."""
 
     from_hz: float
     to_hz: float
@@ -132,7 +136,7 @@ class ReflectionCheck:
 
 @dataclass(frozen=True)
 class SeverityCourse:
-    """The signals over time, for pictures: (M,) each, NaN where nothing is known."""
+    """Signals over time for plots, shape (M,) each; NaN where a value is unknown."""
 
     time_s: Array
     top_rad_s: Array
@@ -147,25 +151,27 @@ class Severity:
     """Result for one record; speeds and torques at the main shaft."""
 
     turning_s: float
-    """Time in which the string turned and its downhole speed is known."""
+    """Total time in which the string turns and its downhole speed is known."""
     mean_rad_s: float
     index: Interval
-    """Severity index of the usual window (median; in stick-slip: of the windows in it), with the interval over J and
-    string."""
+    """Median severity index of all windows, or of the windows in stick-slip if there are any. The interval is over J
+    and the string's tolerances."""
     index_worst: float
-    """Exceeded by 5 % of the windows."""
+    """Severity index that 5 % of the windows exceed."""
     stick_slip_share: float
+    """Share of the turning time in stick-slip."""
     at_risk_share: float
-    """Share of the turning time."""
+    """Share of the turning time with a severity index of `AT_RISK_INDEX` or more."""
     episodes: tuple[StickSlipEpisode, ...]
     period_s: Interval | None
-    """Period of the oscillation; None: nothing repeats."""
+    """Period of the oscillation. None: there is no regular oscillation."""
     cycles: int
     downhole_rad_s: Interval
-    """Half of peak to peak of the downhole speed, in the same windows as ``index``."""
+    """Half of the peak-to-peak downhole speed, median of the same windows as ``index``."""
     torque_nm: Interval
-    """Half of peak to peak of the string's torque, over J."""
+    """Half of the peak-to-peak string torque, median of the same windows as ``index``. The interval is over J."""
     window_s: float
+    """Length of a window: one period of the string's lowest mode."""
     reflection: ReflectionCheck | None
     reflection_refused: str
     course: SeverityCourse
@@ -180,7 +186,7 @@ class Severity:
 
 @dataclass(frozen=True)
 class _GaplessPart:
-    """One stretch without gaps on the common grid: speed, its derivative, and torque without the reports' lags."""
+    """Part of the record without gaps on the common grid: speed, its derivative and torque, corrected for lags."""
 
     time_s: Array
     speed: Array
@@ -190,7 +196,7 @@ class _GaplessPart:
 
 @dataclass(frozen=True)
 class _Windows:
-    """Per sample of all stretches: what the window around it holds. ``used``: turning, and known."""
+    """Figures of the window around each sample. ``used``: the string turns, and its downhole speed is known."""
 
     bit: Array
     swing: Array
@@ -204,9 +210,9 @@ def severity(
     record: SurfaceRecord, string: DrillString, inertia: Interval,
     expected: tuple[TopDrive, SpeedController] | None = None,
 ) -> Severity:
-    """Return what the record says of the string's torsional motion. Raises SeverityRefused where it says nothing.
+    """Return the severity of the torsional oscillation. Raises SeverityRefused if the record is not sufficient.
 
-    ``expected``: top drive and controller that should be in place, for the check of the reflection.
+    ``expected``: top drive and controller that should be active, for the check of the reflection.
     """
     period = 1.0 / string_modes_hz(string)[0]
     stretches = _stretches(record, period)
@@ -240,7 +246,7 @@ def severity(
     cycles = np.concatenate([_cycles(one, windows, bool(stuck.any()), period)
                              for one, windows in zip(stretches, found, strict=True)])
     period_found = _period(cycles)
-    # where nothing repeats, the band is that of the string's lowest mode
+    # without a regular oscillation, the band is that of the string's lowest mode
     band_s = period if period_found is None else period_found.value
     check, refused = _reflection(stretches, string, inertia, band_s, step, expected)
     return Severity(
@@ -288,7 +294,7 @@ def _stretches(record: SurfaceRecord, period_s: float) -> list[_GaplessPart]:
 
 
 def _on_grid(time: Array, signal: Array, grid: Array, step: float, usual: float) -> Array:
-    """Means over a step where the record is faster than the grid, else interpolated."""
+    """Return the signal on the grid: means over each step if the record is faster than the grid, else interpolated."""
     if usual > 0.6 * step:
         return np.asarray(np.interp(grid, time, signal))
     cells = np.rint((time - grid[0]) / step).astype(np.int64)
@@ -300,11 +306,11 @@ def _on_grid(time: Array, signal: Array, grid: Array, step: float, usual: float)
 
 
 def _without_lag(signal: Array, step: float, lag_s: float, highest_hz: float, pad: int) -> tuple[Array, Array]:
-    """Return the signal before a first-order lag, below the highest frequency, and its derivative."""
+    """Return the signal corrected for a first-order lag, and its derivative, both below ``highest_hz``."""
     from scipy.fft import irfft, next_fast_len, rfft
 
     pad = min(pad, len(signal) - 1)
-    # point reflection at both ends: neither value nor slope jumps there
+    # point reflection at both ends, so that value and slope are continuous there
     whole = np.concatenate([2.0 * signal[0] - signal[pad:0:-1], signal, 2.0 * signal[-1] - signal[-2:-pad - 2:-1]])
     rise = np.linspace(whole[0], whole[-1], len(whole))
     size = next_fast_len(len(whole), real=True)
@@ -321,7 +327,7 @@ def _without_lag(signal: Array, step: float, lag_s: float, highest_hz: float, pa
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Downhole.
+# Downhole speed.
 
 
 def downhole_speed(speed: Array, torque: Array, step_s: float, string: DrillString) -> Array:
@@ -362,7 +368,7 @@ def _windows(stretch: _GaplessPart, string: DrillString, inertia: float, period_
 
 
 def _ends_of(string: DrillString) -> list[tuple[DrillString, DrillString]]:
-    """Both ends of each tolerance of the string that the downhole speed depends on."""
+    """Return the string at both ends of each tolerance on which the downhole speed depends."""
     tolerance = string.tolerance
 
     def lines(length: float = 1.0, shear: float = 1.0, polar: float = 1.0) -> DrillString:
@@ -381,7 +387,7 @@ def _ends_of(string: DrillString) -> list[tuple[DrillString, DrillString]]:
 
 
 def _cycles(stretch: _GaplessPart, windows: _Windows, in_stick_slip: bool, period_s: float) -> Array:
-    """Return the lengths, s, of the cycles of the downhole speed: from one rise through the mean to the next."""
+    """Return the lengths, s, of the cycles of the downhole speed, from one rising crossing of the mean to the next."""
     from scipy.ndimage import uniform_filter1d
 
     step = float(stretch.time_s[1] - stretch.time_s[0])
@@ -405,7 +411,7 @@ def _cycles(stretch: _GaplessPart, windows: _Windows, in_stick_slip: bool, perio
 
 
 def _period(cycles: Array) -> Interval | None:
-    """Mean of the cycles with its 95 % interval; None where they are no one oscillation."""
+    """Return the mean length of the cycles with its 95 % interval, or None if the cycles are not one oscillation."""
     if len(cycles) < LEAST_CYCLES:
         return None
     middle = float(np.median(cycles))
@@ -429,7 +435,7 @@ def _episodes(time_s: Array, index: Array, stuck: Flags, step: float) -> tuple[S
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The top's reflection.
+# Reflection at the top.
 
 
 def _reflection(
@@ -466,7 +472,7 @@ def _reflection(
 
 
 def _segments(stretch: _GaplessPart, zeta: float, inertia: float, hertz: float, step: float) -> NDArray[np.complex128]:
-    """(segments, 3): cross spectrum of the waves down and up, and the spectrum of each, summed over the band."""
+    """Return (segments, 3), summed over the band: cross spectrum of the waves down and up, and both spectra."""
     size = round(SEGMENT_PERIODS / hertz / step)
     if len(stretch.speed) < size:
         return np.empty((0, 3), dtype=np.complex128)
@@ -488,7 +494,7 @@ def _segments(stretch: _GaplessPart, zeta: float, inertia: float, hertz: float, 
 
 
 def _course(stretches: Sequence[_GaplessPart], found: Sequence[_Windows], inertia: float) -> SeverityCourse:
-    """All stretches in one, a NaN between two."""
+    """Return the signals of all gapless parts, joined with a NaN between two parts."""
     def joined(rows: Sequence[Array]) -> Array:
         return np.concatenate([part for row in rows for part in (row, np.full(1, np.nan))])[:-1]
 

@@ -1,4 +1,4 @@
-"""The margins of one controller on every truth of a case."""
+"""Margins of one controller on every truth of a case."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tdhil.soft_torque.tune_case import (
 
 
 class TruthMargins:
-    """The truths of one case, with each string's response worked out once."""
+    """Truths of one case. The frequency response of each string is computed once and kept."""
 
     def __init__(self, case: TuneCase) -> None:
         self.truths = case.truths()
@@ -35,10 +35,10 @@ class TruthMargins:
         return loop_margins(truth.drive, law, truth.string, known)
 
     def every(self, law: SpeedController | None) -> LoopMargins:
-        """The least over all truths; ``law`` None: each truth's present gains."""
+        """Return the least of each margin over all truths. ``law`` None: each truth's present gains are used."""
         return least_of([self.margins(k, law or truth.present or SpeedController(0.0, 0.0))
                          for k, truth in enumerate(self.truths)])
 
     def keeps(self, law: SpeedController, required: RequiredMargins) -> bool:
-        """Return whether no truth has a margin that is thinner."""
+        """Return whether the controller has the required margins on every truth."""
         return not any(required.failed(self.margins(k, law)) for k in range(len(self.truths)))

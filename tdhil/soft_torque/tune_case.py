@@ -1,4 +1,4 @@
-"""Data of `tune`: the case, the rows, the advice."""
+"""Data of `tune`: the case, the controllers (rows), the advice."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from tdhil.soft_torque.stability import (
 from tdhil.soft_torque.uncertainty import DrawnValues, Interval, Truth, draw_truths
 
 TUNING_REFUSED = 11
-"""Exit code: the gains that were asked for would be unstable, or leave less margin than is required."""
+"""Exit code: the requested gains would be unstable, or would leave less than the required margins."""
 STEPS = 9
-"""Values of J, from end to end of its interval, at which what follows from it is worked out; odd."""
+"""Number of values of J, from end to end of its interval, at which figures are computed; odd."""
 DRAWS = 20
-"""Truths that a row's figures are taken over."""
+"""Number of truths from which the figures of a row are computed."""
 
 
 class TuningRefused(TdhilError):
-    """The gains that were asked for can't be recommended for this machine, and the message says why."""
+    """Refusal: the requested gains cannot be recommended for this machine. The message gives the reason."""
 
     entry = MessageCode.TUNING_REFUSED
 
@@ -43,7 +43,7 @@ class TuningRefused(TdhilError):
 
 @dataclass(frozen=True)
 class Moved:
-    """All as believed, but for one thing that is at an end of its 95 % interval; None: as believed."""
+    """Nominal values, except one parameter at an end of its 95 % interval. None: the parameter is nominal."""
 
     inner_lags_s: tuple[float, ...] | None = None
     present: SpeedController | None = None
@@ -52,56 +52,58 @@ class Moved:
 
 @dataclass(frozen=True)
 class TuneCase:
-    """String, drive, and all else that tuning needs, at the main shaft."""
+    """String, drive, and all other data for tuning, at the main shaft."""
 
     string: DrillString
     drive: TopDrive
-    """With the J that is believed."""
+    """Top drive with the estimated J."""
     inertia_kg_m2: Interval
     phase_margin_deg: float = 60.0
-    """Of the stiff controller."""
+    """Phase margin of the stiff controller."""
     softness: float | None = None
-    """a, where it is asked for; None: the one with the lowest critical speed."""
+    """Requested softness a. None: the one with the lowest critical speed is searched."""
     compensated_share: float | None = None
-    """Share of J, where it is asked for; None: the one with the lowest critical speed."""
+    """Requested compensated share of J. None: the one with the lowest critical speed is searched."""
     present: SpeedController | None = None
-    """The gains in the drive now, measured (`identify --impedance`) or typed; shown beside the others."""
+    """Present gains of the drive, measured (`identify --impedance`) or typed in. They are shown beside the others."""
     also: tuple[tuple[Moved, Moved], ...] = ()
-    """What else is known to an interval only, each independent of the others: both ends of each."""
+    """Other parameters that are known with an interval, both ends of each. They are independent of each other."""
     required: RequiredMargins = USUAL_MARGINS
-    """On every sampled truth."""
+    """Margins that are required on every sampled truth."""
     lag_tolerance: float = 0.1
-    """Relative, of each lag, where ``also`` has no lags."""
+    """Relative tolerance of each lag, if ``also`` contains no lags."""
     string_draws: tuple[DrillString, ...] = ()
-    """Strings drawn from the covariance of an identification; (): drawn from the string's own tolerances."""
+    """Strings drawn from the covariance of an identification; (): they are drawn from the string's own tolerances."""
     draws: int = DRAWS
+    """Number of truths."""
     seed: int = 1
+    """Seed of the draws."""
 
     def moved(self, by: Moved) -> TuneCase:
-        """The case with that one thing moved."""
+        """Return the case with one parameter moved to an end of its interval."""
         lags = self.drive.inner_lags_s if by.inner_lags_s is None else by.inner_lags_s
         return replace(self, string=by.string or self.string, present=by.present or self.present,
                        drive=replace(self.drive, inner_lags_s=lags))
 
     def moves(self, *, present: bool) -> tuple[tuple[TuneCase, TuneCase], ...]:
-        """Both ends of all that matters to a controller: to the ``present`` one its own gains, too."""
+        """Return both ends of every other parameter. ``present``: the interval of the present gains is included."""
         return tuple((self.moved(low), self.moved(high)) for low, high in self.also
                      if present or low.present is None)
 
     @property
     def at_inertias(self) -> tuple[TopDrive, ...]:
-        """The drive at `STEPS` values of J from end to end of its interval, the believed one in the middle."""
+        """The drive at `STEPS` values of J from end to end of its interval, with the estimated J in the middle."""
         return tuple(self.drive.with_inertia(one) for one in self.inertias(STEPS))
 
     def inertias(self, steps: int) -> tuple[float, ...]:
-        """Return so many values of J (odd) from end to end of its interval, with the believed one in the middle."""
+        """Return ``steps`` (odd) values of J from end to end of its interval, with the estimated J in the middle."""
         low, value, high = self.inertia_kg_m2.low, self.inertia_kg_m2.value, self.inertia_kg_m2.high
         half = steps // 2
         below = [low + (value - low) * k / half for k in range(half)]
         return (*below, *(value + (high - value) * k / half for k in range(half + 1)))
 
     def truths(self) -> tuple[Truth, ...]:
-        """Draw `draws` truths from all that is open."""
+        """Draw `draws` truths from the intervals and tolerances of all parameters."""
         lags, gains_open = [], []
         for low, high in self.also:
             if low.inner_lags_s is not None and high.inner_lags_s is not None:
@@ -120,88 +122,91 @@ class TuneCase:
 
 @dataclass(frozen=True)
 class WrongInertia:
-    """The same recipe with a J that is wrong: ``error`` 0.126 is 12.6 % too large."""
+    """Effect of a wrong J on a recipe: the gains are computed from J (1 + ``error``). 0.126 is 12.6 % too large."""
 
     error: float
     stable: bool
     damping: float | None
-    """The least of the lowest modes'; None: not stable."""
+    """Least damping ratio of the string's lowest modes. None: not stable."""
     cure_rpm: float | None
+    """Cure speed without bit noise, rpm. None: not stable, not simulated, or above the highest that was tried."""
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """One controller, with all that follows from it. Refused: ``controller`` is None and ``refusal`` says why."""
+    """One controller with its figures. If it is refused, ``controller`` is None and ``refusal`` gives the reason."""
 
     kind: str
     controller: SpeedController | None
     refusal: str = ""
     softness: float | None = None
     frequency_factor: float = 1.0
-    """φ: I = (φω)² (J − J_c)."""
+    """Frequency factor φ: I = (φω)² (J − J_c)."""
     softest: float | None = None
-    """The a at which the lags make Z negative at low frequencies."""
+    """Softness a above which the lags make Re Z negative at low frequencies."""
     compensated_share: float = 0.0
     largest_share: float | None = None
-    """That is stable for every J of the interval."""
+    """Largest compensated share that is stable for every J of the interval."""
     integral_nm_rad: Interval | None = None
-    """I as J's interval has it."""
+    """Integral gain I, with its interval from the interval of J."""
     reflection: Interval | None = None
-    """|r| at the lowest mode; this and the next two over J's interval, the string as stated."""
+    """Reflection |r| at the lowest mode, over the interval of J, for the stated string."""
     band_reflection: Interval | None = None
-    """Mean |r| over `BAND_HZ`."""
+    """Mean |r| over `BAND_HZ`, over the interval of J, for the stated string."""
     damping: Interval | None = None
-    """The least of the lowest modes'."""
+    """Least damping ratio of the string's lowest modes, over the interval of J, for the stated string."""
     modes: tuple[NaturalMode, ...] = ()
     margins: Margins | None = None
-    """Of the bare drive."""
+    """Margins of the bare drive, and modulus with the string coupled."""
     with_string: LoopMargins | None = None
-    """All as believed."""
+    """Margins with the string coupled, at nominal values."""
     worst: LoopMargins | None = None
-    """The least of each margin over all sampled truths."""
+    """Least value of each margin over all sampled truths."""
     failed: tuple[str, ...] = ()
-    """Margins that are thinner than required on a sampled truth, with their numbers."""
+    """Margins that are below the required ones on a sampled truth, with their values."""
     quiet_cures: tuple[float | None, ...] = ()
-    """Cure speeds without bit noise, rpm, the string as stated, at values of J from end to end of its interval; None:
-    above the highest that was tried; (): not simulated."""
+    """Cure speeds without bit noise, rpm, for the stated string, at values of J from end to end of its interval. None:
+    above the highest that was tried. (): not simulated."""
     quiet_cures_moved: tuple[tuple[float | None, float | None], ...] = ()
-    """At both ends of each other interval."""
+    """Cure speeds without bit noise, rpm, at both ends of the interval of each other parameter."""
     cure: DrawnValues | None = None
-    """Under bit noise, rpm, over the sampled truths; so are the next two."""
+    """Cure speed under bit noise over the sampled truths, rpm."""
     start: DrawnValues | None = None
+    """Lowest set speed at which the bit turns after a ramp from standstill, under bit noise, rpm; over some truths."""
     linear_limit: DrawnValues | None = None
-    """Mean speed below which steady rotation is unstable."""
+    """Mean speed below which steady rotation is unstable, over the sampled truths, rpm."""
     wrong: tuple[WrongInertia, ...] = ()
+    """Effect of errors of J on this recipe."""
 
     @property
     def quiet_cure_rpm(self) -> float | None:
-        """Without bit noise, all as believed."""
+        """Cure speed without bit noise at nominal values, rpm."""
         return self.quiet_cures[len(self.quiet_cures) // 2] if self.quiet_cures else None
 
     @property
     def lag_reserve_s(self) -> float | None:
-        """Smallest further first-order lag in the loop that destabilises it; None: none does."""
+        """Smallest additional first-order lag that makes the loop unstable, s. None: none does."""
         return None if self.with_string is None or self.with_string.lag_s == inf else self.with_string.lag_s
 
     @property
     def dead_time_reserve_s(self) -> float | None:
-        """Smallest further dead time in the loop that destabilises it; None: none does."""
+        """Smallest additional dead time that makes the loop unstable, s. None: none does."""
         found = self.with_string
         return None if found is None or found.dead_time_s == inf else found.dead_time_s
 
 
 @dataclass(frozen=True)
 class Advice:
-    """Row to type in, or none."""
+    """Recommended row, or the advice to keep the present gains."""
 
     kind: str | None
-    """The row whose gains to type in; None: keep what there is, or nothing can be recommended."""
+    """Row whose gains to type in. None: keep the present gains, or no row can be recommended."""
     compared_with: str
-    """present, or stiff."""
+    """Row with which the others are compared: present, or stiff."""
     keep: bool
-    """Nothing that keeps the margins is better than that."""
+    """True: no row that keeps the margins is better than ``compared_with``."""
     better_share: float | None = None
-    """Share of the sampled truths on which the critical speed isn't higher; None: not simulated."""
+    """Share of the sampled truths on which the critical speed is not higher. None: not simulated."""
 
 
 @dataclass(frozen=True)
@@ -210,13 +215,13 @@ class Tuning:
 
     case: TuneCase
     string_modes_hz: tuple[float, ...]
-    """With the top held."""
+    """Frequencies of the string's lowest modes with the top held."""
     tuned: tuple[Tuned, ...]
     searched: Search | None
-    """How critical speeds were looked for; None: not at all."""
+    """Settings of the search for critical speeds. None: there was no search."""
     advice: Advice
     truths: tuple[Truth, ...] = field(default=(), repr=False)
 
     def by_kind(self, kind: str) -> Tuned | None:
-        """The row of that name."""
+        """Return the row of that kind, or None."""
         return next((one for one in self.tuned if one.kind == kind), None)

@@ -1,9 +1,9 @@
-r"""Figures of one controller: reflection, damping, margins, each with its interval.
+r"""Figures of one controller: reflection, damping and margins. Reflection and damping have an interval.
 
-**How J's error comes in.** The gains are what they are; J is what moves. The figures of one string as it is stated are
-told over the 95 % interval of J alone, with the turning points between its ends. What else was measured (lags, present
-gains, k and ω as identified) is moved to either end of its interval, one after the other, and what each does is added
-in squares.
+**Effect of the error of J.** The gains are fixed, and J varies. The figures of the stated string are computed over the
+95 % interval of J, with the extrema between its ends. Each other measured quantity (lags, present gains, k and ω as
+identified) is moved to either end of its interval, one after the other. Their effects are combined as the root of the
+sum of squares.
 """
 
 from __future__ import annotations
@@ -41,24 +41,25 @@ from tdhil.soft_torque.tune_case import (
 from tdhil.soft_torque.uncertainty import Interval
 
 BAND_HZ = (0.05, 1.5)
-"""Where the mean |r| is taken."""
+"""Frequency band, Hz, over which the mean |r| is taken."""
 WRONG_BY = (0.126, 0.76)
-"""Errors of J whose cost is told: the paper's method on a simulated field rig, and its own spread of slopes."""
+"""Relative errors of J whose effect is shown. The first is that of the acceleration regression (Xu 2026) on a simulated
+field rig. The second is the spread of its slopes."""
 NEXT_MODE_SHARE = 0.85
-"""Of the second mode with the top held, that the whole's second mode stays above: there a top drive is a rotor, or a
-wall."""
+"""Lower bound of the second mode of string and top drive, as a share of the second mode with the top held. At this
+frequency, a top drive acts as a rotor or as a fixed end."""
 GOLDEN_STEPS = 7
-"""Each leaves 0.62 of the range in which a turning point lies: 0.03 of two steps of J."""
+"""Number of golden-section steps. Each keeps 0.62 of the range with the extremum; all leave 0.03 of two steps of J."""
 
 
 def string_modes_hz(string: DrillString) -> tuple[float, ...]:
-    """The lowest three modes with the top held, Hz."""
+    """Return the frequencies of the lowest three modes with the top held, Hz."""
     modes = ClosedSystem(string).modes(3.2 / string.echo_s)
     return tuple(mode.frequency_hz for mode in modes[:3])
 
 
 def lowest_modes_below_hz(held_hz: Sequence[float]) -> float:
-    """Return the frequency below which a mode is the string's lowest one; that of rotor and P is above."""
+    """Return the frequency, Hz, below which a mode belongs to the string's lowest one. Other modes are above it."""
     second = held_hz[1] if len(held_hz) > 1 else 4.0 * held_hz[0]
     return max(sqrt(held_hz[0] * second), NEXT_MODE_SHARE * second)
 
@@ -66,17 +67,17 @@ def lowest_modes_below_hz(held_hz: Sequence[float]) -> float:
 def lowest_modes(
     case: TuneCase, drive: TopDrive, law: SpeedController, held_hz: Sequence[float]
 ) -> tuple[NaturalMode, ...]:
-    """Those that the string's lowest mode has become."""
+    """Return the modes of string and top drive that belong to the string's lowest mode."""
     return ClosedSystem(case.string, drive, law).modes(lowest_modes_below_hz(held_hz))
 
 
 def least_damping(case: TuneCase, drive: TopDrive, law: SpeedController, held_hz: Sequence[float]) -> float:
-    """Return the least damping of `lowest_modes`; 1 where none swings."""
+    """Return the least damping ratio of `lowest_modes`. 1: none of them oscillates."""
     return min((mode.damping for mode in lowest_modes(case, drive, law, held_hz)), default=1.0)
 
 
 def reflections(case: TuneCase, drive: TopDrive, law: SpeedController, mode_hz: float) -> tuple[float, float]:
-    """(|r| at the lowest mode, its mean over the band)."""
+    """Return (|r| at the lowest mode, mean |r| over `BAND_HZ`)."""
     band = np.linspace(*BAND_HZ, 120)
     at = reflection_at(drive, law, case.string, np.append(band, mode_hz))
     return float(at[-1]), float(np.mean(at[:-1]))
@@ -85,13 +86,13 @@ def reflections(case: TuneCase, drive: TopDrive, law: SpeedController, mode_hz: 
 def figures_at(
     case: TuneCase, drive: TopDrive, law: SpeedController, held_hz: Sequence[float]
 ) -> tuple[float, float, float]:
-    """(|r| at the lowest mode, mean |r|, least damping), at one J."""
+    """Return (|r| at the lowest mode, mean |r| over `BAND_HZ`, least damping ratio) for one drive."""
     one, mean = reflections(case, drive, law, held_hz[0])
     return one, mean, least_damping(case, drive, law, held_hz)
 
 
 def with_figures(case: TuneCase, tuned: Tuned, held: Sequence[float], samples: TruthMargins) -> Tuned:
-    """Return the row with its figures; its gains are known."""
+    """Return the row with its figures. The row must have gains."""
     law = tuned.controller
     assert law is not None
     along = np.array([figures_at(case, drive, law, held) for drive in case.at_inertias])
@@ -112,7 +113,7 @@ def with_figures(case: TuneCase, tuned: Tuned, held: Sequence[float], samples: T
         square = (omega * held[0]) ** 2 * share
         integral = in_squares(Interval(law.integral_nm_rad, square * inertia.low, square * inertia.high), of)
     system = ClosedSystem(case.string, case.drive, law)
-    errors = WRONG_BY if not present else ()       # those gains hang on no J that is believed now
+    errors = WRONG_BY if not present else ()       # the present gains do not depend on the estimated J
     wrong = tuple(_wrong(case, tuned, error, held) for error in errors)
     worst = samples.every(None if present else law)
     damping = _turning_points(along[:, 2], case, lambda drive: least_damping(case, drive, law, held))
@@ -128,9 +129,9 @@ def with_figures(case: TuneCase, tuned: Tuned, held: Sequence[float], samples: T
 
 
 def _turning_points(along: NDArray[np.float64], case: TuneCase, value_at: Callable[[TopDrive], float]) -> Interval:
-    """Return the span of a figure over J with its turning points, also kinks where the least of two changes sides.
+    """Return the range of a figure over J with its extrema, including kinks at which the least of two values changes.
 
-    Golden sections between the neighbours of the largest and of the smallest value.
+    The method is a golden-section search between the neighbours of the largest and of the smallest value.
     """
     inertias = case.inertias(len(along))
     ends = [float(along.min()), float(along.max())]
@@ -149,7 +150,7 @@ def _turning_points(along: NDArray[np.float64], case: TuneCase, value_at: Callab
 
 
 def _spanned(along: NDArray[np.float64]) -> Interval:
-    """Return the span of these values and the turning points between them, by a parabola through the nearest three."""
+    """Return the range of these values with the extrema between them, from a parabola through three neighbours."""
     low, high = float(along.min()), float(along.max())
     for k in range(1, len(along) - 1):
         before, here, after = (float(one) for one in along[k - 1 : k + 2])
@@ -164,11 +165,12 @@ def in_squares(
     by_inertia: Interval, moved: Sequence[Sequence[float]] | NDArray[np.float64], least: float = 0.0, most: float = inf,
     ends: tuple[float, float] | None = None,
 ) -> Interval:
-    """An interval over J, widened by what each other move makes of the value at either of its ends.
+    """Return the interval over J, widened by the effect of each other parameter as the root of the sum of squares.
 
-    ``ends``: the values at J's own. Where the least of two dampings has its greatest value every single move lowers
-    it, and two together may raise it: by no more than the mean of both slopes does, which is half of the difference
-    between the ends.
+    ``moved``: values with each other parameter at both ends of its interval. ``least``, ``most``: limits of the result.
+    ``ends``: values at both ends of J's interval. They are needed for the least of two dampings: at its maximum, every
+    single move lowers it, but two moves together may raise it. The rise is at most that of the mean slope, which is
+    half of the difference between the ends.
     """
     if not len(moved):
         return by_inertia
@@ -185,7 +187,10 @@ def in_squares(
 
 
 def recipe_with(case: TuneCase, tuned: Tuned, believed_kg_m2: float, held_hz: Sequence[float]) -> SpeedController:
-    """The same kind of controller for another J: the stiff one's margin, or a and the compensated share, as before."""
+    """Return the controller of the same recipe for another J.
+
+    The stiff controller keeps its phase margin. The others keep a, φ and the compensated share.
+    """
     if tuned.kind == "stiff":
         return stiff_controller(case.drive.with_inertia(believed_kg_m2), case.phase_margin_deg)
     assert tuned.softness is not None

@@ -1,13 +1,14 @@
-"""Gains that can be typed in: the lowest critical speed that the margins allow.
+"""Tuning of the gains: the lowest critical speed that the margins allow.
 
-**Objective.** The lowest set speed without stick-slip, *cure under bit noise*, as the mean over truths that are drawn
-jointly (`uncertainty`): J, string, lags and bit at once. **Subject to** a phase margin, a gain margin and a dead-time
-reserve (`stability`) on every one of these truths. **Free** are softness a, frequency factor φ and the share of J that
-is compensated: P = ζ/a, I = (φω)² (J − J_c). A grid is ranked without a simulation (`candidates`); the best that keep
-the margins are simulated under noise, and the best of those is taken. Without a bit the rank decides.
+**Objective.** The lowest set speed without stick-slip (*cure under bit noise*), as the mean over truths. The truths are
+drawn jointly (`uncertainty`): J, string, lags and bit at once. **Constraints.** A phase margin, a gain margin and a
+dead-time reserve (`stability`) on each of these truths. **Free parameters.** Softness a, frequency factor φ and the
+compensated share of J: P = ζ/a, I = (φω)² (J − J_c). A grid is ranked without a simulation (`candidates`). The best
+candidates that keep the margins are simulated under noise, and the best of these is taken. Without a bit, the rank
+decides.
 
-**Advice.** The best row is compared with the present gains (without them: with the stiff ones), truth by truth. Where
-it isn't better by more than the search resolves, the advice is to keep what there is.
+**Advice.** The best row is compared with the present gains (without them: with the stiff ones), truth by truth. If it
+is not better by more than the search resolves, the advice is to keep the present gains.
 """
 
 from __future__ import annotations
@@ -53,19 +54,21 @@ from tdhil.soft_torque.tuned_figures import (
 from tdhil.soft_torque.uncertainty import DrawnValues, Truth
 
 START_DRAWS = 6
-"""Truths on which the ramp from rest is simulated: it takes longer than the critical speed, and decides nothing."""
+"""Number of truths on which the ramp from standstill is simulated. It takes longer than the search for the cure speed,
+and no decision depends on it."""
 CRITICAL_STEPS = 5
-"""Values of J at which critical speeds of the stated string are simulated."""
+"""Number of values of J at which critical speeds of the stated string are simulated."""
 NOT_BETTER_SHARE = 2.0 * NOISY_RESOLUTION
-"""A critical speed that is lower by less is no reason to change anything."""
+"""Least relative reduction of the critical speed for which new gains are recommended."""
 
 
 def tune(
     case: TuneCase, search: Search | None = Search(), told: Callable[[str], None] = lambda text: None  # noqa: B008
 ) -> Tuning:
-    """Present, stiff, soft, compensated, broadband. `TuningRefused` where what was asked for explicitly can't be.
+    """Tune all controllers: present, stiff, soft, compensated, broadband.
 
-    ``search`` None leaves the simulated critical speeds out; ``told`` hears what is being done.
+    ``search`` None leaves the simulated critical speeds out. ``told`` receives progress texts. Raises `TuningRefused`
+    if a requested softness or compensated share is not possible.
     """
     told("string's modes")
     held = string_modes_hz(case.string)
@@ -98,7 +101,7 @@ def tune(
 def best_by_simulation(
     pools: list[list[Tuned]], samples: TruthMargins, held: Sequence[float]
 ) -> list[list[Tuned]]:
-    """Each pool, the lowest cure speed under noise first, as the mean over the first truths."""
+    """Return each pool, sorted by the cure speed under noise (mean over the first truths), lowest first."""
     every = [one for pool in pools for one in pool if one.controller is not None]
     if len(every) < 2:
         return pools
@@ -112,7 +115,7 @@ def _noisy(
     truths: Sequence[Truth], laws: Sequence[SpeedController | None], held: Sequence[float],
     how: Literal["stuck", "rest"],
 ) -> NDArray[np.float64]:
-    """Critical speeds, rpm, under bit noise: (laws, truths); a law that is None is each truth's present one."""
+    """Return critical speeds under bit noise, rpm, as (laws, truths). None as a law: each truth's present gains."""
     loops = [(truth, law or truth.present) for law in laws for truth in truths]
     found = lowest_turning_with_noise(
         [truth.string for truth, _ in loops],
@@ -124,7 +127,7 @@ def _noisy(
 def noisy_cures(
     truths: Sequence[Truth], laws: Sequence[SpeedController | None], held: Sequence[float]
 ) -> list[DrawnValues]:
-    """Return the critical speed under bit noise, rpm, of every law over the truths; None: each truth's present one."""
+    """Return the critical speed under bit noise, rpm, of every law. None as a law: each truth's present gains."""
     return [DrawnValues(tuple(map(float, row)), LOWEST_NOISY_RPM) for row in _noisy(truths, laws, held, "stuck")]
 
 
@@ -147,7 +150,7 @@ def _under_noise(
 
 
 def _advice(case: TuneCase, found: Sequence[Tuned]) -> Advice:
-    """The best row that keeps every margin, if it is better than what there is."""
+    """Return the advice: the best row that keeps every margin, if it is better than the first row."""
     base = found[0]
     offered = [one for one in found[1:] if one.controller is not None and not one.failed and one.kind != "stiff"]
     if base.kind == "stiff":
@@ -166,7 +169,7 @@ def _advice(case: TuneCase, found: Sequence[Tuned]) -> Advice:
 
     offered.sort(key=mean)
     best = offered[0]
-    # what any drive can take goes first, if it is as good
+    # the soft controller, which every drive can run, is preferred if it is as good
     soft = next((one for one in offered if one.kind == "soft"), None)
     if soft is not None and mean(soft) < mean(best) + NOT_BETTER_SHARE:
         best = soft
@@ -184,7 +187,7 @@ def _advice(case: TuneCase, found: Sequence[Tuned]) -> Advice:
 def _without_noise(
     case: TuneCase, every: tuple[Tuned, ...], held: Sequence[float], search: Search, told: Callable[[str], None]
 ) -> tuple[Tuned, ...]:
-    """Cure speeds of the string as stated: over J and each other interval, and for a wrong J."""
+    """Return the rows with cure speeds of the stated string: over J and each other interval, and for a wrong J."""
     told("critical speeds without noise, and what a wrong J costs")
     inertia = case.inertia_kg_m2
     loops: list[tuple[DrillString, TopDrive, SpeedController]] = []
@@ -216,7 +219,7 @@ def _without_noise(
 def _quiet_cures(
     loops: Sequence[tuple[DrillString, TopDrive, SpeedController]], search: Search
 ) -> list[float | None]:
-    """Return them in the order of ``loops``; those on one string are simulated at once."""
+    """Return cure speeds without noise, rpm, in the order of ``loops``. Loops on one string are simulated together."""
     found: dict[int, float | None] = {}
     for string in dict.fromkeys(string for string, _, _ in loops):
         at = [k for k, (one, _, _) in enumerate(loops) if one == string]

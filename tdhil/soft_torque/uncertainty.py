@@ -1,11 +1,11 @@
-r"""Joint draws of all that is not known exactly: rotor, lags, present gains, string and bit.
+r"""Joint draws of all uncertain parameters: rotor, lags, present gains, string and bit.
 
-The true machine is one of many that the data allow. Each draw, a `Truth`, is one of them: J from its interval, every
-lag, every property of the string and of the bit within its tolerance, all at once. What a controller does is worked
-out on each; a figure's interval is what the draws spread over.
+The data allow many machines, and the true machine is one of them. Each draw is one of them, a `Truth`: J from its
+interval, and every lag and every property of string and bit within its tolerance, all at once. The figures of a
+controller are computed on each truth. The spread over the truths gives the interval of a figure.
 
-Draws are a Latin hypercube: each property takes values from every part of its range once (McKay, Beckman and Conover
-1979), so that some twenty draws represent the whole. From n draws the interval of a further one is
+The draws form a Latin hypercube: each property takes one value from every part of its range (McKay, Beckman and Conover
+1979), so about twenty draws represent the whole range. From n draws, the interval of one further draw is
 mean ± t s √(1 + 1/n) of the logarithm, with Student's t for n − 1 degrees of freedom (prediction interval,
 ISO 16269-8).
 """
@@ -23,14 +23,14 @@ from tdhil.soft_torque.controller import SpeedController, TopDrive
 from tdhil.soft_torque.drill_string import BitFriction, DrillString
 
 COVERAGE_K = 1.959964
-"""Standard deviations from the middle of a normal 95 % interval to either end."""
+"""Half-width of a normal 95 % interval in standard deviations (coverage factor)."""
 COLUMNS_OF_STRING = 8
-"""Properties of string and bit that are drawn; before them J, after them lags and gains."""
+"""Number of drawn properties of string and bit. Their columns follow that of J and precede those of lags and gains."""
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A number with the ends of its 95 % interval."""
+    """Value with the ends of its 95 % interval."""
 
     value: float
     low: float
@@ -45,27 +45,27 @@ class Truth:
     drive: TopDrive
     present: SpeedController | None
     seed: int
-    """Of the bit noise that it is simulated with."""
+    """Seed of the bit noise in its simulation."""
 
 
 @dataclass(frozen=True)
 class DrawnValues:
-    """One number over all draws; a draw at which it wasn't found below the highest tried is infinite."""
+    """Values of one quantity over all draws. A value above the highest that was tried is infinite."""
 
     values: tuple[float, ...]
     lowest_tried: float = 0.0
-    """A value at or below it is only known to be no higher."""
+    """Lowest value that was tried. A value at or below it is an upper bound only."""
 
     @property
     def median(self) -> float | None:
-        """Median of the draws; None: not found."""
+        """Median of the draws. None: the median is above the highest value that was tried."""
         middle = float(np.median(self.values))
         return middle if middle < inf else None
 
     def interval(self, resolution: float = 0.0) -> tuple[float, float | None]:
-        """Return the 95 % prediction interval of one further draw, widened by half of a search's resolution.
+        """Return the 95 % prediction interval of one further draw, widened by half of the search's resolution.
 
-        The high end is None where a draw wasn't found. Values are positive or 0.
+        The high end is None if any draw is infinite. Values are positive or 0.
         """
         found = np.array([one for one in self.values if one < inf])
         if not found.size:
@@ -83,7 +83,7 @@ class DrawnValues:
 
 
 def student_factor(dof: int) -> float:
-    """Return Student's t of a 95 % interval. scipy.stats gives the same bits, and takes a second to load."""
+    """Return Student's t of a 95 % interval. scipy.stats gives the identical value, but takes a second to load."""
     from scipy.special import stdtrit
 
     return float(stdtrit(dof, 0.975))
@@ -99,9 +99,10 @@ def draw_truths(
 ) -> tuple[Truth, ...]:
     """Draw ``count`` truths.
 
-    ``lag_tolerance``: relative, ± of each lag, where ``lag_axes`` (half of the 95 % range along each main axis, s) are
-    not known. ``present_axes``: half ranges of (P, I). ``string_draws``: strings that were drawn elsewhere, from the
-    covariance of an identification; else each is drawn from ``string``'s own tolerances.
+    ``lag_axes``: half of the 95 % range of the lags along each main axis, s. ``lag_tolerance``: relative tolerance ± of
+    each lag, used without ``lag_axes``. ``present_axes``: half-ranges of (P, I). ``string_draws``: strings that were
+    drawn before, from the covariance of an identification. Without them, each string is drawn from the tolerances of
+    ``string``.
     """
     lags = drive.inner_lags_s
     free = len(lag_axes) if lag_axes else len(lags)
@@ -133,7 +134,7 @@ def draw_truths(
 
 
 def string_at(string: DrillString, shares: NDArray[np.float64]) -> DrillString:
-    """Return the string at these shares (0 to 1) of its tolerances' ranges: `COLUMNS_OF_STRING` of them."""
+    """Return the string at the given positions (0 to 1) in the ranges of its `COLUMNS_OF_STRING` tolerances."""
     tolerance = string.tolerance
 
     def within(low: float, high: float, share: float) -> float:

@@ -1,26 +1,28 @@
-r"""A drill string that isn't there, on a top drive that is: string, bit and controller in a host, cycle by cycle. Pure.
+r"""Virtual drill string on a real top drive: the host simulates string, bit and controller, cycle by cycle.
+
+This module only computes; it has no bus and no clock.
 
 ::
 
     reported speed ──► observer ──► ω when the next torque acts ──┬──► controller ──► T ──┐
                                                                   └──► string, bit ──► τ ─┴─► T − τ ──► drive
 
-Everything here is at the main shaft of the machine that is meant (its J, B and F_c), at its speeds and in its time. The
-rig that turns may be another one: its torque is ``κ (T − τ)`` with κ = J_rig i/J, i = ω_motor/ω_main, so that the same
-speeds come at the same times, plus what its own friction takes more than the meant one's. Where the rig is the machine
-itself κ = 1/i, and nothing is added.
+All quantities are at the main shaft of the intended machine (with its J, B and F_c), at its speeds and in its time. The
+rig may be another machine. Its torque is ``κ (T − τ)`` with κ = J_rig i/J and i = ω_motor/ω_main, so the rig has the
+same speeds at the same times. The difference between the rig's friction and the intended machine's is added. If the
+rig is the intended machine, κ = 1/i, and nothing is added.
 
-**Observer.** The reported speed is old by the lag τ_w that `identify` found. With y the report, d a torque that nobody
-knows of, and F the rig's known friction,
+**Observer.** The reported speed lags by the time constant τ_w that `identify` found. y is the reported speed, d an
+unknown torque, and F the known friction of the rig. The model is
 
     J dω/dt = T − F(ω) + d        τ_w dy/dt = ω − y        dd/dt = 0
 
-is followed by the report through three equal poles (`RotorObserver`), exactly sampled; then ω is carried on by the
-torque that is under way to the moment at which the next one acts. d is used for that and is never compensated: what
-the real rotor does otherwise than the believed one, it also does to the virtual string.
+The reports correct this model with three equal poles (`RotorObserver`), in exact discrete time. Then ω is predicted,
+with the torque that acts now, for the moment at which the next torque acts. d is used for this prediction only and is
+never compensated. A difference between the real rotor and its model therefore acts on the virtual string, too.
 
-**Energy.** String and bit take ∫ τ ω dt by their own speed, and ∫ τ y dt by the speed that is reported; what the first
-is ahead of the second was put into the shaft by the loop's own errors.
+**Energy.** String and bit take the energy ∫ τ ω dt at the observed speed, and ∫ τ y dt at the reported speed. The
+difference is the energy that the loop's own errors put into the shaft.
 """
 
 from __future__ import annotations
@@ -37,9 +39,9 @@ from tdhil.soft_torque.simulation import LONGEST_TICK_S, RPM, SLIDING_BLUR_RAD_S
 
 
 class VirtualString:
-    """String and bit below a top whose speed is measured; armed to begin with.
+    """Simulation of string and bit below a top with a given speed. The initial state is that of `arm`.
 
-    Raises ValueError where the string has no bit.
+    Raises ValueError if the string has no bit.
     """
 
     def __init__(self, string: DrillString, longest_tick_s: float = LONGEST_TICK_S) -> None:
@@ -50,31 +52,31 @@ class VirtualString:
         self.arm()
 
     def arm(self) -> None:
-        """Put the string at rest, twisted to the point at which the bit is about to break away."""
+        """Set the string to standstill, twisted so far that the bit is about to break away."""
         self._pipe = PipeSimulation((self._string,), (self._grid,))
         self._pipe.wind_up(np.array([self._static_nm]))
         self._into_tick_s = self._travel_rad = self._top_rad_s = 0.0
 
     @property
     def bit_rad_s(self) -> float:
-        """Speed of the bit; 0 while it sticks."""
+        """Speed of the bit, rad/s; 0 while it sticks."""
         return float(self._pipe.bit_rad_s[0])
 
     @property
     def torque_nm(self) -> float:
-        """τ that the string takes from the top, now."""
+        """Torque τ that the string takes from the top now, N·m."""
         return float(self._pipe.top_torque(np.array([self._top_rad_s]))[0])
 
     def begin(self, top_rad_s: float) -> None:
-        """Turn the top at this speed from now on."""
+        """Set the speed of the top from now on, rad/s."""
         self._top_rad_s = top_rad_s
 
     def release(self) -> None:
-        """The bit comes off bottom: its dry friction is gone."""
+        """Remove the dry friction of the bit, as when it is lifted off bottom."""
         self._pipe.release()
 
     def step(self, top_rad_s: float, dt_s: float) -> float:
-        """Move on while the top's speed goes, evenly, to ``top_rad_s``; τ then."""
+        """Advance by ``dt_s``, while the top's speed changes linearly to ``top_rad_s``. Return τ at the end, N·m."""
         tick_s, impedance = self._grid.tick_s, self._grid.impedance_nm_s_rad[0]
         slope, left_s = (top_rad_s - self._top_rad_s) / dt_s, dt_s
         while left_s > 0.0:
@@ -92,11 +94,14 @@ class VirtualString:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The controller as a host runs it: T = H [P (Ω − ω) + I ∫(Ω − ω) + J_c dω/dt], a cycle at a time.
+# Controller in the host: T = H [P (Ω − ω) + I ∫(Ω − ω) + J_c dω/dt], computed once in each cycle.
 
 
 class HostController:
-    """Lags H are those that are meant to be in the loop; a cycle's own half, in which a torque waits, is taken off."""
+    """Speed controller in the host, with the lags H that the loop shall have.
+
+    Each torque waits for half a cycle on average. The lags are shortened by this time.
+    """
 
     def __init__(self, law: SpeedController, inner_lags_s: tuple[float, ...], period_s: float) -> None:
         lags = sorted(inner_lags_s)
@@ -111,7 +116,7 @@ class HostController:
         self.begin(0.0, 0.0)
 
     def begin(self, speed_rad_s: float, torque_nm: float) -> None:
-        """Steady rotation at the set speed, with that torque."""
+        """Set the state to steady rotation at that speed, rad/s, with that torque, N·m."""
         self._integral_nm = torque_nm
         self._error_rad_s = self._slope_rad_s2 = 0.0
         self._speed_rad_s = speed_rad_s
@@ -119,14 +124,14 @@ class HostController:
             lag.before = lag.after = torque_nm
 
     def shift(self, torque_nm: float) -> None:
-        """Add this torque from now on."""
+        """Add this torque, N·m, to the integral and to the outputs of the lags."""
         self._integral_nm += torque_nm
         for lag in self._lags:
             lag.before += torque_nm
             lag.after += torque_nm
 
     def step(self, set_rad_s: float, speed_rad_s: float) -> float:
-        """The torque of the next cycle; everything goes evenly from cycle to cycle."""
+        """Return the torque of the next cycle, N·m. Signals change linearly from cycle to cycle."""
         law, error = self._law, set_rad_s - speed_rad_s
         self._integral_nm += 0.5 * law.integral_nm_rad * (error + self._error_rad_s) * self._period_s
         slope = (speed_rad_s - self._speed_rad_s) / self._period_s
@@ -139,7 +144,7 @@ class HostController:
 
 
 class _Lag:
-    """1/(1 + τ s) for what goes evenly from cycle to cycle: exact."""
+    """First-order lag 1/(1 + τ s), exact for a signal that changes linearly from cycle to cycle."""
 
     def __init__(self, lag_s: float, period_s: float) -> None:
         self._keeps = exp(-period_s / lag_s)
@@ -156,16 +161,16 @@ class _Lag:
 # ---------------------------------------------------------------------------------------------------------------------
 
 DRIFT_S = 10.0
-"""Over which an unknown torque is taken for one of the drive's own integral, in its own loop."""
+"""Time constant, s, with which the unknown torque is assigned to the integral of the drive's own speed loop."""
 OBSERVER_SHARE = 2.0
-"""The observer's poles lie at this share of 1/τ_w …"""
+"""Poles of the observer, as a multiple of 1/τ_w."""
 SLOWEST_RAD_S, FASTEST_RAD_S = 3.0, 10.0
-"""… within these, and below a quarter of what a cycle can follow."""
+"""Limits of the observer's poles, rad/s. A further limit is a quarter of the cycle's Nyquist frequency."""
 
 
 @dataclass(frozen=True)
 class IdentifiedRig:
-    """The machine that turns, at the motor's shaft, as `identify` found it."""
+    """The rig that turns, as `identify` found it, at the motor shaft."""
 
     inertia_kg_m2: float
     viscous_nm_s_rad: float
@@ -175,7 +180,7 @@ class IdentifiedRig:
 
 
 class RotorObserver:
-    """The rotor's speed now, from torques that were commanded and speeds that were reported late."""
+    """Observer of the rotor's present speed, from the commanded torques and the delayed reported speeds."""
 
     def __init__(self, drive: TopDrive, speed_lag_s: float, period_s: float) -> None:
         from scipy.linalg import expm
@@ -189,7 +194,7 @@ class RotorObserver:
         step = expm(law * period_s)[:3]
         self._period_s = period_s
         self._move, self._push = step[:, :3], step[:, 3]
-        # Ackermann's formula for the errors before a report, of which C A is seen.
+        # Ackermann's formula for the error before a report. Its output matrix is C A.
         seen = np.array([0.0, 1.0, 0.0]) @ self._move
         wanted = np.linalg.matrix_power(self._move - exp(-pole * period_s) * np.eye(3), 3)
         visible = np.stack([seen, seen @ self._move, seen @ self._move @ self._move])
@@ -199,18 +204,18 @@ class RotorObserver:
         self.innovation_rad_s = 0.0
 
     def begin(self, speed_rad_s: float) -> None:
-        """Steady rotation at that speed."""
+        """Set the state to steady rotation at that speed, rad/s."""
         self._state = np.array([speed_rad_s, speed_rad_s, 0.0])
         self.innovation_rad_s = 0.0
 
     @property
     def speed_rad_s(self) -> float:
-        """ω at the last report."""
+        """Estimated speed ω at the last report, rad/s."""
         return float(self._state[0])
 
     @property
     def unknown_nm(self) -> float:
-        """D, the torque that nobody told of."""
+        """Estimated unknown torque d, N·m."""
         return float(self._state[2])
 
     def _carried(self, torque_nm: float) -> Array:
@@ -219,68 +224,74 @@ class RotorObserver:
         return moved
 
     def see(self, torque_nm: float, reported_rad_s: float | None) -> None:
-        """A cycle with that torque has gone by; what was reported at its end, None: nothing."""
+        """Advance by one cycle with that torque, N·m, and correct by the report at its end (None: no report)."""
         self._state = self._carried(torque_nm)
         if reported_rad_s is not None:
             self.innovation_rad_s = reported_rad_s - float(self._state[1])
             self._state = self._state + self._gain * self.innovation_rad_s
 
     def less_unknown(self, torque_nm: float) -> None:
-        """Take this much of the unknown torque as known from now on."""
+        """Subtract this torque, N·m, from the unknown torque, because it is known now."""
         self._state[2] -= torque_nm
 
     def ahead(self, torque_nm: float) -> float:
-        """ω one cycle on, with the torque that is under way."""
+        """Return the predicted speed ω after one more cycle with that torque, rad/s."""
         return float(self._carried(torque_nm)[0])
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What is done with it. The string is wound up to where the bit is about to break away, its torque faded in against as
-# much of the drive's, and let go, the top at full set speed: that is how `tune` tells its *cure*. At a first speed the
-# bit must stick and slip; from there one ramp of the set speed goes up until it turns, which brackets the critical
-# speed. A ramp alone scatters by one stick, 3 rpm, and a stiff loop carries its swing 20 rpm beyond its cure: so trials
-# at steady set speeds follow, each from the bit about to break away, and halve the bracket down to 1 rpm.
+# Program of an evaluation. The string is twisted until the bit is about to break away. Its torque is faded in against
+# the same torque of the drive. Then the string is released with the top at full set speed. `tune` computes its *cure*
+# speed from the same state. At the first set speed the bit must stick and slip. From there, one ramp of the set speed
+# goes up until the bit turns, which brackets the critical speed. The result of a ramp alone scatters by one stick,
+# 3 rpm, and with a stiff loop the oscillation continues up to 20 rpm above the cure speed. Therefore trials at steady
+# set speeds follow. Each begins with the bit about to break away. They halve the bracket down to 1 rpm.
 
 
 class Phase(IntEnum):
-    """Phase of the course."""
+    """Phase of the program."""
 
-    MOVE = 0           # to a set speed, without string
-    ARM = 1            # the wound-up string's torque is faded in
+    MOVE = 0           # the set speed moves, without string
+    ARM = 1            # the torque of the twisted string is faded in
     HOLD = 2           # the bit shall stick and slip
-    RAMP = 3
-    STEADY = 4         # it turns
-    RELEASED = 5       # the bit is off bottom, and what swings decays
-    FADE_OUT = 6
-    TRIAL = 7          # does it end turning, at this set speed?
+    RAMP = 3           # the set speed rises until the bit turns
+    STEADY = 4         # the bit turns
+    RELEASED = 5       # the bit is off bottom, and the oscillation decays
+    FADE_OUT = 6       # the torque of the string is faded out
+    TRIAL = 7          # steady set speed: does the bit turn in the end?
     DONE = 8
 
 
 @dataclass(frozen=True)
 class SpeedProgram:
-    """Speeds are of the main shaft."""
+    """Program of set speeds, at the main shaft."""
 
     start_rad_s: float
-    """At which the bit must stick and slip."""
+    """First set speed. The bit must stick and slip there."""
     highest_rad_s: float
-    """No set speed goes beyond."""
+    """Highest set speed."""
     ramp_rad_s2: float = 0.5 * RPM
+    """Slope of the set speed in the phase RAMP."""
     move_rad_s2: float = 2.0 * RPM
+    """Slope of the set speed in the phase MOVE."""
     settle_s: float = 4.0
+    """Time at a new set speed before the string's torque is faded in."""
     fade_s: float = 5.0
+    """Time of fading in or out."""
     armed_s: float = 0.0
-    """Of the whole torque before the string is let go, for a loop that has to make up for it by itself."""
+    """Time with the whole torque before the string is released, for a loop that must balance this torque itself."""
     hold_s: float = 20.0
     calm_s: float = 15.0
-    """Without sticking for so long, the bit turns."""
+    """The bit counts as turning if it does not stick for this time."""
     steady_s: float = 20.0
     released_s: float = 15.0
     trial_s: float = 60.0
-    """A bit that sticks after it does not turn."""
+    """Longest time of a trial. The bit counts as sticking if it does not turn by then."""
     resolution_rad_s: float = 1.0 * RPM
+    """Width of the bracket of the critical speed at which the trials end."""
     most_trials: int = 8
     peak_nm: float = inf
-    """Of the torque that moves the rotor, as simulated: no 5 s of it may have as much rms."""
+    """Peak of the torque that moves the rotor, from the simulation. The rms over any 5 s must stay below it."""
 
     @property
     def longest_s(self) -> float:
@@ -292,24 +303,24 @@ class SpeedProgram:
 
 
 class ProgramCourse:
-    """Position in the program. In every cycle it takes whether the bit stands still."""
+    """State of the program. Each cycle, `step` gets the information whether the bit stands still."""
 
     def __init__(self, program: SpeedProgram, period_s: float) -> None:
         self._program, self._period_s = program, period_s
         self._time_s = self._phase_s = self._stuck_s = 0.0
         self._target_rad_s = program.start_rad_s
-        self._sticks_at, self._turns_at = program.start_rad_s, 0.0     # 0: nothing has turned yet
+        self._sticks_at, self._turns_at = program.start_rad_s, 0.0     # 0: the bit has not turned in a trial yet
         self._trials = 0
         self._first = True
         self.phase = Phase.MOVE
         self.set_rad_s = program.start_rad_s
         self.slope_rad_s2 = 0.0
-        """Of the set speed while it is moved without a string."""
+        """Slope of the set speed while it moves without a string, rad/s²."""
         self.share = 0.0
-        """Of the string's torque that acts."""
+        """Share of the string's torque that acts."""
 
     def step(self, stuck: bool) -> Phase | None:
-        """A cycle on; the phase that begins with it."""
+        """Advance by one cycle. Return the phase that begins with it, or None if the phase continues."""
         before = self.phase
         self._time_s += self._period_s
         self._phase_s += self._period_s
@@ -325,7 +336,7 @@ class ProgramCourse:
         return self.phase
 
     def end(self) -> None:
-        """Fade out from wherever it is, and be done."""
+        """End the program: fade the string's torque out from its present share."""
         self._trials = self._program.most_trials
         if self.phase is not Phase.DONE:
             self.phase, self._phase_s = Phase.FADE_OUT, (1.0 - self.share) * self._program.fade_s
@@ -355,7 +366,7 @@ class ProgramCourse:
             self.phase = Phase.RAMP if self._time_s - self._stuck_s < 0.5 * self._program.hold_s else Phase.FADE_OUT
             self._first = False
             if self.phase is Phase.FADE_OUT:
-                self._trials = self._program.most_trials      # it does not even stick: nothing is left to look for
+                self._trials = self._program.most_trials      # without stick-slip there is no critical speed to find
 
     def _ramp(self) -> None:
         program = self._program
@@ -415,15 +426,17 @@ COLUMNS = (
     "time_s", "phase", "set_rad_s", "top_rad_s", "innovation_rad_s", "string_nm", "drive_nm", "share", "bit_rad_s",
     "unknown_nm", "put_in_j", "clamped",
 )
-"""Of a cycle, at the meant machine's main shaft: ``top_rad_s`` as observed and carried on, ``share`` of the string's
-torque that acts, ``put_in_j`` of energy by the loop's errors, ``clamped`` 1 where the torque limit cut it."""
+"""Columns of the log, one row for each cycle, at the main shaft of the intended machine. ``top_rad_s``: observed and
+predicted speed of the top. ``share``: share of the string's torque that acts. ``put_in_j``: energy from the loop's own
+errors. ``clamped``: 1 if the torque limit acted."""
 
 
 class HostLoop:
-    """String, controller and observer at one cycle: report in, torque out; ``row`` is what the log keeps of it.
+    """String, controller and observer in one loop. Each cycle takes a report and returns a torque.
 
-    ``own_loop``: the controller is the drive's; what goes out is the string's torque alone, as a torque offset beside
-    `set_rad_s`, and the law is what the observer takes the drive's own torque for.
+    ``row`` has the values of the last cycle for the log. ``own_loop``: the controller is that of the drive. Then the
+    output is only the string's torque, as a torque offset beside `set_rad_s`, and the observer uses ``law`` as a model
+    of the drive's own torque.
     """
 
     def __init__(
@@ -432,7 +445,7 @@ class HostLoop:
     ) -> None:
         self._meant, self._rig, self._period_s, self._own_loop = meant, rig, period_s, own_loop
         self.scale = 1.0 / rig.gear_ratio if own_loop else rig.inertia_kg_m2 * rig.gear_ratio / meant.inertia_kg_m2
-        """κ, from the meant machine's torque to the rig's."""
+        """Factor κ from the intended machine's torque to the rig's torque."""
         self._limit_nm = torque_limit_nm
         self._own = TopDrive(rig.inertia_kg_m2 * rig.gear_ratio / self.scale,
                              rig.viscous_nm_s_rad * rig.gear_ratio / self.scale, rig.coulomb_nm / self.scale)
@@ -441,7 +454,7 @@ class HostLoop:
         self._string = VirtualString(string)
         self._controller = HostController(law, meant.inner_lags_s, period_s)
         self._course = ProgramCourse(program, period_s)
-        self._torque_nm = self._acted_nm = 0.0     # acts until the next one does, and the one before; main shaft
+        self._torque_nm = self._acted_nm = 0.0     # torque that acts now, and the one before it; main shaft
         self._share = 0.0
         self._put_in_j = self._net_nm = 0.0
         self._clamped = self._cut = False
@@ -454,17 +467,17 @@ class HostLoop:
 
     @property
     def set_rad_s(self) -> float:
-        """The set speed, of the main shaft."""
+        """Set speed of the main shaft, rad/s."""
         return self._course.set_rad_s
 
     @property
     def innovation_rad_s(self) -> float:
-        """Difference of the last report from the expected one, at the main shaft."""
+        """Innovation: last reported speed less the expected one, at the main shaft, rad/s."""
         return self._observer.innovation_rad_s
 
     @property
     def net_nm(self) -> float:
-        """That moves the meant rotor: of its drive, less the string's."""
+        """Torque that moves the intended rotor: that of its drive less that of the string, N·m."""
         return self._net_nm
 
     @property
@@ -474,23 +487,23 @@ class HostLoop:
 
     @property
     def clamped(self) -> bool:
-        """Did the torque limit cut the last torque?"""
+        """True: a torque limit acted in the last cycle."""
         return self._clamped
 
     def cut(self) -> None:
-        """A torque limit acts: fade the string out, and be done. Every row from now on says so."""
+        """End the program because a torque limit acts: fade the string out. All further rows have ``clamped`` = 1."""
         self._cut = True
         self._course.end()
 
     def begin(self, reported_rad_s: float, torque_nm: float) -> None:
-        """Steady rotation at the program's start with that torque of the motor."""
+        """Set the state to steady rotation at the program's start, with that torque of the motor, N·m."""
         speed = reported_rad_s / self._rig.gear_ratio
         self._torque_nm = self._acted_nm = torque_nm / self.scale
         self._observer.begin(speed)
         self._controller.begin(speed, self._torque_nm - self._more_friction(speed))
 
     def _more_friction(self, speed: float) -> float:
-        """That the rig has more than the meant machine, N·m at its main shaft."""
+        """Return the rig's friction less that of the intended machine, N·m at its main shaft."""
         if self._same:
             return 0.0
         own, meant = self._own, self._meant
@@ -499,7 +512,7 @@ class HostLoop:
         return viscous * speed + dry * sign
 
     def step(self, time_s: float, reported_rad_s: float | None) -> float:
-        """The motor's torque for the next cycle, N·m, after this cycle's report (None: it brought none)."""
+        """Return the motor's torque for the next cycle, N·m, after this cycle's report (None: no report)."""
         period_s, course, string = self._period_s, self._course, self._string
         seen = None if reported_rad_s is None else reported_rad_s / self._rig.gear_ratio
         self._observer.see(self._acted_nm, seen)
@@ -516,12 +529,12 @@ class HostLoop:
         string_nm = string.torque_nm
         share = course.share
         if self._own_loop:
-            # The drive's integral runs on counts of the set speed that ours doesn't see: they drift apart, slowly.
+            # The drive integrates a rounded set speed, the host an exact one. So the two integrals slowly drift apart.
             drifted_nm = self._observer.unknown_nm * period_s / DRIFT_S
             self._controller.shift(drifted_nm)
             self._observer.less_unknown(drifted_nm)
         else:
-            # What comes in or goes is met by as much of the drive's: no controller under test has to make up for it.
+            # The drive's torque changes with the faded torque. The controller under test need not balance it.
             self._controller.shift((share - self._share) * string_nm)
         self._share = share
         drive_nm = self._controller.step(course.set_rad_s, speed)
@@ -529,7 +542,7 @@ class HostLoop:
         self._put_in_j -= share * string_nm * self._observer.innovation_rad_s * period_s
         by_drive_nm = drive_nm + (0.0 if self._own_loop else moving_nm)
         self._net_nm = by_drive_nm - share * string_nm
-        others_nm = by_drive_nm if self._own_loop else 0.0      # of what acts, that isn't ours to command
+        others_nm = by_drive_nm if self._own_loop else 0.0      # torque that the host does not command
         wanted = self.scale * (self._net_nm - others_nm + self._more_friction(speed))
         torque = min(max(wanted, -self._limit_nm), self._limit_nm)     # NaN stays NaN, for the guard
         self._acted_nm, self._torque_nm = self._torque_nm, torque / self.scale + others_nm

@@ -21,7 +21,6 @@ MOST_EXCEPTIONS = 5
 
 CEILINGS = {
     ("tdhil/soft_torque", "long"): 1,
-    ("tdhil/soft_torque", "word"): 24,
 }
 """Findings left in each room, by kind. Each was counted before the room was reworded."""
 

@@ -1,6 +1,7 @@
-"""The reference case, and a drill string as a chain of lumps: an oracle that shares nothing with the rest.
+"""Reference case, and a drill string as a chain of lumped masses: an oracle that is independent of the product.
 
-The chain is masses and springs, its equations a matrix, its modes the matrix's eigenvalues; no wave, no line, no delay.
+The chain consists of masses and springs. Its equations form a matrix, and the eigenvalues give its modes. It uses no
+wave, no transmission line and no delay.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ TABLE = {"stiff": STIFF, "paper": PAPER, "a=1": SOFT_1, "a=0.25": SOFT_025, "a=0
 
 @dataclass(frozen=True)
 class Pipe:
-    """One stretch for the chain, with the constants written out once more."""
+    """One section of the chain. The material constants are stated here again, independent of the product."""
 
     length_m: float
     outer_m: float
@@ -49,9 +50,9 @@ class Pipe:
 
 
 def lumped_chain(pipes, bottom_inertia, bottom_viscous, drive=None, controller=None, *, stuck=False):
-    """A of x' = A x + b Ω: angles, speeds, and the controller's states; the top held where there is no drive.
+    """Return (A, b, number of masses) of x' = A x + b Ω, with angles, speeds and the controller's states in x.
 
-    Half a cell's mass stands at each end of a cell, springs between them.
+    Without a drive, the top is held. Half of a cell's mass is at each of its ends, with a spring between them.
     """
     masses, losses, springs = [0.0], [0.0], []
     for pipe in pipes:
@@ -103,7 +104,7 @@ def lumped_chain(pipes, bottom_inertia, bottom_viscous, drive=None, controller=N
 
 
 def chain_modes(a, highest_hz):
-    """(hertz, damping) of every eigenvalue that swings, by frequency."""
+    """Return (frequency in Hz, damping ratio) of every oscillating eigenvalue, sorted by frequency."""
     poles = np.linalg.eigvals(a)
     found = [(abs(s) / (2 * pi), -s.real / abs(s)) for s in poles if s.imag > 1e-6]
     return sorted(one for one in found if one[0] <= highest_hz)

@@ -1,7 +1,7 @@
-"""A drill string in time as a chain of masses and springs under bit noise: an oracle that shares nothing with the rest.
+"""Simulation of a drill string under bit noise as a chain of masses and springs: an oracle independent of the product.
 
-Symplectic Euler: springs from angles, speeds from torques, angles from speeds. Lags step exactly for a constant input.
-No wave, no line, no delay, no matrix exponential.
+The method is symplectic Euler: spring torques from angles, speeds from torques, angles from speeds. The step of a lag
+is exact for a constant input. The chain uses no wave, no transmission line, no delay and no matrix exponential.
 """
 
 from __future__ import annotations
@@ -17,7 +17,10 @@ def lowest_turning_of_chain(
     stribeck_rad_s, noise_nm, noise_correlation_s, inertia, viscous, dry_nm, lags_s, laws, seed, period_s, lumps=30,
     wall_nm=0.0, coarse=13, fine=8, lowest=10.0, highest=240.0,
 ):
-    """Lowest set speed, rpm, of each law (P, I, J_c, filter) from which a stuck bit ends turning; infinite: none."""
+    """Return for each law (P, I, J_c, filter) the lowest set speed, rpm, at and above which a stuck bit comes free.
+
+    Infinite: none.
+    """
     speeds = np.geomspace(lowest, highest, coarse)
 
     def turns(rpm):
@@ -46,10 +49,10 @@ def ends_turning(
     stribeck_rad_s, noise_nm, noise_correlation_s, inertia, viscous, dry_nm, lags_s, laws, seed, rpm, period_s, lumps,
     wall_nm=0.0, periods=12.0, calm=3.0, kept=None, keep_every_s=0.02, own_noise=False,
 ):
-    """(laws, speeds): whether the bit, stuck at breakaway at first, does not stand still in the last periods.
+    """Return as (laws, speeds) whether the bit turns in the last ``calm`` periods. It is about to break away at first.
 
-    ``kept``: a list that takes (time, torque on the rotor, speed of the top, speed of the bit), (cases,) each.
-    ``own_noise``: every case has its own bit noise.
+    ``kept``: a list to which (time, torque on the rotor, speed of the top, speed of the bit) are appended; the signals
+    have shape (cases,). ``own_noise``: every case has its own bit noise.
     """
     cell = length_m / lumps
     spring = shear_pa * polar_m4 / cell
@@ -117,7 +120,7 @@ def ends_turning(
 
 
 def reference_case(**other):
-    """Keywords of the reference case: 3,000 m of 5 inch pipe, the bit and the top drive of tests/soft_torque/cases."""
+    """Return the keywords of the reference case: 3,000 m of 5 inch pipe, bit and top drive of cases.py."""
     polar = pi / 32.0 * (0.127**4 - 0.1086**4)
     return {
         "length_m": 3000.0, "polar_m4": polar, "shear_pa": 79.3e9, "density": 7850.0, "drag": 0.005,
@@ -129,7 +132,7 @@ def reference_case(**other):
 
 
 def recorded(**said):
-    """Time (N,), and torque on the rotor, speed of the top and speed of the bit, (N, cases) each."""
+    """Return time (N,), and torque on the rotor, speed of the top and speed of the bit, (N, cases) each."""
     kept = []
     ends_turning(**said, kept=kept)
     time, torque, top, bit = zip(*kept, strict=True)
@@ -137,7 +140,7 @@ def recorded(**said):
 
 
 def reported(time_s, torque, top, lags_s=(0.1, 0.05), seed=1, noise=(0.01, 40.0), quanta=(0.002, 20.0)):
-    """Time, speed and torque as a drive reports them: first-order lags (speed, torque), noise and resolution."""
+    """Return time, speed and torque as a drive reports them: first-order lags (speed, torque), noise and resolution."""
     random = np.random.default_rng([seed, 99])
     found = []
     for signal, lag, sd, quantum in zip((top, torque), lags_s, noise, quanta, strict=True):

@@ -1,4 +1,4 @@
-"""The advice: what it compares, when it says to keep what there is, and what its intervals hold."""
+"""Advice of `tune`: the comparison, the advice to keep the present gains, and the intervals."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ J = Interval(1500.0, 1440.0, 1560.0)
 
 @pytest.fixture(scope="module")
 def beside_good_gains():
-    """The present gains are a = 0.35 at 0.84 f₁, which cure at 46 rpm: better than the most damping, 57 and more."""
+    """Tuning with good present gains: a = 0.35 at 0.84 f₁. They cure at 46 rpm, the best damped ones at 57 or more."""
     return tune(TuneCase(STRING, DRIVE, J, present=SOFT_035, draws=6))
 
 
 @pytest.mark.heavy
 def test_nothing_worse_than_the_present_gains_is_recommended(beside_good_gains):
-    """Under noise the row that is recommended, if any, is below the present one, on nearly every truth."""
+    """A recommended row has a lower critical speed under noise than the present gains, on nearly every truth."""
     advice = beside_good_gains.advice
     present = beside_good_gains.by_kind("present")
     assert advice.compared_with == "present"
@@ -55,7 +55,7 @@ def test_nothing_worse_than_the_present_gains_is_recommended(beside_good_gains):
 
 
 def test_the_soft_row_is_far_below_the_stiff_one(beside_good_gains):
-    """No more than 40 % of the stiff loop's critical speed under noise; the linear limit is lower than either."""
+    """The soft row has less than 40 % of the stiff critical speed under noise. Its linear limit is lower still."""
     stiff, soft = (beside_good_gains.by_kind(kind) for kind in ("stiff", "soft"))
     assert soft.cure.median < 0.4 * stiff.cure.median
     assert soft.linear_limit.median < soft.cure.median
@@ -64,7 +64,7 @@ def test_the_soft_row_is_far_below_the_stiff_one(beside_good_gains):
 
 
 def test_margins_hold_on_truths_that_were_not_drawn(beside_good_gains):
-    """On 100 further truths 95 % keep phase, gain and dead-time margin of the soft row."""
+    """The soft row keeps phase, gain and dead-time margin on 95 % of 100 further truths."""
     law = beside_good_gains.by_kind("soft").controller
     truths = draw_truths(STRING, DRIVE, J, count=100, seed=77, lag_tolerance=0.1)
     kept = [not RequiredMargins().failed(loop_margins(one.drive, law, one.string)) for one in truths]
@@ -73,7 +73,7 @@ def test_margins_hold_on_truths_that_were_not_drawn(beside_good_gains):
 
 @pytest.mark.heavy
 def test_gains_with_thin_margins_are_not_green():
-    """a = 1 matches ζ and has 14° of phase margin: the row fails, and asking for it is refused."""
+    """Gains with a = 1 match ζ and have a phase margin of 14°: the row fails. A request for a = 1.6 is refused."""
     tuning = tune(TuneCase(STRING, DRIVE, J, present=SOFT_1), search=None)
     present = tuning.by_kind("present")
     assert any(words.startswith("phase margin") for words in present.failed)
@@ -83,7 +83,7 @@ def test_gains_with_thin_margins_are_not_green():
 
 @pytest.mark.heavy
 def test_a_string_without_drag_is_refused_for_its_drag():
-    """Not for the lags: with the mud's drag the same request is taken."""
+    """The refusal names the missing drag, not the lags. With the mud's drag, a compensated share is accepted."""
     bare = string_with(drag=0.0)
     with pytest.raises(TuningRefused, match="states no drag"):
         tune(TuneCase(bare, DRIVE, J, compensated_share=0.6), search=None)
@@ -92,7 +92,7 @@ def test_a_string_without_drag_is_refused_for_its_drag():
 
 @pytest.mark.heavy
 def test_a_shear_modulus_of_the_field_lies_in_the_interval():
-    """G of 61 GPa raises the cure speed of fixed gains; draws with and without the string's tolerance show how much."""
+    """The string's tolerance, with G down to 61 GPa, more than doubles the spread of the cure speed of fixed gains."""
     law = tuned_controller(STRING, 1500.0, 0.19, 0.12995)
 
     def cures(string):
@@ -106,7 +106,7 @@ def test_a_shear_modulus_of_the_field_lies_in_the_interval():
 
 @pytest.mark.heavy
 def test_the_turning_point_of_a_kink_is_found():
-    """The least of two dampings has its largest value where they cross, between the values of J that are tried."""
+    """The least of two damping ratios is largest where they cross, between two of the computed values of J."""
     light = TopDrive(104.126, 8.1, 60.0, DRIVE.inner_lags_s)
     case = TuneCase(STRING, light, Interval(104.126, 80.0, 130.0))
     from tdhil.soft_torque import figures_at, string_modes_hz
@@ -129,7 +129,7 @@ def test_an_interval_of_draws_says_where_its_end_is_not_known():
 
 @pytest.mark.heavy
 def test_the_operators_map_agrees_with_a_chain_in_time():
-    """Softer gains leave more green; cells that are clearly stable or clearly stick do so in another simulator."""
+    """Softer gains have more stable cells. Clearly stable and clearly sticking cells agree with another simulator."""
     laws = {"stiff": STIFF, "soft": SOFT_035}
     tuned = tuple(Tuned(kind, law) for kind, law in laws.items())
     string = string_with(torque_per_weight_nm_kn=25.0)

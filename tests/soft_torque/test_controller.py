@@ -1,4 +1,4 @@
-"""Impedance, reflection and poles: against the reference table, against the chain of lumps, and against themselves."""
+"""Impedance, reflection and poles, compared with the reference table, the chain of lumps and each other."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_the_stiff_controller_has_the_margin_that_it_states():
 
 
 def test_tuned_gains_match_where_they_say():
-    """Without inner lags r = (1 − a)/(1 + a) at the mode, but for B."""
+    """Without inner lags and with B = 0, r = (1 − a)/(1 + a) at the mode."""
     bare = TopDrive(1500.0)
     for softness in (0.2, 1.0, 1.7):
         law = tuned_controller(STRING, 1500.0, softness, 0.1299)
@@ -72,7 +72,7 @@ def test_tuned_gains_match_where_they_say():
 
 
 def test_softer_than_allowed_feeds_slow_swings():
-    """Re Z(jω → 0) changes its sign at the a that is said."""
+    """Re Z(jω → 0) changes its sign at the returned a."""
     drive = TopDrive(1500.0, 0.0, 0.0, (0.2, 0.15))
     most = softest_allowed(STRING, drive, 0.1299)
     slow = np.array([1e-3j])
@@ -86,7 +86,7 @@ def test_softer_than_allowed_feeds_slow_swings():
     ((0.005, 0.002, 0.001), (0.70, 0.65, 0.60, 0.35)),
 ])
 def test_how_much_inertia_can_be_compensated(lags, shares):
-    """The notes' table: a = 0.25, steps of 0.05, J believed too large by 0, 4, 12.6 and 76 %."""
+    """The largest stable share is the reference's: a = 0.25, steps of 0.05, J too large by 0, 4, 12.6 and 76 %."""
     drive = TopDrive(1500.0, 8.0, 60.0, lags)
     for error, most in zip((0.0, 0.04, 0.126, 0.76), shares, strict=True):
         laws = [tuned_controller(STRING, 1500.0 * (1.0 + error), 0.25, 0.1299, share) for share in (most, most + 0.05)]
@@ -95,7 +95,7 @@ def test_how_much_inertia_can_be_compensated(lags, shares):
 
 
 def test_stability_is_that_of_the_chain():
-    """Whether a pole lies right of the axis: counted here, eigenvalues there."""
+    """The count of poles in the right half-plane agrees with the eigenvalues of the chain."""
     for share in (0.3, 0.6, 0.75, 0.9):
         law = tuned_controller(STRING, 1500.0, 0.25, 0.1299, share)
         a, _, _ = lumped_chain([Pipe(3000.0, 0.127, 0.1086, lumps=100)], 374.0, 20.0, DRIVE, law)
@@ -110,7 +110,7 @@ def test_gains_at_the_motor():
 
 
 def test_every_root_of_a_polynomial_is_found():
-    """Double and nearly double ones, too, and none beside."""
+    """All roots are found, also two that are close together, and no others."""
     rng = np.random.default_rng(3)
     for _ in range(10):
         roots = list(rng.uniform(-1.0, 1.0, 6) + 1j * rng.uniform(-1.0, 1.0, 6))

@@ -1,4 +1,4 @@
-"""A virtual string on a drive: what is refused beforehand, and what is read off a log's rows."""
+"""Virtual string on a drive: refusals before the run, and evaluation of the rows of a log."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_the_course_is_laid_where_the_shaft_can_bear_it():
     assert 4000.0 < program.peak_nm < 9000.0
     higher = program_for(CASE, replace(WINDOW, lowest_rad_s=2.55)).start_rad_s
     assert 46.0 * RPM <= higher <= 52.0 * RPM
-    # at a motor eight times as fast, the same machine takes the same course with an eighth of the torque
+    # with a motor eight times as fast, the same machine has the same program with an eighth of the torque
     geared = replace(CASE, rig=IdentifiedRig(1500.0 / 64.0, 0.125, 7.5, 0.4, 8.0))
     assert program_for(geared, RigWindow(4.0, 120.0, 15_000.0 / 8.0, 0.857)) == program
 
@@ -90,7 +90,7 @@ def test_the_log_keeps_what_the_loop_tells():
 
 
 def rows(turns_from_rpm, trials, *, damping=0.2, hertz=0.13, **more):
-    """A log as the course would leave it, at 10 Hz; the columns of ``more`` are the same all along."""
+    """Return the rows of a log at 10 Hz as a run would write them. The columns in ``more`` are constant."""
     parts = []
 
     def add(phase, seconds, set_rpm, stuck, top=0.0):
@@ -124,7 +124,7 @@ def rows(turns_from_rpm, trials, *, damping=0.2, hertz=0.13, **more):
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("seed", range(8))
 def test_two_modes_that_are_alike_are_told_apart_in_noise(seed):
-    # As a = 0.25 of the reference case has them, with what the loop's own disturbances leave of the speed.
+    # Modes of a = 0.25 in the reference case, with the noise that the loop's own disturbances leave in the speed.
     table = rows(57.0, (60.0, 52.5, 56.3, 58.1, 57.2))
     released = table[:, COLUMNS.index("phase")] == Phase.RELEASED
     time_s = 0.1 * np.arange(released.sum())
@@ -140,7 +140,7 @@ def test_two_modes_that_are_alike_are_told_apart_in_noise(seed):
 
 def test_critical_speed_and_damping_are_read_off_the_rows():
     found = evaluate(rows(57.0, (60.0, 52.5, 56.3, 58.1, 57.2), damping=0.15), CASE, PROGRAM)
-    assert found.outcome is EvaluationOutcome.DIFFERS                   # by the damping, which is 0.15
+    assert found.outcome is EvaluationOutcome.DIFFERS                   # the damping ratio is 0.15
     assert "damping" in found.why
     assert (found.critical_rpm.value, found.critical_rpm.low) == (pytest.approx(57.2), pytest.approx(56.3))
     assert [one.turns for one in found.trials] == [True, False, False, True, True]
@@ -176,7 +176,7 @@ def test_a_log_that_ends_early_has_no_critical_speed():
 
 
 def decaying(damping, noise, seed):
-    """A log whose decay has two modes in coloured noise."""
+    """Return a log whose decay contains two modes in coloured noise."""
     table = rows(57.0, (60.0, 52.5, 56.3, 58.1, 57.2))
     released = table[:, COLUMNS.index("phase")] == Phase.RELEASED
     time_s = 0.1 * np.arange(released.sum())
@@ -194,7 +194,7 @@ def decaying(damping, noise, seed):
 
 @pytest.mark.parametrize("seeds", [pytest.param(3, marks=pytest.mark.heavy), pytest.param(10, marks=pytest.mark.long)])
 def test_the_damping_of_a_noisy_decay_lies_in_its_interval(seeds):
-    """Of decays in noise of several sizes 93 % cover the truth, and at most one is said to differ."""
+    """In noise of several sizes, 93 % of the intervals cover the truth, and at most one verdict is `differs`."""
     found = [evaluate(decaying(0.226, noise, seed), CASE, PROGRAM)
              for noise in (0.01, 0.05, 0.15) for seed in range(seeds)]
     inside = [one.damping_interval.low <= 0.226 <= one.damping_interval.high for one in found]
@@ -212,7 +212,7 @@ def test_unknown_torque_widens_the_interval():
 
 
 def test_the_torque_of_the_highest_set_speed_counts_before_motion():
-    """A limit that the first set speeds leave in peace and the end of the ramp doesn't is refused, not found later."""
+    """A torque limit that only the end of the ramp would exceed is refused before motion."""
     program = program_for(CASE, WINDOW)
     tight = replace(WINDOW, torque_nm=1.1 * program.peak_nm)
     with pytest.raises(EvaluationRefused, match="would be cut off"):

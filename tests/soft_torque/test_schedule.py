@@ -1,4 +1,4 @@
-"""Gains over depth: each row is what tuning at that depth gives, and what lies between is checked, not supposed."""
+"""Gain schedule over depth: each row equals the tuning at that depth, and interpolated gains are checked."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_the_topmost_section_takes_the_depth():
 
 @pytest.mark.heavy
 def test_a_row_is_what_tuning_at_that_depth_gives(scheduled):
-    """At the length that the string is stated with, the row has the gains of `tune`; deeper is softer and slower."""
+    """At the stated length, the row has the gains of `tune`. With depth, the integral gain and the mode decrease."""
     alone = tune(CASE, search=None).by_kind("soft").controller
     assert scheduled.rows[-1].controller == alone
     gains = [row.controller.integral_nm_rad for row in scheduled.rows]
@@ -50,7 +50,7 @@ def test_a_row_is_what_tuning_at_that_depth_gives(scheduled):
 
 @pytest.mark.heavy
 def test_rows_keep_the_margins_and_what_lies_between_is_measured(scheduled):
-    """Interpolated gains are the mean of their neighbours'; their margins are those of `loop_margins` on each truth."""
+    """Interpolated gains are the mean of both neighbours. Their margins are those of `loop_margins` on each truth."""
     assert not any(row.failed for row in scheduled.rows)
     assert [row.depth_m for row in scheduled.between] == [1875.0, 2625.0]
     for k, row in enumerate(scheduled.between):
@@ -64,7 +64,7 @@ def test_rows_keep_the_margins_and_what_lies_between_is_measured(scheduled):
 
 @pytest.mark.heavy
 def test_critical_speeds_stand_beside_those_of_the_present_gains():
-    """Present gains of a rig that was tuned at 3,000 m, at 1,500 m: the row's critical speed is not above theirs."""
+    """At 1,500 m, the row has a lower critical speed than the present gains of the rig."""
     case = replace(CASE, present=SpeedController(4000.0, 3000.0), draws=6)
     (row,) = schedule(case, (1500.0,), "soft").rows
     assert row.cure.median < row.compared.median

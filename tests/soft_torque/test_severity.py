@@ -1,4 +1,4 @@
-"""Stick-slip from surface signals, judged by a chain of masses whose bit speed is known (chain_in_time.py)."""
+"""Stick-slip from surface signals, compared with a chain of masses whose bit speed is known (chain_in_time.py)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def gains(law: SpeedController):
 
 @pytest.fixture(scope="module")
 def drilled():
-    """By gains and set speed: (record as reported, true speed of the bit, time)."""
+    """Simulated records by gains and set speed, rpm: (record as reported, true speed of the bit)."""
     rpm = np.array([[100.0, 180.0], [100.0, 180.0]])
     time_s, torque, top, bit = recorded(**reference_case(
         laws=[gains(PAPER), gains(SOFT_035)], rpm=rpm, periods=20.0, lumps=14, own_noise=True))
@@ -80,7 +80,7 @@ def test_a_string_that_turns_raises_no_alarm(drilled):
 
 
 def test_the_bits_speed_is_followed_through_sections_of_different_pipe():
-    """A swing that `at_top` carries up in the frequency domain comes back down by waves in time."""
+    """`downhole_speed` in time recovers an oscillation of the bit from the signals that `at_top` gives at the top."""
     sections = (PipeSection(length_m=1500.0, **FIVE_INCH),
                 PipeSection(length_m=400.0, outer_diameter_m=0.1651, inner_diameter_m=0.0714))
     string = string_of(StringFile(sections=sections, bottom=BottomEnd(inertia_kg_m2=200.0, **BIT)))

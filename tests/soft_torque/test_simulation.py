@@ -1,4 +1,4 @@
-"""The string in time: echoes, reflection, modes and damping against theory and the chain of lumps; critical speeds."""
+"""Simulation in time: echoes, reflection, modes and damping against theory and the chain of lumps; critical speeds."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ from tests.soft_torque.cases import (
 from tests.soft_torque.chain_in_time import lowest_turning_of_chain
 
 SMOOTH = {"friction": "coulomb", "static_nm": None, "stribeck_speed_rad_s": None, "coulomb_nm": 0.0}
-"""A bit without dry friction: everything is linear."""
+"""Bit without dry friction, so that the whole system is linear."""
 
 
 def turning(string, law, *, drive=DRIVE, speed=10.0, change=0.5, seconds=40.0, keep=0.0, tick=0.006):
-    """A set speed that jumps by `change` from steady rotation."""
+    """Return the simulation of a jump of the set speed by `change` from steady rotation."""
     start = np.array([[speed]])
     return simulate(string, [(drive, law)], Begin("turning", start), start + change, 1e9, seconds, keep, tick)
 
 
 def test_echoes_come_back_after_twice_the_way():
-    """The top's torque after a jump of the set speed is that of a resistance ζ until the echo, to 0.005 s."""
+    """After a jump of the set speed, the torque is that of a damper ζ until the echo. Its time is exact to 0.005 s."""
     string = string_with(**SMOOTH, viscous_nm_s_rad=0.0, drag=0.0)
     stiff = SpeedController(3e6, 3e6)
     quick = TopDrive(100.0, 0.0, 0.0, (1e-4,))
@@ -58,7 +58,7 @@ def test_echoes_come_back_after_twice_the_way():
     steady = 0.5 * string.impedance_nm_s_rad
     plateau = (trace.time_s > 0.2) & (trace.time_s < string.echo_s - 0.01)
     assert torque[plateau] == pytest.approx(np.full(plateau.sum(), steady), abs=0.005 * steady)
-    for echo in (1, 2):      # a heavy bottom reverses the wave, a stiff top does once more
+    for echo in (1, 2):      # a heavy bottom reverses the wave, and a stiff top reverses it again
         jump = np.abs(np.diff(torque))
         near = np.abs(trace.time_s[1:] - echo * string.echo_s) < 0.1
         assert trace.time_s[1:][near][np.argmax(jump[near])] == pytest.approx(echo * string.echo_s, abs=0.005)
@@ -67,7 +67,7 @@ def test_echoes_come_back_after_twice_the_way():
 @pytest.mark.heavy
 @pytest.mark.parametrize("hertz", [0.1299, 0.567])
 def test_what_the_top_sends_back_is_what_theory_says(hertz):
-    """A wave sent up to it, of one tone: the amplitude that comes down again, to 0.005."""
+    """A sine wave that arrives at the top is reflected with the amplitude of theory, to 0.005."""
     drive = TopDrive(1500.0, 8.0, 0.0, DRIVE.inner_lags_s)
     grid = grid_of(string_with(drag=0.0))
     top = _Top([(drive, law) for law in TABLE.values()], [grid] * len(TABLE), 1)
@@ -84,7 +84,7 @@ def test_what_the_top_sends_back_is_what_theory_says(hertz):
 
 
 def poles_of(samples, step_s, order):
-    """Of a sum of decaying exponentials: the matrix pencil."""
+    """Return the poles of a sum of decaying exponentials, by a matrix pencil."""
     half = len(samples) // 2
     data = np.lib.stride_tricks.sliding_window_view(samples, half)
     _, _, right = np.linalg.svd(data, full_matrices=False)
@@ -97,7 +97,7 @@ def poles_of(samples, step_s, order):
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", TABLE)
 def test_modes_in_time_are_the_poles(name):
-    """Frequency within 1 %, damping within 0.005 (0.012 where it is 0.4 and more)."""
+    """Modes agree with the poles: frequency to 1 %, damping ratio to 0.005 (to 0.012 above a ratio of 0.4)."""
     string = string_with(**SMOOTH)
     drive = TopDrive(1500.0, 8.0, 0.0, DRIVE.inner_lags_s)
     trace = turning(string, TABLE[name], drive=drive, seconds=45.0, keep=0.1)
@@ -107,7 +107,7 @@ def test_modes_in_time_are_the_poles(name):
     found = poles_of(bit, step_s, 14)
     for mode in ClosedSystem(string, drive, TABLE[name]).modes(0.7):
         if mode.damping > 0.75:
-            continue      # gone before the window begins
+            continue      # decayed before the window begins
         seen = found[np.argmin(abs(found - mode.pole_rad_s))]
         assert abs(seen) / (2 * np.pi) == pytest.approx(mode.frequency_hz, rel=0.01)
         assert -seen.real / abs(seen) == pytest.approx(mode.damping, abs=0.012 if mode.damping > 0.4 else 0.005)
@@ -117,7 +117,7 @@ def test_modes_in_time_are_the_poles(name):
 @pytest.mark.heavy
 @pytest.mark.parametrize("law", [STIFF, SOFT_025, HALF], ids=["stiff", "soft", "half"])
 def test_sections_in_time_against_the_chain(law):
-    """A jump of the set speed, through pipe, heavy pipe and collars, to the bit."""
+    """A change of the set speed travels through pipe, heavy pipe and collars to the bit as in the chain."""
     from tdhil.soft_torque import BottomEnd, PipeSection, StringFile, string_of
 
     sections = tuple(PipeSection(length_m=length, outer_diameter_m=outer, inner_diameter_m=inner)
@@ -145,7 +145,7 @@ def test_sections_in_time_against_the_chain(law):
 
 @pytest.mark.heavy
 def test_a_bit_sticks_and_breaks_away_as_an_integration_from_event_to_event_says():
-    """One inertia on a short, stiff stretch under a ramp: breakaway at F_s, then the solution of the equation."""
+    """An inertia on a short, stiff line under a ramp breaks away at F_s and then follows the differential equation."""
     from scipy.integrate import solve_ivp
 
     bit = BitFriction(2500.0, 5000.0, 2.5)
@@ -156,7 +156,7 @@ def test_a_bit_sticks_and_breaks_away_as_an_integration_from_event_to_event_says
     start = np.zeros((1, 1))
     trace = simulate(string, [(drive, firm)], Begin("rest", start), start + 3.0, 0.1, 12.0, 0.01, 0.002)
     stiffness = string.stiffness_nm_rad
-    # the top follows the ramp: angle 0.05 t²; stuck until k·angle = F_s
+    # The top follows the ramp with the angle 0.05 t². The bit sticks until k·angle = F_s.
     away_s = np.sqrt(5000.0 / stiffness / 0.05)
 
     def law(t, y):
@@ -175,7 +175,7 @@ def test_a_bit_sticks_and_breaks_away_as_an_integration_from_event_to_event_says
 
 @pytest.mark.heavy
 def test_a_bit_below_collars_sticks_and_slips_alike_in_finer_steps():
-    """Collars as lines leave the bit next to no inertia of its own: half a tick of them; half as much does the same."""
+    """With collars as lines, the bit has only the inertia of half a tick. Half of this tick gives the same motion."""
     from tdhil.soft_torque import BottomEnd, PipeSection, StringFile, string_of
 
     pipe = PipeSection(length_m=1500.0, outer_diameter_m=0.127, inner_diameter_m=0.1086)
@@ -192,7 +192,7 @@ def test_a_bit_below_collars_sticks_and_slips_alike_in_finer_steps():
 
 @pytest.mark.heavy
 def test_cure_speeds_of_the_reference_case():
-    """Four controllers of the notes: 3 rpm below the bit sticks in the end, 2 rpm above it turns."""
+    """For four reference controllers, the bit sticks 3 rpm below the reference cure speed and turns 2 rpm above it."""
     cures = np.array([[183.0], [72.0], [57.0], [40.0]])
     target = (cures + np.array([[-3.0, 2.0]])) * RPM
     loops = [(DRIVE, law) for law in (STIFF, SOFT_1, SOFT_025, HALF)]
@@ -202,7 +202,7 @@ def test_cure_speeds_of_the_reference_case():
 
 @pytest.mark.heavy
 def test_a_critical_speed_is_found_to_its_resolution():
-    """Coarse, then fine, over a window of few speeds, for one controller."""
+    """The search for one controller, over a narrow range of speeds, finds the cure speed to its resolution."""
     search = Search(lowest_rpm=48.0, highest_rpm=64.0, coarse_rpm=8.0, resolution_rpm=2.0, duration_s=50.0, calm_s=15.0)
     (cure,) = lowest_turning(STRING, [(DRIVE, SOFT_025)], "stuck", search)
     assert cure == pytest.approx(57.0, abs=2.0)
@@ -215,14 +215,14 @@ def test_without_a_bit_there_are_no_critical_speeds():
 
 @pytest.mark.heavy
 def test_a_stuck_bit_that_is_not_freed_stays_stuck():
-    """Below breakaway nothing turns; above every one that is tried, the answer is None."""
+    """If the bit does not break away at any speed that is tried, the critical speed is None."""
     string = string_with(static_nm=1e6, coulomb_nm=1e6)
     search = Search(lowest_rpm=10.0, highest_rpm=20.0, duration_s=20.0, calm_s=5.0, start_ramp_rpm_s=50.0)
     assert lowest_turning(string, [(DRIVE, SOFT_025)], "rest", search) == [None]
 
 
 def test_steady_rotation_stays_steady():
-    """Begun in balance, with drag, drive friction and bit: nothing swings."""
+    """A start in equilibrium, with drag, drive friction and bit, gives no oscillation."""
     start = np.array([[120.0 * RPM]])
     trace = simulate(STRING, [(DRIVE, SOFT_025)], Begin("turning", start), start, 1.0, 20.0, 0.5)
     assert np.ptp(trace.bit_rad_s) < 1e-6 * 120.0 * RPM
@@ -231,7 +231,7 @@ def test_steady_rotation_stays_steady():
 
 @pytest.mark.heavy
 def test_dry_friction_along_the_string_against_the_chain():
-    """A deviated well: 1,500 N·m of dry friction on the wall moves cure speeds as in the chain of masses, to 5 %."""
+    """In a deviated well with 1,500 N·m of dry wall friction, cure speeds agree with the chain of masses to 5 %."""
     from dataclasses import replace
 
     line = replace(STRING.lines[0], coulomb_nm_m=0.5, static_nm_m=0.5)
@@ -248,7 +248,7 @@ def test_dry_friction_along_the_string_against_the_chain():
 
 
 def test_a_string_on_the_wall_holds_what_it_was_wound_up_to():
-    """Below the static friction of its nodes nothing moves, above it the string turns: the file's side force counts."""
+    """The side force in the file gives dry friction per metre. Steady rotation needs its torque at the top."""
     from tdhil.soft_torque import BottomEnd, PipeSection, StringFile, string_of
 
     section = PipeSection(length_m=2000.0, outer_diameter_m=0.127, inner_diameter_m=0.1086, side_force_n_m=100.0)
@@ -260,5 +260,5 @@ def test_a_string_on_the_wall_holds_what_it_was_wound_up_to():
     assert np.ptp(trace.bit_rad_s) < 1e-6 * 120.0 * RPM
     friction_nm = 2000.0 * string.lines[0].coulomb_nm_m
     free = simulate(STRING, [(DRIVE, SOFT_025)], Begin("turning", start), start, 1.0, 1.0, 0.5)
-    drag_nm = 5.0 * 120.0 * RPM      # 1,000 m of mud less than the reference case
+    drag_nm = 5.0 * 120.0 * RPM      # drag of 1,000 m, by which this string is shorter than the reference case
     assert trace.top_torque_nm[0, 0, 0] - free.top_torque_nm[0, 0, 0] == pytest.approx(friction_nm - drag_nm, rel=0.01)

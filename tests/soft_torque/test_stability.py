@@ -1,4 +1,4 @@
-"""Margins, reserves and the linear limit against poles that are found in other ways."""
+"""Margins, reserves and the linear limit, compared with poles from other methods."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.soft_torque.cases import DRIVE, HALF, STIFF, STRING, TABLE, Pipe, lum
 
 
 def unstable_with(string, drive, law, dead_time_s, *, stuck=False):
-    """Whether a pole lies on the right with so much dead time in the loop: counted round a path, none guessed."""
+    """Return whether the loop with this dead time has a pole in the right half-plane, by a count along a path."""
     def characteristic(s):
         s = np.asarray(s, dtype=complex)
         speed, torque = string.at_top(s, stuck=stuck)
@@ -42,7 +42,7 @@ def unstable_with(string, drive, law, dead_time_s, *, stuck=False):
 
 
 def random_cases(count, seed):
-    """(string, drive, law) that are stable: strings of 700 to 5,500 m, all kinds of gains."""
+    """Generate (string, drive, law, margins) of stable loops: strings of 700 to 5,500 m, many kinds of gains."""
     random = np.random.default_rng(seed)
     while count:
         string = string_with(length_m=float(random.uniform(700, 5500)), drag=float(random.uniform(0.002, 0.01)),
@@ -70,7 +70,7 @@ def check_reserve(cases, points):
 
 @pytest.mark.heavy
 def test_the_dead_time_reserve_is_the_smallest_that_destabilises():
-    """Every dead time of a scan up to 1 ms below is stable, 1 ms above is not: random strings, drives and gains."""
+    """Random loops are stable for every dead time up to 1 ms below the reserve, and unstable 1 ms above it."""
     check_reserve(random_cases(50, 1), 3)
 
 
@@ -81,10 +81,10 @@ def test_the_dead_time_reserve_on_many_controllers():
 
 @pytest.mark.parametrize(("law", "reserve_s"), [(HALF, 0.084), (STIFF, 0.0755)])
 def test_the_reserve_of_the_reference_card(law, reserve_s):
-    """An independent bisection near the first crossing has 84 ms (half of J compensated) and 75 to 76 ms (stiff)."""
+    """The dead-time reserves are those of an independent bisection: 84 ms (half of J compensated), 75.5 ms (stiff)."""
     found = loop_margins(DRIVE, law, STRING)
     assert found.dead_time_s == pytest.approx(reserve_s, abs=0.005)
-    # one more lag: stable again for a larger one, so that a bisection may miss the first
+    # One more lag may be stable again if it is larger, so a bisection may miss the first limit.
     lags = (*DRIVE.inner_lags_s, found.lag_s)
     for factor, stable in ((0.98, True), (1.02, False)):
         drive = replace(DRIVE, inner_lags_s=(*lags[:-1], factor * found.lag_s))
@@ -95,7 +95,7 @@ def test_the_reserve_of_the_reference_card(law, reserve_s):
 
 
 def test_the_gain_margin_of_half_the_inertia_compensated():
-    """With all gains times 1.3 the eigenvalues of the chain are unstable, and the margin is 2.3 dB, 1.30."""
+    """The gain margin is 2.3 dB, a factor of 1.305. The chain is stable at 1.27 and unstable at 1.34."""
     found = loop_margins(DRIVE, HALF, STRING)
     assert found.gain_db == pytest.approx(20.0 * np.log10(1.305), abs=0.1)
 
@@ -109,7 +109,7 @@ def test_the_gain_margin_of_half_the_inertia_compensated():
 
 @pytest.mark.parametrize("name", TABLE)
 def test_the_linear_limit_is_where_the_chain_becomes_unstable(name):
-    """The bit's slope there as negative friction in the chain of lumps: stable 2 % above, unstable 2 % below."""
+    """With the slope of the bit's friction, the chain is unstable 2 % below the linear limit and stable 2 % above."""
     law = TABLE[name]
     limit = linear_limit(STRING, DRIVE, law)
     assert 38.0 * RPM < limit < 55.0 * RPM

@@ -1,4 +1,4 @@
-"""string.yaml read strictly, and exact lines against closed forms and against the chain of lumps."""
+"""Strict reading of string.yaml, and exact lines compared with closed forms and with the chain of lumps."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_a_file_is_read_from_the_top_down(tmp_path):
     assert [round(line.length_m) for line in string.lines] == [2500, 200, 150]
     assert string.lines[2].impedance_nm_s_rad > 10 * string.lines[0].impedance_nm_s_rad
     plain = load_string(written(tmp_path, GOOD.replace("length_share: 0.05", "length_share: 1e-9")))
-    # joints are heavier and stiffer
+    # tool joints are heavier and stiffer than the pipe
     assert string.lines[0].inertia_kg_m > plain.lines[0].inertia_kg_m
     assert string.lines[0].compliance_rad_nm_m < plain.lines[0].compliance_rad_nm_m
 
@@ -90,7 +90,7 @@ def test_the_reference_string_by_its_formulas():
 
 
 def test_modes_with_the_top_held_are_those_of_the_transcendental_equation():
-    """ζ cot(ωL/c) = ω J_L, without losses: bisected between the poles of the cotangent."""
+    """Without losses, the modes solve ζ cot(ωL/c) = ω J_L, by bisection between the poles of the cotangent."""
     string = string_with(drag=0.0, viscous_nm_s_rad=0.0)
     delay, impedance = string.echo_s / 2, string.impedance_nm_s_rad
     wanted = []
@@ -143,7 +143,7 @@ def test_cutting_a_section_changes_nothing():
 @given(st.lists(st.tuples(st.floats(1.0, 4000.0), st.floats(0.08, 0.3), st.floats(0.0, 0.7), st.floats(0.0, 0.05)),
                 min_size=1, max_size=4), st.floats(1.0, 5000.0), st.floats(0.0, 100.0))
 def test_every_string_takes_energy_and_gives_none(sections, inertia, viscous):
-    """Z_s is positive real: Re Z_s ≥ 0 right of the axis, and symmetric."""
+    """The impedance Z_s is positive real: Re Z_s ≥ 0 in the right half-plane, and Z_s(s*) = Z_s(s)*."""
     lines = []
     for length, outer, bore, drag in sections:
         polar = pi / 32 * outer**4 * (1 - bore**4)
@@ -160,7 +160,7 @@ def test_a_spring_and_a_mass_as_identified_swing_as_they_were_seen_to():
     assert string.stiffness_nm_rad == pytest.approx(314.0)
     first, second, *_ = string_modes_hz(string)
     assert first == pytest.approx(0.1299, rel=1e-4)
-    assert second > 8.0 * first        # of the spring alone: far from what was identified
+    assert second > 8.0 * first        # mode of the spring itself, far above the identified one
     assert string.inertia_kg_m2 == pytest.approx(314.0 / (2 * pi * 0.1299) ** 2, rel=0.08)
     damped = spring_and_mass(314.0, 0.1299, 40.0)
     mode, *_ = ClosedSystem(damped).modes(0.2)

@@ -1,4 +1,4 @@
-"""Gains from J with its interval: what is chosen, what is refused, and that intervals are what drawing J gives."""
+"""Gains from J with its interval: choice, refusals, and intervals that agree with draws of J."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_the_compensated_one_is_stable_over_the_whole_interval_and_keeps_a_reser
 
 @pytest.mark.heavy
 def test_the_reserve_is_kept_at_the_softness_that_is_chosen():
-    """On a light rotor the softest is the best damped, and bears least."""
+    """For a light rotor, the softest controller has the most damping and allows the least compensation."""
     light = TuneCase(STRING, TopDrive(104.126, 8.1, 60.0, DRIVE.inner_lags_s), Interval(104.126, 99.857, 108.242))
     one = next(found for found in tune(light, search=None).tuned if found.kind == "compensated")
     assert one.controller is not None
@@ -103,7 +103,7 @@ def test_a_wider_interval_leaves_less_to_compensate():
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("kind", ["stiff", "soft", "compensated"])
 def test_intervals_are_what_two_hundred_draws_of_j_give(tuned, kind):
-    """95 % of the draws lie between the ends, which are no further out than what was drawn."""
+    """The intervals contain 95 % of the draws, and are not wider than the range of the draws."""
     rng = np.random.default_rng(11)
     drawn = rng.normal(1500.0, 60.0 / 1.959964, 200)
     law = tuned[kind].controller
@@ -117,7 +117,8 @@ def test_intervals_are_what_two_hundred_draws_of_j_give(tuned, kind):
 
 
 SPREAD = np.array([[0.004, 0.0], [-0.0032, 0.0024]])
-"""Main axes of a speed filter and a torque loop whose sum, 33 ms, is known better than either."""
+"""Main axes of the uncertainty of two lags, speed filter and torque loop. Their sum, 33 ms, is more certain than
+either."""
 
 
 def measured_lags(along=(0.0, 0.0)):
@@ -129,7 +130,7 @@ def measured_lags(along=(0.0, 0.0)):
     "soft", *(pytest.param(one, marks=pytest.mark.heavy) for one in ("present", "compensated")),
 ])
 def test_measured_lags_and_gains_go_in_as_two_hundred_draws_of_all_of_them_do(kind):
-    """95 % of the draws of J, of both lags as they hang together and of the present gains lie between the ends."""
+    """The intervals contain 95 % of the draws of J, of both correlated lags and of the present gains."""
     gain, integral = (1500.0, 1600.0, 1700.0), (900.0, 1000.0, 1100.0)
 
     def law(p=gain[1], i=integral[1]):
@@ -160,7 +161,7 @@ def test_lags_that_are_known_badly_leave_less_to_compensate():
 
 
 def test_a_mode_that_goes_up_is_still_the_lowest():
-    """A light rotor under much compensation: its swing nears the second mode's, and is no better damped for it."""
+    """With a light rotor and compensation, the lowest mode rises towards the second one and still counts as lowest."""
     drive = TopDrive(104.0, 8.0, 60.0, DRIVE.inner_lags_s)
     law = tuned_controller(STRING, 104.0, 0.936, HELD[0], 0.26)
     light = TuneCase(STRING, drive, Interval(104.0, 100.0, 108.0))
@@ -170,7 +171,7 @@ def test_a_mode_that_goes_up_is_still_the_lowest():
 @pytest.mark.long
 @pytest.mark.heavy
 def test_the_cure_speed_over_the_interval_is_what_two_hundred_draws_of_j_give(tuned):
-    """Simulated for each draw: 95 % lie between what the ends give, to the resolution of 1 rpm."""
+    """The cure speeds at the ends of J's interval enclose 95 % of the simulated draws, to the resolution of 1 rpm."""
     rng = np.random.default_rng(12)
     drawn = rng.normal(1500.0, 60.0 / 1.959964, 200)
     law = tuned["soft"].controller
@@ -193,7 +194,7 @@ def test_more_compensation_than_the_interval_allows_is_refused_with_its_numbers(
     wide = Interval(1500.0, 850.0, 2640.0)
     with pytest.raises(TuningRefused, match=r"50 % of J compensated swings by itself if J is 850.*33 ms of lag"):
         tune(case(wide, compensated_share=0.5), search=None)
-    tune(case(compensated_share=0.5, required=NO_MARGINS), search=None)      # and taken where J is known well enough
+    tune(case(compensated_share=0.5, required=NO_MARGINS), search=None)      # accepted if the interval of J is narrow
 
 
 def test_where_nothing_soft_is_stable_it_is_refused_in_words():
@@ -210,7 +211,7 @@ def test_broadband_is_refused_behind_these_lags(tuned):
 
 @pytest.mark.heavy
 def test_a_wrong_j_costs_what_the_notes_say(tuned):
-    """12.6 %: little; 76 %: half of J compensated is not stable."""
+    """With an error of J of 12.6 % all are stable. With 76 %, the controller that compensates half of J is unstable."""
     small, large = tuned["soft"].wrong
     assert small.stable and large.stable
     half = {one.kind: one for one in tune(case(compensated_share=0.5, softness=0.25, required=NO_MARGINS), None).tuned}
@@ -230,7 +231,7 @@ def parameters(gain, integral):
     ("nm_s_rad", "ms", (1186.0, 1e3 * 1186.0 / 999.3)),
     ("nm_s_rad", "s", (1186.0, 1186.0 / 999.3)),
     ("nm_s_rad", "nm_rad", (1186.0, 999.3)),
-    # 10 % of 1500 rpm are 15.708 rad/s: 1186 N·m·s/rad make 18630 N·m of them, 186.3 % of 10 kN·m
+    # 10 % of 1500 rpm is 15.708 rad/s. 1186 N·m·s/rad gives 18630 N·m for it, 186.3 % of 10 kN·m.
     ("percent_per_percent", "s", (18.63, 1186.0 / 999.3)),
     ("unknown", "unknown", (None, None)),
 ])

@@ -1,4 +1,4 @@
-"""The string that a host simulates below a real top: against the lines' theory, the simulation, and ideal rotors."""
+"""Virtual string below a real top, compared with the theory of lines, the simulation and ideal rotors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SMOOTH = {"friction": "coulomb", "static_nm": None, "stribeck_speed_rad_s": None
 
 
 def phasor(time_s, values, hertz):
-    """Of the line at ``hertz`` over whole periods."""
+    """Return the complex amplitude at ``hertz``, over whole periods."""
     return 2.0 * np.mean(values * np.exp(-2j * pi * hertz * time_s))
 
 
@@ -72,7 +72,7 @@ def test_a_bit_that_is_armed_breaks_away_at_once_and_a_stuck_one_winds_the_strin
     virtual.release()
     for _ in range(500):
         virtual.step(4.0, 0.02)
-    assert virtual.bit_rad_s > 0.0      # it swings on: a top that is held damps nothing
+    assert virtual.bit_rad_s > 0.0      # the bit goes on: a top at constant speed gives no damping
     virtual.arm()
     assert virtual.bit_rad_s == 0.0 and virtual.torque_nm == pytest.approx(STRING.bit.static_nm)
 
@@ -92,7 +92,7 @@ def test_the_controller_of_the_host_has_the_law_that_it_was_given(period_s):
     time_s = period_s * np.arange(round(50.0 / period_s))
     speed = np.sin(2.0 * pi * hertz * time_s)
     torque = np.array([host.step(0.0, float(one)) for one in speed])
-    # what is commanded waits half a cycle on the mean
+    # a command waits half a cycle on average
     late = np.exp(-2j * pi * hertz * 0.5 * period_s)
     half = len(time_s) // 2
     found = phasor(time_s[half:], torque[half:], hertz) / phasor(time_s[half:], speed[half:], hertz)
@@ -124,7 +124,7 @@ def test_the_observer_finds_a_speed_that_is_reported_late_and_a_torque_that_nobo
 
 
 def through(course, turns_from, *, sticks=True, longest_s=5000.0, period_s=0.1):
-    """The course with a bit that ends turning from that set speed on; the set speeds of the trials, and the phases."""
+    """Run the program with a bit that turns from that set speed on. Return (set speeds of the trials, phases)."""
     trials, phases, since_s = [], [], 0.0
     for _ in range(round(longest_s / period_s)):
         since_s += period_s
@@ -179,7 +179,7 @@ def test_the_set_speed_only_moves_on_ramps_and_the_string_only_fades():
 
 
 def on_ideal_rotor(loop, program, rig, period_s, seconds, unknown_nm=0.0):
-    """(rows, true speed at the main shaft) with a rotor that obeys, whose speed is reported late by the rig's lag."""
+    """Return (rows, true speed at the main shaft) of an ideal rotor whose reported speed has the rig's lag."""
     speed = reported = program.start_rad_s * rig.gear_ratio
     torque = next_nm = rig.coulomb_nm + rig.viscous_nm_s_rad * speed
     loop.begin(reported, torque)
@@ -201,12 +201,12 @@ def on_ideal_rotor(loop, program, rig, period_s, seconds, unknown_nm=0.0):
 @pytest.mark.heavy
 @pytest.mark.parametrize("rig", [
     IdentifiedRig(1500.0, 8.0, 60.0, 0.4),
-    IdentifiedRig(104.0, 8.0, 60.0, 0.4),                                # a bench of a fifteenth of the inertia
+    IdentifiedRig(104.0, 8.0, 60.0, 0.4),                                # test bench with a fifteenth of the inertia
     IdentifiedRig(1500.0 / 64.0, 8.0 / 64.0, 60.0 / 8.0, 0.4, 8.0),
-    # itself, at a motor that turns eight times as fast
+    # the intended machine, with a motor that turns eight times as fast
 ], ids=["itself", "bench", "geared"])
 def test_the_loop_is_the_simulation_of_the_machine_that_is_meant(rig):
-    """Bit and top over the first swings, at 50 rpm under a soft controller, against `simulate` with the same law."""
+    """Bit and top move as in `simulate` with the same law: first oscillations at 50 rpm, soft controller."""
     program = SpeedProgram(50.0 * RPM, 80.0 * RPM, settle_s=1.0, fade_s=2.0, hold_s=15.0)
     loop = HostLoop(STRING, DRIVE, SOFT_025, rig, program, 0.02, 1e6)
     rows, speeds = on_ideal_rotor(loop, program, rig, 0.02, 18.0)
@@ -228,12 +228,12 @@ def test_a_torque_limit_that_acts_shows_in_the_row():
     loop = HostLoop(STRING, DRIVE, SOFT_025, rig, program, 0.02, 800.0)
     rows, _ = on_ideal_rotor(loop, program, rig, 0.02, 7.0)
     assert rows[:, 11].any()
-    assert rows[rows[:, 1] <= Phase.ARM, 11].sum() == 0     # fading in takes no torque of the shaft
+    assert rows[rows[:, 1] <= Phase.ARM, 11].sum() == 0     # fading in needs no torque at the shaft
 
 
 @pytest.mark.heavy
 def test_fading_in_and_out_leaves_the_shaft_alone():
-    """What comes in of the string's torque is met by as much of the drive's."""
+    """The drive's torque balances the string's torque while it is faded in and out."""
     rig = IdentifiedRig(1500.0, 8.0, 60.0, 0.4)
     program = SpeedProgram(70.0 * RPM, 90.0 * RPM, settle_s=1.0, fade_s=3.0, hold_s=30.0)
     loop = HostLoop(STRING, DRIVE, SOFT_025, rig, program, 0.02, 1e6)
@@ -247,7 +247,7 @@ def test_fading_in_and_out_leaves_the_shaft_alone():
 
 @pytest.mark.parametrize(("gains", "unknown_nm"), [(1.0, (0.0, 120.0)), (1.6, (300.0, 2000.0))])
 def test_in_the_drives_own_loop_the_string_goes_through_the_offset_and_other_gains_show(gains, unknown_nm):
-    """A drive under its own PI, with counts of the set speed that the host doesn't see."""
+    """A drive runs its own PI controller, with a rounded set speed that the host does not know."""
     rig, period_s, fine = IdentifiedRig(1500.0 / 64.0, 8.0 / 64.0, 60.0 / 8.0, 0.4, 8.0), 0.02, 10
     program = SpeedProgram(50.0 * RPM, 80.0 * RPM, settle_s=1.0, fade_s=8.0, armed_s=8.0, hold_s=15.0)
     host = HostLoop(STRING, DRIVE, SOFT_025, rig, program, period_s, 1e6, own_loop=True)
@@ -271,5 +271,5 @@ def test_in_the_drives_own_loop_the_string_goes_through_the_offset_and_other_gai
     rows = np.array(rows)
     assert rows[-1, 1] == Phase.HOLD and np.ptp(speeds[-700:]) > 2.0
     arming = rows[:, 1] == Phase.ARM
-    assert np.abs(np.array(speeds)[arming][-50:] - program.start_rad_s).max() < 0.1      # the loop has made up for it
+    assert np.abs(np.array(speeds)[arming][-50:] - program.start_rad_s).max() < 0.1      # now balanced
     assert unknown_nm[0] <= np.sqrt(np.mean(rows[-600:, 9] ** 2)) <= unknown_nm[1]
