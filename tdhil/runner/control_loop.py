@@ -30,7 +30,7 @@ Watcher = Callable[[Command, Sample], None]
 
 
 class ControlLoop:
-    """Control loop of a drive under guard. ``watch``: live display of every cycle. ``stop_request``: read each cycle."""
+    """Control loop of a drive under guard. ``watch``: live display of each cycle. ``stop_request``: read each cycle."""
 
     def __init__(
         self, drive: Drive, guard: Guard, log: RunLog, stop_request: StopRequest, watch: Watcher | None = None
