@@ -23,14 +23,14 @@ SWITCH_CYCLES = 10
 
 
 NO_WORKER_PROCESS = "computations run in a thread beside the control loop, not in their own process"
-"""Logged with the reason. Cycles may be late meanwhile; there is no other effect."""
+"""Text of the log, before the reason. During a computation cycles may be late; there is no other effect."""
 
 
 Watcher = Callable[[Command, Sample], None]
 
 
 class ControlLoop:
-    """A drive under guard. ``watch`` receives every cycle (live display); each cycle checks ``stop_request``."""
+    """Control loop of a drive under guard. ``watch``: live display of each cycle. ``stop_request``: read each cycle."""
 
     def __init__(
         self, drive: Drive, guard: Guard, log: RunLog, stop_request: StopRequest, watch: Watcher | None = None
@@ -41,7 +41,7 @@ class ControlLoop:
         self.period_s = drive.period_s
         self.stop_side_troubles: list[str] = []
         self.last: Sample | None = None
-        self.before: Sample | None = None            # the one before it
+        self.before: Sample | None = None            # the sample before ``last``
         self.observer: Watcher | None = None         # called by a stage after every cycle, after the guard
         self.quiet = False                         # the operator is being asked: the display stays off the terminal
         self.worker_process: WorkerProcess | None = None     # long computations in real time; None: a thread
@@ -138,11 +138,11 @@ class ControlLoop:
     def compute_while(self, work: Callable[[], T], cycle: Callable[[], object]) -> T:
         """Run a longer computation while the drive keeps receiving setpoints: ``cycle`` sends one of them.
 
-        In stepped time the drive does not need them, and a number of cycles that depends on the computer's speed would
-        not repeat. There only keep-alive messages are sent, which do not advance time. In real time a worker process
-        runs the ``work`` if it is ready and accepts it (`background.WorkerProcess.ask`). A thread shares the
-        interpreter, and cycles are late beside it. On a computer with one processor they may be late in any case, and
-        that alone does not end the run.
+        In stepped time the drive needs no setpoints, and a number of cycles that depends on the computer's speed would
+        not repeat. So only keep-alive messages are sent, which do not advance time. In real time a worker process runs
+        the ``work`` if it is ready and accepts it (`background.WorkerProcess.ask`). Otherwise a thread does, which
+        shares the interpreter, and cycles are late. On a computer with one processor they may be late in any case.
+        Lateness alone does not end the run meanwhile.
 
         An error of ``cycle`` is raised at once: a shaft may be turning without a setpoint, so nothing waits for the
         ``work``. A process is killed. A thread continues beside the stop, and its result is dropped.
@@ -173,7 +173,7 @@ class ControlLoop:
         self.log.event(self.now_s, "host", f"{NO_WORKER_PROCESS}: {why}")
 
     def _wait_alive(self, ended: Event) -> None:
-        """Wait for a moment, or until it is done; then send a keep-alive message if the drive supports it."""
+        """Wait `ALIVE_S` or until the work is done; then send a keep-alive message if the drive supports it."""
         self._stop_request.check()
         if not ended.wait(ALIVE_S) and isinstance(self.drive, KeptAlive):
             self.drive.keep_alive()

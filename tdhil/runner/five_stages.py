@@ -1,4 +1,4 @@
-"""Runs one program of stages (`programs`) on one drive, and after every end the one stop sequence.
+"""Runs one program of stages (`programs`) on one drive, and then the stop sequence, however the program ends.
 
 The first cause is kept. Errors during the stop are reported beside it, never instead of it.
 """
@@ -130,7 +130,7 @@ class Runner:
         self._stop = stop
 
     def _prepare(self, end_setup: Callable[[], None]) -> Run:
-        """Connect, check and set the drive, and measure its offsets at standstill. Nothing moves."""
+        """Connect, check and set the drive, and measure its offsets at standstill. The shaft does not move."""
         identity = self._drive.connect()
         self._log.learn(simulated=identity.simulated)
         task = self._make_task(identity)
@@ -204,7 +204,7 @@ class Runner:
         return replace(task, assumptions=task.assumptions.at_period(period_s))
 
     def _learn_inputs(self, task: Task, preflight: Preflight, prior: LagPrior) -> None:
-        """Write to the log what identification must know of the drive and of the request."""
+        """Write the data of the drive and of the request that identification needs to the log."""
         if (by := task.request.impedance) is not None:
             count = preflight.torque_offset_resolution_nm if by == "offset" else preflight.speed_resolution_rad_s
             self._log.learn(
@@ -237,9 +237,7 @@ class Runner:
         return loop
 
     def _make_ready(self) -> str:
-        """Load and start what would delay the loop later. Return why there is no worker process; empty if there is
-        one.
-        """
+        """Load modules and start the worker process. Return why there is no worker process; empty if there is one."""
         stop_request = self._stop_request
         self._worker_process, why = begin(quieten, lambda: stop_request.signum is not None)
         stop_request.check()
@@ -261,7 +259,7 @@ class Runner:
         self._say(choice.text)
 
     def _learn_torque_answer(self) -> None:
-        """Record how the reported torque follows the commanded one: the estimate before the echo needs it."""
+        """Record how the reported torque follows the commanded one: the estimate from before the echo needs it."""
         if self._before_echo:
             answer = torque_answer(self._log.recording(complete=True), self._log.commanded_nm)
             if answer is not None:

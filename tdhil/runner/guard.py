@@ -8,13 +8,13 @@ reaction time t_r the shaft will have reached, before any action of the host can
 and ω_pred must stay below the window's upper end. (A quantum of speed at 250 Hz is already 2.6 rad/s², so the
 derivative of the reported speed would be noise only.) t_r is the assumed reaction time of loop and drive, plus three
 periods of a slow loop. Downwards ω_pred passes through standstill only if the torque exceeds the friction that then
-holds the shaft. The shaft must not turn backwards (if it may: not faster than the limit). Speeds between there and the
-window's lower end do no harm: that end is checked with the reported speed.
+holds the shaft. The shaft must not turn backwards (with allow_reverse: not faster than the limit). Speeds between
+there and the window's lower end do no harm, so the lower end is checked with the reported speed.
 
 In speed mode the guard checks the following error, as motion controllers do, by a window and a time. A plausible lag is
-no error: the window covers all values of the reference over the longest plausible lag. A shaft that comes nearer is
-waited for, however slow a heavy one may be at its torque limit. A torque offset moves the shaft away from its reference
-on purpose: while one may be commanded, the speed window is checked instead, at both ends.
+no error: the window covers all values of the reference over the longest plausible lag. The guard waits as long as the
+shaft comes nearer, because a heavy shaft at its torque limit is slow. A torque offset moves the shaft away from its
+reference on purpose: while one may be commanded, the speed window is checked instead, at both ends.
 """
 
 from __future__ import annotations
@@ -46,9 +46,8 @@ LONGEST_AGE_S = 0.25
 """Longest time without feedback, s. Meanwhile the drive continues with the last setpoint."""
 
 LIMITED_S = 0.5
-"""Longest time for which the drive's internal limit may act in torque mode, s: the torque is then not the commanded
-one,
-and the motion is not the planned one (row 33)."""
+"""Longest time for which the drive's internal limit may act in torque mode, s. While it acts, the torque is not the
+commanded one, and the motion is not the planned one (row 33)."""
 
 MODE_LOST_S, MODE_SWITCH_S, MODE_CYCLES = 0.25, 1.0, 15
 """Longest times, s, for which the drive may display another mode than the commanded one, and least number of cycles:
@@ -97,7 +96,7 @@ def _leads(sample: Sample, command: Command, predicted_rad_s: float) -> str:
 
 
 class Guard:
-    """Holds the machine's limits over one run.
+    """Guard of the machine's limits in one run.
 
     The stages set ``model``, ``expected``, ``no_braking`` and ``torque_offset_nm``.
     """
@@ -135,14 +134,14 @@ class Guard:
         self.no_braking = ""
         """Why torque below zero is not allowed in torque mode; empty: it is allowed. The Runner sets it."""
         self.to_brake = ""
-        """Advice how to allow it."""
+        """Advice how to allow braking torque."""
         self.disturbed = ""
         """Description of a lasting disturbance by a drill string under load; empty: none. It is used in messages only,
         the limits stay the same."""
         self.torque_offset_nm = 0.0
         """Largest permitted torque offset in either direction, N·m; 0: none. Set by the stage that uses it."""
         self.reckoning = False
-        """A computation beside the loop may make it late: then lateness alone does not stop the run."""
+        """True while a computation beside the loop may make it late: then lateness alone does not stop the run."""
         self.host_late: Callable[[], str] = lambda: ""
         """Lateness of this computer in words, if it is late (`drivers.clock.how_late`)."""
 
@@ -300,7 +299,7 @@ class Guard:
         ahead = speed_rad_s + rate * self._horizon_s
         if ahead * direction >= 0.0:
             return ahead
-        # Through standstill, where friction then opposes the remaining torque.
+        # The predicted speed passes through standstill; friction then opposes the remaining torque.
         push_nm = torque_nm + direction * model.coulomb_nm
         left_s = self._horizon_s + speed_rad_s / rate
         return push_nm / inertia * left_s if push_nm * direction < 0.0 else 0.0
@@ -406,7 +405,7 @@ class Guard:
             )
 
     def torque_told(self, torque_nm: float, limit_active: bool, disturbed: bool = False) -> tuple[str, str]:
-        """Return the torque compared with its limit, and advice for a shaft that does not reach its speed with it.
+        """Return two texts: the torque compared with its limit, and advice for a shaft that does not reach its speed.
 
         ``disturbed``: a drill string under load prevents that.
         """

@@ -53,7 +53,7 @@ from tdhil.runner.stages import RampCourse, reference_plan
 NOT_PREDICTED = "the width of the interval of J is not predicted for this motion; it follows from the recording"
 NOTHING_TO_EXPECT = "no interval of J is expected: this motion can't separate the inertia from lags and friction"
 _PILOT_SHARE = 0.6        # of the expected periods: the pilot's scatter decides about the rest
-_EVER = 1000.0            # times as long: an uncertainty that remains then stays
+_EVER = 1000.0            # factor on the duration: an uncertainty that remains with it can't be reduced by time
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ def refuse_undersampled(request: ExcitationRequest, rate_hz: float) -> None:
 
 
 _FIXED = ("frequency_hz", "amplitude_rad_s", "offset_rad_s", "periods")
-"""Values of a motion that tdhil does not change, if the user gives them."""
+"""Options of a motion that tdhil does not change if the user sets them."""
 
 
 def refuse_uninformative(

@@ -92,7 +92,7 @@ class RateChoice:
 
 
 def quieten() -> None:
-    """Do now what would delay a control loop later: before anything is armed, and before the rate is measured.
+    """Load modules and collect garbage, before anything is armed and before the rate is measured.
 
     Reading scipy from the disk takes seconds, in pieces that block all other threads. Each garbage collection over all
     loaded objects takes a tenth of a second.

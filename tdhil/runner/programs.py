@@ -1,6 +1,6 @@
-"""The four programs of a run, each a list of stages from the top down, and the choice among them.
+"""The four programs of a run, each a sequence of stages, and the choice of the program.
 
-`five_stages` has connected the drive and checked it before; the stop sequence comes after it, however a program ends.
+`five_stages` connects and checks the drive before the program. The stop sequence follows, however the program ends.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def program_of(task: Task) -> Callable[[Run], None]:
 
 @dataclass(frozen=True)
 class Run:
-    """One run with a prepared drive: what its stages need. Stage 1 has begun.
+    """Data and functions that the stages of one run need. The drive is prepared, and stage 1 has begun.
 
     ``prior``: knowledge of the reporting lags at standstill. ``armed`` receives the stop sequence, which is due from
     then on. ``end_setup`` ends stage 1. ``identify`` returns the function that identifies the recording.
@@ -220,9 +220,7 @@ def turn(run: Run) -> Turning:
 
 
 def _note_timing(run: Run, speed: SpeedResult) -> LagPrior:
-    """Note the uncertainty of the sample times. Torque and speed may be offset in time by as much. Return the prior
-    with it.
-    """
+    """Log the uncertainty of the sample times. Return the prior with it: speed and torque may be offset by as much."""
     half_s = sum(sample.half_width_s for sample in speed.last) / max(1, len(speed.last))
     if half_s <= 0.0:
         return run.prior
@@ -339,7 +337,7 @@ def acquire_offset(run: Run, turning: Turning, found: OffsetPlan) -> None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What `virtual_string` has before motion, and its stages 4 and 5.
+# Checks of `virtual_string` before motion, and its stages 4 and 5.
 
 
 def speed_program(run: Run, case: EvaluationCase) -> SpeedProgram:

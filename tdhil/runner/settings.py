@@ -18,15 +18,15 @@ class MachineLimits:
     quick_stop_rad_s2: float = 2.0
     watchdog_s: float = 0.5
     probe_torque_nm: float = 0.0       # sign probe: torque may rise to this until the shaft moves
-    probe_travel_rad: float = 3.0      # sign probe: how far the shaft may turn
+    probe_travel_rad: float = 3.0      # sign probe: longest travel of the shaft
     allow_reverse: bool = False
     load: str = "none"                 # none, string
     torque_ramp_nm_s: float = 0.0      # with a string: release rate of trapped torque
-    wave_impedance_nm_s_rad: float = 0.0   # of a string's pipe; 0: its sizes are unknown
+    wave_impedance_nm_s_rad: float = 0.0   # characteristic impedance of a string's pipe; 0: its sizes are unknown
     echo_s: float = 0.0                # round-trip time 2L/v of a wave; 0: unknown
     temperature_c: float | None = None     # °C; a drive that reports a temperature is stopped above it
     accept_no_watchdog: bool = False   # the operator accepts a drive that won't stop by itself (--accept-no-watchdog)
-    accept_shared_watchdog: bool = False   # … or one that any client feeds (--accept-shared-watchdog)
+    accept_shared_watchdog: bool = False   # the operator accepts that any client feeds it (--accept-shared-watchdog)
     accept_speed_unit: bool = False    # the operator accepts the unit of speed unchecked (--accept-speed-unit)
     accept_wider: frozenset[str] = frozenset()     # own limits of the drive that the operator lets the run widen
 
@@ -68,7 +68,7 @@ class ControlAssumptions:
 
 
 REACTION_CYCLES = 3.0
-"""The sample's own cycle, the cycle of the response, and one that may be lost."""
+"""Cycles of a reaction: the sample's own cycle, the cycle of the response, and one that may be lost."""
 
 
 class StopRequest:

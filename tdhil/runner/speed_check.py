@@ -1,9 +1,9 @@
 """An independent check of the unit of speed, before stage 2 goes to its second mean speed.
 
-The host knows the shaft's speed, and scales its setpoint, through one number of the profile. If it is ten times too
-small, the shaft turns ten times as fast as commanded and reported, and no limit in rad/s holds. So on the way to the
-first mean speed the drive's position is read beside the cycle, if it has one. The ramp continues past `slow_speed`, at
-which a tenfold error does no harm, only while the position agrees. At the first mean speed the ratio of both is taken
+One number of the profile scales the reported speed and the setpoint. If this number is ten times too small, the shaft
+turns ten times as fast as commanded and reported, and no limit in rad/s holds. So on the way to the first mean speed
+tdhil reads the drive's position beside the cycle, if it has one. The ramp continues past `slow_speed`, at which a
+tenfold error does no harm, only while the position agrees. At the first mean speed the ratio of both travels is taken
 over the whole operating point. Without a position the operator confirms the speed.
 
 Refused: a ratio that differs from one, in either direction, by more than `TOLERANCE` plus the resolution of the speed.
@@ -37,11 +37,11 @@ if TYPE_CHECKING:
 WINDOW_S = 0.25
 """Shortest time over which the speed of the position is taken, s."""
 LEAST_WINDOW = 3
-"""Least number of readings for it."""
+"""Least number of readings for the speed of the position."""
 SEEN_FASTER = 12.0
-"""A position that wraps is followed up to a shaft this many times faster than believed."""
+"""Largest ratio of true to reported speed at which a position that wraps must still be followed."""
 EXACT = 0.03
-"""A ratio counts once its half-width is below this share of itself."""
+"""Largest half-width of a usable ratio, as a share of the ratio."""
 LEAST_S = 2.0
 """Shortest stretch for a ratio, s."""
 STOOD_RAD = 8.2
@@ -64,13 +64,13 @@ class _AnglePoint:
 
 
 class Angles:
-    """The positions of one drive over one run; `restart` begins a new stretch."""
+    """Positions of one drive during one run; `restart` begins a new stretch."""
 
     def __init__(self) -> None:
         self.where = ""
         self.count_rad: float | None = None        # the smallest observed step: an upper limit of one count
         self.blind = False                         # too few readings for a position that wraps
-        self._way_rad = 0.0                        # by the reported speed
+        self._way_rad = 0.0                        # travel by the reported speed, rad
         self._before: Sample | None = None
         self._last: _AnglePoint | None = None
         self._raw_rad = 0.0
@@ -144,7 +144,7 @@ class Angles:
         count = self.count_rad
         start, end = self._changed, self._changed_last
         if start is None or end is None:
-            # No change: the position is frozen if it has counted as finely as that before, or over a whole turn.
+            # No change: the position is frozen if the reported travel exceeds five known counts, or `STOOD_RAD`.
             return TravelRatio(0.0,
                                0.0) if way > (STOOD_RAD if count is None else min(STOOD_RAD, 5.0 * count)) else None
         way_rad = end.way_rad - start.way_rad
@@ -200,7 +200,7 @@ _IF_RIGHT = "; if the speed is right, check its position entry (counts per turn)
 
 @dataclass(frozen=True)
 class SpeedWitness:
-    """The operator who confirms the speed if there is no position. ``accepted``: the unit was accepted by name."""
+    """Operator who confirms the speed if there is no position. ``accepted``: the unit was accepted by name."""
 
     confirm: ConfirmSpeed = refuse_unconfirmed_speed
     simulated: bool = False
@@ -216,14 +216,14 @@ def slow_speed(limits: MachineLimits, resolution_rad_s: float) -> float:
 
 
 class _Paused(NamedTuple):
-    """The speed at which the ramp waits: until the position follows, or for a full comparison."""
+    """Speed at which the ramp waits: until the position follows, or for a full comparison."""
 
     speed_rad_s: float
     until_compared: bool
 
 
 class SpeedUnitCheck:
-    """The check in stage 2: `ramp` to the first mean speed, `level` at this speed, `conclude` after it."""
+    """Check of the unit of speed in stage 2: `ramp` to the first mean speed, `level` at it, `conclude` after it."""
 
     def __init__(
         self, loop: ControlLoop, limits: MachineLimits, assumptions: ControlAssumptions, resolution_rad_s: float,
@@ -375,7 +375,7 @@ class SpeedUnitCheck:
             yield
 
     def _pause(self, paused: _Paused) -> None:
-        """Hold a slow speed until both are compared. If that is not possible, ask the operator."""
+        """Hold a slow speed until position and speed are compared. If that is not possible, ask the operator."""
         speed_rad_s, command = paused.speed_rad_s, Command(Mode.SPEED, paused.speed_rad_s, 0.0)
         if self._watching and not self._lost:
             for _ in self._waited(speed_rad_s, self._lag_s):

@@ -1,4 +1,4 @@
-"""Standstill, the one definition that the stop and the release use. Pure.
+"""Definition of standstill, for the stop and the release. Pure.
 
 A shaft stands still once all of these have held for long enough:
 
@@ -7,9 +7,9 @@ A shaft stands still once all of these have held for long enough:
 - no report contradicts another, or the contradiction has been refuted (`observer.Observer.believable`); then the torque
   must be too small to keep the shaft turning,
 - the drive shows a state in which the shaft may stand still: a quick stop or speed mode that reports standstill, or no
-  torque, or torque mode with zero torque. A statusword that is no state shows nothing.
+  torque, or torque mode with zero torque. A statusword without a valid state proves nothing.
 
-"Long enough" is the time in which every lag runs out, and in which friction stops what the reports can hide.
+"Long enough" is the time in which every lag decays, and in which friction stops a motion that the reports can hide.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from drivers import PowerState, Sample
 from tdhil.runner.observer import Observer
 
 NO_TORQUE = (PowerState.OFF, PowerState.READY, PowerState.FAULT)
-"""States without torque on the shaft (CiA 402-2, state machine). Not ready to switch on is none of them: feedback that
-is all zero shows it too."""
+"""States without torque on the shaft (CiA 402-2, state machine). "Not ready to switch on" is not among them, because
+feedback that is all zero shows it too."""
 
 
 class Standstill:
-    """Follows the feedback of one stop. ``settle_s``: least duration; ``longest_gap_s``: longest gap in feedback."""
+    """Standstill test of one stop. ``settle_s``: least duration, s; ``longest_gap_s``: longest gap in feedback, s."""
 
     def __init__(self, observer: Observer, at_rest_rad_s: float, settle_s: float, longest_gap_s: float) -> None:
         self._observer = observer
@@ -35,7 +35,7 @@ class Standstill:
 
     @property
     def settle_s(self) -> float:
-        """How long standstill must be reported, s: a shaft whose motion was never reported gets time to run out."""
+        """Return the time for which standstill must be reported, s; longer if the motion was never reported."""
         return max(self._settle_s, self._observer.blind_s, self._observer.unseen_s)
 
     def quiet(self, sample: Sample) -> bool:
@@ -48,7 +48,7 @@ class Standstill:
         )
 
     def see(self, sample: Sample, polled_gap_s: float = 0.0, *, without_torque: bool = False) -> bool:
-        """Take one sample; true once the shaft has been at rest for long enough.
+        """Add one sample. Return True once the shaft has been at standstill for long enough.
 
         ``polled_gap_s``: longest gap between samples that are answers to single requests, if longer, s.
         ``without_torque``: zero torque is commanded, in torque mode.

@@ -1,29 +1,29 @@
 """The one stop sequence, for every cause and for the normal end.
 
-1. Quick stop under the drive's speed control; where the profile says that a quick stop does not decelerate from
-   torque mode, speed mode at zero first.
+1. Quick stop under the drive's speed control. If the profile states that a quick stop does not decelerate the shaft
+   from torque mode, the stop commands speed mode at zero speed first.
 2. Wait for standstill, by status word and by speed. The reported speed lags, so it must stay at zero for longer than
    the largest plausible lag. The time depends on the torque limit and on torsional vibration: the stop waits as long
    as the shaft becomes slower.
-3. With a drill string, bring trapped torque down under speed control, on the rig's ramp (`string_release`). A drive may
-   end a quick stop by switching its torque off, so the release comes first: the shaft is brought to standstill in speed
-   mode, at the rate of the quick stop, and yields from there. A drive that does not follow gets the quick stop at once.
-   It then holds the string, and is not disabled.
+3. With a drill string, release the trapped torque under speed control, on the rig's ramp (`string_release`). A drive
+   may end a quick stop by switching its torque off, so the release comes first: the shaft is brought to standstill in
+   speed mode, at the rate of the quick stop, and yields from there. If the drive does not follow, the stop requests the
+   quick stop at once. The drive then holds the string, and is not disabled.
 4. Disable, and confirm: torque off by status word, and the shaft at standstill without it.
 
-The stop judges the shaft of the motor. A string below may go on swinging once the torque at the top has been quiet for
-half a swing (`string_release.QUIET_S`). The motor does not follow, since its friction holds.
+Standstill means standstill of the motor shaft. A string below may continue to oscillate after the torque at the top has
+been quiet for half a period (`string_release.QUIET_S`). The motor does not follow, because its friction holds it.
 
 If the cycle brings no feedback any more (a drive that restarted, a foreign NMT command, lost frames), the stop reads
-the drive by single requests. It does so too if the feedback reports a turning shaft after the time of the stop, and a
-poll contradicts it (`FeedbackPolls`).
+the drive by single requests. It also does so if the feedback still reports a turning shaft when the time of the stop
+is over, and a poll contradicts it (`FeedbackPolls`).
 
-If the shaft goes on turning in spite of the quick stop (another master commands it, or the drive does not brake), the
-stop ends the host's sign of life, so that the drive's own watchdog acts. It goes on watching the shaft.
+If the shaft continues to turn after the quick stop (another master commands it, or the drive does not brake), the host
+stops feeding the drive's watchdog, so that the watchdog acts. The stop continues to watch the shaft.
 
-A turning shaft is not disabled from here, but in two cases: the shaft accelerates against the quick stop, or its speed
-is not believed above a drill string and it has run out without torque (decision 0024). If the drive can't be reached,
-its own watchdog must act, and the report says so. No exception on the way, an interrupt included, skips a step.
+The stop removes the torque of a turning shaft in two cases only: the shaft accelerates against the quick stop; or, with
+a drill string and a speed that is not believed, friction has had time to stop it without torque (decision 0024). If the
+drive can't be reached, its own watchdog must act, and the report states it. No exception or interrupt skips a step.
 """
 
 from __future__ import annotations
@@ -54,24 +54,24 @@ from tdhil.runner.standstill import NO_TORQUE, Standstill
 from tdhil.runner.string_release import MEAN_S, StringRelease, StringReleaseLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Single polls of a drive (`drivers.drive.Polled`) for a stop without feedback of the cycle, or none to believe.
+# Single polls of a drive (`drivers.drive.Polled`) for a stop without credible feedback of the cycle.
 #
-# A poll feeds what supervises the host. So it must not go on for ever at a shaft that is not slowing down: such a one
-# is left to the drive's own watchdog, which wants silence (`Slowing`).
+# A poll also feeds the drive's watchdog. So polling must end if the shaft does not slow down: the watchdog acts only
+# if no requests come (`Slowing`).
 
 
 AFTER_S = 0.2
-"""Without cyclic feedback for so long, the drive is polled."""
+"""Time without cyclic feedback after which the drive is polled, s."""
 
 EVERY_S, MOST_S = 0.1, 0.4
-"""Between two polls; twice as long after each that brought nothing, up to the second."""
+"""Interval between two polls, s. It doubles after each poll without an answer, up to the second value."""
 
 SLOWING_S, SLOWER = 1.0, 0.98
-"""Under polls alone the shaft must have lost so much of its speed each second."""
+"""Under polls alone: time within which the speed must fall, s, and the share to which it must fall."""
 
 
 class FeedbackPolls:
-    """Knows when a poll is due. ``only``: the cyclic feedback is not believed any more."""
+    """Polls of the drive, with their timing. ``only``: the cyclic feedback is not believed any more."""
 
     def __init__(self, drive: Drive, period_s: float) -> None:
         self._drive = drive if isinstance(drive, Polled) else None
@@ -84,15 +84,15 @@ class FeedbackPolls:
 
     @property
     def standing(self) -> bool:
-        """Do polls stand in for the cycle's feedback at present?"""
+        """Return whether polls replace the cycle's feedback at present."""
         return self.only or self._missing_s > 0.0
 
     def heard(self) -> None:
-        """The cycle brought feedback."""
+        """Note that the cycle brought feedback."""
         self._missing_s, self._due_s, self._pause_s = 0.0, AFTER_S, EVERY_S
 
     def missed(self) -> Sample | None:
-        """A cycle has brought none: the drive's answer, where a poll was due and was answered. May raise."""
+        """Note a cycle without feedback. Return the drive's answer if a poll was due, or None. May raise."""
         self._missing_s += self._period_s
         if self._drive is None or self._missing_s < self._due_s - 1e-9:
             return None
@@ -101,7 +101,7 @@ class FeedbackPolls:
         return self.ask()
 
     def ask(self) -> Sample | None:
-        """Poll now; None without an answer. May raise."""
+        """Poll now. Return the drive's answer, or None without one. May raise."""
         sample = self._drive.poll() if self._drive is not None else None
         if sample is not None:
             self.answered += 1
@@ -110,7 +110,7 @@ class FeedbackPolls:
 
 
 class Slowing:
-    """Test of a shaft that must lose speed: to `SLOWER` of it within ``within_s``."""
+    """Test whether a shaft slows down: to the share `SLOWER` of its speed within ``within_s``."""
 
     def __init__(self, at_rest_rad_s: float, within_s: float = SLOWING_S) -> None:
         self._at_rest_rad_s = at_rest_rad_s
@@ -119,11 +119,11 @@ class Slowing:
         self._speed_rad_s = math.inf
 
     def reset(self) -> None:
-        """Begin anew with the next sample."""
+        """Start again with the next sample."""
         self._since_s = None
 
     def see(self, time_s: float, speed_rad_s: float) -> bool:
-        """False once a shaft that turns has not got slower for so long."""
+        """Return False once a turning shaft has not become slower for ``within_s``."""
         speed_rad_s = abs(speed_rad_s)
         if self._since_s is None or speed_rad_s <= max(self._at_rest_rad_s, SLOWER * self._speed_rad_s):
             self._since_s, self._speed_rad_s = time_s, speed_rad_s
@@ -131,11 +131,11 @@ class Slowing:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How long a stop is waited for: by the ramp, and beyond it for as long as the shaft keeps getting slower. Pure.
+# Longest wait for standstill: the time of the ramp, and beyond it as long as the shaft keeps becoming slower. Pure.
 #
-# A heavy shaft at its torque limit takes J ω / T instead of the ramp's time, and one on a string swings on the way
-# down: the highest speed of each block of 5 s must be lower than ever before by 1 %, or patience ends after two more
-# blocks.
+# A heavy shaft at its torque limit takes J ω / T instead of the ramp's time, and a shaft with a string oscillates while
+# it slows down. So the highest speed of a block of 5 s is compared with that of all blocks before. If no block is lower
+# by 1 % for two blocks, the wait ends.
 
 
 BLOCK_S = 5.0             # s; block whose highest speed is compared
@@ -145,7 +145,7 @@ LONGEST_S = 300.0         # s; longest wait
 
 
 class StopTimeout:
-    """``see`` every sample and ``wait`` every cycle without one; ``over`` says when to give up."""
+    """Longest wait for standstill. Call `see` for every sample and `wait` for every cycle without one, until `over`."""
 
     def __init__(self, enough_s: float, at_rest_rad_s: float) -> None:
         self._enough_s = enough_s
@@ -158,23 +158,23 @@ class StopTimeout:
 
     @property
     def over(self) -> bool:
-        """Long enough, and no slower for two blocks; or longer than any stop may take."""
+        """Return whether the wait ends: the ramp's time is over and two blocks were no slower, or after LONGEST_S."""
         no_gain_s = self.waited_s - self._gained_s
         return self.waited_s > LONGEST_S or (self.waited_s > self._enough_s and no_gain_s > BLOCKS * BLOCK_S)
 
     def wait(self, period_s: float) -> None:
-        """A cycle has gone by."""
+        """Count a cycle."""
         self.waited_s += period_s
         self._block_s += period_s
         if self._block_s < BLOCK_S:
             return
-        # A shaft that hardly moves gets no slower by noise alone.
+        # At standstill a lower peak is noise only, and does not extend the wait.
         if self._at_rest_rad_s < self._peak < SLOWER_SHARE * self._best:
             self._best, self._gained_s = self._peak, self.waited_s
         self._block_s = self._peak = 0.0
 
     def see(self, speed_rad_s: float, period_s: float) -> None:
-        """A cycle has gone by, and showed this speed."""
+        """Count a cycle with this reported speed, rad/s."""
         self._peak = max(self._peak, abs(speed_rad_s))
         self.wait(period_s)
 
@@ -182,43 +182,43 @@ class StopTimeout:
 # ---------------------------------------------------------------------------------------------------------------------
 
 AT_REST_SHARE = 0.005
-"""Standstill is a speed below this share of the speed limit, or three quanta if that is more."""
+"""Share of the speed limit below which a speed counts as standstill; three quanta if that is more."""
 
 LONGEST_GAP_S, LONGEST_GAP_CYCLES = 0.2, 3
-"""Standstill must have been watched without a longer gap in the feedback than both; on a slow line a frame may go."""
+"""Longest gap in the feedback at standstill, s and cycles (the longer one counts); a slow line may lose a frame."""
 
 POLLED_GAP_S = 0.6
-"""The longest gap while polls stand in for the cycle: two polls without an answer, with the pauses after them, on a
-computer that is late. One swing of a drill string lasts longer."""
+"""Longest gap while polls replace the cycle's feedback, s: two polls without an answer, with the pauses after them, on
+a computer that is late. One oscillation of a drill string lasts longer."""
 
 SILENT_S, SILENT_CYCLES = 1.0, 25
-"""After so long, and so many cycles, without any feedback the drive can't be reached: its watchdog stops the shaft."""
+"""Time, s, and cycles without any feedback after which the drive can't be reached: its watchdog stops the shaft."""
 
 MODE_S = 0.5
-"""The drive may take so long to change to speed mode."""
+"""Longest time of the drive to change to speed mode, s."""
 
 REST_AFTER_S = 10.0
-"""A shaft that begins to turn once its torque is off gets so long to come to rest by itself."""
+"""Time for a shaft that begins to turn when its torque is off to come to rest by itself, s."""
 
 UNMOVED_S, UNMOVED_STRING_S, UNMOVED_RAMP_SHARE = 3.0, 10.0, 0.1
-"""A shaft that got no slower for so long after the quick stop is left to the drive's watchdog; one with a string may
-swing meanwhile. On a long ramp this share of it, from the highest speed, if that is more."""
+"""Time without slowing down after the quick stop, s, after which the drive's watchdog is left to act; longer with a
+string, which may oscillate. The third value is a share of the ramp's time from the highest speed, used if longer."""
 
 MOST_INTERRUPTIONS = 5
-"""The sequence begins anew after an exception of its own so many times; a request made twice does no harm."""
+"""Largest number of attempts: the sequence starts again after an exception of its own. Repeated requests do no harm."""
 
 POSITION_EVERY_S = 0.25
 """Interval of reading a position that does not come with the cycle, while standstill is watched, s."""
 
 TORQUE_BACK_S = 0.2
-"""Before a quick stop whose speed signal is in doubt, zero torque is commanded for so long, s: some cycles, and the
-drive's own torque ramp."""
+"""Duration of zero torque before a quick stop whose speed signal is in doubt, s: some cycles, and the drive's own
+torque ramp."""
 
 TORQUE_FALLS_S = 0.5
-"""Before a shaft runs out, the torque that it turned under goes to zero within this time, s."""
+"""Time within which the torque of a turning shaft is brought to zero before it runs out, s."""
 
 TORQUE_GONE_S = 2.0
-"""The reported torque must have followed zero torque after so long, s."""
+"""Time after which the reported torque must have followed zero torque, s."""
 
 REPEAT_S = 1.0
 """Interval of repeating the quick stop while the drive shows no valid state, s."""
@@ -230,7 +230,7 @@ _NO_TORQUE_ASKED = Command(Mode.TORQUE, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class StopReport:
-    """How the stop went. ``confirmed``: seen at rest and disabled."""
+    """Result of the stop. ``confirmed``: the shaft was seen at standstill, and the drive is disabled."""
 
     confirmed: bool
     at_rest_s: float | None            # control time at which the shaft was seen at rest
@@ -240,7 +240,7 @@ class StopReport:
 
 
 class StopSequence:
-    """Runs once; a second call gives the first one's report. ``watched``: the drive's own watchdog is armed."""
+    """Stop sequence of one run; it runs once, and later calls return its report. ``watched``: the watchdog is armed."""
 
     def __init__(
         self,
@@ -260,7 +260,7 @@ class StopSequence:
         self._at_rest_rad_s = max(3.0 * speed_resolution_rad_s, AT_REST_SHARE * limits.speed_max_rad_s)
         self._longest_gap_s = max(LONGEST_GAP_S, LONGEST_GAP_CYCLES * loop.period_s)
         self._settle_s = 3.0 * assumptions.largest_speed_lag_s
-        # The ramp from the highest speed, with as much again for a drive at its torque limit, and the settling.
+        # Three times the ramp from the highest speed, for a drive at its torque limit, and the settling.
         ramp_s = limits.speed_max_rad_s / limits.quick_stop_rad_s2
         self._enough_s = 3.0 * ramp_s + 2.0 * self._settle_s + 1.0
         self._quick_stop_in_torque_mode = quick_stop_in_torque_mode
@@ -291,7 +291,7 @@ class StopSequence:
         self._report: StopReport | None = None
 
     def run(self) -> StopReport:
-        """Bring the shaft to rest and disable. Never raises; what went wrong is in the report."""
+        """Bring the shaft to standstill and disable the drive. Never raises: errors are in the report."""
         if self._running:
             return StopReport(False, None, False, ("the stop sequence is under way already",))
         self._running = True
@@ -300,7 +300,7 @@ class StopSequence:
                 break
             try:
                 self._report = self._sequence()
-            except BaseException as error:  # an interrupt must not end it either: from the beginning, then
+            except BaseException as error:  # an interrupt must not end the stop either: start again
                 self._note(error)
         self._running = False
         return self._report or StopReport(False, None, False, tuple(self._trouble))
@@ -328,7 +328,7 @@ class StopSequence:
     # -- with a drill string -----------------------------------------------------------------------------------
 
     def _slow_down(self) -> bool:
-        """Speed mode, ramped to zero: whether the drive followed, and so holds the shaft under speed control now."""
+        """Ramp to zero in speed mode. Return whether the drive followed and holds the shaft under speed control."""
         speed = self._begins_at()
         came_from, step = math.copysign(1.0, speed), self._limits.quick_stop_rad_s2 * self._loop.period_s
         patience = StopTimeout(self._enough_s, self._at_rest_rad_s)
@@ -355,14 +355,14 @@ class StopSequence:
         return False
 
     def _begins_at(self) -> float:
-        """The speed that the ramp begins at: a single wrong report, or one beyond the limit, must not be followed."""
+        """Return the ramp's first speed, rad/s: a single wrong report, or one above the limit, must not be followed."""
         seen = [one.speed_rad_s for one in (self._loop.last, self._loop.before) if one is not None]
         speed = min((one for one in seen if math.isfinite(one)), key=abs, default=0.0)
         most = self._limits.speed_max_rad_s
         return kept_within(speed, -most, most)
 
     def _release(self, string: StringReleaseLimits) -> None:
-        """Yield to the trapped torque until nothing is left or the bounds are reached."""
+        """Yield to the trapped torque until it is released or the limits of the release are reached."""
         going = StringRelease(string, self._at_rest_rad_s, self._loop.period_s)
         command = _REST
         while not (going.done or going.failed or self._speed_doubted):
@@ -387,19 +387,19 @@ class StopSequence:
             )
 
     def _run_out(self, string: StringReleaseLimits) -> StopReport | None:
-        """Bring the torque to zero in torque mode and wait until friction has stopped the shaft; then remove it.
+        """Bring the torque to zero in torque mode, give friction the time to stop the shaft, then remove the torque.
 
-        Speed control by a speed that is not believed would drive the shaft on, and so would the drive's watchdog, which
-        brakes by the same signal. A speed that is believed again has shown how fast the shaft is, and not with which
-        sign: the shaft stays without torque until it is at rest. None where the drive does not follow torque mode: then
-        the quick stop has to do.
+        Speed control with a speed that is not believed could accelerate the shaft. So could the drive's watchdog, which
+        brakes with the same signal. If the speed is believed again, its magnitude is known, but not its sign: the shaft
+        stays without torque until standstill. Returns None if the drive does not follow torque mode: then only the
+        quick stop is left.
         """
         last = self._loop.last
         if last is None or last.state is not PowerState.ENABLED:
             return None
         observer = self._loop.guard.observer
         torque_nm = kept_within(last.torque_nm - string.torque_offset_nm, -string.torque_nm, string.torque_nm)
-        # What flows while the shaft turns accelerates it and holds nothing: it goes at once.
+        # While the shaft turns, the flowing torque accelerates it and holds nothing: bring it to zero quickly.
         quick_nm_s = abs(torque_nm) / TORQUE_FALLS_S if observer.turned else 0.0
         step_nm = max(string.ramp_nm_s, quick_nm_s) * self._loop.period_s
         waited_s = without_s = 0.0
@@ -459,9 +459,9 @@ class StopSequence:
         return at_rest_s
 
     def _coast(self) -> float | None:
-        """Give no torque in torque mode until the shaft is at rest: None where the drive does not do it.
+        """Command zero torque in torque mode until standstill. Return its control time, s; None if it is not reached.
 
-        For a shaft that speed control would drive on: the sign of a report is inverted, which does not matter for
+        Used if speed control could accelerate the shaft: the sign of a report is inverted, which does not matter for
         standstill, or no motion has ever been reported.
         """
         rest = Standstill(self._loop.guard.observer, self._at_rest_rad_s, self._settle_s, self._longest_gap_s)
@@ -483,7 +483,7 @@ class StopSequence:
         return None
 
     def _coasted(self) -> StopReport | None:
-        """Coast to rest, then disable; None where the drive does not coast."""
+        """Coast to standstill, then disable the drive. Return None if the shaft does not coast to standstill."""
         at_rest_s = self._coast()
         if at_rest_s is None:
             return None
@@ -492,9 +492,9 @@ class StopSequence:
         return StopReport(stays, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm)
 
     def _take_torque_back(self) -> None:
-        """Command zero torque in torque mode first.
+        """Command zero torque in torque mode before the quick stop.
 
-        Speed control would go on holding the torque that flows, with a speed signal that does not answer.
+        With a speed signal that does not respond, speed control would continue to hold the flowing torque.
         """
         last = self._loop.last
         if last is None or last.mode is not Mode.TORQUE or last.state is not PowerState.ENABLED:
@@ -504,14 +504,14 @@ class StopSequence:
 
     @property
     def _never_moved(self) -> bool:
-        """Above a string: torque was given, and no motion reported. Speed control could drive an unseen shaft on."""
+        """Return whether, above a string, torque caused no reported motion: speed control could drive the shaft."""
         observer, last = self._loop.guard.observer, self._loop.last
         in_torque = last is not None and last.mode is Mode.TORQUE and last.state is PowerState.ENABLED
         return self._string is not None and in_torque and observer.unseen_s > 0.0
 
     @property
     def _speed_doubted(self) -> bool:
-        """Return whether the drive's speed control cannot be relied on: its report of speed contradicts another."""
+        """Return whether the drive's speed control is unreliable: its reported speed contradicts another report."""
         return not self._loop.guard.observer.believable
 
     def _see_rest(self, asked: bool) -> float | None:
@@ -553,7 +553,7 @@ class StopSequence:
         return None
 
     def _ask_position(self, now_s: float) -> None:
-        """A position that does not come with the cycle: one question beside it, now and then."""
+        """Read the position by a single request at intervals, if it does not come with the cycle."""
         drive = self._loop.drive
         coming = self._loop.guard.observer.heard_position(now_s, 2.0 * POSITION_EVERY_S)
         if coming or now_s < self._position_due_s or not isinstance(drive, Positioned) or not self._fed:
@@ -561,20 +561,20 @@ class StopSequence:
         self._position_due_s = now_s + POSITION_EVERY_S
         try:
             reading = drive.read_position()
-        except BaseException as error:  # whatever it is, the stop goes on
+        except BaseException as error:  # any error: the stop continues
             self._note(error)
             return
         if reading is not None:
             self._loop.guard.observer.see_reading(reading)
 
     def _poll_agrees(self, rest: Standstill) -> bool:
-        """Before the drive is disabled, a single request must show standstill too, where the drive answers it."""
+        """Return whether a single request shows standstill too, before the drive is disabled; True if not answered."""
         drive = self._loop.drive
         if self._polls.standing or not isinstance(drive, Polled):
             return True
         try:
             sample = drive.poll()
-        except BaseException as error:  # whatever it is, the stop goes on
+        except BaseException as error:  # any error: the stop continues
             self._note(error)
             return True
         if sample is None or rest.quiet(sample):
@@ -585,9 +585,9 @@ class StopSequence:
         return False
 
     def _removes_torque(self, sample: Sample) -> bool:
-        """Switch the torque of a shaft off that accelerates against the quick stop.
+        """Remove the torque of a shaft that accelerates against the quick stop. Return whether that was done.
 
-        See `docs/decisions` for when that is done above a drill string.
+        `docs/decisions` states when that is done above a drill string.
         """
         how = self._loop.guard.observer.runs_away(sample)
         if not how:
@@ -605,9 +605,9 @@ class StopSequence:
         return self._torque_removed
 
     def _leave_to_watchdog(self, sample: Sample) -> bool:
-        """Once: from now on the drive's own watchdog hears nothing more. Whether that was done now."""
+        """Stop feeding the drive's watchdog, once, so that it acts. Return whether this call did it."""
         drive = self._loop.drive
-        # The drive's watchdog brakes by the same speed signal: with that in doubt the torque is watched from here.
+        # The drive's watchdog brakes with the same speed signal. If this is in doubt, the stop watches the torque.
         doubt = self._loop.guard.observer.doubt
         if doubt is not None and Signal.ALL not in doubt.signals:
             return False
@@ -615,11 +615,11 @@ class StopSequence:
             return False
         try:
             drive.stop_feeding()
-        except CommandRejected as error:   # it would not help: another client feeds the watchdog, too
+        except CommandRejected as error:   # silence would not help: another client feeds the watchdog, too
             self._fed = False
             self._note(error)
             return False
-        except BaseException as error:  # whatever it is, the stop goes on
+        except BaseException as error:  # any error: the stop continues
             self._note(error)
             return False
         self._fed = False
@@ -642,7 +642,7 @@ class StopSequence:
         return False
 
     def _stays_at_rest(self) -> bool:
-        """Nothing turns the shaft now that nothing holds it; it was seen at rest before."""
+        """Return whether the shaft stays at standstill without torque. Without feedback it counts as staying there."""
         quiet_s, told, heard_s = 0.0, False, self._loop.now_s
         enough_s = max(self._settle_s, min(0.8 * REST_AFTER_S, self._loop.guard.observer.shows_s(
             self._at_rest_rad_s, self._held_at_rest_nm)))
@@ -653,7 +653,7 @@ class StopSequence:
                     self._trouble.append("nothing was heard of the drive once it was disabled")
                     return True
                 continue
-            # Polls are further apart than cycles are; a longer gap shows nothing.
+            # Polls are further apart than cycles. Of a longer gap only the longest permitted one counts.
             apart_s = sample.time_s - heard_s if self._polls.standing else 0.0
             quiet_s += max(self._loop.period_s, min(self._longest_gap_s, apart_s))
             heard_s = sample.time_s
@@ -670,10 +670,10 @@ class StopSequence:
         return False
 
     def _ask(self, request: Callable[[], None]) -> bool:
-        """Return whether the drive took a request; one that fails is made again in the next cycle."""
+        """Return whether the drive accepted a request. A request that fails is repeated in the next cycle."""
         try:
             request()
-        except BaseException as error:  # whatever it is, the stop goes on
+        except BaseException as error:  # any error: the stop continues
             self._note(error)
             return False
         return True
@@ -683,11 +683,11 @@ class StopSequence:
             self._trouble.append(str(error) or type(error).__name__)
 
     def _exchange(self, command: Command, *, or_poll: bool = False) -> Sample | None:
-        """One cycle's feedback; where there is none, a poll's, if that may be taken and one is due."""
+        """Run one cycle. Return its feedback; without it the answer to a poll, if permitted and due; else None."""
         sample: Sample | None = None
         try:
             sample = self._loop.stop_cycle(command)
-        except BaseException as error:  # whatever it is, the stop goes on
+        except BaseException as error:  # any error: the stop continues
             self._note(error)
         if sample is None or not sample.fresh or (or_poll and self._polls.only):
             sample = self._poll() if or_poll else None
@@ -709,20 +709,20 @@ class StopSequence:
     def _poll(self) -> Sample | None:
         try:
             sample = self._polls.missed()
-        except BaseException as error:  # whatever it is, the stop goes on
+        except BaseException as error:  # any error: the stop continues
             self._note(error)
             return None
         if sample is not None and self._polls.answered == 1:
-            self._held.clear()             # what was held before the gap tells nothing of now
+            self._held.clear()             # the torque held before the gap is out of date
             self._trouble.append("the cycle brings no feedback: the drive was asked one question at a time instead")
         return sample
 
     def _contradicted(self) -> bool:
-        """Compare a poll with the feedback of the cycle. If they differ, only polls are believed from now on."""
+        """Return whether a poll contradicts the feedback of the cycle. Then only polls are believed from now on."""
         told = self._loop.last
         try:
             sample = self._polls.ask()
-        except BaseException as error:  # whatever it is, the stop goes on
+        except BaseException as error:  # any error: the stop continues
             self._note(error)
             return False
         if sample is None or told is None:
@@ -739,7 +739,7 @@ class StopSequence:
         return self._polls.only
 
     def _gets_slower(self, sample: Sample) -> bool:
-        """A shaft that polls alone show, and that goes on turning, is left to the drive's own watchdog, if armed."""
+        """Return False if only polls show the shaft and it does not slow down: an armed watchdog must then act."""
         if not (self._watched and self._polls.standing) or self._slowing.see(sample.time_s, sample.speed_rad_s):
             return True
         self._trouble.append(
@@ -750,7 +750,7 @@ class StopSequence:
 
 
 def not_confirmed(report: StopReport) -> StopNotConfirmed:
-    """The loudest error there is."""
+    """Return the error for a stop that was not confirmed."""
     return StopNotConfirmed(
         "the stop was NOT confirmed: " + (report.trouble[-1] if report.trouble else "no standstill seen"),
         where="stop sequence",

@@ -35,7 +35,7 @@ QUIET_S = 6.0
 FASTEST_SWING_S = 2.0     # s; a shorter half period is not the string's, but the loop's own
 STIFFEST = 64.0           # largest multiple of the impedance at the beginning
 TRAVEL_RAD = 250.0
-"""About 40 turns: no string holds more twist below its make-up torque."""
+"""Longest travel of the release, rad: about 40 turns. No string holds more twist below its make-up torque."""
 
 EXTRA_S = 90.0
 """Time beyond the ramp for an oscillating string, s."""
@@ -43,7 +43,7 @@ EXTRA_S = 90.0
 
 @dataclass(frozen=True)
 class StringReleaseLimits:
-    """Torque in N·m at the motor shaft; ``ramp_nm_s`` as in rig.yaml."""
+    """Limits of the release at the motor shaft; ``ramp_nm_s`` as in rig.yaml."""
 
     torque_nm: float
     speed_rad_s: float
@@ -69,11 +69,11 @@ class _Impedance:
         self._stiffest = STIFFEST * self.nm_s_rad
         self._residual_nm = residual_nm
         self._fastest_s = fastest_s
-        self._side = 0.0               # side of zero on which the torque was last clearly
+        self._side = 0.0               # sign of the last torque above the residual
         self._since_side_s = 0.0
 
     def watch(self, torque_nm: float, period_s: float) -> None:
-        """Use one cycle's torque."""
+        """Update the impedance with the torque of one cycle, N·m."""
         self._since_side_s += period_s
         if abs(torque_nm) <= self._residual_nm:
             return

@@ -22,22 +22,22 @@ from tdhil.runner.excitation.reference import (
 )
 from tdhil.runner.excitation.signals import PeriodicKind, Shape, begun_at_rest
 
-_OFFSET_SHARE = 0.38     # of the usable window that the two mean speeds are at least apart: friction's lever
-LEAST_COUNTED = 6        # periods at each mean speed, settling aside: their scatter sets the weights
-RAMP_SHARE = 0.9         # of the acceleration that the drive's own ramp was seen to let through
-_BACKWARDS_SHARE = 0.012  # of the greatest speed: foreseen backwards less than this, the guard's own allowance is kept
-SETTLE_S = 10.0          # at least this long before the first period that counts
+_OFFSET_SHARE = 0.38     # least distance of the two mean speeds, share of the usable window; it determines B
+LEAST_COUNTED = 6        # least number of evaluated periods at each mean speed: their scatter sets the weights
+RAMP_SHARE = 0.9         # share of the acceleration that the drive's own ramp permits, as measured in stage 2
+_BACKWARDS_SHARE = 0.012  # share of the highest speed; a predicted reverse speed below it is permitted by the guard
+SETTLE_S = 10.0          # s; least settling time before the first evaluated period
 
 
 @dataclass(frozen=True)
 class PlanRequest:
     """The user's request; None means that the plan chooses.
 
-    ``frequency_hz``: lowest line (multisine), tone (sine), square wave (step). ``amplitude_rad_s``: greatest
-    deviation of speed from its mean. ``offsets_rad_s``: mean speeds, one segment each. ``periods``: per segment,
-    settling included. ``shape``: other lines for the multisine than its own; ``offset_share`` of the usable window: how
-    far apart two mean speeds of the plan's own choice are at least (friction's lever). ``settle_s``: how long each
-    segment settles at least.
+    ``frequency_hz``: frequency of the lowest line (multisine), tone (sine) or square wave (step). ``amplitude_rad_s``:
+    largest deviation of speed from its mean. ``offsets_rad_s``: mean speeds, one segment each. ``periods``: number per
+    segment, with settling. ``shape``: lines that replace those of the multisine. ``offset_share``: least distance of
+    two mean speeds that the plan chooses, as a share of the usable window (lever for the slope of friction).
+    ``settle_s``: least settling time of each segment.
     """
 
     kind: str = DEFAULT_EXCITATION
@@ -53,12 +53,12 @@ class PlanRequest:
 
 @dataclass(frozen=True)
 class PlannedSegment:
-    """One mean speed: its reference from the segment's start, how long it lasts, and what it should reach."""
+    """Segment at one mean speed: reference from its start, number of periods, predicted range of speed and torque."""
 
     reference: PeriodicReference
     periods: int
     settle_periods: int
-    speed_min_rad_s: float    # predicted, if the rough inertia were right
+    speed_min_rad_s: float    # this range is predicted with the rough inertia
     speed_max_rad_s: float
     torque_min_nm: float
     torque_max_nm: float
@@ -68,7 +68,7 @@ class PlannedSegment:
         return self.periods * self.reference.period_s
 
     def recorded(self, start_s: float, end_s: float | None = None) -> Segment:
-        """The segment as a recording keeps it; ``end_s`` is rounded down to the last whole period that was run."""
+        """Return the segment for a recording. ``end_s`` is rounded down to the end of the last complete period."""
         end = start_s + self.duration_s if end_s is None else end_s
         period = self.reference.period_s
         whole = min(self.periods, max(0, math.floor((end - start_s) / period + 1e-6)))
@@ -86,7 +86,7 @@ class PlannedSegment:
 
 @dataclass(frozen=True)
 class Plan:
-    """The whole of stage 5's motion, in order; transitions lead from each segment to the next."""
+    """Motion of stage 5: its segments in order, with transitions between them."""
 
     kind: str
     mode: DriveMode
@@ -147,7 +147,7 @@ class Plan:
 
     @property
     def duration_s(self) -> float:
-        """Segments and the transitions between them; the first transition, from wherever the shaft is, comes on top."""
+        """Return the duration of segments and transitions, s, without the transition to the first segment."""
         between = sum(
             self.transition(before.reference.start_speed_rad_s, index + 1).duration_s
             for index, before in enumerate(self.segments[:-1])
@@ -155,7 +155,7 @@ class Plan:
         return between + sum(segment.duration_s for segment in self.segments)
 
     def followed(self, hertz: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return the ratio of the shaft's motion to the reference, (K,): one, except with the drive's speed control."""
+        """Return the ratio of the shaft's motion to the reference, (K,): one in torque mode, or if it is unknown."""
         following = self.guess.following
         if self.mode != "speed" or following is None:
             return np.ones(len(hertz), dtype=np.complex128)
@@ -172,7 +172,7 @@ class Plan:
         return replace(self, segments=segments)
 
     def extension_s(self, periods: int) -> float:
-        """Return the time of further periods at each mean speed, s: the last first, then the others with settling."""
+        """Return the time of further periods, s: at the last mean speed first, then at the others with settling."""
         others = self.segments[:-1]
         again = sum(one.settle_periods * one.reference.period_s for one in others)
         ways = sum(
@@ -211,7 +211,7 @@ def make_plan(limits: MotionLimits, guess: RigGuess, wish: PlanRequest | None = 
 
 @dataclass(frozen=True)
 class _FittedShape:
-    """A shape of peak 1 with its peaks, against the limits."""
+    """Shape of peak 1, with its peaks of speed and torque for the comparison with the limits."""
 
     shape: Shape
     period_s: float
@@ -222,7 +222,7 @@ class _FittedShape:
     down: float
     torque_up: float     # torque above and below its mean, N·m per rad/s of amplitude
     torque_down: float
-    foreseen: float      # like ``up``, as far ahead as the guard looks
+    foreseen: float      # as ``up``, for the speed that the guard predicts
 
     @classmethod
     def of(cls, shape: Shape, period_s: float, limits: MotionLimits, guess: RigGuess,
@@ -242,13 +242,13 @@ class _FittedShape:
 
     @property
     def ramp_room(self) -> float:
-        """The greatest amplitude that the drive's own speed ramp lets through."""
+        """Return the largest amplitude that the drive's own speed ramp permits, rad/s."""
         if self.mode == "torque" or math.isinf(self.limits.acceleration_rad_s2):
             return math.inf
         return RAMP_SHARE * self.limits.acceleration_rad_s2 / float(np.max(np.abs(self.shape.steepness(self.period_s))))
 
     def largest_at(self, offset_rad_s: float) -> tuple[float, str]:
-        """The greatest amplitude that fits about a mean speed, and the limit that sets it."""
+        """Return the largest amplitude about a mean speed, rad/s, and the limit that determines it."""
         torque_factor = self.guess.torque_swing_factor(self.mode)
         steady = self.guess.steady_torque_nm(offset_rad_s)
         usable = self.limits.usable_torque_nm
@@ -271,7 +271,7 @@ class _FittedShape:
         return low, "standstill (as far ahead as the guard looks)"
 
     def _never_backwards(self, offset_rad_s: float, amplitude_rad_s: float) -> bool:
-        """Return whether the guard predicts no reverse rotation. As `Guard.predicted_speed`, with the plan's torque."""
+        """Return whether the guard predicts no reverse rotation (`Guard.predicted_speed`) with the plan's torque."""
         foresight_s, guess = self.limits.foresight_s, self.guess
         swung = amplitude_rad_s * self.swing
         speed = offset_rad_s + swung * self.shape.deviation()
@@ -343,7 +343,7 @@ def _periods(wish: PlanRequest, period_s: float, settle: int) -> int:
     at_one_speed_s = periodic_kind(wish.kind).at_one_speed_s
     if at_one_speed_s > 0.0:
         return settle + max(10, math.ceil(at_one_speed_s / period_s - 1e-9))
-    # as long as the default multisine, and never fewer than six periods that count: their scatter sets the weights
+    # as long as the default multisine, but at least six evaluated periods: their scatter sets the weights
     counted = (signals.DEFAULT_PERIODS - 1) / signals.MULTISINE_FREQUENCY_HZ
     return settle + max(LEAST_COUNTED, math.ceil(counted / period_s - 1e-9))
 
@@ -369,8 +369,8 @@ def _amplitude_and_offsets(fit: _FittedShape, wish: PlanRequest) -> tuple[float,
 def _default_offsets(fit: _FittedShape, wish: PlanRequest) -> tuple[float, ...]:
     """Return two mean speeds (one if the slope of friction is not needed), as far apart as the amplitude allows.
 
-    The swing takes at most what the window leaves beside the offsets' least distance, and what the torque limit
-    allows at the upper end; whatever it does not need goes to the distance, which is what tells B.
+    The amplitude is limited by the window without the least distance of the mean speeds, by the torque limit, and by
+    the drive's own ramp. The rest of the window increases the distance, which determines B.
     """
     low, high = fit.limits.usable_low_rad_s, fit.limits.usable_high_rad_s
     span = (fit.foreseen + fit.down) * fit.swing

@@ -1,15 +1,15 @@
-"""Torque pulses and coast-down: from one speed to another and back, with calm in between.
+"""Torque pulses and coast-down: changes from one speed to another and back, with steady speed between them.
 
-A pulse is a step of net torque, ΔT for some seconds, up or down; between two pulses the shaft is held at a steady
-speed, so that the momentum from calm to calm can be balanced without knowing any lag. Swings of full height alternate
-with half ones, and strong pulses with weaker ones, which spreads what they say over frequency.
+A pulse is a step of net torque, ΔT for some seconds, up or down. Between two pulses the shaft is held at a steady
+speed, so the momentum balance from one steady speed to the next needs no knowledge of any lag. Changes of full height
+alternate with half ones, and strong pulses with weaker ones, which spreads their information over frequency.
 
 Coast-down switches the torque off at the upper speed, and friction brings the shaft to the lower one. Of J, B and T_c,
-J dω/dt = −B ω − T_c gives only the ratios: with all three multiplied by a factor, the shaft coasts the same way. The
-torque of the way back up determines J, so every coast is paired with a powered ramp, and the ramps differ in steepness.
+J dω/dt = −B ω − T_c gives only the ratios: with all three multiplied by a factor, the shaft coasts in the same way. The
+torque of a powered ramp up determines J, so every coast is paired with a ramp, and the ramps differ in steepness.
 
-Whatever the rough inertia's error, the swing stays within the window; in torque mode that includes what the guard
-foresees (`Guard.foresight_s`) while the torque pushes.
+For any error of the rough inertia within its stated one, the speed stays within the window. In torque mode this
+includes the speed that the guard predicts (`Guard.foresight_s`) while the torque acts.
 """
 
 from __future__ import annotations
@@ -29,23 +29,21 @@ from tdhil.runner.excitation.reference import (
     excitation_kind,
 )
 
-CALM_S = 3.5              # at every speed: momentum's balances want 2 s and more, behind the lags
-TOTAL_S = 210.0           # about as long as the usual multisine
-_LEAST_SWINGS = 6         # ways up and down
-_MOST_S = 12.0            # of one way: a heavy shaft takes its time, within reason
-_LEAST_S = 0.5            # of one way, at least
-_SHARES = (1.0, 0.6)      # of the steepest: pulses of two strengths
-_HEIGHTS = (0.0, 1.0, 0.5, 1.0)     # levels between the lowest and the highest speed, in turn
-_TOPS = (1.0, 0.6, 0.8)             # from which it coasts: no two rounds alike for long, or few frequencies are excited
-_SLACK = 1.1              # margin on the prediction of the guard, since reports are noisy
-_TORQUE_SHARE = 0.9       # of the room that the torque limit leaves above friction
+CALM_S = 3.5              # s; steady time at every speed: the momentum balance needs 2 s or more after the lags
+TOTAL_S = 210.0           # s; about the duration of the usual multisine
+_LEAST_SWINGS = 6         # least number of speed changes
+_MOST_S = 12.0            # s; longest speed change, for a heavy shaft
+_LEAST_S = 0.5            # s; shortest speed change
+_SHARES = (1.0, 0.6)      # shares of the steepest change: pulses of two strengths
+_HEIGHTS = (0.0, 1.0, 0.5, 1.0)     # steady speeds in turn, from 0 (the lowest) to 1 (the highest)
+_TOPS = (1.0, 0.6, 0.8)             # upper speeds of the coasts in turn; equal ones would excite few frequencies
+_SLACK = 1.1              # margin on the prediction of the guard, because reports are noisy
+_TORQUE_SHARE = 0.9       # share of the torque between friction and limit
 
 
 @dataclass(frozen=True)
 class SpeedChange:
-    """A change from one steady speed to the next in ``duration_s``; ``coasting``: without torque, an approximate
-    time.
-    """
+    """Change from one steady speed to the next in ``duration_s``, which is approximate if ``coasting`` (no torque)."""
 
     from_rad_s: float
     to_rad_s: float
@@ -58,7 +56,7 @@ class SpeedChange:
         return (self.to_rad_s - self.from_rad_s) / self.duration_s
 
     def reference(self, t_s: float) -> tuple[float, float]:
-        """Speed (rad/s) and feed-forward torque (N·m), ``t_s`` after its start; the calm behind it afterwards."""
+        """Return speed (rad/s) and feed-forward torque (N·m) ``t_s`` after the start; steady values after the end."""
         if t_s >= self.duration_s:
             return self.to_rad_s, self.guess.steady_torque_nm(self.to_rad_s)
         rate = self.acceleration_rad_s2
@@ -68,10 +66,10 @@ class SpeedChange:
 
 @dataclass(frozen=True)
 class SwingKind(ExcitationKind):
-    """Ways from one steady speed to another.
+    """Excitation by changes from one steady speed to another.
 
-    ``ways``: makes them without end, from the lowest and the highest speed, rad/s, the steepest that a powered way may
-    be, rad/s², and the rough rig. The first begins at the lowest speed.
+    ``ways``: yields changes without end, from the lowest and the highest speed, rad/s, the largest acceleration of a
+    powered change, rad/s², and the rough rig. The first change begins at the lowest speed.
     """
 
     ways: Callable[[float, float, float, RigGuess], Iterator[SpeedChange]] = field(kw_only=True)
@@ -79,7 +77,7 @@ class SwingKind(ExcitationKind):
 
 @dataclass(frozen=True)
 class SwingPlan:
-    """The whole motion of stage 5: calm at ``start_rad_s``, then every way with the calm behind it."""
+    """Motion of stage 5: steady speed ``start_rad_s``, then every speed change with `CALM_S` of steady speed."""
 
     kind: str
     mode: DriveMode
@@ -113,7 +111,7 @@ class SwingPlan:
         return [(f"{self.speed_min_rad_s:.3g} to {self.speed_max_rad_s:.3g} rad/s", ways)]
 
     def lines(self) -> list[tuple[float, float]]:
-        """Return no lines."""
+        """Return an empty list: the motion has no spectral lines."""
         return []
 
 
@@ -127,9 +125,9 @@ def make_swings(
     swings: int | None = None,
     time_s: float | None = None,
 ) -> SwingPlan:
-    """Plan them: ``swings`` ways of either direction, or as many as fit into ``time_s``. Raises PlanRefused.
+    """Return a plan of ``swings`` speed changes, or of as many as fit into ``time_s``. Raises PlanRefused.
 
-    ``amplitude_rad_s``: half of the way from the lower to the upper speed, about ``offset_rad_s``.
+    ``amplitude_rad_s``: half of the difference between the upper and the lower speed; ``offset_rad_s``: their mean.
     """
     asked = swing_kind(kind)
     if asked.needs_torque_mode and mode != "torque":
@@ -174,7 +172,7 @@ def _again(ways: list[SpeedChange], rest: Iterator[SpeedChange]) -> Iterator[Spe
 
 
 def _pulses(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[SpeedChange]:
-    """Up and down between the levels; each round another strength."""
+    """Yield changes up and down between the steady speeds; the strength differs from round to round."""
     at, number = low, 0
     while True:
         number += 1
@@ -185,7 +183,7 @@ def _pulses(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[S
 
 
 def _coasts(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[SpeedChange]:
-    """Up under power, each time another steepness, and down without torque."""
+    """Yield powered changes up, of different steepness, and coasts down without torque, in turn."""
     number = 0
     while True:
         share = _SHARES[number % len(_SHARES)]
@@ -196,9 +194,9 @@ def _coasts(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[S
 
 
 def coasting_s(from_rad_s: float, to_rad_s: float, guess: RigGuess) -> float:
-    """Return the time that friction takes from one speed to a lower one: (J/B) ln(T(ω₀)/T(ω₁)), (J/T_c) Δω for B → 0.
+    """Return the time of a coast to a lower speed, s: (J/B) ln(T(ω₀)/T(ω₁)), or (J/T_c) Δω for B → 0.
 
-    Raises PlanRefused where there is next to no friction.
+    Raises PlanRefused if there is almost no friction.
     """
     upper, lower = guess.steady_torque_nm(from_rad_s), guess.steady_torque_nm(to_rad_s)
     if not (lower > 0.0 and upper > 0.0):
@@ -217,11 +215,11 @@ COAST_DOWN = SwingKind(
 
 
 class _SpeedRoom:
-    """Lower and upper speed, and the steepest way between them, within the limits."""
+    """Lower and upper speed, and the largest acceleration between them, within the limits."""
 
     def __init__(self, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> None:
         self._limits, self._guess = limits, guess
-        # At worst a way goes as much further as the shaft is lighter than thought.
+        # In the worst case the shaft is lighter than estimated, and a change goes further by this share.
         self._beyond = guess.speed_swing_factor(mode) - 1.0
         self._torque_factor = guess.torque_swing_factor(mode)
         self._foresight_s = limits.foresight_s if mode == "torque" else 0.0
@@ -236,7 +234,7 @@ class _SpeedRoom:
                 "that a plan may use"
             )
         rate = min(torque / self._guess.inertia_kg_m2, 0.9 * self._limits.acceleration_rad_s2)
-        # The prediction of the guard may take a fifth of the window at either end. A shaft that light gets less torque.
+        # The prediction of the guard may take a fifth of the window at either end. A lighter shaft gets less torque.
         rate = min(rate, (high - low) / 5.0 / self._foresight_s) if self._foresight_s > 0.0 else rate
         ahead = _SLACK * rate * self._foresight_s
         largest = (high - low - 2.0 * ahead) / (1.0 + 2.0 * self._beyond)

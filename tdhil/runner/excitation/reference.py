@@ -1,4 +1,4 @@
-"""The limits of an excitation, and the knowledge of the rig when it is planned."""
+"""Limits of an excitation, rough rig for its plan, and references of speed and torque."""
 
 import math
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from tdhil.runner.excitation.speed_loop import SpeedFollowing
 DriveMode = Literal["torque", "speed"]
 
 TORQUE_RESERVE = 0.15   # share of the torque limit that a plan leaves to the speed control
-SPEED_MARGIN = 0.03     # share of the speed window kept free at either end, for what drifts
+SPEED_MARGIN = 0.03     # share of the speed window that a plan keeps free at either end, for drift
 
 
 USUAL_STEP = "Change --amplitude, --offset, --frequency or the limits"
@@ -19,7 +19,7 @@ USUAL_STEP = "Change --amplitude, --offset, --frequency or the limits"
 class PlanRefused(ValueError):
     """The requested motion does not fit. The message names the limit, the required and the available value.
 
-    ``next_step``: the option that would change that.
+    ``next_step``: advice which option to change.
     """
 
     def __init__(self, what: str, next_step: str = USUAL_STEP) -> None:
@@ -29,9 +29,9 @@ class PlanRefused(ValueError):
 
 @dataclass(frozen=True)
 class ExcitationKind:
-    """The properties of an excitation before it is planned; `tdhil.config.registry` lists them by name.
+    """Properties of an excitation before it is planned; `tdhil.config.registry` lists them by name.
 
-    A kind is one of two families: `PeriodicKind` has lines, `SwingKind` goes from one steady speed to another.
+    There are two families: `PeriodicKind` has spectral lines, `SwingKind` changes from one steady speed to another.
     ``needs_torque_mode``: it is not possible under the drive's speed control; ``why_torque_mode`` is the reason.
     ``with_string``: it is permitted with a drill string on the shaft.
     """
@@ -42,7 +42,7 @@ class ExcitationKind:
 
     @property
     def adaptive(self) -> bool:
-        """Return whether a tolerance can end it, by the scatter from period to period."""
+        """Return whether a tolerance can end the excitation, by the scatter from period to period."""
         return False
 
 
@@ -60,10 +60,10 @@ class MotionLimits:
 
     The machine's own limits, which the guard enforces, are `tdhil.runner.settings.MachineLimits`.
 
-    ``foresight_s``: in torque mode the guard holds speed + foresight·acceleration below the window's upper end, since
-    what is reported is old; the plan must keep that free too. ``acceleration_rad_s2``: what the drive's own speed ramp
-    lets through, where it was seen to hold the shaft back (speed mode only). ``least_torque_nm``: a torque mode's
-    torque stays above it, where braking can't be had.
+    ``foresight_s``: prediction time of the guard. In torque mode it keeps speed + foresight·acceleration below the
+    window's upper end, because reports are late; the plan keeps this free. ``acceleration_rad_s2``: limit of the
+    drive's own speed ramp, if stage 2 has shown one (speed mode only). ``least_torque_nm``: least torque in torque
+    mode, if braking torque is not available.
     """
 
     speed_low_rad_s: float
@@ -103,10 +103,10 @@ class MotionLimits:
 
 @dataclass(frozen=True)
 class RigGuess:
-    """A rough rig: T = inertia·dω/dt + viscous·ω + coulomb, forward rotation.
+    """Rough model of the rig: T = inertia·dω/dt + viscous·ω + coulomb, forward rotation.
 
-    ``inertia_rel_error`` is how wrong the inertia may be (0.2 = a fifth either way); the plan keeps room for it.
-    ``following``: how the shaft follows a speed setpoint, where that was seen.
+    ``inertia_rel_error``: possible error of the inertia as a share (0.2 = ±20 %); the plan keeps room for it.
+    ``following``: response of the shaft to a speed setpoint; None: unknown.
     """
 
     inertia_kg_m2: float
@@ -137,7 +137,7 @@ class RigGuess:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The reference of one segment, evaluated once a cycle.
+# Reference of one segment, evaluated once a cycle.
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class PeriodicReference:
 
     @property
     def start_speed_rad_s(self) -> float:
-        """Return the speed at t = 0, the end of a transition."""
+        """Return the speed at t = 0, rad/s, at which a transition to the segment ends."""
         return self.reference(0.0)[0]
 
     def reference(self, t_s: float) -> tuple[float, float]:
@@ -201,12 +201,12 @@ class PeriodicReference:
 
 
 _SHORTEST_S = 2.0         # s; shortest transition
-_TORQUE_SHARE = 0.5   # of the torque above friction: a transition is slow
+_TORQUE_SHARE = 0.5   # share of the torque above friction that a transition uses
 
 
 @dataclass(frozen=True)
 class Transition:
-    """Half a cosine: v(t) = v0 + (v1 − v0)(1 − cos(π t / D)) / 2, and T = J v̇ + B v + T_c."""
+    """Transition by half a cosine: v(t) = v0 + (v1 − v0)(1 − cos(π t / D)) / 2, and T = J v̇ + B v + T_c."""
 
     from_rad_s: float
     to_rad_s: float
@@ -214,7 +214,7 @@ class Transition:
     guess: RigGuess
 
     def reference(self, t_s: float) -> tuple[float, float]:
-        """Speed (rad/s) and feed-forward torque (N·m), ``t_s`` after its start; the end's steady values afterwards."""
+        """Return speed (rad/s) and feed-forward torque (N·m) ``t_s`` after the start; steady values after the end."""
         if t_s >= self.duration_s:
             return self.to_rad_s, self.guess.steady_torque_nm(self.to_rad_s)
         rate = math.pi / self.duration_s
@@ -228,9 +228,9 @@ class Transition:
 def make_transition(
     from_rad_s: float, to_rad_s: float, limits: MotionLimits, guess: RigGuess, mode: DriveMode = "torque"
 ) -> Transition:
-    """Return the quickest calm transition: at most half of the torque above friction, and at least 2 s.
+    """Return the quickest transition with at most half of the torque above friction, and of at least 2 s.
 
-    Raises PlanRefused if friction alone needs the whole torque.
+    Raises PlanRefused if friction needs the whole usable torque.
     """
     friction = max(abs(guess.steady_torque_nm(from_rad_s)), abs(guess.steady_torque_nm(to_rad_s)))
     room = _TORQUE_SHARE * (limits.usable_torque_nm - friction) / guess.torque_swing_factor(mode)

@@ -1,9 +1,9 @@
-"""How a shaft under the drive's speed control follows its setpoint: two poles and a zero, and the drive's own ramp.
+"""Response of the shaft to its setpoint under the drive's speed control: two poles, a zero, and the drive's own ramp.
 
-A speed loop with integral action makes H(s) = (1 + b s)/(1 + a₁ s + a₂ s²) of setpoint to speed: flat at low frequency,
-often a little above one near its bandwidth, falling beyond; the report adds its lag. It is fitted to the ramp between
-the two mean speeds of stage 2, sampled as slowly as the line has it. It plans, and bounds what slow sampling between
-the setpoint's steps may do to J (`tdhil.estimation.setpoint_sampling`); J itself is not read off it.
+A speed loop with integral action has about H(s) = (1 + b s)/(1 + a₁ s + a₂ s²) from setpoint to speed: flat at low
+frequency, often a little above one near its bandwidth, falling beyond it. The report adds its lag. H is fitted to the
+ramp between the two mean speeds of stage 2, at the cycle rate of the run. It is used to plan, and to bound the effect
+of slow sampling of a stepped setpoint on J (`tdhil.estimation.setpoint_sampling`). J itself is not computed from H.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from tdhil.recording import FloatArray
 
 _GRID_S = 0.02            # s; step of the simulated loop
-_STARTS = ((1.0, 1.0, 0.3), (0.2, 0.6, 0.1), (0.1, 0.15, 0.01))    # b, a1, a2
+_STARTS = ((1.0, 1.0, 0.3), (0.2, 0.6, 0.1), (0.1, 0.15, 0.01))    # starting values of b, a1, a2 for the fit
 _LEAST_S, _MOST_S = 1e-3, 5.0   # s; bounds of the loop's time constants in the fit
-_GOOD = 0.05              # of the change: a fit that leaves more of it says nothing
-_HELD_BACK = 1.12         # times the commanded time from a fifth to four fifths of the way: the drive has its own ramp
+_GOOD = 0.05              # largest rms residual of a usable fit, share of the change
+_HELD_BACK = 1.12         # ratio of reported to commanded time from 20 to 80 %, above which the drive has its own ramp
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ def fit_following(
     speed_lag_s: float = 0.0,
     ramp_rad_s2: float = math.inf,
 ) -> SpeedFollowing | None:
-    """Fit one change of setpoint that begins and ends steadily, (N,) each; None if the model does not fit.
+    """Fit one change of setpoint with steady ends, (N,) each. Return None if the model does not fit.
 
-    ``ramp_rad_s2``: of the drive's own ramp, which the setpoint passes first.
+    ``ramp_rad_s2``: acceleration limit of the drive's own ramp, which acts on the setpoint first.
     """
     from scipy.optimize import least_squares
 
@@ -102,7 +102,7 @@ def held_back_to(
 
 
 def _ramped(wanted: FloatArray, rate: float) -> FloatArray:
-    """Return a setpoint on the grid after a ramp."""
+    """Return a setpoint on the grid with its rate limited to ``rate``, 1/s."""
     if math.isinf(rate):
         return wanted
     found, now = np.empty_like(wanted), float(wanted[0])
@@ -115,7 +115,7 @@ def _ramped(wanted: FloatArray, rate: float) -> FloatArray:
 def _response(wanted: FloatArray, zero: float, first: float, second: float, lag: float) -> FloatArray:
     """Return the response of H and the lag on the grid, by the bilinear transform.
 
-    Two filters in the transposed direct form II, as scipy.signal's, which takes a second to load.
+    Two filters in transposed direct form II, as in scipy.signal, which would take a second to load.
     """
     k = 2.0 / _GRID_S
     scale = 1.0 + first * k + second * k * k

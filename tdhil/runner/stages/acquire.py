@@ -29,10 +29,10 @@ from tdhil.runner.stages.hold import MeanSpeedControl
 
 
 COUNTS = 2.0              # peak of the triangle, in counts of the reported speed
-COARSE_SHARE = 0.002      # of the window: finer counts than this need none
-MOST_SHARE = 0.015        # of the window: half of the margin that a plan keeps free at either end
+COARSE_SHARE = 0.002      # share of the speed window; finer counts than this need no triangle
+MOST_SHARE = 0.015        # largest peak, share of the window: half of the margin that a plan keeps free at either end
 PERIODS = (math.sqrt(5.0) - 1.0) / 2.0
-"""Period of the triangle over the excitation's: the golden ratio is the farthest from every whole ratio."""
+"""Ratio of the triangle's period to the excitation's: the golden ratio is farthest from every ratio of integers."""
 
 
 def dither_peak(resolution_rad_s: float, window_rad_s: float) -> float:
@@ -121,11 +121,11 @@ def run_acquire(
     speed_resolution_rad_s: float = 0.0,
     watch: InertiaWatch | None = None,
 ) -> None:
-    """Run every segment of the plan, with its transitions. ``announce`` receives the excitation as it grows.
+    """Run every segment of the plan, with its transitions. ``announce`` receives the excitation at every change.
 
     A segment is announced with its planned end when it begins, so that a log which ends in it can be read. With
-    ``enough`` the plan is a pilot: after it the last segment continues during the interim analysis. If more is needed,
-    that many periods follow at its mean speed and then, unless that is enough, at the others after settling.
+    ``enough`` the plan is a pilot: after it the last segment continues during the interim analysis. Further periods
+    follow at its mean speed and then, unless the decision is for this speed only, at the others after settling.
     In speed mode a coarse ``speed_resolution_rad_s`` is dithered (`dither`). ``watch`` shows J after periods.
     """
     begun_s = loop.now_s
@@ -168,10 +168,10 @@ class _SegmentCourse:
         self._index = 0
         self._segment: PlannedSegment = plan.segments[0]
         self._start_s = 0.0
-        self._end_s = 0.0              # of all planned segments, about
+        self._end_s = 0.0              # approximate end of all planned segments, s
 
     def expect(self, duration_s: float) -> None:
-        """Note how long the planned segments take, s."""
+        """Note the duration of the planned segments, s."""
         self._end_s = self._loop.now_s + duration_s
 
     @property
@@ -225,19 +225,18 @@ class _SegmentCourse:
         self._announce(Excitation(self._plan.kind, self._plan.mode, (*self._done, planned)))
 
     def _recorded(self) -> Segment:
-        # The last period is whole when its last sample is there: the one before the cycle that would begin the next.
+        # The last period is complete with its last sample, one cycle before the next period would begin.
         return self._segment.recorded(self._start_s, self._follower.time_s + 1.5 * self._loop.period_s)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Stage 5 with torque pulses or coast-down: every speed change of the plan, and the calm after each.
+# Stage 5 with torque pulses or coast-down: every speed change of the plan, and the steady speed after each.
 #
 # A powered change follows its reference like any other motion. Coasting is zero torque until the shaft is about to
-# reach
-# its lower speed, with an allowance for late reports. A time alone would rely on the rough friction.
+# reach its lower speed, with an allowance for late reports. A fixed time would depend on the rough friction.
 
 
-_LONGEST = 2.0            # times the planned coasting, at most: the friction may be overestimated
+_LONGEST = 2.0            # longest coasting, multiple of the planned one: the friction may be overestimated
 
 
 def run_swings(
@@ -248,7 +247,7 @@ def run_swings(
     assumptions: ControlAssumptions,
     announce: Announce,
 ) -> None:
-    """Run the whole plan. Raises what the bench raises. The slow loop is frozen while the shaft coasts."""
+    """Run the whole plan. Raises what the bench raises. The host's slow control is frozen while the shaft coasts."""
     announce(Excitation(plan.kind, plan.mode))
     follower = Follower(loop, limits, Mode(plan.mode), control)
     follower.follow(_calm(plan.start_rad_s, plan.guess), CALM_S)
@@ -292,7 +291,7 @@ def run_plan(
     speed_resolution_rad_s: float,
     watch: InertiaWatch | None = None,
 ) -> None:
-    """Run a plan of either family, whatever the excitation. Raises what the bench raises."""
+    """Run a plan of either family of excitations. Raises what the bench raises."""
     if isinstance(plan, SwingPlan):
         run_swings(loop, limits, plan, control, assumptions, announce)
     else:

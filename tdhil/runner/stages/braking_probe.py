@@ -1,10 +1,10 @@
 """The braking probe: one small braking torque at low speed, before any motion in torque mode depends on its sign.
 
-The sign probe of stage 1 only pushes forward. A drive (or a profile) that reads a torque setpoint below zero as one
-above it passes that, and would accelerate the shaft where it should brake. Stage 2 ends at its lower speed. There, at
-the beginning of stage 3, a pulse is tried whose worst effect is known in advance (`plan_pulse`), and the response
-awaited (`BrakingListener`). Before that, and in the whole run if there is no safe pulse, the guard lets no torque below
-zero through in torque mode.
+The sign probe of stage 1 only pushes forward. A drive (or a profile) that reads a negative torque setpoint as a
+positive one passes the sign probe, and would accelerate the shaft instead of braking it. Stage 2 ends at its lower
+speed. There, at the beginning of stage 3, tdhil tries a pulse whose worst effect is known in advance (`plan_pulse`),
+and waits for the response (`BrakingListener`). Before the pulse, and in the whole run if no pulse is safe, the guard
+permits no torque below zero in torque mode.
 """
 
 from __future__ import annotations
@@ -47,17 +47,16 @@ from tdhil.runner.stages.steady import CALM_S, WINDOW_S, calm_string, swing_of, 
 #
 #     ω_0 − (T_f + T_b) / J_min · (t_p + t_c)  ≥  ω_0 − 0.6 (ω_0 − ω_min)                                      (down)
 #
-# and the guard, which looks t_r and the longest reporting lag τ ahead, must not predict reverse rotation: T_b is below
-# the friction at standstill, or too small to stop the shaft within t_r + τ. The change that shows the response,
-# (T_f + T_b) t_p / J, must exceed the noise clearly. If that is impossible, the shaft gets no braking torque in the
-# whole run.
+# and the guard, which predicts over t_r and the longest reporting lag τ, must not predict reverse rotation: T_b is
+# below the friction at standstill, or too small to stop the shaft within t_r + τ. The change of speed that shows the
+# response, (T_f + T_b) t_p / J, must exceed the noise clearly. If that is impossible, the run uses no braking torque.
 #
 # With a drill string the torque comes down and up again on ramps, of torque_ramp_nm_s or, where friction would stop the
 # shaft meanwhile, at most half a second each. That ramp is meant for releasing trapped torque completely; here the
 # string keeps its twist, since the shaft neither stops nor turns back.
 #
-# An oscillating string pushes and brakes by itself. It is damped first. Its remaining oscillation, at its worst for the
-# whole pulse, counts as noise of the speed. If that hides the response, there is no pulse.
+# An oscillating string pushes and brakes by itself. It is damped first. Its remaining oscillation, assumed at its worst
+# during the whole pulse, counts as noise of the speed. If this noise hides the response, there is no pulse.
 
 
 UP_SHARE, DOWN_SHARE = 0.8, 0.6   # shares of the room above and below the speed, in the bounds (up) and (down)
@@ -90,7 +89,7 @@ of the report lasts one cycle, but this lasts until the response is known."""
 
 @dataclass(frozen=True)
 class Pulse:
-    """``torque_nm`` is the braking torque, below zero. ``cycles`` at it, and the ``edge_cycles`` of each ramp.
+    """Braking pulse. ``torque_nm`` is below zero. ``cycles`` at this torque, and ``edge_cycles`` of each ramp.
 
     ``slowing_rad_s``: expected loss of speed. ``highest_rad_s``: highest speed if the drive inverts it.
     """
@@ -111,7 +110,7 @@ class Pulse:
 
 @dataclass(frozen=True)
 class NoPulse:
-    """Why no pulse is safe and detectable, and what would help."""
+    """Reason why no pulse is safe and detectable, and the next step."""
 
     why: str
     next_step: str
@@ -172,7 +171,7 @@ def plan_pulse(
     wanted_s = wanted_rad_s * model.inertia_kg_m2 / change_nm
     longest_s = min(max(wanted_s, period_s), LONGEST_S, up_s, down_s)
     edge = _edge_cycles(limits, change_nm, min(up_s, down_s), period_s)
-    # Both ramps together act like the full torque for the time of one, and both may be misread.
+    # Both ramps together act like the full torque for the time of one ramp, and the drive may invert both.
     cycles = max(1, min(_whole(longest_s, period_s) - edge, _whole(up_s, period_s) - 2 * edge))
     slowing = change_nm * (cycles + edge) * period_s / model.inertia_kg_m2
     if slowing < CLEAR * before.speed_noise_rad_s or braking_nm < LEAST_FLOWING_SHARE * before.flowing_nm:
@@ -213,9 +212,9 @@ def _whole(time_s: float, period_s: float) -> int:
 # ---------------------------------------------------------------------------------------------------------------------
 # The response of a shaft to a braking torque: slower, faster or none. Pure; it receives one sample per cycle.
 #
-# The reported speed decides, since it is the shaft itself: whichever comes first, half of the expected change downwards
-# or as much upwards. Reported torque and torque demand are quicker: if either clearly rises, the probe ends at once. A
-# falling torque proves nothing about the shaft, and is no condition.
+# The reported speed decides, because it shows the shaft itself: half of the expected change, downwards or upwards,
+# whichever comes first. Reported torque and torque demand are quicker: if either clearly rises, the probe ends at once.
+# A falling torque proves nothing about the shaft, and is no condition.
 #
 # A reported demand may still be that of the speed loop when torque mode has just been displayed. It counts once it has
 # followed the switch, or should have.

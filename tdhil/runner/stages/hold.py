@@ -1,4 +1,4 @@
-"""Stage 4, hold: the host's fine adjustment on real-time feedback, to the mean speed at which stage 5 begins."""
+"""Stage 4, hold: the host controls the mean speed to the value at which stage 5 begins."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from tdhil.runner.guard import LIGHTEN, kept_within
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The host's slow control of the mean speed in torque mode. Pure: time and speed are handed in.
+# The host's slow control of the mean speed in torque mode. Pure: time and speed are arguments.
 #
-# A host loop as fast as a drive's own would oscillate or diverge behind a reported-speed lag τ_w of 0.4 s. With the
-# plant 1/(J s + B), the lag 1/(1 + τ_w s) and
+# A host loop as fast as a drive's own would oscillate or diverge with a lag τ_w of 0.4 s of the reported speed. With
+# the plant 1/(J s + B), the lag 1/(1 + τ_w s) and
 #
 #     T = K_p e + K_i ∫e dt        K_p = J ω_b,  K_i = K_p ω_b / 4,  ω_b = 0.2 / τ_w
 #
-# the crossing is at about ω_b, where the lag costs atan(0.2) = 11° and the integral atan(1/4) = 14°: some 65° of
-# phase are left, and 45° if the lag is four times what was assumed.
+# the gain crossover is at about ω_b, where the lag costs atan(0.2) = 11° and the integral atan(1/4) = 14°: the phase
+# margin is about 65°, and 45° if the lag is four times the assumed one.
 
 
 class MeanSpeedControl:
@@ -39,7 +39,7 @@ class MeanSpeedControl:
         torque = self._kp * error_rad_s + integral
         if abs(torque) > self._authority_nm:
             torque = self._authority_nm if torque > 0.0 else -self._authority_nm
-            # Held while at the bound, unless the error leads away from it.
+            # The integral is held while the torque is at its bound, unless the error leads away from the bound.
             if (error_rad_s > 0.0) == (torque > 0.0):
                 return torque
         self._integral_nm = integral

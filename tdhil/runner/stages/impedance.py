@@ -38,7 +38,7 @@ from tdhil.runner.stages.steady import trace, wait_until_steady
 
 HARMONICS = (1, 2, 3, 5, 7, 10, 14, 20, 30)   # excited lines, multiples of 1/PERIOD_S
 PHASES_RAD = (0.4081, 5.3094, 1.6031, 0.07, 3.2103, 0.7969, 5.0826, 4.208, 5.651)
-"""Equal lines with them have a crest of 1.75: found by a search with growing p-norms."""
+"""Phases of the lines, rad: equal lines then have a crest factor of 1.75. Found by a search with growing p-norms."""
 PERIOD_S = 20.0            # lines of 0.05 to 1.5 Hz: from string modes to the bandwidth of speed loops
 COUNTED, SETTLE = 24, 2    # periods; the offset is faded in over the first settling period
 DRAWS, SHARPNESS = 400, 1.0   # random sets of phases, the best is used; weight of the lines that determine |r|
@@ -47,7 +47,7 @@ LARGEST_SHARE = 0.4
 """Largest offset as a share of the torque limit; the rest is for the speed loop."""
 PILOT_SHARE, PILOT_PERIODS = 0.05, 2   # offset of the pilot as a share of the torque limit; its periods
 ROOM_SHARE = 0.9           # share of the room in speed and torque that a plan uses
-FADE_S = 2.0               # at the end
+FADE_S = 2.0               # s; fade-out at the end
 LEAST_COUNTED = 6         # periods that must follow the settling ones
 RESERVE_S = 10.0           # s; reserved of the time limit, beside stage 5
 DITHER_COUNTS, DITHER_TURNS = 3.0, 6.0 * 1.0103
@@ -57,7 +57,7 @@ from every line). Without it a stiff loop's few counts of speed are rounded alik
 
 @dataclass(frozen=True)
 class OffsetPlan:
-    """``plan`` is the expected motion, for display and log; the lines of torque are the command."""
+    """Plan with a torque offset. ``plan``: expected motion, for display and log; the torque lines are commanded."""
 
     plan: Plan
     torque_amplitudes_nm: tuple[float, ...]
@@ -211,7 +211,7 @@ class _WaveSender:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# From the pilot to the plan.
+# Plan of stage 5 from the pilot.
 
 
 def _answer(samples: list[Sample]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:

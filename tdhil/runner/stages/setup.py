@@ -70,7 +70,7 @@ def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resol
             raise _wrong_way(mean_rad_s)
         if mean_rad_s > threshold_rad_s:
             return torque_nm if mode is Mode.TORQUE else None
-        # In speed mode the drive raises the torque itself: at most to the probe's limit.
+        # In speed mode the drive itself raises the torque. Above the limit of the probe, the probe ends.
         if mode is Mode.SPEED and abs(sample.torque_nm) > limits.probe_torque_nm > 0.0:
             strained = strained + 1
             if strained >= loop.cycles(TORQUE_SEEN_S):

@@ -1,4 +1,4 @@
-"""Stage 2, speed: to n0 under the drive's own speed control, settle; then a second mean speed.
+"""Stage 2, speed: go to the first mean speed under the drive's own speed control, settle; then to a second one.
 
 The mean torque at two steady speeds gives Coulomb and viscous friction without any lag. The ramp between them gives a
 rough inertia by its momentum balance, in which a lag cancels because both ends are steady.
@@ -49,22 +49,20 @@ GOOD_ENOUGH = 0.2
 """Relative uncertainty of the rough inertia that is sufficient for planning."""
 
 STRING_ERROR = 0.75
-"""Relative uncertainty of the rough inertia with a drill string: depending on frequency the motor feels anything from
-its
-own inertia to that of the whole string. A plan must leave room for it, and a harder ramp gives no better value."""
+"""Relative uncertainty of the rough inertia with a drill string. Depending on frequency, the motor moves its own
+inertia only, or up to that of the whole string. A plan must leave room for it. A steeper ramp gives no better value."""
 
 ECHO_SHARE, BEFORE_RAMPS_S = 0.75, (6.0, 7.3, 5.2, 8.1, 6.7, 5.6)
-"""With a string that keeps oscillating: ramps between the speeds, each over this share of the time before its echo, and
-the times between them, s. These differ so that the remaining oscillations add up to nothing."""
+"""With a string that keeps oscillating: duration of a ramp between the speeds, as a share of the time before its echo;
+and the times between these ramps, s. The times differ so that the remaining oscillations cancel on average."""
 
 RESTLESS_ERROR = 0.5
-"""The same as `STRING_ERROR`, if the shaft's own inertia follows from the time before an echo: the motor then
-moves further than by its inertia alone, because the string oscillates along."""
+"""Relative uncertainty of the rough inertia with a drill string, if it follows from the time before an echo: the motor
+moves further than its own inertia explains, because the string oscillates too."""
 
 WANDER = 1.25
-"""Ratio of the deviation at constant torque to the largest deviation under a yielding speed control, with an
-oscillating
-string."""
+"""Ratio of the deviation of speed at constant torque to the largest one under a yielding speed control, with an
+oscillating string."""
 
 TRIES = 4                 # ramps between the two speeds, until the rough inertia is good enough
 NOBODY = SpeedWitness()
@@ -96,7 +94,7 @@ class SpeedResult:
     ramp: Ramp
     last: tuple[Sample, ...]           # the steady samples at the higher speed, before the switch
     steady: tuple[Samples, ...] = ()   # both operating points, torque without its offset: the disturbances
-    course: RampCourse | None = None       # how the drive followed the ramp
+    course: RampCourse | None = None       # setpoint and report on the ramp
     swing: Swing | None = None         # of a drill string that keeps oscillating
 
     @property
@@ -146,7 +144,7 @@ def run_speed(
     for _ in range(TRIES):
         ramped = ramp_speed(loop, low_rad_s, high_rad_s, rate)
         high_held = _settle_and_hold(loop, limits, high_rad_s, tolerance_rad_s, assumptions)
-        # A disturbance may be calm at one operating point for a time, but a string is not at both.
+        # A disturbed string may be calm at one operating point for a time, but not at both.
         swing = widest(swing, high_held.swing)
         low_samples, between, high_samples = low_held.level, [*ramped, *high_held.settling], high_held.level
         low, high = steady_level(low_samples), steady_level(high_samples)
@@ -271,7 +269,7 @@ def _settle_and_hold(
     assumptions: ControlAssumptions,
     before_level: Callable[[], None] = lambda: None,
 ) -> _Held:
-    """Settle, wait for the reporting lags, then hold the operating point. With a drill string the top yields."""
+    """Settle, wait for the reporting lags, then hold the operating point. With a drill string the motor yields."""
     lags_s = 2.0 * assumptions.largest_speed_lag_s
     if limits.winds_up:
         calmed = calm_string(loop, limits, speed_rad_s, tolerance_rad_s)

@@ -1,8 +1,8 @@
 """Stages 4 and 5 of `tdhil tune verify`: small steps of the set speed, up and down, in the drive's own speed loop.
 
 The step follows from the limits: its torque is a share of what friction leaves of the torque limit, its size a share of
-the speed window. The guard watches every cycle as always. Besides, a speed that overshoots far more than predicted ends
-the run.
+the speed window. The guard checks every cycle. In addition, a speed that overshoots far more than predicted ends the
+run.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from tdhil.runner.stages.virtual_string import differs_from
 from tdhil.speed_loop import LEAST_PAIRS, StepCase, StepProgram, step_length_s
 
 PAIRS = 24
-"""Counted pairs of steps: twice as many narrow the intervals by a third."""
+"""Counted pairs of steps. Twice as many would narrow the intervals by a third."""
 TORQUE_SHARE = 0.45
-"""Share of the torque that friction leaves below the limit, for a step; noise and overshoot need the rest."""
+"""Share of the torque between friction and limit that a step uses; noise and overshoot need the rest."""
 SPEED_SHARE = 0.25
 """Largest step, as a share of the speed window."""
 LEAST_COUNTS = 2
 """Least step, in counts of the reported speed."""
 STEPS_RESERVE_S, BEFORE_S = 20.0, 100.0
-"""Seconds of the time limit that are reserved for the stop, and for stages 1 to 4."""
+"""Time that is reserved of the time limit, s: for the stop, and for stages 1 to 4."""
 OVERSHOOTS = 3.0
 """Permitted overshoot, as a multiple of the predicted one, plus `OVERSHOOT_SHARE` of the step."""
 OVERSHOOT_SHARE = 0.5
-"""Share of the step."""
+"""Part of the permitted overshoot that does not depend on the prediction, as a share of the step."""
 STRANGE_COUNTS, STRANGE_SDS = 8.0, 6.0
 """Deviation that rounding and noise of the reported speed explain, in counts and in standard deviations."""
 
@@ -75,7 +75,7 @@ def plan_steps_before(
 
 
 def refuse_other_shaft(case: StepCase, model: RigGuess) -> None:
-    """Raise PreflightRefused if the turning shaft can't be the one that was tuned for."""
+    """Raise PreflightRefused if the turning shaft can't be the shaft for which the gains were tuned."""
     tuned = case.plant.believed.total_inertia_kg_m2
     if differs_from(tuned, model):
         raise _refused(

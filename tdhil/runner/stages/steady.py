@@ -1,4 +1,4 @@
-"""Steady speed: when a speed counts as steady, and the means at it."""
+"""Steady speed: the test for it, and means during it."""
 
 from __future__ import annotations
 
@@ -59,12 +59,13 @@ def steady_level(samples: Sequence[Sample]) -> SteadyLevel:
 BLOCK_S = 0.5             # s; a block whose mean speed is compared with the target
 BLOCKS = 4                # blocks in a row that must be at the target
 APPROACH_S = 10.0
-"""Two such times, the last and one that ended as many times `APPROACH_APART` earlier, show how a speed approaches."""
-APPROACH_APART = 3        # times of `APPROACH_S` from the first of the two to the last
-LEAST_APPROACH = 1.05     # ratio of the two errors; below it the error stands
-NEAR_SHARE = 0.25         # ratio of the error to the set speed, above which the speed is elsewhere and not on its way
+"""Averaging time of the speed's error, s. Its last mean, and the mean `APPROACH_APART` such times before, show how fast
+the speed approaches its target."""
+APPROACH_APART = 3        # distance of the two means, in units of `APPROACH_S`
+LEAST_APPROACH = 1.05     # ratio of the two errors; below it the error counts as constant
+NEAR_SHARE = 0.25         # ratio of the error to the set speed, above which the speed does not count as approaching
 SLOWEST_S = 20.0
-"""Time constant with which a speed loop should remove a standing error: three of them are the time it is given here."""
+"""Time constant with which a speed loop should remove a standing error, s: three of them fit into the usual timeout."""
 
 
 def wait_until_steady(
@@ -131,7 +132,7 @@ CALM_SHARE = 0.02
 """Share of the torque limit within which the torque of a calm string oscillates around its mean."""
 
 CALM_S = 6.0
-"""Time for which it must be calm, s: half a period of a string with a period of 12 s."""
+"""Time for which a string must be calm, s: half a period of a string with a period of 12 s."""
 
 WINDOW_S = 12.0           # s; the oscillation of one such window is compared with that of the window before
 NO_CALMER = 0.75
@@ -145,7 +146,7 @@ MOST_CALMING_S = 120.0    # s; longest wait for a string to become calm
 
 @dataclass(frozen=True)
 class Swing:
-    """Oscillation of a string: half of peak to peak; ``period_s`` 0 and ``regular`` 0 where nothing repeats."""
+    """Oscillation of a string: half of peak to peak; ``period_s`` and ``regular`` are 0 if it is not periodic."""
 
     torque_nm: float
     speed_rad_s: float
@@ -154,7 +155,7 @@ class Swing:
 
     @property
     def told(self) -> str:
-        """Return it in words."""
+        """Return the oscillation in words."""
         every = f" every {self.period_s:.1f} s" if self.regular >= STICK_SLIP_REGULAR else ""
         return (
             f"the string below oscillates with ±{self.torque_nm:.0f} N·m{every}, the top with ±{self.speed_rad_s:.2f}"
@@ -162,13 +163,13 @@ class Swing:
         )
 
     def restless(self, limits: MachineLimits) -> bool:
-        """Return whether it oscillates more than a calm string."""
+        """Return whether the string oscillates more than a calm string."""
         return self.torque_nm > CALM_SHARE * limits.torque_nm
 
 
 @dataclass(frozen=True)
 class Calmed:
-    """``setpoints_rad_s``: one per sample. ``swing``: the remaining oscillation. ``damper`` continues to damp it."""
+    """Calmed string: samples, one setpoint per sample, remaining oscillation, and the damper, which can continue."""
 
     samples: list[Sample]
     setpoints_rad_s: list[float]
@@ -182,7 +183,7 @@ def widest(*swings: Swing | None) -> Swing | None:
 
 
 def swing_of(samples: Sequence[Sample], period_s: float) -> Swing:
-    """Return the oscillation, from means over half a second, which remove the noise of the reports."""
+    """Return the oscillation, from means over `BLOCK_S`/2, which remove the noise of the reports."""
     width = max(1, round(BLOCK_S / 2.0 / period_s))
     seen = trace(samples)
     blocks = len(seen.time_s) // width
@@ -195,7 +196,7 @@ def swing_of(samples: Sequence[Sample], period_s: float) -> Swing:
 
 
 def hold_damped(loop: ControlLoop, damper: SwingDamper, seconds: float) -> tuple[list[Sample], list[float]]:
-    """Hold with a yielding top for a time. Return the samples and the speed setpoints."""
+    """Hold the speed with a yielding motor for a time. Return the samples and the speed setpoints."""
     samples: list[Sample] = []
     setpoints: list[float] = []
     for _ in range(loop.cycles(seconds)):
@@ -258,7 +259,7 @@ def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, t
 
 
 def is_stick_slip(swing: Swing, limits: MachineLimits, speed_rad_s: float, mean_nm: float) -> bool:
-    """Return whether a periodic oscillation is as large as stick-slip: downhole if the pipe is known."""
+    """Return whether a periodic oscillation is as large as stick-slip: judged downhole if the pipe is known."""
     if swing.regular < STICK_SLIP_REGULAR:
         return False
     zeta = limits.wave_impedance_nm_s_rad

@@ -46,7 +46,7 @@ def run_torque(
     slow: Sequence[Sample],
     torque_offset_nm: float, speed_resolution_rad_s: float, setpoint_where: str,
 ) -> TorqueResult:
-    """Switch, try to brake, ramp, let the speed drift. ``slow``: steady rotation in speed mode, where it begins.
+    """Run stage 3: switch, braking probe, ramp, drift. ``slow``: samples of steady rotation in speed mode before it.
 
     ``setpoint_where`` names the drive's torque setpoint. Raises ModeNotConfirmed, PreflightRefused if the drive does
     not brake with a braking torque, and what the bench raises.

@@ -1,10 +1,10 @@
 """Stage 5 with a virtual string: the drive in torque mode, with string, bit and speed controller in the host; or the
 drive in its own speed loop, with the string's torque through its torque offset.
 
-Besides the guard, which checks speed, torque and time as always, it is ended by a shaft that does not follow its
-torque, a loop that oscillates more than string and bit can, and energy that the loop's own errors put into the shaft.
-However it ends, the string's torque ends first: at a regular end it is faded out, and in every other case the first
-cycle of the stop commands none.
+The guard checks speed, torque and time. In addition the stage ends if the shaft does not follow its torque, if the loop
+oscillates more than string and bit can, or if the loop's own errors put too much energy into the shaft. However the
+stage ends, the string's torque ends first: at a regular end it is faded out, and in every other case the first cycle of
+the stop commands no torque.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ ENERGY_SHARE = 0.05
 SAME_RIG = 0.5
 """Permitted difference of stage 2's rough inertia from the result's, unless its uncertainty is larger."""
 TORQUE_SHARE, RAMP_S = 0.25, 5.0
-"""Share of the torque limit with which the first set speed is approached in the drive's own loop; or time for the whole
-window, s."""
+"""Ramp to the first set speed in the drive's own loop: share of the torque limit that may accelerate the shaft, and
+least time from zero to the speed limit, s."""
 RESERVE_S = 20.0          # s; reserved of the time limit
 BEFORE_S = 150.0
 """Approximate duration of stages 1 to 4, s; the rest of the time limit is checked before motion."""
@@ -114,7 +114,7 @@ def run_virtual_string(
 ) -> None:
     """Run the whole program, from steady rotation at its first speed; ``keep`` receives one row per cycle.
 
-    ``resolution_rad_s``, ``noise_rad_s``: of the reported speed, a count and a standard deviation.
+    ``resolution_rad_s``: count of the reported speed; ``noise_rad_s``: its standard deviation.
     Raises LimitHit, and what the bench raises.
     """
     host = HostLoop(case.string, case.meant, case.law, case.rig, program, loop.period_s, limits.torque_nm,
