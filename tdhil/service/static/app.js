@@ -762,7 +762,7 @@
   });
 
   const pages = { login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, waiting, when, zone };
+  window.tdhil = { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, follow, inertia, interval, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, waiting, when, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);
