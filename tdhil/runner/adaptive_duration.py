@@ -1,4 +1,4 @@
-"""Stage 5 with a tolerance: after the pilot and each extension, decide whether to acquire more, and how much."""
+"""Stage 5 with a tolerance: decision after the pilot and each extension whether to acquire more, and how much."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from tdhil.runner.excitation import Plan
 from tdhil.runner.interim import Identify, counted_periods, identify_plainly, live_inertia
 
 Snapshot = Callable[[], Recording]
-LEAST_EXTENSION = 2       # periods at each mean speed: fewer do not justify the way back
-_SECOND_SHARE = 0.5       # of the acquired periods: least extension after an interval, for a different next interval
-_AT_LAST_SHARE = 1.0      # of the acquired periods: most at one mean speed alone; the slope of friction needs both
+LEAST_EXTENSION = 2       # periods at each mean speed; fewer do not justify the transition back
+_SECOND_SHARE = 0.5       # least extension after an interval, share of the acquired periods: the next must differ
+_AT_LAST_SHARE = 1.0      # longest extension at one mean speed alone, share of the acquired periods; B needs both
 
 
 @dataclass(frozen=True)
 class Decision:
-    """The result of an interim analysis: number of further periods at each mean speed (0: the end), and the reason.
+    """Result of an interim analysis: number of further periods at each mean speed (0: the end), and the reason.
 
-    ``at_last``: only at the present mean speed, which saves the way back and its settling.
+    ``at_last``: only at the present mean speed, which saves the transition back and its settling.
     ``seen``: number of intervals found too wide so far; ``working_confidence``: of the interval that follows if the run
     ends after this decision. ``interval``: half-width of the checked interval, as a share of J.
     """
@@ -49,7 +49,7 @@ class Decision:
 
 @dataclass
 class Enough:
-    """Makes and keeps the decisions. ``snapshot`` returns the recording so far; ``note`` receives every decision."""
+    """Decisions of one run. ``snapshot`` returns the recording so far; ``note`` receives every decision."""
 
     stopping: Stopping
     plan: Plan
@@ -63,7 +63,7 @@ class Enough:
         return self.decisions[-1].working_confidence if self.decisions else self.stopping.working(0)
 
     def question(self, spent_s: float) -> Callable[[], Decision]:
-        """Return one interim analysis for any thread or process. The samples are taken now."""
+        """Return a function for one interim analysis in any thread or process. The samples are taken now."""
         recording, rule = self.snapshot(), self.stopping
         left_s = rule.allowed_s - spent_s
         seen = self.decisions[-1].seen if self.decisions else 0
@@ -93,7 +93,7 @@ def decide(
         return look(recording, rule.working(number), rule.tolerance / MARGIN, most, rule.pilot_dof, most_at_last)
 
     def more(found: Look, share: float | None = None) -> tuple[int, str]:
-        """Return how many periods, and where. ``share``: least extension after an interval."""
+        """Return the number of further periods, and a text. ``share``: least extension after an interval."""
         at, limit, where = (1, room_at_last, "here") if found.at_last else (segments, room, "at each mean speed")
         wanted = math.ceil((found.scale - 1.0) * found.periods / at - 1e-6)
         least = LEAST_EXTENSION if found.enough else 0

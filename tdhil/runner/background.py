@@ -2,8 +2,8 @@
 
 A process has its own interpreter and priority: no cycle waits for it. It is started, and has loaded all modules, before
 the shaft moves. It receives work as pickles through a pipe, and answers through another. As a new program it inherits
-neither sockets nor signal handlers nor threads. It ends when its pipe does, thus with this process, for whatever
-reason. Nothing ever waits for it: when its answer is not needed any more, it is killed.
+neither sockets nor signal handlers nor threads. It ends when its pipe is closed, and so whenever this process ends.
+Nothing ever waits for it: when its answer is not needed any more, it is killed.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from tdhil.numerics import ONE_THREAD
 T = TypeVar("T")
 
 SWITCH_S = 0.0005
-"""Longest time for which a computing thread of this process may keep the interpreter, s."""
+"""Longest time for which a computing thread of this process may hold the interpreter, s."""
 
 NICE = 10
-"""Nice value of the process above the control loop's. It must not starve beside a busy program either."""
+"""Increment of the process's nice value over the control loop's. The process must still run beside a busy program."""
 
 READY_S = 60.0
 """Wall time for the process to load its modules, s. tdhil waits, because loading would disturb later steps."""
@@ -46,7 +46,7 @@ class Gone(Exception):
 
 
 class WorkerProcess:
-    """A worker process for computations. ``program`` is what it runs, for tests.
+    """A worker process for computations. ``program``: its Python program; tests use another one.
 
     Raises OSError if it can't be started. The owner calls `end`, and `close` when there is time.
     """
@@ -74,11 +74,11 @@ class WorkerProcess:
         return self._process.pid
 
     def wait_ready(self, for_s: float) -> bool | None:
-        """Return whether it is ready. None: not within ``for_s`` of wall time; False: it never will be."""
+        """Return whether the process is ready. None: not within ``for_s`` of wall time; False: it failed to start."""
         return self._began if self._ready.wait(for_s) else None
 
     def ask(self, work: Callable[[], T]) -> T:
-        """Return what ``work`` returns, or raise what it raises, however long it takes. Raises Gone without an answer.
+        """Run ``work`` in the process; return its result or raise its error. No timeout. Raises Gone without an answer.
 
         ``work`` is pickled: a function of a module, or a `functools.partial` of one with arguments of plain data.
         """
@@ -100,12 +100,12 @@ class WorkerProcess:
         return result
 
     def end(self) -> None:
-        """Kill it in any state; returns at once."""
+        """Kill the process in any state; returns at once."""
         with suppress(OSError):
             self._process.kill()
 
     def close(self) -> None:
-        """Kill it and close its pipes. This takes a moment, at most about a second."""
+        """Kill the process and close its pipes. This takes two seconds at most."""
         self.end()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(_REAPED_S)
@@ -204,8 +204,10 @@ def _in_a_thread(work: Background[Any]) -> Iterator[None]:
 
 
 def goes_on() -> bool:
-    """Return whether a dropped computation still runs in a thread of this process. Then the process must not end in the
-    usual way: on exit the C library ends OpenBLAS, which has been observed to wait forever for such a thread.
+    """Return whether a dropped computation still runs in a thread of this process.
+
+    The process must then not end in the usual way: on exit the C library ends OpenBLAS, which has been observed to
+    wait forever for such a thread.
     """
     return bool(_in_threads)
 

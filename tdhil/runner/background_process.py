@@ -1,4 +1,4 @@
-"""The program of the worker process: it loads what a plan needs, then answers one request after another."""
+"""Program of the worker process: it loads the modules for a plan, then answers one request after another."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""J during stage 5: after periods of the excitation, a worker process identifies what was recorded so far.
+"""J during stage 5: after periods of the excitation, a worker process identifies the samples recorded so far.
 
-The answer is the one of the run's end: the same function on the same samples. It goes to the display and into the log,
-and to nothing else: no cycle waits for it, and the length of stage 5 never depends on it. `adaptive_duration` ends a
-run early, by its own analyses, whose cost in confidence is known beforehand.
+The answer equals that at the end of the run: the same function on the same samples. It goes to the display and to the
+log only: no cycle waits for it, and the length of stage 5 never depends on it. `adaptive_duration` may end a run early,
+by its own analyses, whose cost in confidence is known beforehand.
 
 In real time the worker process receives only the samples since its last answer, and an answer is due when the earlier
 ones took at most `CORE_SHARE` of a core. Without that process there are no answers, because a thread would disturb the
@@ -35,7 +35,7 @@ LEAST_PERIODS = 3
 NO_ANSWERS = "J is not shown during the run: the worker process is not available"
 
 Identify = Callable[[Recording, float], Identification]
-"""Identifies a recording with a confidence, as at the end of the run. It can be pickled (`WorkerProcess.ask`)."""
+"""Function that identifies a recording with a confidence, as at the end of the run; it can be pickled."""
 
 
 def identify_plainly(recording: Recording, confidence: float) -> Identification:
@@ -49,7 +49,7 @@ class FollowsInertia(Protocol):
 
     @property
     def follows_inertia(self) -> bool:
-        """Return whether the answers are wanted now. Without a viewer they are not computed."""
+        """Return whether answers are requested now. Without a viewer they are not computed."""
         ...
 
     def inertia(self, found: LiveInertia) -> None:
@@ -59,7 +59,7 @@ class FollowsInertia(Protocol):
 
 @dataclass(frozen=True)
 class Answered:
-    """An answer, and the processor time that it took."""
+    """An answer, and the processor time for it, s."""
 
     found: LiveInertia
     cpu_s: float
@@ -67,10 +67,10 @@ class Answered:
 
 @dataclass(frozen=True)
 class Interim:
-    """A question: everything but the samples. ``motion`` ends with the last whole period.
+    """Request for J, without the samples. ``motion`` ends with the last complete period.
 
-    ``working``: confidence to compute with, so that the interval has the ``confidence`` after the analyses of a run
-    with a tolerance; else the same.
+    ``working``: confidence for the computation; in a run with a tolerance it is higher, so that the interval has the
+    ``confidence`` after all analyses.
     """
 
     motion: Excitation
@@ -82,7 +82,7 @@ class Interim:
 
 
 def interim_answer(recording: Recording, asked: Interim) -> Answered:
-    """Identify the periods so far."""
+    """Identify the periods so far. Return J, and the processor time."""
     began_s = time.thread_time()
     recording = replace(recording, excitation=asked.motion)
     found = live_inertia(asked.identify(recording, asked.working), recording, asked.confidence)
@@ -115,7 +115,7 @@ def live_inertia(found: Identification, recording: Recording, confidence: float)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# In the worker process, which serves one run and keeps its samples.
+# Functions of the worker process, which serves one run and keeps its samples.
 
 
 _kept: list[RecordingBuilder] = []
@@ -135,7 +135,7 @@ def answer_with(part: RecordingPart, asked: Interim) -> Answered:
 
 
 class InertiaWatch:
-    """Asks for J at ends of periods, and passes each answer on. Made for one stage 5; nothing of it ends a run."""
+    """Requests J at ends of periods in one stage 5, and passes each answer on. None of its errors ends a run."""
 
     def __init__(
         self, loop: ControlLoop, log: RunLog, display: object, identify: Identify,

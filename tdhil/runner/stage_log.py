@@ -1,4 +1,4 @@
-"""Record of the stages: each is announced, shown, rated and logged, however it ends."""
+"""Record of the stages: each stage is announced, shown, rated and logged, however it ends."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from tdhil.runner import preconditions
 from tdhil.runner.task import Display, Say
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Actions of others on the drive's bus during a run, for the log, the display and the result.
+# Actions of other masters on the drive's bus during a run, for the log, the display and the result.
 
 
 def summary(drive: Drive) -> tuple[str, ...]:
-    """Return the actions in the whole run, a line each; none if the drive can't detect them."""
+    """Return the actions of others in the whole run, one line each; none if the drive can't detect them."""
     return drive.summary() if isinstance(drive, Telling) else ()
 
 
 def tell(drive: Drive, configure: Callable[..., None], say: Callable[[str], None]) -> None:
-    """Write them at the end to the log's configuration and to the display."""
+    """Write the actions of others to the log's configuration and to the display, at the end."""
     if lines := summary(drive):
         configure(others=list(lines))
         for line in lines:
@@ -37,7 +37,7 @@ def stage_warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The quality of a stage: from errors on the bus and in the loop while it ran. Pure.
+# Quality of a stage, from errors on the bus and in the loop while it ran. Pure.
 
 
 TOLERATED_LOSS = 0.01
@@ -47,7 +47,7 @@ TOLERATED_LATE = 0.05
 """Tolerated share of cycles that began late, or with feedback after its cycle or twice."""
 
 FEW_LATE = 10
-"""Tolerated number of these, also in a short stage."""
+"""Tolerated number of late cycles, also in a short stage."""
 
 
 def stage_quality(before: Counters, after: Counters) -> tuple[str, str]:

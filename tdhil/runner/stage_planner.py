@@ -1,4 +1,4 @@
-"""Plans stage 5 while the shaft turns. The plan is shown and logged before it is carried out."""
+"""Plan of stage 5, made while the shaft turns. The plan is shown and logged before it is executed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ RESERVE_S = 30.0
 
 
 class StagePlanner:
-    """The planner of one run. It keeps the cycles going while it computes."""
+    """Planner of one run. The cycles continue while it computes."""
 
     def __init__(self, loop: ControlLoop, log: RunLog, display: Display, say: Say) -> None:
         self._loop = loop
@@ -58,7 +58,7 @@ class StagePlanner:
                 entry=MessageCode.NO_ROOM_FOR_MOTION,
             )
         room = Guard.room(limits, task.assumptions, free)
-        if speed.swing is not None:     # it may hide the braking, which is then not used
+        if speed.swing is not None:     # the oscillation may hide the response to braking, which is then not used
             room = replace(room, least_torque_nm=loop.guard.least_torque_nm)
         course = speed.course if mode is Mode.SPEED else None
         last = loop.last
@@ -109,7 +109,7 @@ class StagePlanner:
         return planned
 
     def enough(self, planned: Planned, identify: Identify) -> Enough | None:
-        """Return the stopping decision for a given tolerance. Each decision is logged before it is carried out."""
+        """Return the stopping decisions for a given tolerance; None without one. Each is logged before it is used."""
         rule = planned.stopping
         if rule is None:
             return None
@@ -155,7 +155,7 @@ def _reckon(
     left_s: float,
     winds_up: bool,
 ) -> Planned:
-    """Compute the plan: plain data in and out, so that any process can run it."""
+    """Compute the plan. Arguments and result are plain data, so any process can run it."""
     known = DesignKnowledge(measured_noise(steady, theta, assumed), prior, winds_up)
     if course is None:
         return plan_acquisition(request, mode.value, room, model, known, left_s)

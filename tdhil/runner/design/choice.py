@@ -1,6 +1,6 @@
-"""Choose the excitation: of about a dozen candidates the one that gives the narrowest interval of J in the given time.
+"""Choice of the excitation: of about a dozen candidates, the one with the narrowest interval of J in the given time.
 
-Values that the user sets stay fixed: `make_plan` follows every request exactly, and what it refuses is no candidate.
+Values that the user sets stay fixed: `make_plan` follows every request exactly, and a refused plan is no candidate.
 The usual multisine is always a candidate, and only a clearly better one replaces it.
 """
 
@@ -52,12 +52,12 @@ from tdhil.runner.excitation import (
 )
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A quick figure for the search: the Cramér-Rao bound of J, the structure of the lags being open.
+# A quick figure for the search: the Cramér-Rao bound of J, with an unknown structure of the lags.
 #
-# The lines' information about the rigid model's theta = (J, B; τ_w, ρ_w, τ_T, ρ_T, u, d), whose last six are the
-# family of `signal_filters`: first-order lags, two poles, moving averages, delays. Shapes ρ and averages u are
-# bounded rather than unknown; here they count as known to about their bounds. So a high line buys little: what it
-# says of J it first has to say of the structure.
+# It uses the lines' information about the rigid model's theta = (J, B; τ_w, ρ_w, τ_T, ρ_T, u, d). The last six are the
+# family of `signal_filters`: first-order lags, two poles, moving averages, delays. Shapes ρ and averages u are bounded;
+# here they count as known to about their bounds. So a high line adds little: most of its information is used up by the
+# structure of the lags.
 
 
 _SKEW_SD_S = 0.3          # s; standard uncertainty of the time offset between speed and torque in this bound
@@ -116,17 +116,17 @@ def _known(theta: FloatArray, prior: LagPrior) -> dict[int, float]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Candidate multisines: which lines, how strong, phased so that they fit the most motion into the limits.
+# Candidate multisines: their lines and amplitudes, and the phases that permit the largest motion within the limits.
 
 
-HIGHEST_TURN = 0.24    # of 1/τ, Hz: the highest line, τ being the longest plausible lag
+HIGHEST_TURN = 0.24    # highest line as a share of 1/τ, Hz; τ is the longest plausible lag
 LINES_LIMIT_HZ = (0.1, 2.0)
-"""The highest line, Hz: not below the first (a rig would take an hour), not above the second (structure, backlash)."""
+"""Bounds of the highest line, Hz: a lower one would take an hour, a higher one would show structure and backlash."""
 
 SLOPES = (1.0, 1.5, 2.0)                               # amplitude ~ harmonic^−slope
 _HARMONICS = ((1, 2, 3, 4), (1, 2, 3, 5), (1, 2, 3, 4, 5), (1, 2, 3, 4, 6), (1, 2, 3, 4, 5, 6), (1, 3, 5, 7, 9))
 """Sets of excited lines that are tried, multiples of the lowest one."""
-_REACHES = (0.8, 1.0)                                  # of the highest line that is allowed
+_REACHES = (0.8, 1.0)                                  # shares of the highest permitted line
 _GRID = 128               # points of a period on which the peaks of a candidate are searched
 _TURN = 2.0 * np.pi * np.arange(_GRID) / _GRID
 _POPULATION, _KEPT, _ROUNDS, _STEP_RAD = 96, 6, 5, 0.8   # search for phases: candidates, survivors, rounds, step in rad
@@ -134,7 +134,7 @@ _POPULATION, _KEPT, _ROUNDS, _STEP_RAD = 96, 6, 5, 0.8   # search for phases: ca
 
 @dataclass(frozen=True)
 class Proposal:
-    """Lowest frequency and harmonics, with amplitudes ~ harmonic^−slope."""
+    """Proposed lines: lowest frequency and harmonics, with amplitudes ~ harmonic^−slope."""
 
     lowest_hz: float
     harmonics: tuple[int, ...]
@@ -147,9 +147,7 @@ class Proposal:
 
 
 def highest_line_hz(longest_lag_s: float) -> float:
-    """Return the highest useful frequency, Hz. Above a quarter of 1/τ the unknown structure of a lag τ matters too
-    much.
-    """
+    """Return the highest useful frequency, Hz. Above about 1/(4 τ) the structure of a lag τ has too much effect."""
     return float(np.clip(HIGHEST_TURN / max(longest_lag_s, 1e-3), *LINES_LIMIT_HZ))
 
 
@@ -162,7 +160,7 @@ def proposals(highest_hz: float, slope: float) -> Iterator[Proposal]:
 def phased(proposal: Proposal, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> Shape:
     """Return the proposal with phases that allow the largest amplitude within the limits, scaled to peak 1.
 
-    A search over random phases, narrowed around the best ones; seeded, so that the same rig gets the same motion.
+    Random phases are searched, then narrowed around the best ones. A fixed seed gives the same rig the same motion.
     """
     fit = _AmplitudeRoom(proposal, limits, guess, mode)
     rng = np.random.default_rng(len(proposal.harmonics))
@@ -178,7 +176,7 @@ def phased(proposal: Proposal, limits: MotionLimits, guess: RigGuess, mode: Driv
 
 
 class _AmplitudeRoom:
-    """The amplitude of a proposal that fits, by its phases."""
+    """Amplitude of a proposal that fits within the limits, as a function of its phases."""
 
     def __init__(self, proposal: Proposal, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> None:
         harmonics, amplitudes = np.array(proposal.harmonics), np.array(proposal.amplitudes)
@@ -189,7 +187,7 @@ class _AmplitudeRoom:
         self._ahead = amplitudes * (1.0 + 1j * omega * foresight)
         self._torque = amplitudes * (guess.viscous_nm_s_rad + 1j * omega * guess.inertia_kg_m2)
         self._both_ends = mode == "speed" and guess.following is not None
-        if self._both_ends and guess.following is not None:     # what the shaft makes of the setpoint
+        if self._both_ends and guess.following is not None:     # the shaft's response to the setpoint
             gains = guess.following.shaft(proposal.lowest_hz * harmonics)
             self._ahead, self._torque = amplitudes * gains, self._torque * gains
         steady = max(guess.steady_torque_nm(limits.usable_low_rad_s), guess.steady_torque_nm(limits.usable_high_rad_s))
@@ -211,8 +209,8 @@ class _AmplitudeRoom:
 # ---------------------------------------------------------------------------------------------------------------------
 
 OFFSET_SHARES = (0.2, 0.4)   # candidates for the distance of the mean speeds from the ends, shares of the window
-BETTER = 0.95         # of the usual multisine's interval: what a candidate must come down to
-_SLACK = 1.02         # of the usual plan's time: a transition may take a second longer
+BETTER = 0.95         # share of the usual multisine's half-width that a candidate must not exceed
+_SLACK = 1.02         # factor on the usual plan's time, because a transition may take a second longer
 
 
 @dataclass(frozen=True)
@@ -229,20 +227,18 @@ class DesignKnowledge:
 
     @property
     def speed_lag_s(self) -> float:
-        """Return the stated lag, else the assumed one, s."""
+        """Return the stated lag of the reported speed, else the assumed one, s."""
         return SPEED_LAG_S if self.prior.speed_lag_s is None else self.prior.speed_lag_s
 
     @property
     def torque_lag_s(self) -> float:
-        """Return the stated lag, else the assumed one, s."""
+        """Return the stated lag of the reported torque, else the assumed one, s."""
         return TORQUE_LAG_S if self.prior.torque_lag_s is None else self.prior.torque_lag_s
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The plan, the expected relative half-width of J, and that of the usual excitation in the same time; NaN
-    if none is predicted.
-    """
+    """Plan, expected relative half-width of J, and that of the usual excitation in that time; NaN: not predicted."""
 
     plan: Plan
     half_width: float
@@ -269,13 +265,13 @@ def choose(
         return expected_half_width(plan, theta, known.noise, known.prior, confidence)
 
     usual = make_plan(limits, guess, wish)
-    if told_before_echo(wish.kind):     # the prediction is of a rigid shaft
+    if told_before_echo(wish.kind):     # the prediction is for a rigid shaft only
         return Choice(_in_time(usual, wish, time_s), math.nan, math.nan)
     allowed_s = _SLACK * usual.duration_s if time_s is None else time_s
     if known.winds_up and _lines_are_free(wish):
         try:
             return Choice(_for_string(limits, guess, wish, allowed_s), math.nan, math.nan)
-        except PlanRefused:        # too long for the time there is, say
+        except PlanRefused:        # such as: too long for the available time
             pass
     if _fixed(wish):
         usual = _in_time(usual, wish, time_s)
@@ -338,14 +334,14 @@ def choose_soonest(
     return best
 
 
-SOON_COUNTED = (5, 6)     # periods at each mean speed at first, where time is what counts; four are too few: most runs
-                          # need more then, and some 14 minutes, as each look in vain asks for a higher confidence
-SETTLE_SOON_S = 8.0       # settling, where time is what counts: leaves 0.03 % of J at most, with reports' lags of 1 s
-_WIDTHS_OF_SD = 2.3       # half-width over the bound's standard deviation, as plans have it
-_OF_A_SLOPE, _FINALISTS = 4, 8   # candidates kept of each slope, and of all slopes for the exact prediction
-_LEAST_MORE = 0.2         # of the periods at first: two of ten are the least that an extension has
-_SPREAD = 0.2             # of the logarithm of a half-width about the one that was predicted: 1 sd
-_QUANTILES = np.array([-1.5, -0.9, -0.5, -0.2, 0.2, 0.5, 0.9, 1.5])     # of a normal distribution, equally likely
+SOON_COUNTED = (5, 6)     # first periods at each mean speed for the shortest run. Four are too few: most runs then need
+                          # more, some 14 minutes, because each analysis without success raises the next confidence
+SETTLE_SOON_S = 8.0       # s; settling for the shortest run: error of 0.03 % of J at most, with reporting lags of 1 s
+_WIDTHS_OF_SD = 2.3       # typical ratio of a plan's half-width to the standard deviation of the bound
+_OF_A_SLOPE, _FINALISTS = 4, 8   # candidates kept for each slope, and of all slopes for the exact prediction
+_LEAST_MORE = 0.2         # least extension as a share of the first periods: two of ten
+_SPREAD = 0.2             # standard deviation of the logarithm of a half-width about the predicted one
+_QUANTILES = np.array([-1.5, -0.9, -0.5, -0.2, 0.2, 0.5, 0.9, 1.5])     # equally likely, of a normal distribution
 
 
 def _until_s(plan: Plan, width: float, tolerance: float) -> float:
@@ -380,14 +376,14 @@ def refuse_unfit(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# With a drill string on the shaft: its lines tell the motor from what swings below, and both from the reports' filters.
+# Lines with a drill string: they must separate the motor from the string below, and both from the reporting filters.
 #
-# A rigid shaft's best lines are few, low and falling as ω^−2. Behind a string they leave J open by 3 to 7 %, however
-# little noise there is: of the shipped string's four lines one lies where the motor stands still, and two masses, a
-# string and filters of two poles bend the other three alike. Ten lines of equal torque, from below the lowest swing to
-# above the second one, leave 0.2 to 0.4 % open in the same time (1.3 % where two masses stand and any string that the
-# data allow counts), though a line may fall on a resonance, which the host's slow control damps. Lines from 0.1 Hz, of
-# which one less lies below the swing, leave twice as much; rising torques gain nothing.
+# A rigid shaft's best lines are few and low, with amplitudes falling as ω^−2. With a string they leave ±3 to 7 % of J
+# undetermined, even without noise. Of four such lines on the shipped string, one lies at an antiresonance of the motor;
+# two masses, a string and filters of two poles have the same effect on the other three. Ten lines of equal torque, from
+# below the lowest mode to above the second, leave 0.2 to 0.4 % in the same time (1.3 % with two masses and every string
+# that the data permit), although a line may be at a resonance, which the host's slow control damps. Lines from 0.1 Hz,
+# with one line less below the lowest mode, leave twice as much. Torques that rise with frequency add nothing.
 
 
 STRING = Proposal(0.08, tuple(range(1, 11)), 1.0)

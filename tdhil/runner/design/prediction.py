@@ -1,10 +1,10 @@
-"""The interval that the estimator itself would give: its own fit, on expected lines.
+"""Prediction of the interval of J: the estimator's own fit, on expected spectral lines.
 
-Everything that forms an interval (lag structures, estimated weights, priors) is taken from `identify`, here and nowhere
-else in this room. So the prediction agrees with the later result.
+All parts of an interval (lag structures, estimated weights, priors) come from `identify`, here and nowhere else in this
+room. So the prediction agrees with the later result.
 
 Lines without noise fit exactly, and would give too narrow an interval: −2 ln L = Σ 2(ν + M) ln(1 + q/ν) has the
-curvature (ν + M)/(ν + q), and q is about M where there is noise, but 0 here. So S is taken (ν + M)/ν times as large.
+curvature (ν + M)/(ν + q), and q is about M with noise, but 0 here. So S is multiplied by (ν + M)/ν.
 """
 
 from __future__ import annotations
@@ -29,35 +29,34 @@ from tdhil.recording import FloatArray, LagPrior, Segment
 from tdhil.runner.excitation import Plan
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How much disturbs the equation of motion: assumed from the machine's size, or measured at steady speed.
+# Disturbance of the equation of motion: assumed from the machine's limits, or measured at steady speed.
 #
-# What an estimator fights with at a line is the error of T − G W. With the load disturbance (density S_L, correlated
-# over τ_L) and the speed sensor's white noise (density S_ω) it has, behind the lag τ_T of the torque report, the
-# density
+# The error of the estimator at a line is that of T − G W. With the load disturbance (density S_L, correlation time τ_L)
+# and the speed sensor's white noise (density S_ω) its density, with the lag τ_T of the torque report, is
 #
 #     S(f) = (S_L/(1 + (ω τ_L)²) + |J s + B|² S_ω) / (1 + (ω τ_T)²),     s = jω,
 #
-# whatever regulates the shaft: torque that the drive itself makes is in both signals and cancels. Densities are two-
-# sided, per Hz. A line fitted to one period of length L then has E|r|² = 4 S/L, a mean over L the variance S(0)/L.
+# for any control of the shaft: the drive's own torque is in both signals and cancels. Densities are two-sided, per Hz.
+# A line that is fitted to one period of length L then has E|r|² = 4 S/L, and a mean over L has the variance S(0)/L.
 
 
 RIGID = Model()
-"""The model that plans are made with; theta (8,) = (J, B) and the six parameters of the reports."""
+"""Model of the shaft for plans; theta (8,) = (J, B) and the six parameters of the reports."""
 
-LOAD_SHARE = 0.0075        # of the torque limit: sd of the load if it is not measured
+LOAD_SHARE = 0.0075       # standard deviation of the load if it is not measured, share of the torque limit
 LOAD_TIME_S = 0.5         # s; correlation time of the load if it is not measured
-SENSOR_SHARE = 0.002       # of the highest speed: sd of the speed sensor in 2 ms
+SENSOR_SHARE = 0.002      # standard deviation of the speed sensor in 2 ms, share of the highest speed
 _SENSOR_STEP_S = 0.002    # s; the step of `SENSOR_SHARE`
-SPEED_LAG_S = 0.40         # assumed lag of the reported speed, and of the torque, if none is stated
+SPEED_LAG_S = 0.40        # s; assumed lag of the reported speed, if none is stated
 TORQUE_LAG_S = 0.15       # s; assumed lag of the reported torque, if none is stated
-_LOW_LINES = 3             # of a stretch: its lowest lines tell the load
-_HIGH_LINES = 9            # … those behind them, up to this one, what grows with frequency
-_LEAST_SHARE = 1e-3        # of the assumed density: less than that, and something else will set the interval
+_LOW_LINES = 3            # lowest lines of a stretch, which give the density of the load
+_HIGH_LINES = 9           # number of lines of a stretch; the lines above the lowest give the density of the sensor
+_LEAST_SHARE = 1e-3       # least density, share of the assumed one: below it other errors determine the interval
 
 
 @dataclass(frozen=True)
 class NoiseDensity:
-    """Densities S_L, (N·m)²·s, and S_ω, (rad/s)²·s; the load's correlation time, s."""
+    """Noise densities of the load, S_L in (N·m)²·s, and of the speed sensor, S_ω in (rad/s)²·s."""
 
     load_nm2_s: float
     speed_rad2_s: float
@@ -66,7 +65,7 @@ class NoiseDensity:
 
     @property
     def load_sd_nm(self) -> float:
-        """Return the standard deviation of the load disturbance: S_L = 2 sd² τ_L."""
+        """Return the standard deviation of the load disturbance, N·m: S_L = 2 sd² τ_L."""
         return math.sqrt(0.5 * self.load_nm2_s / self.load_time_s)
 
     def error_density(self, hertz: FloatArray, theta: FloatArray) -> FloatArray:
@@ -80,13 +79,13 @@ class NoiseDensity:
 
 
 def assumed_noise(torque_limit_nm: float, speed_max_rad_s: float, load_sd_nm: float | None = None) -> NoiseDensity:
-    """Return noise as typical shares of the machine's limits; or with a stated load disturbance."""
+    """Return noise as typical shares of the machine's limits, or with a stated load disturbance ``load_sd_nm``."""
     load = LOAD_SHARE * torque_limit_nm if load_sd_nm is None else load_sd_nm
     return NoiseDensity(2.0 * load**2 * LOAD_TIME_S, (SENSOR_SHARE * speed_max_rad_s) ** 2 * _SENSOR_STEP_S)
 
 
 def assumed_theta(inertia_kg_m2: float, viscous_nm_s_rad: float, prior: LagPrior) -> FloatArray:
-    """Return the parameters, (8,), with first-order lags: stated, else assumed."""
+    """Return the parameters of `RIGID`, (8,), with first-order lags: stated, else assumed."""
     theta = np.zeros(RIGID.size)
     theta[:2] = inertia_kg_m2, viscous_nm_s_rad
     theta[RIGID.at(SPEED_LAG)] = SPEED_LAG_S if prior.speed_lag_s is None else prior.speed_lag_s
@@ -97,10 +96,10 @@ def assumed_theta(inertia_kg_m2: float, viscous_nm_s_rad: float, prior: LagPrior
 def measured_noise(steady: tuple[Samples, ...], theta: FloatArray, fallback: NoiseDensity) -> NoiseDensity:
     """Return densities from stretches of steady speed, at the harmonics of each stretch's own length.
 
-    The error's line e = T − G W takes spectra and cross spectrum of the two signals at once, and stays the same under
-    whatever regulates the speed: |e|² L/4 is a reading of S with two degrees of freedom. The lowest lines of all
-    stretches tell S_L with the correlation time assumed, the next ones what |J s + B|² S_ω adds. With lags other than
-    theta's some of the drive's own torque stays in e, so that the reading errs on the high side.
+    The error's line e = T − G W uses spectra and cross spectrum of both signals, and does not depend on the control of
+    the speed: |e|² L/4 is an estimate of S with two degrees of freedom. The lowest lines of all stretches give S_L,
+    with the assumed correlation time; the next ones give the added |J s + B|² S_ω. With lags other than theta's, some
+    of the drive's own torque remains in e, so the estimate is rather too large than too small.
     """
     frequencies: list[FloatArray] = []
     readings: list[FloatArray] = []
@@ -123,7 +122,7 @@ def measured_noise(steady: tuple[Samples, ...], theta: FloatArray, fallback: Noi
 
 
 def _readings(samples: Samples, theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Return frequencies and readings of S, (K,) each, of one stretch; None if it is too short."""
+    """Return frequencies, Hz, and estimates of S, (K,) each, of one stretch; None if it is too short."""
     if len(samples) < 4 * _HIGH_LINES:
         return None
     interval = float(np.median(np.diff(samples.time_s)))
@@ -133,7 +132,7 @@ def _readings(samples: Samples, theta: FloatArray) -> tuple[FloatArray, FloatArr
     segment = Segment(begin, begin + length, length, 0, float(np.mean(samples.speed_rad_s)), lines, (), ())
     try:
         found = period_lines(Stretch(segment, (samples,), (0,)), samples)
-    except np.linalg.LinAlgError:       # samples that do not tell these frequencies apart
+    except np.linalg.LinAlgError:       # the samples can't separate these frequencies
         return None
     torque = found.torque[0] - theta[1] * found.drift[0] * found.ramp[0]
     s = 2j * np.pi * hertz.astype(np.complex128)
@@ -145,7 +144,7 @@ def _readings(samples: Samples, theta: FloatArray) -> tuple[FloatArray, FloatArr
 # ---------------------------------------------------------------------------------------------------------------------
 
 _NINE_IN_TEN = 1.28       # standard deviations: one-sided 90 % quantile of the normal distribution
-LEAST_NU = 2.0      # complex degrees of freedom of a line's weight, below which identification leaves it out
+LEAST_NU = 2.0            # complex degrees of freedom of a line's weight, below which identification omits the line
 
 
 @dataclass(frozen=True)
@@ -235,12 +234,12 @@ def half_width(evidence: Evidence, confidence: float) -> float:
 
 
 def safe_half_width(evidence: Evidence, confidence: float) -> float:
-    """Return the relative half-width of J that nine runs of ten stay below.
+    """Return the relative half-width of J that nine of ten runs do not exceed.
 
-    Quite another set of lags may explain the lines nearly as well. Without noise its −2 ln L is D₀ above the best, with
-    noise D ~ N(D₀, 4 D₀); it widens the interval where D < t². That stays rarer than one in ten if √D₀ ≥ x + √(x² + t²)
-    with x = 1.28. So the profile is followed up to there, and scaled back: a parabola gives the same as ever, a second
-    valley within reach shows.
+    A different set of lags may explain the lines almost as well. Without noise its −2 ln L is D₀ above the best, with
+    noise D ~ N(D₀, 4 D₀). It widens the interval if D < t². This has a probability below 10 % if √D₀ ≥ x + √(x² + t²)
+    with x = 1.28. So the profile is followed to that value, and the width is scaled back: for a parabola nothing
+    changes, and a second minimum within reach widens the interval.
     """
     nu = [line.nu for line in evidence.lines if line.nu >= LEAST_NU]
     if not nu:
@@ -266,8 +265,8 @@ def whole_periods(lines: Sequence[SpectralLine]) -> float:
 def predicted(plan: Plan, theta: FloatArray, noise: NoiseDensity, prior: LagPrior) -> Evidence:
     """Return lines without noise and their expected covariance.
 
-    In torque mode the disturbance shows in speed alone (torque is what the host commands), in speed mode in torque
-    alone; either way T − G W has the variance 4 S/L of `noise`.
+    In torque mode the disturbance is in the speed only, because the host commands the torque. In speed mode it is in
+    the torque only. In both modes T − G W has the variance 4 S/L of `noise`.
     """
     reference = plan.segments[0].reference
     hertz = np.array(reference.lines_hz)
@@ -293,5 +292,5 @@ def predicted(plan: Plan, theta: FloatArray, noise: NoiseDensity, prior: LagPrio
 
 def expected_half_width(plan: Plan, theta: FloatArray, noise: NoiseDensity, prior: LagPrior,
                         confidence: float) -> float:
-    """Return the half-width of J, as a share of J, after this plan, with other lags than the true ones allowed."""
+    """Return the expected relative half-width of J after this plan, also with other lags than the assumed ones."""
     return safe_half_width(predicted(plan, theta, noise, prior), confidence)

@@ -1,31 +1,32 @@
-"""The stopping rule of stage 5: the cost of deciding by the scatter, and of deciding by the interval itself.
+"""Stopping rule of stage 5: the cost of deciding by the scatter, and of deciding by the interval itself.
 
-By the scatter. A pilot of n₀ periods at each mean speed is run. Its scatter (never its value of J) says how tight the
-interval will be, and how many periods it takes; so many are run, and it is looked again. Of Gaussian data the means and
-the scatter about them are independent, so given the number of periods N the error of J̄ is what it would have been had
-N been fixed beforehand, N(0, σ²/N). Only the scatter is picked: where the pilot's s₀² came out small, N is small and
-s₀² keeps a large share of the pooled s². With t the quantile, the interval covers with
+By the scatter. A pilot of n₀ periods at each mean speed is run. Its scatter (never its value of J) gives the expected
+width of the interval and the necessary number of periods. These are run, and the scatter is analysed again. In Gaussian
+data the means and the scatter about them are independent. So, given the number of periods N, the error of J̄ has the
+same distribution as with an N fixed beforehand, N(0, σ²/N). Only the scatter is selected: if the pilot's s₀² is small,
+N is small and s₀² keeps a large share of the pooled s². With t the quantile, the interval covers with
 
     P = E[2 Φ(t s/σ) − 1],   s² = (ν₀ s₀² + ν₁ s₁²)/(ν₀ + ν₁),   ν₁ = ν₀ (N − 1),   N = N(s₀²),
 
-(N in pilots, s₀²/σ² = χ²/ν₀ and s₁²/σ² = χ²/ν₁ independent), which falls short of the confidence by some tenths of a
-percent, most where N is between one and two pilots. For the rule N = 1 where s₀² ≤ r σ², else a s₀²/(r σ²), whatever r
-and a may be, `working_confidence` makes up for it: the confidence whose quantile gives min over r and a of P equal to
-what was asked. Both expectations are sums over equally likely values. Further looks come where the first extension was
-not enough, seldom and with ν doubled: simulated, three of them change P by less than 0.0003. ν₀ is that of one line's
-variance; J rests on several lines and on B, so that the true ν₀ is larger and the correction a little too large.
+(N in pilots, s₀²/σ² = χ²/ν₀ and s₁²/σ² = χ²/ν₁ independent). P is below the confidence by some tenths of a percent,
+most if N is between one and two pilots. `working_confidence` corrects this for the rule N = 1 if s₀² ≤ r σ², else
+N = a s₀²/(r σ²), for any r and a: it returns the confidence whose quantile makes the minimum of P over r and a equal to
+the requested one. Both expectations are sums over equally likely values. Further analyses follow if the first extension
+was not enough; they are rare, with ν doubled: in simulation, three of them change P by less than 0.0003. ν₀ is that of
+one line's variance. J depends on several lines and on B, so the true ν₀ is larger, and the correction slightly too
+large.
 
-By the interval. It also depends on how the residuals fell: another set of lags may be excluded, or just not. So when
-the scatter suffices, the interval itself is checked; if it is still too wide, there is one more extension, and another
-check. Keeping an interval only where it is narrow is a choice by the data, of whatever
-kind. But the run's interval is one of several; it misses at most as often as any of these does, however the choice is
-made. That any does is P(I₁ misses) + P(I₂ misses and I₁ doesn't) + … , of which the k-th gets α_k = 0.7·0.3^(k − 1) α;
-they add up to α. Where the k-th misses the (k − 1)-th mostly does too, since it holds a share r of the same data: an
-interval misses where the signed root z of its likelihood ratio at the true J is too large, and such roots of data that
-grow have normal increments, so that z_k and z_(k − 1) are correlated with √r (Lan and DeMets' spending). An extension
-behind an interval is at most three times as long as all before it: r ≥ ¼ is assumed. Most runs pay a few percent
-of width for it, those that need a second look a sixth; were it at most as long (r ≥ ½, an eighth), runs whose lags are
-told apart late would need a third look and a fourth, which cost far more.
+By the interval. It also depends on the residuals: another set of lags may be excluded, or just not. So when the scatter
+suffices, the interval itself is checked. If it is still too wide, one more extension and another check follow. To keep
+an interval only if it is narrow is a selection by the data. But the run's interval is one of several, and its
+probability of a miss is at most that any of them misses, for every way of selection. This is P(I₁ misses) + P(I₂ misses
+and I₁ doesn't) + … . The k-th term gets α_k = 0.7·0.3^(k − 1) α, and the sum is α. If the k-th interval misses, the
+(k − 1)-th mostly does too, because it holds a share r of the same data: an interval misses if the signed root z of its
+likelihood ratio at the true J is too large. Such roots of growing data have normal increments, so the correlation of
+z_k and z_(k − 1) is √r (alpha spending, Lan and DeMets). An extension after an interval is at most three times as long
+as all data before it: r ≥ ¼ is assumed. This widens the interval by a few percent in most runs, and by a sixth in runs
+with a second check. If the extension were at most as long (r ≥ ½), a second check would cost an eighth, but runs with
+lags that are separated late would need a third and a fourth check, which cost far more.
 """
 
 from __future__ import annotations
@@ -59,20 +60,20 @@ from tdhil.runner.design.prediction import (
     whole_periods,
 )
 
-LOOKS = 4                 # extensions at most
-FIRST_SHARE = 0.7         # of the remaining miss probability, spent on the next checked interval
-MOST_BEHIND = 3.0         # of all before, that an extension behind an interval may be long: r ≥ ¼
-AIM = 0.7                 # probability with which one extension is enough; the way back for another costs little
-MARGIN = 1.05             # an interval comes out 4 % (1 sd) wider or narrower than its scatter says, as residuals fall
-_WORTH_SHARE = 0.1        # of the interval at the end of the time: what is nearer than this needs no more time
-_THRESHOLDS = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0)   # r: candidates
-_MARGINS = (1.0, 1.3)     # a: candidates
+LOOKS = 4                 # largest number of extensions
+FIRST_SHARE = 0.7         # share of the remaining miss probability that the next checked interval uses
+MOST_BEHIND = 3.0         # longest extension after an interval, multiple of all data before it: r ≥ ¼
+AIM = 0.7                 # probability that one extension is enough; another one costs little more time
+MARGIN = 1.05             # an interval is 4 % (1 sd) wider or narrower than its scatter predicts, by the residuals
+_WORTH_SHARE = 0.1        # excess over the interval at the end of the time, as a share, that is not worth more time
+_THRESHOLDS = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0)   # candidates of r
+_MARGINS = (1.0, 1.3)     # candidates of a
 _PILOTS, _EXTENSIONS = 128, 32   # equally likely scatters of a pilot and of an extension over which a rule is rated
 
 
 @dataclass(frozen=True)
 class Stopping:
-    """The end of stage 5. ``working``: confidences of the intervals, so that ``confidence`` holds after the analyses.
+    """Stopping rule of one run. `working`: confidences of the intervals, so that ``confidence`` holds at the end.
 
     ``reachable``: the tolerance is expected to be reached in ``allowed_s``. If not, ``advice`` states what would help.
     ``by_interval``: the scatter of a rigid shaft is no criterion here; the interval itself is checked.
@@ -115,7 +116,7 @@ def spent_confidence(confidence: float, seen: int) -> float:
     nodes, weights = np.polynomial.legendre.leggauss(64)
 
     def newly(edge: float) -> float:
-        """Return how often |z_k| is beyond ``edge`` while |z_(k − 1)| is within its own."""
+        """Return the probability that |z_k| is above ``edge`` while |z_(k − 1)| is within its own limit."""
         z = edge + 4.0 * (nodes + 1.0)
         inside = ndtr((before - root * z) / math.sqrt(1.0 - root**2)) - ndtr(
             (-before - root * z) / math.sqrt(1.0 - root**2)
@@ -185,10 +186,10 @@ def aimed_scatter(dof: float, added: float) -> float:
 
 
 def least_scale(half_width: Callable[[float], float], tolerance: float, most: float) -> tuple[float, float, bool]:
-    """Return how much longer the run must be: (scale, half-width then, whether it suffices); 1 ≤ scale ≤ ``most``.
+    """Return the necessary length of the run: (scale, half-width with it, whether it suffices); 1 ≤ scale ≤ ``most``.
 
-    ``half_width(scale)`` falls about as √(a/scale + b), b being what the lag structure leaves open however long it
-    takes. Where time is not enough, the scale at which nearly nothing is left to gain.
+    ``half_width(scale)`` falls about as √(a/scale + b); b is the part that the unknown lag structure leaves for any
+    duration. If the time is not enough, the scale is that above which almost nothing is gained.
     """
     now = half_width(1.0)
     if now <= tolerance or most <= 1.0:
@@ -214,7 +215,7 @@ def least_scale(half_width: Callable[[float], float], tolerance: float, most: fl
 
 
 def _between(low: tuple[float, float], high: tuple[float, float], target: float) -> float:
-    """Return where √(a/scale + b) through both points meets the target, away from the ends."""
+    """Return the scale at which √(a/scale + b) through both points equals the target, away from the ends."""
     (x0, h0), (x1, h1) = low, high
     share = 0.5
     if math.isfinite(h0) and h0 > h1:
@@ -225,16 +226,16 @@ def _between(low: tuple[float, float], high: tuple[float, float], target: float)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Interim analysis of the scatter: the present width of the interval, and the necessary extension.
+# Interim analysis of the scatter: present width of the interval, and necessary extension.
 
 
 @dataclass(frozen=True)
 class Look:
     """Result of an interim analysis: J's relative half-width now, and after ``scale`` times as many periods.
 
-    ``enough``: the tolerance is met then (now, if ``scale`` is 1). ``at_last``: all of what is more may be at the mean
-    speed where the shaft is, without a way back to the others. None of it knows how J came out but for what the
-    lines' weights owe to it, which is of second order: multiply torque by anything, and nothing here changes.
+    ``enough``: the tolerance is met then (now, if ``scale`` is 1). ``at_last``: the whole extension may be at the
+    present mean speed, without a return to the others. The analysis does not use the value of J, except for an effect
+    of second order through the lines' weights: a factor on the torque changes nothing here.
     """
 
     periods: float

@@ -22,7 +22,7 @@ from tdhil.runner.excitation.reference import (
 )
 from tdhil.runner.excitation.signals import PeriodicKind, Shape, begun_at_rest
 
-_OFFSET_SHARE = 0.38     # least distance of the two mean speeds, share of the usable window; it determines B
+_OFFSET_SHARE = 0.38     # least distance of the two mean speeds, share of the usable window: lever for B
 LEAST_COUNTED = 6        # least number of evaluated periods at each mean speed: their scatter sets the weights
 RAMP_SHARE = 0.9         # share of the acceleration that the drive's own ramp permits, as measured in stage 2
 _BACKWARDS_SHARE = 0.012  # share of the highest speed; a predicted reverse speed below it is permitted by the guard
