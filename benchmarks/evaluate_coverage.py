@@ -18,7 +18,6 @@ wrong. Promised: 93 % of the intervals cover the damping, and at most 5 % of the
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
@@ -28,6 +27,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.kept_rows import kept_rows
 from benchmarks.virtual_string import MEANT, MODES_HZ, SETTLE_S, STRING
 from sim_bus.inverter import Inverter
 from sim_bus.params import DriveParams, RigParams
@@ -132,19 +132,9 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first rig")
     parser.add_argument("--out", type=Path, help="file that keeps the rigs that are done, one line of JSON each")
     asked = parser.parse_args()
-    rows: list[dict[str, Any]] = []
-    if asked.out is not None and asked.out.exists():
-        rows = [json.loads(line) for line in asked.out.read_text(encoding="utf-8").splitlines()]
-    known = {row["rig"] for row in rows}
     begun = time.process_time()
-    for number in range(asked.first, asked.first + asked.rigs):
-        if number in known:
-            continue
-        rows.append(judged(number))
-        print(words(rows[-1]), flush=True)
-        if asked.out is not None:
-            with asked.out.open("a", encoding="utf-8") as kept:
-                kept.write(json.dumps(rows[-1]) + "\n")
+    rows = kept_rows(asked.out, "rig", range(asked.first, asked.first + asked.rigs), judged,
+                     lambda row: print(words(row), flush=True))
     ran = [row for row in rows if row["outcome"] != "refused"]
     measured = [row for row in ran if row["damping"] is not None]
     if not measured:

@@ -15,20 +15,17 @@ from __future__ import annotations
 
 import argparse
 import os
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import tdhil
-from benchmarks.tolerance_coverage import LIMITS, TRUE_KG_M2, InverterDrive, bounds
+from benchmarks.real_time_priority import busy_loops
+from benchmarks.tolerance_coverage import LIMITS, TRUE_KG_M2, InverterDrive, bounds, over_seeds
 from sim_bus.params import RigParams
 from tdhil.recording import LiveInertia
 from tdhil.runner import interim
@@ -37,8 +34,6 @@ from tdhil.runner.settings import ExcitationRequest, StopRequest
 from tdhil.runner.task import Task
 from tests.runner.fake_drive import FakeDisplay
 from tests.runner.line_drive import BuilderLog
-
-HOG = "while True: pass"
 
 
 class Viewer(FakeDisplay):
@@ -82,20 +77,10 @@ def course(seed: int, fixed_s: float, tolerance: float | None) -> Course:
     return Course(seed, tuple(viewer.answers), "" if outcome.cause is None else repr(outcome.cause))
 
 
-def courses(asked: argparse.Namespace) -> Iterator[Course]:
-    one = partial(course, fixed_s=asked.fixed, tolerance=asked.tolerance)
-    seeds = range(asked.first, asked.first + asked.runs)
-    if asked.processes <= 1:
-        yield from map(one, seeds)
-        return
-    with ProcessPoolExecutor(asked.processes) as pool:
-        yield from pool.map(one, seeds)
-
-
 def coverage(asked: argparse.Namespace) -> int:
     """Print the misses; 1 if more than 5 % of all intervals miss, beyond chance."""
     found: list[Course] = []
-    for one in courses(asked):
+    for one in over_seeds(course, asked):
         found.append(one)
         print(f"{one.seed:>5} {len(one.numbers)} intervals, {len(one.missed)} miss {one.note}", flush=True)
     whole = [one for each in found for one in each.numbers]
@@ -136,9 +121,8 @@ def one_round(shown: bool, rate_hz: float, periods: int, seed: int) -> tuple[int
 
 def late(asked: argparse.Namespace) -> int:
     """Print the late cycles, with J and without."""
-    hogs = [subprocess.Popen([sys.executable, "-c", HOG]) for _ in range(asked.hogs)]
     totals = {False: [0, 0], True: [0, 0]}
-    try:
+    with busy_loops(asked.hogs):
         for number in range(2 * asked.rounds):
             shown = bool(number % 2)
             cycles, begun_late, missed, answers, took_s = one_round(shown, asked.rate, asked.periods, 1 + number // 2)
@@ -146,10 +130,6 @@ def late(asked: argparse.Namespace) -> int:
             totals[shown][1] += begun_late + missed
             print(f"{'with J   ' if shown else 'without J'} {cycles} cycles in {took_s:.0f} s: {begun_late} begun late,"
                   f" {missed} without feedback in time; {answers} answers", flush=True)
-    finally:
-        for hog in hogs:
-            hog.kill()
-            hog.wait()
     for shown, (cycles, out) in totals.items():
         print(f"{'with J' if shown else 'without J'}: {out} of {cycles} cycles, {100 * out / max(1, cycles):.4f} %")
     print(f"{os.cpu_count()} cores, {asked.hogs} busy loops beside it, {asked.rate:g} Hz")

@@ -14,7 +14,8 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import can
@@ -32,6 +33,18 @@ LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, w
 REST = Command(Mode.SPEED, 0.0, 0.0)
 DRIVE_PRIORITY = 60
 HOG = "while True: pass"
+
+
+@contextmanager
+def busy_loops(count: int) -> Iterator[None]:
+    """Let this many processes compute without end beside the block."""
+    hogs = [subprocess.Popen([sys.executable, "-c", HOG]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for hog in hogs:
+            hog.kill()
+            hog.wait()
 
 
 def one_round(raised: bool, seconds: float) -> tuple[int, int, int, float, float, str]:
@@ -72,18 +85,13 @@ def main() -> int:
     parser.add_argument("--hogs", type=int, default=os.cpu_count() or 2, metavar="N", help="default: one a core")
     options = parser.parse_args()
     shares: dict[bool, list[float]] = {False: [], True: []}
-    hogs = [subprocess.Popen([sys.executable, "-c", HOG]) for _ in range(options.hogs)]
-    try:
+    with busy_loops(options.hogs):
         for number in range(2 * options.rounds):
             raised = bool(number % 2)
             cycles, late, missed, p999_s, worst_s, said = one_round(raised, options.seconds)
             shares[raised].append((late + missed) / cycles)
             print(f"{'with   ' if raised else 'without'} {cycles} cycles: {late} begun late, {missed} without feedback;"
                   f" late by {1e3 * p999_s:.2f} ms (p99.9), {1e3 * worst_s:.2f} ms (worst) {said}", flush=True)
-    finally:
-        for hog in hogs:
-            hog.kill()
-            hog.wait()
     print("missed, median of rounds: " + ", ".join(
         f"{'with' if raised else 'without'} priority {100 * statistics.median(found):.3f} %"
         for raised, found in shares.items()

@@ -30,6 +30,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 
+from benchmarks.kept_rows import kept_rows
 from benchmarks.speed_loop_margins import stated, upper_bound
 from tdhil.cli.tune_speed import plant_of
 from tdhil.estimation import identify
@@ -122,18 +123,14 @@ def main() -> int:
     parser.add_argument("--rigs", type=int, default=300)
     parser.add_argument("--first", type=int, default=1)
     asked = parser.parse_args()
-    lines = asked.out.read_text(encoding="utf-8").splitlines() if asked.out.exists() else []
-    rows = [json.loads(line) for line in lines]
-    have, begun = {row["seed"] for row in rows}, time.monotonic()
-    for seed in range(asked.first, asked.first + asked.rigs):
-        if seed in have:
-            continue
-        rows.append(judged(seed))
-        with asked.out.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(rows[-1]) + "\n")
-        if not rows[-1]["refused"]:
-            print(f"    {seed}: typed {rows[-1]['typed']['verdict']}, {rows[-1]['kind']} by {rows[-1]['factor']} "
-                  f"{rows[-1]['wrong']['verdict']}, {time.monotonic() - begun:.0f} s", flush=True)
+    begun = time.monotonic()
+
+    def show(row: dict[str, Any]) -> None:
+        if not row["refused"]:
+            print(f"    {row['seed']}: typed {row['typed']['verdict']}, {row['kind']} by {row['factor']} "
+                  f"{row['wrong']['verdict']}, {time.monotonic() - begun:.0f} s", flush=True)
+
+    rows = kept_rows(asked.out, "seed", range(asked.first, asked.first + asked.rigs), judged, show)
     return told(rows)
 
 

@@ -13,12 +13,12 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -34,6 +34,8 @@ from tdhil.runner.task import Task
 from tdhil.session.conclusion import conclude
 from tests.runner.fake_drive import FakeDisplay
 from tests.runner.line_drive import BuilderLog
+
+T = TypeVar("T")
 
 TRUE_KG_M2 = 104.0
 LIMITS = MachineLimits(0.5, 10.0, 400.0, 3600.0, probe_torque_nm=200.0)
@@ -162,7 +164,8 @@ def bounds(hits: int, count: int, confidence: float = 0.99) -> tuple[float, floa
     return low, float(beta.ppf(1.0 - tail, hits + 1, count - hits)) if hits < count else 1.0
 
 
-def results(asked: argparse.Namespace) -> Iterator[Result]:
+def over_seeds(run: Callable[..., T], asked: argparse.Namespace) -> Iterator[T]:
+    """Yield ``run(seed, tolerance=…, fixed_s=…)`` for each seed that was requested, in their order."""
     one = partial(run, tolerance=asked.tolerance, fixed_s=asked.fixed)
     seeds = range(asked.first, asked.first + asked.runs)
     if asked.processes <= 1:
@@ -181,7 +184,7 @@ def main() -> int:
     parser.add_argument("--processes", type=int, default=1)
     asked = parser.parse_args()
     begun, found = time.monotonic(), []
-    for one in results(asked):
+    for one in over_seeds(run, asked):
         found.append(one)
         print(f"{one.seed:>5} {one.value:9.3f} {one.low:9.3f} {one.high:9.3f} ±{100 * one.half:5.3f} % "
               f"{'yes' if one.covers else 'NO ':<3} {one.acquire_s:6.0f} s  {one.extensions}  {one.note}", flush=True)

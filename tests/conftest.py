@@ -46,7 +46,6 @@ gc.disable()        # until everything is collected
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-ROOT = Path(__file__).parents[1]
 GROUPS = "one_worker"
 """Where a worker of pytest-xdist finds the file's name in which it writes what its `one_worker` items belong to."""
 
@@ -92,27 +91,6 @@ def pytest_xdist_make_scheduler(config, log):      # type: ignore[no-untyped-def
                 del groups[done]
 
     return ByMarker(config, log) if config.getvalue("dist") == "load" else None
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_sessionstart(session: pytest.Session) -> None:
-    """Rewrite the asserts of this worker's share of the test files, which is a third of a first run's collection.
-
-    Every worker collects every file, and at the same pace: none would find in the cache what another has rewritten.
-    """
-    given = getattr(session.config, "workerinput", None)
-    if given is None or sys.dont_write_bytecode:
-        return
-    from _pytest.assertion import rewrite
-
-    state = session.config.stash[rewrite.assertstate_key]
-    files = sorted(file for one in session.config.args for file in (ROOT / one).rglob("test_*.py"))
-    for file in files[int(given["workerid"].removeprefix("gw"))::given["workercount"]]:
-        folder = rewrite.get_cache_dir(file)
-        cached = folder / (file.stem + rewrite.PYC_TAIL)
-        if rewrite.try_makedirs(folder) and rewrite._read_pyc(file, cached) is None:
-            stat, code = rewrite._rewrite_test(file, session.config)
-            rewrite._write_pyc(state, code, stat, cached)
 
 
 def cases_of(items: list[pytest.Item], name: str) -> set[str]:

@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     from tdhil.speed_loop import StepCase
 
 
+def _shown_limits(limits: MachineLimits) -> dict[str, float]:
+    return {"speed_min_rad_s": limits.speed_min_rad_s, "speed_max_rad_s": limits.speed_max_rad_s,
+            "torque_nm": limits.torque_nm, "time_s": limits.time_s}
+
+
 def dry_run(options: RunOptions, rig: Rig | None, simulated: bool, profile: Profile) -> int:
     """Plan and print; exit code 0. Raises PreflightRefused if no plan is possible, as a run would."""
     from tdhil.report import stderr_console
@@ -55,8 +60,7 @@ def dry_run_steps(
         "dry_run": True, "gains": case.kind, "rate_hz": rate_hz, "pairs": program.pairs,
         "step_rad_s": program.step_rad_s, "low_rad_s": program.low_rad_s, "high_rad_s": program.high_rad_s,
         "step_torque_nm": case.gains.gain_nm_s_rad * program.step_rad_s, "duration_s": program.duration_s,
-        "limits": {"speed_min_rad_s": limits.speed_min_rad_s, "speed_max_rad_s": limits.speed_max_rad_s,
-                   "torque_nm": limits.torque_nm, "time_s": limits.time_s},
+        "limits": _shown_limits(limits),
         "tdhil": __version__,
     }
     if options.json:
@@ -85,8 +89,7 @@ def dry_run_course(
         "dry_run": True, "controller": case.prediction.kind, "rate_hz": rate_hz,
         "set_speed_rad_s": {"min": program.start_rad_s, "max": program.highest_rad_s},
         "moving_torque_nm": program.peak_nm * case.scale, "duration_s": program.longest_s,
-        "limits": {"speed_min_rad_s": limits.speed_min_rad_s, "speed_max_rad_s": limits.speed_max_rad_s,
-                   "torque_nm": limits.torque_nm, "time_s": limits.time_s},
+        "limits": _shown_limits(limits),
         "tdhil": __version__,
     }
     if options.json:

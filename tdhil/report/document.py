@@ -61,6 +61,25 @@ def marks(document: Mapping[str, Any]) -> str:
     return f"{SIMULATED} · {REHEARSAL}" if document.get("rehearsed_faults") else SIMULATED
 
 
+def run_facts(recording: Recording, run: Mapping[str, Any], log: str) -> dict[str, Any]:
+    """Return what the document of a run with a virtual string or with steps states of the run itself."""
+    return {
+        "gear_ratio": recording.gear_ratio,
+        "simulated": recording.simulated,
+        "rehearsed_faults": rehearsed_faults(run),
+        "rehearsal": rehearsal_of(run),
+        "complete": recording.complete,
+        **provenance(run),
+        "log": log,
+        "cycle": run.get("cycle"),
+        "stages": [
+            {"name": stage.name, "outcome": stage.outcome, "duration_s": stage.end_s - stage.start_s}
+            for stage in recording.stages
+        ],
+        "tdhil": __version__,
+    }
+
+
 def result_document(
     identification: Identification, recording: Recording, run: Mapping[str, Any], log: str
 ) -> dict[str, Any]:

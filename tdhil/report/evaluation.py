@@ -14,11 +14,10 @@ from rich.text import Text as Words
 from tdhil.recording import FloatArray, Recording
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, shown_date
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import SIMULATED, provenance, rehearsal_of, rehearsal_rows, rehearsed_faults
+from tdhil.report.document import SIMULATED, rehearsal_rows, run_facts
 from tdhil.report.html import sha256_of, write_blocks
 from tdhil.report.plots import DARK, OURS, QUIET, envelope
 from tdhil.soft_torque import COLUMNS, RPM, Phase
-from tdhil.version import __version__
 
 if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
@@ -63,19 +62,7 @@ def evaluation_document(
         "string": case.string.name,
         "bit": None if bit is None else
         f"{bit.describe()}, viscous {case.string.bottom_viscous_nm_s_rad:g} N·m·s/rad",
-        "gear_ratio": recording.gear_ratio,
-        "simulated": recording.simulated,
-        "rehearsed_faults": rehearsed_faults(run),
-        "rehearsal": rehearsal_of(run),
-        "complete": recording.complete,
-        **provenance(run),
-        "log": log,
-        "cycle": run.get("cycle"),
-        "stages": [
-            {"name": stage.name, "outcome": stage.outcome, "duration_s": stage.end_s - stage.start_s}
-            for stage in recording.stages
-        ],
-        "tdhil": __version__,
+        **run_facts(recording, run, log),
     }
 
 

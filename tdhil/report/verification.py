@@ -15,17 +15,9 @@ from rich.text import Text as Words
 from tdhil.recording import Recording
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, shown_date
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import (
-    SIMULATED,
-    only_finite,
-    provenance,
-    rehearsal_of,
-    rehearsal_rows,
-    rehearsed_faults,
-)
+from tdhil.report.document import SIMULATED, only_finite, rehearsal_rows, run_facts
 from tdhil.report.html import sha256_of, write_blocks
 from tdhil.report.plots import DARK, OURS, QUIET
-from tdhil.version import __version__
 
 if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
@@ -70,17 +62,7 @@ def verification_document(
         "steps": asdict(program) | {"step_rad_s": program.step_rad_s, "counted_pairs": found.pairs},
         "misfit": {"rms_share": found.misfit_rms, "p": found.misfit_p},
         "response": {name: getattr(found, name).tolist() for name in ("time_s", "reported", "fitted", "predicted")},
-        "gear_ratio": recording.gear_ratio,
-        "simulated": recording.simulated,
-        "rehearsed_faults": rehearsed_faults(run),
-        "rehearsal": rehearsal_of(run),
-        "complete": recording.complete,
-        **provenance(run),
-        "log": log,
-        "cycle": run.get("cycle"),
-        "stages": [{"name": stage.name, "outcome": stage.outcome, "duration_s": stage.end_s - stage.start_s}
-                   for stage in recording.stages],
-        "tdhil": __version__,
+        **run_facts(recording, run, log),
     }
     cleaned = only_finite(document)
     assert isinstance(cleaned, dict)

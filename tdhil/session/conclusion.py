@@ -12,7 +12,7 @@ from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.estimation import Identification, Options, Verdict
 from tdhil.recording import Recording
 from tdhil.session.rehearsal import code_with
-from tdhil.session.stored_calibration import AppliedCalibration, apply_calibration
+from tdhil.session.stored_calibration import apply_calibration
 
 TORQUE_SCALE = "torque scale"
 """Source in the uncertainty budget that a torque calibration reduces."""
@@ -71,16 +71,12 @@ def _options(run: Mapping[str, Any], log: str) -> Options:
         raise UsageError(str(error), where=log, next_step=f"Give {flags} again") from error
 
 
-def identified(run: Mapping[str, Any], applied: AppliedCalibration, confidence: float) -> Identification:
-    """Return the identification with the run's options."""
-    from tdhil.estimation import identify
-
-    return identify(applied.recording, replace(_options(run, "the run"), confidence=confidence))
-
-
 def identified_so_far(run: Mapping[str, Any], recording: Recording, confidence: float) -> Identification:
     """Return the identification during a run, with its options and its calibration: as `conclude` identifies."""
-    return identified(run, apply_calibration(recording, run), confidence)
+    from tdhil.estimation import identify
+
+    recording = apply_calibration(recording, run).recording
+    return identify(recording, replace(_options(run, "the run"), confidence=confidence))
 
 
 def conclude(
@@ -90,6 +86,7 @@ def conclude(
 
     ``warnings``: assumptions in reading a foreign trace; None for a tdhil log.
     """
+    from tdhil.estimation import identify
     from tdhil.report import result_document
     from tdhil.runner import precondition_warnings, speed_warnings, stage_warnings
 
@@ -97,7 +94,7 @@ def conclude(
     working = working_confidence_of(run, options.confidence)
     applied = apply_calibration(recording, run)
     recording = applied.recording
-    identification = after_looks(identified(run, applied, working), run, options.confidence)
+    identification = after_looks(identify(recording, replace(options, confidence=working)), run, options.confidence)
     identification = _dated(identification, applied.day)
     said = (
         *(CodedText(one, MessageCode.TRACE_ASSUMPTION) for one in warnings or ()),

@@ -26,6 +26,11 @@
   }
   const show = (where, ...inside) => where.replaceChildren(...inside.filter((one) => one !== null && one !== undefined));
 
+  /** Value of a CSS variable: colours follow light and dark. */
+  const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  /** Axis of a uPlot chart in the page's colours. */
+  const axis = (more) => ({ stroke: colour("--dim"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") }, ...more });
+
   class Refused extends Error {}
 
   const STARTED = "tdhil-started";
@@ -385,26 +390,23 @@
 
   /** Draw J's interval over time: inner band without, outer band with the torque scale; dashed: --tolerance about the last J. */
   function inertiaPlot(where) {
-    const style = () => getComputedStyle(document.documentElement);
     let plot = null, known = [];
     const data = () => ["time_s", "high_total_kg_m2", "low_total_kg_m2", "high_kg_m2", "low_kg_m2", "inertia_kg_m2"].map((name) => known.map((one) => one[name]));
     const draw = () => {
       if (plot) plot.destroy();
-      const ink = style().getPropertyValue("--dim").trim(), line = style().getPropertyValue("--line").trim(), colour = style().getPropertyValue("--c2").trim();
-      const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line } };
-      const edge = (width) => ({ stroke: colour, width, points: { show: false } });
+      const shade = colour("--c2"), edge = (width) => ({ stroke: shade, width, points: { show: false } });
       plot = new uPlot({
         width: where.clientWidth || 320, height: 190, legend: { show: false }, cursor: { show: false },
         scales: { x: { time: false, range: (self, low, high) => (high > low ? [low, high] : [(low || 0) - 5, (low || 0) + 5]) } },
-        axes: [{ ...axis, size: 34, values: (self, ticks) => ticks.map((one) => `${one} s`) }, { ...axis, size: 52 }],
-        series: [{}, edge(0), edge(0), edge(1), edge(1), { stroke: colour, width: 2, points: { show: true, size: 7, fill: colour } }],
-        bands: [{ series: [1, 2], fill: `${colour}22` }, { series: [3, 4], fill: `${colour}44` }],
+        axes: [axis({ size: 34, values: (self, ticks) => ticks.map((one) => `${one} s`) }), axis({ size: 52 })],
+        series: [{}, edge(0), edge(0), edge(1), edge(1), { stroke: shade, width: 2, points: { show: true, size: 7, fill: shade } }],
+        bands: [{ series: [1, 2], fill: `${shade}22` }, { series: [3, 4], fill: `${shade}44` }],
         hooks: { draw: [(self) => {
           const last = known[known.length - 1];
           if (!last || !last.tolerance) return;
           const c = self.ctx;
           c.save();
-          c.strokeStyle = style().getPropertyValue("--limit").trim();
+          c.strokeStyle = colour("--limit");
           c.lineWidth = 1.5 * devicePixelRatio;
           c.setLineDash([6 * devicePixelRatio, 4 * devicePixelRatio]);
           for (const sign of [-1, 1]) {
@@ -762,7 +764,7 @@
   });
 
   const pages = { login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, follow, inertia, interval, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, waiting, when, zone };
+  window.tdhil = { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inertia, interval, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, waiting, when, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);

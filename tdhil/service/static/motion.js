@@ -1,13 +1,12 @@
 // Speed and torque of a run over one time axis: zoom, pan, values under the cursor, export of the view.
 "use strict";
 (() => {
-  const { byId, el, inSpeedUnit, onSpeedUnit, speedUnit } = window.tdhil;
+  const { axis, byId, colour, el, inSpeedUnit, onSpeedUnit, speedUnit } = window.tdhil;
   const HEIGHT = 190;
   const LEAST_S = 0.2;           // shortest view: five displayed samples
   const DRAG_PX = 6;             // a shorter drag is a click
   const STEP = 0.25, ZOOM = 2;   // a press of a button moves by a quarter of the view, or halves it
   const HINT = "Drag across a chart to zoom. Double-click shows the whole run.";
-  const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
   /** Nearest index of `time` to `at`; `time` rises. */
   function nearest(time, at) {
@@ -94,11 +93,11 @@
       c.restore();
     }
 
-    const data = (chart) => [samples[0], samples[chart.column].map((one) => (one === null ? null : chart.shown(one)))];
+    /** Columns of a chart. Only speeds in rpm need a copy: this runs as long as samples come. */
+    const data = (chart) => [samples[0], chart.column === 1 && speedUnit() === "rpm" ? samples[1].map((one) => (one === null ? null : inSpeedUnit(one))) : samples[chart.column]];
     function draw() {
       for (const chart of charts) {
         if (chart.plot) chart.plot.destroy();
-        const axis = { stroke: colour("--dim"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") } };
         chart.plot = new uPlot({
           width: chart.where.clientWidth || 320, height: HEIGHT, legend: { show: false },
           cursor: { y: false, sync: { key: "motion" }, drag: { x: true, y: false, setScale: false, dist: DRAG_PX }, bind: { dblclick: () => () => look(null) } },
@@ -110,7 +109,7 @@
               return [from - pad, to + pad];
             } },
           },
-          axes: [{ ...axis, size: 34, values: (self, ticks) => ticks.map((one) => `${one} s`) }, { ...axis, size: 52 }],
+          axes: [axis({ size: 34, values: (self, ticks) => ticks.map((one) => `${one} s`) }), axis({ size: 52 })],
           series: [{}, { stroke: colour(chart.colour), width: 1.5, points: { show: false } }],
           hooks: {
             draw: [(self) => marks(chart, self)],

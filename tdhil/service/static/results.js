@@ -1,7 +1,7 @@
 // Results: one run, a comparison, a rig over time, many logs. As in app.js, data from elsewhere are inserted as text.
 "use strict";
 (() => {
-  const { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, follow, inSpeedUnit, inertia, interval, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, waiting, when, zone } = window.tdhil;
+  const { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, waiting, when, zone } = window.tdhil;
 
   // -- one run
 
@@ -221,7 +221,6 @@
 
   // -- pictures of several runs
 
-  const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const ALIVE_MS = 3000;
   const alive = () => every(ALIVE_MS, () => call("GET", "/healthz"));     // a page with a single request also reports a lost service
 
@@ -243,11 +242,10 @@
     let plot = null;
     const draw = () => {
       if (plot) plot.destroy();
-      const axis = { stroke: colour("--dim"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") } };
       plot = new uPlot({
         width: where.clientWidth || 320, height: 240, legend: { show: false }, cursor: { show: false },
         scales: { x: { time, range: () => [xs[0] - side, xs[xs.length - 1] + side] }, y: { range: () => [low - pad, high + pad] } },
-        axes: [{ ...axis, size: 48, label: time ? `local time, ${zone(new Date(1000 * xs[xs.length - 1]))}` : label, labelSize: 22, ...(time ? { values: TIMES } : {}) }, { ...axis, size: 62 }],
+        axes: [axis({ size: 48, label: time ? `local time, ${zone(new Date(1000 * xs[xs.length - 1]))}` : label, labelSize: 22, ...(time ? { values: TIMES } : {}) }), axis({ size: 62 })],
         series: [{}, ...series.map(() => ({ stroke: "transparent", paths: () => null, points: { show: false } }))],
         hooks: { draw: [(self) => {
           const c = self.ctx, px = devicePixelRatio;

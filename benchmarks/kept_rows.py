@@ -1,0 +1,33 @@
+"""Rows of a long study in a file of JSON lines, so that the study can be stopped, continued and added to."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+Row = dict[str, Any]
+
+
+def kept_rows(
+    out: Path | None, key: str, numbers: Iterable[int], judged: Callable[[int], Row], show: Callable[[Row], None]
+) -> list[Row]:
+    """Return the rows of earlier parts in ``out``, then those of all ``numbers`` that are not among them.
+
+    ``judged`` makes the row of a number, whose number stands under ``key``. Each new row is appended to ``out``, if it
+    is given, before ``show`` is called with it.
+    """
+    rows: list[Row] = []
+    if out is not None and out.exists():
+        rows = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
+    known = {row[key] for row in rows}
+    for number in numbers:
+        if number in known:
+            continue
+        rows.append(judged(number))
+        if out is not None:
+            with out.open("a", encoding="utf-8") as kept:
+                kept.write(json.dumps(rows[-1]) + "\n")
+        show(rows[-1])
+    return rows
