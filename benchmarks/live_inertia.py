@@ -109,9 +109,9 @@ def one_round(shown: bool, rate_hz: float, periods: int, seed: int) -> tuple[int
     """(cycles, begun late, without feedback in time, answers, wall time of the run)."""
     seen: list[LiveInertia] = []
     began_s = time.monotonic()
-    with tempfile.TemporaryDirectory() as folder, tdhil.simulate(seed=seed, real_time=True, rate_hz=rate_hz) as drive:
+    with tempfile.TemporaryDirectory() as folder, tdhil.simulate(seed=seed, real_time=True) as drive:
         record = tdhil.run(
-            drive, tdhil.Multisine(periods=periods), log=str(Path(folder) / "run.mcap"),
+            drive, tdhil.Multisine(periods=periods), rate_hz=rate_hz, log=str(Path(folder) / "run.mcap"),
             on_inertia=seen.append if shown else None,
         )
     counters = record.configuration["counters"]

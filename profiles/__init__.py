@@ -11,7 +11,9 @@ if TYPE_CHECKING:
         Confidence as Confidence, DriveProfile as DriveProfile, ProfileEntry as ProfileEntry, Require as Require,
         SpeedControllerParameters as SpeedControllerParameters,
     )
-    from profiles.errors import DataFileError as DataFileError, Problem as Problem, TdhilError as TdhilError
+    from profiles.errors import (
+        DataFileError as DataFileError, Problem as Problem, TdhilError as TdhilError, UsageError as UsageError,
+    )
     from profiles.library import (
         Profile as Profile, eds_path as eds_path, load_canopen_profile as load_canopen_profile,
         load_modbus_profile as load_modbus_profile, load_profile as load_profile, matching_names as matching_names,
@@ -42,7 +44,7 @@ else:
         "eds_import": "begin_profile",
         "eds_reader": "read_eds",
         "entry": "Confidence DriveProfile ProfileEntry Require SpeedControllerParameters",
-        "errors": "DataFileError Problem TdhilError",
+        "errors": "DataFileError Problem TdhilError UsageError",
         "library": "Profile eds_path load_canopen_profile load_modbus_profile load_profile matching_names "
                    "parse_profile profile_names profile_text",
         "messages": "CodedText MessageCode entry_of message_of with_code",

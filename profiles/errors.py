@@ -1,4 +1,4 @@
-"""The root of the error tree, and the errors of data files.
+"""The root of the error tree, and the errors of use and of data files.
 
 The root is defined here because `profiles` lies below every other room. `drivers.errors` re-exports it and draws the
 whole tree.
@@ -44,6 +44,12 @@ class TdhilError(Exception):
         text = f"{self.where}: {self.what}" if self.where else self.what
         text = f"{text}. {self.next_step}" if self.next_step else text
         return visible(_FLAG.sub(lambda found: self.spelling.get(found[0], found[0]), text), keep="\n")
+
+
+class UsageError(TdhilError):
+    """Refusal: the command line requests something impossible, or two things that exclude each other."""
+
+    entry = MessageCode.USAGE
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ from drivers import (
     StopNotConfirmed,
     TdhilError,
 )
-from profiles import MessageCode
+from profiles import MessageCode, UsageError
 
 SIGNALS, HIGHEST_SIGNAL = 128, 64
 """Exit code 128 + n: signal n ended the process; n is at most 64."""
@@ -75,12 +75,6 @@ class ExitCode(IntEnum):
         member = int.__new__(cls, value)
         member._name_, member._value_ = f"SIGNAL_{value - SIGNALS}", value
         return member
-
-
-class UsageError(TdhilError):
-    """Refusal: the command line requests something impossible, or two things that exclude each other."""
-
-    entry = MessageCode.USAGE
 
 
 class Interrupted(TdhilError):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from profiles import MessageCode, TdhilError
+from profiles import MessageCode, UsageError
 from tdhil.config import MODELS
 from tdhil.recording import FloatArray
 
@@ -385,12 +385,12 @@ class FrequencyResponse:
     def to_xarray(self) -> xarray.Dataset:
         """Return the lines along ``hertz``, each quantity with its unit (extra `notebook`).
 
-        Raises TdhilError without xarray, with the command that installs it.
+        Raises UsageError without xarray, with the command that installs it.
         """
         try:
             library = import_module("xarray")
         except ImportError as error:
-            raise TdhilError("xarray is not installed", next_step="Install it with: pip install '.[notebook]'",
+            raise UsageError("xarray is not installed", next_step="Install it with: pip install '.[notebook]'",
                              entry=MessageCode.PACKAGE_MISSING) from error
         columns = response_columns(self)
         hertz = columns.pop("hertz")

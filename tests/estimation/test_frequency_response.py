@@ -10,7 +10,7 @@ import control
 import numpy as np
 import pytest
 
-from profiles import MessageCode, TdhilError
+from profiles import MessageCode, UsageError
 from tdhil.estimation import Options, identify, response_columns, unit_of, usable_samples
 from tdhil.estimation.case import Case
 from tdhil.estimation.frequency_domain.frequency_response import _pooled, measure_response
@@ -96,7 +96,7 @@ def test_xarray_has_the_lines_with_their_units(linear):
 
 def test_a_missing_xarray_is_an_error_with_what_to_install(linear, monkeypatch):
     monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(TdhilError, match="xarray is not installed") as raised:
+    with pytest.raises(UsageError, match="xarray is not installed") as raised:
         linear.to_xarray()
     assert "pip install" in raised.value.next_step and raised.value.entry is MessageCode.PACKAGE_MISSING
 
