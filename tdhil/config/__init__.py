@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         BUSES as BUSES, DEFAULT_BUS as DEFAULT_BUS, DEFAULT_EXCITATION as DEFAULT_EXCITATION,
         EXCITATIONS as EXCITATIONS, MODELS as MODELS, SPEED_UNIT_TOLERANCE as SPEED_UNIT_TOLERANCE,
         has_plateaus as has_plateaus, imported as imported, load as load,
-        told_before_echo as told_before_echo,
+        identified_before_echo as identified_before_echo,
     )
     from tdhil.config.acceptance import (
         ACCEPTED_QUANTITIES as ACCEPTED_QUANTITIES, Expectation as Expectation, expectations_in as expectations_in,
@@ -40,7 +40,7 @@ else:
         "options": "ASKED_AGAIN CLOCKS OPTION OPTIONS Topic Option Origin Overrides RunDetails RunOptions Setting "
                    "form_options",
         "registry": "BUSES DEFAULT_BUS DEFAULT_EXCITATION EXCITATIONS MODELS SPEED_UNIT_TOLERANCE has_plateaus "
-                    "imported load told_before_echo",
+                    "imported load identified_before_echo",
         "acceptance": "ACCEPTED_QUANTITIES Expectation expectations_in expectations_of",
         "resolution": "check_values resolve wrong_values",
         "rig": "DriveData Limits Registered Rig load_rig parse_rig require_limits require_name rig_model "

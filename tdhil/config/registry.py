@@ -102,6 +102,6 @@ def has_plateaus(excitation: str) -> bool:
     return excitation in EXCITATIONS and EXCITATIONS[excitation].plateaus
 
 
-def told_before_echo(excitation: str) -> bool:
+def identified_before_echo(excitation: str) -> bool:
     """Return whether J follows from the time before a string's echo. False for an unknown excitation."""
     return excitation in EXCITATIONS and EXCITATIONS[excitation].before_echo

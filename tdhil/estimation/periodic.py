@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from profiles import CodedText, MessageCode
-from tdhil.config import told_before_echo
+from tdhil.config import identified_before_echo
 from tdhil.estimation.candidates import (
     BEFORE_ECHO,
     BENT_FRICTION,
@@ -172,7 +172,7 @@ def _load_may_swing(now: _LineWalk) -> bool:
     if now.asked.compliant is not None:
         return True
     return now.asked.widened and (
-        now.weak or now.case.recording.winds_up or (now.rigid is not None and may_swing(now.rigid)))
+        now.weak or now.case.recording.has_drill_string or (now.rigid is not None and may_swing(now.rigid)))
 
 
 def _try_load(now: _LineWalk) -> _LineWalk:
@@ -222,7 +222,7 @@ def _advised(finding: Finding | Refusal, case: PeriodicCase) -> Finding | Refusa
 def _before_echo(case: PeriodicCase) -> bool:
     """Return whether the time before the echo is used; False if the requested shaft is not a string."""
     excitation = case.recording.excitation
-    return excitation is not None and told_before_echo(excitation.kind) and shaft_model(case.options.model).piped
+    return excitation is not None and identified_before_echo(excitation.kind) and shaft_model(case.options.model).piped
 
 
 def _too_few(case: PeriodicCase, what: str, advice: str) -> Refused:

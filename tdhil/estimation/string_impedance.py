@@ -64,7 +64,7 @@ def measure_string(
     excitation = recording.excitation
     if excitation is None or not excitation.segments:
         raise Refused("there is no periodic excitation in it", "identify with a multisine")
-    recording = replace(recording, pipe=pipe, winds_up=True)
+    recording = replace(recording, pipe=pipe, has_drill_string=True)
     begun: Case = Case(recording, Options(), samples=usable_samples(recording))
     case: PeriodicCase = settled(clear_lines(measured(begun, excitation)))
     priors, fixed = known_of(recording.lag_prior, len(case.usable), case.constraint)

@@ -183,7 +183,7 @@ class Recording:
     stepped_setpoint: SteppedSetpoint | None = None     # of speed mode
     impedance: ImpedanceInput | None = None             # if the drive's impedance was measured
     torque_answer: TorqueAnswer | None = None           # of torque mode, if it was checked
-    winds_up: bool = False                 # a load that winds up hangs on the shaft, as rig.yaml states (load: string)
+    has_drill_string: bool = False         # rig.yaml states load: string
     pipe: Pipe | None = None               # of the drill string on the shaft, if its sizes are known
     simulated: bool = False
     complete: bool = True                  # False: the log ended before the run did

@@ -148,13 +148,13 @@ class ControlLoop:
         ``work``. A process is killed. A thread continues beside the stop, and its result is dropped.
         """
         background = Background(work, None if self.drive.clock.stepped else self.worker_process)
-        told = False
+        reported = False
         self.guard.reckoning = True
         try:
             while not background.ended.is_set():
-                if background.instead and not told:
+                if background.instead and not reported:
                     self.no_worker_process(background.instead)
-                    told = True
+                    reported = True
                 if self.drive.clock.stepped:
                     self._wait_alive(background.ended)
                 else:
@@ -164,7 +164,7 @@ class ControlLoop:
             raise
         finally:
             self.guard.reckoning = False
-        if background.instead and not told:
+        if background.instead and not reported:
             self.no_worker_process(background.instead)
         return background.result()
 

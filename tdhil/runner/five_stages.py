@@ -12,7 +12,7 @@ from dataclasses import asdict, replace
 
 from drivers import Command, Drive, DriveLimits, Mode, Outcome, Paced, Preflight, PreflightRefused, Sample, Timed
 from profiles import MessageCode
-from tdhil.config import OPTION, told_before_echo
+from tdhil.config import OPTION, identified_before_echo
 from tdhil.estimation import torque_answer
 from tdhil.recording import ImpedanceInput, LagPrior, RunLog
 from tdhil.runner import preconditions, stage_log
@@ -149,7 +149,7 @@ class Runner:
         self._learn_inputs(task, preflight, prior)
         loop = self._make_loop(task, preflight, no_worker_process)
         mode = choose_mode(task.request, task.limits, preflight)
-        self._before_echo = told_before_echo(task.request.kind)
+        self._before_echo = identified_before_echo(task.request.kind)
         _, torque_offset_nm = measure_offsets(loop, task.limits)
         loop.guard.observer.torque_offset_nm = torque_offset_nm
         return Run(
@@ -165,7 +165,7 @@ class Runner:
                 limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s,
                 limits.accept_no_watchdog, limits.accept_wider, limits.accept_shared_watchdog,
                 limits.temperature_c,
-                string=limits.winds_up,
+                string=limits.has_drill_string,
                 torque_offset=task.request.impedance == "offset"
                 or (task.evaluation is not None and task.evaluation.own_loop),
             )

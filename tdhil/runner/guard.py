@@ -483,7 +483,7 @@ class _Following:
         self._window_rad_s = max(FOLLOW_SHARE * limits.speed_max_rad_s, 5.0 * speed_resolution_rad_s)
         self._nearer_rad_s = max(NEARER_SHARE * limits.speed_max_rad_s, 2.0 * speed_resolution_rad_s)
         reach_s = assumptions.reaction_s + 3.0 * assumptions.largest_speed_lag_s + FOLLOW_MEAN_S
-        self.within_s = FOLLOW_STRING_S if limits.winds_up else FOLLOW_S
+        self.within_s = FOLLOW_STRING_S if limits.has_drill_string else FOLLOW_S
         self._blocks: deque[_Block] = deque(maxlen=1 + math.ceil(reach_s / max(FOLLOW_BLOCK_S, period_s)))
         recent = max(1, round(FOLLOW_MEAN_S / period_s))
         self._speeds: deque[float] = deque(maxlen=recent)

@@ -185,7 +185,7 @@ def refuse_uninformative(
     if not isinstance(kind, PeriodicKind) or len(kind.shape().harmonics) < 2 or request.impedance is not None:
         return
     named = [OPTION[name].flag for name in _FIXED if getattr(request, name) is not None]
-    if not named or known.winds_up:
+    if not named or known.has_drill_string:
         return
     for rig in _rigs(guess, limits):
         for mode in modes:

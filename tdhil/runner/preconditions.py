@@ -26,7 +26,7 @@ from drivers import (
 )
 from drivers.own_limits import SPEED, TORQUE, WIDER_FLAG
 from profiles import CodedText, MessageCode
-from tdhil.config import DEFAULT_EXCITATION, told_before_echo
+from tdhil.config import DEFAULT_EXCITATION, identified_before_echo
 from tdhil.recording import LagPrior
 from tdhil.runner.settings import ControlAssumptions, ExcitationRequest, MachineLimits
 
@@ -236,9 +236,9 @@ def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, releases_a
 
     ``releases_after_stop``: the drive is disabled after a quick stop, according to its profile.
     """
-    from tdhil.runner.excitation import ECHOES_S, excitation_kind, tells_before_echo
+    from tdhil.runner.excitation import ECHOES_S, excitation_kind, leaves_time_before_echo
 
-    if told_before_echo(request.kind) and limits.wave_impedance_nm_s_rad <= 0.0:
+    if identified_before_echo(request.kind) and limits.wave_impedance_nm_s_rad <= 0.0:
         raise PreflightRefused(
             f"{request.kind} needs a drill string whose pipe is known, and rig.yaml describes no pipe",
             where="--excitation and load in rig.yaml",
@@ -246,7 +246,7 @@ def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, releases_a
             " inner_diameter_m}",
             entry=MessageCode.EXCITATION_NOT_POSSIBLE,
         )
-    if told_before_echo(request.kind) and not tells_before_echo(limits.echo_s):
+    if identified_before_echo(request.kind) and not leaves_time_before_echo(limits.echo_s):
         raise PreflightRefused(
             f"{request.kind} needs an echo after {ECHOES_S[0]:g} to {ECHOES_S[1]:g} s (about 1100 to 6000 m of pipe);"
             f" the echo of this pipe returns after {limits.echo_s:.2f} s",
@@ -254,7 +254,7 @@ def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, releases_a
             next_step="Use --excitation multisine",
             entry=MessageCode.EXCITATION_NOT_POSSIBLE,
         )
-    if not limits.winds_up:
+    if not limits.has_drill_string:
         return
     if not excitation_kind(request.kind).with_string:
         raise PreflightRefused(
@@ -277,7 +277,7 @@ def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, releases_a
 def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, preflight: Preflight) -> None:
     """Raise PreflightRefused if a twisted string could lose its torque, or if a string is required and missing."""
     refuse_by_plan(limits, request, releases_after_stop=False)      # the value in the drive is checked below
-    if not limits.winds_up:
+    if not limits.has_drill_string:
         return
     if not preflight.watched:
         raise PreflightRefused(

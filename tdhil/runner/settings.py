@@ -31,7 +31,7 @@ class MachineLimits:
     accept_wider: frozenset[str] = frozenset()     # own limits of the drive that the operator lets the run widen
 
     @property
-    def winds_up(self) -> bool:
+    def has_drill_string(self) -> bool:
         """Return whether a drill string is on the shaft."""
         return self.load == "string"
 

@@ -9,13 +9,13 @@ from typing import Any
 
 from drivers import Command, LimitHit, Mode, PreflightRefused
 from profiles import MessageCode
-from tdhil.config import told_before_echo
+from tdhil.config import identified_before_echo
 from tdhil.estimation import Samples
 from tdhil.recording import FloatArray, LagPrior, RunLog, SteppedSetpoint
 from tdhil.runner.adaptive_duration import Decision, Enough
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.design import DesignKnowledge, NoiseDensity, assumed_noise, measured_noise
-from tdhil.runner.excitation import MotionLimits, Plan, PlanRefused, RigGuess, SwingPlan, tells_before_echo
+from tdhil.runner.excitation import MotionLimits, Plan, PlanRefused, RigGuess, SwingPlan, leaves_time_before_echo
 from tdhil.runner.guard import LIGHTEN, Guard
 from tdhil.runner.interim import Identify
 from tdhil.runner.planning import Planned, as_followed, plan_acquisition
@@ -69,7 +69,7 @@ class StagePlanner:
         theta = DesignKnowledge(assumed, prior).theta(model)
 
         work = partial(_reckon, request, mode, room, model, prior, assumed, speed.steady, theta, course,
-                       left_s, limits.winds_up)
+                       left_s, limits.has_drill_string)
         try:
             planned = loop.compute(work, keep)
         except PlanRefused as error:
@@ -98,7 +98,8 @@ class StagePlanner:
             f"{plan.speed_max_rad_s:.2f} rad/s, torque {plan.torque_min_nm:.0f} to {plan.torque_max_nm:.0f} N·m",
         )
         self._tell(planned.said())
-        if speed.swing is not None and not told_before_echo(request.kind) and tells_before_echo(limits.echo_s):
+        before_echo = identified_before_echo(request.kind)
+        if speed.swing is not None and not before_echo and leaves_time_before_echo(limits.echo_s):
             self._tell(
                 "the string's motion will hide some of these frequencies; --excitation prbs uses only the time before"
                 " an echo, and is more accurate for J above a bit"
@@ -153,10 +154,10 @@ def _reckon(
     theta: FloatArray,
     course: RampCourse | None,
     left_s: float,
-    winds_up: bool,
+    has_drill_string: bool,
 ) -> Planned:
     """Compute the plan. Arguments and result are plain data, so any process can run it."""
-    known = DesignKnowledge(measured_noise(steady, theta, assumed), prior, winds_up)
+    known = DesignKnowledge(measured_noise(steady, theta, assumed), prior, has_drill_string)
     if course is None:
         return plan_acquisition(request, mode.value, room, model, known, left_s)
     seen, within = as_followed(model, room, course, known.speed_lag_s)

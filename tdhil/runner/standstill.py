@@ -4,8 +4,8 @@ A shaft stands still once all of these have held for long enough:
 
 - the reported speed is zero within its resolution,
 - the position, where the drive reports one, does not move,
-- no report contradicts another, or the contradiction has been refuted (`observer.Observer.believable`); then the torque
-  must be too small to keep the shaft turning,
+- no report contradicts another, or the contradiction has been refuted (`observer.Observer.reports_trusted`); then the
+  torque must be too small to keep the shaft turning,
 - the drive shows a state in which the shaft may stand still: a quick stop or speed mode that reports standstill, or no
   torque, or torque mode with zero torque. A statusword without a valid state proves nothing.
 
@@ -44,7 +44,7 @@ class Standstill:
         return (
             abs(observer.speed_rad_s(sample)) <= observer.rest_rad_s(self._at_rest_rad_s)
             and observer.angle_quiet(self._at_rest_rad_s)
-            and observer.believable
+            and observer.reports_trusted
         )
 
     def see(self, sample: Sample, polled_gap_s: float = 0.0, *, without_torque: bool = False) -> bool:

@@ -71,7 +71,7 @@ SLOWING_S, SLOWER = 1.0, 0.98
 
 
 class FeedbackPolls:
-    """Polls of the drive, with their timing. ``only``: the cyclic feedback is not believed any more."""
+    """Polls of the drive, with their timing. ``only``: the cyclic feedback no longer counts."""
 
     def __init__(self, drive: Drive, period_s: float) -> None:
         self._drive = drive if isinstance(drive, Polled) else None
@@ -266,7 +266,7 @@ class StopSequence:
         self._quick_stop_in_torque_mode = quick_stop_in_torque_mode
         self._watched = watched
         self._string = None
-        if limits.winds_up:
+        if limits.has_drill_string:
             self._string = StringReleaseLimits(
                 torque_nm=limits.torque_nm,
                 speed_rad_s=limits.speed_max_rad_s,
@@ -512,7 +512,7 @@ class StopSequence:
     @property
     def _speed_doubted(self) -> bool:
         """Return whether the drive's speed control is unreliable: its reported speed contradicts another report."""
-        return not self._loop.guard.observer.believable
+        return not self._loop.guard.observer.reports_trusted
 
     def _see_rest(self, asked: bool) -> float | None:
         observer = self._loop.guard.observer
@@ -542,7 +542,7 @@ class StopSequence:
             if rest.see(sample, POLLED_GAP_S if self._polls.standing else 0.0) and self._poll_agrees(rest):
                 self._held_at_rest_nm = math.fsum(self._held) / len(self._held)
                 return sample.time_s
-        if observer.doubt is not None and not observer.believable:
+        if observer.doubt is not None and not observer.reports_trusted:
             self._trouble.append(
                 f"standstill cannot be confirmed: {observer.doubt.what}. The drive was not disabled"
             )
@@ -643,14 +643,14 @@ class StopSequence:
 
     def _stays_at_rest(self) -> bool:
         """Return whether the shaft stays at standstill without torque. Without feedback it counts as staying there."""
-        quiet_s, told, heard_s = 0.0, False, self._loop.now_s
+        quiet_s, turned, heard_s = 0.0, False, self._loop.now_s
         enough_s = max(self._settle_s, min(0.8 * REST_AFTER_S, self._loop.guard.observer.shows_s(
             self._at_rest_rad_s, self._held_at_rest_nm)))
         for _ in range(self._loop.cycles(REST_AFTER_S)):
             sample = self._exchange(_REST, or_poll=True)
             if sample is None:
                 if self._silent >= self._enough_silent:
-                    self._trouble.append("nothing was heard of the drive once it was disabled")
+                    self._trouble.append("the drive sent no feedback after it was disabled")
                     return True
                 continue
             # Polls are further apart than cycles. Of a longer gap only the longest permitted one counts.
@@ -659,8 +659,8 @@ class StopSequence:
             heard_s = sample.time_s
             if not abs(self._loop.guard.observer.speed_rad_s(sample)) <= self._at_rest_rad_s:
                 quiet_s = 0.0
-                if not told:
-                    told = True
+                if not turned:
+                    turned = True
                     self._trouble.append(
                         f"the shaft began to turn ({sample.speed_rad_s:.3f} rad/s) once its torque was off:"
                         " is torque trapped in the load, or does a weight hang on it?"
@@ -714,27 +714,27 @@ class StopSequence:
             return None
         if sample is not None and self._polls.answered == 1:
             self._held.clear()             # the torque held before the gap is out of date
-            self._trouble.append("the cycle brings no feedback: the drive was asked one question at a time instead")
+            self._trouble.append("no cyclic feedback arrived: the drive was polled instead")
         return sample
 
     def _contradicted(self) -> bool:
-        """Return whether a poll contradicts the feedback of the cycle. Then only polls are believed from now on."""
-        told = self._loop.last
+        """Return whether a poll contradicts the feedback of the cycle. Then only polls count from now on."""
+        cyclic = self._loop.last
         try:
             sample = self._polls.ask()
         except BaseException as error:  # any error: the stop continues
             self._note(error)
             return False
-        if sample is None or told is None:
+        if sample is None or cyclic is None:
             return False
         rest = self._at_rest_rad_s
-        other_state = sample.state in _STOPPING and told.state not in _STOPPING
-        self._polls.only = other_state or (abs(sample.speed_rad_s) <= rest and not abs(told.speed_rad_s) <= rest)
+        other_state = sample.state in _STOPPING and cyclic.state not in _STOPPING
+        self._polls.only = other_state or (abs(sample.speed_rad_s) <= rest and not abs(cyclic.speed_rad_s) <= rest)
         if self._polls.only:
             self._held.clear()
             self._trouble.append(
-                f"the cycle's feedback tells of {told.speed_rad_s:.3f} rad/s, and a look at the drive of"
-                f" {sample.speed_rad_s:.3f} rad/s: the cycle's is not believed any more"
+                f"the cyclic feedback reports {cyclic.speed_rad_s:.3f} rad/s, a poll {sample.speed_rad_s:.3f} rad/s:"
+                " the cyclic feedback no longer counts"
             )
         return self._polls.only
 

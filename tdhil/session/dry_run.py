@@ -204,7 +204,7 @@ def _assumed(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, DesignKnowled
     guess, figures = _guess(bench, limits)
     stated = bench.expected.load_noise_nm
     noise = assumed_noise(limits.torque_nm, limits.speed_max_rad_s, stated)
-    known = DesignKnowledge(noise, lag_prior(bench), limits.winds_up)
+    known = DesignKnowledge(noise, lag_prior(bench), limits.has_drill_string)
     return guess, known, (
         *figures,
         Figure("disturbing torque (sd)", noise.load_sd_nm, "N·m", _source(bench, "expected.load_noise_nm")),

@@ -34,7 +34,7 @@ def suited(rig: Rig | None, plant: Any) -> Rig | None:
         return rig
     from sim_bus.plant import PLANTS
 
-    if not PLANTS[plant.plant.kind].winds_up:
+    if not PLANTS[plant.plant.kind].has_drill_string:
         return rig
     most_nm = plant.drive.torque_limit_nm
     data = simulated_default_rig(rig).model_dump(by_alias=True)
@@ -158,7 +158,7 @@ def facts(bench: Rig) -> dict[str, Any]:
         "gear_ratio": bench.gear.ratio,
         "torque_scale_rel_sd": ASSUMED_TORQUE_SCALE_REL_SD if scale is None else scale,
         "lag_prior": lag_prior(bench),
-        "winds_up": bench.load.kind == "string",
+        "has_drill_string": bench.load.kind == "string",
         "pipe": pipe_of(bench),
     }
 

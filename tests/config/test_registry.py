@@ -24,7 +24,7 @@ from sim_bus.params import RigParams
 from sim_bus.plant import kinds as plants
 from sim_bus.plant.friction.shaft import ShaftParams
 from tdhil.cli.main import build_parser, main
-from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, RegistryEntry, load, names, told_before_echo
+from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, RegistryEntry, identified_before_echo, load, names
 from tdhil.config.rig import Registered, Rig, load_rig
 from tdhil.errors import UsageError
 from tdhil.estimation import Options, identify
@@ -206,8 +206,8 @@ def test_every_excitation_is_what_its_entry_says():
         kind = load(EXCITATIONS, name)
         assert isinstance(kind, ExcitationKind)
         assert isinstance(kind, PeriodicKind) == entry.periodic
-        assert told_before_echo(name) == entry.before_echo and not (entry.before_echo and kind.adaptive)
-    assert not told_before_echo("nobody's")
+        assert identified_before_echo(name) == entry.before_echo and not (entry.before_echo and kind.adaptive)
+    assert not identified_before_echo("nobody's")
 
 
 @pytest.mark.parametrize("registry", [EXCITATIONS, MODELS, BUSES], ids=["excitations", "models", "buses"])

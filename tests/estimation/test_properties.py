@@ -51,7 +51,7 @@ TEN_LINES = {"lines": tuple(k / 10.0 for k in range(1, 11)), "amplitudes": (1.5,
 @pytest.mark.long       # the intervals of a string that is none take a minute
 def test_of_a_string_that_ten_lines_do_not_show_a_rigid_shafts_inertia_is_said_to_be_of_all_that_turns():
     recording = closed_form(**TEN_LINES)
-    plain, found = identify(recording), identify(replace(recording, winds_up=True))
+    plain, found = identify(recording), identify(replace(recording, has_drill_string=True))
     assert found.inertia == plain.inertia
     assert set(found.warnings) - set(plain.warnings) == {warning for warning in found.warnings if "together" in warning}
     assert len(found.warnings) == len(plain.warnings) + 1
@@ -60,7 +60,7 @@ def test_of_a_string_that_ten_lines_do_not_show_a_rigid_shafts_inertia_is_said_t
 @pytest.mark.heavy
 def test_behind_a_declared_string_too_few_lines_to_show_it_give_no_inertia(plain):
     """A rigid shaft explains these four lines; so would many strings, each with another inertia of the motor."""
-    found = identify(replace(closed_form(), winds_up=True))
+    found = identify(replace(closed_form(), has_drill_string=True))
     assert plain.verdict is Verdict.VALID
     assert (found.verdict, found.inertia) == (Verdict.NOT_IDENTIFIABLE, None)
     assert "string" in found.reason and "4 excited lines" in found.reason

@@ -20,7 +20,7 @@ LAG_S = 0.2               # of the drive's filter behind the sensor
 @pytest.fixture(scope="module")
 def recorded():
     recording = run(PLANT, [4], noise=MILD, lag_prior=KNOWN, settle=8)[0]
-    return replace(recording, commanded_torque_nm=recording.torque_nm, winds_up=True)
+    return replace(recording, commanded_torque_nm=recording.torque_nm, has_drill_string=True)
 
 
 def rescaled(recording, factor, lag_s=LAG_S):
@@ -69,5 +69,5 @@ def test_speed_mode_a_gap_and_an_open_side_say_nothing(recorded):
 
 @pytest.mark.heavy
 def test_a_rigid_shaft_is_not_asked(recorded):
-    rigid = replace(rescaled(recorded, 2.0), winds_up=False)
+    rigid = replace(rescaled(recorded, 2.0), has_drill_string=False)
     assert identify(rigid).entry is not MessageCode.SPEED_JUMPED

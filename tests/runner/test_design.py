@@ -188,7 +188,7 @@ STRING_GUESS = RigGuess(1950.0, 23.0, 100.0, STRING_ERROR)
 
 
 def hung(**options):
-    return replace(KNOWN, winds_up=True), PlanRequest(**options)
+    return replace(KNOWN, has_drill_string=True), PlanRequest(**options)
 
 
 def test_with_a_string_lines_of_equal_torque_reach_from_below_its_swing_to_above_the_second_one():

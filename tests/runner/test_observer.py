@@ -110,7 +110,7 @@ def healthy(rig, wrong, rel_error, frequency_hz, seed):
     assert bench.observer.doubt is None, bench.observer.doubt
     assert bench.quick_stop(2.0 * top / rig.limits.quick_stop_rad_s2 / 3.0 + 4.0) == ""
     assert bench.observer.doubt is None, bench.observer.doubt
-    assert bench.observer.believable
+    assert bench.observer.reports_trusted
     assert bench.observer.moved and bench.observer.unseen_s == 0.0
 
 
@@ -126,7 +126,7 @@ def test_a_late_speed_goes_on_falling_once_friction_has_stopped_the_shaft(speed_
     bench = Bench(rig).begun(3.0)
     assert bench.quick_stop(8.0) == ""
     assert bench.observer.doubt is None, bench.observer.doubt
-    assert bench.observer.believable
+    assert bench.observer.reports_trusted
 
 
 def test_nothing_is_doubted_of_a_shaft_that_never_moves():
@@ -161,7 +161,7 @@ def test_a_speed_that_jumps_is_found_at_once(name, lag_s, mode):
     assert bench.observer.doubt is not None
     assert bench.observer.doubt.time_s - start_s <= 0.2
     assert bench.observer.doubt.signals in (SPEED_AND_TORQUE, frozenset({Signal.TORQUE}))   # beyond its limit: it alone
-    assert not bench.observer.believable
+    assert not bench.observer.reports_trusted
 
 
 @pytest.mark.parametrize("lag_s", LAGS)
@@ -241,7 +241,7 @@ def test_torque_alone_is_doubted_where_it_contradicts_its_command():
     bench.excite(8.0, 4.0, 0.2)
     assert bench.observer.doubt is not None
     assert bench.observer.doubt.signals == frozenset({Signal.TORQUE})
-    assert bench.observer.believable
+    assert bench.observer.reports_trusted
 
 
 @pytest.mark.parametrize(("name", "moved_rad_s"), [("dead", 5.0), ("half", 5.0), ("sign", 5.0), ("double", 5.0)])
@@ -371,7 +371,7 @@ def test_a_speed_that_was_lost_is_not_believed_again():
     bench.sensor = lambda _: 0.0
     bench.found_after(3.0, lambda: bench.hold(0.02, 5.0))
     bench.quick_stop(20.0)
-    assert not bench.observer.believable
+    assert not bench.observer.reports_trusted
 
 
 @pytest.mark.parametrize("rig", [PLAIN, WITH_POSITION])
@@ -385,16 +385,16 @@ def test_a_speed_that_stays_frozen_is_not_believed_again(rig):
     bench.quick_stop(0.1)
     if not rig.position_count:
         bench.quick_stop(10.0)
-        assert not bench.observer.believable
+        assert not bench.observer.reports_trusted
 
 
 def test_a_position_that_lives_stands_in_for_a_lost_speed():
     bench = Bench(WITH_POSITION).begun()
     bench.lie = JUMPS["lost"]
     bench.hold(0.5, 5.0)
-    assert not bench.observer.believable
+    assert not bench.observer.reports_trusted
     assert bench.quick_stop(8.0) == ""
-    assert bench.observer.believable
+    assert bench.observer.reports_trusted
     sample = bench.samples[-1]
     assert abs(bench.observer.speed_rad_s(sample)) < 0.05 and bench.observer.angle_quiet(0.05)
 
@@ -418,7 +418,7 @@ def test_a_lost_load_is_a_lighter_shaft_and_its_speed_lives(left):
     assert bench.observer.doubt is not None
     assert bench.fastest < 1.5 * LIMITS.speed_max_rad_s
     assert bench.quick_stop(12.0) == ""
-    assert bench.observer.believable                 # it came down as a shaft does
+    assert bench.observer.reports_trusted                 # it came down as a shaft does
     assert bench.observer.doubt.lighter
     assert "load" in bench.observer.doubt.helps
 
@@ -617,7 +617,7 @@ def test_a_position_that_ceases_to_come_is_no_witness():
     bench.lie = lambda reports: reports._replace(speed_rad_s=0.0, position_rad=None)
     bench.hold(3.0, 0.0)
     assert bench.observer.rate_rad_s is None
-    assert not bench.observer.believable and not bench.observer.comes_down
+    assert not bench.observer.reports_trusted and not bench.observer.comes_down
 
 
 def test_standstill_is_held_more_closely_once_a_report_was_in_doubt():

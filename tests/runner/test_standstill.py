@@ -13,10 +13,10 @@ AT_REST, SETTLE_S, GAP_S, PERIOD_S = 0.05, 1.5, 0.2, 0.02
 
 
 @dataclass
-class Told:
-    """What the observer says of the reports."""
+class Observed:
+    """State of the observer, set by a test."""
 
-    believable: bool = True
+    reports_trusted: bool = True
     position_quiet: bool = True
     blind_s: float = 0.0
     unseen_s: float = 0.0
@@ -38,9 +38,9 @@ def sample(time_s, speed=0.0, state=PowerState.QUICK_STOP, standstill=True):
     return Sample(time_s, 0.0, 0.0, True, speed, 0.0, None, Mode.SPEED, state, standstill, False, 0x27)
 
 
-def rested_after(told, seconds=20.0, **report):
+def rested_after(observed, seconds=20.0, **report):
     """How long it takes until standstill is seen, s; None within ``seconds``."""
-    rest = Standstill(told, AT_REST, SETTLE_S, GAP_S)
+    rest = Standstill(observed, AT_REST, SETTLE_S, GAP_S)
     for cycle in range(1, round(seconds / PERIOD_S)):
         if rest.see(sample(cycle * PERIOD_S, **report)):
             return (cycle - 1) * PERIOD_S
@@ -53,7 +53,7 @@ def rested_after(told, seconds=20.0, **report):
     {"state": PowerState.ENABLED},
 ])
 def test_all_conditions_hold(report):
-    assert rested_after(Told(), **report) == pytest.approx(SETTLE_S, abs=2.0 * PERIOD_S)
+    assert rested_after(Observed(), **report) == pytest.approx(SETTLE_S, abs=2.0 * PERIOD_S)
 
 
 @pytest.mark.parametrize("report", [
@@ -62,30 +62,34 @@ def test_all_conditions_hold(report):
       for state in (PowerState.ENABLED, PowerState.QUICK_STOP, PowerState.NOT_READY, PowerState.UNKNOWN)),
 ])
 def test_a_report_that_shows_none(report):
-    assert rested_after(Told(), **report) is None
+    assert rested_after(Observed(), **report) is None
 
 
-@pytest.mark.parametrize("told", [Told(believable=False), Told(position_quiet=False), Told(by_position=1.0)])
-def test_an_observer_that_shows_none(told):
-    assert rested_after(told) is None
+@pytest.mark.parametrize("observed", [
+    Observed(reports_trusted=False), Observed(position_quiet=False), Observed(by_position=1.0),
+])
+def test_an_observer_that_shows_none(observed):
+    assert rested_after(observed) is None
 
 
 def test_a_position_that_stands_in_for_a_speed_in_doubt():
-    assert rested_after(Told(by_position=0.0), speed=4.0) is not None
+    assert rested_after(Observed(by_position=0.0), speed=4.0) is not None
 
 
-@pytest.mark.parametrize("told", [Told(blind_s=4.0), Told(unseen_s=4.0), Told(blind_s=3.0, unseen_s=4.0)])
-def test_it_lasts_as_long_as_the_observer_asks_for(told):
-    assert rested_after(told) == pytest.approx(4.0, abs=2.0 * PERIOD_S)
+@pytest.mark.parametrize("observed", [
+    Observed(blind_s=4.0), Observed(unseen_s=4.0), Observed(blind_s=3.0, unseen_s=4.0),
+])
+def test_it_lasts_as_long_as_the_observer_asks_for(observed):
+    assert rested_after(observed) == pytest.approx(4.0, abs=2.0 * PERIOD_S)
 
 
 def test_an_observer_that_asks_for_less_shortens_nothing():
-    assert rested_after(Told(blind_s=0.1, unseen_s=0.1)) == pytest.approx(SETTLE_S, abs=2.0 * PERIOD_S)
+    assert rested_after(Observed(blind_s=0.1, unseen_s=0.1)) == pytest.approx(SETTLE_S, abs=2.0 * PERIOD_S)
 
 
 def at_seconds(seconds, *reports):
     """Standstill over so long, with other samples in between: `(time, sample)`; when it is seen."""
-    rest, others = Standstill(Told(), AT_REST, SETTLE_S, GAP_S), dict(reports)
+    rest, others = Standstill(Observed(), AT_REST, SETTLE_S, GAP_S), dict(reports)
     for cycle in range(1, round(seconds / PERIOD_S)):
         one = others.get(cycle, sample(cycle * PERIOD_S))
         if one is not None and rest.see(one):
@@ -114,12 +118,12 @@ def test_a_state_that_shows_none_at_the_end_waits_for_one_that_does():
 
 
 def test_doubt_that_comes_while_it_rests_undoes_it():
-    told = Told()
-    rest = Standstill(told, AT_REST, SETTLE_S, GAP_S)
+    observed = Observed()
+    rest = Standstill(observed, AT_REST, SETTLE_S, GAP_S)
     for cycle in range(1, 60):
         assert not rest.see(sample(cycle * PERIOD_S))
-    told.believable = False
+    observed.reports_trusted = False
     assert not rest.see(sample(60 * PERIOD_S))
-    told.believable = True
+    observed.reports_trusted = True
     seen = [cycle for cycle in range(61, 200) if rest.see(sample(cycle * PERIOD_S))]
     assert seen[0] * PERIOD_S == pytest.approx(61 * PERIOD_S + SETTLE_S, abs=3.0 * PERIOD_S)

@@ -61,7 +61,7 @@ def test_lost_frames_afterwards_and_silence_afterwards(world):
     when_off(here.drive, [0.0, None, None, None])
     report = here.stop_sequence().run()
     assert report.confirmed            # it was seen at rest, and disabled
-    assert "nothing was heard" in report.trouble[-1]
+    assert "sent no feedback" in report.trouble[-1]
     here = world()
     here.turn(5.0)
     since = when_off(here.drive, [0.0])

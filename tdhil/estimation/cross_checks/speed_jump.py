@@ -52,7 +52,7 @@ _IN_A_ROW = 2             # points in a row beyond the bound: a single false rep
 def jump_checked(finding: Finding, case: Case) -> Finding:
     """Return the finding, without its inertia if the speed jumps. Never raises."""
     inertia = finding.inertia
-    if inertia is None or not case.sound or not case.recording.winds_up or not inertia.low > 0.0:
+    if inertia is None or not case.sound or not case.recording.has_drill_string or not inertia.low > 0.0:
         return finding
     contradiction = jump_contradiction(case.recording, inertia.low, inertia.value)
     if contradiction is None:

@@ -510,7 +510,7 @@ def identify_compliant(
     """
     told = None
     contradicted = rigid if isinstance(rigid, Finding) and rigid.rejected else None
-    is_string = rigid is not None and contradicted is None and case.recording.winds_up
+    is_string = rigid is not None and contradicted is None and case.recording.has_drill_string
     try:
         chosen = _chosen(case)
         if isinstance(chosen, Chosen) and not chosen.rejected:
@@ -546,7 +546,7 @@ def _chosen(case: PeriodicCase) -> Chosen | Refusal:
     recording = case.recording
     priors, fixed = known_of(recording.lag_prior, len(case.usable), case.constraint)
     return choose(
-        case.options.model, case.usable, case.constraint, priors, fixed, recording.pipe, recording.winds_up)
+        case.options.model, case.usable, case.constraint, priors, fixed, recording.pipe, recording.has_drill_string)
 
 
 def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Finding | Refusal | None) -> Finding:
@@ -570,7 +570,7 @@ def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Fi
     )
     if isinstance(rigid, Finding) and rigid.rejected:
         finding = replace(finding, preface=f"{rigid.contradicted}; ")
-    elif rigid is not None and not case.recording.winds_up:
+    elif rigid is not None and not case.recording.has_drill_string:
         finding = replace(finding, remark=", much better than the lags of a rigid shaft do")
     if chosen.impedance_ratio is not None:
         # a J that does not stand gets no further figures, as for residuals that contradict the model

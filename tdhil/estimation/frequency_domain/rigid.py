@@ -288,7 +288,8 @@ def rigid_finding(
     as_paper = not shaft_model(case.options.model).lags
     lines = fitted_points(result.fitted, case.options.confidence)
     bare = Finding(model=case.options.model if as_paper else RIGID, words=_words(result, as_paper, what),
-                   residual=result.residual, lines=lines, warnings=_caveats(result, as_paper, case.recording.winds_up),
+                   residual=result.residual, lines=lines,
+                   warnings=_caveats(result, as_paper, case.recording.has_drill_string),
                    curve=ModelCurve(result.fitted, case.options.confidence, result.residual))
     if bare.rejected:
         return bare
@@ -343,9 +344,9 @@ def of_reports(prior: LagPrior) -> list[str]:
     return found
 
 
-def _caveats(result: RigidResult, as_paper: bool, winds_up: bool) -> tuple[str, ...]:
+def _caveats(result: RigidResult, as_paper: bool, has_drill_string: bool) -> tuple[str, ...]:
     found = []
-    if winds_up:
+    if has_drill_string:
         found.append(CodedText(
             "the rig's load is a string, but at these lines all turns as one: J is that of motor, string and "
             "what hangs below it together, not the motor's alone",

@@ -13,7 +13,7 @@ from itertools import product
 
 import numpy as np
 
-from tdhil.config import told_before_echo
+from tdhil.config import identified_before_echo
 from tdhil.estimation.frequency_domain import (
     AVERAGE,
     LAG_BOUND_S,
@@ -219,7 +219,7 @@ class DesignKnowledge:
 
     noise: NoiseDensity
     prior: LagPrior
-    winds_up: bool = False    # a drill string hangs on the shaft
+    has_drill_string: bool = False    # a drill string hangs on the shaft
 
     def theta(self, guess: RigGuess) -> FloatArray:
         """Return the assumed parameters of the rigid model, (8,)."""
@@ -265,10 +265,10 @@ def choose(
         return expected_half_width(plan, theta, known.noise, known.prior, confidence)
 
     usual = make_plan(limits, guess, wish)
-    if told_before_echo(wish.kind):     # the prediction is for a rigid shaft only
+    if identified_before_echo(wish.kind):     # the prediction is for a rigid shaft only
         return Choice(_in_time(usual, wish, time_s), math.nan, math.nan)
     allowed_s = _SLACK * usual.duration_s if time_s is None else time_s
-    if known.winds_up and _lines_are_free(wish):
+    if known.has_drill_string and _lines_are_free(wish):
         try:
             return Choice(_for_string(limits, guess, wish, allowed_s), math.nan, math.nan)
         except PlanRefused:        # such as: too long for the available time
@@ -313,7 +313,7 @@ def choose_soonest(
     None if no candidate fits into ``time_s``, if the user's values leave nothing to choose, or if a string needs its
     own lines. As in `choose` the information matrix selects for each slope, and the estimator's own interval decides.
     """
-    if _fixed(wish) or known.winds_up:
+    if _fixed(wish) or known.has_drill_string:
         return None
     theta, wish = known.theta(guess), replace(wish, settle_s=SETTLE_SOON_S)
     rated: list[tuple[float, int, Plan]] = []

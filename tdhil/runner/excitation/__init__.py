@@ -15,8 +15,8 @@ from tdhil.runner.excitation.reference import (
     Transition as Transition, excitation_kind as excitation_kind, make_transition as make_transition,
 )
 from tdhil.runner.excitation.signals import (
-    ECHOES_S as ECHOES_S, PeriodicKind as PeriodicKind, Shape as Shape, tells_before_echo as tells_before_echo,
-    unit_peak as unit_peak,
+    ECHOES_S as ECHOES_S, PeriodicKind as PeriodicKind, Shape as Shape,
+    leaves_time_before_echo as leaves_time_before_echo, unit_peak as unit_peak,
 )
 from tdhil.runner.excitation.speed_loop import (
     SpeedFollowing as SpeedFollowing, fit_following as fit_following, held_back_to as held_back_to,

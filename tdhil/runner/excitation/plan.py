@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.config import DEFAULT_EXCITATION, told_before_echo
+from tdhil.config import DEFAULT_EXCITATION, identified_before_echo
 from tdhil.recording import Segment
 from tdhil.runner.excitation import signals
 from tdhil.runner.excitation.reference import (
@@ -309,7 +309,7 @@ def _shape_and_frequency(wish: PlanRequest) -> tuple[Shape, float]:
     frequency = kind.frequency_hz if wish.frequency_hz is None else wish.frequency_hz
     if not (math.isfinite(frequency) and frequency > 0.0):
         raise PlanRefused(f"frequency must be positive, not {frequency:g} Hz")
-    if told_before_echo(wish.kind) and frequency > kind.frequency_hz:
+    if identified_before_echo(wish.kind) and frequency > kind.frequency_hz:
         raise PlanRefused(
             f"{wish.kind} with lines {frequency:g} Hz apart can't separate an echo from the time before it",
             f"Remove --frequency ({kind.frequency_hz:g} Hz), or give a lower one",

@@ -211,7 +211,7 @@ _ORDER, _TAPS = 6, (6, 5)   # length and taps of the shift register, x⁶ + x⁵
 _PRBS_LINES = 30          # lines of the sequence in use: up to 1.5 Hz
 
 
-def tells_before_echo(echo_s: float) -> bool:
+def leaves_time_before_echo(echo_s: float) -> bool:
     """Return whether an echo after ``echo_s`` leaves enough time to identify J, and decays in time."""
     return ECHOES_S[0] <= echo_s <= ECHOES_S[1]
 

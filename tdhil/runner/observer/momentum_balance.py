@@ -89,7 +89,7 @@ class MomentumBalance:
             least_nm = min([point.torque_least for point in recent])
             most_nm = max([point.torque_most for point in recent])
         fastest = max([abs(point.speed) for point in recent])
-        if limits.winds_up:            # above a string the rough inertia has a wide interval already
+        if limits.has_drill_string:            # above a string the rough inertia has a wide interval already
             load_low, load_high = recent[0].load_low, recent[0].load_high
             lightest = known.inertia_low
         else:
@@ -105,7 +105,7 @@ class MomentumBalance:
         Returns 0 above a string, whose load may take the whole torque.
         """
         limits = self._limits
-        if limits.winds_up:
+        if limits.has_drill_string:
             return 0.0
         torque_nm = min(now.torque_most if now.slope > 0.0 else -now.torque_least, limits.torque_nm)
         return STEEPEST * max(0.0, torque_nm) / (LIGHTEST_SHARE * known.inertia_low)
@@ -124,7 +124,7 @@ class MomentumBalance:
         impulse = now.impulse - start.impulse
         window_s = now.time_s - start.time_s
         friction_low, friction_high = now.friction_low - start.friction_low, now.friction_high - start.friction_high
-        if self._limits.winds_up:
+        if self._limits.has_drill_string:
             swing = known.string_nm_s_rad * (abs(change) + abs(now.slope_high - now.slope_low) * lag_s) * window_s
             friction_low, friction_high = start.load_low * window_s - swing, start.load_high * window_s + swing
         rough = now.rough - start.rough + self._torque_count_nm * window_s

@@ -138,7 +138,7 @@ class Observer:
         """
         if self._moved or self._unseen_nm <= 0.0:
             return 0.0
-        if self._limits.winds_up:          # the string continues to turn the shaft long after its torque is off
+        if self._limits.has_drill_string:          # the string continues to turn the shaft long after its torque is off
             return RUN_OUT_S
         return min(UNSEEN_MOST_S, self._unseen_nms / (UNSEEN_SHARE * self._unseen_nm))
 
@@ -249,7 +249,7 @@ class Observer:
         return any(one is not None and one.falling and one.is_fresh(self._time_s) for one in seen)
 
     @property
-    def believable(self) -> bool:
+    def reports_trusted(self) -> bool:
         """True if a report of standstill counts: there is no contradiction, or it has been refuted."""
         doubt = self.doubt
         if doubt is None or Signal.ALL in doubt.signals or Signal.SPEED not in doubt.signals:
@@ -275,7 +275,7 @@ class Observer:
     def _balanced(self) -> bool:
         """Return whether the torque at reported standstill is too small to turn the shaft against its friction."""
         points = self._points
-        if self._limits.winds_up or not points:
+        if self._limits.has_drill_string or not points:
             return True
         return abs(points[-1].torque) <= 0.5 * self._bounds.breakaway_low_nm + 5.0 * self._torque_count_nm
 
@@ -385,7 +385,7 @@ class Observer:
     def _load(self, point: Point) -> None:
         """Set the bounds of a drill string's load, from the earlier torque less the accelerating part."""
         point.load_low = point.load_high = 0.0
-        if not self._limits.winds_up:
+        if not self._limits.has_drill_string:
             return
         accelerating_nm = self._bounds.likely_inertia * point.slope if self._bounds.known else 0.0
         self._loads.append(point.torque - accelerating_nm)
@@ -418,7 +418,7 @@ class Observer:
 
     @property
     def _belief(self) -> Belief:
-        return Belief(self.doubt, self.believable, self.comes_down, self._moved, self.rate_rad_s, self.demand_nm)
+        return Belief(self.doubt, self.reports_trusted, self.comes_down, self._moved, self.rate_rad_s, self.demand_nm)
 
     def _noise_rad_s(self) -> float:
         """Return the noise of a point's speed, rad/s."""

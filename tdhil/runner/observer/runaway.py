@@ -45,7 +45,7 @@ class Belief:
     """Present trust in the reports."""
 
     doubt: Contradiction | None
-    believable: bool                   # True if a report of standstill counts
+    reports_trusted: bool                   # True if a report of standstill counts
     comes_down: bool                   # True if a speed in doubt has decreased as under a quick stop
     moved: bool                        # True if motion of the shaft was reported
     rate_rad_s: float | None           # speed from the position
@@ -107,21 +107,21 @@ class Runaway:
         took_s = point.time_s - before.time_s
         if self._by_impulse_rad_s is not None:
             # the torque of a string is too uncertain, except for a torque near the limit
-            counts = not self._limits.winds_up or abs(point.torque) >= DOUBTED_SHARE * self._limits.torque_nm
+            counts = not self._limits.has_drill_string or abs(point.torque) >= DOUBTED_SHARE * self._limits.torque_nm
             held = abs(point.speed) <= point.still and abs(point.torque) <= known.friction(0.0, point.still)[1]
-            counts = counts and not (held and belief.believable)     # static friction balances it
+            counts = counts and not (held and belief.reports_trusted)     # static friction balances it
             self._by_impulse_rad_s += counts * (point.impulse - before.impulse) / known.likely_inertia
         # Torque in the direction of the last motion beyond all friction. If motion was never reported, friction is
         # unknown and any torque counts.
         least = known.pushing_nm
         if belief.doubt is not None:
             least = min(least, DOUBTED_SHARE * self._limits.torque_nm)
-        if not belief.believable:
+        if not belief.reports_trusted:
             least = PUSHING_SHARE * self._limits.torque_nm
         elif not belief.moved:       # static friction may balance a small remaining torque
             least = DOUBTED_SHARE * (self._limits.probe_torque_nm or self._limits.torque_nm)
         turning = belief.rate_rad_s if belief.rate_rad_s and belief.doubt is not None else self.start_rad_s
-        if self._limits.winds_up and belief.believable:
+        if self._limits.has_drill_string and belief.reports_trusted:
             turning = point.speed      # the string may have reversed the shaft
         forward = 1.0 if turning >= 0.0 else -1.0
         pushes = (forward * point.torque if belief.moved else abs(point.torque)) > least
@@ -141,7 +141,7 @@ class Runaway:
         window_s = point.time_s - start.time_s
         change = abs(point.speed) - abs(start.speed)
         least = FASTER_SHARE * self._limits.speed_max_rad_s
-        if self._limits.winds_up or not known.known or window_s < 0.9 * INVERTED_S or change < least:
+        if self._limits.has_drill_string or not known.known or window_s < 0.9 * INVERTED_S or change < least:
             return
         forward = math.copysign(1.0, point.speed)
         pushed_nms = -forward * (point.impulse - start.impulse)
@@ -168,20 +168,20 @@ class Runaway:
             return ""
         limit = self._limits.speed_max_rad_s
         more = FASTER_SHARE * limit
-        if self._limits.winds_up:
+        if self._limits.has_drill_string:
             # A released string turns back. Its torque is removed only if the shaft exceeds its limit.
             self._slowest_rad_s = self._slowest_angle_rad_s = limit
         faster = more + max(self._slowest_rad_s, IMPULSE_SHARE * abs(self.start_rad_s))
         doubt = belief.doubt
         # the inertia of a shaft that lost load is unknown, but its reported speed is used
         lighter = doubt is not None and doubt.lighter
-        in_vain = (not belief.believable and not lighter and not belief.comes_down) or (
-            not belief.moved and not self._limits.winds_up
+        in_vain = (not belief.reports_trusted and not lighter and not belief.comes_down) or (
+            not belief.moved and not self._limits.has_drill_string
         )
         by_speed = by_position = ""
         took_s = 0.0 if self._seen_s is None else min(sample.time_s - self._seen_s, STALE_S)
         self._seen_s = sample.time_s
-        above = belief.believable and abs(sample.speed_rad_s) > faster
+        above = belief.reports_trusted and abs(sample.speed_rad_s) > faster
         self._speed_above_s = self._speed_above_s + took_s if above else 0.0
         enough_s = FASTER_BRAKED_S if self._brakes else FASTER_S
         if in_vain:
@@ -195,7 +195,7 @@ class Runaway:
             self._angle_above_s = self._angle_above_s + took_s if above else 0.0
             if self._angle_above_s >= enough_s:
                 by_position = f"the position moves at {rate:.2f} rad/s"
-        by_torque = "" if lighter else self._by_torque(belief.believable, more)
+        by_torque = "" if lighter else self._by_torque(belief.reports_trusted, more)
         # The speed of a shaft that lost load is used, also if only the sign of the torque is wrong.
         if lighter and self._inverted and abs(sample.speed_rad_s) > limit:
             by_speed = by_speed or f"the reported speed rose to {sample.speed_rad_s:.2f} rad/s"
@@ -203,7 +203,7 @@ class Runaway:
         ways = [one for one in (by_speed, by_position, by_torque) if one]
         return "; ".join(ways) if len(ways) >= 2 else ""
 
-    def _by_torque(self, believable: bool, more_rad_s: float) -> str:
+    def _by_torque(self, reports_trusted: bool, more_rad_s: float) -> str:
         """Return the evidence from the torque alone. A torque that does not follow the demanded one gives none."""
         if self._apart_nm_s > TORQUE_SHARE * self._limits.torque_nm * self._took_s:
             return ""
@@ -211,19 +211,19 @@ class Runaway:
             return f"{self._pushed_nm:.0f} N·m for {self._unanswered_s:.0f} s have stopped any such shaft"
         # above a string the stop begins with a ramp of the setpoint, which may accelerate the shaft until it has ended
         ramp_s = self._limits.speed_max_rad_s / self._limits.quick_stop_rad_s2
-        pushes = not self._limits.winds_up or (believable and self._for_s >= ramp_s)
+        pushes = not self._limits.has_drill_string or (reports_trusted and self._for_s >= ramp_s)
         if self._pushing_s >= PUSHING_S and pushes:
             return f"{self._pushed_nm:.0f} N·m push the shaft on"
         by_impulse = self._by_impulse_rad_s
-        if by_impulse is not None and self._beyond(by_impulse, more_rad_s, believable):
+        if by_impulse is not None and self._beyond(by_impulse, more_rad_s, reports_trusted):
             return f"the torque since the quick stop accounts for {by_impulse:.2f} rad/s"
         return ""
 
-    def _beyond(self, by_impulse_rad_s: float, more_rad_s: float, believable: bool) -> bool:
+    def _beyond(self, by_impulse_rad_s: float, more_rad_s: float, reports_trusted: bool) -> bool:
         """Return whether the torque alone drives the shaft beyond its limit or, with a speed in doubt, beyond zero."""
         start = abs(self.start_rad_s)
         forward = by_impulse_rad_s * (1.0 if self.start_rad_s >= 0.0 else -1.0)
-        if believable or self._limits.winds_up:
+        if reports_trusted or self._limits.has_drill_string:
             return abs(by_impulse_rad_s) > max(start, self._limits.speed_max_rad_s) + more_rad_s
         slack = IMPULSE_SHARE * start + more_rad_s
         return forward > start + slack or forward < -slack

@@ -168,7 +168,7 @@ class ShaftBounds:
     def learn(self, points: deque[Point]) -> None:
         """Learn bounds from the points before stage 2 ends. Above a string they give none."""
         done = self._model is not None or self._level is not None
-        if done or self._limits.winds_up or self.breakaway_nm <= 0.0 or len(points) < 3:
+        if done or self._limits.has_drill_string or self.breakaway_nm <= 0.0 or len(points) < 3:
             return
         now = points[-1]
         least = LEARN_SHARE * self._limits.speed_max_rad_s
@@ -206,7 +206,7 @@ class ShaftBounds:
     def shows_s(self, at_rest_rad_s: float, torque_nm: float) -> float:
         """Return the time for which a disabled shaft must show standstill, s; see `Observer.shows_s`."""
         model = self._model
-        if model is None or self._limits.winds_up or abs(torque_nm) <= 0.5 * self.breakaway_low_nm:
+        if model is None or self._limits.has_drill_string or abs(torque_nm) <= 0.5 * self.breakaway_low_nm:
             return 0.0
         if model.coulomb_nm <= 0.0:        # case of two levels with a Stribeck effect between them
             return math.inf
@@ -215,7 +215,7 @@ class ShaftBounds:
     def blind_s(self, still_rad_s: float) -> float:
         """Return the longest time in which friction stops a motion that (1) cannot detect, s."""
         model = self._model
-        if model is None or self._limits.winds_up or self.breakaway_low_nm <= 0.0:
+        if model is None or self._limits.has_drill_string or self.breakaway_low_nm <= 0.0:
             return 0.0
         # A lag hides an impulse of lag·ΔT; when a shaft comes to standstill the torque changes by about its friction.
         hidden_nms = self._lag_s * 2.0 * model.steady_torque_nm(self._limits.speed_min_rad_s)

@@ -81,7 +81,7 @@ class UnansweredTorque(Protocol):
 def rules(limits: MachineLimits, still_rad_s: float, lag_s: float, point_s: float) -> tuple[UnansweredTorque, ...]:
     """Return the rules for a shaft with these limits; ``still_rad_s``: speed that counts as standstill, rad/s."""
     always: tuple[UnansweredTorque, ...] = (HeldShaft(limits, still_rad_s),)
-    if not limits.winds_up:
+    if not limits.has_drill_string:
         return always
     return (
         TorqueAtLimit(limits, still_rad_s), FlatSpeed(limits, still_rad_s, lag_s),

@@ -197,7 +197,7 @@ def plan_pulse(
 
 def _edge_cycles(limits: MachineLimits, change_nm: float, longest_s: float, period_s: float) -> int:
     """Return the cycles of a ramp, none without a string; both ramps and a cycle take at most ``longest_s``."""
-    if not limits.winds_up:
+    if not limits.has_drill_string:
         return 0
     wanted_s = change_nm / limits.torque_ramp_nm_s if limits.torque_ramp_nm_s > 0.0 else STRING_EDGE_S
     room = (_whole(longest_s, period_s) - 1) // 2
@@ -325,7 +325,7 @@ def slow_down(
     """
     tolerance = max(2.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
     target = _ramp_to(loop, limits, speed, speed.high.speed_rad_s)
-    if not limits.winds_up:
+    if not limits.has_drill_string:
         command = Command(Mode.SPEED, target, 0.0)
         loop.hold(command, assumptions.largest_speed_lag_s)
         settled = wait_until_steady(loop, command, target, tolerance, timeout_s=60.0)
@@ -364,7 +364,7 @@ def probe_braking(
     samples: list[Sample] = []
     unclear = ""
     # Under speed control the torque shows the string; after the switch it is the commanded torque.
-    swing_nm = swing_of(steady, loop.period_s).torque_nm if limits.winds_up else 0.0
+    swing_nm = swing_of(steady, loop.period_s).torque_nm if limits.has_drill_string else 0.0
     steady = steady[-loop.cycles(STEADY_S) :]
     for _ in range(TRIES):
         noise = speed_noise_rad_s(steady, speed_resolution_rad_s)

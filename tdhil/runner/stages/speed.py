@@ -140,7 +140,7 @@ def run_speed(
     low_held = _settle_and_hold(loop, limits, low_rad_s, tolerance_rad_s, assumptions, unit_check.level)
     swing = low_held.swing
     unit_check.conclude(Command(Mode.SPEED, low_rad_s, 0.0))
-    good_enough = STRING_ERROR if limits.winds_up else GOOD_ENOUGH
+    good_enough = STRING_ERROR if limits.has_drill_string else GOOD_ENOUGH
     for _ in range(TRIES):
         ramped = ramp_speed(loop, low_rad_s, high_rad_s, rate)
         high_held = _settle_and_hold(loop, limits, high_rad_s, tolerance_rad_s, assumptions)
@@ -151,7 +151,7 @@ def run_speed(
         moved = trace([*low_samples, *between, *high_samples])
         rough = rough_inertia(
             moved.time_s, moved.speed_rad_s, moved.torque_nm - torque_offset_nm, low.level, high.level,
-            swinging=limits.winds_up,
+            swinging=limits.has_drill_string,
         )
         if rough is not None and rough.rel_error <= good_enough:
             break
@@ -172,7 +172,7 @@ def run_speed(
         raise DriveFault(
             f"the speed ramp gives no plausible inertia ({found})",
             where="stage speed",
-            next_step=_TOO_RESTLESS if limits.winds_up else _WRONG_TORQUE,
+            next_step=_TOO_RESTLESS if limits.has_drill_string else _WRONG_TORQUE,
             entry=MessageCode.NO_PLAUSIBLE_INERTIA,
         )
     friction = rough.friction.opposing(0.5 * (low.speed_rad_s + high.speed_rad_s))
@@ -271,7 +271,7 @@ def _settle_and_hold(
 ) -> _Held:
     """Settle, wait for the reporting lags, then hold the operating point. With a drill string the motor yields."""
     lags_s = 2.0 * assumptions.largest_speed_lag_s
-    if limits.winds_up:
+    if limits.has_drill_string:
         calmed = calm_string(loop, limits, speed_rad_s, tolerance_rad_s)
         later, asked_later = hold_damped(loop, calmed.damper, lags_s)
         before_level()
