@@ -51,10 +51,23 @@ def dry_run(options: RunOptions, rig: Rig | None, simulated: bool, profile: Prof
     return 0
 
 
-def dry_run_steps(
+def dry_run_case(
+    options: RunOptions, rig: Rig | None, case: EvaluationCase | StepCase, simulated: bool, rate_hz: float
+) -> int:
+    """Print the plan of a virtual string, or of steps of the set speed; exit code 0.
+
+    Raises the errors that a run would raise before motion.
+    """
+    from tdhil.speed_loop import StepCase
+
+    if isinstance(case, StepCase):
+        return _dry_run_steps(options, rig, case, simulated, rate_hz)
+    return _dry_run_course(options, rig, case, simulated, rate_hz)
+
+
+def _dry_run_steps(
     options: RunOptions, rig: Rig | None, case: StepCase, simulated: bool, rate_hz: float
 ) -> int:
-    """Print the largest steps of a verification; exit code 0. Raises what a run would raise before motion."""
     program, limits = plan_dry_steps(case, rig, simulated, rate_hz)
     plain = {
         "dry_run": True, "gains": case.kind, "rate_hz": rate_hz, "pairs": program.pairs,
@@ -79,10 +92,9 @@ def dry_run_steps(
     return 0
 
 
-def dry_run_course(
+def _dry_run_course(
     options: RunOptions, rig: Rig | None, case: EvaluationCase, simulated: bool, rate_hz: float
 ) -> int:
-    """Print a virtual string's speed program; exit code 0. Raises the errors that a run would raise before motion."""
     program, limits = plan_course(case, rig, simulated, rate_hz)
     ratio = case.rig.gear_ratio
     plain = {

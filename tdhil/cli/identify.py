@@ -86,16 +86,15 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def run_with(
-    namespace: argparse.Namespace, evaluation: EvaluationCase | None = None, logs: list[Path] | None = None,
-    steps: StepCase | None = None,
+    namespace: argparse.Namespace, case: EvaluationCase | StepCase | None = None, logs: list[Path] | None = None,
 ) -> int:
-    """Run the command, in stage 5 with a virtual string or with steps of the set speed if one of them is given.
+    """Run the command; ``case``: a virtual string, or steps of the set speed, in stage 5.
 
     ``logs``: receives the path of the run's log; the process then continues after the run.
 
     Raises TdhilError before the drive is accessed; after that every error becomes an exit code.
     """
-    from tdhil.cli.dry_run import dry_run, dry_run_course, dry_run_steps, say_before
+    from tdhil.cli.dry_run import dry_run, dry_run_case, say_before
     from tdhil.report import stderr_console
     from tdhil.session import RunRequest, check_unverified, connection_of, plan_peer, suited, with_faults
 
@@ -115,24 +114,18 @@ def run_with(
     _check_files(namespace, options)
     simulated = options.simulate or not connection.configured
     if namespace.dry_run:
-        if evaluation is not None:
+        if case is not None:
             bench = suited(rig, plan_peer(options, connection).plant)
-            rate_hz = options.rate_hz or connection.profile.usual_rate_hz
-            return dry_run_course(options, bench, evaluation, simulated, rate_hz)
-        if steps is not None:
-            bench = suited(rig, plan_peer(options, connection).plant)
-            return dry_run_steps(options, bench, steps, simulated,
-                                 options.rate_hz or connection.profile.usual_rate_hz)
+            return dry_run_case(options, bench, case, simulated, options.rate_hz or connection.profile.usual_rate_hz)
         return dry_run(options, rig, simulated, connection.profile)
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
     show_settings(console, options, connection, peer, rig)
     details = RunDetails.of(vars(namespace))
     request = RunRequest.of(
         options, connection, peer, rig, overrides=Overrides.of(vars(namespace)), operator=details.operator,
-        note=details.note, real_time_priority=bool(details.real_time_priority), evaluation=evaluation,
-        steps=steps, expect=details.expect,
+        note=details.note, real_time_priority=bool(details.real_time_priority), case=case, expect=details.expect,
     )
-    if evaluation is None and steps is None:
+    if case is None:
         with console.status("planning …") if console.is_terminal else nullcontext():
             said = say_before(options, rig, connection.profile, simulated)
         if said is not None:

@@ -31,4 +31,4 @@ def run(namespace: argparse.Namespace) -> int:
 
     if "list" in (namespace.fault or ()):
         return run_with(namespace)
-    return run_with(namespace, steps=load_step_case(namespace.tuning, namespace.use))
+    return run_with(namespace, load_step_case(namespace.tuning, namespace.use))

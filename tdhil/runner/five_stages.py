@@ -167,7 +167,7 @@ class Runner:
                 limits.temperature_c,
                 string=limits.has_drill_string,
                 torque_offset=task.request.impedance == "offset"
-                or (task.evaluation is not None and task.evaluation.own_loop),
+                or (task.case is not None and task.case.torque_offset),
             )
         )
         self._display.preflight(preflight)
@@ -199,7 +199,7 @@ class Runner:
         self._log.configure(cycle={"period_s": period_s, "rate_hz": 1.0 / period_s})
         self._log.event(self._drive.clock.now_s(), "rate", f"{1.0 / period_s:.4g} cycles per second")
         refuse_slow_reference(task.request, period_s)
-        if task.evaluation is None and task.steps is None:
+        if task.case is None:
             _refuse_undersampled(task.request, period_s)
         return replace(task, assumptions=task.assumptions.at_period(period_s))
 

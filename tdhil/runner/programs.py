@@ -100,10 +100,10 @@ def speed_steps(run: Run, case: StepCase) -> None:
 
 def program_of(task: Task) -> Callable[[Run], None]:
     """Return the program for a task."""
-    if task.evaluation is not None:
-        return partial(virtual_string, case=task.evaluation)
-    if task.steps is not None:
-        return partial(speed_steps, case=task.steps)
+    if isinstance(task.case, EvaluationCase):
+        return partial(virtual_string, case=task.case)
+    if isinstance(task.case, StepCase):
+        return partial(speed_steps, case=task.case)
     return offset_impedance if task.request.impedance == "offset" else identify
 
 

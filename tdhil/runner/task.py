@@ -60,8 +60,8 @@ class Task:
     request: ExcitationRequest
     facts: Mapping[str, Any] = field(default_factory=dict)
     assumptions: ControlAssumptions = field(default_factory=ControlAssumptions)
-    evaluation: EvaluationCase | None = None       # a virtual string in stage 5, in place of an excitation
-    steps: StepCase | None = None                  # small steps of the set speed in stage 5, in place of an excitation
+    case: EvaluationCase | StepCase | None = None
+    """Virtual string or small steps of the set speed in stage 5, in place of an excitation."""
 
     @property
     def string_at_motor_nm_s_rad(self) -> float:

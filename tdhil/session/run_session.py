@@ -62,10 +62,8 @@ class RunRequest:
     operator: str | None = None
     note: str | None = None
     real_time_priority: bool = False
-    evaluation: EvaluationCase | None = None
-    """Virtual string in stage 5, in place of an excitation."""
-    steps: StepCase | None = None
-    """Small steps of the set speed in stage 5, in place of an excitation."""
+    case: EvaluationCase | StepCase | None = None
+    """Virtual string or small steps of the set speed in stage 5, in place of an excitation."""
     acceptance: tuple[Expectation, ...] = ()
     """Expected values that decide whether the result is accepted."""
 
@@ -73,13 +71,13 @@ class RunRequest:
     def of(
         cls, options: RunOptions, connection: Connection, peer: PeerPlan, rig: Rig | None, *, overrides: Overrides,
         operator: str | None = None, note: str | None = None, real_time_priority: bool = False,
-        evaluation: EvaluationCase | None = None, steps: StepCase | None = None, expect: Sequence[str] = (),
+        case: EvaluationCase | StepCase | None = None, expect: Sequence[str] = (),
     ) -> RunRequest:
         """Return the request, with limits that suit the plant. Raises PreflightRefused for motion beyond the limits."""
         bench = suited(rig, peer.plant)
-        if evaluation is None and steps is None:
+        if case is None:
             refuse_hopeless(options, bench, connection.profile)
-        return cls(options, connection, peer, bench, overrides, operator, note, real_time_priority, evaluation, steps,
+        return cls(options, connection, peer, bench, overrides, operator, note, real_time_priority, case,
                    expectations_of({} if bench is None else bench.acceptance, expect))
 
 
@@ -230,7 +228,7 @@ class RunSession:
         request, outcome = self._request, self._outcome
         if not request.peer.faults or outcome is None:
             return
-        other = request.evaluation is not None or request.steps is not None or request.options.impedance
+        other = request.case is not None or request.options.impedance
         self.rehearsal = judge_rehearsal(request.peer, request.connection.drive, outcome, document, code,
                                          other_program=bool(other))
         with suppress(LogError):
@@ -291,11 +289,9 @@ class RunSession:
         if not identity.simulated:
             require_name(request.rig)
         asked = excitation_request(request.options, bench)
-        if request.evaluation is not None:
-            asked = ExcitationRequest(mode="speed" if request.evaluation.own_loop else "torque")
-        if request.steps is not None:
-            asked = ExcitationRequest(mode="speed", reference_filter_s=asked.reference_filter_s)
-        return Task(limits, asked, facts(bench), evaluation=request.evaluation, steps=request.steps)
+        if request.case is not None:
+            asked = ExcitationRequest(mode=request.case.mode, reference_filter_s=asked.reference_filter_s)
+        return Task(limits, asked, facts(bench), case=request.case)
 
 
 def configuration(request: RunRequest) -> dict[str, Any]:

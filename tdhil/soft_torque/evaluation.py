@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from math import inf, pi
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +87,16 @@ class EvaluationCase:
     """Half-width of the lag's 95 % interval, s."""
     own_loop: bool = False
     """True: the drive's own speed loop runs these gains, and the string's torque enters as a torque offset."""
+
+    @property
+    def mode(self) -> Literal["speed", "torque"]:
+        """Return the drive's mode in stage 5."""
+        return "speed" if self.own_loop else "torque"
+
+    @property
+    def torque_offset(self) -> bool:
+        """Return whether stage 5 writes the drive's torque offset."""
+        return self.own_loop
 
     @property
     def scale(self) -> float:

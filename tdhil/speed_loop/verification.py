@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from math import ceil, exp, inf, sqrt
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -85,6 +85,16 @@ class StepCase:
     """Time constant of the reported speed."""
     source: str = ""
     """File of the tuning."""
+
+    @property
+    def mode(self) -> Literal["speed", "torque"]:
+        """Return the drive's mode in stage 5."""
+        return "speed"
+
+    @property
+    def torque_offset(self) -> bool:
+        """Return whether stage 5 writes the drive's torque offset."""
+        return False
 
     def plain(self) -> dict[str, Any]:
         """Return the case as plain data for the log; `step_case_of` reads it."""

@@ -24,7 +24,7 @@ CASE = StepCase("tuned", PLANT, PiGains(500.0, 600.0), Range(0.2, 0.15, 0.25), R
 
 
 def runner(here, case=CASE, limits=LIMITS):
-    task = Task(limits, ExcitationRequest(mode="speed"), {}, steps=case)
+    task = Task(limits, ExcitationRequest(mode="speed"), {}, case=case)
     return Runner(here.drive, lambda _: task, here.log, here.stop_request, here.display, lambda *_: None)
 
 

@@ -50,7 +50,7 @@ def course(monkeypatch):
 
 def runner(here, case=BENCH, limits=ROOM):
     here.log = RowsLog()
-    task = Task(limits, ExcitationRequest(mode="torque"), {}, evaluation=case)
+    task = Task(limits, ExcitationRequest(mode="torque"), {}, case=case)
     return Runner(here.drive, lambda _: task, here.log, here.stop_request, here.display, lambda *_: None)
 
 
