@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import pytest
 
 from sim_bus.modbus.faults import KINDS, ONLY_ON
-from tests.path.path_runs import HANGS_S, Shaft, process, tdhil, wait_for
+from tests.path.path_runs import HANGS_S, Shaft, ShaftTrace, process, tdhil, wait_for
 
 IN_MOTION = "@speed+15s"       # at 4 rad/s
 PATIENT = (                    # against the wall clock a busy machine's pauses must not be taken for a fault
@@ -122,8 +122,10 @@ def test_a_connection_that_is_reset_in_motion(tmp_path):
         ))
         out, err = host.communicate(timeout=HANGS_S)
 
+        follower = ShaftTrace(trace)
+
         def resting():
-            shaft = Shaft.read(trace)
+            shaft = follower.read()
             return shaft.time_s[-1] > shaft.at_rest_from() + 1.0
 
         wait_for("the shaft to come to rest", resting)

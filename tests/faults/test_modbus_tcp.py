@@ -16,7 +16,7 @@ import threading
 
 import pytest
 
-from tests.path.path_runs import HANGS_S, SETTLING_S, Shaft, process, tail_time, wait_for
+from tests.path.path_runs import HANGS_S, SETTLING_S, ShaftTrace, process, tail_time, wait_for
 
 pytestmark = pytest.mark.real_time
 
@@ -85,6 +85,7 @@ class Bench:
 
     def __init__(self, folder, stack):
         self.folder, self.trace, self.log = folder, folder / "shaft.csv", folder / "run.mcap"
+        self.follower = ShaftTrace(self.trace)
         self.stack = stack
         drive = stack.enter_context(process(
             sys.executable, "-m", "sim_bus", "modbus", "--tcp", "127.0.0.1:0", "--trace", self.trace,
@@ -103,7 +104,7 @@ class Bench:
 
     @property
     def shaft(self):
-        return Shaft.read(self.trace)
+        return self.follower.read()
 
     def wait_until_turning(self):
         def turning():

@@ -16,8 +16,10 @@ import subprocess
 import sys
 import threading
 import time
+from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,7 @@ QUICK = ("--rate", 50)    # a fifth of the drive's usual rate, and of the cycles
 SHORT = ("--simulate", *QUICK, "--seed", 1, "--periods", 3)
 TOO_MUCH = ("--excitation", "sine", "--frequency", 0.2, "--amplitude", 3)
 """A motion that a lighter shaft could do: a run finds out in stage 2 that this one can't, and ends there with 7."""
+POLL_S = 0.02             # between two looks of a wait: looks must not take the processor from what is waited for
 HANGS_S = 600.0           # wall time after which something is taken to hang, on however busy a computer
 HELD = {"operation enabled", "quick stop active"}   # the states in which the drive holds its shaft
 
@@ -109,10 +112,7 @@ class Shaft:
 
     @classmethod
     def read(cls, path: Path) -> Shaft:
-        rows = [line.split(",") for line in path.read_text().split("\n")[1:-1]]
-        rows = [row for row in rows if len(row) == 5]
-        numbers = np.array([[float(cell) for cell in row[:3]] for row in rows]).reshape(-1, 3)
-        return cls(numbers[:, 0], numbers[:, 1], numbers[:, 2], [row[3] for row in rows], [row[4] for row in rows])
+        return ShaftTrace(path).read()
 
     def events(self, text: str) -> list[float]:
         """Plant times of the events that contain a text."""
@@ -148,6 +148,38 @@ class Shaft:
         return begun_s
 
 
+@dataclass
+class ShaftTrace:
+    """Trace of a shaft that still turns. Each `read` parses only the rows that were added since the last one.
+
+    A wait reads the trace many times a second, beside the drive that writes it.
+    """
+
+    path: Path
+    _size: int = 0
+    _head: bool = False
+    _numbers: array[float] = field(default_factory=lambda: array("d"))
+    _state: list[str] = field(default_factory=list)
+    _event: list[str] = field(default_factory=list)
+
+    def read(self) -> Shaft:
+        """Return the whole shaft, up to the last whole row."""
+        with self.path.open("rb") as file:
+            file.seek(self._size)
+            text, end, _ = file.read().rpartition(b"\n")
+        self._size += len(text) + len(end)
+        lines = text.decode().split("\n") if end else []
+        for line in lines if self._head else lines[1:]:
+            row = line.split(",")
+            if len(row) == 5:
+                self._numbers.extend(map(float, row[:3]))
+                self._state.append(row[3])
+                self._event.append(row[4])
+        self._head = self._head or bool(lines)
+        time_s, speed_rad_s, torque_nm = np.array(self._numbers).reshape(-1, 3).T.copy()
+        return Shaft(time_s, speed_rad_s, torque_nm, list(self._state), list(self._event))
+
+
 def tail_time(trace: Path) -> float:
     """Plant time of the last whole row."""
     size = trace.stat().st_size
@@ -166,7 +198,7 @@ def wait_for(
         if alive is not None and alive.poll() is not None:
             return done()
         assert time.monotonic() < end, f"hangs: {what}"
-        time.sleep(0.005)
+        time.sleep(POLL_S)
     return True
 
 
@@ -202,10 +234,14 @@ class Peer:
     trace: Path
     child: subprocess.Popen
 
+    @cached_property
+    def _follower(self) -> ShaftTrace:
+        return ShaftTrace(self.trace)
+
     @property
     def shaft(self) -> Shaft:
         """What the shaft has done so far."""
-        return Shaft.read(self.trace)
+        return self._follower.read()
 
 
 @contextlib.contextmanager

@@ -11,13 +11,24 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import can
 
 from sim_bus.canopen.simulator import Simulator
 from sim_bus.params import RigParams
-from tests.path.path_runs import HANGS_S, INERTIA, SWINGS_IN_RAD_S, TORQUE_NM, Finished, Shaft, identify, wait_for
+from tests.path.path_runs import (
+    HANGS_S,
+    INERTIA,
+    SWINGS_IN_RAD_S,
+    TORQUE_NM,
+    Finished,
+    Shaft,
+    ShaftTrace,
+    identify,
+    wait_for,
+)
 
 RATE_HZ = 25.0
 """A guest takes milliseconds for a cycle; plant time is the same at any rate."""
@@ -45,9 +56,13 @@ class Drive:
     simulator: Simulator
     trace: Path
 
+    @cached_property
+    def _follower(self) -> ShaftTrace:
+        return ShaftTrace(self.trace)
+
     @property
     def shaft(self) -> Shaft:
-        return Shaft.read(self.trace)
+        return self._follower.read()
 
     def rests(self) -> bool:
         """It has been brought to rest, and has stood for more than a second of plant time."""
