@@ -49,7 +49,7 @@ def test_stick_slip_is_named_and_never_answered_wrong():
 
 
 @pytest.mark.parametrize("every", [
-    pytest.param(9, marks=pytest.mark.heavy), pytest.param(1, marks=pytest.mark.long),
+    pytest.param(18, marks=pytest.mark.heavy), pytest.param(1, marks=pytest.mark.long),
 ])
 def test_none_of_108_records_in_stick_slip_is_answered_wrong(every):
     shafts = every_shaft()

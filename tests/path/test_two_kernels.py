@@ -40,7 +40,7 @@ def replayed(log, **environment):
     return done.stdout
 
 
-@pytest.mark.heavy
+@pytest.mark.long        # CI runs the tests of estimation under other kernels
 def test_a_replay_under_other_kernels(tmp_path):
     blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
     if "openblas" not in blas["name"] or "DYNAMIC_ARCH" not in blas.get("openblas configuration", ""):

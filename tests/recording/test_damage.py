@@ -249,7 +249,9 @@ def test_random_bytes_after_the_magic(tmp_path):
         read_damaged(tmp_path / "x.mcap", MAGIC + random.Random(seed).randbytes(5000))
 
 
-@pytest.mark.parametrize("apart", [283, pytest.param(29, marks=pytest.mark.heavy)])
+@pytest.mark.parametrize("apart", [
+    283, pytest.param(71, marks=pytest.mark.heavy), pytest.param(29, marks=pytest.mark.long),
+])
 def test_a_short_run_cut_every_few_bytes(tmp_path, apart):
     make_run(tmp_path / "short.mcap", 3)
     data = (tmp_path / "short.mcap").read_bytes()
