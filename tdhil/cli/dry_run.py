@@ -31,8 +31,8 @@ def dry_run(options: RunOptions, rig: Rig | None, simulated: bool, profile: Prof
     """Plan and print; exit code 0. Raises PreflightRefused if no plan is possible, as a run would."""
     from tdhil.report import stderr_console
 
-    told = stderr_console()
-    with told.status("planning …") if told.is_terminal else nullcontext():
+    stderr = stderr_console()
+    with stderr.status("planning …") if stderr.is_terminal else nullcontext():
         planned, figures, limits = plan_dry(options, rig, simulated, profile)
     if options.json:
         plain = plan_document(planned, figures, limits)

@@ -268,6 +268,6 @@ def _result_text(row: FleetRow) -> str:
     from tdhil.report import inertia_text
 
     low, high = row.inertia_low_total_kg_m2, row.inertia_high_total_kg_m2
-    told = inertia_text({"value": row.inertia_kg_m2, "low": low, "high": high})
+    inertia = inertia_text({"value": row.inertia_kg_m2, "low": low, "high": high})
     part = "" if row.part_text is None else f", {row.part_text}"
-    return f"{row.verdict}, J {told}{part}"
+    return f"{row.verdict}, J {inertia}{part}"

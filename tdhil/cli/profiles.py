@@ -84,12 +84,12 @@ def _by_hand(profile: Profile, console: Console) -> None:
             needed = required_text(one.require, unit_text(one.unit))
             table.add_row(one.title, needed, _advice(one, one in profile.untold))
         console.print(table)
-    told = [(f"parameters: {{{one.name}: …}}", one.title, unit_text(one.unit)) for one in profile.untold]
+    missing = [(f"parameters: {{{one.name}: …}}", one.title, unit_text(one.unit)) for one in profile.untold]
     if profile.rated_torque_by_hand:
-        told.insert(0, ("rated_torque_nm", "torque that is 100 %", "N·m"))
-    if told:
+        missing.insert(0, ("rated_torque_nm", "torque that is 100 %", "N·m"))
+    if missing:
         table = _table("required in rig.yaml, not reported by the drive", "key under drive_data", "meaning", "unit")
-        for row in told:
+        for row in missing:
             table.add_row(*row)
         console.print(table)
     written = [one for one in profile.parameters if one.set_to is not None]

@@ -91,8 +91,8 @@ def _assess(
     require_file(path)
     recorded = read_recorded(namespace, path)
     warnings += [f"{path.name}: {one}" for one in (*(recorded.assumed or ()), *recorded.problems)]
-    record, told = _surface(recorded.recording, result, namespace)
-    warnings += told
+    record, remarks = _surface(recorded.recording, result, namespace)
+    warnings += remarks
     return severity(record, string, inertia, expected), recorded.recording.simulated
 
 
@@ -121,7 +121,7 @@ def _surface(
     time_s = recording.time_s[good]
     kept = np.concatenate([[True], np.diff(time_s) > 0.0]) if len(time_s) else np.zeros(0, dtype=bool)
     ratio = recording.gear_ratio if namespace.gear is not None or recording.gear_ratio != 1.0 else result["gear_ratio"]
-    lags, told = [], []
+    lags, remarks = [], []
     for name, own in (("speed_lag_s", recording.lag_prior.speed_lag_s),
                       ("torque_lag_s", recording.lag_prior.torque_lag_s)):
         stated = result.get(name)
@@ -129,11 +129,11 @@ def _surface(
         if getattr(namespace, name.removesuffix("_s")) is not None or value is None:
             value = own
         if value is None:
-            told.append(f"The lag of the reported {name.split('_')[0]} is not known and counts as 0: state it with "
+            remarks.append(f"The lag of the reported {name.split('_')[0]} is not known and counts as 0: state it with "
                         f"--{name.removesuffix('_s').replace('_', '-')}.")
         lags.append(max(0.0, float(value or 0.0)))
     return SurfaceRecord(time_s[kept], recording.speed_rad_s[good][kept] / ratio,
-                         recording.torque_nm[good][kept] * ratio, *lags), told
+                         recording.torque_nm[good][kept] * ratio, *lags), remarks
 
 
 def _expected(namespace: argparse.Namespace) -> tuple[TopDrive, SpeedController]:

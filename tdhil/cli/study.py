@@ -269,12 +269,12 @@ def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, repo
         write_study,
     )
 
-    told, out = stderr_console(), PlainConsole()
+    stderr, out = stderr_console(), PlainConsole()
     folder = _made(namespace.out)
     chapters: list[Chapter] = []
     documents: list[dict[str, Any]] = []
     code, without = 0, False
-    bar = StudyBar(told, len(wanted))
+    bar = StudyBar(stderr, len(wanted))
     for index, (study, settings) in enumerate(wanted):
         begun_s = time.monotonic()
         try:
@@ -284,7 +284,7 @@ def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, repo
             if not report or isinstance(error, Interrupted):
                 raise
             # with a report, the other studies continue
-            told.print(f"tdhil: {study.name}: {error.coded}", style="bold red", markup=False, soft_wrap=True)
+            stderr.print(f"tdhil: {study.name}: {error.coded}", style="bold red", markup=False, soft_wrap=True)
             code = code or int(exit_code(error))
             chapters.append(Chapter(study.name, None, None, str(error)))
             documents.append({"study": study.name, "error": error_document(error)})
@@ -296,17 +296,17 @@ def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, repo
         documents.append(document(outcome, settings, written))
         if not namespace.json:
             print_outcome(outcome, written, out)
-        told.print(_cost(outcome, took_s), style="dim", markup=False)
+        stderr.print(_cost(outcome, took_s), style="dim", markup=False)
         if outcome.interrupted:
-            told.print(f"tdhil: {study.name} was interrupted; its figures use the runs finished before",
+            stderr.print(f"tdhil: {study.name} was interrupted; its figures use the runs finished before",
                        style="bold yellow", markup=False, soft_wrap=True)
             code = int(ExitCode.INTERRUPTED)
             break
     if without:
-        told.print(f"tdhil: {INSTALL}", markup=False, soft_wrap=True)
+        stderr.print(f"tdhil: {INSTALL}", markup=False, soft_wrap=True)
     index_path = write_report(chapters, folder) if report else None
     if index_path is not None:
-        told.print(f"{tally(chapters)}; report: {index_path}", markup=False, soft_wrap=True)
+        stderr.print(f"{tally(chapters)}; report: {index_path}", markup=False, soft_wrap=True)
     if namespace.json:
         several = {"studies": documents, "report": None if index_path is None else str(index_path)}
         print_json(documents[0] if len(documents) == 1 and not report else several)

@@ -122,12 +122,12 @@ def run(namespace: argparse.Namespace) -> int:
     _check_files(namespace)
     if namespace.report is not None:
         check_report_path(namespace.report, namespace.result)
-    told = stderr_console()
-    with _progress(told, "reading the result"):          # a log is identified again, which takes seconds
+    stderr = stderr_console()
+    with _progress(stderr, "reading the result"):          # a log is identified again, which takes seconds
         result = read_result(namespace.result)
     case, lags_from = case_of(result, namespace)
     profile = profile_for(namespace, result)
-    with _progress(told, "tuning") as tell:
+    with _progress(stderr, "tuning") as tell:
         tuning = tune(case, None if namespace.no_simulation else Search(), tell)
         tuned_for = _tuned_for(result, namespace, tuning, lags_from, profile)
         document = tuning_document(tuning, tuned_for)
@@ -140,28 +140,28 @@ def run(namespace: argparse.Namespace) -> int:
     if namespace.json:
         print_json(document)
         if namespace.no_simulation:
-            told.print("tune: tdhil evaluate does not accept this file: --no-simulation omits the critical speeds",
+            stderr.print("tune: tdhil evaluate does not accept this file: --no-simulation omits the critical speeds",
                        style="yellow", markup=False, soft_wrap=True)
     else:
         print_tuning(document, PlainConsole())
     if namespace.report is not None:
         written = write_tuning_report(document, showcase_of(tuning), namespace.report)
-        told.print(f"report: {written}", markup=False, soft_wrap=True)
+        stderr.print(f"report: {written}", markup=False, soft_wrap=True)
     return int(ExitCode.OK)
 
 
 @contextmanager
-def _progress(told: Console, text: str) -> Iterator[Callable[[str], None]]:
+def _progress(stderr: Console, text: str) -> Iterator[Callable[[str], None]]:
     """Yield a function that prints each step, one line each; at a terminal the present step also has a moving sign."""
     def line(step: str) -> None:
-        told.print(f"tune: {step} …", style="dim", markup=False)
+        stderr.print(f"tune: {step} …", style="dim", markup=False)
 
-    if not told.is_terminal:
+    if not stderr.is_terminal:
         yield line
         return
     from rich.markup import escape
 
-    with told.status(escape(f"tune: {text} …")) as status:
+    with stderr.status(escape(f"tune: {text} …")) as status:
         def step(what: str) -> None:
             line(what)
             status.update(escape(f"tune: {what} …"))
@@ -226,7 +226,7 @@ def _schedule(
         raise UsageError(str(error), where="--depths", next_step="Begin deeper than that",
                          entry=MessageCode.VALUE_NOT_ALLOWED) from None
     found = schedule(case, namespace.depths, "compensated" if namespace.compensate else "soft",
-                     simulated=not namespace.no_simulation, told=tell)
+                     simulated=not namespace.no_simulation, report=tell)
     parameters = profile.speed_controller if profile is not None and namespace.loop == "drive" else None
 
     def settings(law: SpeedController) -> Sequence[DriveSetting]:

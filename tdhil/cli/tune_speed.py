@@ -108,12 +108,12 @@ def run(namespace: argparse.Namespace) -> int:
         print_json(document)
     else:
         print_loop_tuning(document, PlainConsole())
-    told = stderr_console()
+    stderr = stderr_console()
     if namespace.plot is not None:
         save_loop_picture(document, namespace.plot)
-        told.print(f"plot: {namespace.plot}", markup=False, soft_wrap=True)
+        stderr.print(f"plot: {namespace.plot}", markup=False, soft_wrap=True)
     if namespace.report is not None:
-        told.print(f"report: {write_loop_report(document, namespace.report)}", markup=False, soft_wrap=True)
+        stderr.print(f"report: {write_loop_report(document, namespace.report)}", markup=False, soft_wrap=True)
     return int(ExitCode.OK)
 
 

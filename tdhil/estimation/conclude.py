@@ -45,16 +45,16 @@ def _inertia(case: Case, finding: Finding) -> InertiaEstimate | None:
     if finding.inertia is None:
         return None
     conditions = ("torque scale exact", *finding.conditions)
-    told = with_total(finding.inertia, case.recording.torque_scale_rel_sd, case.options.confidence, conditions)
+    total = with_total(finding.inertia, case.recording.torque_scale_rel_sd, case.options.confidence, conditions)
     half = finding.reading_kg_m2
     if half == 0.0:
-        return told
+        return total
     return replace(
-        told,
-        low=max(told.low - half, 0.0),
-        high=told.high + half,
-        low_total=max(told.low_total - half, 0.0),
-        high_total=told.high_total + half,
+        total,
+        low=max(total.low - half, 0.0),
+        high=total.high + half,
+        low_total=max(total.low_total - half, 0.0),
+        high_total=total.high_total + half,
     )
 
 

@@ -497,10 +497,10 @@ def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProbl
     shows = _undeclared(problem, fitted, confidence) if asked.by == REFERENCE else None
     p_value = 1.0 if test is None else test.p_value
     if shows is not None:
-        told, expected = _filter_words(problem.declared_s, *shows)
+        other, expected = _filter_words(problem.declared_s, *shows)
         return replace(
             bare, verdict=Verdict.MODEL_REJECTED, reference_filter_s=shows[0],
-            reason=f"the residuals contradict a speed loop with {expected} (p = {p_value:.2g}): {told} would explain"
+            reason=f"the residuals contradict a speed loop with {expected} (p = {p_value:.2g}): {other} would explain"
             " them",
             advice="measure by the torque offset (--impedance offset), which a reference filter doesn't touch; or"
             " switch the filter off at the drive, or state it (drive_data.reference_filter_s in rig.yaml)",
@@ -586,11 +586,13 @@ def _small_filter(problem: ImpedanceProblem, plain: FittedImpedance, confidence:
 
 def _filter_words(declared_s: float, shows: Estimate, instead: bool) -> tuple[str, str]:
     """Return the texts for the filter that the data show and for the expected one."""
-    told = f"one of {shows.value:.3g} s ({shows.low:.3g} to {shows.high:.3g})"
+    other = f"one of {shows.value:.3g} s ({shows.low:.3g} to {shows.high:.3g})"
     if declared_s <= 0.0:
-        return told, "no reference filter"
+        return other, "no reference filter"
     expected = f"the declared reference filter of {declared_s:g} s"
-    return (told + " in place of it" if instead else told.replace("one", "a further one", 1) + " besides it"), expected
+    if instead:
+        return f"{other} in place of it", expected
+    return f"a further {other} besides it", expected
 
 
 def _points(

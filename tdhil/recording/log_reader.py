@@ -432,11 +432,11 @@ class _Reading:
     def _sample(self, message: Any) -> None:
         enabled = message.state == log_messages.ENABLED_STATE
         in_torque = enabled and message.mode == log_messages.TORQUE_MODE and self._command.time_s == message.time_s
-        told = enabled and message.HasField("torque_demand_nm")
+        demanded = enabled and message.HasField("torque_demand_nm")
         self._builder.add_values(
             message.time_s, message.speed_rad_s, message.torque_nm, fresh=message.fresh, limited=message.limit_active,
             commanded_nm=self._command.torque_nm if in_torque else math.nan,
-            demanded_nm=message.torque_demand_nm if told else math.nan,
+            demanded_nm=message.torque_demand_nm if demanded else math.nan,
             position_rad=message.position_rad if message.HasField("position_rad") else None)
 
     def _torque_command(self, message: Any) -> None:

@@ -133,10 +133,10 @@ def impedance_rows(document: Mapping[str, Any]) -> Iterator[Row]:
     seen = [point for point in found["points"] if point["reflection_total"] is not None]
     if seen:
         least = min(seen, key=lambda point: float(point["reflection_total"]["value"]))
-        told = dict.fromkeys([min(seen, key=lambda point: abs(float(point["hertz"]) - hertz))["hertz"]
+        chosen = dict.fromkeys([min(seen, key=lambda point: abs(float(point["hertz"]) - hertz))["hertz"]
                               for hertz in (0.1, 0.2, 0.5)])
         parts = [f"{point['hertz']:.2g} Hz: {_plus_minus(point['reflection_total'])}" for point in seen
-                 if point["hertz"] in told]
+                 if point["hertz"] in chosen]
         yield "|r| at the string", f"least at {least['hertz']:.2g} Hz: {_plus_minus(least['reflection_total'])}"
         yield "", "   ".join(parts)
 

@@ -88,14 +88,15 @@ def _rows(document: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "why", document["reason"]
     yield from rehearsal_rows(document.get("rehearsal"))
     critical, predicted = document["critical_rpm"], document["predicted_critical_rpm"]
-    told = f"tune: {predicted['value']:.0f} ({predicted['low']:.0f} to {predicted['high']:.0f})"
+    expected_text = f"tune: {predicted['value']:.0f} ({predicted['low']:.0f} to {predicted['high']:.0f})"
     yield "critical speed", (
-        f"not found; {told}" if critical is None
-        else f"{critical['value']:.1f} rpm, above {critical['low']:.1f}; {told}")
+        f"not found; {expected_text}" if critical is None
+        else f"{critical['value']:.1f} rpm, above {critical['low']:.1f}; {expected_text}")
     damping, expected = document["least_damping"], document["predicted_least_damping"]
-    told = f"tune: {expected['value']:.3f} ({expected['low']:.3f} to {expected['high']:.3f})"
+    expected_text = f"tune: {expected['value']:.3f} ({expected['low']:.3f} to {expected['high']:.3f})"
     yield "least damping", (
-        f"not seen; {told}" if damping is None else f"{_damping(damping)} at {damping['hertz']:.3f} Hz; {told}")
+        f"not seen; {expected_text}" if damping is None else f"{_damping(damping)} at {damping['hertz']:.3f} Hz; "
+        f"{expected_text}")
     rms = document["torque_rms_nm"]
     yield "torque at the top, rms", ", ".join(
         f"{value:.0f} N·m {what}" for what, value in rms.items() if value is not None) or "not seen"

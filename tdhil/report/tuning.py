@@ -546,15 +546,15 @@ def _answer(best: Part | None, document: Part) -> AnswerBox:
         return AnswerBox("red" if thin else "yellow", "Nothing to change", lines,
                          "keep what you have", sentence, "")
     gains = best["at_motor"]
-    told = [f"at the motor shaft; {best['kind']}: {_WHAT[best['kind']]}"]
+    remarks = [f"at the motor shaft; {best['kind']}: {_WHAT[best['kind']]}"]
     if gains["compensated_kg_m2"]:
-        told.append(f"inertia compensation J_c = {gains['compensated_kg_m2']:.4g} kg·m², its derivative filtered by "
+        remarks.append(f"inertia compensation J_c = {gains['compensated_kg_m2']:.4g} kg·m², its derivative filtered by "
                      f"{1e3 * gains['derivative_filter_s']:g} ms")
     headline = f"P = {gain_words(gains['gain_nm_s_rad'])} N·m·s/rad, I = {gain_words(gains['integral_nm_rad'])} N·m/rad"
     required = document["required_margins"]
     verdict = (f"keeps {required['phase_deg']:.0f}°, {required['gain_db']:g} dB and "
                f"{1e3 * required['dead_time_s']:.0f} ms on every sampled machine and string")
-    return AnswerBox("green", headline, tuple(told), verdict, sentence, "")
+    return AnswerBox("green", headline, tuple(remarks), verdict, sentence, "")
 
 
 def draw_reflection(figure: FigureBase, document: Part) -> None:

@@ -27,13 +27,13 @@ class ServiceError(TdhilError):
     """
 
     def __init__(self, status: int, body: Mapping[str, Any]) -> None:
-        told = body.get("error") or {}
-        super().__init__(str(told.get("what", f"HTTP {status}")), where=str(told.get("where", "")),
-                         next_step=str(told.get("next_step", "")))
+        stated = body.get("error") or {}
+        super().__init__(str(stated.get("what", f"HTTP {status}")), where=str(stated.get("where", "")),
+                         next_step=str(stated.get("next_step", "")))
         self.status = status
-        self.kind = str(told.get("kind", ""))
-        self.exit_code = told.get("exit_code", 1)
-        self.entry = message_of(str(told.get("code", ""))) or self.entry
+        self.kind = str(stated.get("kind", ""))
+        self.exit_code = stated.get("exit_code", 1)
+        self.entry = message_of(str(stated.get("code", ""))) or self.entry
         self.holder = body.get("holder")
 
 
@@ -205,10 +205,10 @@ class Client:
         except urllib.error.HTTPError as error:
             with error:
                 try:
-                    told = json.loads(error.read())
+                    stated = json.loads(error.read())
                 except ValueError:
-                    told = {}
-            raise ServiceError(error.code, told if isinstance(told, dict) else {}) from None
+                    stated = {}
+            raise ServiceError(error.code, stated if isinstance(stated, dict) else {}) from None
         except (OSError, ValueError) as error:
             raise CommunicationLost(
                 f"the service can't be reached ({getattr(error, 'reason', error)})", where=self._url,

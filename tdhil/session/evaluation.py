@@ -98,15 +98,16 @@ def _value(part: Any) -> float:
     return max(0.0, float(value)) if value is not None else 0.0
 
 
-def _same_string(string: DrillString, told: Mapping[str, Any], where: str) -> None:
+def _same_string(string: DrillString, stated: Mapping[str, Any], where: str) -> None:
     bit = string.bit
     pairs = [
-        (string.impedance_nm_s_rad, told["impedance_nm_s_rad"]), (string.stiffness_nm_rad, told["stiffness_nm_rad"]),
-        (string.echo_s, told["echo_s"]), (string.bottom_inertia_kg_m2, told["bottom_inertia_kg_m2"]),
+        (string.impedance_nm_s_rad, stated["impedance_nm_s_rad"]),
+        (string.stiffness_nm_rad, stated["stiffness_nm_rad"]),
+        (string.echo_s, stated["echo_s"]), (string.bottom_inertia_kg_m2, stated["bottom_inertia_kg_m2"]),
     ]
-    if bit is not None and told["bit"] is not None:
-        pairs += [(bit.coulomb_nm, told["bit"]["coulomb_nm"]), (bit.static_nm, told["bit"]["static_nm"])]
-    if (bit is None) is not (told["bit"] is None) or any(
+    if bit is not None and stated["bit"] is not None:
+        pairs += [(bit.coulomb_nm, stated["bit"]["coulomb_nm"]), (bit.static_nm, stated["bit"]["static_nm"])]
+    if (bit is None) is not (stated["bit"] is None) or any(
         abs(one - other) > SAME_STRING * max(abs(one), abs(other)) for one, other in pairs
     ):
         raise UsageError("was tuned for a different string than --virtual-string", where=where, next_step=_TUNE_AGAIN,

@@ -240,9 +240,11 @@ def _joint(recordings: Sequence[Recording], identified: Sequence[Identification]
         else:
             return (fit.inertia_kg_m2, fit.covariance, fit.covariance_known_filters, fit.degrees_of_freedom,
                     fit.sharing, True)
-    told = [found.inertia for found in identified if found.inertia is not None]
-    values = np.array([one.value for one in told])
-    sds = np.array([max(one.high - one.value, one.value - one.low) / normal_quantile(one.confidence) for one in told])
+    answered = [found.inertia for found in identified if found.inertia is not None]
+    values = np.array([one.value for one in answered])
+    sds = np.array([
+        max(one.high - one.value, one.value - one.low) / normal_quantile(one.confidence) for one in answered
+    ])
     return values, np.diag(sds**2), np.diag(sds**2), 50.0, None, False
 
 

@@ -74,20 +74,20 @@ def at_depth(string: DrillString, depth_m: float) -> DrillString:
 
 def schedule(
     case: TuneCase, depths_m: Sequence[float], kind: ScheduledKind, *, simulated: bool = True,
-    told: Callable[[str], None] = lambda text: None,
+    report: Callable[[str], None] = lambda text: None,
 ) -> DepthSchedule:
     """Tune at each depth, and check the interpolated gains. Raises the errors of `at_depth` and `tune`.
 
-    If ``simulated`` is False or no bit is stated, no critical speeds are computed. ``told`` receives progress texts.
+    If ``simulated`` is False or no bit is stated, no critical speeds are computed. ``report`` receives progress texts.
     """
     rows, between = [], []
     for depth_m in depths_m:
-        told(f"gains at {depth_m:.0f} m")
+        report(f"gains at {depth_m:.0f} m")
         rows.append(_row(replace(case, string=at_depth(case.string, depth_m)), depth_m, kind, simulated))
     for above, below in pairwise(rows):
         if above.controller is not None and below.controller is not None:
             depth_m = 0.5 * (above.depth_m + below.depth_m)
-            told(f"interpolated gains at {depth_m:.0f} m")
+            report(f"interpolated gains at {depth_m:.0f} m")
             own = replace(case, string=at_depth(case.string, depth_m))
             halfway = _halfway(above.controller, below.controller)
             between.append(_judged(own, DepthRow(depth_m, string_modes_hz(own.string)[0], halfway), simulated))

@@ -63,38 +63,38 @@ NOT_BETTER_SHARE = 2.0 * NOISY_RESOLUTION
 
 
 def tune(
-    case: TuneCase, search: Search | None = Search(), told: Callable[[str], None] = lambda text: None  # noqa: B008
+    case: TuneCase, search: Search | None = Search(), report: Callable[[str], None] = lambda text: None  # noqa: B008
 ) -> Tuning:
     """Tune all controllers: present, stiff, soft, compensated, broadband.
 
-    ``search`` None leaves the simulated critical speeds out. ``told`` receives progress texts. Raises `TuningRefused`
+    ``search`` None leaves the simulated critical speeds out. ``report`` receives progress texts. Raises `TuningRefused`
     if a requested softness or compensated share is not possible.
     """
-    told("string's modes")
+    report("string's modes")
     held = string_modes_hz(case.string)
-    told("what is open: drawing truths")
+    report("what is open: drawing truths")
     samples = TruthMargins(case)
     simulated = search is not None and case.string.bit is not None
     found: list[Tuned] = []
     if case.present is not None:
         found.append(Tuned("present", case.present))
     found.append(stiff(case))
-    told("soft, compensated: gains that keep the margins")
+    report("soft, compensated: gains that keep the margins")
     pools = [soft(case, held, samples), compensated(case, held, samples)]
     if simulated:
-        told("the best of them, simulated under bit noise")
+        report("the best of them, simulated under bit noise")
         pools = best_by_simulation(pools, samples, held)
     found += [pool[0] for pool in pools]
-    told("broadband: gains")
+    report("broadband: gains")
     found.append(broadband(case, held, samples))
     for k, one in enumerate(found):
         if one.controller is not None:
-            told(f"{one.kind}: reflection, modes, margins")
+            report(f"{one.kind}: reflection, modes, margins")
             found[k] = with_figures(case, one, held, samples)
     if simulated and search is not None:
-        found = _under_noise(found, samples, held, told)
+        found = _under_noise(found, samples, held, report)
         stated = replace(search, longest_tick_s=coarse_tick_s(case.string))
-        found = list(_without_noise(case, tuple(found), held, stated, told))
+        found = list(_without_noise(case, tuple(found), held, stated, report))
     return Tuning(case, held, tuple(found), search if simulated else None, _advice(case, found), samples.truths)
 
 
@@ -132,9 +132,9 @@ def noisy_cures(
 
 
 def _under_noise(
-    found: list[Tuned], samples: TruthMargins, held: Sequence[float], told: Callable[[str], None]
+    found: list[Tuned], samples: TruthMargins, held: Sequence[float], report: Callable[[str], None]
 ) -> list[Tuned]:
-    told("critical speeds under bit noise, simulated on every truth")
+    report("critical speeds under bit noise, simulated on every truth")
     taken = [one for one in found if one.controller is not None]
     laws = [None if one.kind == "present" else one.controller for one in taken]
     cures = noisy_cures(samples.truths, laws, held)
@@ -185,10 +185,10 @@ def _advice(case: TuneCase, found: Sequence[Tuned]) -> Advice:
 
 
 def _without_noise(
-    case: TuneCase, every: tuple[Tuned, ...], held: Sequence[float], search: Search, told: Callable[[str], None]
+    case: TuneCase, every: tuple[Tuned, ...], held: Sequence[float], search: Search, report: Callable[[str], None]
 ) -> tuple[Tuned, ...]:
     """Return the rows with cure speeds of the stated string: over J and each other interval, and for a wrong J."""
-    told("critical speeds without noise, and what a wrong J costs")
+    report("critical speeds without noise, and what a wrong J costs")
     inertia = case.inertia_kg_m2
     loops: list[tuple[DrillString, TopDrive, SpeedController]] = []
     sizes = []

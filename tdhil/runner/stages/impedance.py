@@ -137,8 +137,8 @@ def run_offset(loop: ControlLoop, plan: OffsetPlan, announce: Announce, speed_re
     drive = _WaveSender(loop, _ExcitationWave(sizes, plan.phases_rad, mean, speed_resolution_rad_s))
 
     def recorded(start_s: float, end_s: float | None = None) -> Excitation:
-        told: Segment = replace(segment.recorded(start_s, end_s), torque_amplitudes_nm=plan.torque_amplitudes_nm)
-        return Excitation(plan.plan.kind, plan.plan.mode, (told,))
+        applied: Segment = replace(segment.recorded(start_s, end_s), torque_amplitudes_nm=plan.torque_amplitudes_nm)
+        return Excitation(plan.plan.kind, plan.plan.mode, (applied,))
 
     start_s = drive.time_s + loop.period_s
     announce(recorded(start_s))
