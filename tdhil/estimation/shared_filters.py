@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tdhil.estimation.case import Case, PeriodicCase
-from tdhil.estimation.frequency_domain import Box, Fit, FittedModel, descend, fit_inertia, known_of, refuse_count
+from tdhil.estimation.frequency_domain import Box, Fit, FittedModel, descend, fit_parameters, known_of, refuse_count
 from tdhil.estimation.periodic import clear_lines, measured
 from tdhil.estimation.result import Options, Refused, ResidualTest
 from tdhil.estimation.samples import usable_samples
@@ -107,7 +107,8 @@ def identify_together(recordings: Sequence[Recording]) -> FittedTogether:
         degrees_of_freedom=_satterthwaite(shares), viscous_nm_s_rad=best.theta[1:start_index:_OWN],
         sharing=_sharing(best.objective, [one.whole.objective for one in fits], _excess(fits),
                          (size - len(fixed)) * (number - 1)),
-        alone_kg_m2=np.array([one.likelier.theta[0] for one in fits]), covariance_known_filters=own[np.ix_(index, index)] * rise,
+        alone_kg_m2=np.array([one.likelier.theta[0] for one in fits]),
+        covariance_known_filters=own[np.ix_(index, index)] * rise,
     )
 
 
@@ -121,7 +122,7 @@ def _fitted(recording: Recording) -> FittedModel:
     refusal = refuse_count(len(periodic.lines), periodic.constraint, priors)
     if refusal is not None:
         raise Refused(refusal.reason, refusal.advice, refusal.entry)
-    return fit_inertia(periodic.lines, periodic.constraint, priors, fixed, 0.95)[2]
+    return fit_parameters(periodic.lines, periodic.constraint, priors, fixed)
 
 
 def _greatest(parts: list[FloatArray]) -> FloatArray:
