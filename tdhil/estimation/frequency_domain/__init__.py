@@ -28,8 +28,8 @@ from tdhil.estimation.frequency_domain.model import GaussianPrior as GaussianPri
 from tdhil.estimation.frequency_domain.nonlinear_friction import identify_bent as identify_bent
 from tdhil.estimation.frequency_domain.optimiser import Box as Box, Fit as Fit, descend as descend
 from tdhil.estimation.frequency_domain.rigid import (
-    RigidResult as RigidResult, fit_inertia as fit_inertia, fit_rigid as fit_rigid, known_of as known_of,
-    lag_priors as lag_priors, refuse_count as refuse_count, rigid_finding as rigid_finding,
+    RigidResult as RigidResult, fit_inertia as fit_inertia, fit_parameters as fit_parameters, fit_rigid as fit_rigid,
+    known_of as known_of, lag_priors as lag_priors, refuse_count as refuse_count, rigid_finding as rigid_finding,
     simultaneous as simultaneous, unfiltered as unfiltered,
 )
 from tdhil.estimation.frequency_domain.shafts import (

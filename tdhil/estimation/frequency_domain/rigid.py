@@ -225,13 +225,23 @@ def fit_inertia(
     confidence: float,
 ) -> tuple[Estimate, ResidualTest | None, FittedModel]:
     """Return J only, as `fit_rigid`, in a third of the time; J has no width if the data reject the model."""
-    problem = Likelihood(lines, Model(), constraint, priors)
-    fitted = fit_model(problem, fixed, rigid_starts(problem), rigid_rivals)
+    fitted = fit_parameters(lines, constraint, priors, fixed)
     residual = residual_of(fitted)
     if rejects(residual):            # then no interval is reported, and none is computed
         value = float(fitted.whole.theta[INERTIA])
         return Estimate(value, value, value), residual, fitted
     return estimate(fitted, INERTIA, confidence), residual, fitted
+
+
+def fit_parameters(
+    lines: tuple[SpectralLine, ...],
+    constraint: ViscousConstraint | None,
+    priors: tuple[GaussianPrior, ...],
+    fixed: Fixed,
+) -> FittedModel:
+    """Return the fit only, without test and interval."""
+    problem = Likelihood(lines, Model(), constraint, priors)
+    return fit_model(problem, fixed, rigid_starts(problem), rigid_rivals)
 
 
 def _bare(fitted: FittedModel, residual: ResidualTest | None) -> RigidResult:
