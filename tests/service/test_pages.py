@@ -355,7 +355,7 @@ def test_the_list_of_runs_can_be_searched_and_sorted(page, served):
     names, search = page.locator("#runs td:last-child"), page.get_by_label("Search")
     page.get_by_text("Carla: done").wait_for()
     assert set(names.all_inner_texts()) == {"Carla: done", "Berta: done", "Anna: done"}
-    page.get_by_role("button", name="operator, note").click()
+    page.get_by_role("button", name="operator, note, tags").click()
     assert names.all_inner_texts() == ["Anna: done", "Berta: done", "Carla: done"]
     page.get_by_role("button", name="when").click()
     search.fill("anna done")
@@ -366,6 +366,50 @@ def test_the_list_of_runs_can_be_searched_and_sorted(page, served):
     search.fill("")
     page.get_by_label("State").select_option("failed")
     page.get_by_text("no run matches").wait_for()
+
+
+@pytest.mark.heavy
+def test_a_run_is_tagged_archived_and_deleted_from_its_page(page, served):
+    runs = []
+    for note in ("done", "done"):
+        runs.append(served.service.supervisor.start_run("a", {"note": note}, "local").request.id)
+        served.service.wait(runs[-1], "done")
+    wait_for("their end", lambda: not served.service.supervisor.live())
+    run = runs[0]
+    page.goto(f"/runs/{run}")
+    page.get_by_label("Tags, separated by commas").fill(f"after repair, {HOSTILE}")
+    page.get_by_label("Operator").fill("Anna")
+    page.get_by_role("button", name="Save").click()
+    page.get_by_text("a tag has at most 40 characters").wait_for()          # at its field, and nothing was saved
+    assert page.get_by_label("Tags, separated by commas").get_attribute("aria-invalid") == "true"
+    page.get_by_label("Tags, separated by commas").fill("after repair, <b id=x>")
+    page.get_by_role("button", name="Save").click()
+    page.get_by_text("Edits: 2").click()
+    page.get_by_role("row", name="after repair, <b id=x>").get_by_text("local").wait_for()
+    page.goto("/runs")
+    page.get_by_label("Search").fill("repair anna")
+    page.locator("#runs").get_by_text("after repair", exact=True).wait_for()
+    assert page.locator("#runs tr").count() == 1 and page.locator("b#x").count() == 0
+    page.goto(f"/runs/{run}")
+    page.get_by_role("button", name="Archive", exact=True).click()
+    page.get_by_role("button", name="Take out of the archive").wait_for()
+    page.goto("/runs")
+    page.locator("#runs tr").first.wait_for()
+    assert page.locator("#runs tr").count() == 1
+    page.get_by_label("Archived runs too").check()
+    page.locator("#runs").get_by_text("ARCHIVED").wait_for()
+    page.goto(f"/runs/{run}")
+    page.get_by_text("Delete this run").click()
+    button, typed = page.get_by_role("button", name="Delete", exact=True), page.get_by_label("Type the run's id")
+    typed.fill(run[:-1])
+    assert button.is_disabled()
+    typed.fill(run)
+    button.click()
+    page.wait_for_url("**/runs")
+    page.get_by_label("Archived runs too").check()
+    page.locator("#runs tr").first.wait_for()
+    assert [one.name for one in served.service.store.runs.iterdir()] == [runs[1]]
+    assert page.evaluate("window.pwned") is None
 
 
 def test_a_stop_that_was_asked_for_is_no_alarm(page, served):
