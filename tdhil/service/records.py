@@ -1,4 +1,6 @@
-"""Changes to the records of ended runs: annotations, archive, deletion. The recorded log is never changed.
+"""Changes to the records of ended runs: annotations, archive, deletion, signature of an acceptance.
+
+The recorded log and its result are never changed.
 
 Each change is in the audit before it is made. Without an audit entry nothing changes.
 """
@@ -6,17 +8,26 @@ Each change is in the audit before it is made. Without an audit entry nothing ch
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
-from hashlib import file_digest
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
-from tdhil.errors import LogError, MessageCode, UsageError
+from tdhil.errors import LogError, MessageCode
+from tdhil.service.acceptance_signature import (
+    FILE,
+    LONGEST_NAME,
+    LONGEST_REMARK,
+    PASS,
+    AcceptanceSignature,
+    hash_of,
+    signature_in,
+)
 from tdhil.service.annotations import LONGEST_TEXT, one_line, tags_of
 from tdhil.service.run_channel import lives
 from tdhil.service.run_state import Conflict, State, now
 from tdhil.service.start_request import ValuesWrong
-from tdhil.service.store import read_json
+from tdhil.service.store import read_json, sha256_of_file, write_json
 from tdhil.service.supervisor import Supervisor
 
 LOG: Final = "run.mcap"
@@ -29,6 +40,7 @@ class RunRecords:
         self._supervisor, self._store = supervisor, supervisor.store
         self._reading = reading
         self._lock = threading.Lock()
+        self._hashes: dict[str, tuple[tuple[int, int, int], str]] = {}
 
     def annotate(
         self, run: str, who: str, *, tags: Sequence[str] | None = None, operator: str | None = None,
@@ -75,6 +87,8 @@ class RunRecords:
                 raise Conflict("the log is being identified again", where=where, next_step="Wait until that has ended")
             if self._store.signed_off(run) is not None:
                 raise Conflict("a sign-off refers to this run: it is kept", where=where, next_step="Archive it")
+            if self.signature(run) is not None:
+                raise Conflict("the acceptance of this run is signed: it is kept", where=where, next_step="Archive it")
             log_sha256 = sha256_of_file(folder / LOG)
             if (found := self._calibration_from(log_sha256)) is not None:
                 raise Conflict(f"the torque calibration {found.name} refers to this run: it is kept", where=where,
@@ -90,6 +104,78 @@ class RunRecords:
                                next_step="Check the folder of the service") from error
         self._supervisor.forget(run)
         return files, log_sha256
+
+    # -- acceptance --------------------------------------------------------------------------------------------------
+
+    def signature(self, run: str) -> AcceptanceSignature | None:
+        """Return the signature under the acceptance of a run; None without one. Raises NotThere."""
+        return signature_in(read_json(self._store.place(run) / FILE))
+
+    def acceptance(self, run: str) -> tuple[dict[str, Any], str]:
+        """Return the present acceptance of a run, and the SHA-256 of its log. Raises NotThere, and Conflict without an
+        acceptance or a log.
+        """
+        where = f"run {run}"
+        found = (self._store.result(run) or {}).get("acceptance")
+        if not isinstance(found, Mapping):
+            raise Conflict("this run has no acceptance: no values were expected of it", where=where,
+                           next_step="State them in rig.yaml (acceptance:), or request the run with expect")
+        if not (digest := self._log_sha256(run)):
+            raise Conflict("this run has no log", where=where)
+        return dict(found), digest
+
+    def sign_acceptance(
+        self, run: str, who: str, role: str, *, name: str, verdict: str, log_sha256: str, remark: str,
+    ) -> None:
+        """Sign the acceptance of a run. ``verdict``, ``log_sha256``: as the person saw them. Raises NotThere,
+        LogError, ValuesWrong with all wrong values, and Conflict if it is signed, or if verdict or log are others.
+        """
+        name, remark = one_line(name), one_line(remark)
+        with self._lock:
+            request, where = self._store.request(run), f"run {run}"
+            self._require_settled(run)
+            if request.rehearsal:
+                raise Conflict("faults were rehearsed in this run: it is no acceptance of a rig", where=where)
+            present, digest = self.acceptance(run)
+            if (before := self.signature(run)) is not None:
+                raise Conflict(f"the acceptance is signed already: by {before.name}, {before.at}", where=where,
+                               next_step="Start a new run for another acceptance")
+            if verdict != present.get("verdict"):
+                raise Conflict(f"the verdict is {present.get('verdict')}, not {verdict[:20]}", where=where,
+                               next_step="Load the page again", entry=MessageCode.CHANGED_MEANWHILE)
+            if log_sha256 != digest:
+                raise Conflict("the log is another one than the page showed", where=where,
+                               next_step="Load the page again", entry=MessageCode.CHANGED_MEANWHILE)
+            wrong = []
+            if not 1 <= len(name) <= LONGEST_NAME:
+                wrong.append(("name", f"must be a name of at most {LONGEST_NAME} characters"))
+            if len(remark) > LONGEST_REMARK:
+                wrong.append(("remark", f"must be a text of at most {LONGEST_REMARK} characters"))
+            if verdict != PASS and not remark:
+                wrong.append(("remark", f"a remark is needed, because the verdict is {verdict}"))
+            if wrong:
+                raise ValuesWrong(wrong)
+            signature = AcceptanceSignature(name, role, who, now(), remark, verdict, digest, hash_of(present))
+            self._audit(who, "acceptance signed", run, request.rig, **asdict(signature))
+            try:
+                write_json(self._store.place(run) / FILE, asdict(signature))
+            except OSError as error:
+                self._supervisor.note(who, "signature failed", run, request.rig, why=str(error))
+                raise LogError(f"the signature can't be written ({error.strerror or error})", where=where,
+                               next_step="Nothing was signed. Check the folder of the service") from error
+
+    def _log_sha256(self, run: str) -> str:
+        """Return the SHA-256 of the log; from memory while the file keeps its size and times."""
+        path = self._store.place(run) / LOG
+        try:
+            looked = path.stat()
+        except OSError:
+            return ""
+        stamp = (looked.st_size, looked.st_mtime_ns, looked.st_ctime_ns)
+        known = self._hashes.get(run)
+        if known is None or known[0] != stamp:
+            known = self._hashes[run] = (stamp, sha256_of_file(path))
+        return known[1]
 
     # ----------------------------------------------------------------------------------------------------------------
 
@@ -142,14 +228,3 @@ class RunRecords:
         except OSError as error:
             raise LogError(f"the audit can't be written ({error.strerror or error})", where="audit",
                            next_step="Nothing was changed. Free some disk space, or check that folder") from error
-
-
-def sha256_of_file(path: Path) -> str:
-    """Return the SHA-256 of a file in hex; '' without the file. Raises UsageError if it can't be read."""
-    try:
-        with path.open("rb") as file:
-            return file_digest(file, "sha256").hexdigest()
-    except FileNotFoundError:
-        return ""
-    except OSError as error:
-        raise UsageError(f"can't be read ({error.strerror or error})", where=path.name) from error

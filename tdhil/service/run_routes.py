@@ -12,11 +12,13 @@ import anyio
 from tdhil.config import ASKED_AGAIN, resolve
 from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.access import principal
+from tdhil.service.accounts import ROLES
 from tdhil.service.attendance import LEASE_S
 from tdhil.service.middleware import off, told_of
 from tdhil.service.routing import api
 from tdhil.service.run_state import NotThere, State, now
 from tdhil.service.schemas import (
+    AcceptanceView,
     AnnotationsBody,
     ArchiveBody,
     CompareView,
@@ -29,6 +31,7 @@ from tdhil.service.schemas import (
     ReplayBody,
     ReplayView,
     RunView,
+    SignatureBody,
     SignOffBody,
     plain,
 )
@@ -60,6 +63,8 @@ def routes(site: Site) -> list[Route]:
         api(site, "annotate", annotate),
         api(site, "archive", archive),
         api(site, "delete_run", delete_run),
+        api(site, "acceptance", acceptance),
+        api(site, "sign_acceptance", sign_acceptance),
         api(site, "ask_replay", ask_replay),
         api(site, "replay", replay),
     ]
@@ -181,6 +186,27 @@ async def delete_run(site: Site, request: Request, body: DeleteBody) -> DeletedV
     """Delete a run with all its files."""
     which, who = request.path_params["run"], principal(request).name
     return DeletedView(which, *await off(lambda: site.records.delete(which, who, body.confirm)))
+
+
+async def acceptance(site: Site, request: Request, body: None) -> AcceptanceView:
+    """Return the acceptance of a run."""
+    return await off(lambda: _acceptance_of(site, request.path_params["run"]))
+
+
+async def sign_acceptance(site: Site, request: Request, body: SignatureBody) -> AcceptanceView:
+    """Sign the acceptance of a run with the highest role of the client."""
+    which, who = request.path_params["run"], principal(request)
+    role = next(one for one in reversed(ROLES) if one in who.roles)
+    await off(lambda: site.records.sign_acceptance(
+        which, who.name, role, name=body.name, verdict=body.verdict, log_sha256=body.log_sha256, remark=body.remark))
+    return await off(lambda: _acceptance_of(site, which))
+
+
+def _acceptance_of(site: Site, run: str) -> AcceptanceView:
+    found, log_sha256 = site.records.acceptance(run)
+    signature = site.records.signature(run)
+    problem = "" if signature is None else signature.problem(found, log_sha256)
+    return AcceptanceView(run, found, log_sha256, signature, problem)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

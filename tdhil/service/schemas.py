@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Final, Literal
 
 from pydantic import ConfigDict, TypeAdapter
 
+from tdhil.service.acceptance_signature import AcceptanceSignature
 from tdhil.service.accounts import Role
 from tdhil.service.annotations import AnnotationEdit
 from tdhil.service.audit import Broken, Entry
@@ -73,6 +74,7 @@ class RunView:
     """A run without its samples. ``result``: document of `tdhil identify --json`; ``files``: names for downloads.
 
     ``operator``, ``note``: as edited later, else as in ``options``. ``edits``: each later edit, with old and new value.
+    ``signature``: under its acceptance.
     """
 
     id: str
@@ -109,6 +111,7 @@ class RunView:
     tags: list[str] = field(default_factory=list)
     archived: bool = False
     edits: list[AnnotationEdit] = field(default_factory=list)
+    signature: AcceptanceSignature | None = None
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,17 @@ class DeletedView:
     run: str
     files: list[str]
     log_sha256: str
+
+
+@dataclass(frozen=True)
+class AcceptanceView:
+    """The acceptance of a run, the SHA-256 of its log, and its signature. ``problem``: why it is not valid."""
+
+    run: str
+    acceptance: dict[str, Any]
+    log_sha256: str
+    signature: AcceptanceSignature | None
+    problem: str
 
 
 @dataclass(frozen=True)
@@ -344,6 +358,19 @@ class DeleteBody(Body):
 
 
 @dataclass(frozen=True)
+class SignatureBody(Body):
+    """Signature under an acceptance. ``verdict``, ``log_sha256``: as the person saw them. ``name``: of the person.
+
+    ``remark`` is required unless the verdict is a pass.
+    """
+
+    name: str
+    verdict: str
+    log_sha256: str
+    remark: str = ""
+
+
+@dataclass(frozen=True)
 class ReplayBody(Body):
     """Settings of a replay. None: the setting of the run. A relative value is a number, or a text such as ``1%``."""
 
@@ -506,6 +533,10 @@ ROUTES: Final = (
           "engineer", {200: RunView}, ArchiveBody, (403, 404, 409, 422, 503)),
     Route("POST", "/runs/{run}/delete", "delete_run", "Delete a run with all its files; the audit keeps the entry",
           "admin", {200: DeletedView}, DeleteBody, (403, 404, 409, 422, 503)),
+    Route("GET", "/runs/{run}/acceptance", "acceptance", "The acceptance of a run, with its signature", "viewer",
+          {200: AcceptanceView}, errors=(404, 409)),
+    Route("POST", "/runs/{run}/acceptance", "sign_acceptance", "Sign the acceptance of a run, once", "engineer",
+          {200: AcceptanceView}, SignatureBody, (403, 404, 409, 422, 503)),
     Route("POST", "/runs/{run}/replays", "ask_replay", "Identify again; the first result is kept", "operator",
           {202: ReplayView, 200: ReplayView}, ReplayBody, (403, 404, 422)),
     Route("GET", "/runs/{run}/replays/{replay}", "replay", "One replay", "viewer", {200: ReplayView}, errors=(404,)),

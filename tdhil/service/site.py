@@ -207,6 +207,7 @@ class Site:
             lives(folder), request.rehearsal, None if status.rehearsal is None else dict(status.rehearsal),
             annotations.text("operator", request.options), annotations.text("note", request.options),
             list(annotations.tags), annotations.archived, list(annotations.edits),
+            self.records.signature(run),
         )
 
     def told(self) -> dict[str, Any]:

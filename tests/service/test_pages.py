@@ -369,6 +369,31 @@ def test_the_list_of_runs_can_be_searched_and_sorted(page, served):
 
 
 @pytest.mark.heavy
+def test_an_acceptance_that_fails_is_signed_with_a_remark_and_then_shows_who_signed(page, served):
+    from tests.service.test_records import ACCEPTANCE
+
+    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    wait_for("its end", lambda: not served.service.supervisor.live())
+    path = served.service.store.place(run) / "result.json"
+    write_json(path, {**json.loads(path.read_bytes()), "acceptance": {**ACCEPTANCE, "verdict": "fail"}})
+    page.goto(f"/runs/{run}")
+    page.get_by_label("Name of the person").fill("Anna Berg")
+    page.get_by_role("button", name="Sign", exact=True).click()
+    page.get_by_text("a remark is needed, because the verdict is fail").wait_for()
+    assert page.get_by_label("Remark").get_attribute("aria-invalid") == "true"
+    page.get_by_label("Remark").fill(HOSTILE)
+    page.keyboard.press("Enter")
+    page.get_by_role("row", name="signed by").get_by_text("Anna Berg (admin, account local)").wait_for()
+    page.get_by_role("row", name="remark").get_by_text(HOSTILE).wait_for()
+    log = path.with_name("run.mcap")
+    log.write_bytes(log.read_bytes() + b"x")
+    page.reload()
+    page.get_by_text("The signature does not hold: the log is another one").wait_for()
+    assert page.evaluate("window.pwned") is None
+
+
+@pytest.mark.heavy
 def test_a_run_is_tagged_archived_and_deleted_from_its_page(page, served):
     runs = []
     for note in ("done", "done"):

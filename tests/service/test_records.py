@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 
+from tdhil.report.acceptance import signature_rows
+from tdhil.service.acceptance_signature import AcceptanceSignature, hash_of
 from tdhil.service.annotations import Annotations, tags_of
 from tdhil.service.run_state import State, now, way_to
 from tdhil.service.schemas import ReplayView
@@ -148,6 +150,110 @@ def test_a_fleet_of_the_service_s_runs_leaves_archived_ones_out(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     assert _own_logs(Store(tmp_path.relative_to(tmp_path)), archived=False) == (f"runs/{runs[1]}/run.mcap",)
     assert len(_own_logs(Store(tmp_path), archived=True)) == 2
+
+
+# -- the signature of an acceptance
+
+ACCEPTANCE = {"verdict": "pass", "code": "", "off": [], "quantities": [
+    {"name": "inertia", "label": "moment of inertia J", "unit": "kg·m²", "expected": 104.0, "tolerance": 5.0,
+     "value": 104.0, "low": 100.0, "high": 108.0, "verdict": "pass", "text": "pass: expected 104, identified 104"}]}
+
+
+def accepted(call, service, verdict="pass"):
+    run = ended(call, service)
+    path = service.store.place(run) / "result.json"
+    write_json(path, {**json.loads(path.read_bytes()), "acceptance": {**ACCEPTANCE, "verdict": verdict}})
+    return run, {**SIGNED, "verdict": verdict, "log_sha256": call("GET", f"/runs/{run}/acceptance", 200)["log_sha256"]}
+
+
+SIGNED = {"name": "Anna Berg", "remark": ""}
+
+
+def test_a_person_signs_the_verdict_and_the_log_once_and_the_audit_has_it(call, service):
+    run, sent = accepted(call, service)
+    log = service.store.place(run) / "run.mcap"
+    assert sent["log_sha256"] == hashlib.sha256(log.read_bytes()).hexdigest()
+    found = call("POST", f"/runs/{run}/acceptance", 200, json=sent)
+    signature = found["signature"]
+    assert (signature["name"], signature["by"], signature["role"], signature["verdict"], found["problem"]) == (
+        "Anna Berg", "local", "admin", "pass", "")
+    assert call("GET", f"/runs/{run}", 200)["signature"] == signature
+    (entry,) = noted(service, "acceptance signed")
+    assert (entry.run, dict(entry.details)) == (run, signature)
+    refused = call("POST", f"/runs/{run}/acceptance", 409, json=sent)["error"]["message"]
+    assert "signed already: by Anna Berg" in refused
+    refused = call("POST", f"/runs/{run}/delete", 409, json={"confirm": run})["error"]["message"]
+    assert "acceptance of this run is signed" in refused
+    call("POST", f"/runs/{run}/annotations", 200, json={"note": "later"})      # beside the signed log, not in it
+    assert call("GET", f"/runs/{run}/acceptance", 200)["problem"] == ""
+    result = service.store.place(run) / "result.json"
+    before = result.read_bytes()
+    write_json(result, {"acceptance": {**ACCEPTANCE, "quantities": []}})
+    assert "another one than the signed one" in call("GET", f"/runs/{run}/acceptance", 200)["problem"]
+    result.write_bytes(before)
+    log.write_bytes(log.read_bytes() + b"x")
+    assert "the log is another one" in call("GET", f"/runs/{run}/acceptance", 200)["problem"]
+
+
+@pytest.mark.parametrize("verdict", ["fail", "cannot tell"])
+def test_what_is_no_pass_is_signed_with_a_remark_only(call, service, verdict):
+    run, sent = accepted(call, service, verdict)
+    found = call("POST", f"/runs/{run}/acceptance", 422, json={**sent, "name": " ", "remark": " "})
+    assert [(one["option"], verdict in one["message"]) for one in found["fields"]] == [
+        ("name", False), ("remark", True)]
+    found = call("POST", f"/runs/{run}/acceptance", 200, json={**sent, "remark": "bearing is replaced next week"})
+    assert found["signature"]["remark"] == "bearing is replaced next week"
+
+
+def test_another_verdict_or_log_than_the_person_saw_is_refused_in_words(call, service):
+    run, sent = accepted(call, service, "fail")
+    for other, words in (({"verdict": "pass"}, "the verdict is fail, not pass"),
+                         ({"log_sha256": "0" * 64}, "another one than the page showed")):
+        found = call("POST", f"/runs/{run}/acceptance", 409, json={**sent, "remark": "x", **other})["error"]
+        assert words in found["message"] and "Load the page again" in found["message"]
+    assert service.web.records.signature(run) is None and not noted(service, "acceptance signed")
+    assert "no values were expected" in call(
+        "GET", f"/runs/{ended(call, service)}/acceptance", 409)["error"]["message"]
+    moving = call.start("b", "hold")["id"]
+    service.wait(moving, "moving")
+    assert "has not ended" in call("POST", f"/runs/{moving}/acceptance", 409, json=sent)["error"]["message"]
+
+
+def test_a_report_older_than_the_signature_is_made_again(call, service, monkeypatch):
+    run, sent = accepted(call, service)
+    folder, made = service.store.place(run), []
+    for name in ("report.html", "report.pdf"):
+        (folder / name).write_text("before")
+
+    def work(what, run, asked):
+        made.append((what, asked["name"]))
+        (folder / asked["name"]).write_text("signed")
+        return {"document": {}}
+
+    monkeypatch.setattr(service.supervisor, "work", work)
+    assert call("GET", f"/runs/{run}/report.html", 200).text == "before" and not made
+    call("POST", f"/runs/{run}/acceptance", 200, json=sent)
+    for name in ("report.html", "report.pdf", "report.html"):
+        assert call("GET", f"/runs/{run}/{name}", 200).text == "signed"
+    assert made == [("report", "report.html"), ("report", "report.pdf")]
+
+
+def test_the_worker_puts_the_signature_into_the_document_of_the_report(tmp_path, monkeypatch):
+    from tdhil.service.worker import _signed
+
+    monkeypatch.chdir(tmp_path)
+    document = {"acceptance": ACCEPTANCE}
+    (tmp_path / "run.mcap").write_bytes(b"log")
+    assert _signed(document) == document
+    digest = hashlib.sha256(b"log").hexdigest()
+    signature = AcceptanceSignature("Anna", "engineer", "anna", now(), "", "pass", digest, hash_of(ACCEPTANCE))
+    write_json(tmp_path / "acceptance_signed.json", asdict(signature))
+    rows = dict(signature_rows(_signed(document)["acceptance"]))
+    assert rows["signed by"] == "Anna (engineer, account anna)" and rows["SHA-256 of the log"] == digest
+    assert "signature does not hold" not in rows and set(rows["signature"]) == {"_"}
+    (tmp_path / "run.mcap").write_bytes(b"other")
+    assert "another one" in dict(signature_rows(_signed(document)["acceptance"]))["signature does not hold"]
+    assert [name for name, _ in signature_rows(ACCEPTANCE)] == ["accepted by"]
 
 
 # -- deletion

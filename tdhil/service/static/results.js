@@ -159,6 +159,7 @@
       }
     });
     annotations(id);
+    signature(id);
     const sign = byId("sign");
     if (sign) sign.addEventListener("submit", async (event) => {
       event.preventDefault();
@@ -173,6 +174,30 @@
 
   /** Tags as badges. */
   const tags = (found) => found.map((one) => el("span", { class: "tag" }, one));
+
+  /** The signature under an acceptance: whether it still holds; or the form, once the hash of the log is known. */
+  async function signature(id) {
+    const where = byId("acceptance"), form = byId("accept"), problem = byId("signature-problem");
+    if (!where || (!form && !problem)) return;
+    const said = form ? byId("accept-said") : problem, fail = (text) => { said.textContent = text; said.hidden = false; };
+    let found = null;
+    if (form) form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      submits(form, said, async () => {
+        await call("POST", `/runs/${id}/acceptance`, { name: form.elements.name.value, remark: form.elements.remark.value, verdict: where.dataset.verdict, log_sha256: found.log_sha256 });
+        location.reload();
+      });
+    });
+    try {
+      found = await call("GET", `/runs/${id}/acceptance`, undefined, {}, 120000);
+      if (found.problem) fail(`The signature does not hold: ${found.problem}.`);
+      if (!form) return;
+      byId("log-sha256").textContent = found.log_sha256;
+      form.querySelector("button").disabled = false;
+    } catch (error) {
+      fail(error instanceof Refused ? error.message : "No answer from tdhil serve.");
+    }
+  }
 
   /** Forms that change the records of a run: annotations, archive, deletion. Each is there for its role only. */
   function annotations(id) {
