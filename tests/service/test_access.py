@@ -155,7 +155,8 @@ def test_who_may_what_is_as_it_was_agreed(guarded):
         "operator": {"start", "confirm", "renew", "ask_replay", "calibration", "ask_fleet", "stop_fleet", "pace",
                      "annotate"},
         "engineer": {"edit_rig", "sign_off", "archive", "sign_acceptance"},
-        "admin": {"audit", "delete_run", "accounts", "add_user", "set_password", "remove_user", "add_token", "remove_token"},
+        "admin": {"audit", "delete_run", "accounts", "add_user", "set_password", "remove_user", "add_token",
+                  "remove_token"},
         "anybody": {"login", "logout", "me", "health", "openapi"},
     }
     changes_nothing = {"plan", "password", *STOPS}         # of somebody else's

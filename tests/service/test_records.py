@@ -316,6 +316,15 @@ def test_a_deletion_that_was_cut_short_is_finished_at_the_next_start(tmp_path, s
     assert list(store.runs.iterdir()) == []
 
 
+def test_a_run_is_kept_until_its_process_has_ended_and_can_be_signed_and_archived_before(call, service, monkeypatch):
+    run, sent = accepted(call, service)
+    monkeypatch.setattr("tdhil.service.records.lives", lambda folder: True)
+    refused = call("POST", f"/runs/{run}/delete", 409, json={"confirm": run})["error"]["message"]
+    assert "about to end" in refused and "Try again" in refused
+    call("POST", f"/runs/{run}/acceptance", 200, json=sent)
+    call("POST", f"/runs/{run}/archive", 200, json={"archived": True})
+
+
 def test_a_run_that_is_replayed_is_kept_until_that_has_ended(call, service):
     run = ended(call, service)
     service.web.waiting_replays[run, "001"] = ReplayView("001", {}, now(), "local", "waiting")

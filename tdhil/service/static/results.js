@@ -256,7 +256,7 @@
         return el("tr", {}, el("td", { class: "pick" }, box),
           el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}` }, when(one.asked))), el("td", {}, one.rig, " ", badge(one.simulated) || "", " ", rehearsal(one.rehearsal) || ""),
           el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict || ""),
-          el("td", {}, said(one) || "", ...(one.tags.length ? [" ", ...tags(one.tags)] : []), one.archived ? el("span", { class: "badge" }, "ARCHIVED") : null));
+          el("td", {}, said(one) || "", ...(one.tags.length ? [" ", ...tags(one.tags)] : []), ...(one.archived ? [" ", el("span", { class: "badge" }, "ARCHIVED")] : [])));
       }) : [el("tr", {}, el("td", { colspan: 7, class: "dim" }, form.elements.text.value || form.elements.state.value ? "no run matches" : "no run yet"))]));
     }
     async function look() {
