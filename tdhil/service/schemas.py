@@ -345,7 +345,7 @@ class AnnotationsBody(Body):
 
 @dataclass(frozen=True)
 class ArchiveBody(Body):
-    """Whether lists and histories leave the run out unless they are asked for archived runs."""
+    """State of the archive: lists and histories leave out an archived run."""
 
     archived: bool
 

@@ -789,7 +789,7 @@ def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypat
         "results": [], "differences": [], "settings": [], "apparent_inertia": [], "friction": []}}
     page.goto("/runs")
     button = page.get_by_role("button", name="Compare")
-    boxes = page.get_by_role("checkbox")
+    boxes = page.locator("#runs").get_by_role("checkbox")
     boxes.first.check()
     assert button.is_disabled()
     boxes.nth(1).check()
