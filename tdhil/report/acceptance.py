@@ -73,7 +73,9 @@ def signature_rows(acceptance: Part) -> list[tuple[str, str]]:
     signed = acceptance.get("signature")
     if not isinstance(signed, Mapping):
         return [("accepted by", f"name, date, signature: {SIGNATURE_LINE}")]
-    rows = [("signed by", f"{signed['name']} ({signed['role']}, account {signed['by']})"), ("date", str(signed["at"])),
+    at = str(signed["at"])                 # ISO 8601 in UTC, to the millisecond
+    rows = [("signed by", f"{signed['name']} ({signed['role']}, account {signed['by']})"),
+            ("date", f"{at[:10]} {at[11:19]} UTC"),
             ("signed verdict", str(signed["verdict"])), ("remark", str(signed["remark"]) or "none"),
             ("SHA-256 of the log", str(signed["log_sha256"]))]
     if signed.get("problem"):

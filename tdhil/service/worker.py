@@ -18,7 +18,7 @@ from tdhil.errors import UsageError
 from tdhil.numerics import prepare
 from tdhil.service.run_state import Told
 
-NICE: Final = {"plan": 5, "trend": 5, "pace": 0}      # a page waits for these; a run in real time has 0, too
+NICE: Final = {"plan": 5, "trend": 5, "report": 5, "pace": 0}     # a page waits for these; a run by the clock has 0
 USUAL_NICE: Final = 19
 
 

@@ -246,10 +246,12 @@ def test_the_worker_puts_the_signature_into_the_document_of_the_report(tmp_path,
     (tmp_path / "run.mcap").write_bytes(b"log")
     assert _signed(document) == document
     digest = hashlib.sha256(b"log").hexdigest()
-    signature = AcceptanceSignature("Anna", "engineer", "anna", now(), "", "pass", digest, hash_of(ACCEPTANCE))
+    signature = AcceptanceSignature("Anna", "engineer", "anna", "2026-05-01T12:30:00.123Z", "", "pass", digest,
+                                    hash_of(ACCEPTANCE))
     write_json(tmp_path / "acceptance_signed.json", asdict(signature))
     rows = dict(signature_rows(_signed(document)["acceptance"]))
     assert rows["signed by"] == "Anna (engineer, account anna)" and rows["SHA-256 of the log"] == digest
+    assert rows["date"] == "2026-05-01 12:30:00 UTC"
     assert "signature does not hold" not in rows and set(rows["signature"]) == {"_"}
     (tmp_path / "run.mcap").write_bytes(b"other")
     assert "another one" in dict(signature_rows(_signed(document)["acceptance"]))["signature does not hold"]
