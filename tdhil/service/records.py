@@ -200,7 +200,7 @@ class RunRecords:
         status, where = self._store.status(run), f"run {run}"
         if not status.ended:
             raise Conflict(f"the run has not ended: it is {status.state}", where=where,
-                           next_step="Wait until it has ended, or stop it", entry=MessageCode.NOT_READY)
+                           next_step="Wait until it has ended, or stop it")
         if status.state is State.STOP_NOT_CONFIRMED and self._store.signed_off(run) is None:
             raise Conflict("the stop of this run was neither confirmed nor signed off", where=where,
                            next_step="Check that the shaft is at standstill, then sign it off")
@@ -209,10 +209,10 @@ class RunRecords:
         """Raise Conflict while a process still has the files of the run open."""
         if run in self._supervisor.live() or lives(self._store.place(run)):
             raise Conflict("the process of the run is about to end", where=f"run {run}",
-                           next_step="Try again in some seconds", entry=MessageCode.NOT_READY)
+                           next_step="Try again in some seconds")
         if self._reading(run):
             raise Conflict("the log is being identified again", where=f"run {run}",
-                           next_step="Wait until that has ended", entry=MessageCode.NOT_READY)
+                           next_step="Wait until that has ended")
 
     def _calibration_from(self, log_sha256: str) -> Path | None:
         """Return the calibration file, beside a rig's file or named in it, that was made from this log."""
