@@ -65,6 +65,24 @@ def acceptance_rows(acceptance: Part | None) -> list[tuple[str, str]]:
             *(("off", with_code(one, acceptance["code"])) for one in acceptance["off"])]
 
 
+SIGNATURE_LINE: Final = "______________________________"
+
+
+def signature_rows(acceptance: Part) -> list[tuple[str, str]]:
+    """Return the line to sign on, as names and texts. A signature of the service (``signature``) stands above it."""
+    signed = acceptance.get("signature")
+    if not isinstance(signed, Mapping):
+        return [("accepted by", f"name, date, signature: {SIGNATURE_LINE}")]
+    at = str(signed["at"])                 # ISO 8601 in UTC, to the millisecond
+    rows = [("signed by", f"{signed['name']} ({signed['role']}, account {signed['by']})"),
+            ("date", f"{at[:10]} {at[11:19]} UTC"),
+            ("signed verdict", str(signed["verdict"])), ("remark", str(signed["remark"]) or "none"),
+            ("SHA-256 of the log", str(signed["log_sha256"]))]
+    if signed.get("problem"):
+        rows.append(("signature does not hold", str(signed["problem"])))
+    return [*rows, ("signature", SIGNATURE_LINE)]
+
+
 def _judged(expected: Expectation, document: Part) -> Accepted:
     quantity = ACCEPTED_QUANTITIES[expected.name]
     value, low, high = _identified(expected.name, quantity.at, document)

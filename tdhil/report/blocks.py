@@ -14,7 +14,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from tdhil.recording import Recording
-from tdhil.report.acceptance import acceptance_rows
+from tdhil.report.acceptance import acceptance_rows, signature_rows
 from tdhil.report.card import COMPLIANT, estimate_text, inertia_text, minutes, plus_minus, rounded, sentence
 from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows
 from tdhil.report.labels import ACCELERATION_REGRESSION, ESTIMATES, MOMENTUM_CROSS_CHECK, UNCERTAINTY_BUDGET
@@ -177,8 +177,7 @@ def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Rep
     if rehearsed := rehearsal_rows(document.get("rehearsal")):
         yield ReportSection("Rehearsal", (Pairs(tuple(rehearsed)),))
     if accepted := acceptance_rows(document.get("acceptance")):
-        signature = ("accepted by", "name, date, signature: ______________________________")
-        yield ReportSection("Acceptance", (Pairs((*accepted, signature)),))
+        yield ReportSection("Acceptance", (Pairs((*accepted, *signature_rows(document["acceptance"]))),))
     yield ReportSection("The run", (Pairs(tuple(_run_rows(document, recording))),))
     if len(recording.time_s):
         picture = Picture(partial(draw_run, recording=recording), 2.9, "Reported values, not smoothed. Green: "

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 from starlette.responses import FileResponse, Response, StreamingResponse
 
 from tdhil.errors import MessageCode, UsageError
+from tdhil.service.acceptance_signature import FILE
 from tdhil.service.access import principal
 from tdhil.service.middleware import off
 from tdhil.service.routing import api
@@ -46,19 +47,33 @@ async def log(site: Site, request: Request, body: None) -> Response:
 
 
 async def report(site: Site, request: Request, body: None) -> Response:
-    """Return the report, for display in the browser."""
+    """Return the report, for display in the browser. It is made again after a signature."""
+    await _renew_signed(site, request.path_params["run"], "report.html")
     response = await _file(site, request, "report.html", "text/html", shown=True)
     response.headers["content-security-policy"] = REPORT_POLICY
     return response
 
 
 async def report_pdf(site: Site, request: Request, body: None) -> Response:
-    """Return the report as PDF on A4 pages. It is made at the first request."""
+    """Return the report as PDF on A4 pages. It is made at the first request, and again after a signature."""
     run = request.path_params["run"]
+    await _renew_signed(site, run, "report.pdf")
     folder = await off(lambda: site.store.place(run))
     if not (folder / "report.pdf").exists() and (folder / "result.json").exists():
         await site.work("report", run, {"name": "report.pdf"})
     return await _file(site, request, "report.pdf", "application/pdf")
+
+
+async def _renew_signed(site: Site, run: str, name: str) -> None:
+    """Make a report again that is older than the signature under the acceptance. Raises NotThere and Refused."""
+    folder = await off(lambda: site.store.place(run))
+
+    def outdated() -> bool:
+        signed, made = folder / FILE, folder / name
+        return signed.is_file() and made.is_file() and made.stat().st_mtime_ns <= signed.stat().st_mtime_ns
+
+    if await off(outdated):
+        await site.work("report", run, {"name": name})
 
 
 async def result(site: Site, request: Request, body: None) -> Response:

@@ -45,7 +45,7 @@ LOOK_S: Final = 0.3
 class FleetView:
     """State of a fleet request. ``held``: it waits until no shaft turns; ``left_s``: estimated remaining time, s.
 
-    ``summary`` is the document of `tdhil fleet --json`.
+    ``summary`` is the document of `tdhil fleet --json`. ``archived``: the service's archived runs are included.
     """
 
     id: str
@@ -62,6 +62,7 @@ class FleetView:
     left_s: float | None = None
     summary: dict[str, Any] | None = None
     error: Told | None = None
+    archived: bool = False
 
 
 @dataclass
@@ -102,10 +103,14 @@ class Fleets:
             raise NotThere("this fleet does not exist", where=f"fleet {fleet[:40]}", next_step="See the list of fleets")
         return found
 
-    def ask(self, folder: str, below: str, settings: Mapping[str, Any], who: str) -> FleetView:
+    def ask(
+        self, folder: str, below: str, settings: Mapping[str, Any], who: str, *, archived: bool = False,
+    ) -> FleetView:
         """Start a request, or continue an earlier one. Raises UsageError, and Conflict while another request runs."""
         self._check(folder, below)
-        plain = {"folder": folder, "below": below, "settings": dict(settings)}
+        plain: dict[str, Any] = {"folder": folder, "below": below, "settings": dict(settings)}
+        if archived:
+            plain["archived"] = True
         fleet = hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:12]
         place = self._places / fleet
         with self._lock:
@@ -123,7 +128,7 @@ class Fleets:
                 [sys.executable, "-m", "tdhil.service.fleets", str(place)], stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE, start_new_session=True,
             )
-            view = FleetView(fleet, folder, below, dict(settings), asked, who, "running")
+            view = FleetView(fleet, folder, below, dict(settings), asked, who, "running", archived=archived)
             self._going = going = _Going(view, process, began_s=time.monotonic())
         for work in (self._listen, self._gate):
             threading.Thread(target=work, args=(going,), daemon=True).start()
@@ -296,6 +301,12 @@ class _Teller:
         os.kill(os.getpid(), signal.SIGINT)
 
 
+def _own_logs(store: Store, *, archived: bool) -> tuple[str, ...]:
+    """Return the logs of the service's runs, from the folder of the service; archived ones only with ``archived``."""
+    runs = sorted(one for one in store.ids() if archived or not store.annotations(one).archived)
+    return tuple(str(path) for one in runs if (path := store.runs / one / "run.mcap").is_file())
+
+
 def main(folder: Path) -> int:
     """Compute the request of this folder and write its outcome to stdout. Return 0."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -310,7 +321,7 @@ def main(folder: Path) -> int:
         os.chdir(request["root"])
         roots: tuple[str, ...] = (request["below"] or ".",)
         if request["folder"] == RUNS:
-            roots = tuple(sorted(str(path) for path in Path("runs").glob("*/run.mcap")))
+            roots = _own_logs(Store(Path()), archived=bool(request.get("archived")))
         summary = run_fleet(
             FleetRequest(roots, folder / TABLE, FleetSettings(**request["settings"]), jobs=usable_cores()), teller)
         found = summary.document() | {"out": TABLE}

@@ -9,6 +9,7 @@ from tdhil.errors import MessageCode, UsageError
 from tdhil.service.access import address_of, principal, require_options
 from tdhil.service.middleware import off
 from tdhil.service.routing import api
+from tdhil.service.run_routes import archived_too
 from tdhil.service.run_state import Conflict, NotAllowed
 from tdhil.service.schemas import (
     CalibrationBody,
@@ -112,7 +113,8 @@ async def trend(site: Site, request: Request, body: None) -> TrendView:
     """Return how the results of a rig changed over time."""
     which = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
 
-    found = await off(lambda: site.trend_rows(which.id))
+    archived = archived_too(request)
+    found = await off(lambda: site.trend_rows(which.id, archived=archived))
     if not found:
         nothing = {"rig": which.id, "logs": 0, "results": 0, "notes": ["no run has a result yet"], "quantities": []}
         return TrendView(which.id, nothing)

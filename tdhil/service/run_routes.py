@@ -1,4 +1,4 @@
-"""The routes of a run: lists and comparison, confirmation, lease, stop, sign-off, replays."""
+"""The routes of a run: lists and comparison, confirmation, lease, stop, sign-off, annotations, deletion, replays."""
 
 from __future__ import annotations
 
@@ -12,19 +12,26 @@ import anyio
 from tdhil.config import ASKED_AGAIN, resolve
 from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.access import principal
+from tdhil.service.accounts import ROLES
 from tdhil.service.attendance import LEASE_S
 from tdhil.service.middleware import off, told_of
 from tdhil.service.routing import api
 from tdhil.service.run_state import NotThere, State, now
 from tdhil.service.schemas import (
+    AcceptanceView,
+    AnnotationsBody,
+    ArchiveBody,
     CompareView,
     ConfirmBody,
+    DeleteBody,
+    DeletedView,
     FleetBody,
     LeaseBody,
     LeaseView,
     ReplayBody,
     ReplayView,
     RunView,
+    SignatureBody,
     SignOffBody,
     plain,
 )
@@ -53,6 +60,11 @@ def routes(site: Site) -> list[Route]:
         api(site, "renew", renew),
         api(site, "stop", stop),
         api(site, "sign_off", sign_off),
+        api(site, "annotate", annotate),
+        api(site, "archive", archive),
+        api(site, "delete_run", delete_run),
+        api(site, "acceptance", acceptance),
+        api(site, "sign_acceptance", sign_acceptance),
         api(site, "ask_replay", ask_replay),
         api(site, "replay", replay),
     ]
@@ -70,7 +82,16 @@ async def runs(site: Site, request: Request, body: None) -> list[Summary]:
     text = query.get("text", "")
     if len(text) > LONGEST_SEARCH:
         raise UsageError(f"must be at most {LONGEST_SEARCH} characters", where="text", entry=MessageCode.REQUEST_WRONG)
-    return await off(lambda: site.list_runs(query.get("rig"), state, int(limit), text))
+    archived = archived_too(request)
+    return await off(lambda: site.list_runs(query.get("rig"), state, int(limit), text, archived=archived))
+
+
+def archived_too(request: Request) -> bool:
+    """Return whether the request asks for archived runs, too. Raises UsageError."""
+    text = request.query_params.get("archived", "false")
+    if text not in ("true", "false"):
+        raise UsageError("must be true or false", where="archived", entry=MessageCode.REQUEST_WRONG)
+    return bool(text == "true")
 
 
 async def compare(site: Site, request: Request, body: None) -> CompareView:
@@ -79,9 +100,13 @@ async def compare(site: Site, request: Request, body: None) -> CompareView:
     if not 2 <= len(set(which)) == len(which) <= 8:
         raise UsageError("name two to eight different runs", where="runs", next_step="?runs=ID,ID",
                          entry=MessageCode.REQUEST_WRONG)
+    archived = archived_too(request)
     for one in which:
         if not (await off(partial(site.store.place, one)) / "run.mcap").is_file():
             raise NotThere("this run has no log", where=f"run {one}")
+        if not archived and (await off(partial(site.store.annotations, one))).archived:
+            raise UsageError("this run is archived", where=f"run {one}", next_step="Add archived=true, or leave it out",
+                             entry=MessageCode.REQUEST_WRONG)
     asked = {"runs": which, "runs_folder": str(site.store.runs)}
     return CompareView(which, await off(partial(_asked_at, site, which, await site.work("compare", None, asked))))
 
@@ -141,6 +166,47 @@ async def sign_off(site: Site, request: Request, body: SignOffBody) -> RunView:
                          entry=MessageCode.REQUEST_WRONG)
     await off(lambda: site.supervisor.sign_off(which, who, body.note))
     return await off(lambda: site.run_view(which))
+
+
+async def annotate(site: Site, request: Request, body: AnnotationsBody) -> RunView:
+    """Edit tags, operator and note of a run."""
+    which, who = request.path_params["run"], principal(request).name
+    await off(lambda: site.records.annotate(which, who, tags=body.tags, operator=body.operator, note=body.note))
+    return await off(lambda: site.run_view(which))
+
+
+async def archive(site: Site, request: Request, body: ArchiveBody) -> RunView:
+    """Archive a run, or show it again."""
+    which, who = request.path_params["run"], principal(request).name
+    await off(lambda: site.records.archive(which, who, archived=body.archived))
+    return await off(lambda: site.run_view(which))
+
+
+async def delete_run(site: Site, request: Request, body: DeleteBody) -> DeletedView:
+    """Delete a run with all its files."""
+    which, who = request.path_params["run"], principal(request).name
+    return DeletedView(which, *await off(lambda: site.records.delete(which, who, body.confirm)))
+
+
+async def acceptance(site: Site, request: Request, body: None) -> AcceptanceView:
+    """Return the acceptance of a run."""
+    return await off(lambda: _acceptance_of(site, request.path_params["run"]))
+
+
+async def sign_acceptance(site: Site, request: Request, body: SignatureBody) -> AcceptanceView:
+    """Sign the acceptance of a run with the highest role of the client."""
+    which, who = request.path_params["run"], principal(request)
+    role = next(one for one in reversed(ROLES) if one in who.roles)
+    await off(lambda: site.records.sign_acceptance(
+        which, who.name, role, name=body.name, verdict=body.verdict, log_sha256=body.log_sha256, remark=body.remark))
+    return await off(lambda: _acceptance_of(site, which))
+
+
+def _acceptance_of(site: Site, run: str) -> AcceptanceView:
+    found, log_sha256 = site.records.acceptance(run)
+    signature = site.records.signature(run)
+    problem = "" if signature is None else signature.problem(found, log_sha256)
+    return AcceptanceView(run, found, log_sha256, signature, problem)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

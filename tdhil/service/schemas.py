@@ -13,7 +13,9 @@ from typing import Any, ClassVar, Final, Literal
 
 from pydantic import ConfigDict, TypeAdapter
 
+from tdhil.service.acceptance_signature import AcceptanceSignature
 from tdhil.service.accounts import Role
+from tdhil.service.annotations import AnnotationEdit
 from tdhil.service.audit import Broken, Entry
 from tdhil.service.fleets import FleetView
 from tdhil.service.foxglove import PROTOCOLS
@@ -69,7 +71,11 @@ class ReplayView:
 
 @dataclass(frozen=True)
 class RunView:
-    """A run without its samples. ``result``: document of `tdhil identify --json`; ``files``: names for downloads."""
+    """A run without its samples. ``result``: document of `tdhil identify --json`; ``files``: names for downloads.
+
+    ``operator``, ``note``: as edited later, else as in ``options``. ``edits``: each later edit, with old and new value.
+    ``signature``: under its acceptance.
+    """
 
     id: str
     rig: str
@@ -100,6 +106,32 @@ class RunView:
     alive: bool
     rehearsal: bool = False
     rehearsal_verdict: dict[str, Any] | None = None
+    operator: str = ""
+    note: str = ""
+    tags: list[str] = field(default_factory=list)
+    archived: bool = False
+    edits: list[AnnotationEdit] = field(default_factory=list)
+    signature: AcceptanceSignature | None = None
+
+
+@dataclass(frozen=True)
+class DeletedView:
+    """A deleted run: its files, and the SHA-256 of its log ('' without one). The audit keeps both."""
+
+    run: str
+    files: list[str]
+    log_sha256: str
+
+
+@dataclass(frozen=True)
+class AcceptanceView:
+    """The acceptance of a run, the SHA-256 of its log, and its signature. ``problem``: why it is not valid."""
+
+    run: str
+    acceptance: dict[str, Any]
+    log_sha256: str
+    signature: AcceptanceSignature | None
+    problem: str
 
 
 @dataclass(frozen=True)
@@ -303,6 +335,42 @@ class SignOffBody(Body):
 
 
 @dataclass(frozen=True)
+class AnnotationsBody(Body):
+    """New annotations of a run. None: the value stays."""
+
+    tags: list[str] | None = None
+    operator: str | None = None
+    note: str | None = None
+
+
+@dataclass(frozen=True)
+class ArchiveBody(Body):
+    """State of the archive: lists and histories leave out an archived run."""
+
+    archived: bool
+
+
+@dataclass(frozen=True)
+class DeleteBody(Body):
+    """Confirmation of a deletion: the run's id, as the user typed it."""
+
+    confirm: str
+
+
+@dataclass(frozen=True)
+class SignatureBody(Body):
+    """Signature under an acceptance. ``verdict``, ``log_sha256``: as the person saw them. ``name``: of the person.
+
+    ``remark`` is required unless the verdict is a pass.
+    """
+
+    name: str
+    verdict: str
+    log_sha256: str
+    remark: str = ""
+
+
+@dataclass(frozen=True)
 class ReplayBody(Body):
     """Settings of a replay. None: the setting of the run. A relative value is a number, or a text such as ``1%``."""
 
@@ -378,6 +446,7 @@ class FleetBody(Body):
     """Logs to identify again, and settings; None: the setting of each run.
 
     ``folder``: a name from `/fleets/folders`, '' for the service's own runs; ``below``: a folder inside it.
+    ``archived``: whether the service's own runs include the archived ones.
     """
 
     folder: str = ""
@@ -385,6 +454,7 @@ class FleetBody(Body):
     model: str | None = None
     tolerance: float | str | None = None
     confidence: float | str | None = None
+    archived: bool = False
 
 
 @dataclass(frozen=True)
@@ -415,6 +485,7 @@ class Route:
     headers: Mapping[str, str] = field(default_factory=dict)
 
 
+_ARCHIVED: Final = {"archived": "true: archived runs too"}
 _RANGE: Final = {"Range": "a part of it, such as bytes=0-99"}
 
 
@@ -429,7 +500,7 @@ ROUTES: Final = (
     Route("POST", "/rigs/{rig}/file", "edit_rig", "Change a rig's file (not the drive's address)",
           "engineer", {200: RigFileView}, RigFileBody, (404, 409, 422, 503)),
     Route("GET", "/rigs/{rig}/trend", "trend", "J, friction and lags over time, and whether they changed", "viewer",
-          {200: TrendView}, errors=(404, 422)),
+          {200: TrendView}, errors=(404, 422), query=_ARCHIVED),
     Route("POST", "/rigs/{rig}/calibration", "calibration", "Calibrate the torque by two runs; nothing is connected,"
           " and nothing is stored", "operator", {200: CalibrationView}, CalibrationBody, (403, 404, 422)),
     Route("POST", "/rigs/{rig}/plan", "plan", "Plan a run; nothing is connected", "viewer", {200: PlanView},
@@ -441,12 +512,12 @@ ROUTES: Final = (
           headers={"Idempotency-Key": "the same key returns the same run and never starts a second one"}),
     Route("POST", "/rigs/{rig}/stop", "stop_rig", "Stop the rig's run; without a run, tdhil stop on its drive, which"
           " needs an operator if no tdhil moves it", "viewer", {200: StoppedView}, Nothing, (403, 404, 503, 504)),
-    Route("GET", "/runs", "runs", "The runs, the newest first", "viewer", {200: list[Summary]},
+    Route("GET", "/runs", "runs", "The runs, the newest first", "viewer", {200: list[Summary]}, errors=(422,),
           query={"rig": "runs of this rig only", "state": "runs in this state only",
-                 "text": "runs with these words in id, rig, state, time, user, verdict, operator or note",
-                 "limit": "most runs to return (100)"}),
+                 "text": "runs with these words in id, rig, state, time, user, verdict, operator, note or tags",
+                 "limit": "most runs to return (100)", **_ARCHIVED}),
     Route("GET", "/runs/compare", "compare", "Compare runs", "viewer", {200: CompareView}, errors=(404, 422),
-          query={"runs": "two to eight runs, separated by commas"}),
+          query={"runs": "two to eight runs, separated by commas", **_ARCHIVED}),
     Route("GET", "/runs/{run}", "run", "One run", "viewer", {200: RunView}, errors=(404,)),
     Route("POST", "/runs/{run}/confirm", "confirm", "Confirm motion with the code shown at the rig", "operator",
           {200: RunView}, ConfirmBody, (403, 404, 409, 422)),
@@ -456,6 +527,16 @@ ROUTES: Final = (
           Nothing, (403, 404, 503, 504)),
     Route("POST", "/runs/{run}/sign-off", "sign_off", "Sign off a stop that was not confirmed", "engineer",
           {200: RunView}, SignOffBody, (403, 404, 409, 422)),
+    Route("POST", "/runs/{run}/annotations", "annotate", "Edit tags, operator and note of a run; its log stays as"
+          " recorded", "operator", {200: RunView}, AnnotationsBody, (403, 404, 422, 503)),
+    Route("POST", "/runs/{run}/archive", "archive", "Hide a run from lists and histories, or show it again",
+          "engineer", {200: RunView}, ArchiveBody, (403, 404, 409, 422, 503)),
+    Route("POST", "/runs/{run}/delete", "delete_run", "Delete a run with all its files; the audit keeps the entry",
+          "admin", {200: DeletedView}, DeleteBody, (403, 404, 409, 422, 503)),
+    Route("GET", "/runs/{run}/acceptance", "acceptance", "The acceptance of a run, with its signature", "viewer",
+          {200: AcceptanceView}, errors=(404, 409)),
+    Route("POST", "/runs/{run}/acceptance", "sign_acceptance", "Sign the acceptance of a run, once", "engineer",
+          {200: AcceptanceView}, SignatureBody, (403, 404, 409, 422, 503)),
     Route("POST", "/runs/{run}/replays", "ask_replay", "Identify again; the first result is kept", "operator",
           {202: ReplayView, 200: ReplayView}, ReplayBody, (403, 404, 422)),
     Route("GET", "/runs/{run}/replays/{replay}", "replay", "One replay", "viewer", {200: ReplayView}, errors=(404,)),

@@ -24,6 +24,7 @@ from tdhil.service.access import Access
 from tdhil.service.answers import KeptAnswers
 from tdhil.service.fleets import Fleets
 from tdhil.service.live_feed import Feeds
+from tdhil.service.records import RunRecords
 from tdhil.service.run_channel import lives
 from tdhil.service.run_state import NotThere, Status
 from tdhil.service.schemas import ReplayView, RigView, RunView, adapter
@@ -82,6 +83,7 @@ class Site:
         self.logins = anyio.CapacityLimiter(1)         # limit of simultaneous password checks: each takes 32 MB
         self.waiting_replays: dict[tuple[str, str], ReplayView] = {}
         self.replay_names = threading.Lock()
+        self.records = RunRecords(supervisor, lambda run: any(one == run for one, _ in tuple(self.waiting_replays)))
         self.tasks: set[asyncio.Task[None]] = set()
         self._stops = ThreadPoolExecutor(STOPS, "stop")
         self._answers = KeptAnswers(self.store.runs)
@@ -137,25 +139,35 @@ class Site:
             next((one for one in last if one.inertia_kg_m2 is not None and not one.rehearsal), None),
         )
 
-    def list_runs(self, rig: str | None, state: str | None, limit: int, text: str = "") -> list[Summary]:
-        """Return runs from the index; from the files if the index is missing or out of date, as for a live run."""
+    def list_runs(
+        self, rig: str | None, state: str | None, limit: int, text: str = "", *, archived: bool = False,
+    ) -> list[Summary]:
+        """Return runs from the index; from the files if the index is missing or out of date, as for a live run.
+
+        Archived runs are included only with ``archived``.
+        """
         live = self.supervisor.ahead_of_the_index()
         now_live = []
         for run in live:
             with suppress(NotThere):
                 now_live.append(self.store.summary(run))
         try:
-            ended = [one for one in self.supervisor.index.find(rig=rig, state=state, text=text, limit=limit + len(live))
-                     if one.id not in live]
+            indexed = self.supervisor.index.find(rig=rig, state=state, text=text, limit=limit + len(live),
+                                                 archived=archived)
+            ended = [one for one in indexed if one.id not in live]
         except (sqlite3.Error, OSError):
             ended = [one for one in self.store.summaries() if one.id not in live]
         found = [one for one in (*now_live, *ended)
-                 if rig in (None, one.rig) and state in (None, one.state) and one.contains(text)]
+                 if rig in (None, one.rig) and state in (None, one.state) and one.contains(text)
+                 and (archived or not one.archived)]
         return sorted(found, key=lambda one: one.id, reverse=True)[:limit]
 
-    def trend_rows(self, rig: str) -> list[dict[str, Any]]:
-        """Return the rows of a rig's history, each with the time of the run's request, as on every page."""
-        runs = self.list_runs(rig, "done", TREND_RUNS)
+    def trend_rows(self, rig: str, *, archived: bool = False) -> list[dict[str, Any]]:
+        """Return the rows of a rig's history, each with the time of the run's request, as on every page.
+
+        Archived runs are included only with ``archived``.
+        """
+        runs = self.list_runs(rig, "done", TREND_RUNS, archived=archived)
         return [{**row, "date": _local(one.asked)} for one in runs
                 if (row := read_json(self.store.place(one.id) / "row.json")) is not None]
 
@@ -182,6 +194,7 @@ class Site:
         rig_name = request.rig
         with suppress(TdhilError):
             rig_name = self.supervisor.rigs.get(request.rig).name
+        annotations = self.store.annotations(run)
         found = [name for name in ("run.mcap", "recovered.mcap", "report.html", "result.json", "report.pdf")
                  if (folder / name).is_file()]
         return RunView(
@@ -192,6 +205,9 @@ class Site:
             status.error, status.exit_code, status.verdict,
             self.store.result(run), found, self.replays(run), read_json(folder / "signed_off.json"),
             lives(folder), request.rehearsal, None if status.rehearsal is None else dict(status.rehearsal),
+            annotations.text("operator", request.options), annotations.text("note", request.options),
+            list(annotations.tags), annotations.archived, list(annotations.edits),
+            self.records.signature(run),
         )
 
     def told(self) -> dict[str, Any]:

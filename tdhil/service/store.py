@@ -2,8 +2,8 @@
 
 ::
 
-    runs/<id>/request.json, state.json, connection.json, confirm.json, signed_off.json, result.json, run.mcap,
-              report.html, replays/
+    runs/<id>/request.json, state.json, connection.json, confirm.json, signed_off.json, annotations.json,
+              result.json, run.mcap, report.html, replays/
     index.sqlite
 """
 
@@ -13,16 +13,19 @@ import json
 import os
 import re
 import secrets
+import shutil
 import sqlite3
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from hashlib import file_digest
 from pathlib import Path
 from typing import Any, Final
 
-from tdhil.errors import LogUnopened
+from tdhil.errors import LogUnopened, UsageError
+from tdhil.service.annotations import Annotations
 from tdhil.service.run_state import NotThere, State, Status, now
 
 ID: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[0-9a-f]{6}")
@@ -33,6 +36,9 @@ RESERVE: Final = 2**16
 CONNECTION_FILE: Final = "connection.json"
 """File in a run's folder with the address of its drive, for a later stop (`tdhil.session.kept`)."""
 _RESERVE, _USED = ".reserve", ".state.json"
+_ANNOTATIONS: Final = "annotations.json"
+_DELETED: Final = ".deleted-"
+"""Start of the name of a run's folder during its deletion."""
 
 
 def write_whole(path: Path, data: bytes, mode: int | None = None) -> None:
@@ -64,6 +70,17 @@ def read_json(path: Path) -> dict[str, Any] | None:
             found = json.loads(path.read_bytes())
             return found if isinstance(found, dict) else None
     return None
+
+
+def sha256_of_file(path: Path) -> str:
+    """Return the SHA-256 of a file in hex; '' without the file. Raises UsageError if it can't be read."""
+    try:
+        with path.open("rb") as file:
+            return file_digest(file, "sha256").hexdigest()
+    except FileNotFoundError:
+        return ""
+    except OSError as error:
+        raise UsageError(f"can't be read ({error.strerror or error})", where=path.name) from error
 
 
 def _sync_folder(folder: Path) -> None:
@@ -121,30 +138,51 @@ class Summary:
     repeatability_rel: float | None = None
     exit_code: int | None = None
     rehearsal: bool = False                # whether a fault of the simulated drive was rehearsed
-    operator: str | None = None
+    operator: str | None = None            # as edited later, else as recorded; `note` too
     note: str | None = None
+    tags: tuple[str, ...] = ()
+    archived: bool = False
 
     def contains(self, text: str) -> bool:
         """Return whether every word of ``text`` occurs in a text of this row, in upper or lower case."""
-        said = " ".join(str(getattr(self, name) or "") for name in SEARCHED).casefold()
+        said = self.searched
         return all(word in said for word in text.casefold().split())
 
+    @property
+    def searched(self) -> str:
+        """Return the text in which a search looks, in lower case."""
+        kept = {**self.__dict__, "tags": ", ".join(self.tags)}
+        return " ".join(str(kept[name] or "") for name in SEARCHED).casefold()
 
-SEARCHED: Final = ("id", "rig", "state", "asked", "asked_by", "verdict", "operator", "note")
+
+SEARCHED: Final = ("id", "rig", "state", "asked", "asked_by", "verdict", "operator", "note", "tags")
 """Columns of `Summary` in which a search finds text."""
 
 
-def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any] | None) -> Summary:
+def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any] | None,
+               annotations: Annotations | None = None) -> Summary:
     """Return a run's row of the list from the contents of its files."""
     inertia = (result or {}).get("inertia_kg_m2") or {}
+    annotations = annotations or Annotations()
     return Summary(
         request.id, request.rig, status.state.value, request.asked, request.asked_by,
         status.at if status.ended else None,
         request.simulated if status.simulated is None else status.simulated,
         (result or {}).get("verdict"), inertia.get("value"), inertia.get("low_total"), inertia.get("high_total"),
         inertia.get("repeatability_rel"), status.exit_code, request.rehearsal,
-        *(None if (said := request.options.get(name)) is None else str(said) for name in ("operator", "note")),
+        annotations.text("operator", request.options) or None, annotations.text("note", request.options) or None,
+        annotations.tags, annotations.archived,
     )
+
+
+def _plain_row(summary: Summary) -> dict[str, Any]:
+    """Return the row as values of the index: its tags are one text, and so is all that a search looks in."""
+    return {**summary.__dict__, "tags": ", ".join(summary.tags), _SEARCHED: summary.searched}
+
+
+def _summary_of_row(plain: Mapping[str, Any]) -> Summary:
+    flags = {name: bool(plain[name]) for name in ("simulated", "rehearsal", "archived")}
+    return Summary(**{**plain, **flags, "tags": tuple(filter(None, plain["tags"].split(", ")))})
 
 
 class Store:
@@ -207,7 +245,33 @@ class Store:
         return read_json(self.place(run) / "result.json")
 
     def summary(self, run: str) -> Summary:
-        return summary_of(self.request(run), self.status(run), self.result(run))
+        return summary_of(self.request(run), self.status(run), self.result(run), self.annotations(run))
+
+    def annotations(self, run: str) -> Annotations:
+        """Return the present annotations of the run; none if the file can't be read."""
+        plain = read_json(self.place(run) / _ANNOTATIONS)
+        with suppress(TypeError):
+            return Annotations.of_plain(plain or {})
+        return Annotations()
+
+    def annotate(self, run: str, annotations: Annotations) -> None:
+        """Write the annotations of the run. Raises NotThere and OSError."""
+        write_json(self.place(run) / _ANNOTATIONS, annotations.plain())
+
+    def delete(self, run: str) -> None:
+        """Delete the folder of the run with all its files. Raises NotThere and OSError.
+
+        The folder first gets another name. So the run exists as a whole or not at all, also after a loss of power.
+        """
+        folder = self.place(run)
+        gone = folder.rename(folder.with_name(f"{_DELETED}{run}"))
+        _sync_folder(self.runs)
+        shutil.rmtree(gone, ignore_errors=True)
+
+    def finish_deletions(self) -> None:
+        """Delete the folders whose deletion was interrupted."""
+        for folder in self.runs.glob(f"{_DELETED}*"):
+            shutil.rmtree(folder, ignore_errors=True)
 
     def summaries(self) -> Iterator[Summary]:
         """Yield the row of every run that has a request, from the files."""
@@ -269,7 +333,9 @@ class Store:
 
 
 _COLUMNS: Final = tuple(Summary.__dataclass_fields__)
-_VERSION: Final = 3
+_SEARCHED: Final = "searched"
+"""Column with the text of a row in lower case, so that a search calls no function for each row."""
+_VERSION: Final = 4
 
 
 class Index:
@@ -285,22 +351,31 @@ class Index:
         with self._lock, closing(self._open()) as base, base:
             self._put(base, summary)
 
+    def remove(self, run: str) -> None:
+        """Remove a row, if it exists. Raises sqlite3.Error."""
+        with self._lock, closing(self._open()) as base, base:
+            base.execute("delete from runs where id = ?", (run,))
+
     def find(
-        self, *, rig: str | None = None, state: str | None = None, text: str = "", limit: int = 100
+        self, *, rig: str | None = None, state: str | None = None, text: str = "", limit: int = 100,
+        archived: bool = False,
     ) -> list[Summary]:
-        """Return matching rows, the newest first. ``text``: words for `Summary.contains`. Raises sqlite3.Error."""
-        where = [f"{name} = ?" for name, value in (("rig", rig), ("state", state)) if value is not None]
+        """Return matching rows, the newest first; archived runs only with ``archived``. Raises sqlite3.Error.
+
+        ``text``: words for `Summary.contains`.
+        """
+        where = [] if archived else ["not archived"]
+        where += [f"{name} = ?" for name, value in (("rig", rig), ("state", state)) if value is not None]
         values = [value for value in (rig, state) if value is not None]
         for word in text.split():
-            where.append("instr(casefold(" + " || ' ' || ".join(f"ifnull({name}, '')" for name in SEARCHED) + "), ?)")
+            where.append(f"instr({_SEARCHED}, ?)")
             values.append(word.casefold())
         clause = f"where {' and '.join(where)}" if where else ""
         with self._lock, closing(self._open()) as base:
             rows = base.execute(
                 f"select {', '.join(_COLUMNS)} from runs {clause} order by id desc limit ?", (*values, limit)
             ).fetchall()
-        found = (dict(zip(_COLUMNS, row, strict=True)) for row in rows)
-        return [Summary(**{**one, **{name: bool(one[name]) for name in ("simulated", "rehearsal")}}) for one in found]
+        return [_summary_of_row(dict(zip(_COLUMNS, row, strict=True))) for row in rows]
 
     def rebuild(self) -> int:
         """Make the index again from the files. Return the number of runs."""
@@ -313,14 +388,13 @@ class Index:
         new = not self._path.exists()
         base = sqlite3.connect(self._path, timeout=0.5)
         try:
-            base.create_function("casefold", 1, str.casefold, deterministic=True)
             base.execute("pragma journal_mode = delete")
             base.execute("pragma synchronous = full")
             (version,) = base.execute("pragma user_version").fetchone()
             if new or version != _VERSION:
                 with base:
                     base.execute("drop table if exists runs")
-                    base.execute(f"create table runs (id text primary key, {', '.join(_COLUMNS[1:])})")
+                    base.execute(f"create table runs (id text primary key, {', '.join((*_COLUMNS[1:], _SEARCHED))})")
                     base.execute("create index by_rig on runs (rig, id)")
                     base.execute(f"pragma user_version = {_VERSION}")
                     if filled:
@@ -338,8 +412,6 @@ class Index:
 
     @staticmethod
     def _put(base: sqlite3.Connection, summary: Summary) -> None:
-        plain = asdict(summary)
-        base.execute(
-            f"insert or replace into runs ({', '.join(_COLUMNS)}) values ({', '.join('?' * len(_COLUMNS))})",
-            tuple(plain[name] for name in _COLUMNS),
-        )
+        plain = _plain_row(summary)
+        base.execute(f"insert or replace into runs ({', '.join(plain)}) values ({', '.join('?' * len(plain))})",
+                     tuple(plain.values()))

@@ -131,6 +131,7 @@ class Supervisor:
 
     def start(self) -> None:
         """Find the runs that are alive, handle those whose process is gone, and start the periodic check."""
+        self.store.finish_deletions()
         for run in self.store.ids():
             with suppress(Exception):
                 status = self.store.status(run)
@@ -562,7 +563,21 @@ class Supervisor:
                 self.say(f"the audit can't be written: {error}")
 
         self._notes.add(write)
-        if run is not None and run not in self._being_indexed:
+        if run is not None:
+            self._index_later(run)
+
+    def reindex(self, run: str) -> None:
+        """Renew the index entry of an ended run later. Until then, lists read its files."""
+        self._to_index.add(run)
+        self._index_later(run)
+
+    def forget(self, run: str) -> None:
+        """Remove a deleted run from memory and, later, from the index."""
+        self._unconfirmed.pop(run, None)
+        self.reindex(run)
+
+    def _index_later(self, run: str) -> None:
+        if run not in self._being_indexed:
             self._being_indexed.add(run)
             self._indexing.add(lambda: self._index(run))
 
@@ -575,7 +590,10 @@ class Supervisor:
     def _index(self, run: str) -> None:
         self._being_indexed.discard(run)       # removed first, so that later changes are indexed once more
         try:
-            self.index.put(self.store.summary(run))
+            try:
+                self.index.put(self.store.summary(run))
+            except NotThere:                   # deleted meanwhile
+                self.index.remove(run)
             self._unindexed.discard(run)
         except Exception as error:             # a locked index or a full disk: the files are complete; retry
             if run not in self._unindexed:

@@ -152,9 +152,11 @@ def test_who_may_what_is_as_it_was_agreed(guarded):
     """Written down here once more, since the document comes from the table that it is to judge: everybody who is known
     sees and stops; what else somebody may, stands here."""
     least = {
-        "operator": {"start", "confirm", "renew", "ask_replay", "calibration", "ask_fleet", "stop_fleet", "pace"},
-        "engineer": {"edit_rig", "sign_off"},
-        "admin": {"audit", "accounts", "add_user", "set_password", "remove_user", "add_token", "remove_token"},
+        "operator": {"start", "confirm", "renew", "ask_replay", "calibration", "ask_fleet", "stop_fleet", "pace",
+                     "annotate"},
+        "engineer": {"edit_rig", "sign_off", "archive", "sign_acceptance"},
+        "admin": {"audit", "delete_run", "accounts", "add_user", "set_password", "remove_user", "add_token",
+                  "remove_token"},
         "anybody": {"login", "logout", "me", "health", "openapi"},
     }
     changes_nothing = {"plan", "password", *STOPS}         # of somebody else's

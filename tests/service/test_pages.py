@@ -355,7 +355,7 @@ def test_the_list_of_runs_can_be_searched_and_sorted(page, served):
     names, search = page.locator("#runs td:last-child"), page.get_by_label("Search")
     page.get_by_text("Carla: done").wait_for()
     assert set(names.all_inner_texts()) == {"Carla: done", "Berta: done", "Anna: done"}
-    page.get_by_role("button", name="operator, note").click()
+    page.get_by_role("button", name="operator, note, tags").click()
     assert names.all_inner_texts() == ["Anna: done", "Berta: done", "Carla: done"]
     page.get_by_role("button", name="when").click()
     search.fill("anna done")
@@ -366,6 +366,75 @@ def test_the_list_of_runs_can_be_searched_and_sorted(page, served):
     search.fill("")
     page.get_by_label("State").select_option("failed")
     page.get_by_text("no run matches").wait_for()
+
+
+@pytest.mark.heavy
+def test_an_acceptance_that_fails_is_signed_with_a_remark_and_then_shows_who_signed(page, served):
+    from tests.service.test_records import ACCEPTANCE
+
+    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    wait_for("its end", lambda: not served.service.supervisor.live())
+    path = served.service.store.place(run) / "result.json"
+    write_json(path, {**json.loads(path.read_bytes()), "acceptance": {**ACCEPTANCE, "verdict": "fail"}})
+    page.goto(f"/runs/{run}")
+    page.get_by_label("Name of the person").fill("Anna Berg")
+    page.get_by_role("button", name="Sign", exact=True).click()
+    page.get_by_text("a remark is needed, because the verdict is fail").wait_for()
+    assert page.get_by_label("Remark").get_attribute("aria-invalid") == "true"
+    page.get_by_label("Remark").fill(HOSTILE)
+    page.keyboard.press("Enter")
+    page.get_by_role("row", name="signed by").get_by_text("Anna Berg (admin, account local)").wait_for()
+    page.get_by_role("row", name="remark").get_by_text(HOSTILE).wait_for()
+    log = path.with_name("run.mcap")
+    log.write_bytes(log.read_bytes() + b"x")
+    page.reload()
+    page.get_by_text("The signature does not hold: the log is another one").wait_for()
+    assert page.evaluate("window.pwned") is None
+
+
+@pytest.mark.heavy
+def test_a_run_is_tagged_archived_and_deleted_from_its_page(page, served):
+    runs = []
+    for note in ("done", "done"):
+        runs.append(served.service.supervisor.start_run("a", {"note": note}, "local").request.id)
+        served.service.wait(runs[-1], "done")
+    wait_for("their end", lambda: not served.service.supervisor.live())
+    run = runs[0]
+    page.goto(f"/runs/{run}")
+    page.get_by_label("Tags, separated by commas").fill(f"after repair, {HOSTILE}")
+    page.get_by_label("Operator").fill("Anna")
+    page.get_by_role("button", name="Save").click()
+    page.get_by_text("a tag has at most 40 characters").wait_for()          # at its field, and nothing was saved
+    assert page.get_by_label("Tags, separated by commas").get_attribute("aria-invalid") == "true"
+    page.get_by_label("Tags, separated by commas").fill("after repair, <b id=x>")
+    page.get_by_role("button", name="Save").click()
+    page.get_by_text("Edits: 2").click()
+    page.get_by_role("row", name="after repair, <b id=x>").get_by_text("local").wait_for()
+    page.goto("/runs")
+    page.get_by_label("Search").fill("repair anna")
+    page.locator("#runs").get_by_text("after repair", exact=True).wait_for()
+    assert page.locator("#runs tr").count() == 1 and page.locator("b#x").count() == 0
+    page.goto(f"/runs/{run}")
+    page.get_by_role("button", name="Archive", exact=True).click()
+    page.get_by_role("button", name="Take out of the archive").wait_for()
+    page.goto("/runs")
+    page.locator("#runs tr").first.wait_for()
+    assert page.locator("#runs tr").count() == 1
+    page.get_by_label("Archived runs too").check()
+    page.locator("#runs").get_by_text("ARCHIVED").wait_for()
+    page.goto(f"/runs/{run}")
+    page.get_by_text("Delete this run").click()
+    button, typed = page.get_by_role("button", name="Delete", exact=True), page.get_by_label("Type the run's id")
+    typed.fill(run[:-1])
+    assert button.is_disabled()
+    typed.fill(run)
+    button.click()
+    page.wait_for_url("**/runs")
+    page.get_by_label("Archived runs too").check()
+    page.locator("#runs tr").first.wait_for()
+    assert [one.name for one in served.service.store.runs.iterdir()] == [runs[1]]
+    assert page.evaluate("window.pwned") is None
 
 
 def test_a_stop_that_was_asked_for_is_no_alarm(page, served):
@@ -720,7 +789,7 @@ def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypat
         "results": [], "differences": [], "settings": [], "apparent_inertia": [], "friction": []}}
     page.goto("/runs")
     button = page.get_by_role("button", name="Compare")
-    boxes = page.get_by_role("checkbox")
+    boxes = page.locator("#runs").get_by_role("checkbox")
     boxes.first.check()
     assert button.is_disabled()
     boxes.nth(1).check()

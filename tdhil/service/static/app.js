@@ -260,6 +260,37 @@
     return found;
   }
 
+  /** Mark the fields whose values were refused, each with its reason, and go to the first one. */
+  function markWrong(form, fields) {
+    const known = fields.filter((one) => form.elements[one.option]);
+    known.forEach((one) => {
+      const field = form.elements[one.option], note = el("span", { class: "alarm wrong", id: `wrong-${one.option}` }, one.message);
+      field.setAttribute("aria-invalid", "true");
+      field.setAttribute("aria-describedby", note.id);
+      field.closest("label").append(note);
+      const closed = field.closest("details");
+      if (closed) closed.open = true;
+    });
+    if (known.length) form.elements[known[0].option].focus();
+    return known.length;
+  }
+  function unmark(form) {
+    form.querySelectorAll("[aria-invalid]").forEach((one) => { one.removeAttribute("aria-invalid"); one.removeAttribute("aria-describedby"); });
+    form.querySelectorAll(".wrong").forEach((one) => one.remove());
+  }
+  /** Send a form. A refusal is shown at its fields, or in the text `said` if it names none of them. */
+  async function submits(form, said, send) {
+    unmark(form);
+    said.hidden = true;
+    try {
+      await send();
+    } catch (error) {
+      if (error.fields && markWrong(form, error.fields)) return;
+      said.textContent = error instanceof Refused ? error.message : "No answer from tdhil serve.";
+      said.hidden = false;
+    }
+  }
+
   function planTable(plan) {
     const half = plan.expected_half_width, speed = (value) => number(inSpeedUnit(value), 3);
     const rows = [
@@ -326,18 +357,9 @@
     function refuse(message, fields = []) {
       byId("plan").hidden = true;            // the plan of other values
       if (fields.length) {
-        const known = fields.filter((one) => form.elements[one.option]);
         show(byId("said"), el("div", { class: "alarm", role: "alert" }, el("p", {}, `${fields.length === 1 ? "One value" : `${fields.length} values`} can't be used. Nothing was started.`),
           el("ul", {}, ...fields.map((one) => el("li", {}, el("strong", {}, one.label), `: ${one.message}`)))));
-        known.forEach((one) => {
-          const field = form.elements[one.option], note = el("span", { class: "alarm wrong", id: `wrong-${one.option}` }, one.message);
-          field.setAttribute("aria-invalid", "true");
-          field.setAttribute("aria-describedby", note.id);
-          field.closest("label").append(note);
-          const closed = field.closest("details");
-          if (closed) closed.open = true;
-        });
-        if (known.length) form.elements[known[0].option].focus();
+        markWrong(form, fields);
         return;
       }
       const mine = flagged.filter((one) => new RegExp(`(^|[^\\w-])${one.dataset.flag}(?![\\w-])`).test(message));
@@ -357,8 +379,7 @@
       const buttons = [...form.querySelectorAll("button")];
       const options = asked(form);
       buttons.forEach((one) => { one.disabled = true; });
-      form.querySelectorAll("[aria-invalid]").forEach((one) => { one.removeAttribute("aria-invalid"); one.removeAttribute("aria-describedby"); });
-      form.querySelectorAll(".wrong").forEach((one) => one.remove());
+      unmark(form);
       const over = wanted === "plan" ? waiting(byId("said"), "Planning", "plan") : () => {};
       if (wanted === "plan") byId("plan").hidden = true; else show(byId("said"), el("p", { class: "dim" }, "Asking …"));
       let planned = false;
@@ -764,7 +785,7 @@
   });
 
   const pages = { login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inertia, interval, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, waiting, when, zone };
+  window.tdhil = { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inertia, interval, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, waiting, when, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);

@@ -1,7 +1,7 @@
 // Results: one run, a comparison, a rig over time, many logs. As in app.js, data from elsewhere are inserted as text.
 "use strict";
 (() => {
-  const { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, waiting, when, zone } = window.tdhil;
+  const { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, may, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, waiting, when, zone } = window.tdhil;
 
   // -- one run
 
@@ -158,6 +158,8 @@
         said.hidden = false;
       }
     });
+    annotations(id);
+    signature(id);
     const sign = byId("sign");
     if (sign) sign.addEventListener("submit", async (event) => {
       event.preventDefault();
@@ -170,11 +172,70 @@
     });
   }
 
+  /** Tags as badges. */
+  const tags = (found) => found.map((one) => el("span", { class: "tag" }, one));
+
+  /** The signature under an acceptance: whether it still holds; or the form, once the hash of the log is known. */
+  async function signature(id) {
+    const where = byId("acceptance"), form = byId("accept"), problem = byId("signature-problem");
+    if (!where || (!form && !problem)) return;
+    const said = form ? byId("accept-said") : problem, fail = (text) => { said.textContent = text; said.hidden = false; };
+    let found = null;
+    if (form) form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      submits(form, said, async () => {
+        await call("POST", `/runs/${id}/acceptance`, { name: form.elements.name.value, remark: form.elements.remark.value, verdict: where.dataset.verdict, log_sha256: found.log_sha256 });
+        location.reload();
+      });
+    });
+    try {
+      found = await call("GET", `/runs/${id}/acceptance`, undefined, {}, 120000);
+      if (found.problem) fail(`The signature does not hold: ${found.problem}.`);
+      if (!form) return;
+      byId("log-sha256").textContent = found.log_sha256;
+      form.querySelector("button").disabled = false;
+    } catch (error) {
+      fail(error instanceof Refused ? error.message : "No answer from tdhil serve.");
+    }
+  }
+
+  /** Forms that change the records of a run: annotations, archive, deletion. Each is there for its role only. */
+  function annotations(id) {
+    const form = byId("annotate"), archive = byId("archive"), remove = byId("delete");
+    if (form) form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      submits(form, byId("annotate-said"), async () => {
+        const text = (name) => form.elements[name].value;
+        await call("POST", `/runs/${id}/annotations`, { tags: text("tags").split(","), operator: text("operator"), note: text("note") });
+        location.reload();
+      });
+    });
+    if (archive) archive.addEventListener("submit", (event) => {
+      event.preventDefault();
+      submits(archive, byId("archive-said"), async () => {
+        await call("POST", `/runs/${id}/archive`, { archived: archive.dataset.archived !== "yes" });
+        location.reload();
+      });
+    });
+    if (!remove) return;
+    const typed = remove.elements.confirm, button = remove.querySelector("button");
+    const ready = () => { button.disabled = typed.value.trim() !== id; };
+    typed.addEventListener("input", ready);
+    ready();
+    remove.addEventListener("submit", (event) => {
+      event.preventDefault();
+      submits(remove, byId("delete-said"), async () => {
+        await call("POST", `/runs/${id}/delete`, { confirm: typed.value });
+        location.replace("/runs");
+      });
+    });
+  }
+
   // -- lists
 
   function runsPage() {
     const chosen = new Set(), link = byId("compare");
-    link.addEventListener("click", () => location.assign(`/compare?runs=${[...chosen].sort().join()}`));
+    link.addEventListener("click", () => location.assign(`/compare?runs=${[...chosen].sort().join()}${form.elements.archived.checked ? "&archived=true" : ""}`));
     let shown = "";
     function choose(id, yes) {
       if (yes) chosen.add(id); else chosen.delete(id);
@@ -195,12 +256,13 @@
         return el("tr", {}, el("td", { class: "pick" }, box),
           el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}` }, when(one.asked))), el("td", {}, one.rig, " ", badge(one.simulated) || "", " ", rehearsal(one.rehearsal) || ""),
           el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict || ""),
-          el("td", {}, said(one) || ""));
+          el("td", {}, said(one) || "", ...(one.tags.length ? [" ", ...tags(one.tags)] : []), ...(one.archived ? [" ", el("span", { class: "badge" }, "ARCHIVED")] : [])));
       }) : [el("tr", {}, el("td", { colspan: 7, class: "dim" }, form.elements.text.value || form.elements.state.value ? "no run matches" : "no run yet"))]));
     }
     async function look() {
       const query = new URLSearchParams(), mine = ++asking;
       for (const name of ["text", "state"]) if (form.elements[name].value.trim()) query.set(name, form.elements[name].value.trim());
+      if (form.elements.archived.checked) query.set("archived", "true");
       const runs = await call("GET", `/runs?${query}`), now = JSON.stringify(runs);
       if (mine !== asking || now === shown) return;          // a later request is on its way; or keep the keyboard focus
       shown = now;
@@ -290,18 +352,22 @@
     alive();
   }
 
+  /** The part of an address that asks for archived runs, too, as this page's own address does. */
+  const archivedToo = (before = "?") => (new URLSearchParams(location.search).get("archived") === "true" ? `${before}archived=true` : "");
+
   // -- a rig over time
 
   function historyPage() {
-    const rig = document.body.dataset.rig, where = byId("history"), at = (date) => new Date(date).getTime() / 1000;
+    const rig = document.body.dataset.rig, where = byId("history"), link = byId("archived"), at = (date) => new Date(date).getTime() / 1000;
+    if (archivedToo()) { link.href = location.pathname; link.textContent = "Without archived runs"; }
     once(where, async () => {
-      const { trend } = await call("GET", `/rigs/${encodeURIComponent(rig)}/trend`, undefined, {}, 120000);
+      const { trend } = await call("GET", `/rigs/${encodeURIComponent(rig)}/trend${archivedToo()}`, undefined, {}, 120000);
       show(where, ...trend.notes.map((one) => el("p", { class: "dim" }, one)));
       for (const quantity of trend.quantities.filter((one) => one.points.length)) {
         const plot = el("div", { class: "plot", role: "img", "aria-label": `${quantity.name} over time` });
         where.append(el("section", {}, el("h2", {}, `${quantity.name}, ${quantity.unit}`),
           el("p", { class: quantity.changes.length || quantity.drift ? "alarm" : "" }, quantity.text),
-          ...quantity.changes.map((one) => el("p", {}, el("a", { href: `/compare?runs=${encodeURIComponent(one.before)},${encodeURIComponent(one.after)}` }, `Compare the runs before and after, ${when(one.before_date)} and ${when(one.after_date)}`))),
+          ...quantity.changes.map((one) => el("p", {}, el("a", { href: `/compare?runs=${encodeURIComponent(one.before)},${encodeURIComponent(one.after)}${archivedToo("&")}` }, `Compare the runs before and after, ${when(one.before_date)} and ${when(one.after_date)}`))),
           el("figure", {}, el("figcaption", {}, "each point with its repeatability on this drive; dashed: a change"), plot),
           numbers(`${quantity.name} in numbers`, ["run", `${quantity.unit}, interval`], quantity.points.map((one) => [el("a", { href: `/runs/${encodeURIComponent(one.log)}` }, when(one.date)), of(one)]))));
         points(plot, [{ colour: "--c0", points: quantity.points.map((one) => ({ ...one, x: at(one.date) })) }],
@@ -315,7 +381,7 @@
   function comparePage() {
     const where = byId("compared"), runs = new URLSearchParams(location.search).get("runs") || "";
     once(where, async () => {
-      const { runs: ids, comparison } = await call("GET", `/runs/compare?runs=${encodeURIComponent(runs)}`, undefined, {}, 300000);
+      const { runs: ids, comparison } = await call("GET", `/runs/compare?runs=${encodeURIComponent(runs)}${archivedToo("&")}`, undefined, {}, 300000);
       const names = comparison.results.map((one, k) => `${one.rig || "?"}, ${when(one.date) || ids[k]}`);
       const dot = (k) => el("span", { class: `dot c${k}`, "aria-hidden": "true" });
       const heads = ids.map((id, k) => el("th", { scope: "col" }, dot(k), " ", el("a", { href: `/runs/${id}` }, names[k]), " ", badge(comparison.results[k].simulated) || "", " ", rehearsal(comparison.results[k].rehearsed_faults) || ""));
@@ -481,7 +547,7 @@
       if (now === shown) return;
       shown = now;
       show(byId("fleets"), ...(found.length ? found.map((one) => el("tr", {}, el("th", { scope: "row" }, el("a", { href: `/fleets/${one.id}` }, when(one.asked))),
-        el("td", {}, one.folder || "the runs of this service", one.below ? `, ${one.below}` : ""), el("td", {}, asWhat(one.settings)), el("td", {}, stateOf(one))))
+        el("td", {}, one.folder || "the runs of this service", one.below ? `, ${one.below}` : "", one.archived ? ", archived too" : ""), el("td", {}, asWhat(one.settings)), el("td", {}, stateOf(one))))
         : [el("tr", {}, el("td", { colspan: 4, class: "dim" }, "none yet"))]));
     });
   }
@@ -539,7 +605,7 @@
       try { await work(); } catch (error) { away(error instanceof Refused ? error.message : "No answer from tdhil serve."); }
     };
     byId("end").addEventListener("click", () => press(() => call("POST", `/fleets/${id}/stop`, {})));
-    byId("again").addEventListener("click", () => press(() => call("POST", "/fleets", { folder: view.folder, below: view.below, ...view.settings })));
+    byId("again").addEventListener("click", () => press(() => call("POST", "/fleets", { folder: view.folder, below: view.below, archived: view.archived, ...view.settings })));
     byId("more").addEventListener("click", () => press(() => { wanted += 200; return rows(); }));
   }
 

@@ -1,0 +1,58 @@
+"""Signature of a person under the acceptance of a run. Pure data, file acceptance_signed.json.
+
+It is bound to the log by the log's SHA-256, and to the signed verdict with all its quantities by their SHA-256.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+FILE: Final = "acceptance_signed.json"
+LONGEST_NAME: Final = 200
+"""Longest name of the person who signs, characters."""
+LONGEST_REMARK: Final = 500
+"""Longest remark of a signature, characters."""
+PASS: Final = "pass"
+"""The verdict that is signed without a remark."""
+
+
+@dataclass(frozen=True)
+class AcceptanceSignature:
+    """A signature. ``by``: the account, and ``role`` its role; ``name``: the person, as typed; ``at``: ISO 8601, UTC.
+
+    ``acceptance_sha256``: hash of the signed verdict with its quantities.
+    """
+
+    name: str
+    role: str
+    by: str
+    at: str
+    remark: str
+    verdict: str
+    log_sha256: str
+    acceptance_sha256: str
+
+    def problem(self, acceptance: Mapping[str, Any] | None, log_sha256: str) -> str:
+        """Return why the signature does not hold for this acceptance and this log, in words; '' if it does."""
+        if log_sha256 != self.log_sha256:
+            return "the log is another one than the signed one"
+        if acceptance is None or hash_of(acceptance) != self.acceptance_sha256:
+            return f"the acceptance is another one than the signed one, whose verdict was {self.verdict}"
+        return ""
+
+
+def signature_in(plain: Mapping[str, Any] | None) -> AcceptanceSignature | None:
+    """Return the signature in a file's content; None without one."""
+    try:
+        return None if plain is None else AcceptanceSignature(**plain)
+    except TypeError:
+        return None
+
+
+def hash_of(acceptance: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of an acceptance, in hex. The order of its keys does not matter."""
+    return hashlib.sha256(json.dumps(acceptance, sort_keys=True).encode()).hexdigest()
