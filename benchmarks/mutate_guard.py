@@ -12,8 +12,8 @@ door. The benchmark works on copies in memory: it forks a child process per muta
 the place of the real one. Nothing in the checkout is written.
 
 The tests of a subject run once as they are, which notes how long each takes and which functions it enters. A mutant
-runs those that enter its function, the quick ones first, up to the first failure. A subject whose tests fail as it is
-comes first: nothing can be said of it.
+runs those that enter its function, the quick ones first, up to the first failure. Only a mutant that the usual tests
+do not notice runs the heavy ones, too. A subject whose tests fail as it is comes first: nothing can be said of it.
 
 `--out` keeps each mutant's outcome: the next call goes on where this one was stopped. A file that was changed since
 begins anew; `--again` runs the survivors once more, for new tests.
@@ -35,6 +35,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -303,6 +304,8 @@ START_S = 60.0
 """Added to the limit, s: imports and collection."""
 UNLIMITED_S = 1800.0
 """Limit of the tests as they are, s."""
+NO_TESTS = 5
+"""Exit code of pytest if there is no test."""
 LEAST_OF_EACH = 2
 """Least deletions of each subject in a sample."""
 
@@ -537,14 +540,14 @@ class Counted(ast.NodeTransformer):
         return node
 
 
-def run_tests(subject: str, changed: Changed, watch: Watch) -> int:
-    """Run pytest in this process. Return its exit code."""
+def run_tests(subject: str, changed: Changed, watch: Watch, which: str) -> int:
+    """Run pytest in this process, with the option ``which`` of tests/conftest.py. Return its exit code."""
     import pytest
 
     forget(SUBJECTS[subject].module)
     sys.meta_path.insert(0, changed)
     quiet = ["-q", "-x", "-p", "no:cacheprovider", "--no-header", "--hypothesis-seed=0", "-o", "addopts=",
-             f"--rootdir={ROOT}", *(["--all-but-long"] if SUBJECTS[subject].heavy else [])]
+             f"--rootdir={ROOT}", *([which] if which else [])]
     files = [f"tests/{name}" for name in SUBJECTS[subject].tests]
     if watch.chosen is not None:
         among = {name.partition("::")[0] for name in watch.chosen}
@@ -580,7 +583,7 @@ def forget(module: str) -> None:
 
 def fork(
     subject: str, changed: Changed, report: Path | None = None, chosen: list[str] | None = None,
-    longest_s: float = UNLIMITED_S,
+    longest_s: float = UNLIMITED_S, which: str = "",
 ) -> int:
     """Run tests in a child process. Return its exit code, below 0 for a signal. ``report``: what was noted, as JSON."""
     child = os.fork()
@@ -604,7 +607,7 @@ def fork(
 
         changed.extra["_went"] = note
         changed.extra["_entered"] = lambda line: entered.setdefault(watch.now, set()).add(line)
-        code = run_tests(subject, changed, watch)
+        code = run_tests(subject, changed, watch, which)
         if report is not None:
             lines = {name: sorted(numbers) for name, numbers in list(entered.items())}
             report.write_text(json.dumps({"went": sorted(went), "took_s": watch.took_s, "entered": lines}))
@@ -613,35 +616,48 @@ def fork(
 
 
 @cache
-def traced(subject: str) -> Trace | None:
-    """Run the tests of a subject as it is; None if they fail."""
+def traced(subject: str, which: str) -> Trace | None:
+    """Run the tests of a subject as it is; None if they fail. ``which``: '' for the usual ones, or ``--heavy``."""
     tree = ast.fix_missing_locations(Entered().visit(ast.parse(text_of(subject))))
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "trace.json"
-        if fork(subject, Changed(SUBJECTS[subject].module, tree, path_of(subject)), report) != 0:
+        changed = Changed(SUBJECTS[subject].module, tree, path_of(subject))
+        if fork(subject, changed, report, which=which) not in (0, NO_TESTS):
             print(Path(str(report) + ".log").read_text()[-3000:])
             return None
         plain = json.loads(report.read_text())
         return Trace(plain["took_s"], plain["entered"])
 
 
-def noticed(subject: str, tree: ast.Module, tests: list[str] | None, took_s: float) -> bool:
-    """Does one of the tests (none: all of the subject's) fail?"""
-    if tests == []:
-        return False                           # no test enters the function
-    longest_s = START_S + max(LEAST_S, LONGEST * took_s)
-    return fork(subject, Changed(SUBJECTS[subject].module, tree, path_of(subject)), None, tests, longest_s) != 0
+class TestsFail(Exception):
+    """They do so without a mutant."""
+
+
+def noticed(subject: str, tree: ast.Module, function: int) -> tuple[bool, int]:
+    """Return whether a test fails, and how many there were to run. ``function``: its line. Raises TestsFail."""
+    count = 0
+    for which in ("", "--heavy") if SUBJECTS[subject].heavy else ("",):
+        if (trace := traced(subject, which)) is None:
+            raise TestsFail(subject)
+        if not (tests := trace.tests(function)):
+            continue
+        count += len(tests)
+        longest_s = START_S + max(LEAST_S, LONGEST * sum(trace.took_s[one] for one in tests))
+        changed = Changed(SUBJECTS[subject].module, tree, path_of(subject))
+        if fork(subject, changed, None, tests, longest_s, which) != 0:
+            return True, count
+    return False, count
 
 
 def judged(mutant: Mutant) -> Row:
     """The row of a mutant. ``noticed``: None if nothing can be said, as the tests fail without it."""
-    begun_s, trace = time.monotonic(), traced(mutant.subject)
-    tests = None if trace is None else trace.tests(mutant.function)
-    found = None
-    if trace is not None and tests is not None:
-        found = noticed(mutant.subject, mutant.tree(), tests, sum(trace.took_s[one] for one in tests))
+    begun_s = time.monotonic()
+    found: bool | None = None
+    count = 0
+    with suppress(TestsFail):
+        found, count = noticed(mutant.subject, mutant.tree(), mutant.function)
     return {"mutant": mutant.key, "subject": mutant.subject, "line": mutant.line, "text": mutant.text,
-            "noticed": found, "tests": len(tests or ()), "took_s": round(time.monotonic() - begun_s, 1)}
+            "noticed": found, "tests": count, "took_s": round(time.monotonic() - begun_s, 1)}
 
 
 def outcome(row: Row) -> str:
@@ -679,15 +695,14 @@ def named(subjects: list[str]) -> list[str]:
         if text.count(old) != 1:
             survivors.append(f"{what}: found {text.count(old)} times")
             continue
-        if (trace := traced(subject)) is None:
-            survivors.append(f"{subject}.py: its tests fail as it is")
-            continue
         line = text[:text.index(old.strip())].count("\n") + 1
         functions = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)
                      and node.lineno < line <= (node.end_lineno or 0)]
-        tests = trace.tests(functions[-1].lineno if functions else 0)
-        took_s = sum(trace.took_s[one] for one in tests)
-        seen = noticed(subject, ast.parse(text.replace(old, new)), tests, took_s)
+        try:
+            seen, _ = noticed(subject, ast.parse(text.replace(old, new)), functions[-1].lineno if functions else 0)
+        except TestsFail:
+            survivors.append(f"{subject}.py: its tests fail as it is")
+            continue
         print(f"{'noticed ' if seen else 'SURVIVES'} {what}", flush=True)
         if not seen:
             survivors.append(what)
@@ -702,7 +717,8 @@ def branches(subject: str) -> list[str]:
     tree = ast.fix_missing_locations(tree)
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "went.json"
-        if fork(subject, Changed(SUBJECTS[subject].module, tree, path_of(subject)), report) != 0:
+        every = "--all-but-long" if SUBJECTS[subject].heavy else ""
+        if fork(subject, Changed(SUBJECTS[subject].module, tree, path_of(subject)), report, which=every) != 0:
             print(Path(str(report) + ".log").read_text()[-3000:])
             return [f"{subject}.py: its tests fail"]
         went = {(number, way) for number, way in json.loads(report.read_text())["went"]}
