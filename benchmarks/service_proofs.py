@@ -518,8 +518,9 @@ def idle(folder: Path, seconds: float, descriptors: int | None, count: int = 500
     p99_s, alone_p99_s = (quantile(sorted(one), 0.99) for one in (took_s, alone_s))
     print(f"{'no own' if descriptors is None else descriptors} limit of open files: {len(took_s)} stops beside {count}"
           f" idle connections ({most} open at once, {opened} opened in all): {in_ms(took_s)}; the run is"
-          f" {end['state']}; {len(said)} bytes of log; {len(alone_s)} stops without connections: {in_ms(alone_s)}; ratio of p99"
-          f" {p99_s / alone_p99_s:.2f}, of medians {np.median(took_s) / np.median(alone_s):.2f}; {load()}", flush=True)
+          f" {end['state']}; {len(said)} bytes of log; {len(alone_s)} stops without connections: {in_ms(alone_s)};"
+          f" ratio of p99 {p99_s / alone_p99_s:.2f}, of medians {np.median(took_s) / np.median(alone_s):.2f};"
+          f" {load()}", flush=True)
     return good and p99_s <= IDLE_STOP_S and len(said) <= 200 * (2.0 * seconds + 60.0)
 
 
