@@ -96,3 +96,13 @@ def test_a_bit_that_flips_in_the_head_is_noticed(request_pdu, bytes_out, bytes_i
 def test_what_no_request_can_hold(address, count):
     with pytest.raises(ValueError, match="don't fit"):
         pdu.read(3, address, count)
+
+
+def test_the_count_of_requests_is_that_of_the_drive():
+    """Section 6.8: function and sub-function come back, then the count."""
+    asked = pdu.count_requests()
+    assert asked == h("08 000e 0000")
+    assert pdu.words_of(asked, h("08 000e a537")) == (0xA537,)
+    for other in ("08 000d a537", "08 010e a537", "08 000e a5", "08 000e a537 00", "08"):
+        with pytest.raises(BadReply, match="to diagnostics"):
+            pdu.words_of(asked, h(other))
