@@ -8,8 +8,8 @@
 
 Guard, observer and stop, the protocol's stages, every file of the drivers, the log's writer, what opens a drive and
 ends a run, and `tdhil identify`; of the service what begins, stops and loses a run, who may do what, its audit and its
-door. The benchmark works on copies in memory: it forks a child process per mutant, which loads the changed module in
-the place of the real one. Nothing in the checkout is written.
+door. The benchmark works on copies in memory: it forks a child process per mutant, which replaces the function in
+question (`prepared_tests`). Nothing in the checkout is written.
 
 The tests of a subject run once as they are, which notes how long each takes and which functions it enters. A mutant
 runs those that enter its function, the quick ones first, up to the first failure. Only a mutant that the usual tests
@@ -24,26 +24,31 @@ from __future__ import annotations
 import argparse
 import ast
 import hashlib
-import importlib.abc
-import importlib.util
 import json
-import math
-import os
 import random
-import signal
 import sys
 import tempfile
 import time
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
 from benchmarks.kept_rows import Row, drop_rows, kept_rows  # noqa: E402
+from benchmarks.prepared_tests import (  # noqa: E402
+    NOT_REPLACED,
+    Changed,
+    PreparedTests,
+    Watch,
+    forget,
+    in_child,
+    is_text,
+    wait_for,
+)
 
 TESTS = ROOT / "tests"
 OURS = ("drivers", "profiles", "sim_bus", "tdhil")
@@ -298,14 +303,12 @@ NAMED: tuple[tuple[str, str, str], ...] = (
 )
 """(subject, what stands there, what it becomes): lines that could be changed unnoticed once, and what came anew."""
 
-LEAST_S, LONGEST = 60.0, 5.0
+LEAST_S, LONGEST = 60.0, 4.0
 """Limit of a mutant's time, s, and as a multiple of its tests' time: an endless wait or loop counts as noticed."""
 START_S = 60.0
 """Added to the limit, s: imports and collection."""
 UNLIMITED_S = 1800.0
 """Limit of the tests as they are, s."""
-NO_TESTS = 5
-"""Exit code of pytest if there is no test."""
 LEAST_OF_EACH = 2
 """Least deletions of each subject in a sample."""
 
@@ -340,22 +343,6 @@ EQUIVALENT = {
 """Deletions that change nothing that can be seen, and why. (mypy refuses them all the same.)"""
 
 
-class Changed(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Finds one module: the changed one."""
-
-    def __init__(self, name: str, tree: ast.Module, path: Path) -> None:
-        self.name = name
-        self.code = compile(tree, str(path), "exec")
-        self.extra: dict[str, object] = {}
-
-    def find_spec(self, fullname, path=None, target=None):
-        return importlib.util.spec_from_loader(fullname, self) if fullname == self.name else None
-
-    def exec_module(self, module) -> None:
-        vars(module).update(self.extra)
-        exec(self.code, vars(module))
-
-
 def path_of(subject: str) -> Path:
     return ROOT / SUBJECTS[subject].path
 
@@ -363,11 +350,6 @@ def path_of(subject: str) -> Path:
 @cache
 def text_of(subject: str) -> str:
     return path_of(subject).read_text("utf-8")
-
-
-def is_text(statement: ast.stmt) -> bool:
-    """A docstring, of a module, a class, a function or a constant."""
-    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
 
 
 def deletable(tree: ast.Module) -> list[tuple[list[ast.stmt], int]]:
@@ -450,62 +432,6 @@ def sample(subjects: list[str], count: int | None, seed: int) -> list[Mutant]:
     return drawn
 
 
-class Entered(ast.NodeTransformer):
-    """Every function says that it was entered."""
-
-    def visit_FunctionDef(self, node):
-        self.generic_visit(node)
-        call = ast.Call(ast.Name("_entered", ast.Load()), [ast.Constant(node.lineno)], [])
-        node.body.insert(int(is_text(node.body[0])), ast.copy_location(ast.Expr(call), node.body[0]))
-        return node
-
-
-@dataclass
-class Trace:
-    """How long each test takes, s; the tests that enter a function, by its line.
-
-    What is entered outside of a test, or by what prepares one of a file, is entered by all of them.
-    """
-
-    took_s: dict[str, float]
-    entered: dict[str, list[int]]
-
-    def tests(self, function: int) -> list[str]:
-        """The tests for a mutant of this function, file by file, the quick ones first."""
-        everywhere = function == 0 or function in self.entered.get("", [])
-        chosen = [
-            test for test in self.took_s if everywhere
-            or function in self.entered.get(test, []) or function in self.entered.get(test.partition("::")[0], [])
-        ]
-        least: dict[str, float] = {}
-        for test in chosen:
-            file = test.partition("::")[0]
-            least[file] = min(least.get(file, math.inf), self.took_s[test])
-        return sorted(chosen, key=lambda test: (least[test.partition("::")[0]], test.partition("::")[0],
-                                                self.took_s[test]))
-
-
-class Watch:
-    """A plugin of pytest that notes which test runs and what it takes; or that runs the chosen ones in their order."""
-
-    def __init__(self, chosen: list[str] | None = None) -> None:
-        self.chosen = chosen
-        self.now = ""
-        self.took_s: dict[str, float] = {}
-
-    def pytest_collection_modifyitems(self, items) -> None:
-        if self.chosen is not None:
-            by_name = {item.nodeid: item for item in items}
-            items[:] = [by_name[name] for name in self.chosen if name in by_name]
-
-    def pytest_runtest_logstart(self, nodeid: str) -> None:
-        self.now = nodeid.partition("::")[0]
-
-    def pytest_runtest_logreport(self, report) -> None:
-        self.took_s[report.nodeid] = self.took_s.get(report.nodeid, 0.0) + report.duration
-        self.now = report.nodeid if report.when == "setup" else report.nodeid.partition("::")[0]
-
-
 class Counted(ast.NodeTransformer):
     """Every test of an if, while, conditional expression or comprehension says which way it went; loops likewise."""
 
@@ -544,15 +470,12 @@ def run_tests(subject: str, changed: Changed, watch: Watch, which: str) -> int:
     """Run pytest in this process, with the option ``which`` of tests/conftest.py. Return its exit code."""
     import pytest
 
-    forget(SUBJECTS[subject].module)
+    forget(SUBJECTS[subject].module, OURS)
     sys.meta_path.insert(0, changed)
     quiet = ["-q", "-x", "-p", "no:cacheprovider", "--no-header", "--hypothesis-seed=0", "-o", "addopts=",
              f"--rootdir={ROOT}", *([which] if which else [])]
-    files = [f"tests/{name}" for name in SUBJECTS[subject].tests]
-    if watch.chosen is not None:
-        among = {name.partition("::")[0] for name in watch.chosen}
-        files = [name for name in files if name in among]
-    return int(pytest.main([*quiet, "--import-mode=importlib", *(str(ROOT / name) for name in files)], [watch]))
+    files = [str(TESTS / name) for name in SUBJECTS[subject].tests]
+    return int(pytest.main([*quiet, "--import-mode=importlib", *files], [watch]))
 
 
 def preload() -> None:
@@ -574,88 +497,64 @@ def preload() -> None:
                 tdhil.runner.design, tdhil.runner.excitation, tdhil.recording.run_log))
 
 
-def forget(module: str) -> None:
-    """Unload our modules, so that none keeps a reference to a loaded subject."""
-    if module in sys.modules:
-        for name in [name for name in sys.modules if name.split(".")[0] in OURS]:
-            del sys.modules[name]
+def fork(subject: str, changed: Changed, longest_s: float, which: str, log: Path | None = None) -> int:
+    """Run all tests in a child process. Return its exit code, below 0 for a signal."""
+    return wait_for(in_child(lambda: run_tests(subject, changed, Watch(), which), log), longest_s)
 
 
-def fork(
-    subject: str, changed: Changed, report: Path | None = None, chosen: list[str] | None = None,
-    longest_s: float = UNLIMITED_S, which: str = "",
-) -> int:
-    """Run tests in a child process. Return its exit code, below 0 for a signal. ``report``: what was noted, as JSON."""
-    child = os.fork()
-    if child:
-        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    code = 99
-    try:
-        signal.alarm(math.ceil(longest_s))
-        folder = tempfile.mkdtemp(prefix="mutate-")
-        os.chdir(folder)
-        hush = os.open(os.devnull if report is None else str(report) + ".log", os.O_WRONLY | os.O_CREAT)
-        os.dup2(hush, 1)
-        os.dup2(hush, 2)
-        went: set[tuple[int, bool]] = set()
-        watch = Watch(chosen)
-        entered: dict[str, set[int]] = {}
-
-        def note(number, value):
-            went.add((number, bool(value)))
-            return value
-
-        changed.extra["_went"] = note
-        changed.extra["_entered"] = lambda line: entered.setdefault(watch.now, set()).add(line)
-        code = run_tests(subject, changed, watch, which)
-        if report is not None:
-            lines = {name: sorted(numbers) for name, numbers in list(entered.items())}
-            report.write_text(json.dumps({"went": sorted(went), "took_s": watch.took_s, "entered": lines}))
-    finally:
-        os._exit(code)
+_PREPARED: dict[tuple[str, str], PreparedTests] = {}
 
 
-@cache
-def traced(subject: str, which: str) -> Trace | None:
-    """Run the tests of a subject as it is; None if they fail. ``which``: '' for the usual ones, or ``--heavy``."""
-    tree = ast.fix_missing_locations(Entered().visit(ast.parse(text_of(subject))))
-    with tempfile.TemporaryDirectory() as folder:
-        report = Path(folder) / "trace.json"
-        changed = Changed(SUBJECTS[subject].module, tree, path_of(subject))
-        if fork(subject, changed, report, which=which) not in (0, NO_TESTS):
-            print(Path(str(report) + ".log").read_text()[-3000:])
-            return None
-        plain = json.loads(report.read_text())
-        return Trace(plain["took_s"], plain["entered"])
+def prepared(subject: str, which: str) -> PreparedTests:
+    """The tests of a subject; those of the subject before are closed. ``which``: '' or ``--heavy``."""
+    for other in [key for key in _PREPARED if key[0] != subject]:
+        _PREPARED.pop(other).close()
+    if (subject, which) not in _PREPARED:
+        _PREPARED[subject, which] = PreparedTests(
+            SUBJECTS[subject].module, path_of(subject), partial(_run_prepared, subject, which), UNLIMITED_S
+        )
+    return _PREPARED[subject, which]
+
+
+def _run_prepared(subject: str, which: str, changed: Changed, watch: Watch) -> int:
+    return run_tests(subject, changed, watch, which)
 
 
 class TestsFail(Exception):
     """They do so without a mutant."""
 
 
-def noticed(subject: str, tree: ast.Module, function: int) -> tuple[bool, int]:
-    """Return whether a test fails, and how many there were to run. ``function``: its line. Raises TestsFail."""
+def noticed(subject: str, tree: ast.Module, function: int, *, usual: bool = False) -> tuple[bool, int]:
+    """Return whether a test fails, and how many there were to run. ``function``: its line; ``usual``: no heavy tests.
+
+    Raises TestsFail.
+    """
     count = 0
-    for which in ("", "--heavy") if SUBJECTS[subject].heavy else ("",):
-        if (trace := traced(subject, which)) is None:
+    for which in ("", "--heavy") if SUBJECTS[subject].heavy and not usual else ("",):
+        tests = prepared(subject, which)
+        if (trace := tests.trace) is None:
+            print(tests.said)
             raise TestsFail(subject)
-        if not (tests := trace.tests(function)):
+        if not (chosen := trace.tests(function)):
             continue
-        count += len(tests)
-        longest_s = START_S + max(LEAST_S, LONGEST * sum(trace.took_s[one] for one in tests))
-        changed = Changed(SUBJECTS[subject].module, tree, path_of(subject))
-        if fork(subject, changed, None, tests, longest_s, which) != 0:
+        count += len(chosen)
+        longest_s = max(LEAST_S, LONGEST * sum(trace.took_s[one] for one in chosen))
+        code = tests.run(tree, chosen, longest_s) if tests.replaceable(function) else NOT_REPLACED
+        if code == NOT_REPLACED:
+            changed = Changed(SUBJECTS[subject].module, tree, path_of(subject))
+            code = fork(subject, changed, START_S + longest_s, which)
+        if code != 0:
             return True, count
     return False, count
 
 
-def judged(mutant: Mutant) -> Row:
+def judged(mutant: Mutant, *, usual: bool = False) -> Row:
     """The row of a mutant. ``noticed``: None if nothing can be said, as the tests fail without it."""
     begun_s = time.monotonic()
     found: bool | None = None
     count = 0
     with suppress(TestsFail):
-        found, count = noticed(mutant.subject, mutant.tree(), mutant.function)
+        found, count = noticed(mutant.subject, mutant.tree(), mutant.function, usual=usual)
     return {"mutant": mutant.key, "subject": mutant.subject, "line": mutant.line, "text": mutant.text,
             "noticed": found, "tests": count, "took_s": round(time.monotonic() - begun_s, 1)}
 
@@ -716,12 +615,25 @@ def branches(subject: str) -> list[str]:
     tree.body = [counted.visit(node) if not meant or at_the_top(tree, node) & meant else node for node in tree.body]
     tree = ast.fix_missing_locations(tree)
     with tempfile.TemporaryDirectory() as folder:
-        report = Path(folder) / "went.json"
+        report, log = Path(folder) / "went.json", Path(folder) / "log"
         every = "--all-but-long" if SUBJECTS[subject].heavy else ""
-        if fork(subject, Changed(SUBJECTS[subject].module, tree, path_of(subject)), report, which=every) != 0:
-            print(Path(str(report) + ".log").read_text()[-3000:])
+        seen: set[tuple[int, bool]] = set()
+
+        def note(number, value):
+            seen.add((number, bool(value)))
+            return value
+
+        def work() -> int:
+            changed = Changed(SUBJECTS[subject].module, tree, path_of(subject))
+            changed.extra["_went"] = note
+            code = run_tests(subject, changed, Watch(), every)
+            report.write_text(json.dumps(sorted(seen)))
+            return code
+
+        if wait_for(in_child(work, log), UNLIMITED_S) != 0:
+            print(log.read_text()[-3000:])
             return [f"{subject}.py: its tests fail"]
-        went = {(number, way) for number, way in json.loads(report.read_text())["went"]}
+        went = {(number, way) for number, way in json.loads(report.read_text())}
     wanted = {(number, way) for number in range(len(counted.places)) for way in (True, False)}
     missing = sorted(wanted - went)
     share = 100.0 * (1.0 - len(missing) / max(1, len(wanted)))
@@ -739,6 +651,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1, help="of the sample (1)")
     parser.add_argument("--within", default="", help="only in functions of these names, with commas between")
     parser.add_argument("--out", type=Path, help="the outcomes as JSON lines; deletions that stand there are not run")
+    parser.add_argument("--usual", action="store_true", help="without heavy tests: --again then runs the rest with them")
     parser.add_argument("--again", action="store_true", help="run those again that are not noticed in --out")
     wanted = parser.parse_args()
     begun_s = time.monotonic()
@@ -757,7 +670,7 @@ def main() -> int:
         if wanted.again and wanted.out is not None:
             drop_rows(wanted.out, lambda row: not row["noticed"])
         by_key = {one.key: one for one in drawn}
-        rows = kept_rows(wanted.out, "mutant", by_key, lambda key: judged(by_key[key]), show)
+        rows = kept_rows(wanted.out, "mutant", by_key, lambda key: judged(by_key[key], usual=wanted.usual), show)
         left += summary([row for row in rows if row["mutant"] in by_key])
     for line in left:
         print(line)

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.prepared_tests import Trace
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -62,7 +64,7 @@ def test_a_mutant_is_its_file_without_one_statement(mutants):
 
 
 def test_a_mutant_runs_the_tests_that_enter_its_function_the_quick_ones_first(mutants):
-    trace = mutants.Trace(
+    trace = Trace(
         {"a::slow": 2.0, "a::quick": 0.1, "b::one": 0.5, "c::other": 0.01},
         {"a::slow": [7], "a::quick": [7, 9], "b": [7], "c::other": [11], "": [3]},
     )
