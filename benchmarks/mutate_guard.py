@@ -651,7 +651,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1, help="of the sample (1)")
     parser.add_argument("--within", default="", help="only in functions of these names, with commas between")
     parser.add_argument("--out", type=Path, help="the outcomes as JSON lines; deletions that stand there are not run")
-    parser.add_argument("--usual", action="store_true", help="without heavy tests: --again then runs the rest with them")
+    parser.add_argument("--usual", action="store_true", help="without the heavy tests; see --again")
     parser.add_argument("--again", action="store_true", help="run those again that are not noticed in --out")
     wanted = parser.parse_args()
     begun_s = time.monotonic()
