@@ -230,7 +230,8 @@ def watched_bus(clock: Clockwork) -> Iterator[None]:
         can.BusABC.recv = receive  # type: ignore[method-assign]
 
 
-def show_pieces(cycles: int) -> None:
+def show_pieces(cycles: int) -> float:
+    """Print the pieces. Return the observer's share of the processor time of all threads."""
     clock = Clockwork()
     with watched_bus(clock):
         rate = run_path(cycles, clock)
@@ -248,7 +249,9 @@ def show_pieces(cycles: int) -> None:
         print(f"  {thread:<44}{total / cycles / 1e3:7.1f}")
         for piece, ns in sorted(own.items(), key=lambda item: -item[1]):
             print(f"    {piece:<42}{ns / cycles / 1e3:7.1f}")
-    print(f"  {'all threads':<44}{sum(clock.total_ns.values()) / cycles / 1e3:7.1f}")
+    whole_ns = sum(clock.total_ns.values())
+    print(f"  {'all threads':<44}{whole_ns / cycles / 1e3:7.1f}")
+    return clock.own_ns.get(("MainThread", "observer"), 0) / whole_ns
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -285,7 +288,9 @@ def main() -> int:
     costs = [(without - found) / base for found, without, base in zip(ours, blind, rates[LOOPS[0]], strict=True)]
     cost = statistics.median(costs)
     print(f"  the observer lowers C/A by {cost:.3f} ({min(costs):.3f} to {max(costs):.3f})")
-    show_pieces(options.cycles)
+    share = show_pieces(options.cycles)
+    alike = shares[LOOPS[2]] * share / (1.0 - share)
+    print(f"\nthe observer takes {100.0 * share:.1f} % of the processor time of C: without it, C/A were {alike:.3f} higher")
     if options.observer_costs is not None and cost > options.observer_costs:
         print(f"the observer costs {cost:.3f}, more than {options.observer_costs:g}", file=sys.stderr)
         return 1
