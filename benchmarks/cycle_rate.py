@@ -290,7 +290,7 @@ def main() -> int:
     print(f"  the observer lowers C/A by {cost:.3f} ({min(costs):.3f} to {max(costs):.3f})")
     share = show_pieces(options.cycles)
     alike = shares[LOOPS[2]] * share / (1.0 - share)
-    print(f"\nthe observer takes {100.0 * share:.1f} % of the processor time of C: without it, C/A were {alike:.3f} higher")
+    print(f"the observer takes {100.0 * share:.1f} % of the processor time of C: without it, C/A is {alike:.3f} higher")
     if options.observer_costs is not None and cost > options.observer_costs:
         print(f"the observer costs {cost:.3f}, more than {options.observer_costs:g}", file=sys.stderr)
         return 1
