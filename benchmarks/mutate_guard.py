@@ -81,7 +81,7 @@ def _driver(name: str, *tests: str, within: str = "") -> Subject:
 
 def _service(name: str, *tests: str, within: str = "") -> Subject:
     tests = tuple(f"service/{test}" for test in tests)
-    return Subject(f"tdhil/service/{name}.py", tests, frozenset(within.split()), heavy=False)
+    return Subject(f"tdhil/service/{name}.py", tests, frozenset(within.split()))
 
 
 _STOP = (
