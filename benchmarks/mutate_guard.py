@@ -336,6 +336,8 @@ EQUIVALENT = {
         "the function's last line returns the same, and nothing between asks for this",
     "service/run_process.py, _run: self.stop.check(next_step='Nothing has moved')":
         "a stop is seen once more by the Runner, before it moves anything; here it only comes sooner",
+    "service/attendance.py, _write: self._wake.clear()":
+        "the thread then writes the same status again and again: a core is lost, and nothing else",
     "canopen/drive.py, check: if watch.quiet:": _ONLY_SOONER,
     "canopen/drive.py, check: return": _ONLY_SOONER,
     "string_release.py, __init__: self._mean_nm = self._smooth_nm = 0.0 (last)": "the first step sets both",
