@@ -5,17 +5,18 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 Row = dict[str, Any]
+Number = TypeVar("Number", int, str)
 
 
 def kept_rows(
-    out: Path | None, key: str, numbers: Iterable[int], judged: Callable[[int], Row], show: Callable[[Row], None]
+    out: Path | None, key: str, numbers: Iterable[Number], judged: Callable[[Number], Row], show: Callable[[Row], None]
 ) -> list[Row]:
     """Return the rows of earlier parts in ``out``, then those of all ``numbers`` that are not among them.
 
-    ``judged`` makes the row of a number, whose number stands under ``key``. Each new row is appended to ``out``, if it
+    ``judged`` makes the row of a number or name, which stands under ``key``. Each new row is appended to ``out``, if it
     is given, before ``show`` is called with it.
     """
     rows: list[Row] = []
@@ -31,3 +32,11 @@ def kept_rows(
                 kept.write(json.dumps(rows[-1]) + "\n")
         show(rows[-1])
     return rows
+
+
+def drop_rows(out: Path, dropped: Callable[[Row], bool]) -> None:
+    """Remove rows of earlier parts from ``out``, so that `kept_rows` makes them anew."""
+    if not out.exists():
+        return
+    lines = [line for line in out.read_text(encoding="utf-8").splitlines() if not dropped(json.loads(line))]
+    out.write_text("".join(line + "\n" for line in lines), encoding="utf-8")

@@ -1,36 +1,55 @@
-"""Deletes every single statement of the lines that keep a shaft safe in turn: each deletion must make a test fail.
+"""Deletes single statements of the lines that keep a shaft safe, one at a time: each deletion must make a test fail.
 
-    python benchmarks/mutate_guard.py                 # all of it; 1 if a deletion survives
-    python benchmarks/mutate_guard.py --branches      # which branches of them the same tests leave out; 1 if any
-    python benchmarks/mutate_guard.py guard --jobs 2
+    python benchmarks/mutate_guard.py --sample 300 --out rows.jsonl   # of every subject some; 1 if one survives
+    python benchmarks/mutate_guard.py                 # all of them, some 7,000
+    python benchmarks/mutate_guard.py guard clock     # all of these subjects
     python benchmarks/mutate_guard.py --named         # single lines changed by hand that no test noticed once
-    python benchmarks/mutate_guard.py clock --limit 20 --skip 40
+    python benchmarks/mutate_guard.py --branches      # which branches of them the same tests leave out; 1 if any
 
-Guard and stop, the protocol's stages, the drivers' time, limits, watchdogs and bare stops, the log's writer, and the
-end of `tdhil identify`; of the service what begins, stops and loses a run, who may do what, its audit and its door.
-Works on copies in memory: a child process per mutant is forked off this one, loads the changed module in the place of
-the real one, and runs the module's tests up to the first failure. Nothing in the checkout is written. A subject whose
-tests fail as it is comes first: nothing can be said of it.
+Guard, observer and stop, the protocol's stages, every file of the drivers, the log's writer, what opens a drive and
+ends a run, and `tdhil identify`; of the service what begins, stops and loses a run, who may do what, its audit and its
+door. The benchmark works on copies in memory: it forks a child process per mutant, which replaces the function in
+question (`prepared_tests`). Nothing in the checkout is written.
+
+The tests of a subject run once as they are, which notes how long each takes and which functions it enters. A mutant
+runs those that enter its function, the quick ones first, up to the first failure. Only a mutant that the usual tests
+do not notice runs the heavy ones, too. A subject whose tests fail as it is comes first: nothing can be said of it.
+
+`--out` keeps each mutant's outcome: the next call goes on where this one was stopped. A file that was changed since
+begins anew; `--again` runs the survivors once more, for new tests.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
-import importlib.abc
-import importlib.util
+import hashlib
 import json
-import math
-import os
-import signal
+import random
 import sys
 import tempfile
 import time
+from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
-from itertools import islice
+from functools import cache, partial
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT)]
+
+from benchmarks.kept_rows import Row, drop_rows, kept_rows  # noqa: E402
+from benchmarks.prepared_tests import (  # noqa: E402
+    NOT_REPLACED,
+    Changed,
+    PreparedTests,
+    Watch,
+    forget,
+    in_child,
+    is_text,
+    wait_for,
+)
+
 TESTS = ROOT / "tests"
 OURS = ("drivers", "profiles", "sim_bus", "tdhil")
 
@@ -62,7 +81,7 @@ def _driver(name: str, *tests: str, within: str = "") -> Subject:
 
 def _service(name: str, *tests: str, within: str = "") -> Subject:
     tests = tuple(f"service/{test}" for test in tests)
-    return Subject(f"tdhil/service/{name}.py", tests, frozenset(within.split()), heavy=False)
+    return Subject(f"tdhil/service/{name}.py", tests, frozenset(within.split()))
 
 
 _STOP = (
@@ -73,8 +92,12 @@ _RUNS = ("test_control_loop.py", "test_five_stages.py", "test_run_goes_wrong.py"
 SUBJECTS = {
     "guard": _run("guard", "test_guard.py", "test_guard_prediction.py", "test_guard_follows.py", "test_kept_within.py"),
     "stop": _run("stop", *_STOP),
-    "string_release": _run("string_release", *_STOP),
-    "speed_check": _run("speed_check", "test_speed_check.py", "test_angles.py", "test_five_stages.py"),
+    "string_release": _run("string_release", *_STOP, "test_swinging_string.py"),
+    "speed_check": Subject(
+        "tdhil/runner/speed_check.py",
+        ("runner/test_speed_check.py", "runner/test_speed_witness.py", "runner/test_angles.py",
+         "faults/test_speed_unit.py"),
+    ),
     "preconditions": _run("preconditions", "test_stop_string.py", within="_LETS_GO refuse_with_string"),
     **{
         f"observer/{name}": _run(f"observer/{name}", "test_observer.py", "test_standstill.py")
@@ -109,17 +132,13 @@ SUBJECTS = {
         "test_guarding.py", "test_no_watchdog.py", "test_profile_preflight.py", "test_drive_contract.py",
         "test_cia402_without_bus.py",
     ),
-    "clock": _driver(
-        "clock", "test_late_host.py", "test_drive_faults.py",
-        within="RECENT LATE_SHARE RATES_HZ STALL_S STALL_CYCLES how_late quantile Ticks",
-    ),
+    "clock": _driver("clock", "test_clock.py", "test_recent_cycles.py", "test_late_host.py", "test_drive_faults.py"),
     "cia402/limits": _driver(
-        "cia402/limits", "test_preflight.py", "test_profile_preflight.py",
-        within="_LIMIT _TITLES set_limits note_temperature _set _count _rounded _limit _same",
+        "cia402/limits", "test_preflight.py", "test_profile_preflight.py", "test_torque_offset.py",
     ),
     "canopen/supervision": _driver(
         "canopen/supervision", "test_preflight.py", "test_guarding.py", "test_other_master.py", "test_supervision.py",
-        within="HEARTBEAT_S ANSWER_S SignOfLife _guarded",
+        "test_changed_feedback.py", "test_watchdog_feed.py",
     ),
     "canopen/watchdog": _driver(
         "canopen/watchdog", "test_preflight.py", "test_no_watchdog.py", "test_guarding.py", "test_watchdog_feed.py",
@@ -135,16 +154,15 @@ SUBJECTS = {
     "canopen/slow_feedback": _driver("canopen/slow_feedback", "test_angle_in_cycle.py", "test_drive_contract.py"),
     "cia402/polling": _driver("cia402/polling", "test_sdo_feedback.py", "test_no_valid_state.py"),
     "canopen/other_master": _driver("canopen/other_master", "test_other_master.py", "test_falling_out.py"),
-    "cia402/read back": _driver(
-        "cia402/supervision", "test_other_master.py", "test_changed_feedback.py",
-        within="Group ReadBack _WatchedObject _shown",
+    "cia402/supervision": _driver(
+        "cia402/supervision", "test_other_master.py", "test_changed_feedback.py", "test_supervision.py",
+        "test_cia402_without_bus.py", "test_torque_offset.py",
     ),
     "angle": _driver("angle", "test_angle_in_cycle.py"),
-    "bare stop": _driver("quick_stop", "test_modbus_quick_stop.py", "test_no_valid_state.py"),
-    "canopen/quick_stop": _driver(
-        "canopen/quick_stop", "test_quick_stop.py",
-        within="BY_SDO_TRIES BY_RPDO_TRIES BURST BURST_PAUSE_S _RPDOS _CONTROLWORD CanopenTarget",
+    "bare stop": _driver(
+        "quick_stop", "test_modbus_quick_stop.py", "test_no_valid_state.py", "test_quick_stop.py", "test_stop_table.py"
     ),
+    "canopen/quick_stop": _driver("canopen/quick_stop", "test_quick_stop.py"),
     "cia402/quick_stop": _driver(
         "cia402/quick_stop", "test_quick_stop.py", "test_other_master.py", "test_cia402_without_bus.py",
     ),
@@ -161,16 +179,46 @@ SUBJECTS = {
     "modbus/position": _driver("modbus/position", "test_position.py", "test_angle_in_cycle.py"),
     "modbus/tcp": _driver("modbus/tcp", "test_modbus_links.py"),
     "modbus/preflight": _driver(
-        "modbus/preflight", "test_modbus_preflight.py", "test_modbus_wrongs.py",
-        within="SHARES ECHO_POLLS ECHO_POLL_S clear_setpoints check_setpoints _check_one",
+        "modbus/preflight", "test_modbus_preflight.py", "test_modbus_wrongs.py", "test_modbus_drive.py",
+        "test_modbus_announce.py", "test_modbus_temperature.py",
     ),
     "modbus/watchdog": _driver("modbus/watchdog", "test_modbus_preflight.py", "test_modbus_watchdog.py"),
     "modbus/parameters": _driver(
-        "modbus/parameters", "test_modbus_preflight.py", "test_modbus_wrongs.py",
-        within="_SLACK RegisterSetting _LIMIT set_limits _write_limit own_speed_limits write_setting wanted_setting"
-        " _unit",
+        "modbus/parameters", "test_modbus_preflight.py", "test_modbus_wrongs.py", "test_undo_journal.py",
     ),
     "modbus/quick_stop": _driver("modbus/quick_stop", "test_modbus_quick_stop.py"),
+    "own_limits": _driver("own_limits", "test_preflight.py", "test_profile_preflight.py", "test_modbus_preflight.py"),
+    "preflight": _driver(
+        "preflight", "test_preflight.py", "test_profile_preflight.py", "test_no_watchdog.py", "test_modbus_preflight.py"
+    ),
+    "undo_journal": _driver("undo_journal", "test_undo_journal.py", "test_preflight.py"),
+    "canopen/bus": _driver("canopen/bus", "test_bus.py", "test_stamps.py", "test_sdo.py", "test_trouble.py"),
+    "canopen/sdo": _driver("canopen/sdo", "test_sdo.py", "test_trouble.py", "test_filters.py", "test_quick_stop.py"),
+    "canopen/pdo": _driver(
+        "canopen/pdo", "test_pdo_mapping.py", "test_feedback.py", "test_trouble.py", "test_changed_feedback.py",
+        "test_other_master.py", "test_quick_stop.py", "test_late_host.py",
+    ),
+    "cia402/bus": _driver("cia402/bus", "test_cia402_without_bus.py"),
+    "cia402/objects": _driver("cia402/objects", "test_objects.py", "test_sdo.py", "test_cia402_without_bus.py"),
+    "cia402/preflight": _driver(
+        "cia402/preflight", "test_preflight.py", "test_profile_preflight.py", "test_filters.py",
+        "test_torque_offset.py", "test_cia402_without_bus.py", "test_undo_journal.py",
+    ),
+    "cia402/process_data": _driver(
+        "cia402/process_data", "test_objects.py", "test_feedback.py", "test_cia402_without_bus.py",
+        "test_profile_preflight.py",
+    ),
+    **{f"ethercat/{name}": _driver(f"ethercat/{name}", "test_ethercat_drive.py", "test_drive_contract.py")
+       for name in ("drive", "mailbox", "pdo", "quick_stop", "raw", "scan", "segment", "station", "supervision")},
+    "modbus/access": _driver("modbus/access", "test_modbus_preflight.py", "test_modbus_wrongs.py"),
+    "modbus/codec": _driver("modbus/codec", "test_modbus_codec.py", "test_modbus_drive.py"),
+    "modbus/cycle": _driver("modbus/cycle", "test_modbus_plan.py", "test_modbus_drive.py", "test_angle_in_cycle.py"),
+    "modbus/identity": _driver("modbus/identity", "test_modbus_drive.py", "test_modbus_preflight.py"),
+    "modbus/link": _driver("modbus/link", "test_modbus_links.py", "test_modbus_drive.py"),
+    "modbus/other_master": _driver("modbus/other_master", "test_modbus_other_master.py"),
+    "modbus/pdu": _driver("modbus/pdu", "test_modbus_pdu.py", "test_modbus_links.py"),
+    "modbus/rtu": _driver("modbus/rtu", "test_modbus_links.py"),
+    "modbus/temperature": _driver("modbus/temperature", "test_modbus_temperature.py"),
     "log_writer": Subject(
         "tdhil/recording/log_writer.py", ("recording/test_writer.py", "recording/test_round_trip.py"),
         frozenset({
@@ -191,7 +239,19 @@ SUBJECTS = {
     "service/door": _service("door", "test_door.py"),
     "service/run_channel": _service("run_channel", "test_run_channel.py", "test_supervisor.py", "test_lost_drive.py"),
     "service/drive_stop": _service("drive_stop", "test_drive_stop.py"),
+    "service/accounts": _service("accounts", "test_access.py"),
+    "service/run_state": _service("run_state", "test_run_state.py", "test_lost_run.py"),
+    "service/store": _service("store", "test_store.py", "test_supervisor.py"),
+    "service/start_request": _service("start_request", "test_attended.py", "test_supervisor.py", "test_api.py"),
     "session/drive_lock": Subject("tdhil/session/drive_lock.py", ("session/test_drive_lock.py",)),
+    "session/confirm": Subject(
+        "tdhil/session/confirm.py",
+        ("session/test_confirm_speed.py", "session/test_unverified.py", "cli/test_only_the_operator.py",
+         "cli/test_no_watchdog.py"),
+    ),
+    "session/overrides": Subject("tdhil/session/overrides.py", ("session/test_unverified.py",)),
+    "session/pace": Subject("tdhil/session/pace.py", ("session/test_pace.py",)),
+    "session/real_time": Subject("tdhil/session/real_time.py", ("session/test_real_time.py",)),
     "session/kept": Subject("tdhil/session/kept.py", ("session/test_kept.py",)),
     "session/run_session": Subject(
         "tdhil/session/run_session.py", ("service/test_run_process.py", "cli/test_identify_end.py")
@@ -207,6 +267,9 @@ NAMED: tuple[tuple[str, str, str], ...] = (
     ("cia402/limits", "return _rounded(one, limits.torque_nm * nm, per_lsb, math.floor)",
      "return _rounded(one, limits.torque_nm * nm, per_lsb, math.ceil)"),
     ("canopen/supervision", "self._every_s = min(HEARTBEAT_S, every_s)", "self._every_s = HEARTBEAT_S"),
+    ("speed_check", "TOO_FAST = 2.0", "TOO_FAST = 4.0"),
+    ("speed_check", "FASTEST_SHARE = 0.7", "FASTEST_SHARE = 1.4"),
+    ("speed_check", "SILENT = 5", "SILENT = 500"),
     ("canopen/watchdog", "return time_ms / 5000.0", "return time_ms / 2500.0"),
     ("cia402/state_machine", "return State.UNKNOWN if state is State.NOT_READY else state", "return state"),
     ("modbus/tcp", "self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)", "pass"),
@@ -240,8 +303,14 @@ NAMED: tuple[tuple[str, str, str], ...] = (
 )
 """(subject, what stands there, what it becomes): lines that could be changed unnoticed once, and what came anew."""
 
-LONGEST_S, LONGEST = 90, 4
-"""Time limit of a mutant, s, and as a multiple of the tests' usual time: an endless loop counts as found."""
+LEAST_S, LONGEST = 60.0, 4.0
+"""Limit of a mutant's time, s, and as a multiple of its tests' time: an endless wait or loop counts as noticed."""
+START_S = 60.0
+"""Added to the limit, s: imports and collection."""
+UNLIMITED_S = 1800.0
+"""Limit of the tests as they are, s."""
+LEAST_OF_EACH = 2
+"""Least deletions of each subject in a sample."""
 
 _FALLS_THROUGH = "the function's last line: what falls off its end gives None, which its only caller takes alike"
 _POWER = "shows after a loss of power alone"
@@ -267,36 +336,23 @@ EQUIVALENT = {
         "the function's last line returns the same, and nothing between asks for this",
     "service/run_process.py, _run: self.stop.check(next_step='Nothing has moved')":
         "a stop is seen once more by the Runner, before it moves anything; here it only comes sooner",
+    "service/attendance.py, _write: self._wake.clear()":
+        "the thread then writes the same status again and again: a core is lost, and nothing else",
     "canopen/drive.py, check: if watch.quiet:": _ONLY_SOONER,
     "canopen/drive.py, check: return": _ONLY_SOONER,
+    "string_release.py, __init__: self._mean_nm = self._smooth_nm = 0.0 (last)": "the first step sets both",
     "string_release.py, _yielding: assert self._reference_nm is not None": "says to mypy what its caller has just set",
 }
 """Deletions that change nothing that can be seen, and why. (mypy refuses them all the same.)"""
-
-
-class Changed(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Finds one module: the changed one."""
-
-    def __init__(self, name: str, tree: ast.Module, path: Path) -> None:
-        self.name = name
-        self.code = compile(tree, str(path), "exec")
-        self.extra: dict[str, object] = {}
-
-    def find_spec(self, fullname, path=None, target=None):
-        return importlib.util.spec_from_loader(fullname, self) if fullname == self.name else None
-
-    def exec_module(self, module) -> None:
-        vars(module).update(self.extra)
-        exec(self.code, vars(module))
 
 
 def path_of(subject: str) -> Path:
     return ROOT / SUBJECTS[subject].path
 
 
-def is_text(statement: ast.stmt) -> bool:
-    """A docstring, of a module, a class, a function or a constant."""
-    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+@cache
+def text_of(subject: str) -> str:
+    return path_of(subject).read_text("utf-8")
 
 
 def deletable(tree: ast.Module) -> list[tuple[list[ast.stmt], int]]:
@@ -324,20 +380,59 @@ def at_the_top(tree: ast.Module, statement: ast.stmt) -> set[str]:
     return {node.id for node in ast.walk(outer) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
 
 
-def mutants(subject: str):
-    """(line, what and where in words, tree without that statement), one by one."""
-    text = path_of(subject).read_text("utf-8")
-    for number in range(len(deletable(ast.parse(text)))):
-        tree = ast.parse(text)
-        block, place = deletable(tree)[number]
+@dataclass(frozen=True)
+class Mutant:
+    """A deletion. ``number``: place in `deletable`; ``function``: line of the innermost function around, 0 for none."""
+
+    subject: str
+    number: int
+    line: int
+    text: str
+    function: int
+
+    @property
+    def key(self) -> str:
+        """The same until the file changes."""
+        return f"{self.subject} {self.number} {hashlib.sha256(text_of(self.subject).encode()).hexdigest()[:12]}"
+
+    def tree(self) -> ast.Module:
+        """The file without that statement."""
+        tree = ast.parse(text_of(self.subject))
+        block, place = deletable(tree)[self.number]
+        block[place] = ast.copy_location(ast.Pass(), block[place])
+        return ast.fix_missing_locations(tree)
+
+
+def mutants(subject: str) -> list[Mutant]:
+    """All deletions of a subject, with what and where in words."""
+    tree, meant = ast.parse(text_of(subject)), SUBJECTS[subject].within
+    around: dict[ast.AST, ast.FunctionDef] = {}
+    for node in ast.walk(tree):                                  # outer ones first
+        if isinstance(node, ast.FunctionDef):
+            around.update(dict.fromkeys((inner for inner in ast.walk(node) if inner is not node), node))
+    found = []
+    for number, (block, place) in enumerate(deletable(tree)):
         gone = block[place]
-        within = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and gone in ast.walk(node)]
-        name = within[-1].name if within else "module"
-        if SUBJECTS[subject].within and not at_the_top(tree, gone) & SUBJECTS[subject].within:
+        if meant and not at_the_top(tree, gone) & meant:
             continue
-        last = " (last)" if within and within[-1].body[-1] is gone else ""
-        block[place] = ast.copy_location(ast.Pass(), gone)
-        yield gone.lineno, f"{name}: {ast.unparse(gone).splitlines()[0]}{last}", ast.fix_missing_locations(tree)
+        within = around.get(gone)
+        last = " (last)" if within is not None and within.body[-1] is gone else ""
+        text = f"{'module' if within is None else within.name}: {ast.unparse(gone).splitlines()[0]}{last}"
+        found.append(Mutant(subject, number, gone.lineno, f"{subject}.py, {text}",
+                            0 if within is None else within.lineno))
+    return found
+
+
+def sample(subjects: list[str], count: int | None, seed: int) -> list[Mutant]:
+    """All deletions; or ``count``, drawn by subject in proportion to its size, but at least `LEAST_OF_EACH` of each."""
+    found = {subject: mutants(subject) for subject in subjects}
+    if count is None:
+        return [one for every in found.values() for one in every]
+    whole, drawn = sum(map(len, found.values())), []
+    for subject, every in found.items():
+        share = min(len(every), max(LEAST_OF_EACH, round(count * len(every) / whole)))
+        drawn += random.Random(f"{seed} {subject}").sample(every, share)
+    return drawn
 
 
 class Counted(ast.NodeTransformer):
@@ -374,16 +469,16 @@ class Counted(ast.NodeTransformer):
         return node
 
 
-def run_tests(subject: str, changed: Changed) -> int:
-    """Run pytest in this process. Return its exit code."""
+def run_tests(subject: str, changed: Changed, watch: Watch, which: str) -> int:
+    """Run pytest in this process, with the option ``which`` of tests/conftest.py. Return its exit code."""
     import pytest
 
-    forget(SUBJECTS[subject].module)
+    forget(SUBJECTS[subject].module, OURS)
     sys.meta_path.insert(0, changed)
     quiet = ["-q", "-x", "-p", "no:cacheprovider", "--no-header", "--hypothesis-seed=0", "-o", "addopts=",
-             *(["--all-but-long"] if SUBJECTS[subject].heavy else [])]
+             f"--rootdir={ROOT}", *([which] if which else [])]
     files = [str(TESTS / name) for name in SUBJECTS[subject].tests]
-    return int(pytest.main([*quiet, "--import-mode=importlib", *files]))
+    return int(pytest.main([*quiet, "--import-mode=importlib", *files], [watch]))
 
 
 def preload() -> None:
@@ -405,106 +500,113 @@ def preload() -> None:
                 tdhil.runner.design, tdhil.runner.excitation, tdhil.recording.run_log))
 
 
-def forget(module: str) -> None:
-    """Unload our modules, so that none keeps a reference to a loaded subject."""
-    if module in sys.modules:
-        for name in [name for name in sys.modules if name.split(".")[0] in OURS]:
-            del sys.modules[name]
+def fork(subject: str, changed: Changed, longest_s: float, which: str, log: Path | None = None) -> int:
+    """Run all tests in a child process. Return its exit code, below 0 for a signal."""
+    return wait_for(in_child(lambda: run_tests(subject, changed, Watch(), which), log), longest_s)
 
 
-def fork(subject: str, changed: Changed, report: Path | None = None, longest_s: float = 900.0) -> int:
-    """The child's process number."""
-    child = os.fork()
-    if child:
-        return child
-    code = 99
-    try:
-        signal.alarm(math.ceil(longest_s))
-        folder = tempfile.mkdtemp(prefix="mutate-")
-        os.chdir(folder)
-        hush = os.open(os.devnull if report is None else str(report) + ".log", os.O_WRONLY | os.O_CREAT)
-        os.dup2(hush, 1)
-        os.dup2(hush, 2)
-        went: set[tuple[int, bool]] = set()
-
-        def note(number, value):
-            went.add((number, bool(value)))
-            return value
-
-        changed.extra["_went"] = note
-        code = run_tests(subject, changed)
-        if report is not None:
-            report.write_text(json.dumps(sorted(went)))
-    finally:
-        os._exit(code)
+_PREPARED: dict[tuple[str, str], PreparedTests] = {}
 
 
-def delete_all(
-    subject: str, jobs: int, longest_s: float, skip: int = 0, limit: int | None = None, within: str = ""
-) -> list[str]:
-    """The deletions that no test noticed."""
-    name = SUBJECTS[subject].module
-    running: dict[int, tuple[int, str]] = {}
-    survivors: list[str] = []
-    count = alike = 0
-
-    def reap() -> None:
-        nonlocal alike
-        child, status = os.wait()
-        line, text = running.pop(child)
-        if os.waitstatus_to_exitcode(status) != 0:
-            return
-        if text in EQUIVALENT:
-            alike += 1
-        else:
-            survivors.append(f"line {line}, {text}")
-            print(f"SURVIVES {survivors[-1]}", flush=True)
-
-    wanted = (one for one in mutants(subject) if not within or one[1].split(":")[0] in within.split(","))
-    for line, text, tree in islice(wanted, skip, None if limit is None else skip + limit):
-        count += 1
-        while len(running) >= jobs:
-            reap()
-        child = fork(subject, Changed(name, tree, path_of(subject)), longest_s=longest_s)
-        running[child] = line, f"{subject}.py, {text}"
-    while running:
-        reap()
-    noticed = count - alike - len(survivors)
-    print(f"{subject}.py: {count} deletions, {noticed} noticed, {alike} alike, {len(survivors)} survive", flush=True)
-    return survivors
+def prepared(subject: str, which: str) -> PreparedTests:
+    """The tests of a subject; those of the subject before are closed. ``which``: '' or ``--heavy``."""
+    for other in [key for key in _PREPARED if key[0] != subject]:
+        _PREPARED.pop(other).close()
+    if (subject, which) not in _PREPARED:
+        _PREPARED[subject, which] = PreparedTests(
+            SUBJECTS[subject].module, path_of(subject), partial(_run_prepared, subject, which), UNLIMITED_S
+        )
+    return _PREPARED[subject, which]
 
 
-def as_it_is(subject: str) -> float | None:
-    """Return the time limit of a mutant from the time of the unchanged tests; None if they fail."""
-    tree = ast.parse(path_of(subject).read_text("utf-8"))
+def _run_prepared(subject: str, which: str, changed: Changed, watch: Watch) -> int:
+    return run_tests(subject, changed, watch, which)
+
+
+class TestsFail(Exception):
+    """They do so without a mutant."""
+
+
+def noticed(subject: str, tree: ast.Module, function: int, *, usual: bool = False) -> tuple[bool, int]:
+    """Return whether a test fails, and how many there were to run. ``function``: its line; ``usual``: no heavy tests.
+
+    Raises TestsFail.
+    """
+    count = 0
+    for which in ("", "--heavy") if SUBJECTS[subject].heavy and not usual else ("",):
+        tests = prepared(subject, which)
+        if (trace := tests.trace) is None:
+            print(tests.said)
+            raise TestsFail(subject)
+        if not (chosen := trace.tests(function)):
+            continue
+        count += len(chosen)
+        longest_s = max(LEAST_S, LONGEST * sum(trace.took_s[one] for one in chosen))
+        code = tests.run(tree, chosen, longest_s) if tests.replaceable(function) else NOT_REPLACED
+        if code == NOT_REPLACED:
+            changed = Changed(SUBJECTS[subject].module, tree, path_of(subject))
+            code = fork(subject, changed, START_S + longest_s, which)
+        if code != 0:
+            return True, count
+    return False, count
+
+
+def judged(mutant: Mutant, *, usual: bool = False) -> Row:
+    """The row of a mutant. ``noticed``: None if nothing can be said, as the tests fail without it."""
     begun_s = time.monotonic()
-    _, status = os.waitpid(fork(subject, Changed(SUBJECTS[subject].module, tree, path_of(subject))), 0)
-    took_s = time.monotonic() - begun_s
-    return None if os.waitstatus_to_exitcode(status) != 0 else max(LONGEST_S, LONGEST * took_s)
+    found: bool | None = None
+    count = 0
+    with suppress(TestsFail):
+        found, count = noticed(mutant.subject, mutant.tree(), mutant.function, usual=usual)
+    return {"mutant": mutant.key, "subject": mutant.subject, "line": mutant.line, "text": mutant.text,
+            "noticed": found, "tests": count, "took_s": round(time.monotonic() - begun_s, 1)}
+
+
+def outcome(row: Row) -> str:
+    if row["noticed"] is None:
+        return "its tests fail as it is"
+    return "noticed" if row["noticed"] else "argued" if row["text"] in EQUIVALENT else "SURVIVES"
+
+
+def show(row: Row) -> None:
+    if outcome(row) != "noticed":
+        print(f"{outcome(row)}: line {row['line']}, {row['text']} ({row['tests']} tests)", flush=True)
+
+
+def summary(rows: list[Row]) -> list[str]:
+    """Print the counts by subject. Return the survivors."""
+    for subject in dict.fromkeys(row["subject"] for row in rows):
+        counts = Counter(outcome(row) for row in rows if row["subject"] == subject)
+        print(f"{subject}.py: {counts.total()} deletions: " + ", ".join(f"{n} {what}" for what, n in counts.items()))
+    counts = Counter(map(outcome, rows))
+    good = counts["noticed"] + counts["argued"]
+    print(f"{len(rows)} deletions, {counts['noticed']} noticed, {counts['argued']} argued, {len(rows) - good} not: "
+          f"{100.0 * good / max(1, len(rows)):.1f} % noticed or argued")
+    return [f"line {row['line']}, {row['text']}: {outcome(row)}" for row in rows
+            if outcome(row) not in ("noticed", "argued")]
 
 
 def named(subjects: list[str]) -> list[str]:
     """The changes by hand that no test noticed, or whose line is no longer there."""
-    survivors, longest_s = [], {}
+    survivors = []
     for subject, old, new in NAMED:
         if subject not in subjects:
             continue
-        if subject not in longest_s:
-            longest_s[subject] = as_it_is(subject)
-        allowed_s = longest_s[subject]
-        if allowed_s is None:
-            survivors.append(f"{subject}.py: its tests fail as it is")
-            continue
-        text = path_of(subject).read_text("utf-8")
+        text = text_of(subject)
         what = f"{subject}.py: {old.strip()} → {new.strip() or 'nothing'}"
         if text.count(old) != 1:
             survivors.append(f"{what}: found {text.count(old)} times")
             continue
-        changed = Changed(SUBJECTS[subject].module, ast.parse(text.replace(old, new)), path_of(subject))
-        _, status = os.waitpid(fork(subject, changed, longest_s=allowed_s), 0)
-        noticed = os.waitstatus_to_exitcode(status) != 0
-        print(f"{'noticed ' if noticed else 'SURVIVES'} {what}", flush=True)
-        if not noticed:
+        line = text[:text.index(old.strip())].count("\n") + 1
+        functions = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)
+                     and node.lineno < line <= (node.end_lineno or 0)]
+        try:
+            seen, _ = noticed(subject, ast.parse(text.replace(old, new)), functions[-1].lineno if functions else 0)
+        except TestsFail:
+            survivors.append(f"{subject}.py: its tests fail as it is")
+            continue
+        print(f"{'noticed ' if seen else 'SURVIVES'} {what}", flush=True)
+        if not seen:
             survivors.append(what)
     return survivors
 
@@ -516,10 +618,23 @@ def branches(subject: str) -> list[str]:
     tree.body = [counted.visit(node) if not meant or at_the_top(tree, node) & meant else node for node in tree.body]
     tree = ast.fix_missing_locations(tree)
     with tempfile.TemporaryDirectory() as folder:
-        report = Path(folder) / "went.json"
-        _, status = os.waitpid(fork(subject, Changed(SUBJECTS[subject].module, tree, path_of(subject)), report), 0)
-        if os.waitstatus_to_exitcode(status) != 0:
-            print(Path(str(report) + ".log").read_text()[-3000:])
+        report, log = Path(folder) / "went.json", Path(folder) / "log"
+        every = "--all-but-long" if SUBJECTS[subject].heavy else ""
+        seen: set[tuple[int, bool]] = set()
+
+        def note(number, value):
+            seen.add((number, bool(value)))
+            return value
+
+        def work() -> int:
+            changed = Changed(SUBJECTS[subject].module, tree, path_of(subject))
+            changed.extra["_went"] = note
+            code = run_tests(subject, changed, Watch(), every)
+            report.write_text(json.dumps(sorted(seen)))
+            return code
+
+        if wait_for(in_child(work, log), UNLIMITED_S) != 0:
+            print(log.read_text()[-3000:])
             return [f"{subject}.py: its tests fail"]
         went = {(number, way) for number, way in json.loads(report.read_text())}
     wanted = {(number, way) for number in range(len(counted.places)) for way in (True, False)}
@@ -535,10 +650,12 @@ def main() -> int:
     parser.add_argument("subjects", nargs="*", help=f"{', '.join(SUBJECTS)} (default: all)")
     parser.add_argument("--branches", action="store_true", help="branch coverage instead")
     parser.add_argument("--named", action="store_true", help="only the changes by hand")
-    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--sample", type=int, metavar="N", help="about so many deletions, of each subject its share")
+    parser.add_argument("--seed", type=int, default=1, help="of the sample (1)")
     parser.add_argument("--within", default="", help="only in functions of these names, with commas between")
-    parser.add_argument("--skip", type=int, default=0, help="so many deletions of each subject")
-    parser.add_argument("--limit", type=int, default=None, help="at most so many of each")
+    parser.add_argument("--out", type=Path, help="the outcomes as JSON lines; deletions that stand there are not run")
+    parser.add_argument("--usual", action="store_true", help="without the heavy tests; see --again")
+    parser.add_argument("--again", action="store_true", help="run those again that are not noticed in --out")
     wanted = parser.parse_args()
     begun_s = time.monotonic()
     preload()
@@ -546,14 +663,18 @@ def main() -> int:
     subjects = wanted.subjects or list(SUBJECTS)
     if wanted.named:
         left += named(subjects)
-        subjects = []
-    for subject in subjects:
-        if wanted.branches:
+    elif wanted.branches:
+        for subject in subjects:
             left += branches(subject)
-        elif (longest_s := as_it_is(subject)) is None:
-            left.append(f"{subject}.py: its tests fail as it is")
-        else:
-            left += delete_all(subject, wanted.jobs, longest_s, wanted.skip, wanted.limit, wanted.within)
+    else:
+        names = {f" {name}: " for name in wanted.within.split(",") if name}
+        drawn = [one for one in sample(subjects, wanted.sample, wanted.seed)
+                 if not names or any(name in one.text for name in names)]
+        if wanted.again and wanted.out is not None:
+            drop_rows(wanted.out, lambda row: not row["noticed"])
+        by_key = {one.key: one for one in drawn}
+        rows = kept_rows(wanted.out, "mutant", by_key, lambda key: judged(by_key[key], usual=wanted.usual), show)
+        left += summary([row for row in rows if row["mutant"] in by_key])
     for line in left:
         print(line)
     print(f"{time.monotonic() - begun_s:.0f} s")

@@ -23,8 +23,8 @@
   the other half begins a header. Meanwhile some 20 stops a second are asked for, each by a new connection: from an
   address without other connections, and from one with very many (8 s; --full: 60 s). From the call to the answer it
   takes at most 200 ms in 99 of 100, and each answer says that the run was asked to stop. Once with the limit of open
-  files that holds here, once with 1,024. Beside it stands what a stop takes without connections: on a computer with
-  other load, that alone may take longer.
+  files that holds here, once with 1,024. Beside it stands what the same number of stops takes without connections, half
+  of them before and half after, and the ratio: on a computer with other load, that alone may take longer.
 
 `cycles`, `idle` and `stop` want a machine with nothing else to do, and say the load that they had.
 """
@@ -471,46 +471,57 @@ def timed_stop(url: str, run: str, source: str) -> tuple[float, Any]:
     return time.monotonic() - begun_s, answer.get("stop")
 
 
+def timed_stops(server: Server, run: str, count: int, sources: tuple[str, ...]) -> tuple[list[float], bool]:
+    """Return what so many stops took, s, some `STOPS_A_SECOND`; and whether each asked the run."""
+    took_s, good = [], True
+    for number in range(count):
+        took, stop = timed_stop(server.url, run, sources[number % len(sources)])
+        took_s.append(took)
+        good &= bool(stop and stop["asked"])
+        time.sleep(1.0 / STOPS_A_SECOND)
+    return took_s, good
+
+
+def in_ms(took_s: list[float]) -> str:
+    return (f"p99 {1e3 * quantile(sorted(took_s), 0.99):.0f} ms, median {1e3 * float(np.median(took_s)):.0f} ms,"
+            f" longest {1e3 * max(took_s):.0f} ms")
+
+
 def idle(folder: Path, seconds: float, descriptors: int | None, count: int = 5000) -> bool:
     """``descriptors``: the limit of open files that the service has; None: as it is here."""
     took_s: list[float] = []
     good, most, opened = True, 0, 0
+    half = max(1, round(0.5 * seconds * STOPS_A_SECOND))
     with served(folder / f"data-{descriptors}", descriptors=descriptors) as server:
         run = server.client.start(RIG, real_time=True, rate_hz=10.0)["id"]
         wait_for("motion", lambda: stage_of(server, run) == "speed" or ended_early(server, run))
         port = server.url.rpartition(":")[2]
-        alone_s = []
-        for _ in range(2 * STOPS_A_SECOND):            # what the machine takes for a stop beside nothing
-            alone_s.append(timed_stop(server.url, run, "127.0.0.9")[0])
-            time.sleep(1.0 / STOPS_A_SECOND)
+        alone_s, _ = timed_stops(server, run, half, ("127.0.0.9",))
         with subprocess.Popen([sys.executable, __file__, "keep", port, str(count)], stdout=subprocess.PIPE,
                               text=True) as child:
             assert child.stdout is not None
             try:
                 child.stdout.readline()
-                end_s, number = time.monotonic() + seconds, 0
-                while time.monotonic() < end_s:
-                    for _ in range(STOPS_A_SECOND):
-                        source = "127.0.0.9" if number % 2 else "127.0.1.1"
-                        took, stop = timed_stop(server.url, run, source)
-                        took_s.append(took)
-                        good &= bool(stop and stop["asked"])
-                        number += 1
-                        time.sleep(1.0 / STOPS_A_SECOND)
+                end_s = time.monotonic() + seconds
+                while time.monotonic() < end_s or len(took_s) < half:
+                    more_s, all_asked = timed_stops(server, run, STOPS_A_SECOND, ("127.0.1.1", "127.0.0.9"))
+                    took_s += more_s
+                    good &= all_asked
                     there, opened = (int(one) for one in child.stdout.readline().split())
                     most = max(most, there)
             finally:
                 child.kill()
+        alone_s += timed_stops(server, run, half, ("127.0.0.9",))[0]
         wait_for("its end", lambda: state_of(server, run) in ENDED)
         end, said = server.client.run(run), server.said()
     good &= end["stop"]["confirmed"] is True and "Traceback" not in said
-    p99_s = quantile(sorted(took_s), 0.99)
+    p99_s, alone_p99_s = (quantile(sorted(one), 0.99) for one in (took_s, alone_s))
     print(f"{'no own' if descriptors is None else descriptors} limit of open files: {len(took_s)} stops beside {count}"
-          f" idle connections ({most} open at once, {opened} opened in all): p99 {1e3 * p99_s:.0f} ms, median"
-          f" {1e3 * float(np.median(took_s)):.0f} ms, longest {1e3 * max(took_s):.0f} ms; the run is {end['state']};"
-          f" {len(said)} bytes of log; without connections: p99 {1e3 * quantile(sorted(alone_s), 0.99):.0f} ms;"
+          f" idle connections ({most} open at once, {opened} opened in all): {in_ms(took_s)}; the run is"
+          f" {end['state']}; {len(said)} bytes of log; {len(alone_s)} stops without connections: {in_ms(alone_s)};"
+          f" ratio of p99 {p99_s / alone_p99_s:.2f}, of medians {np.median(took_s) / np.median(alone_s):.2f};"
           f" {load()}", flush=True)
-    return good and p99_s <= IDLE_STOP_S and len(said) <= 200 * (seconds + 60.0)
+    return good and p99_s <= IDLE_STOP_S and len(said) <= 200 * (2.0 * seconds + 60.0)
 
 
 def main(arguments: list[str]) -> int:

@@ -17,6 +17,7 @@ from tdhil.cli.arguments import add_option, add_settings, settings_in
 from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
+from tdhil.csv_text import cell_of
 from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.session import is_evaluation, is_verification, require_file
 
@@ -172,7 +173,13 @@ def _write_csv(rows: Sequence[dict[str, Any]], path: Path) -> None:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(rows[0])
         for row in rows:
-            table.writerow(["" if isinstance(cell, float) and math.isnan(cell) else cell for cell in row.values()])
+            table.writerow([_cell(value) for value in row.values()])
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, str):
+        return cell_of(value)                       # the name of a log comes from anyone
+    return "" if isinstance(value, float) and math.isnan(value) else value
 
 
 def _write_parquet(rows: Sequence[dict[str, Any]], path: Path) -> None:

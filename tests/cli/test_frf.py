@@ -63,6 +63,14 @@ def test_json_csv_parquet_and_picture_have_the_same_lines(trace, tmp_path, capsy
     assert head.startswith(b"\x89PNG") and struct.unpack(">II", head[16:24])[0] > 900
 
 
+def test_the_name_of_a_log_is_no_formula_in_the_table(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    name, *motion = write_trace(tmp_path, "=cmd")
+    assert main(["frf", Path(name).name, *motion, "--out", "frf.csv"]) == 0
+    with Path("frf.csv").open(newline="", encoding="utf-8") as file:
+        assert {row["log"] for row in csv.DictReader(file)} == {"'=cmd.csv"}
+
+
 def test_python_has_the_same_response(trace, capsys):
     import tdhil
 

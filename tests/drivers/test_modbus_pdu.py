@@ -8,6 +8,7 @@ from pymodbus.pdu import DecodePDU
 from drivers.errors import ObjectRefused, PreflightRefused
 from drivers.modbus import pdu
 from drivers.modbus.pdu import BadReply, CycleRefused, RegisterRefused, exception_text
+from profiles import MessageCode
 
 WORDS = st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=100)
 OTHER_SIDE = DecodePDU(True)
@@ -96,3 +97,28 @@ def test_a_bit_that_flips_in_the_head_is_noticed(request_pdu, bytes_out, bytes_i
 def test_what_no_request_can_hold(address, count):
     with pytest.raises(ValueError, match="don't fit"):
         pdu.read(3, address, count)
+
+
+def test_the_count_of_requests_is_that_of_the_drive():
+    """Section 6.8: function and sub-function come back, then the count."""
+    asked = pdu.count_requests()
+    assert asked == h("08 000e 0000")
+    assert pdu.words_of(asked, h("08 000e a537")) == (0xA537,)
+    for other in ("08 000d a537", "08 010e a537", "08 000e a5", "08 000e a537 00", "08"):
+        with pytest.raises(BadReply, match="to diagnostics"):
+            pdu.words_of(asked, h(other))
+
+
+@pytest.mark.parametrize("made", [
+    lambda: pdu.write_many(0xFFFF, (1, 2)), lambda: pdu.write_many(0, ()), lambda: pdu.write_many(0, (0,) * 124),
+    lambda: pdu.read_write(0, 126, 0, (1,)), lambda: pdu.read_write(0, 1, 0xFFFF, (1, 2)),
+    lambda: pdu.read_write(0, 1, 0, (0,) * 122),
+])
+def test_nor_can_a_request_that_writes(made):
+    with pytest.raises(ValueError, match="don't fit"):
+        made()
+
+
+def test_what_is_wrong_with_a_line_has_a_message_each():
+    errors = (pdu.NoReply, BadReply, pdu.LinkLost)
+    assert [one.entry for one in errors] == [MessageCode.NO_REPLY, MessageCode.BAD_REPLY, MessageCode.LINK_LOST]

@@ -39,3 +39,14 @@ def test_what_is_not_known_of_time_is_not_known_of_the_ratio():
     sharp, dull = compared(lambda cycle: 0.0), compared(lambda cycle: 0.0, half_width_s=0.01)
     assert dull.half_width > sharp.half_width + 0.004
     assert compared(lambda cycle: 0.0, half_width_s=0.2) is None
+
+
+def test_an_angle_that_moves_without_any_reported_speed_has_a_ratio_all_the_same():
+    angles, backwards = Angles(), Angles()
+    for cycle in range(100):
+        time_s = cycle * PERIOD_S
+        for found, sign in ((angles, 1.0), (backwards, -1.0)):
+            found.saw(Sample(time_s, 0.0, 0.0, True, 0.0, 0.0, None, Mode.SPEED, PowerState.ENABLED, False, False, 0))
+            angle = COUNT_RAD * math.floor(sign * SPEED_RAD_S * time_s / COUNT_RAD)
+            found.read(PositionReading(time_s, 0.001, angle, None, "6064h"), SPEED_RAD_S)
+    assert angles.ratio().value == backwards.ratio().value == pytest.approx(1000.0)

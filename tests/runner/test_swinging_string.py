@@ -329,3 +329,17 @@ def test_a_run_that_is_told_before_an_echo_learns_how_its_torque_answered():
     run = here.runner(ExcitationRequest(kind="prbs", periods=3)).run()
     assert run.cause is None, run.cause
     assert here.log.facts["torque_answer"].lag_s < 0.01
+
+
+def test_the_damper_yields_to_the_swing_about_the_mean_and_within_its_bounds():
+    damper = SwingDamper(4000.0, 10.0, 2.0, PERIOD_S)
+    assert [damper.step(500.0) for _ in range(100)] == [2.0] * 100            # friction moves no mean speed
+    first, later = damper.step(900.0), [damper.step(900.0) for _ in range(25)][-1]
+    assert 2.0 > first > later > 2.0 - 0.1 * 10.0                             # smoothed over 0.2 s
+    assert damper.step(math.nan) == 2.0                                       # a missing report is no swing
+    assert [damper.step(4000.0) for _ in range(50)][-1] == 1.0                # a tenth of the speed limit
+    assert [damper.step(-4000.0) for _ in range(50)][-1] == 3.0
+    slow = SwingDamper(4000.0, 10.0, 0.5, PERIOD_S)
+    for _ in range(100):
+        slow.step(0.0)
+    assert [slow.step(4000.0) for _ in range(50)][-1] == 0.0                  # never backwards

@@ -163,6 +163,15 @@ def test_a_header_that_is_not_completed_in_time_ends_its_connection(served, sent
     assert not is_closed(early)
 
 
+@pytest.mark.parametrize("sent", [b"", HEADER[:30]])
+def test_a_client_that_goes_before_its_header_is_complete_leaves_nothing(served, sent):
+    """Its place is free at once, not only when its time is over: the clock stands."""
+    client = served.connect(sent=sent)
+    wait_for("it", lambda: served.door.waiting == 1)
+    client.close()
+    wait_for("its end", lambda: served.door.waiting == 0, 30.0)
+
+
 def test_a_body_that_is_not_completed_in_time_ends_its_connection(served):
     slow = served.connect(sent=HEADER.replace(b"Length: 0", b"Length: 9") + b"\r\nhalf")
     wait_for("it", lambda: served.door.served == 1)

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from drivers import DriveFault
 from tdhil.errors import ExitCode
 from tdhil.recording import read_run
 from tdhil.report import has_extra
@@ -209,3 +210,29 @@ def test_a_lease_and_a_code_are_handed_on_as_they_came(tmp_path):
     process.operator_interface.confirming.confirmed_by = "anna"
     assert process.answer({"do": "code"}) == {"code": None}
     process.board.close()
+
+
+def test_a_run_whose_motion_is_over_needs_no_page_and_keeps_its_plan(tmp_path, monkeypatch):
+    """A page that goes while the result is made stops nothing: the lease has ended before."""
+    done: list[str] = []
+
+    class Session:
+        log, rehearsal = SimpleNamespace(), None
+
+        def __init__(self, *_: object, **__: object) -> None:
+            process.operator_interface.lease = SimpleNamespace(end=lambda: done.append("lease ended"))
+
+        def move(self, stop: object) -> SimpleNamespace:
+            return SimpleNamespace(cause=DriveFault("it faulted", where="a test"), stop=None)
+
+        def abandon(self) -> None:
+            done.append("abandoned")
+
+    plan = {"expected_half_width": 0.1, "duration_s": 60.0}
+    monkeypatch.setattr("tdhil.session.RunSession", Session)
+    monkeypatch.setattr("tdhil.service.run_process.plan_of", lambda *_: plan)
+    process = RunProcess(Asked(tmp_path, SIMULATED, motion="watched").folder)
+    assert process._run() == ExitCode.DRIVE_FAULT
+    process.board.close()
+    assert done == ["lease ended", "abandoned"]
+    assert read_json(process.folder / "plan.json") == plan

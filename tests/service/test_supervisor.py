@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import signal
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -14,12 +15,13 @@ from typing import Any
 import pytest
 
 from drivers import CommunicationLost, DataFileError
-from tdhil.errors import LogError
+from tdhil.errors import LogError, UsageError
 from tdhil.service import supervisor as supervisor_module
 from tdhil.service.run_channel import STOP_FILE, RunRefused
 from tdhil.service.run_state import Conflict, NoRoom, State, Status, now, way_to
 from tdhil.service.store import StoredRequest
 from tdhil.service.supervisor import KEYS
+from tdhil.session import drive_lock
 from tests.service.conftest import FAKE, Service, wait_for
 
 
@@ -454,3 +456,43 @@ def test_what_changes_while_a_run_is_indexed_is_indexed_once_more(service, monke
     go.set()
     assert service.supervisor._indexing.finish(60.0)
     assert puts == [run, run]
+
+
+@pytest.mark.parametrize(("code", "said", "seen", "words"), [
+    (0, b"{}", True, "confirmed standstill"), (8, b"{}", False, "did NOT confirm"), (8, b"", False, "did NOT confirm"),
+    (8, b"Traceback", False, "did NOT confirm"), (8, b"[1]", False, "did NOT confirm"),
+    (8, b'{"same_drive": true}', False, "did NOT confirm"),
+    (8, b'{"same_drive": false, "identity": "9,9"}', False, "another identity (9,9)"),
+])
+def test_what_a_stop_s_process_ended_with_is_all_that_was_seen(monkeypatch, code, said, seen, words):
+    monkeypatch.setattr(supervisor_module.subprocess, "run",
+                        lambda *_, **__: SimpleNamespace(returncode=code, stdout=said))
+    found, text = supervisor_module._stop_seen(["stop"])
+    assert found is seen and words in text
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOENT, "no such program"), subprocess.TimeoutExpired("stop", 1.0)])
+def test_a_stop_s_process_that_never_ends_has_seen_nothing(monkeypatch, error):
+    def fails(*_: Any, **__: Any) -> Any:
+        raise error
+
+    monkeypatch.setattr(supervisor_module.subprocess, "run", fails)
+    found, text = supervisor_module._stop_seen(["stop"])
+    assert not found and text.startswith("tdhil stop: ")
+
+
+def test_a_drive_is_certainly_idle_where_nothing_of_this_computer_can_move_it(service, monkeypatch):
+    supervisor, rig = service.supervisor, service.supervisor.rigs.get("real")
+    assert supervisor.certainly_idle(rig) is True
+    assert supervisor.certainly_idle(supervisor.rigs.get("a")) is False        # simulated: there is no drive
+    with drive_lock.hold(rig.address):
+        assert supervisor.certainly_idle(rig) is False
+    monkeypatch.setattr(supervisor, "blocked", lambda rig_id: "a run" if rig_id == "real" else None)
+    assert supervisor.certainly_idle(rig) is False
+
+
+def test_a_rig_that_is_part_of_tdhil_is_not_edited(tmp_path):
+    found = Service(tmp_path / "data", None)
+    rig = found.supervisor.rigs.all()[0]
+    with pytest.raises(UsageError, match="part of tdhil"):
+        found.supervisor.edit_rig(rig.id, rig.path.read_text(), rig.sha256, "anna")
