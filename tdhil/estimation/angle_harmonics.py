@@ -12,19 +12,22 @@ torque, the rest obeys
     Y = T − Z W = F_T e^(−δ s) Σ (c_n C_n + s_n S_n) + noise,        c_n = a_n cos φ_n,  s_n = −a_n sin φ_n,
 
 where T, W, C_n and S_n are the spectra of torque, speed, cos nθ and sin nθ over all periods of a segment. δ is the
-delay of the reported speed behind the angle, beyond its filter. The spectrum of the noise is estimated from Y itself.
-The fit is linear, and weighted by this noise.
+delay of the reported speed behind the angle, beyond its filter. The derivative Ω of the angle gives a second rest,
+Y' = T − (J s + B) F_T e^(−δ s) Ω, with the same harmonics and other noise. In each band of frequencies the one with
+less power counts. The spectrum of the noise is estimated from the rest itself. The fit is linear, and weighted by this
+noise.
 
 An order counts if it lowers −2 ln L by more than `LEAST_GAIN`. Its torque, as the drive reports it, is then subtracted
-from the reported torque, and the recording is identified again. Both steps are repeated, so that J and the harmonics are
-those of one fit. What the uncertainty of the harmonics adds to J is added to its interval.
+from the reported torque, and the recording is identified again. Both steps are repeated, so that J and the harmonics
+are those of one fit. What the uncertainty of the harmonics adds to J is added to its interval.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -48,7 +51,8 @@ HIGHEST_ORDER = 256
 _BINS = 4096              # bins of a turn, in which the angle is sorted for the first look
 _FIRST_LOOK = 0.5         # of LEAST_GAIN: least gain in the first look, which is approximate, for the exact one
 _MOST_RATE_HZ = 500.0     # Hz; a faster recording is averaged down to it
-_USED_BAND = 0.4          # of the rate: highest frequency used
+_USED_BAND = 0.3          # of the rate: highest frequency used
+_ANGLE_BAND = 0.25        # of the rate of the angle's readings: highest frequency of its derivative
 _TAPER = 0.25             # of a period: length of the taper at either end of a segment
 _LEAST_PERIODS = 3        # periods in one segment
 _BAND_BINS = 24           # fewest spectral lines whose median gives the noise
@@ -59,7 +63,8 @@ _ROUNDS = 2               # rounds of harmonics and model
 _STEP = 0.5               # sd: step of a parameter, for the slope of the harmonics over it
 _FINER = 2                # grid points for one sample, on which the harmonics pass the filter
 _SETTLED_S = 20.0         # s; after this time the longest filter has settled
-_SEEN_SHARE = 0.5         # share of the time in which an order must be inside the used band
+_SEEN_SHARE = 0.98        # share of the time in which an order must be inside the used band
+_BLOCK_S = 2.0            # s; blocks of time whose scores are independent: longer than load and filters remember
 _SMALL = 1e-12            # relative: smaller eigenvalues of the normal matrix count as zero
 
 
@@ -99,7 +104,7 @@ class AngleTorque:
 class _Angle:
     """Angle of the shaft as a smooth function of time, from ``begin_s`` to ``end_s``."""
 
-    spline: object
+    spline: Callable[..., FloatArray]
     begin_s: float
     end_s: float
     times: FloatArray
@@ -120,13 +125,11 @@ class _Angle:
 
     def at(self, time_s: FloatArray) -> FloatArray:
         """Return the angle (N,), rad."""
-        found: FloatArray = self.spline(time_s)      # type: ignore[operator]
-        return found
+        return self.spline(time_s)
 
     def speed(self, time_s: FloatArray) -> FloatArray:
         """Return the derivative of the angle (N,), rad/s."""
-        found: FloatArray = self.spline(time_s, 1)      # type: ignore[operator]
-        return found
+        return self.spline(time_s, 1)
 
     def covers(self, begin_s: float, end_s: float, longest_gap_s: float) -> bool:
         """Return whether the angle is known in a span without a long gap."""
@@ -150,6 +153,11 @@ class _Segment:
     chosen: slice
     torque: ComplexArray
     speed: ComplexArray
+    turning: ComplexArray
+    """Spectrum (K,) of the derivative of the angle."""
+    angle_band: int
+    """Number of the used frequencies at which the readings of the angle are close enough for its derivative."""
+    kept: dict[int, tuple[ComplexArray, ComplexArray]] = field(default_factory=dict)
 
     def repeats(self, signal: FloatArray) -> FloatArray:
         """Return a signal (N,) without its mean over the periods."""
@@ -163,15 +171,17 @@ class _Segment:
         return found
 
     def waves(self, order: int) -> tuple[ComplexArray, ComplexArray]:
-        """Return the spectra (K,) of cos nθ and of sin nθ."""
-        turned = order * self.angle_rad
-        return self.spectrum(np.cos(turned)), self.spectrum(np.sin(turned))
+        """Return the spectra (K,) of cos nθ and of sin nθ, computed once."""
+        if order not in self.kept:
+            turned = order * self.angle_rad
+            self.kept[order] = self.spectrum(np.cos(turned)), self.spectrum(np.sin(turned))
+        return self.kept[order]
 
 
 def _run(index: tuple[int, ...]) -> tuple[int, int]:
     """Return the first and the last place of the longest run of consecutive numbers."""
     breaks = [0, *(k + 1 for k in range(len(index) - 1) if index[k + 1] != index[k] + 1), len(index)]
-    begin, end = max(zip(breaks[:-1], breaks[1:], strict=True), key=lambda span: span[1] - span[0])
+    begin, end = max(itertools.pairwise(breaks), key=lambda span: span[1] - span[0])
     return begin, end - 1
 
 
@@ -188,17 +198,19 @@ def _segment(stretch: Stretch, samples: Samples, angle: _Angle) -> _Segment | No
     interval = max(usual_interval(inside.time_s), 1.0 / _MOST_RATE_HZ)
     count = max(1, round(period_s / interval))
     step = period_s / count
-    time = begin + step * np.arange(periods * count)
+    time: FloatArray = np.asarray(begin + step * np.arange(periods * count), dtype=np.float64)
     speed, torque = (_on_grid(time, step, inside.time_s, signal) for signal in (inside.speed_rad_s, inside.torque_nm))
     rise = max(1, round(_TAPER * count))
-    taper = np.ones(len(time))
+    taper: FloatArray = np.ones(len(time))
     edge = 0.5 - 0.5 * np.cos(math.pi * (np.arange(rise) + 0.5) / rise)
     taper[:rise], taper[-rise:] = edge, edge[::-1]
     hertz = np.fft.rfftfreq(len(time), step)
     chosen = slice(1, int(np.searchsorted(hertz, _USED_BAND / step)))
     blank = np.zeros(0, dtype=np.complex128)
-    bare = _Segment(angle.at(time), taper, periods, hertz[chosen], chosen, blank, blank)
-    return replace(bare, torque=bare.spectrum(torque), speed=bare.spectrum(speed))
+    band = int(np.searchsorted(hertz[chosen], _ANGLE_BAND / usual_interval(angle.times)))
+    bare = _Segment(angle.at(time), taper, periods, hertz[chosen], chosen, blank, blank, blank, band)
+    return replace(bare, torque=bare.spectrum(torque), speed=bare.spectrum(speed),
+                   turning=bare.spectrum(angle.speed(time)))
 
 
 def _on_grid(time: FloatArray, step: float, sampled_s: FloatArray, signal: FloatArray) -> FloatArray:
@@ -215,9 +227,41 @@ def _on_grid(time: FloatArray, step: float, sampled_s: FloatArray, signal: Float
 # The fit
 
 
+def _bands(hertz: FloatArray) -> list[tuple[int, int]]:
+    """Return bands [begin, end) of the frequencies, each with enough lines for its noise."""
+    ends = [0]
+    while ends[-1] < len(hertz):
+        wide = int(np.searchsorted(hertz, _BAND_RATIO * hertz[ends[-1]]))
+        ends.append(max(wide, ends[-1] + _BAND_BINS))
+    ends[-1] = len(hertz)
+    if len(ends) > 2 and ends[-1] - ends[-2] < _BAND_BINS:
+        del ends[-2]
+    return list(itertools.pairwise(ends))
+
+
+def _noise(hertz: FloatArray, rest: ComplexArray) -> FloatArray:
+    """Return the spectrum of the noise, E|Y|² (K,), from medians over bands; a narrow peak does not change it."""
+    power, spans = np.abs(rest) ** 2, _bands(hertz)
+    level = np.array([np.median(power[a:b]) / _MEDIAN for a, b in spans])
+    middle = np.array([math.sqrt(hertz[a] * hertz[b - 1]) for a, b in spans])
+    floor = 1e-20 * float(np.max(power, initial=0.0)) + 1e-300
+    found: FloatArray = np.exp(np.interp(np.log(hertz), np.log(middle), np.log(np.maximum(level, floor))))
+    return found
+
+
+def _quieter(segment: _Segment, by_speed: ComplexArray, by_angle: ComplexArray) -> ComplexArray:
+    """Return, in each band, the rest (K,) with less power: both have the same harmonics, so it has less noise."""
+    found = by_speed.copy()
+    for begin, end in _bands(segment.hertz):
+        part = slice(begin, min(end, segment.angle_band))
+        if end <= segment.angle_band and np.median(np.abs(by_angle[part])) < np.median(np.abs(by_speed[part])):
+            found[part] = by_angle[part]
+    return found
+
+
 @dataclass(frozen=True)
 class _Seen:
-    """One segment as a model sees it: Y (K,), the filter of the torque F (K,), and the spectrum of the noise (K,)."""
+    """One segment as a model sees it: Y or Y' (K,), the filter of the torque F (K,), and E|noise|² (K,)."""
 
     segment: _Segment
     rest: ComplexArray
@@ -229,50 +273,38 @@ class _Seen:
         waves = [self.through * wave for order in orders for wave in self.segment.waves(order)]
         return np.stack(waves, axis=1) if waves else np.zeros((len(self.rest), 0), dtype=np.complex128)
 
-
-def _noise(hertz: FloatArray, rest: ComplexArray) -> FloatArray:
-    """Return the spectrum of the noise, E|Y|² (K,), from medians over bands; a narrow peak does not change it."""
-    power = np.abs(rest) ** 2
-    ends = [0]
-    while ends[-1] < len(hertz):
-        wide = int(np.searchsorted(hertz, _BAND_RATIO * hertz[ends[-1]]))
-        ends.append(max(wide, ends[-1] + _BAND_BINS))
-    ends[-1] = len(hertz)
-    if len(ends) > 2 and ends[-1] - ends[-2] < _BAND_BINS:
-        del ends[-2]
-    spans = list(zip(ends[:-1], ends[1:], strict=True))
-    level = np.array([np.median(power[a:b]) / _MEDIAN for a, b in spans])
-    middle = np.array([math.sqrt(hertz[a] * hertz[b - 1]) for a, b in spans])
-    floor = 1e-20 * float(np.max(power, initial=0.0)) + 1e-300
-    found: FloatArray = np.exp(np.interp(np.log(hertz), np.log(middle), np.log(np.maximum(level, floor))))
-    return found
+    def matched(self, rest: ComplexArray) -> FloatArray:
+        """Return the signal (N,) whose product with cos nθ, summed and times N, is the score of c_n for a rest (K,)."""
+        count = len(self.segment.angle_rad)
+        whole = np.zeros(count // 2 + 1, dtype=np.complex128)
+        whole[self.segment.chosen] = self.through.conj() * rest / self.noise
+        return self.segment.repeats(self.segment.taper * np.fft.irfft(whole, count))
 
 
 @dataclass(frozen=True)
 class _View:
     """The segments as one model sees them."""
 
-    segments: tuple[_Segment, ...]
-    rests: tuple[ComplexArray, ...]
-    through: tuple[ComplexArray, ...]
+    seen: tuple[_Seen, ...]
 
     @classmethod
     def of(cls, segments: tuple[_Segment, ...], curve: ModelCurve, theta: FloatArray, delay_s: float) -> _View:
-        problem = curve.fitted.problem
-        rests, through = [], []
+        model = curve.fitted.problem.model
+        found = []
         for one in segments:
-            s: ComplexArray = 2j * np.pi * one.hertz
-            rests.append(one.torque - problem.model.impedance(theta, s) * one.speed)
-            through.append(filters(theta[problem.model.mechanical :], s)[1] * np.exp(-delay_s * s))
-        return cls(segments, tuple(rests), tuple(through))
+            s: ComplexArray = np.asarray(2j * np.pi * one.hertz, dtype=np.complex128)
+            through = filters(theta[model.mechanical :], s)[1] * np.exp(-delay_s * s)
+            by_speed = one.torque - model.impedance(theta, s) * one.speed
+            by_angle = one.torque - model.shaft.impedance(theta[: model.mechanical], s) * through * one.turning
+            found.append(_Seen(one, _quieter(one, by_speed, by_angle), through, np.ones(len(s))))
+        return cls(tuple(found))
 
     def weighted(self, torque: AngleTorque | None) -> tuple[_Seen, ...]:
         """Return the segments with the noise that is left without the harmonics found so far."""
         found = []
-        for segment, rest, through in zip(self.segments, self.rests, self.through, strict=True):
-            seen = _Seen(segment, rest, through, np.ones(len(rest)))
-            left = rest if torque is None else rest - seen.columns(torque.orders) @ torque.parts
-            found.append(replace(seen, noise=_noise(segment.hertz, left)))
+        for seen in self.seen:
+            left = seen.rest if torque is None else seen.rest - seen.columns(torque.orders) @ torque.parts
+            found.append(replace(seen, noise=_noise(seen.segment.hertz, left)))
         return tuple(found)
 
 
@@ -287,7 +319,30 @@ def _fit(seen: tuple[_Seen, ...], orders: Sequence[int]) -> AngleTorque:
         right += (weighted.T @ one.rest).real
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     inverse = np.linalg.pinv(normal * np.outer(scale, scale), rcond=_SMALL, hermitian=True) * np.outer(scale, scale)
-    return AngleTorque(tuple(orders), inverse @ right, inverse)
+    parts = inverse @ right
+    return AngleTorque(tuple(orders), parts, _robust(seen, orders, parts, inverse))
+
+
+def _robust(seen: tuple[_Seen, ...], orders: Sequence[int], parts: FloatArray, inverse: FloatArray) -> FloatArray:
+    """Return the covariance of the parts, raised where their scatter over time is larger than that of the noise.
+
+    Rounding makes tones that come and go with the speed: they are no noise of a spectrum. The scores of blocks of time
+    scatter with them. Their covariance between ``inverse`` on both sides is that of the parts, whatever the noise is.
+    """
+    meat = np.zeros_like(inverse)
+    for one in seen:
+        segment, count = one.segment, len(one.segment.angle_rad)
+        signal = one.matched(one.rest - one.columns(orders) @ parts)
+        blocks = max(2, round(segment.hertz[0] ** -1 / _BLOCK_S))
+        ends = np.linspace(0, count, blocks + 1).astype(np.int64)[:-1]
+        scores = np.stack([count * np.add.reduceat(signal * wave, ends) for order in orders
+                           for wave in (np.cos(order * segment.angle_rad), np.sin(order * segment.angle_rad))])
+        meat += scores @ scores.T
+    seen_variance = np.diag(inverse @ meat @ inverse).reshape(-1, 2).sum(axis=1)
+    assumed = np.diag(inverse).reshape(-1, 2).sum(axis=1)
+    raised = np.repeat(np.sqrt(np.maximum(seen_variance / np.maximum(assumed, 1e-300), 1.0)), 2)
+    found: FloatArray = inverse * np.outer(raised, raised)
+    return found
 
 
 def _gains(torque: AngleTorque) -> FloatArray:
@@ -310,9 +365,7 @@ def _candidates(seen: tuple[_Seen, ...], torque: AngleTorque | None) -> list[int
     for one in seen:
         segment, count = one.segment, len(one.segment.angle_rad)
         rest = one.rest if torque is None else one.rest - one.columns(torque.orders) @ torque.parts
-        whole = np.zeros(count // 2 + 1, dtype=np.complex128)
-        whole[segment.chosen] = one.through.conj() * rest / one.noise
-        signal = segment.repeats(segment.taper * np.fft.irfft(whole, count))
+        signal = one.matched(rest)
         place = np.floor(np.mod(segment.angle_rad, 2.0 * np.pi) * (_BINS / (2.0 * np.pi))).astype(np.int64) % _BINS
         mean = np.fft.rfft(np.bincount(place, weights=signal, minlength=_BINS))[: HIGHEST_ORDER + 1]
         sums += count * mean * np.exp(-1j * np.pi * orders / _BINS)
@@ -363,28 +416,41 @@ def _search(view: _View) -> AngleTorque | None:
 # The model's part in the uncertainty, and the delay of the speed behind the angle
 
 
-def _delay(case: PeriodicCase, angle: _Angle, curve: ModelCurve, theta: FloatArray) -> tuple[float, float]:
-    """Return the delay of the reported speed behind the angle beyond its filter, and its standard deviation, s.
+@dataclass(frozen=True)
+class _AngleLines:
+    """Lines of the reported speed and of the derivative of the angle, (K,), rad/s, at ``omega`` (K,), rad/s."""
 
-    At an excited line, W = Ω F_w e^(−δ s), with Ω the line of the angle's derivative.
-    """
-    phases, rates, weights = [], [], []
-    for stretch, fit in zip(case.stretches, case.fits, strict=True):
-        if not len(fit.speed):
-            continue
-        omega = 2.0 * np.pi * np.array(fit.lines_hz)
-        times = [period.time_s for period in stretch.periods]
-        own = np.array([_lines(time, angle.speed(time), stretch.segment.start_s, omega) for time in times])
-        seen = fit.speed.mean(axis=0)
-        model = own.mean(axis=0) * filters(theta[curve.fitted.problem.model.mechanical :], 1j * omega)[0]
-        phases.append(np.angle(seen / model))
-        rates.append(omega)
-        weights.append(np.abs(seen) ** 2)
-    phase, rate, weight = (np.concatenate(each) for each in (phases, rates, weights))
-    power = float(np.sum(weight * rate**2))
-    delay = -float(np.sum(weight * rate * phase)) / power
-    left = phase + delay * rate
-    return delay, math.sqrt(float(np.sum(weight * left**2)) / max(len(phase) - 1, 1) / power)
+    omega: FloatArray
+    speed: ComplexArray
+    turning: ComplexArray
+
+    @classmethod
+    def of(cls, case: PeriodicCase, angle: _Angle) -> _AngleLines:
+        rates, speeds, turnings = [], [], []
+        for stretch, fit in zip(case.stretches, case.fits, strict=True):
+            if not len(fit.speed):
+                continue
+            omega = 2.0 * np.pi * np.array(fit.lines_hz)
+            times = [period.time_s for period in stretch.periods]
+            own = np.array([_lines(time, angle.speed(time), stretch.segment.start_s, omega) for time in times])
+            rates.append(omega)
+            speeds.append(fit.speed.mean(axis=0))
+            turnings.append(own.mean(axis=0))
+        return cls(np.concatenate(rates), np.concatenate(speeds), np.concatenate(turnings))
+
+    def delay(self, phi: FloatArray) -> tuple[float, float]:
+        """Return the delay of the reported speed behind the angle beyond its filter, and its standard deviation, s.
+
+        At an excited line, W = Ω F_w e^(−δ s). ``phi`` (6,): the parameters of the reports.
+        """
+        s: ComplexArray = np.asarray(1j * self.omega, dtype=np.complex128)
+        ratio: ComplexArray = self.speed / (self.turning * filters(phi, s)[0])
+        phase = np.arctan2(ratio.imag, ratio.real)
+        weight = np.abs(self.speed) ** 2
+        power = float(np.sum(weight * self.omega**2))
+        delay = -float(np.sum(weight * self.omega * phase)) / power
+        left = phase + delay * self.omega
+        return delay, math.sqrt(float(np.sum(weight * left**2)) / max(len(phase) - 1, 1) / power)
 
 
 def _lines(time: FloatArray, signal: FloatArray, start_s: float, omega: FloatArray) -> ComplexArray:
@@ -406,10 +472,10 @@ class _Model:
     delay_sd_s: float
 
     @classmethod
-    def of(cls, case: PeriodicCase, angle: _Angle, curve: ModelCurve) -> _Model:
+    def of(cls, lines: _AngleLines, curve: ModelCurve) -> _Model:
         theta = curve.fitted.likelier.theta
         free, covariance = curve.covariance()
-        return cls(curve, theta, tuple(free), covariance, *_delay(case, angle, curve, theta))
+        return cls(curve, theta, tuple(free), covariance, *lines.delay(theta[curve.fitted.problem.model.mechanical :]))
 
     def inertia_by_torque(self, lines: ComplexArray) -> float:
         """Return the change of J per unit of a torque that is subtracted, with its lines in every segment mean."""
@@ -422,7 +488,7 @@ class _Model:
         return -float(row @ self.covariance @ score)
 
 
-def _fitted(case: PeriodicCase, angle: _Angle, segments: tuple[_Segment, ...], model: _Model) -> AngleTorque | None:
+def _fitted(lines: _AngleLines, segments: tuple[_Segment, ...], model: _Model) -> AngleTorque | None:
     """Return the harmonics beside a model, with the model's part in their covariance; None without any."""
     found = _search(_View.of(segments, model.curve, model.theta, model.delay_s))
     if found is None:
@@ -441,7 +507,7 @@ def _fitted(case: PeriodicCase, angle: _Angle, segments: tuple[_Segment, ...], m
         if root[column] > 0.0:
             theta = model.theta.copy()
             theta[index] += _STEP * root[column]
-            delay_s, _ = _delay(case, angle, model.curve, theta)
+            delay_s, _ = lines.delay(theta[model.curve.fitted.problem.model.mechanical :])
             slopes[:, column] = (parts(theta, delay_s) - found.parts) / (_STEP * root[column])
     return replace(found, covariance=covariance + slopes @ model.covariance @ slopes.T)
 
@@ -458,7 +524,7 @@ def _through_filter(
     for k, order in enumerate(torque.orders):
         exact += torque.parts[2 * k] * np.cos(order * turned) + torque.parts[2 * k + 1] * np.sin(order * turned)
     size = 1 << math.ceil(math.log2(len(time) + _SETTLED_S / step))      # zeros behind the end: no wave comes round
-    s: ComplexArray = 2j * np.pi * np.fft.rfftfreq(size, step)
+    s: ComplexArray = np.asarray(2j * np.pi * np.fft.rfftfreq(size, step), dtype=np.complex128)
     mechanical = model.curve.fitted.problem.model.mechanical
     through = filters(model.theta[mechanical:], s)[1] * np.exp(-model.delay_s * s)
     reported = np.fft.irfft(np.fft.rfft(exact, size) * through, size)[: len(time)]
@@ -474,16 +540,17 @@ def _lines_of_parts(case: PeriodicCase, segments: dict[int, _Segment], torque: A
     for number, (stretch, fit) in enumerate(zip(case.stretches, case.fits, strict=True)):
         if not len(fit.speed):
             continue
-        omega = 2.0 * np.pi * np.array(fit.lines_hz)
+        omega: FloatArray = np.asarray(2.0 * np.pi * np.array(fit.lines_hz), dtype=np.float64)
+        s: ComplexArray = np.asarray(1j * omega, dtype=np.complex128)
         own = np.zeros((2 * len(torque.orders), len(omega)), dtype=np.complex128)
         segment = segments.get(number)
         if segment is not None:
             count = len(segment.angle_rad) // segment.periods
-            time = stretch.segment.period_s / count * np.arange(count)
+            time: FloatArray = np.asarray(stretch.segment.period_s / count * np.arange(count), dtype=np.float64)
             for k, order in enumerate(torque.orders):
                 for j, wave in enumerate((np.cos(order * segment.angle_rad), np.sin(order * segment.angle_rad))):
                     own[2 * k + j] = _lines(time, wave.reshape(segment.periods, -1).mean(axis=0), 0.0, omega)
-            own *= filters(model.theta[mechanical:], 1j * omega)[1] * np.exp(-1j * omega * model.delay_s)
+            own *= filters(model.theta[mechanical:], s)[1] * np.exp(-s * model.delay_s)
         for column, hertz in enumerate(fit.lines_hz):
             by_line.setdefault(round(hertz, 9), []).append(own[:, column])
     rows = [np.array(by_line[round(line.hertz, 9)]) for line in problem.lines]
@@ -515,7 +582,8 @@ Again = Callable[[Samples], tuple[PeriodicCase, Finding]]
 def without_harmonics(case: PeriodicCase, finding: Finding, again: Again) -> tuple[PeriodicCase, Finding]:
     """Return the case and the finding without the torque that depends on the angle, and with its harmonics.
 
-    Without an angle, or if no order stands out, both are returned unchanged. Raises Refused if ``again`` does.
+    Without a reported angle both are returned unchanged. If no order stands out, the finding only states this. Raises
+    Refused if ``again`` does.
     """
     curve, raw = finding.curve, case.samples
     if not isinstance(curve, ModelCurve):
@@ -528,11 +596,12 @@ def without_harmonics(case: PeriodicCase, finding: Finding, again: Again) -> tup
     if not segments:
         return case, finding
     torque: AngleTorque | None = None
+    lines = _AngleLines.of(case, angle)
     for _ in range(_ROUNDS):
-        model = _Model.of(case, angle, curve)
-        torque = _fitted(case, angle, tuple(segments.values()), model)
+        model = _Model.of(lines, curve)
+        torque = _fitted(lines, tuple(segments.values()), model)
         if torque is None:
-            return case, finding
+            return case, replace(finding, harmonics=())
         clean = replace(raw, torque_nm=raw.torque_nm - _through_filter(raw, angle, torque, model))
         case, finding = again(clean)
         if not isinstance(finding.curve, ModelCurve):

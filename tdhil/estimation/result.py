@@ -481,7 +481,7 @@ class ModelResult:
     second_opinions: tuple[SecondOpinion, ...] = ()
     friction_curve: tuple[FrictionPoint, ...] = ()      # in order of speed; empty with fewer than three speeds
     compliant: Compliant | None = None                  # for the models two-mass and string; ``inertia`` is then J_r
-    harmonics: tuple[AngleHarmonic, ...] = ()           # of the shaft's angle, the largest first; out of all the rest
+    harmonics: tuple[AngleHarmonic, ...] | None = None  # of the shaft's angle, the largest first; None: not known
     lines: tuple[LinePoint, ...] = ()                   # in order of frequency; for the figure of the report
 
     def quantities(self) -> dict[str, Any]:
