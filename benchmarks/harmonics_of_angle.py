@@ -1,6 +1,6 @@
 """Harmonics of the shaft's angle: found or not, amplitude, phase, and J with and without them.
 
-    python benchmarks/harmonics_of_angle.py [--rows 180] [--clean] [--first 0] [--out rows.jsonl]
+    python benchmarks/harmonics_of_angle.py [--rows 180] [--clean] [--first 0] [--step 1] [--out rows.jsonl]
 
 A row is one seed of the bench in `tests/estimation/angle_bench.py`: stages 2 to 5 of a run, whose drive reports the
 angle. Batches of 10 seeds share one rig; rigs differ in lags, noise and rounding, drawn from the batch's number. Orders
@@ -120,10 +120,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rows", type=int, default=180, help="how many")
     parser.add_argument("--first", type=int, default=0, help="the first one")
+    parser.add_argument("--step", type=int, default=1, help="every so many rows; 5 takes two of each batch")
     parser.add_argument("--clean", action="store_true", help="without harmonics")
     parser.add_argument("--out", type=Path, help="file of the rows, continued if it exists")
     asked = parser.parse_args()
-    numbers = range(asked.first, asked.first + asked.rows)
+    numbers = range(asked.first, asked.first + asked.rows, asked.step)
     rows = kept_rows(asked.out, "row", numbers, lambda number: judged(number, asked.clean), show)
     table(rows)
     return 1 if any(row["false"] for row in rows) else 0

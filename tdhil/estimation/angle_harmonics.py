@@ -13,9 +13,9 @@ torque, the rest obeys
 
 where T, W, C_n and S_n are the spectra of torque, speed, cos nθ and sin nθ over all periods of a segment. δ is the
 delay of the reported speed behind the angle, beyond its filter. The derivative Ω of the angle gives a second rest,
-Y' = T − (J s + B) F_T e^(−δ s) Ω, with the same harmonics and other noise. In each band of frequencies the one with
-less power counts. The spectrum of the noise is estimated from the rest itself. The fit is linear, and weighted by this
-noise.
+Y' = T − (J s + B) F_T e^(−δ s) Ω, with the same harmonics and other noise. It does not depend on the filter of the
+speed, so it counts in each band of frequencies in which it has not much more power. The spectrum of the noise is
+estimated from the rest itself. The fit is linear, and weighted by this noise.
 
 An order counts if it lowers −2 ln L by more than `LEAST_GAIN`. Its torque, as the drive reports it, is then subtracted
 from the reported torque, and the recording is identified again. Both steps are repeated, so that J and the harmonics
@@ -53,6 +53,7 @@ _FIRST_LOOK = 0.5         # of LEAST_GAIN: least gain in the first look, which i
 _MOST_RATE_HZ = 500.0     # Hz; a faster recording is averaged down to it
 _USED_BAND = 0.3          # of the rate: highest frequency used
 _ANGLE_BAND = 0.25        # of the rate of the angle's readings: highest frequency of its derivative
+_LOUDER = 4.0             # largest power of the rest by the angle over that by the speed, with which it is used
 _TAPER = 0.25             # of a period: length of the taper at either end of a segment
 _LEAST_PERIODS = 3        # periods in one segment
 _BAND_BINS = 24           # fewest spectral lines whose median gives the noise
@@ -250,12 +251,16 @@ def _noise(hertz: FloatArray, rest: ComplexArray) -> FloatArray:
 
 
 def _quieter(segment: _Segment, by_speed: ComplexArray, by_angle: ComplexArray) -> ComplexArray:
-    """Return, in each band, the rest (K,) with less power: both have the same harmonics, so it has less noise."""
+    """Return the rest by the angle (K,), in each band in which it has no more than `_LOUDER` times the power of that by
+    the speed. The harmonics in it do not depend on the filter of the speed.
+    """
     found = by_speed.copy()
     for begin, end in _bands(segment.hertz):
         part = slice(begin, min(end, segment.angle_band))
-        if end <= segment.angle_band and np.median(np.abs(by_angle[part])) < np.median(np.abs(by_speed[part])):
-            found[part] = by_angle[part]
+        if end <= segment.angle_band:
+            loud, quiet = (float(np.median(np.abs(rest[part]) ** 2)) for rest in (by_angle, by_speed))
+            if loud <= _LOUDER * quiet:
+                found[part] = by_angle[part]
     return found
 
 
