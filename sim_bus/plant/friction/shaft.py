@@ -41,9 +41,9 @@ class ShaftParams(Validated):
 class Harmonic(Validated):
     """Torque a·cos(nθ + φ) against positive rotation, θ the angle of the motor's shaft: cogging, eccentricity."""
 
-    order: Annotated[int, Field(ge=1, le=1000)]
+    order: Annotated[int, Field(ge=1, le=1000)] = 1
     """n, periods of the torque per turn of the shaft."""
-    amplitude_nm: NonNegative
+    amplitude_nm: NonNegative = 0.0
     phase_rad: float = 0.0
 
 
