@@ -16,13 +16,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import cos, sin
-from typing import TYPE_CHECKING, TypeVar
+from typing import Generic, Protocol, TypeVar
 
-if TYPE_CHECKING:
-    from sim_bus.plant.friction import Harmonic
-    from sim_bus.plant.kinds import MotorState, Plant
+from sim_bus.plant.friction import Harmonic
 
-S = TypeVar("S", bound="MotorState")
+
+class _Turning(Protocol):
+    @property
+    def speed_rad_s(self) -> float: ...
+    @property
+    def angle_rad(self) -> float: ...
+
+
+S = TypeVar("S", bound=_Turning)
 
 _SERIES = 1e-3
 """x below which sin x / x is taken as 1; the error is below 2e-7."""
@@ -40,12 +46,12 @@ def torque_over_step(harmonics: tuple[Harmonic, ...], angle_rad: float, travel_r
     return total
 
 
-class AngleTorque:
-    """Another plant with the torque of ``harmonics`` at its motor end."""
+class AngleTorque(Generic[S]):
+    """Another plant, by its rest and its step, with the torque of ``harmonics`` at its motor end."""
 
-    def __init__(self, plant: Plant[S], harmonics: tuple[Harmonic, ...]) -> None:
-        self.rest = plant.rest
-        self.step = _with_harmonics(plant.step, harmonics)
+    def __init__(self, rest: Callable[[], S], step: Callable[..., S], harmonics: tuple[Harmonic, ...]) -> None:
+        self.rest = rest
+        self.step = _with_harmonics(step, harmonics)
 
 
 def _with_harmonics(move: Callable[..., S], harmonics: tuple[Harmonic, ...]) -> Callable[..., S]:

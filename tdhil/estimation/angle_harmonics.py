@@ -205,7 +205,7 @@ def _segment(stretch: Stretch, samples: Samples, angle: _Angle) -> _Segment | No
     taper: FloatArray = np.ones(len(time))
     edge = 0.5 - 0.5 * np.cos(math.pi * (np.arange(rise) + 0.5) / rise)
     taper[:rise], taper[-rise:] = edge, edge[::-1]
-    hertz = np.fft.rfftfreq(len(time), step)
+    hertz: FloatArray = np.asarray(np.fft.rfftfreq(len(time), step), dtype=np.float64)
     chosen = slice(1, int(np.searchsorted(hertz, _USED_BAND / step)))
     blank = np.zeros(0, dtype=np.complex128)
     band = int(np.searchsorted(hertz[chosen], _ANGLE_BAND / usual_interval(angle.times)))
