@@ -465,6 +465,7 @@ class Inverter:
             inertia_kg_m2=share * motor.inertia_kg_m2,
             viscous_nm_s_rad=share * motor.viscous_nm_s_rad,
             coulomb_nm=share * motor.coulomb_nm,
+            harmonics=motor.harmonics,
         )
         self.state = RigidState(before.speed_rad_s, before.angle_rad)
         self._bottom_load = None

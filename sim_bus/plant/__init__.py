@@ -4,6 +4,8 @@ from sim_bus.plant.batch import (
     FixedStep as FixedStep, LARGEST_BRISTLE_STEP as LARGEST_BRISTLE_STEP, SPEED as SPEED, Shafts as Shafts,
     white_torque as white_torque,
 )
+from sim_bus.plant.angle_torque import AngleTorque as AngleTorque
+from sim_bus.plant.friction import Harmonic as Harmonic
 from sim_bus.plant.kinds import (
     AnyPlantParams as AnyPlantParams, MotorState as MotorState, PLANTS as PLANTS, build as build,
 )

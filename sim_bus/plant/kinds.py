@@ -17,6 +17,7 @@ from pydantic import BaseModel, PlainSerializer, PlainValidator
 
 from profiles import refuse_if
 from sim_bus.plant import rigid, two_mass
+from sim_bus.plant.angle_torque import AngleTorque
 from sim_bus.plant.drill_string import DrillString, StringParams
 from sim_bus.plant.rigid import Params
 from sim_bus.plant.two_mass import TwoMassParams
@@ -86,7 +87,9 @@ def build(params: Any) -> Plant[Any]:
     if body > 0.0:
         whole = params.inertia_kg_m2 + body
         params = params.model_copy(update={"inertia_kg_m2": whole, "added_inertia_kg_m2": 0.0})
-    return PLANTS[params.kind].plant(params)
+    plant = PLANTS[params.kind].plant(params)
+    harmonics = tuple(one for one in params.harmonics if one.amplitude_nm > 0.0)
+    return AngleTorque(plant.rest, plant.step, harmonics) if harmonics else plant
 
 
 def _rigid_unless_said(section: Any) -> Any:

@@ -6,7 +6,9 @@ method is reported too.
 """
 
 from dataclasses import replace
+from functools import partial
 
+from tdhil.estimation.angle_harmonics import without_harmonics
 from tdhil.estimation.case import Case, Finding, PeriodicCase
 from tdhil.estimation.conclude import conclude
 from tdhil.estimation.cross_checks import (
@@ -23,10 +25,10 @@ from tdhil.estimation.impedance import measure_impedance, refusal
 from tdhil.estimation.paper_method import paper_estimate
 from tdhil.estimation.periodic import clear_lines, identify_lines, measured
 from tdhil.estimation.result import Identification, Options, Refused
-from tdhil.estimation.samples import excited_window, usable_samples
+from tdhil.estimation.samples import Samples, excited_window, usable_samples
 from tdhil.estimation.setpoint_sampling import stretched
 from tdhil.estimation.time_domain import identify_record, recorded
-from tdhil.recording import Recording, aborted_stage, before_abort
+from tdhil.recording import Excitation, Recording, aborted_stage, before_abort
 
 
 def identify(recording: Recording, options: Options | None = None) -> Identification:
@@ -41,9 +43,11 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
             finding = identify_record(case)
         else:
             # the case is built step by step, so that a refusal contains the counts so far
+            bare = case
             case = periodic = measured(case, excitation)
             case = periodic = clear_lines(periodic)
             finding = identify_lines(periodic)
+            case, finding = without_harmonics(periodic, finding, partial(_again, bare, excitation))
     except Refused as refused:
         finding = Finding(refusal=refused.refusal)
     seen = finding
@@ -62,6 +66,12 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
     if isinstance(case, PeriodicCase):
         return replace(found, impedance=measure_impedance(case))
     return replace(found, impedance=refusal(asked, finding.refusal.reason, finding.refusal.advice))
+
+
+def _again(case: Case, excitation: Excitation, samples: Samples) -> tuple[PeriodicCase, Finding]:
+    """Return the periodic case with other samples, and its finding. Raises Refused as the first time."""
+    found = clear_lines(measured(replace(case, samples=samples), excitation))
+    return found, identify_lines(found)
 
 
 def _sampled(case: Case) -> Case:

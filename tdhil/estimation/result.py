@@ -197,6 +197,18 @@ class FrictionPoint:
 
 
 @dataclass(frozen=True)
+class AngleHarmonic:
+    """Torque a·cos(nθ + φ) against positive rotation, θ the angle of the motor shaft since the first reading.
+
+    ``order``: n, periods in one turn. Cogging has the orders of slots and poles, eccentricity has low orders.
+    """
+
+    order: int
+    amplitude_nm: Estimate
+    phase_rad: Estimate
+
+
+@dataclass(frozen=True)
 class Compliant:
     """A shaft that is not rigid: the parameters behind the spring, kg·m², N·m/rad, N·m·s/rad, Hz.
 
@@ -469,6 +481,7 @@ class ModelResult:
     second_opinions: tuple[SecondOpinion, ...] = ()
     friction_curve: tuple[FrictionPoint, ...] = ()      # in order of speed; empty with fewer than three speeds
     compliant: Compliant | None = None                  # for the models two-mass and string; ``inertia`` is then J_r
+    harmonics: tuple[AngleHarmonic, ...] | None = None  # of the shaft's angle, the largest first; None: not known
     lines: tuple[LinePoint, ...] = ()                   # in order of frequency; for the figure of the report
 
     def quantities(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ wide.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -17,7 +17,13 @@ from tdhil.recording import Recording
 from tdhil.report.acceptance import acceptance_rows, signature_rows
 from tdhil.report.card import COMPLIANT, estimate_text, inertia_text, minutes, plus_minus, rounded, sentence
 from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows
-from tdhil.report.labels import ACCELERATION_REGRESSION, ESTIMATES, MOMENTUM_CROSS_CHECK, UNCERTAINTY_BUDGET
+from tdhil.report.labels import (
+    ACCELERATION_REGRESSION,
+    ESTIMATES,
+    MOMENTUM_CROSS_CHECK,
+    TORQUE_OVER_ANGLE,
+    UNCERTAINTY_BUDGET,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
@@ -215,6 +221,8 @@ def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Rep
         picture = Picture(partial(draw_friction, document=document), 1.8,
                           "Torque at steady speed, load included. Lags do not affect it.")
         yield ReportSection("Friction over speed", (picture, _friction(document)))
+    if harmonics := document.get("harmonics"):
+        yield ReportSection(TORQUE_OVER_ANGLE.capitalize(), tuple(_harmonics(harmonics)))
     yield ReportSection("Numbers", tuple(_numbers(document)))
     if document["lines"]:
         yield ReportSection("Excited frequencies", (_lines(document),))
@@ -379,6 +387,24 @@ def _friction(document: Part) -> Table:
     rows = [(*cells[k], *(cells[middle + k] if middle + k < len(cells) else ("", ""))) for k in range(middle)]
     head = (Column("speed, rad/s", 0.25, True), Column("torque, N·m", 0.25, True))
     return Table(head + head, tuple(rows))
+
+
+def _harmonics(harmonics: Sequence[Part]) -> Iterator[Block]:
+    """Yield the orders of the torque that depends on the angle, the largest first."""
+    rows = [
+        (f"{one['order']}", *rounded(*(one["amplitude_nm"][key] for key in _ENDS)),
+         *rounded(*(math.degrees(one["phase_rad"][key]) for key in _ENDS)))
+        for one in harmonics
+    ]
+    heads = (("order", 0.1), ("amplitude, N·m", 0.18), ("from", 0.14), ("to", 0.14), ("phase, °", 0.16), ("from", 0.14),
+             ("to", 0.14))
+    yield Table(tuple(Column(title, share, True) for title, share in heads), tuple(rows))
+    yield Text("Torque a·cos(nθ + φ) against positive rotation, with order n and the angle θ of the motor shaft since "
+               "the first reading. J and friction are without it. Cogging has the orders of slots and poles; an "
+               "eccentric or unbalanced part has order 1.")
+
+
+_ENDS = ("value", "low", "high")
 
 
 def _lines(document: Part) -> Table:

@@ -15,7 +15,13 @@ from rich.text import Text
 from tdhil.report.acceptance import acceptance_rows
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows
-from tdhil.report.labels import ACCELERATION_REGRESSION, ESTIMATES, MOMENTUM_CROSS_CHECK, UNCERTAINTY_BUDGET
+from tdhil.report.labels import (
+    ACCELERATION_REGRESSION,
+    ESTIMATES,
+    MOMENTUM_CROSS_CHECK,
+    TORQUE_OVER_ANGLE,
+    UNCERTAINTY_BUDGET,
+)
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Numbers with the digits that their interval justifies.
@@ -161,6 +167,19 @@ def friction_rows(document: Mapping[str, Any], to_a_line: int = 2) -> Iterator[R
         yield "friction, N·m", "\n".join("   ".join(f"{point:<{width}}" for point in pair).rstrip() for pair in pairs)
 
 
+def harmonic_rows(document: Mapping[str, Any]) -> Iterator[Row]:
+    """Yield the torque that depends on the shaft's angle, a row for each order; a document before 0.4 has none."""
+    title = TORQUE_OVER_ANGLE
+    for one in document.get("harmonics") or ():
+        amplitude, phase = estimate_text(one["amplitude_nm"], "N·m"), _degrees(one["phase_rad"])
+        yield title, f"order {one['order']}: {amplitude}, phase {_plus_minus(phase)}°"
+        title = ""
+
+
+def _degrees(part: Mapping[str, Any]) -> dict[str, float]:
+    return {key: math.degrees(part[key]) for key in ("value", "low", "high")}
+
+
 def budget_table(budget: Sequence[Mapping[str, Any]], value: float, notes: bool = True) -> Table:
     """Return the uncertainty budget, largest contribution first; ``notes``: with explanations."""
     table = Table.grid(padding=(0, 2))
@@ -236,8 +255,8 @@ def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
     for label in ESTIMATES:
         if (part := document[label.key]) is not None:
             rows.add_row(label.on_card, estimate_text(part, label.unit))
-    more = (*impedance_rows(document), *compliant_rows(document), *friction_rows(document, 1 if narrow else 2),
-            *opinion_rows(document))
+    more = (*impedance_rows(document), *compliant_rows(document), *harmonic_rows(document),
+            *friction_rows(document, 1 if narrow else 2), *opinion_rows(document))
     for title, text in more:
         rows.add_row(title, text)
     if (paper := document["paper"]) is not None and paper["inertia_kg_m2"] is not None:

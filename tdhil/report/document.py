@@ -109,6 +109,7 @@ def result_document(
         "budget": [asdict(line) for line in found.budget],
         "second_opinions": [asdict(opinion) for opinion in found.second_opinions],
         "friction_curve": [asdict(point) for point in found.friction_curve],
+        "harmonics": None if found.harmonics is None else [asdict(one) for one in found.harmonics],
         "compliant": _compliant(found),
         "impedance": None if found.impedance is None else asdict(found.impedance) | {
             "verdict": found.impedance.verdict.value

@@ -37,6 +37,7 @@ class Rig:
     speed_average: float = 0.0       # moving average in the speed report, s
     speed_delay: float = 0.0         # of the reported speed, s
     torque_delay: float = 0.0
+    harmonics: tuple[tuple[int, float, float], ...] = ()     # order n, N·m, rad: against rotation, over the angle
     quiet: bool = False              # no disturbance, no noise, no rounding
 
 
@@ -85,6 +86,7 @@ class Shaft:
 
     speed: np.ndarray
     torque: np.ndarray
+    angle: np.ndarray | None = None
 
 
 def simulate(rig: Rig, motion: Motion, seeds: list[int], mode: str = "torque", **report: object) -> list[Recording]:

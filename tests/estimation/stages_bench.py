@@ -66,7 +66,8 @@ def turn(stages: Stages, seeds: list[int]) -> tuple[Motion, Shaft, np.ndarray]:
     host_target, slow = HOLDS[0], 0.2 / 0.5
     kp, ki = 300.0 * rig.inertia / 104.0, 300.0 * rig.inertia / 104.0
     host_kp, host_ki = slow * rig.inertia, slow**2 * rig.inertia / 4.0
-    speed, torque, reported = (np.empty((len(time), many)) for _ in range(3))
+    speed, torque, reported, turned = (np.empty((len(time), many)) for _ in range(4))
+    angle = np.zeros(many)
     host_keep, drop = np.exp(-DT / 0.4), None
     for n in range(len(time)):
         phase = mode[n]
@@ -87,18 +88,22 @@ def turn(stages: Stages, seeds: list[int]) -> tuple[Motion, Shaft, np.ndarray]:
         host += (1.0 - host_keep) * (omega - host)
         motor = motor + (DT / rig.torque_lag) * (command - motor) if phase < 3 else np.full(many, stages.coast_torque)
         actual = motor + (ripple[n] if phase < 3 else 0.0)
-        speed[n], torque[n] = omega, actual
+        speed[n], torque[n], turned[n] = omega, actual, angle
         reported[n] = actual if phase < 3 else 0.0
         extra = stages.static * np.exp(-((omega / stages.stribeck_speed) ** 2))
         friction = rig.viscous * omega + (rig.coulomb + extra) * np.sign(omega)
+        for order, amplitude, shift in rig.harmonics:
+            friction = friction + amplitude * np.cos(order * (angle + 0.5 * DT * omega) + shift)
+        before = omega
         omega = np.maximum(omega + DT / rig.inertia * (actual - load[n] - friction), 0.0)
+        angle = angle + 0.5 * DT * (before + omega)
 
     segments = tuple(
         Segment(start, start + length, PERIOD, 1, offset, LINES, AMPLITUDES, PHASES)
         for start, offset in zip(begin, OFFSETS, strict=True)
     )
     motion = Motion((), segments, levels=(Level(2.0, 8.0), Level(18.0, 24.0)), end_s=end)
-    return motion, Shaft(speed + sensor, torque), reported
+    return motion, Shaft(speed + sensor, torque, turned), reported
 
 
 def reference(time, begin, length):

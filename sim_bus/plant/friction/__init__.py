@@ -17,9 +17,9 @@ the step::
 from collections.abc import Callable
 
 from sim_bus.plant.friction import coulomb, dahl, lugre, stribeck
-from sim_bus.plant.friction.shaft import MotorEnd, ShaftParams
+from sim_bus.plant.friction.shaft import Harmonic, MotorEnd, ShaftParams
 
-__all__ = ["Advance", "MotorEnd", "ShaftParams", "advance", "advance_of", "torque"]
+__all__ = ["Advance", "Harmonic", "MotorEnd", "ShaftParams", "advance", "advance_of", "torque"]
 
 Advance = Callable[[ShaftParams, float, float, float, float], tuple[float, float, float]]
 

@@ -1,8 +1,8 @@
 """One inertia: moment, friction, constant load. A rig has one, or one at each end of a string."""
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from profiles import NonNegative, Positive, Validated, refuse_if
 
@@ -38,8 +38,19 @@ class ShaftParams(Validated):
         return self
 
 
+class Harmonic(Validated):
+    """Torque a·cos(nθ + φ) against positive rotation, θ the angle of the motor's shaft: cogging, eccentricity."""
+
+    order: Annotated[int, Field(ge=1, le=1000)] = 1
+    """n, periods of the torque per turn of the shaft."""
+    amplitude_nm: NonNegative = 0.0
+    phase_rad: float = 0.0
+
+
 class MotorEnd(ShaftParams):
     """The inertia on the motor's shaft."""
 
     added_inertia_kg_m2: NonNegative = 0.0
     """Inertia of a known body that is bolted to the shaft, in addition to ``inertia_kg_m2``."""
+    harmonics: tuple[Harmonic, ...] = Field(default=(), strict=False)      # a YAML list is no tuple
+    """Torque that depends on the shaft's angle."""

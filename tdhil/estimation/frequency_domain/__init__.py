@@ -40,6 +40,6 @@ from tdhil.estimation.frequency_domain.shafts import (
 from tdhil.estimation.frequency_domain.signal_filters import (
     AVERAGE as AVERAGE, LAG_BOUND_S as LAG_BOUND_S, SHAPE_BOUND as SHAPE_BOUND, SKEW as SKEW,
     SKEW_BOUND_S as SKEW_BOUND_S, SPEED_LAG as SPEED_LAG, SPEED_SHAPE as SPEED_SHAPE, TORQUE_LAG as TORQUE_LAG,
-    TORQUE_SHAPE as TORQUE_SHAPE, shared_lag as shared_lag,
+    TORQUE_SHAPE as TORQUE_SHAPE, filters as filters, shared_lag as shared_lag,
 )
 from tdhil.estimation.frequency_domain.transient import settled_lines as settled_lines

@@ -61,12 +61,7 @@ class ModelCurve:
     def at(self, hertz: FloatArray) -> tuple[ComplexArray, FloatArray, FloatArray]:
         """Return T/ω (K,), N·m·s/rad, and the half-widths of its interval: relative magnitude, and phase, rad."""
         problem, theta = self.fitted.problem, self.fitted.likelier.theta
-        held = self.fitted.simple_held if self.fitted.first_order else self.fitted.fixed
-        free = [index for index in range(problem.model.size) if index not in held]
-        whole, _ = problem.information(theta)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(whole)[free], 1e-300))
-        inverse = np.linalg.pinv(whole[np.ix_(free, free)] * np.outer(scale, scale), rcond=1e-13, hermitian=True)
-        covariance = inverse * np.outer(scale, scale)
+        free, covariance = self.covariance()
         s: ComplexArray = np.asarray(2j * np.pi * hertz, dtype=np.complex128)
         value, slopes = problem.model.impedance_jacobian(theta, s)
         relative = slopes[:, free] / value[:, None]
@@ -77,6 +72,16 @@ class ModelCurve:
             for part in (relative.real, relative.imag)
         )
         return value, magnitude, phase
+
+    def covariance(self) -> tuple[list[int], FloatArray]:
+        """Return the free parameters of the likelier fit (F,) and their covariance (F, F)."""
+        problem, theta = self.fitted.problem, self.fitted.likelier.theta
+        held = self.fitted.simple_held if self.fitted.first_order else self.fitted.fixed
+        free = [index for index in range(problem.model.size) if index not in held]
+        whole, _ = problem.information(theta)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(whole)[free], 1e-300))
+        inverse = np.linalg.pinv(whole[np.ix_(free, free)] * np.outer(scale, scale), rcond=1e-13, hermitian=True)
+        return free, inverse * np.outer(scale, scale)
 
     @property
     def _excess(self) -> float:

@@ -1,0 +1,73 @@
+"""Torque over the shaft's angle: found, measured, and out of J."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tdhil.estimation import identify
+from tdhil.estimation.angle_harmonics import AngleTorque
+from tests.estimation.angle_bench import RATED_NM, OverAngle, run_over_angle
+from tests.estimation.shaft_bench import Rig
+
+TRUE, PHASE = 104.0, 0.7
+
+
+@cache
+def recorded(order: int, share: float) -> tuple:
+    """Two seeds of a run with one harmonic of this share of the rated torque."""
+    harmonics = ((order, share * RATED_NM, PHASE),) if order else ()
+    return tuple(run_over_angle(OverAngle(rig=Rig(harmonics=harmonics)), [0, 1]))
+
+
+def test_amplitude_and_phase_of_two_parts():
+    torque = AngleTorque((1, 6), np.array([3.0, -4.0, 0.0, 1.0]), np.diag([0.01, 0.01, 0.04, 0.04]))
+    first, second = torque.told(0.95)
+    assert (first.order, second.order) == (1, 6)
+    assert first.amplitude_nm.value == pytest.approx(5.0)
+    assert first.phase_rad.value == pytest.approx(math.atan2(4.0, 3.0))
+    assert first.amplitude_nm.high - 5.0 == pytest.approx(1.96 * 0.1, rel=1e-3)
+    assert second.phase_rad.value == pytest.approx(-0.5 * math.pi)
+    assert second.phase_rad.high - second.phase_rad.value == pytest.approx(math.atan(1.96 * 0.2), rel=1e-3)
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize(("order", "share"), [(1, 0.01), (1, 0.1), (6, 0.1)])
+def test_an_order_is_found_with_its_amplitude_and_phase(order, share):
+    for recording in recorded(order, share):
+        found = identify(recording)
+        assert [one.order for one in found.harmonics] == [order]
+        one = found.harmonics[0]
+        assert one.amplitude_nm.value == pytest.approx(share * RATED_NM, rel=0.1)
+        assert one.phase_rad.value == pytest.approx(PHASE, abs=math.radians(5.0))
+        assert found.inertia.low <= TRUE <= found.inertia.high
+
+
+@pytest.mark.heavy
+def test_the_harmonic_is_out_of_the_inertia():
+    """With 10 % of rated torque at order 1 the scatter is that of the harmonic, unless it is taken out."""
+    for clean, bent in zip(recorded(0, 0.0), recorded(1, 0.1), strict=True):
+        before, found = identify(replace(bent, position_rad=None)), identify(bent)
+        without = identify(clean)
+        assert before.harmonics is None
+        assert found.inertia.high - found.inertia.low < before.inertia.high - before.inertia.low
+        assert found.inertia.value == pytest.approx(without.inertia.value, rel=0.002)
+        assert found.speed_lag_s.value == pytest.approx(without.speed_lag_s.value, abs=0.005)
+
+
+@pytest.mark.heavy
+def test_nothing_changes_without_a_harmonic():
+    for recording in recorded(0, 0.0):
+        found, before = identify(recording), identify(replace(recording, position_rad=None))
+        assert found.harmonics == ()
+        assert replace(found, harmonics=None, frequency_response=None) == replace(before, frequency_response=None)
+
+
+@pytest.mark.heavy
+def test_an_angle_with_a_long_gap_is_not_used():
+    recording = recorded(1, 0.1)[0]
+    position = recording.position_rad.copy()
+    position[np.arange(len(position)) % 1000 != 0] = np.nan      # once in 4 s
+    assert identify(replace(recording, position_rad=position)).harmonics is None
