@@ -21,14 +21,14 @@ from typing import Generic, Protocol, TypeVar
 from sim_bus.plant.friction import Harmonic
 
 
-class _Turning(Protocol):
+class _Rotation(Protocol):
     @property
     def speed_rad_s(self) -> float: ...
     @property
     def angle_rad(self) -> float: ...
 
 
-S = TypeVar("S", bound=_Turning)
+S = TypeVar("S", bound=_Rotation)
 
 _SERIES = 1e-3
 """x below which sin x / x is taken as 1; the error is below 2e-7."""

@@ -70,7 +70,7 @@ _SMALL = 1e-12            # relative: smaller eigenvalues of the normal matrix c
 
 
 @dataclass(frozen=True)
-class AngleTorque:
+class HarmonicTorque:
     """Harmonics with their covariance. ``orders`` (H,); ``parts`` (2H,): c_n and s_n of each order in turn, N·m;
     ``covariance`` (2H, 2H).
     """
@@ -141,7 +141,7 @@ class _Angle:
 
 
 @dataclass(frozen=True)
-class _Segment:
+class _GridSegment:
     """One segment on a grid of N points: spectra of torque and speed without what repeats, and the angle.
 
     ``hertz`` (K,) are the used frequencies, ``chosen`` their places in the spectrum of the N points.
@@ -186,7 +186,7 @@ def _run(index: tuple[int, ...]) -> tuple[int, int]:
     return begin, end - 1
 
 
-def _segment(stretch: Stretch, samples: Samples, angle: _Angle) -> _Segment | None:
+def _segment(stretch: Stretch, samples: Samples, angle: _Angle) -> _GridSegment | None:
     if not stretch.index:
         return None
     first, last = (stretch.index[k] for k in _run(stretch.index))
@@ -209,7 +209,7 @@ def _segment(stretch: Stretch, samples: Samples, angle: _Angle) -> _Segment | No
     chosen = slice(1, int(np.searchsorted(hertz, _USED_BAND / step)))
     blank = np.zeros(0, dtype=np.complex128)
     band = int(np.searchsorted(hertz[chosen], _ANGLE_BAND / usual_interval(angle.times)))
-    bare = _Segment(angle.at(time), taper, periods, hertz[chosen], chosen, blank, blank, blank, band)
+    bare = _GridSegment(angle.at(time), taper, periods, hertz[chosen], chosen, blank, blank, blank, band)
     return replace(bare, torque=bare.spectrum(torque), speed=bare.spectrum(speed),
                    turning=bare.spectrum(angle.speed(time)))
 
@@ -250,7 +250,7 @@ def _noise(hertz: FloatArray, rest: ComplexArray) -> FloatArray:
     return found
 
 
-def _quieter(segment: _Segment, by_speed: ComplexArray, by_angle: ComplexArray) -> ComplexArray:
+def _quieter(segment: _GridSegment, by_speed: ComplexArray, by_angle: ComplexArray) -> ComplexArray:
     """Return the rest by the angle (K,), in each band in which it has no more than `_LOUDER` times the power of that by
     the speed. The harmonics in it do not depend on the filter of the speed.
     """
@@ -265,10 +265,10 @@ def _quieter(segment: _Segment, by_speed: ComplexArray, by_angle: ComplexArray) 
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _WeighedSegment:
     """One segment as a model sees it: Y or Y' (K,), the filter of the torque F (K,), and E|noise|² (K,)."""
 
-    segment: _Segment
+    segment: _GridSegment
     rest: ComplexArray
     through: ComplexArray
     noise: FloatArray
@@ -290,10 +290,10 @@ class _Seen:
 class _View:
     """The segments as one model sees them."""
 
-    seen: tuple[_Seen, ...]
+    seen: tuple[_WeighedSegment, ...]
 
     @classmethod
-    def of(cls, segments: tuple[_Segment, ...], curve: ModelCurve, theta: FloatArray, delay_s: float) -> _View:
+    def of(cls, segments: tuple[_GridSegment, ...], curve: ModelCurve, theta: FloatArray, delay_s: float) -> _View:
         model = curve.fitted.problem.model
         found = []
         for one in segments:
@@ -301,10 +301,10 @@ class _View:
             through = filters(theta[model.mechanical :], s)[1] * np.exp(-delay_s * s)
             by_speed = one.torque - model.impedance(theta, s) * one.speed
             by_angle = one.torque - model.shaft.impedance(theta[: model.mechanical], s) * through * one.turning
-            found.append(_Seen(one, _quieter(one, by_speed, by_angle), through, np.ones(len(s))))
+            found.append(_WeighedSegment(one, _quieter(one, by_speed, by_angle), through, np.ones(len(s))))
         return cls(tuple(found))
 
-    def weighted(self, torque: AngleTorque | None) -> tuple[_Seen, ...]:
+    def weighted(self, torque: HarmonicTorque | None) -> tuple[_WeighedSegment, ...]:
         """Return the segments with the noise that is left without the harmonics found so far."""
         found = []
         for seen in self.seen:
@@ -313,7 +313,7 @@ class _View:
         return tuple(found)
 
 
-def _fit(seen: tuple[_Seen, ...], orders: Sequence[int]) -> AngleTorque:
+def _fit(seen: tuple[_WeighedSegment, ...], orders: Sequence[int]) -> HarmonicTorque:
     """Return the weighted least squares of the orders. An order that the angle cannot show has an infinite variance."""
     count = 2 * len(orders)
     normal, right = np.zeros((count, count)), np.zeros(count)
@@ -325,10 +325,12 @@ def _fit(seen: tuple[_Seen, ...], orders: Sequence[int]) -> AngleTorque:
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     inverse = np.linalg.pinv(normal * np.outer(scale, scale), rcond=_SMALL, hermitian=True) * np.outer(scale, scale)
     parts = inverse @ right
-    return AngleTorque(tuple(orders), parts, _robust(seen, orders, parts, inverse))
+    return HarmonicTorque(tuple(orders), parts, _robust(seen, orders, parts, inverse))
 
 
-def _robust(seen: tuple[_Seen, ...], orders: Sequence[int], parts: FloatArray, inverse: FloatArray) -> FloatArray:
+def _robust(
+    seen: tuple[_WeighedSegment, ...], orders: Sequence[int], parts: FloatArray, inverse: FloatArray
+) -> FloatArray:
     """Return the covariance of the parts, raised where their scatter over time is larger than that of the noise.
 
     Rounding makes tones that come and go with the speed: they are no noise of a spectrum. The scores of blocks of time
@@ -350,7 +352,7 @@ def _robust(seen: tuple[_Seen, ...], orders: Sequence[int], parts: FloatArray, i
     return found
 
 
-def _gains(torque: AngleTorque) -> FloatArray:
+def _gains(torque: HarmonicTorque) -> FloatArray:
     """Return the decrease of −2 ln L by each order (H,)."""
     gains = []
     for k in range(len(torque.orders)):
@@ -360,7 +362,7 @@ def _gains(torque: AngleTorque) -> FloatArray:
     return np.array(gains)
 
 
-def _candidates(seen: tuple[_Seen, ...], torque: AngleTorque | None) -> list[int]:
+def _candidates(seen: tuple[_WeighedSegment, ...], torque: HarmonicTorque | None) -> list[int]:
     """Return the orders that may stand out, the clearest first. One pass for all orders: the weighted rest is averaged
     over the angle, and the orders are the spectrum of this mean.
     """
@@ -395,15 +397,15 @@ def _histogram(values: FloatArray, weights: FloatArray) -> tuple[FloatArray, Flo
     return 0.5 * (edges[1:] + edges[:-1]), total
 
 
-def _search(view: _View) -> AngleTorque | None:
+def _search(view: _View) -> HarmonicTorque | None:
     """Return all orders that stand out; None without one. The clearest order of each look is added, and those that do
     not stand out any more are left out.
     """
-    found: AngleTorque | None = None
+    found: HarmonicTorque | None = None
     for _ in range(MOST_ORDERS):
         seen = view.weighted(found)
         known = () if found is None else found.orders
-        best: AngleTorque | None = None
+        best: HarmonicTorque | None = None
         for order in _candidates(seen, found):
             tried = _fit(seen, (*known, order))
             if _gains(tried)[-1] > LEAST_GAIN and (best is None or _gains(tried)[-1] > _gains(best)[-1]):
@@ -466,7 +468,7 @@ def _lines(time: FloatArray, signal: FloatArray, start_s: float, omega: FloatArr
 
 
 @dataclass(frozen=True)
-class _Model:
+class _FittedShaft:
     """A fitted model: its curve, theta (P,), the covariance of its free parameters, and the delay with its sd, s."""
 
     curve: ModelCurve
@@ -477,7 +479,7 @@ class _Model:
     delay_sd_s: float
 
     @classmethod
-    def of(cls, lines: _AngleLines, curve: ModelCurve) -> _Model:
+    def of(cls, lines: _AngleLines, curve: ModelCurve) -> _FittedShaft:
         theta = curve.fitted.likelier.theta
         free, covariance = curve.covariance()
         return cls(curve, theta, tuple(free), covariance, *lines.delay(theta[curve.fitted.problem.model.mechanical :]))
@@ -493,7 +495,7 @@ class _Model:
         return -float(row @ self.covariance @ score)
 
 
-def _fitted(lines: _AngleLines, segments: tuple[_Segment, ...], model: _Model) -> AngleTorque | None:
+def _fitted(lines: _AngleLines, segments: tuple[_GridSegment, ...], model: _FittedShaft) -> HarmonicTorque | None:
     """Return the harmonics beside a model, with the model's part in their covariance; None without any."""
     found = _search(_View.of(segments, model.curve, model.theta, model.delay_s))
     if found is None:
@@ -518,7 +520,7 @@ def _fitted(lines: _AngleLines, segments: tuple[_Segment, ...], model: _Model) -
 
 
 def _through_filter(
-    samples: Samples, angle: _Angle, torque: AngleTorque, model: _Model
+    samples: Samples, angle: _Angle, torque: HarmonicTorque, model: _FittedShaft
 ) -> FloatArray:
     """Return the torque of the harmonics as the drive reports it at the samples (N,), N·m; 0 before the first angle."""
     begin, end = max(angle.begin_s, float(samples.time_s[0])), min(angle.end_s, float(samples.time_s[-1]))
@@ -536,7 +538,7 @@ def _through_filter(
     return np.interp(samples.time_s, time, reported, left=0.0, right=float(reported[-1]))
 
 
-def _lines_of_parts(case: PeriodicCase, segments: dict[int, _Segment], torque: AngleTorque, model: _Model
+def _lines_of_parts(case: PeriodicCase, segments: dict[int, _GridSegment], torque: HarmonicTorque, model: _FittedShaft
                     ) -> list[ComplexArray]:
     """Return the reported lines of each part of the torque, 1 N·m, in every segment mean of the model's lines."""
     problem = model.curve.fitted.problem
@@ -563,8 +565,9 @@ def _lines_of_parts(case: PeriodicCase, segments: dict[int, _Segment], torque: A
         len(row) == len(line.speed) for row, line in zip(rows, problem.lines, strict=True)) else []
 
 
-def _widened(case: PeriodicCase, finding: Finding, segments: dict[int, _Segment], torque: AngleTorque, model: _Model
-             ) -> Finding:
+def _widened(
+    case: PeriodicCase, finding: Finding, segments: dict[int, _GridSegment], torque: HarmonicTorque, model: _FittedShaft
+) -> Finding:
     """Return the finding with the part of the harmonics in the uncertainty of J."""
     inertia = finding.inertia
     if inertia is None:
@@ -600,10 +603,10 @@ def without_harmonics(case: PeriodicCase, finding: Finding, again: Again) -> tup
                 if (found := _segment(stretch, raw, angle)) is not None}
     if not segments:
         return case, finding
-    torque: AngleTorque | None = None
+    torque: HarmonicTorque | None = None
     lines = _AngleLines.of(case, angle)
     for _ in range(_ROUNDS):
-        model = _Model.of(lines, curve)
+        model = _FittedShaft.of(lines, curve)
         torque = _fitted(lines, tuple(segments.values()), model)
         if torque is None:
             return case, replace(finding, harmonics=())

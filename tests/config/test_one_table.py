@@ -228,10 +228,12 @@ EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
     "studies/paper/sweeps.py": ("the paper's own motions", {"sine"}),
     "service/static/app.js": ("a role, signals of the plots, the key of a sign-off, the clock that a page measures", {
         "note", "operator", "step", "speed", "torque", "real_time"}),
-    "service/static/results.js": ("a rehearsal's request; keys of answers; a column of the friction table", {
-        "fault", "faults", "log", "model", "note", "real_time", "speed", "yes"}),
+    "service/static/results.js": (
+        "a rehearsal's request; keys of answers; a column of the friction table; the records of a run, edited later", {
+            "fault", "faults", "log", "model", "note", "operator", "real_time", "speed", "yes"}),
     "service/templates/accounts.html": ("a role", {"operator"}),
-    "service/templates/run.html": ("what was seen, for a sign-off", {"note"}),
+    "service/templates/run.html": ("what was seen, for a sign-off; the records of a run, edited later", {
+        "note", "operator"}),
 }
 """File → (reason, names that may stand in it)."""
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tdhil.estimation import identify
-from tdhil.estimation.angle_harmonics import AngleTorque
+from tdhil.estimation.angle_harmonics import HarmonicTorque
 from tests.estimation.angle_bench import RATED_NM, OverAngle, run_over_angle
 from tests.estimation.shaft_bench import Rig
 
@@ -23,7 +23,7 @@ def recorded(order: int, share: float) -> tuple:
 
 
 def test_amplitude_and_phase_of_two_parts():
-    torque = AngleTorque((1, 6), np.array([3.0, -4.0, 0.0, 1.0]), np.diag([0.01, 0.01, 0.04, 0.04]))
+    torque = HarmonicTorque((1, 6), np.array([3.0, -4.0, 0.0, 1.0]), np.diag([0.01, 0.01, 0.04, 0.04]))
     first, second = torque.told(0.95)
     assert (first.order, second.order) == (1, 6)
     assert first.amplitude_nm.value == pytest.approx(5.0)
