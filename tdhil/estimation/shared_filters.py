@@ -98,8 +98,8 @@ def identify_together(recordings: Sequence[Recording]) -> FittedTogether:
     index = [_OWN * k for k in range(number)]
     every = [int(k) for k in np.flatnonzero(free)]
     inverse = _inverse(whole, every)
-    own = _inverse(whole, list(range(start_index)))
-    # all J are free, and come before every filter: their places are the same in theta, ``every`` and ``own``
+    known = _inverse(whole, list(range(start_index)))
+    # all J are free, and come before every filter: their places are the same in theta, ``every`` and ``known``
     shares = _shares(inverse[index[-1]] - inverse[index[0]] if number > 1 else inverse[index[0]], inverse, parts, every)
     rise = _rise_by_weights(shares)
     return FittedTogether(
@@ -108,7 +108,7 @@ def identify_together(recordings: Sequence[Recording]) -> FittedTogether:
         sharing=_sharing(best.objective, [one.whole.objective for one in fits], _excess(fits),
                          (size - len(fixed)) * (number - 1)),
         alone_kg_m2=np.array([one.likelier.theta[0] for one in fits]),
-        covariance_known_filters=own[np.ix_(index, index)] * rise,
+        covariance_known_filters=known[np.ix_(index, index)] * rise,
     )
 
 
