@@ -79,7 +79,7 @@ class HarmonicTorque:
     parts: FloatArray
     covariance: FloatArray
 
-    def told(self, confidence: float) -> tuple[AngleHarmonic, ...]:
+    def estimates(self, confidence: float) -> tuple[AngleHarmonic, ...]:
         """Return amplitude and phase of every order with their intervals, in order of amplitude."""
         width = normal_quantile(confidence)
         found = []
@@ -618,4 +618,4 @@ def without_harmonics(case: PeriodicCase, finding: Finding, again: Again) -> tup
     assert torque is not None
     finding = _widened(case, finding, segments, torque, replace(model, curve=curve, theta=model.theta)
                        ) if isinstance(finding.curve, ModelCurve) else finding
-    return case, replace(finding, harmonics=torque.told(case.options.confidence))
+    return case, replace(finding, harmonics=torque.estimates(case.options.confidence))

@@ -24,7 +24,7 @@ def recorded(order: int, share: float) -> tuple:
 
 def test_amplitude_and_phase_of_two_parts():
     torque = HarmonicTorque((1, 6), np.array([3.0, -4.0, 0.0, 1.0]), np.diag([0.01, 0.01, 0.04, 0.04]))
-    first, second = torque.told(0.95)
+    first, second = torque.estimates(0.95)
     assert (first.order, second.order) == (1, 6)
     assert first.amplitude_nm.value == pytest.approx(5.0)
     assert first.phase_rad.value == pytest.approx(math.atan2(4.0, 3.0))
