@@ -88,7 +88,7 @@ def build(params: Any) -> Plant[Any]:
         whole = params.inertia_kg_m2 + body
         params = params.model_copy(update={"inertia_kg_m2": whole, "added_inertia_kg_m2": 0.0})
     plant = PLANTS[params.kind].plant(params)
-    harmonics = tuple(one for one in params.harmonics if one.amplitude_nm > 0.0)
+    harmonics = tuple(one for one in getattr(params, "harmonics", ()) if one.amplitude_nm > 0.0)
     return AngleTorque(plant.rest, plant.step, harmonics) if harmonics else plant
 
 

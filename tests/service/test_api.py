@@ -724,7 +724,7 @@ def test_a_process_that_cannot_be_started_on_a_full_disk_is_refused_in_words(cal
     ("/start/real", {"tolerance", "max_time_s", "excitation", "operator", "note", "accept_unverified",
                      "accept_speed_unit", "reset_fault"}),
     ("/rehearse/a", {"stage", "after", "duration", "real_time"}),
-    ("/fleets", {"folder", "below", "tolerance", "model"}),
+    ("/fleets", {"folder", "below", "archived", "tolerance", "model"}),
 ])
 def test_a_form_has_the_fields_of_the_table(client, path, fields):
     page = client.get(path)

@@ -254,8 +254,8 @@
         const box = el("input", { type: "checkbox", "aria-label": `compare ${one.rig}, ${when(one.asked)}`, checked: chosen.has(one.id), disabled: one.verdict === null });
         box.addEventListener("change", () => choose(one.id, box.checked));
         return el("tr", {}, el("td", { class: "pick" }, box),
-          el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}` }, when(one.asked))), el("td", {}, one.rig, " ", badge(one.simulated) || "", " ", rehearsal(one.rehearsal) || ""),
-          el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict || ""),
+          el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}`, "aria-label": `${one.rig}, ${when(one.asked)}` }, one.rig), " ", badge(one.simulated) || "", " ", rehearsal(one.rehearsal) || ""),
+          el("td", {}, when(one.asked)), el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict || ""),
           el("td", {}, said(one) || "", ...(one.tags.length ? [" ", ...tags(one.tags)] : []), ...(one.archived ? [" ", el("span", { class: "badge" }, "ARCHIVED")] : [])));
       }) : [el("tr", {}, el("td", { colspan: 7, class: "dim" }, form.elements.text.value || form.elements.state.value ? "no run matches" : "no run yet"))]));
     }
