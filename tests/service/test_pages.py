@@ -329,7 +329,7 @@ def test_an_acceptance_shows_expected_beside_identified_and_what_is_off(page, se
     expected = [Expectation("inertia", 104.0, 10.0), Expectation("speed-lag", 0.4, 0.05), Expectation("gain", 1.0, 0.1)]
     write_json(path, {**result, "acceptance": acceptance_of(expected, result)})
     page.goto(f"/runs/{run}")
-    page.get_by_role("heading", name="Acceptance").wait_for()
+    page.get_by_role("heading", name="Acceptance", exact=True).wait_for()
     page.get_by_text("lag of the reported speed is 3 times the expected value: the speed filter").wait_for()
     for name, verdict in (("moment of inertia J", "pass"), ("lag of the reported speed", "fail"),
                           ("gain P of the drive's speed loop", "cannot tell")):
