@@ -32,6 +32,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from tdhil.estimation.case import Finding, PeriodicCase
+from tdhil.estimation.cubic_spline import CubicSpline
 from tdhil.estimation.frequency_domain import ModelCurve, filters
 from tdhil.estimation.result import AngleHarmonic, BudgetLine, Estimate, normal_quantile
 from tdhil.estimation.samples import Samples, Stretch, usual_interval
@@ -105,7 +106,7 @@ class HarmonicTorque:
 class _Angle:
     """Angle of the shaft as a smooth function of time, from ``begin_s`` to ``end_s``."""
 
-    spline: Callable[..., FloatArray]
+    spline: CubicSpline
     begin_s: float
     end_s: float
     times: FloatArray
@@ -119,18 +120,16 @@ class _Angle:
         times = np.asarray(recording.time_s[known], dtype=np.float64)
         if len(times) < _BAND_BINS or not np.all(np.diff(times) > 0.0):
             return None
-        from scipy.interpolate import CubicSpline
-
-        spline = CubicSpline(times, recording.position_rad[known])
+        spline = CubicSpline.through(times, np.asarray(recording.position_rad[known], dtype=np.float64))
         return cls(spline, float(times[0]), float(times[-1]), times)
 
     def at(self, time_s: FloatArray) -> FloatArray:
         """Return the angle (N,), rad."""
-        return self.spline(time_s)
+        return self.spline.at(time_s)
 
     def speed(self, time_s: FloatArray) -> FloatArray:
         """Return the derivative of the angle (N,), rad/s."""
-        return self.spline(time_s, 1)
+        return self.spline.slope(time_s)
 
     def covers(self, begin_s: float, end_s: float, longest_gap_s: float) -> bool:
         """Return whether the angle is known in a span without a long gap."""
