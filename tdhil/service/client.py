@@ -7,7 +7,7 @@ import ssl
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote, urlencode
@@ -17,6 +17,8 @@ from profiles import message_of
 from tdhil.errors import MessageCode, TdhilError, UsageError
 
 _API: Final = "/api/v1"
+_ARCHIVED: Final[dict[bool, dict[str, Any]]] = {False: {}, True: {"archived": "true"}}
+"""Fields of a request without archived runs, and with them."""
 _ENDED: Final = frozenset({"done", "refused", "stopped", "failed", "stop_not_confirmed", "interrupted"})
 
 
@@ -89,9 +91,9 @@ class Client:
         found: dict[str, Any] = self._object("GET", f"/rigs/{quote(rig, safe='')}/trend")["trend"]
         return found
 
-    def compare(self, *runs: str) -> dict[str, Any]:
-        """Return a comparison of runs: the document of ``tdhil compare --json``."""
-        asked = urlencode({"runs": ",".join(runs)})
+    def compare(self, *runs: str, archived: bool = False) -> dict[str, Any]:
+        """Return a comparison of runs: the document of ``tdhil compare --json``. ``archived``: archived runs, too."""
+        asked = urlencode({"runs": ",".join(runs), **_ARCHIVED[archived]})
         found: dict[str, Any] = self._object("GET", f"/runs/compare?{asked}")["comparison"]
         return found
 
@@ -104,10 +106,14 @@ class Client:
         headers = {} if key is None else {"Idempotency-Key": key}
         return self._object("POST", f"/rigs/{quote(rig, safe='')}/runs", options, headers)
 
-    def runs(self, *, rig: str | None = None, state: str | None = None, limit: int = 100) -> list[dict[str, Any]]:
-        """Return the runs, the newest first."""
-        asked = {name: value for name, value in (("rig", rig), ("state", state), ("limit", limit)) if value is not None}
-        found: list[dict[str, Any]] = self._json("GET", f"/runs?{urlencode(asked)}")
+    def runs(
+        self, *, rig: str | None = None, state: str | None = None, text: str | None = None, archived: bool = False,
+        limit: int = 100,
+    ) -> list[dict[str, Any]]:
+        """Return the runs, the newest first. ``text``: words to search for. ``archived``: archived runs, too."""
+        asked = {"rig": rig, "state": state, "text": text, "limit": limit, **_ARCHIVED[archived]}
+        given = {name: value for name, value in asked.items() if value is not None}
+        found: list[dict[str, Any]] = self._json("GET", f"/runs?{urlencode(given)}")
         return found
 
     def run(self, run: str) -> dict[str, Any]:
@@ -124,6 +130,32 @@ class Client:
     def stop_rig(self, rig: str) -> dict[str, Any]:
         """Stop the rig's present run. Without a run, stop the rig's drive, as ``tdhil stop`` does."""
         return self._object("POST", f"/rigs/{quote(rig, safe='')}/stop", {})
+
+    def annotate(
+        self, run: str, *, tags: Sequence[str] | None = None, operator: str | None = None, note: str | None = None
+    ) -> dict[str, Any]:
+        """Edit tags, operator and note of an ended run; None leaves a value. The log stays as it is."""
+        body = {"tags": None if tags is None else list(tags), "operator": operator, "note": note}
+        return self._object("POST", f"/runs/{quote(run, safe='')}/annotations", body)
+
+    def archive(self, run: str, archived: bool = True) -> dict[str, Any]:
+        """Hide a run from lists and histories, or show it again."""
+        return self._object("POST", f"/runs/{quote(run, safe='')}/archive", {"archived": archived})
+
+    def delete(self, run: str, *, confirm: str) -> dict[str, Any]:
+        """Delete an ended run with its files. ``confirm``: the run's id once more."""
+        return self._object("POST", f"/runs/{quote(run, safe='')}/delete", {"confirm": confirm})
+
+    def acceptance(self, run: str) -> dict[str, Any]:
+        """Return the acceptance of a run, the SHA-256 of its log, and its signature."""
+        return self._object("GET", f"/runs/{quote(run, safe='')}/acceptance")
+
+    def sign_acceptance(
+        self, run: str, *, name: str, verdict: str, log_sha256: str, remark: str = ""
+    ) -> dict[str, Any]:
+        """Sign the acceptance of a run by ``name``. ``verdict``, ``log_sha256``: as this person saw them."""
+        body = {"name": name, "verdict": verdict, "log_sha256": log_sha256, "remark": remark}
+        return self._object("POST", f"/runs/{quote(run, safe='')}/acceptance", body)
 
     def replay(self, run: str, **asked: Any) -> dict[str, Any]:
         """Identify a run again with another ``model``, ``tolerance`` or ``confidence``. Return when it is done."""

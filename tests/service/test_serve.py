@@ -119,6 +119,15 @@ def test_a_run_outlives_its_web_and_is_one_result(tmp_path):
             (run, found["result"]["inertia_kg_m2"]["value"])]
         assert second.client.audit()["broken"] is None
         assert second.client.rig("simulated-canopen")["last"]["inertia_kg_m2"] == pytest.approx(1.05 * 104.0, rel=0.02)
+        second.client.annotate(run, tags=["after repair"], operator="Anna")
+        assert [one["id"] for one in second.client.runs(text="repair anna")] == [run]
+        with pytest.raises(ServiceError, match="no acceptance"):
+            second.client.acceptance(run)
+        second.client.archive(run)
+        assert (second.client.runs(), len(second.client.runs(archived=True))) == ([], 1)
+        with pytest.raises(ServiceError, match="id of the run"):
+            second.client.delete(run, confirm="yes")
+        assert second.client.run(run)["result"] == found["result"]
     one = json.loads((folder / "result.json").read_bytes())
     assert one == found["result"]
 
