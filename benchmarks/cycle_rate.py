@@ -51,7 +51,7 @@ RATE_HZ = 250.0
 LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5)
 TURN = Command(Mode.SPEED, 2.0, 0.0)
 KNOWN = RigGuess(RigParams().plant.inertia_kg_m2, RigParams().plant.viscous_nm_s_rad, RigParams().plant.coulomb_nm)
-"""What stage 2 finds of the default rig."""
+"""Result of stage 2 for the default rig."""
 RPDO = Struct("<Hhi")
 SYNC, RPDO_ID, TPDO_ID = 0x080, 0x201, 0x181
 LOOPS = ("A bare", "B drive", "C run", "D blind")

@@ -552,7 +552,7 @@ def noticed(subject: str, tree: ast.Module, function: int, *, usual: bool = Fals
 
 
 def judged(mutant: Mutant, *, usual: bool = False) -> Row:
-    """The row of a mutant. ``noticed``: None if nothing can be said, as the tests fail without it."""
+    """The row of a mutant. ``noticed``: None if the tests fail without the mutant, too."""
     begun_s = time.monotonic()
     found: bool | None = None
     count = 0

@@ -98,7 +98,7 @@ class Trace:
 
 
 class Watch:
-    """A plugin of pytest that notes which test runs, what it takes, and which functions are entered meanwhile."""
+    """Plugin of pytest that notes each test with its time and the functions that it enters."""
 
     def __init__(self, serve: Callable[[Any], None] | None = None) -> None:
         self._serve = serve

@@ -68,13 +68,13 @@ class PlantKind:
 
     params: type[BaseModel]
     plant: Callable[[Any], Plant[Any]]
-    has_drill_string: bool = False
+    winds_up: bool = False
 
 
 PLANTS: dict[str, PlantKind] = {
     "rigid": PlantKind(Params, Rigid),
-    "two_mass": PlantKind(TwoMassParams, TwoMass, has_drill_string=True),
-    "string": PlantKind(StringParams, DrillString, has_drill_string=True),
+    "two_mass": PlantKind(TwoMassParams, TwoMass, winds_up=True),
+    "string": PlantKind(StringParams, DrillString, winds_up=True),
 }
 """Every kind of plant. plant.yaml accepts these kinds, and the keys of their models."""
 

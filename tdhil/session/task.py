@@ -34,7 +34,7 @@ def suited(rig: Rig | None, plant: Any) -> Rig | None:
         return rig
     from sim_bus.plant import PLANTS
 
-    if not PLANTS[plant.plant.kind].has_drill_string:
+    if not PLANTS[plant.plant.kind].winds_up:
         return rig
     most_nm = plant.drive.torque_limit_nm
     data = simulated_default_rig(rig).model_dump(by_alias=True)
