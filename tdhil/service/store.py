@@ -203,9 +203,14 @@ class Store:
                               next_step="Name a folder for the runs with --data") from error
 
     def new_id(self) -> str:
-        """Return a new id, and make its folder."""
+        """Return a new id, and make its folder. Ids sort by the time they were made at, also within a second.
+
+        The last six hexadecimal digits are the microsecond times 16 (at most 15,999,984 of 16,777,216), plus a random
+        number below 16.
+        """
         while True:
-            found = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
+            now = datetime.now(UTC)
+            found = f"{now:%Y%m%d-%H%M%S}-{16 * now.microsecond + secrets.randbelow(16):06x}"
             with suppress(FileExistsError):
                 (self.runs / found).mkdir(mode=0o750)
                 return found

@@ -10,6 +10,7 @@ import os
 import random
 import sqlite3
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,6 +77,14 @@ def test_a_run_comes_back_as_it_was_written(store):
     assert store.result(run) is None
     write_json(store.place(run) / "result.json", {"verdict": "valid", "inertia_kg_m2": {"value": 104.0}})
     assert store.summary(run).inertia_kg_m2 == 104.0
+
+
+def test_ids_sort_by_the_time_they_were_made_at(store):
+    made = []
+    for _ in range(20):
+        made.append(store.new_id())
+        time.sleep(2e-6)        # an id holds whole microseconds
+    assert store.ids() == made[::-1]
 
 
 @pytest.mark.parametrize("name", [
