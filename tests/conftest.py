@@ -1,7 +1,8 @@
 """One setting for every property test: the same examples at every run. TDHIL_FUZZ=1 looks for new ones instead.
 
 The README's command takes what is quick, so that it stays below four minutes. Heavy cases run in CI (--heavy: those
-alone), the longest with --long only, which the header of every run says.
+alone), the longest with --long only, which the header of every run says. A commit's CI runs one of three shares of the
+heavy cases (--share), so that it ends in 20 minutes: decision 0061.
 What the markers mean: pyproject.toml.
 
 A test in real time (`real_time`) that fails has shown nothing where this computer stood still meanwhile: a drive's
@@ -17,6 +18,7 @@ the environment forbids it (PYTHONDONTWRITEBYTECODE), each of them would compile
 Linear algebra has one thread: beside another worker of pytest two of them wait for each other, for twice the time.
 """
 
+import argparse
 import gc
 import json
 import os
@@ -24,6 +26,7 @@ import signal
 import sys
 import threading
 import time
+import zlib
 from collections import Counter
 from pathlib import Path
 
@@ -54,6 +57,21 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--long", action="store_true", help="also the cases that are left out for their time")
     parser.addoption("--heavy", action="store_true", help="only the heavy cases, which CI runs beside the README's")
     parser.addoption("--all-but-long", action="store_true", help="the heavy cases, too")
+    parser.addoption("--share", type=share, metavar="K/N", default=(1, 1),
+                     help="of the heavy cases the K-th of N shares, and those that each share has")
+
+
+def share(text: str) -> tuple[int, int]:
+    """Return K and N of "K/N"."""
+    one, _, of = text.partition("/")
+    if not (one.isdecimal() and of.isdecimal() and 1 <= int(one) <= int(of)):
+        raise argparse.ArgumentTypeError(f"{text!r}: must be K/N with 1 <= K <= N, as 2/3")
+    return int(one), int(of)
+
+
+def in_share(nodeid: str, one: int, of: int) -> bool:
+    """A case stays in its share, whatever cases are added beside it."""
+    return zlib.crc32(nodeid.encode()) % of == one - 1
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -109,8 +127,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if not config.getoption("--long"):
         only, too = config.getoption("--heavy"), config.getoption("--all-but-long")
         heavy, longest = cases_of(items, "heavy"), cases_of(items, "long")
+        always = {item.nodeid for item in items for mark in item.iter_markers("heavy") if mark.kwargs.get("each_share")}
+        other = {nodeid for nodeid in heavy - always if not in_share(nodeid, *config.getoption("--share"))}
         chosen = [
-            item for item in items if item.nodeid not in longest and (too or (item.nodeid in heavy) is only)
+            item for item in items
+            if item.nodeid not in longest and item.nodeid not in other and (too or (item.nodeid in heavy) is only)
         ]
         if len(chosen) < len(items):
             kept = set(chosen)
@@ -178,7 +199,9 @@ def pytest_collection_finish() -> None:
 def pytest_report_header(config: pytest.Config) -> str:
     if config.getoption("--long"):
         return "long and heavy cases: run too"
+    one, of = config.getoption("--share")
+    part = f", share {one} of {of}" if of > 1 else ""
     if config.getoption("--all-but-long"):
-        return "long cases: LEFT OUT (--long); heavy cases: run too"
-    heavy = "ONLY THESE" if config.getoption("--heavy") else "LEFT OUT, run by .ci/run (--heavy)"
+        return f"long cases: LEFT OUT (--long); heavy cases: run too{part}"
+    heavy = f"ONLY THESE{part}" if config.getoption("--heavy") else "LEFT OUT, run by .ci/run (--heavy)"
     return f"long cases: LEFT OUT (--long); heavy cases: {heavy}"

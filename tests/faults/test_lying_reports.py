@@ -25,7 +25,7 @@ ONCE_BELIEVED = (856, 4889)
 rad/s. 4889: a torque constant that halves within stage 2 doubled J above a string of known size, and valid."""
 
 
-@pytest.mark.heavy
+@pytest.mark.heavy(each_share=True)     # fifty lies at each commit: no other fault is as bad as a lie that is believed
 @pytest.mark.parametrize(
     "combination", [*sample(COUNT, SEED), *(product()[number] for number in ONCE_BELIEVED)], ids=str)
 def test_no_lie_is_believed(combination, tmp_path):
