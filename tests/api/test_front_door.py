@@ -21,6 +21,8 @@ from tdhil.errors import Interrupted, UsageError
 from tdhil.session.confirm import CallbackOperator, TerminalOperator
 from tdhil.session.stop_signals import stop_on_signals
 
+pytestmark = pytest.mark.one_worker      # its fixture is expensive
+
 SHORT = tdhil.Multisine(frequency_hz=0.3, periods=6)
 EXAMPLE = Path(__file__).parents[2] / "examples" / "identify_in_python.py"
 

@@ -25,6 +25,8 @@ def document(tmp_path_factory):
     return document_of_calibration(find_calibration(two(tmp_path_factory.mktemp("logs")), "motor"))
 
 
+pytestmark = pytest.mark.one_worker      # its fixture is expensive
+
 RUN = {"identity": IDENTITY, "started": "2026-12-01T10:00:00+00:00"}
 
 

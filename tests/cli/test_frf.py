@@ -14,6 +14,8 @@ import yaml
 from tdhil.cli.main import main
 from tests.estimation.analytic import closed_form
 
+pytestmark = pytest.mark.one_worker      # its fixture is expensive
+
 
 def write_trace(folder: Path, name: str, **how) -> list[str]:
     """Write a trace with its motion; return the words of the command line that name both."""

@@ -374,6 +374,7 @@ def test_a_missing_string_is_told_before_the_log_is_identified(tmp_path, monkeyp
     assert "nosuch.yaml" in capsys.readouterr().err
 
 
+@pytest.mark.heavy
 def test_a_tuning_that_evaluate_refuses_says_so(tmp_path, capsys):
     path = tmp_path / "result.json"
     path.write_text(json.dumps(result()))

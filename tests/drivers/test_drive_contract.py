@@ -141,6 +141,7 @@ def test_the_limits_stand_in_the_drive_and_act(run):
     assert last.speed_rad_s == pytest.approx(run.bench.limits.speed_rad_s, rel=0.01)
 
 
+@pytest.mark.heavy(but_first=3)
 @pytest.mark.parametrize("mode", [Mode.SPEED, Mode.TORQUE])
 def test_a_quick_stop_brakes_on_the_ramp_and_holds(run, mode):
     if mode not in run.bench.modes:

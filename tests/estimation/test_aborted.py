@@ -8,6 +8,8 @@ import pytest
 from tdhil.estimation import Verdict, identify
 from tdhil.recording.recording import MARGIN_S, Stage, before_abort
 
+pytestmark = pytest.mark.one_worker("default plan")      # its recording is one of 24 that are simulated at once
+
 DETAIL = "DriveFault: the drive left the state 'enabled' and shows 'off'"
 
 

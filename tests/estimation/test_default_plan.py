@@ -8,7 +8,7 @@ import pytest
 from tdhil.estimation import Options, Verdict, identify
 from tests.estimation.shaft_bench import Rig, recordings
 
-pytestmark = pytest.mark.one_worker
+pytestmark = pytest.mark.one_worker("default plan")
 
 SEEDS = list(range(24))
 

@@ -136,6 +136,7 @@ def test_detected_distortion_widens_the_intervals(linear):
         assert wide.distortion_rel > wide.noise_rel > 0.0
 
 
+@pytest.mark.heavy
 def test_a_response_that_differs_between_mean_speeds_is_distortion():
     plain = closed_form(noise=3.0)
     speeds = [plain.speed_rad_s[(plain.time_s >= one.start_s) & (plain.time_s < one.end_s)] - one.offset_rad_s

@@ -85,6 +85,7 @@ def test_the_sound_record_has_a_number_and_no_warning():
         assert not any(words in said for said in found.warnings for words in ("drifting", "undeclared", "left out"))
 
 
+@pytest.mark.heavy
 @pytest.mark.filterwarnings("error")
 def test_one_tone_with_nothing_known_of_the_lags_is_not_identifiable(records):
     for number in range(EACH):

@@ -86,6 +86,7 @@ def test_a_reference_filter_that_nobody_declared_is_refused(name):
     assert seen.gain_nm_s_rad is None and seen.points == ()
 
 
+@pytest.mark.heavy
 def test_one_too_small_to_show_is_within_the_intervals():
     """0.03 s that is not declared: with no room for it, these two records put P out of its interval."""
     drive = machine("the paper's", reference_filter=0.03)

@@ -11,6 +11,8 @@ from tdhil.estimation.cross_checks.level_torque import LEAST, MOST, level_contra
 from tdhil.estimation.samples import usable_samples
 from tests.estimation.stages_bench import Stages, run_stages
 
+pytestmark = pytest.mark.one_worker      # its fixture is expensive
+
 BEGINS_S = 46.0           # stage 5 of the bench
 
 

@@ -97,7 +97,7 @@ def test_without_knowing_the_lags_it_is_wider_and_still_covers(runs):
     assert sum(e.low <= TRUE <= e.high for e in unknown) >= binom.ppf(0.005, runs, 0.95)
 
 
-@pytest.mark.parametrize("runs", [20, pytest.param(60, marks=pytest.mark.heavy)])
+@pytest.mark.parametrize("runs", [pytest.param(20, marks=pytest.mark.heavy), pytest.param(60, marks=pytest.mark.long)])
 def test_without_excited_segments_the_rows_tell_the_scatter(runs):
     """As after a refusal, or in a foreign trace: no levels, nothing of the lags, no result."""
     nothing = replace(result(delay=None), inertia=None)

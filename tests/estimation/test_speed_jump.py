@@ -12,6 +12,8 @@ from tdhil.estimation.cross_checks.speed_jump import MOST, jump_contradiction
 from tests.estimation.compliant_bench import Pipe, run
 from tests.estimation.test_two_mass import KNOWN, MILD
 
+pytestmark = pytest.mark.one_worker      # its fixture is expensive
+
 PLANT = Pipe()
 AT_S = 60.0
 LAG_S = 0.2               # of the drive's filter behind the sensor

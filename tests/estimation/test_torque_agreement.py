@@ -16,6 +16,8 @@ def heavy(value):
     return pytest.param(value, marks=pytest.mark.heavy)
 
 
+pytestmark = pytest.mark.one_worker      # its fixture is expensive
+
 FINE_S = 0.002
 LAGS = {
     "none": (), "one pole": (0.5,), "two poles": (0.25, 0.15), "average": ("average", 0.4), "dead time": ("late", 0.3),
@@ -200,7 +202,7 @@ def test_an_angle_that_fits_changes_nothing(turned):
     assert replace(with_angle, harmonics=None) == identify(replace(turned, position_rad=None))
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize(("factor", "said"), [
     (0.9, "contradicts the shaft's angle"), (1.15, "contradicts the shaft's angle"), (0.94, "changed its scale"),
 ])

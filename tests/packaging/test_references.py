@@ -18,6 +18,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.one_worker      # its fixture is expensive
+
 ROOT = Path(__file__).parents[2]
 ROOMS = ("tdhil", "drivers", "sim_bus", "profiles")
 FOLDERS = (*ROOMS, "tests", "benchmarks", "docs", "examples", "deploy")

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.one_worker      # its fixture is expensive
+
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("tdhil", "drivers", "sim_bus", "profiles")
 

@@ -79,6 +79,7 @@ def test_a_place_where_no_report_can_go_is_refused_before_anything_moves(tmp_pat
     assert not (tmp_path / "run.mcap").exists()
 
 
+@pytest.mark.heavy
 def test_the_log_is_never_written_over_by_its_own_report(run):
     before = run.log.read_bytes()
     done = tdhil("replay", run.log, "--report", run.log)

@@ -89,6 +89,7 @@ def test_a_full_device(log, monkeypatch):
     assert "Traceback" not in err
 
 
+@pytest.mark.heavy
 def test_a_full_device_at_the_end_of_a_run(ended):
     code, err, log = ended
     assert code == 3, err

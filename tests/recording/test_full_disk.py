@@ -38,6 +38,7 @@ def test_a_log_that_fails_in_mid_run_stops_the_shaft(tmp_path):
     assert (tmp_path / "run.mcap").stat().st_size <= 100_000
 
 
+@pytest.mark.heavy
 def test_a_disk_without_room_refuses_the_run(tmp_path):
     done = identify(Path("/dev/full"), 10**9)
     assert done.returncode == 4, done.stderr

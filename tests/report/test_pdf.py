@@ -111,6 +111,7 @@ def test_it_is_a_pdf_with_that_many_pages_and_the_same_twice():
     assert b"/Subtype /Image" not in one            # vectors
 
 
+@pytest.mark.heavy
 @pytest.mark.skipif(shutil.which("pdftotext") is None, reason="no pdftotext (poppler-utils) here")
 def test_its_text_can_be_read_by_others(tmp_path):
     (tmp_path / "r.pdf").write_bytes(pdf_bytes(report(full())))

@@ -14,6 +14,8 @@ from tdhil.runner.preconditions import choose_mode, refuse_slow_reference
 from tdhil.runner.settings import ExcitationRequest
 from tests.runner.line_drive import RIG_LIMITS, Line, LineDrive, run_line
 
+pytestmark = pytest.mark.one_worker      # its fixture is expensive
+
 ZETA = 20.56
 OFFSET = ExcitationRequest(impedance="offset", string_nm_s_rad=ZETA, periods=8)
 RIG = RigParams(drive=DriveParams(control_period_s=0.01, speed_gain_nm_s_rad=82.2, speed_integral_gain_nm_rad=69.3))

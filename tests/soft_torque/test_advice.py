@@ -30,6 +30,8 @@ from tdhil.soft_torque import (
 from tests.soft_torque.cases import DRIVE, SOFT_035, SOFT_1, STIFF, STRING, string_with
 from tests.soft_torque.chain_in_time import ends_turning, reference_case
 
+pytestmark = pytest.mark.one_worker      # its fixture is expensive
+
 J = Interval(1500.0, 1440.0, 1560.0)
 
 
@@ -63,6 +65,7 @@ def test_the_soft_row_is_far_below_the_stiff_one(beside_good_gains):
     assert low < soft.cure.median < high
 
 
+@pytest.mark.heavy
 def test_margins_hold_on_truths_that_were_not_drawn(beside_good_gains):
     """The soft row keeps phase, gain and dead-time margin on 95 % of 100 further truths."""
     law = beside_good_gains.by_kind("soft").controller

@@ -24,6 +24,8 @@ from tdhil.soft_torque.torsional_severity import downhole_speed
 from tests.soft_torque.cases import BIT, DRIVE, FIVE_INCH, PAPER, SOFT_035, STRING, BottomEnd
 from tests.soft_torque.chain_in_time import recorded, reference_case, reported
 
+pytestmark = pytest.mark.one_worker      # its fixture is expensive
+
 INERTIA = Interval(1500.0, 1440.0, 1560.0)
 PERIOD_S = 1.0 / 0.1299
 LAGS_S = (0.1, 0.05)

@@ -29,6 +29,8 @@ from tdhil.soft_torque import (
 from tdhil.soft_torque.candidates import gains, ranked_speeds
 from tests.soft_torque.cases import DRIVE, SOFT_025, STRING
 
+pytestmark = pytest.mark.one_worker      # its fixture is expensive
+
 HELD = string_modes_hz(STRING)
 NARROW = Interval(1500.0, 1440.0, 1560.0)
 
@@ -100,7 +102,7 @@ def test_a_wider_interval_leaves_less_to_compensate():
     assert shares[0] > shares[1] > shares[2]
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize("kind", ["stiff", "soft", "compensated"])
 def test_intervals_are_what_two_hundred_draws_of_j_give(tuned, kind):
     """The intervals contain 95 % of the draws, and are not wider than the range of the draws."""

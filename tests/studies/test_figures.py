@@ -81,6 +81,7 @@ def test_figure11_gives_the_sine_its_gain_and_the_step_its_true_one(outcomes):
     assert longer["step_gain_at_the_end"] == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.heavy
 def test_figure12_gain_grows_and_lag_falls_with_p(outcomes):
     found = outcomes["figure12"]
     assert np.all(np.diff(column(found, "gain")) > 0)
@@ -88,6 +89,7 @@ def test_figure12_gain_grows_and_lag_falls_with_p(outcomes):
     assert list(said(found).values()) == [True, True]
 
 
+@pytest.mark.heavy
 def test_figure13_amplitude_comes_nearer_and_lag_grows_with_i(outcomes):
     found = outcomes["figure13"]
     assert np.all(np.diff(np.abs(column(found, "amplitude_difference_rad_s"))) < 0)
