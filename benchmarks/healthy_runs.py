@@ -33,7 +33,6 @@ import numpy as np  # noqa: E402
 from benchmarks.called_here import called_here  # noqa: E402
 from profiles.library import load_profile, profile_names  # noqa: E402
 from sim_bus.shaft_judge import read_shaft  # noqa: E402
-from tdhil.buses.ethercat import PLAIN  # noqa: E402
 
 ALARM = "Contradict"
 """Part of the class name of the observer's errors."""
@@ -79,15 +78,10 @@ def holds_a_string(name: str) -> bool:
     return profile.quick_stop.ends == "quick_stop" and profile.watchdog.reaction == "quick_stop"
 
 
-def is_simulated(name: str) -> bool:
-    """Whether the simulator has a drive with this profile: on EtherCAT the generic one only."""
-    return load_profile(name).bus != "ethercat" or name == PLAIN
-
-
 def draw(seed: int) -> Rig:
     """The rig of this seed."""
     rng = np.random.default_rng([seed, 202611])
-    names = [name for name in sorted(profile_names()) if is_simulated(name)]
+    names = sorted(profile_names())
     shaft = str(rng.choice(SHAFTS))
     fits = [name for name in names if shaft == "rigid" or holds_a_string(name)]
     profile = fits[int(rng.integers(len(fits)))]

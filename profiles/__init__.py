@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     )
     from profiles.library import (
         Profile as Profile, eds_path as eds_path, load_canopen_profile as load_canopen_profile,
-        load_modbus_profile as load_modbus_profile, load_profile as load_profile, matching_names as matching_names,
+        load_ethercat_profile as load_ethercat_profile, load_modbus_profile as load_modbus_profile,
+        load_profile as load_profile, matching_names as matching_names,
         parse_profile as parse_profile, profile_names as profile_names, profile_text as profile_text,
     )
     from profiles.messages import (
@@ -45,8 +46,8 @@ else:
         "eds_reader": "read_eds",
         "entry": "Confidence DriveProfile ProfileEntry Require SpeedControllerParameters",
         "errors": "DataFileError Problem TdhilError UsageError",
-        "library": "Profile eds_path load_canopen_profile load_modbus_profile load_profile matching_names "
-                   "parse_profile profile_names profile_text",
+        "library": "Profile eds_path load_canopen_profile load_ethercat_profile load_modbus_profile load_profile "
+                   "matching_names parse_profile profile_names profile_text",
         "messages": "CodedText MessageCode entry_of message_of with_code",
         "model": "DataModel Finding NonNegative Positive Validated one_of refuse_if",
         "simulator_marker": "CYCLES_END CYCLE_ANSWER CYCLE_ASKED CYCLE_ID CYCLE_OVER LAST_CYCLE_OVER MARKER_INDEX "

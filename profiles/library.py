@@ -124,6 +124,13 @@ def load_canopen_profile(name_or_path: str) -> CanopenProfile:
     return profile
 
 
+def load_ethercat_profile(name_or_path: str) -> EthercatProfile:
+    """Return an EtherCAT profile like `load_profile`. Raises DataFileError for a profile of another bus."""
+    profile = load_profile(name_or_path, "ethercat")
+    assert isinstance(profile, EthercatProfile)
+    return profile
+
+
 def load_modbus_profile(name_or_path: str) -> ModbusProfile:
     """Return a Modbus profile like `load_profile`. Raises DataFileError for a profile of another bus."""
     profile = load_profile(name_or_path, "modbus")

@@ -19,7 +19,7 @@ from math import floor, pi
 
 from canopen.sdo import SdoAbortedError
 
-from profiles.canopen import CanopenProfile
+from profiles.cia402 import Cia402Profile
 from sim_bus.cia402 import Application, ApplicationSettings
 from sim_bus.inverter import RPM
 from sim_bus.objects import ABORT_VALUE, ObjectStore, key_of
@@ -63,7 +63,7 @@ def standard_units(drive: DriveParams) -> ObjectUnits:
     )
 
 
-def profile_units(drive: DriveParams, profile: CanopenProfile, scales: dict[str, float]) -> ObjectUnits:
+def profile_units(drive: DriveParams, profile: Cia402Profile, scales: dict[str, float]) -> ObjectUnits:
     """Return the units of the profile; ``scales`` are the values of the parameters that multiply and divide
     its units.
     """

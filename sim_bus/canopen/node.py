@@ -13,7 +13,7 @@ from profiles.canopen import CanopenProfile
 from sim_bus.application_objects import ApplicationObjects
 from sim_bus.canopen import services as emcy
 from sim_bus.canopen.pdo import ReceivePdo, TransmitPdo
-from sim_bus.canopen.profile_emulation import WornProfile
+from sim_bus.canopen.profile_emulation import apply_on_canopen
 from sim_bus.canopen.sender import PassiveNetwork, Sender
 from sim_bus.canopen.services import (
     Emergency,
@@ -26,6 +26,7 @@ from sim_bus.canopen.services import (
 )
 from sim_bus.objects import ObjectStore, generic_eds, key_of
 from sim_bus.params import RigParams
+from sim_bus.profile_emulation import WornProfile
 from sim_bus.timed_drive import TimedDrive
 from sim_bus.trace import ShaftTrace
 
@@ -49,11 +50,13 @@ class Cia402Node(TimedDrive):
         self.network = PassiveNetwork(sender)
         self.network.add_node(self.store)
         self.emergency = Emergency(self.store, lambda data: sender.send(0x080 + node_id, data))
-        self.worn = WornProfile(profile, self.application) if profile is not None else None
+        self.profile = profile
         self._guard = LifeGuard()
-        self._objects = ApplicationObjects(self.store, self.application, self.worn.units if self.worn else None)
-        if self.worn is not None:
-            self.worn.apply(self.store, self._guard, self._set_period)
+        worn = WornProfile(profile, self.application) if profile is not None else None
+        self._objects = ApplicationObjects(self.store, self.application, worn.units if worn else None)
+        if profile is not None and worn is not None:
+            worn.apply(self.store)
+            apply_on_canopen(profile, self.store, self._guard, self._set_period)
         self._receive = [
             ReceivePdo(self.store, n, self._objects.setters, self._route, self._short_pdo) for n in range(4)
         ]
@@ -84,7 +87,7 @@ class Cia402Node(TimedDrive):
 
     def on_remote(self, can_id: int) -> None:
         """Handle one remote frame. A drive with node guarding and without a heartbeat of its own replies."""
-        guarded = self.worn is not None and self.worn.profile.watchdog.kind == "node_guarding"
+        guarded = self.profile is not None and self.profile.watchdog.kind == "node_guarding"
         if can_id != 0x700 + self.id or not guarded or self._producer.active:
             return
         self._send(can_id, self._guard.answer(self.nmt.state.value))

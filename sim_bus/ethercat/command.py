@@ -23,6 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                        help="the Ethernet interface to answer on, such as one end of a veth pair (needs CAP_NET_RAW)")
     group.add_argument("--alias", metavar="N", type=number_from(0, 65535, "an alias"), default=0,
                        help="configured station alias, 0 to 65535 (default 0)")
+    group.add_argument("--profile", metavar="NAME",
+                       help="the drive to be: a profile that ships, or a YAML file (default: our own EDS)")
     add_rig_arguments(group)
     add_fault_argument(group, "frame-loss@hold+2s=1%%")
     group.add_argument("--stepped", action="store_true",
@@ -38,12 +40,14 @@ def run(namespace: argparse.Namespace) -> int:
         return EXIT_OK
 
     def simulate(stop: threading.Event) -> None:
+        from profiles import load_ethercat_profile
         from sim_bus.ethercat.simulator import Simulator, raw_socket
 
         if namespace.interface is None:
             raise Unusable("no interface: give -i NAME")
         simulator = Simulator(rig_of(namespace), seed=namespace.seed, trace=namespace.trace, alias=namespace.alias,
-                              stepped=namespace.stepped, faults=parse_all(namespace.fault))
+                              stepped=namespace.stepped, faults=parse_all(namespace.fault),
+                              profile=load_ethercat_profile(namespace.profile) if namespace.profile else None)
         with raw_socket(namespace.interface) as line:
             ready(f"{namespace.interface} position 0: a simulator for tests, not a product slave")
             simulator.run(line, stop)

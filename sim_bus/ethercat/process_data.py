@@ -1,4 +1,4 @@
-"""Process data: PDO mapping 1600h to 1603h and 1A00h to 1A03h, assignment 1C12h and 1C13h, and the fast path."""
+"""Process data: PDO mapping 1600h to 1607h and 1A00h to 1A07h, assignment 1C12h and 1C13h, and the fast path."""
 
 from collections.abc import Callable
 from struct import Struct
@@ -10,7 +10,7 @@ from sim_bus import objects as od
 from sim_bus.ethercat.sii import PdoEntry, SiiPdo
 from sim_bus.objects import FORMATS, ObjectStore, key_of
 
-PDOS, ENTRIES, SIZE_LIMIT = 4, 8, 64
+PDOS, ENTRIES, SIZE_LIMIT = 8, 8, 64
 """Number of PDOs in one direction, entries of a PDO, bytes of one direction."""
 
 _GAPS = {8: "x", 16: "xx", 32: "xxxx"}
@@ -60,19 +60,22 @@ class _Numbers:
 
 
 class ProcessData:
-    """One direction: mappings and their assignment to a SyncManager. ``writable``: in the present state."""
+    """One direction: mappings and their assignment to a SyncManager. ``writable``: in the present state. ``usual``: the
+    PDO that is assigned and filled as delivered.
+    """
 
-    def __init__(self, store: ObjectStore, *, outputs: bool, writable: Callable[[], bool]) -> None:
-        self._store, self.outputs, self._writable = store, outputs, writable
+    def __init__(self, store: ObjectStore, *, outputs: bool, writable: Callable[[], bool], usual: int) -> None:
+        self._store, self.outputs, self._writable, self._usual = store, outputs, writable, usual
         self.first, self.manager, kind = (0x1600, 2, "Receive") if outputs else (0x1A00, 3, "Transmit")
-        default = DEFAULT_OUTPUTS if outputs else DEFAULT_INPUTS
+        default = tuple(one for one in (DEFAULT_OUTPUTS if outputs else DEFAULT_INPUTS)
+                        if not one >> 16 or one >> 16 in store.object_dictionary)
         self._mappings = [
-            _Numbers(store, self.first + number, f"{kind} PDO {number + 1} mapping", bits=32, size=ENTRIES,
-                     entries=() if number else default, check=self._check_entry, done=self.compile)
-            for number in range(PDOS)
+            _Numbers(store, number, f"{kind} PDO {number - self.first + 1} mapping", bits=32, size=ENTRIES,
+                     entries=default if number == usual else (), check=self._check_entry, done=self.compile)
+            for number in range(self.first, self.first + PDOS)
         ]
         self._assigned = _Numbers(store, 0x1C10 + self.manager, f"SyncManager {self.manager} PDO assignment", bits=16,
-                                  size=PDOS, entries=(self.first,), check=self._check_pdo, done=self.compile)
+                                  size=PDOS, entries=(usual,), check=self._check_pdo, done=self.compile)
         self._compile()
 
     @property
@@ -89,9 +92,10 @@ class ProcessData:
         return list(zip(self._keys, self._struct.unpack_from(data), strict=True))
 
     def delivered(self) -> SiiPdo:
-        """Return the first PDO for the EEPROM."""
-        entries = [PdoEntry(one >> 16, one >> 8 & 0xFF, self._kind(one), one & 0xFF) for one in self._mappings[0].used]
-        return SiiPdo(self.first, self.manager, entries)
+        """Return the PDO of the delivered assignment, for the EEPROM."""
+        mapping = self._mappings[self._usual - self.first].used
+        entries = [PdoEntry(one >> 16, one >> 8 & 0xFF, self._kind(one), one & 0xFF) for one in mapping]
+        return SiiPdo(self._usual, self.manager, entries)
 
     def compile(self) -> None:
         """Build the fast path of the assigned PDOs. Refused outside PRE-OPERATIONAL."""

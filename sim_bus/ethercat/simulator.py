@@ -5,6 +5,7 @@ import threading
 import time
 from pathlib import Path
 
+from profiles.ethercat import EthercatProfile
 from sim_bus.command_arguments import Unusable
 from sim_bus.ethercat.esc import ETHERTYPE
 from sim_bus.ethercat.faults import Faults
@@ -27,9 +28,10 @@ class Simulator:
 
     def __init__(self, params: RigParams | None = None, *, seed: int = 0, trace: Path | None = None,
                  stepped: bool = False, silence_s: float = 1.0, alias: int = 0,
-                 faults: tuple[Scripted, ...] = ()) -> None:
+                 profile: EthercatProfile | None = None, faults: tuple[Scripted, ...] = ()) -> None:
         self.trace = ShaftTrace(trace)
-        self.slave = Cia402Slave(params or RigParams(), seed=seed, trace=self.trace, stepped=stepped, alias=alias)
+        self.slave = Cia402Slave(params or RigParams(), seed=seed, trace=self.trace, stepped=stepped, alias=alias,
+                                 profile=profile)
         self._faults = Faults(faults, self.slave, seed)
         self._silence_s = silence_s
         self._silent_s = self._last_s = self._plant_s = 0.0

@@ -12,6 +12,7 @@ from canopen.objectdictionary import datatypes
 from canopen.sdo import SdoAbortedError
 
 from profiles import MARKER_INDEX
+from profiles.ethercat import EthercatProfile
 from sim_bus.application_objects import ApplicationObjects
 from sim_bus.ethercat.coe import CoeServer
 from sim_bus.ethercat.esc import AL_STATUS, AL_STATUS_CODE, Esc
@@ -19,6 +20,7 @@ from sim_bus.ethercat.process_data import ProcessData
 from sim_bus.ethercat.sii import Area, eeprom
 from sim_bus.objects import ABORT_LENGTH, ObjectStore, generic_eds, key_of
 from sim_bus.params import RigParams
+from sim_bus.profile_emulation import WornProfile
 from sim_bus.timed_drive import TimedDrive
 from sim_bus.trace import ShaftTrace
 
@@ -66,9 +68,10 @@ class SlaveObjects(ObjectStore):
 
 
 class Cia402Slave(TimedDrive):
-    """A CiA 402 drive on EtherCAT over a simulated inverter."""
+    """A CiA 402 drive on EtherCAT over a simulated inverter, with our own EDS or with a ``profile``."""
 
-    def __init__(self, params: RigParams, *, seed: int, trace: ShaftTrace, stepped: bool, alias: int = 0) -> None:
+    def __init__(self, params: RigParams, *, seed: int, trace: ShaftTrace, stepped: bool, alias: int = 0,
+                 profile: EthercatProfile | None = None) -> None:
         super().__init__(params, seed=seed, trace=trace, stepped=stepped)
         self.state = AlState.INIT
         self.cycled = False
@@ -82,9 +85,13 @@ class Cia402Slave(TimedDrive):
         self.store = SlaveObjects(1, generic_eds())
         for index in _CAN_ONLY:
             self.store.remove(index)
-        self._setters = ApplicationObjects(self.store, self.application).setters
-        self.received = ProcessData(self.store, outputs=True, writable=self._configurable)
-        self.sent = ProcessData(self.store, outputs=False, writable=self._configurable)
+        worn = WornProfile(profile, self.application) if profile else None
+        self._setters = ApplicationObjects(self.store, self.application, worn.units if worn else None).setters
+        if worn is not None:
+            worn.apply(self.store)
+        pdos = (profile.cyclic.rx_pdos[0], profile.cyclic.tx_pdos[0]) if profile else (0x1600, 0x1A00)
+        self.received = ProcessData(self.store, outputs=True, writable=self._configurable, usual=pdos[0])
+        self.sent = ProcessData(self.store, outputs=False, writable=self._configurable, usual=pdos[1])
         self._bind()
         areas = (Area(0x1000, MAILBOX, 0x26, 1), Area(0x1000 + MAILBOX, MAILBOX, 0x22, 2),
                  Area(_OUTPUTS_AT, self.received.size, 0x64, 3), Area(_INPUTS_AT, self.sent.size, 0x20, 4))

@@ -131,13 +131,8 @@ def _rated_torque_nm(plan: PeerPlan, profile: EthercatProfile, data: DriveData) 
 def _interface(plan: PeerPlan, connection: Connection, trace: Path | None = None) -> Iterator[str]:
     """Yield the network interface, with the simulated drive behind it if requested."""
     if plan.embedded:
-        if connection.profile.name != PLAIN:
-            raise UsageError(
-                f"the simulated EtherCAT drive has the units of {PLAIN} only, not those of {connection.profile.name}",
-                where=OPTION["profile"].flag, next_step="Leave the profile out, or name the drive's network interface",
-                entry=MessageCode.BUS_OPTIONS_WRONG,
-            )
-        with _simulated(plan, trace) as interface:
+        worn = None if connection.profile.name == PLAIN else profile_of(connection)
+        with _simulated(plan, worn, trace) as interface:
             yield interface
         return
     interface = connection.line.value("interface")
@@ -158,8 +153,11 @@ SIMULATOR_STARTS_S = 30.0
 
 
 @contextmanager
-def _simulated(plan: PeerPlan, trace: Path | None) -> Iterator[str]:
-    """Yield the host's end of the pair. Raises SimulatorUnusable if the system does not permit it."""
+def _simulated(plan: PeerPlan, worn: EthercatProfile | None, trace: Path | None) -> Iterator[str]:
+    """Yield the host's end of the pair. ``worn``: the drive's profile, unless it is the plain one.
+
+    Raises SimulatorUnusable if the system does not permit it.
+    """
     import multiprocessing
     import os
 
@@ -168,7 +166,7 @@ def _simulated(plan: PeerPlan, trace: Path | None) -> Iterator[str]:
     number = next(_PAIRS)
     ends = (f"ec{os.getpid()}h{number}", f"ec{os.getpid()}d{number}")
     faults = [fault.text for fault in plan.faults]
-    asked = (plan.plant, plan.seed or 0, trace, plan.stepped, faults, ends, theirs)
+    asked = (plan.plant, plan.seed or 0, trace, plan.stepped, worn, faults, ends, theirs)
     process = context.Process(target=_serve, args=asked, daemon=True)
     _ip("link", "add", ends[0], "type", "veth", "peer", "name", ends[1])
     try:
@@ -208,7 +206,8 @@ def _ip(*words: str) -> None:
 
 
 def _serve(
-    plant: Any, seed: int, trace: Path | None, stepped: bool, faults: Sequence[str], ends: tuple[str, str], host: Any
+    plant: Any, seed: int, trace: Path | None, stepped: bool, worn: EthercatProfile | None, faults: Sequence[str],
+    ends: tuple[str, str], host: Any,
 ) -> None:
     """Simulate the drive in this process until the host has ended."""
     import signal
@@ -225,7 +224,7 @@ def _serve(
         stop.set()
 
     try:
-        simulator = Simulator(plant, seed=seed, trace=trace, stepped=stepped, faults=parse_all(faults))
+        simulator = Simulator(plant, seed=seed, trace=trace, stepped=stepped, profile=worn, faults=parse_all(faults))
         with raw_socket(ends[1]) as line:
             host.send("")
             threading.Thread(target=wait, daemon=True).start()

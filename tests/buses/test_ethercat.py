@@ -116,11 +116,6 @@ def test_simulate_says_what_it_needs(monkeypatch, capsys):
     assert "--drive canopen" in err
 
 
-def test_the_simulated_drive_wears_no_other_profile(capsys):
-    assert main(["identify", "--simulate", "--profile", "maxon/epos4-ethercat"]) == 2
-    assert "has the units of generic/cia402-ethercat only" in " ".join(capsys.readouterr().err.split())
-
-
 def test_a_run_without_an_interface_says_how_to_name_one(capsys):
     assert main(["stop", "--drive", "ethercat", "--position", "0"]) == 2
     assert "-i eth1" in capsys.readouterr().err

@@ -50,6 +50,16 @@ def test_the_five_stages_identify_the_inertia(tmp_path):
 
 
 @pytest.mark.heavy
+@pytest.mark.parametrize("name", ["maxon/epos4-ethercat", "elmo/gold-ethercat", "beckhoff/ax8000"])
+def test_the_simulated_drive_has_the_units_of_each_profile(tmp_path, name):
+    done, shaft = embedded(tmp_path, "--seed", 1, "--periods", 3, "--profile", name)
+    assert done.code == 0, done.err
+    inertia = done.document["inertia_kg_m2"]
+    assert inertia["low_total"] < INERTIA < inertia["high_total"]
+    shaft.assert_at_rest()
+
+
+@pytest.mark.heavy
 @pytest.mark.parametrize(("fault", "code", "said"), [
     ("bus-dead@speed+5s", 8, "no feedback from the drive any more"),
     ("al-error@speed+5s=001Ah", 6, "AL status code 001Ah"),

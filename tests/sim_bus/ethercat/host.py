@@ -2,6 +2,7 @@
 
 import struct
 
+from profiles.ethercat import EthercatProfile
 from sim_bus.ethercat import Simulator
 from sim_bus.params import FAITHFUL, QUIET, RigParams
 
@@ -30,10 +31,11 @@ def frame(*datagrams: bytes) -> bytes:
 class Host:
     """``now_s`` is the host's own clock; a frame takes none of it."""
 
-    def __init__(self, *faults: str, stepped: bool = True, rig: RigParams = QUIET_RIG, alias: int = 0) -> None:
+    def __init__(self, *faults: str, stepped: bool = True, rig: RigParams = QUIET_RIG, alias: int = 0,
+                 profile: EthercatProfile | None = None) -> None:
         from sim_bus.ethercat import parse_all
 
-        self.simulator = Simulator(rig, stepped=stepped, faults=parse_all(faults), alias=alias)
+        self.simulator = Simulator(rig, stepped=stepped, faults=parse_all(faults), alias=alias, profile=profile)
         self.slave = self.simulator.slave
         self.now_s = 1.0
         self.counter = 0

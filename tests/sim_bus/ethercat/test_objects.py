@@ -4,6 +4,7 @@ import struct
 
 import pytest
 
+from profiles import load_ethercat_profile
 from tests.sim_bus.ethercat.host import (
     FPRD,
     FPWR,
@@ -77,7 +78,7 @@ def test_mapping_is_written_in_preop_as_count_entries_count():
     host = Host().preop()
     assert host.refused(0x1600, 1, 0x60FF0020, 4) == 0x08000022       # counts still
     host.map((0x60400010, 0x60FF0020), (0x60410010, 0x606C0020, 0x60770010))
-    assert host.refused(0x1C12, 0, 5, 1) == 0x06090031
+    assert host.refused(0x1C12, 0, 9, 1) == 0x06090031
     host.download(0x1600, 0, 0, 1)
     for wrong in (0x60410010, 0x60FF0010, 0x10080008, 0x00000005):
         assert host.refused(0x1600, 1, wrong, 4) == 0x06040041
@@ -157,3 +158,22 @@ def test_the_shaft_repeats_with_a_seed_to_the_last_frame():
         return [host.cycle(outputs(0x0F, 10, torque=60))[0] for _ in range(200)]
 
     assert run() == run()
+
+
+@pytest.mark.parametrize(("name", "vendor", "pdos", "there", "missing"), [
+    ("maxon/epos4-ethercat", 0xFB, (0x1600, 0x1A00), ((0x3001, 2), (0x3001, 5), (0x60A9, 0)), (0x6072, 0x6074)),
+    ("elmo/gold-ethercat", 0x9A, (0x1607, 0x1A07), ((0x608F, 1), (0x6072, 0)), (0x6080, 0x6074)),
+    ("beckhoff/ax8000", 0x02, (0x1600, 0x1A00), ((0x3005, 2), (0x6085, 0)), (0x6007, 0x6080)),
+])
+def test_a_profile_gives_the_drive_its_identity_its_pdos_and_its_objects(name, vendor, pdos, there, missing):
+    host = Host(profile=load_ethercat_profile(name)).preop()
+    assert host.sii(8) == vendor
+    assert host.number(0x1018, 1) == vendor
+    assert (host.number(0x1C12, 1), host.number(0x1C13, 1)) == pdos
+    assert host.number(pdos[0], 1) == 0x60400010
+    for place in there:
+        host.upload(*place)
+    for index in missing:
+        with pytest.raises(SdoAbort) as refused:
+            host.upload(index)
+        assert refused.value.code == 0x06020000
