@@ -30,10 +30,10 @@
       J ? el("p", { class: "figure large" }, `J = ${ofResult(result)}`) : null,
       el("p", { class: `verdict ${VERDICTS[result.verdict] || ""}` }, result.verdict),
       region("Numbers", el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))),
-      el("p", {}, result.reason || ""), result.advice ? el("p", {}, result.advice) : null);
+      el("p", {}, sentence(result.reason || "")), result.advice ? el("p", {}, sentence(result.advice)) : null);
     parts.push(card);
     const codes = result.warning_codes || [], wanted = run.state === "stopped" && run.stop.asked;
-    (result.warnings || []).forEach((one, k) => parts.push(el("p", { class: wanted && codes[k] === ENDED_EARLY ? "dim" : "alarm" }, one)));
+    (result.warnings || []).forEach((one, k) => parts.push(el("p", { class: wanted && codes[k] === ENDED_EARLY ? "dim" : "alarm" }, sentence(one))));
     return parts;
   }
   /** Expected against identified, each by its interval, and what is off. */
@@ -502,7 +502,7 @@
     });
   }
 
-  const sentence = (text) => `${text.charAt(0).toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
+  const sentence = (text) => text && `${text.charAt(0).toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
 
   function calibrated(found) {
     const factor = found.calibration_factor, J = found.inertia_kg_m2, share = (one) => percent(0.5 * (one.high - one.low) / one.value);
