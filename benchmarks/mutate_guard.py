@@ -87,6 +87,7 @@ def _service(name: str, *tests: str, within: str = "") -> Subject:
 _STOP = (
     "test_stop.py", "test_stop_feedback.py", "test_stop_interrupted.py", "test_stop_patience.py",
     "test_stop_torque_off.py", "test_stop_in_between.py", "test_stop_string.py", "test_stop_polls.py",
+    "test_stop_doubt.py", "test_stop_properties.py",
 )
 _RUNS = ("test_control_loop.py", "test_five_stages.py", "test_run_goes_wrong.py")
 SUBJECTS = {
@@ -320,6 +321,7 @@ _A_PROCESS = "a process of its own loads the file and not the mutant; tests that
 EQUIVALENT = {
     "stop.py, _slow_down: return False (last)": _FALLS_THROUGH,
     "stop.py, _see_rest: return None (last)": _FALLS_THROUGH,
+    "stop.py, _coast: return None (last)": _FALLS_THROUGH,
     "stop.py, _gets_slower: return False (last)": _FALLS_THROUGH,
     "stop.py, __init__: self._speed_rad_s = math.inf (last)": "what is seen first sets it in any case",
     **{f"{name}.py, module: {line}": _A_PROCESS for name in ("service/run_process", "service/drive_stop")

@@ -2,13 +2,14 @@
 
 import math
 import struct
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from drivers.errors import CommandRejected
-from drivers.modbus.codec import RANGES, from_words, register_name, to_counts, to_words
+from drivers.modbus.codec import RANGES, from_words, register_name, settle, to_counts, to_words
 from profiles.modbus import Register
 
 FORMATS = {"u16": ">H", "i16": ">h", "u32": ">I", "i32": ">i"}
@@ -76,3 +77,12 @@ def test_what_is_no_number_is_rejected(value):
 def test_names():
     assert register_name(Register(address=99, reference="40100")) == "register 99 (40100)"
     assert register_name(Register(address=7, table="input")) == "input register 7"
+
+
+def test_a_setting_is_found_whose_factor_stands_after_it():
+    first, second = (SimpleNamespace(name=name, per_lsb=per_lsb, factor=factor)
+                     for name, per_lsb, factor in (("ramp", 0.01, "speed"), ("speed", 0.1, None)))
+    both = SimpleNamespace(parameters=(first, second))
+    assert settle(both, {"ramp": 50, "speed": 200}, {}) == {"speed": 20.0, "ramp": 10.0}
+    assert settle(both, {"ramp": 50}, {"speed": 30.0}) == {"speed": 30.0, "ramp": 15.0}
+    assert settle(both, {"ramp": 50}, {}) == {}

@@ -62,6 +62,28 @@ def test_without_feedback_looks_confirm_it(world, gone, speed):
     assert here.drive.looks <= took_s / EVERY_S + 10
 
 
+def test_a_polled_speed_of_zero_that_the_angle_contradicts_is_no_rest(world):
+    """The shaft brakes to 0.5 rad/s and goes on; the reported speed is 0.5 rad/s too low all the time."""
+
+    class Low(LookedAt):
+        turned_rad = 0.0
+
+        def _move(self, command):
+            super()._move(command)
+            self.speed = max(0.5, self.speed)
+            self.turned_rad += self.speed * PERIOD_S
+
+        def report(self):
+            low = self.speed - 0.5
+            return super().report()._replace(speed_rad_s=low, position_rad=self.turned_rad, standstill=low == 0.0)
+
+    here = world(Low())
+    here.turn(5.0)
+    here.drive.gone = "missing"
+    report = here.stop_sequence().run()
+    assert not report.confirmed and all(speed == 0.0 for speed in here.drive.disabled_at)
+
+
 def test_polls_of_which_two_in_three_bring_nothing_confirm_it(world):
     """A computer that is late: the drive has tripped its watchdog, sends no frame, and answers now and then."""
 
