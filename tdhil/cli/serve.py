@@ -36,6 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--webhook", metavar="URL",
                         help="send a JSON message to this address when a run has ended or failed, and when a rig's"
                         " results have changed; signed with the secret in TDHIL_WEBHOOK_SECRET_FILE")
+    parser.add_argument("--mail", metavar="URL",
+                        help="send an e-mail for the same events, smtp[s]://user@host:port/recipient,recipient; the"
+                        " password is in the file that TDHIL_MAIL_PASSWORD_FILE names, the sender in TDHIL_MAIL_FROM")
     parser.add_argument("--check-idle", action="store_true",
                         help="do not serve: exit 0 if no run of --data is alive and no tdhil here holds a drive,"
                         " else 4 (before an upgrade)")
@@ -99,7 +102,7 @@ def run(namespace: argparse.Namespace) -> int:
         return check_idle(namespace.data, say)
     viewers = frozenset(one.rstrip("/").lower() for one in namespace.viewer)
     return serve(namespace.rigs, namespace.data, namespace.host, namespace.port, say, viewers=viewers,
-                 mqtt=namespace.mqtt, webhook=namespace.webhook,
+                 mqtt=namespace.mqtt, webhook=namespace.webhook, mail=namespace.mail,
                  tls=None if cert is None else Tls(cert, key), names=namespace.allowed_host,
                  logs=namespace.logs)
 

@@ -113,14 +113,15 @@ def _names(host: str, more: Sequence[str]) -> frozenset[str]:
 
 def serve(
     rigs: Path | None, data: Path, host: str, port: int, say: Say, *, viewers: frozenset[str] = frozenset(),
-    mqtt: str | None = None, webhook: str | None = None, tls: Tls | None = None, names: Sequence[str] = (),
-    logs: Sequence[Path] = (),
+    mqtt: str | None = None, webhook: str | None = None, mail: str | None = None, tls: Tls | None = None,
+    names: Sequence[str] = (), logs: Sequence[Path] = (),
 ) -> int:
     """Serve until SIGINT or SIGTERM; then live runs are stopped first. Return the exit code.
 
     ``viewers``: origins of Foxglove or Lichtblick in a browser, which may read logs as they grow.
     ``mqtt``: the address of a broker that receives states and results.
-    ``webhook``: the address that receives a message for each ended run and each change of a rig.
+    ``webhook``: the address that receives a message for each ended run and each change of a rig; ``mail``: the mail
+    server and the recipients of the same messages.
     ``names``: more names of this host; ``logs``: folders of logs for fleet requests, besides the service's runs.
 
     Raises UsageError for unusable arguments or unreadable accounts, and LogUnopened for a folder that can't be made.
@@ -149,15 +150,19 @@ def serve(
     from tdhil.service.access import Access
     from tdhil.service.audit import Audit
     from tdhil.service.door import Room, raise_limit
+    from tdhil.service.mail import Mail
     from tdhil.service.mqtt import Broker, Publisher
+    from tdhil.service.notifications import RUNS, Notifier, Receiver
     from tdhil.service.start_request import Rigs
     from tdhil.service.store import Index, Store
     from tdhil.service.supervisor import Supervisor
     from tdhil.service.web import Web
-    from tdhil.service.webhook import RUNS, Notifier, Webhook
+    from tdhil.service.webhook import Webhook
 
     broker = None if mqtt is None else Broker.of(mqtt)
-    hook = None if webhook is None else Webhook.of(webhook)
+    receivers: list[Receiver] = [] if webhook is None else [Webhook.of(webhook)]
+    if mail is not None:
+        receivers.append(Mail.of(mail))
     store = Store(data.resolve())
     store.prepare()
     alone = _alone(store.folder)
@@ -166,11 +171,11 @@ def serve(
     web = Web(supervisor, hosts=allowed, viewers=viewers, access=Access(store.folder, login=accounts, say=say),
               logs={str(one): one for one in logs})
     publisher = None if broker is None else Publisher(broker, web.told, say)
-    notifier = None if hook is None else Notifier(hook, lambda: web.list_runs(None, None, RUNS), web.trends_around, say)
     listening = _listen(host, port)
     at = listening.getsockname()[1]
     shown = f"[{host}]" if ":" in host else host
-    say(f"tdhil serve: {'http' if tls is None else 'https'}://{shown}:{at}   (runs: {store.folder})")
+    site = f"{'http' if tls is None else 'https'}://{shown}:{at}"
+    say(f"tdhil serve: {site}   (runs: {store.folder})")
     if not _loopback(host):
         say(f"Accepted host names: {', '.join(sorted(allowed))}. Add others with --allowed-host.")
     if supervisor.rigs.built_in:
@@ -181,14 +186,16 @@ def serve(
     say("A stop over HTTP is no emergency stop: keep the hard-wired stop within reach. Ctrl-C stops all runs.")
     if publisher is not None:
         publisher.start()
-    if notifier is not None:
+    notifiers = [Notifier(one.at(site), lambda: web.list_runs(None, None, RUNS), web.trends_around, say)
+                 for one in receivers]
+    for notifier in notifiers:
         notifier.start()
     try:
         _uvicorn(web.asgi, listening, supervisor.brake, say, tls, room)
     finally:
         if publisher is not None:
             publisher.close()
-        if notifier is not None:
+        for notifier in notifiers:
             notifier.close()
         listening.close()
         alone.close()

@@ -12,8 +12,9 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 import pytest
 
 from tdhil.errors import UsageError
+from tdhil.service.notifications import Notifier
 from tdhil.service.store import Summary
-from tdhil.service.webhook import SECRET_FILE, SIGNATURE, Notifier, Webhook
+from tdhil.service.webhook import SECRET_FILE, SIGNATURE, Webhook
 from tests.service.conftest import wait_for
 
 DONE = Summary("20260101-000000-aaaaaa", "a", "done", "2026-01-01T00:00:00.000Z", "local", "2999-01-01T00:01:00.000Z",
@@ -54,8 +55,8 @@ def address(server):
 
 
 def test_an_end_a_failure_and_a_change_are_sent_once(tmp_path, listener, monkeypatch):
-    monkeypatch.setattr("tdhil.service.webhook.EVERY_S", 0.01)
-    monkeypatch.setattr("tdhil.service.webhook.TRIES_S", (0.0, 0.0))
+    monkeypatch.setattr("tdhil.service.notifications.EVERY_S", 0.01)
+    monkeypatch.setattr("tdhil.service.notifications.TRIES_S", (0.0, 0.0))
     listener.statuses += [503]                                     # the first try fails
     secret = tmp_path / "secret"
     secret.write_text("hush\n")
@@ -89,7 +90,7 @@ def test_a_change_is_sent_with_the_run_that_shows_it_and_never_for_a_rehearsal()
 
 
 def test_a_message_that_cannot_be_delivered_is_reported_and_the_next_one_is_sent(listener, monkeypatch):
-    monkeypatch.setattr("tdhil.service.webhook.TRIES_S", (0.0, 0.0))
+    monkeypatch.setattr("tdhil.service.notifications.TRIES_S", (0.0, 0.0))
     said = []
     listener.statuses += [500, 301]
     Notifier(Webhook.of(address(listener), {}), list, lambda rig, run: ({}, {}), said.append)._deliver({"run": "x"})
