@@ -329,6 +329,18 @@ def test_an_inverted_sign_coasts_to_standstill_without_speed_control(world, limi
     assert abs(here.drive.disabled_at[0]) < 0.05
 
 
+@pytest.mark.parametrize("limits", [LIMITS, STRING])
+def test_an_inverted_sign_whose_shaft_does_not_coast_to_standstill_is_not_disabled_in_motion(world, limits):
+    here = world(Removing(direction=-1.0, viscous=0.0, coulomb=0.0), limits)
+    here.bench.enable(Mode.TORQUE, Command(Mode.TORQUE, 0.0, 0.0))
+    with pytest.raises(PreflightRefused):
+        probe_sign(here.bench, limits, Mode.TORQUE, SPEED_RESOLUTION)
+    assert abs(here.drive.speed) > 0.05
+    report = here.stop_sequence().run()
+    assert report.confirmed and "quick_stop" in here.drive.calls
+    assert all(abs(speed) < 0.05 for speed in here.drive.disabled_at)
+
+
 def test_above_a_string_a_probe_that_saw_no_motion_gets_no_speed_control(world):
     here = world(Removing(sees=0.0, viscous=4.0), STRING)
     here.bench.enable(Mode.TORQUE, Command(Mode.TORQUE, 0.0, 0.0))
