@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, Final
 
 from profiles import Profile
@@ -17,7 +18,7 @@ LIMIT_KEYS: Final = tuple(name for name, field in Limits.model_fields.items() if
 """Keys of the section limits: that a real drive needs."""
 STRING_KEYS: Final = ("make_up_torque_nm", "torque_ramp_nm_s")
 """Keys that a drill string needs."""
-_NUMBER: Final = re.compile(r"-?[0-9]+(\.[0-9]+)?([eE][-+]?[0-9]+)?")
+_NUMBER: Final = re.compile(r"-?(0|[1-9][0-9]*)(\.[0-9]+)?")
 _PLAIN: Final = re.compile(r"[A-Za-z_./][A-Za-z0-9_./-]*")
 _WORDS: Final = {"true", "false", "null", "yes", "no", "on", "off", "y", "n", "~", ".inf", ".nan"}
 
@@ -62,6 +63,7 @@ class RigEntries:
     """Entries that are known already, as typed: in the unit of the key, or with another unit.
 
     ``address``: keys of the bus's section, and further keys beside it. ``string``: make-up torque and torque ramp.
+    ``parameters``: parameters of the drive that can't be read over the bus, in the profile's units.
     """
 
     name: str | None = None
@@ -69,6 +71,7 @@ class RigEntries:
     limits: Mapping[str, Any] = field(default_factory=dict)
     string: Mapping[str, Any] = field(default_factory=dict)
     drive_data: Mapping[str, Any] = field(default_factory=dict)
+    parameters: Mapping[str, Any] = field(default_factory=dict)
     gear_ratio: Any = None
     accept_unverified: Sequence[str] = ()
     motion: str = "never"
@@ -104,11 +107,11 @@ def blank_rig(
     parts += ["", "#gear: {ratio: }    # motor turns per turn of the main shaft; default 1" if known.gear_ratio is None
               else f"gear: {{ratio: {_typed(known.gear_ratio)}}}    # motor turns per turn of the main shaft",
               "", "# Facts that the drive does not report. Omit unknown ones.",
-              "drive_data:" if known.drive_data else "#drive_data:"]
+              "drive_data:" if known.drive_data or known.parameters else "#drive_data:"]
     if profile.rated_torque_by_hand or "rated_torque_nm" in known.drive_data:
         parts.append(_entry("rated_torque_nm", known.drive_data, "N·m; from the name plate"))
     parts.append(_entry("torque_scale_rel_sd", known.drive_data, "standard uncertainty of the torque scale (2 %)"))
-    parts += _untold(profile)
+    parts += _untold(profile, known.parameters)
     if known.motion != "never":
         parts += ["", "# A run over HTTP moves this rig only with a code from the operator at the rig.",
                   f"service: {{motion: {known.motion}}}"]
@@ -205,10 +208,12 @@ def _doubts(profile: Profile | None, accepted: Sequence[str] = ()) -> list[str]:
     ]
 
 
-def _untold(profile: Profile | None) -> list[str]:
+def _untold(profile: Profile | None, known: Mapping[str, Any] = MappingProxyType({})) -> list[str]:
     """Return lines for the parameters that cannot be read over the bus."""
-    blanks = [] if profile is None else [f"#    {one.name}:    # {_comment(one.title)}" for one in profile.untold]
-    return ["#  parameters:", *blanks] if blanks else []
+    lines = [] if profile is None else [
+        f"    {one.name}: {_typed(known[one.name])}    # {_comment(one.title)}" if one.name in known
+        else f"#    {one.name}:    # {_comment(one.title)}" for one in profile.untold]
+    return ["  parameters:" if known else "#  parameters:", *lines] if lines else []
 
 
 def by_hand(profile: Profile) -> list[str]:
