@@ -94,7 +94,7 @@ def draft_of(body: DraftBody) -> DraftView:
     except DataFileError as error:
         missing = {problem.field for problem in problems}
         problems += [one for problem in error.problems if (one := _problem_of(problem.message, profile)).field
-                     not in missing and one.field != "limits"]
+                     not in missing and one.field not in ("limits", "load")]
     else:
         if rig.limits is not None:
             view = {name: value for name in (*LIMIT_KEYS, "watchdog_s")

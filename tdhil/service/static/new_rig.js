@@ -39,7 +39,7 @@
     field("name").addEventListener("input", () => {
       if (!field("id").dataset.typed) field("id").value = field("name").value.trim().toLowerCase().replace(/[^a-z0-9_.]+/g, "-").replace(/^[^a-z0-9]+|-+$/g, "").slice(0, 64);
     });
-    field("id").addEventListener("input", () => { field("id").dataset.typed = "yes"; });
+    field("id").addEventListener("input", () => { field("id").dataset.typed = "by hand"; });
     const { machine, profiles } = await call("GET", "/new-rig");
     const byName = new Map(profiles.map((one) => [one.name, one]));
     const input = (name, label) => el("label", { "data-field": name }, label, el("input", { name, autocomplete: "off", autocapitalize: "none", spellcheck: "false" }));
@@ -47,7 +47,7 @@
     const capital = (text) => `${text.charAt(0).toUpperCase()}${text.slice(1)}`;
     /** Label of a key of the machine: "N·m; highest torque" is "Highest torque, N·m". */
     const meaning = ({ description }) => (description.includes("; ") ? capital(`${description.split("; ").slice(1).join("; ")}, ${description.split("; ")[0]}`) : capital(description));
-    const place = (one) => capital(`${one.name}: ${one.description}`);
+    const place = (one) => capital(`${one.name.replaceAll("_", " ")}: ${one.description}`);
     const buses = [...new Set(profiles.map((one) => one.bus_title))];
     show(field("profile"), ...buses.map((bus) => el("optgroup", { label: bus }, ...profiles.filter((one) => one.bus_title === bus)
       .map((one) => el("option", { value: one.name }, `${one.title} (${one.name})`)))));
