@@ -219,7 +219,7 @@ EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
     "service/access.py": ("what an engineer alone may ask for: a rule of roles",
                           {"accept_unverified", "accept_wider_limit", "accept_speed_unit"}),
     "service/new_rig.py": ("keys of a new rig.yaml; the command line of tdhil scan", {
-        "accept_unverified", "profile", "string", "--json"}),
+        "accept_unverified", "--json"}),
     "service/static/new_rig.js": ("keys of a new rig.yaml", {"accept_unverified", "profile", "string"}),
     "service/templates/new_rig.html": ("keys of a new rig.yaml", {"profile", "string"}),
     "service/start_request.py": ("a key of rig.yaml that may be edited", {"accept_unverified"}),
