@@ -29,7 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(namespace: argparse.Namespace) -> int:
     """Write the file, and report the entries to fill in. Raises UsageError if it cannot be written."""
     from profiles import load_profile
-    from tdhil.cli.scan import blank_rig, to_fill_in, write_new
+    from tdhil.cli.scan import write_new
+    from tdhil.session import RigEntries, blank_rig, to_fill_in
 
     path: Path = namespace.file
     name = namespace.name or _asked()
@@ -37,7 +38,7 @@ def run(namespace: argparse.Namespace) -> int:
     named = namespace.profile
     if named.endswith((".yaml", ".yml")):
         named = Path(os.path.relpath(named, path.parent)).as_posix()      # relative to the folder of rig.yaml
-    write_new(path, blank_rig(profile, named, namespace.load, name))
+    write_new(path, blank_rig(profile, named, namespace.load, RigEntries(name=name)))
     print(f"{path}: written. Fill these in; until then a real drive does not move:", file=sys.stderr)  # noqa: T201
     for line in to_fill_in(profile, namespace.load, name):
         print(f"  {line}", file=sys.stderr)  # noqa: T201

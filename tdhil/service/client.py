@@ -86,6 +86,18 @@ class Client:
     def rig(self, rig: str) -> dict[str, Any]:
         return self._object("GET", f"/rigs/{quote(rig, safe='')}")
 
+    def draft_rig(self, profile: str, **entries: Any) -> dict[str, Any]:
+        """Return the file of a new rig, with its mistakes by field; ``entries`` as in `schemas.DraftBody`."""
+        return self._object("POST", "/new-rig/draft", {"profile": profile, **entries})
+
+    def scan(self, profile: str, address: Mapping[str, str]) -> dict[str, Any]:
+        """Return the drives at an address. No other master may be active on the bus."""
+        return self._object("POST", "/new-rig/scan", {"profile": profile, "address": dict(address), "alone": True})
+
+    def add_rig(self, rig: str, text: str) -> dict[str, Any]:
+        """Add a rig with the text of its file. An existing one is never overwritten."""
+        return self._object("POST", "/rigs", {"id": rig, "text": text})
+
     def trend(self, rig: str) -> dict[str, Any]:
         """Return a rig's results over time, and whether they changed: the document of ``tdhil trend --json``."""
         found: dict[str, Any] = self._object("GET", f"/rigs/{quote(rig, safe='')}/trend")["trend"]

@@ -51,6 +51,7 @@ class Pages:
         """Return the routes: every page with its template, its entry in the menu and its least role."""
         return [
             self._page("/", "rigs.html", "rigs"),
+            self._page("/new-rig", "new_rig.html", "rigs", "engineer"),
             self._page("/rigs/{rig}", "history.html", "rigs"),
             self._page("/rigs/{rig}/file", "rig_file.html", "rigs"),
             self._page("/start/{rig}", "start.html", "rigs"),

@@ -47,6 +47,76 @@ class RigView:
 
 
 @dataclass(frozen=True)
+class FieldView:
+    """A key of a rig's file, with its unit and meaning."""
+
+    name: str
+    description: str
+
+
+@dataclass(frozen=True)
+class ProfileView:
+    """A profile that ships. ``by_hand``: settings at the drive. ``unverified``: its unverified entries and sources."""
+
+    name: str
+    title: str
+    bus: str
+    bus_title: str
+    experimental: bool
+    by_hand: list[str]
+    unverified: dict[str, str]
+    rated_torque_by_hand: bool
+    parameters: list[FieldView]
+    address: list[FieldView]
+
+
+@dataclass(frozen=True)
+class NewRigView:
+    """Everything that the page of a new rig offers."""
+
+    machine: list[FieldView]
+    profiles: list[ProfileView]
+
+
+@dataclass(frozen=True)
+class DraftProblemView:
+    """A mistake in a draft, with its field; '' belongs to the whole file."""
+
+    field: str
+    message: str
+
+
+@dataclass(frozen=True)
+class DraftView:
+    """The text of a new rig's file, its mistakes, and its limits in SI if they have none."""
+
+    text: str
+    problems: list[DraftProblemView]
+    limits: dict[str, float]
+
+
+@dataclass(frozen=True)
+class FoundDriveView:
+    """A drive that a scan found. ``fields``: what names it on its bus."""
+
+    address: int
+    title: str
+    identity: str
+    simulated: bool
+    profile: str | None
+    why: str
+    fields: dict[str, str]
+
+
+@dataclass(frozen=True)
+class ScanView:
+    """The drives that replied, and remarks of the scan."""
+
+    found: list[FoundDriveView]
+    remarks: list[str]
+
+
+@dataclass(frozen=True)
 class RigFileView:
     """A rig's present file; ``editable``: the keys that may be changed over HTTP."""
 
@@ -402,6 +472,36 @@ class RigFileBody(Body):
 
 
 @dataclass(frozen=True)
+class DraftBody(Body):
+    """Entries of a new rig's file, as typed: in the unit of the key, or with another unit.
+
+    ``address``: keys of the drive's address. ``accept_unverified``: entries of the profile that were compared with the
+    drive's manual. ``alone``: no other master is active on the bus; a scan needs it.
+    """
+
+    profile: str
+    name: str = ""
+    load: str = "none"
+    address: dict[str, str] = field(default_factory=dict)
+    limits: dict[str, str] = field(default_factory=dict)
+    string: dict[str, str] = field(default_factory=dict)
+    rated_torque_nm: str = ""
+    parameters: dict[str, str] = field(default_factory=dict)
+    gear_ratio: str = ""
+    accept_unverified: list[str] = field(default_factory=list)
+    motion: str = "never"
+    alone: bool = False
+
+
+@dataclass(frozen=True)
+class NewRigBody(Body):
+    """A new rig: its id, which is the name of its file, and the text of the file."""
+
+    id: str
+    text: str
+
+
+@dataclass(frozen=True)
 class LoginBody(Body):
     """Login of a user."""
 
@@ -496,6 +596,13 @@ def _file(media: str) -> Mapping[int, Any]:
 ROUTES: Final = (
     Route("GET", "/rigs", "rigs", "The rigs of this site", "viewer", {200: list[RigView]}),
     Route("GET", "/rigs/{rig}", "rig", "One rig", "viewer", {200: RigView}, errors=(404,)),
+    Route("GET", "/new-rig", "new_rig", "Fields and profiles for a new rig", "viewer", {200: NewRigView}),
+    Route("POST", "/new-rig/draft", "draft_rig", "The file of a new rig with all its mistakes; nothing is written",
+          "engineer", {200: DraftView}, DraftBody, (422,)),
+    Route("POST", "/new-rig/scan", "scan_bus", "The drives at an address, by tdhil scan; nothing is written to a drive",
+          "engineer", {200: ScanView}, DraftBody, (403, 409, 422, 503)),
+    Route("POST", "/rigs", "add_rig", "Add a rig by its file", "engineer", {201: RigView}, NewRigBody,
+          (403, 409, 422, 503)),
     Route("GET", "/rigs/{rig}/file", "rig_file", "A rig's file", "viewer", {200: RigFileView}, errors=(404, 422)),
     Route("POST", "/rigs/{rig}/file", "edit_rig", "Change a rig's file (not the drive's address)",
           "engineer", {200: RigFileView}, RigFileBody, (404, 409, 422, 503)),

@@ -285,6 +285,20 @@ def edited(old: str, text: str, name: str) -> tuple[str, ...]:
     return keys
 
 
+NEW_RIG_MOTIONS: Final = ("never", "attended")
+"""Rules of motion of a rig that is added over HTTP. In a watched run no person has to stand at the rig. So only a file
+that was written on the service's computer allows it."""
+
+
+def require_new_rig(text: str, name: str) -> None:
+    """Check the file of a new rig. Raises DataFileError, and NotAllowed for motion without a person at the rig."""
+    rig = parse_rig(text, name)
+    if rig.service.motion not in NEW_RIG_MOTIONS:
+        raise NotAllowed("a rig that is added over HTTP may move only with a code from the rig",
+                         where=rig.source("service.motion") or name,
+                         next_step=f"Use {' or '.join(NEW_RIG_MOTIONS)}, or edit the file on the service's computer")
+
+
 def require_motion(rig: RigFile) -> None:
     """Raise UsageError or NotAllowed if motion of this rig can't be requested over HTTP."""
     if rig.rig is None:

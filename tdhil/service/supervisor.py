@@ -44,7 +44,16 @@ from tdhil.service.run_state import (
     now,
     way_to,
 )
-from tdhil.service.start_request import RigFile, Rigs, edited, is_as_it_was, options_of, require_motion
+from tdhil.service.start_request import (
+    RIG_ID,
+    RigFile,
+    Rigs,
+    edited,
+    is_as_it_was,
+    options_of,
+    require_motion,
+    require_new_rig,
+)
 from tdhil.service.store import CONNECTION_FILE, Index, Store, StoredRequest, read_json, write_json, write_whole
 from tdhil.session import Holder, holder_of, holders
 
@@ -427,6 +436,35 @@ class Supervisor:
                                next_step="Edit it on the service's computer") from error
             found = self.rigs.get(rig_id)
         self.note(who, "rig file edited", None, rig_id, keys=list(keys), before=sha256, after=found.sha256)
+        return found
+
+    def add_rig(self, rig_id: str, text: str, who: str) -> RigFile:
+        """Write the file of a new rig; an existing file is never overwritten.
+
+        Raises UsageError for an id that is none or without a folder of rigs; DataFileError and NotAllowed for an
+        unacceptable text; Conflict if the rig exists; LogError if the file can't be written.
+        """
+        folder = self.rigs.folder
+        if folder is None:
+            raise UsageError("this service has no folder of rigs", where=f"rig {rig_id[:64]}",
+                             next_step="Start it with tdhil serve --rigs DIR", entry=MessageCode.SERVICE_OPTION_WRONG)
+        if not RIG_ID.fullmatch(rig_id):
+            raise UsageError("must be letters, digits, _, . and -, and begin with a letter or digit", where="id",
+                             entry=MessageCode.REQUEST_WRONG)
+        path = folder / f"{rig_id}.yaml"
+        require_new_rig(text, path.name)
+        try:
+            with path.open("x", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+        except FileExistsError:
+            raise Conflict("this rig exists already", where=f"rig {rig_id}", next_step="Choose another id") from None
+        except OSError as error:
+            raise LogError(f"the rig's file can't be written ({error.strerror or error})", where=path.name,
+                           next_step="Check the folder of --rigs") from error
+        found = self.rigs.get(rig_id)
+        self.note(who, "rig added", None, rig_id, after=found.sha256)
         return found
 
     # -- supervision of the runs ---------------------------------------------------------------------------------

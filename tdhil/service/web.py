@@ -27,7 +27,7 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
-from tdhil.service import auth_routes, file_routes, fleet_routes, rig_routes, run_routes, service_routes
+from tdhil.service import auth_routes, file_routes, fleet_routes, new_rig_routes, rig_routes, run_routes, service_routes
 from tdhil.service.access import SOCKET_LOOK_S, Access, principal, require
 from tdhil.service.accounts import Role
 from tdhil.service.door import NO_DESCRIPTOR, Seldom
@@ -42,7 +42,7 @@ from tdhil.service.site import Site
 from tdhil.service.supervisor import Supervisor
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
-SUBJECTS: Final = (rig_routes, run_routes, file_routes, fleet_routes, auth_routes, service_routes)
+SUBJECTS: Final = (new_rig_routes, rig_routes, run_routes, file_routes, fleet_routes, auth_routes, service_routes)
 _GONE: Final = suppress(WebSocketDisconnect, RuntimeError)
 """Context for messages to a socket, whose other end may disconnect at any time."""
 

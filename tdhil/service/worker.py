@@ -18,7 +18,8 @@ from tdhil.errors import UsageError
 from tdhil.numerics import prepare
 from tdhil.service.run_state import Told
 
-NICE: Final = {"plan": 5, "trend": 5, "report": 5, "pace": 0}     # a page waits for these; a run by the clock has 0
+NICE: Final = {"plan": 5, "trend": 5, "report": 5, "scan": 0, "pace": 0}
+"""Niceness of the tasks that a page waits for. A run by the clock has 0."""
 USUAL_NICE: Final = 19
 
 
@@ -134,9 +135,17 @@ def calibrate(asked: dict[str, Any]) -> dict[str, Any]:
     return {"document": document_of_calibration(find_calibration(runs, asked["at"]))}
 
 
+def scan(asked: dict[str, Any]) -> dict[str, Any]:
+    """Scan for the drives at the address of a new rig."""
+    from tdhil.service.new_rig import scan_for
+    from tdhil.service.schemas import DraftBody, ScanView, adapter, plain
+
+    return {"document": plain(scan_for(adapter(DraftBody).validate_python(asked["draft"])), ScanView)}
+
+
 WORK: Final = {
-    "plan": plan, "pace": pace, "replay": replay, "report": report, "samples": samples, "recover": recover,
-    "trend": trend, "compare": compare, "calibrate": calibrate,
+    "plan": plan, "scan": scan, "pace": pace, "replay": replay, "report": report, "samples": samples,
+    "recover": recover, "trend": trend, "compare": compare, "calibrate": calibrate,
 }
 
 

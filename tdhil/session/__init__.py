@@ -49,6 +49,10 @@ if TYPE_CHECKING:
         RequiredReaction as RequiredReaction, judge_rehearsal as judge_rehearsal,
         required_reaction as required_reaction,
     )
+    from tdhil.session.rig_text import (
+        LIMIT_KEYS as LIMIT_KEYS, STRING_KEYS as STRING_KEYS, RigEntries as RigEntries, blank_rig as blank_rig,
+        by_hand as by_hand, starter as starter, to_fill_in as to_fill_in,
+    )
     from tdhil.session.run_record import (
         RunRecord as RunRecord, ByKeyword as ByKeyword, is_log as is_log, read as read,
         require_file as require_file,
@@ -97,6 +101,7 @@ else:
         "overrides": "UNVERIFIED_FLAG check_unverified doubtful is_accepted",
         "pace": "PaceMeasured measure_pace",
         "rehearsal": "ANY_FAULT REQUIRED Rehearsal RehearsalVerdict RequiredReaction judge_rehearsal required_reaction",
+        "rig_text": "LIMIT_KEYS STRING_KEYS RigEntries blank_rig by_hand starter to_fill_in",
         "run_record": "RunRecord ByKeyword is_log read require_file",
         "run_session": "OperatorInterface RunRequest RunSession",
         "speed_calibration": "SECONDS_SD SPEED_REL_SD TURNS_SD TurnsCount add_speed_calibration check_speed_place "

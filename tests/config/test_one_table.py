@@ -218,6 +218,10 @@ EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
     "session/overrides.py": ("decides what this option means", {"accept_unverified"}),
     "service/access.py": ("what an engineer alone may ask for: a rule of roles",
                           {"accept_unverified", "accept_wider_limit", "accept_speed_unit"}),
+    "service/new_rig.py": ("keys of a new rig.yaml; the command line of tdhil scan", {
+        "accept_unverified", "--json"}),
+    "service/static/new_rig.js": ("keys of a new rig.yaml", {"accept_unverified", "profile", "string"}),
+    "service/templates/new_rig.html": ("keys of a new rig.yaml", {"profile", "string"}),
     "service/start_request.py": ("a key of rig.yaml that may be edited", {"accept_unverified"}),
     "service/supervisor.py": ("the command line of tdhil stop", {"--json"}),
     "soft_torque/evaluation.py": ("advice in a refusal; this room knows no table", {"--rate"}),

@@ -16,8 +16,8 @@ from sim_bus.params import RigParams
 from tdhil.buses import FoundDrive, canopen, modbus
 from tdhil.buses.canopen import match
 from tdhil.buses.modbus import parse_units
-from tdhil.cli.scan import starter
 from tdhil.config.rig import load_rig, require_limits
+from tdhil.session import starter
 from tests.path.path_runs import tdhil
 from tests.path.scan_lines_scripted import Answering, Garbled, Silent
 from tests.path.watched_bus import WatchedBus

@@ -58,8 +58,8 @@ def test_what_others_build_on_is_there_and_described(call, client, route):
 
 
 @pytest.mark.parametrize(("method", "path", "allowed"), [
-    ("DELETE", f"{API}/rigs", {"GET", "HEAD"}), ("GET", f"{API}/rigs/a/runs", {"POST"}), ("POST", "/", {"GET", "HEAD"}),
-    ("PUT", f"{API}/rigs/a/file", {"GET", "HEAD", "POST"}),
+    ("DELETE", f"{API}/rigs", {"GET", "HEAD", "POST"}), ("GET", f"{API}/rigs/a/runs", {"POST"}),
+    ("POST", "/", {"GET", "HEAD"}), ("PUT", f"{API}/rigs/a/file", {"GET", "HEAD", "POST"}),
 ])
 def test_what_an_address_does_not_take_is_told_with_what_it_takes(client, method, path, allowed):
     answer = client.request(method, path)

@@ -38,7 +38,7 @@ pytestmark = [
     pytest.mark.skipif(find_spec("playwright") is None, reason="no playwright: pip install -e '.[browser]'"),
 ]
 HOSTILE = "<script>window.pwned=1</script><b id=x>bold</b>"
-PAGES = ("/", "/start/a", "/calibrate/a", "/rehearse/a", "/rigs/a", "/runs", "/fleets", "/audit", "/docs")
+PAGES = ("/", "/new-rig", "/start/a", "/calibrate/a", "/rehearse/a", "/rigs/a", "/runs", "/fleets", "/audit", "/docs")
 PLAN = {
     "excitation": "multisine", "mode": "torque", "duration_s": 100.0, "expected_half_width": 0.021, "stopping": None,
     "speed_rad_s": {"min": 1.0, "max": 5.0}, "torque_nm": {"min": -10.0, "max": 50.0},
@@ -717,6 +717,47 @@ def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, serv
     page.locator("li", has_text="asked ").wait_for()
     page.get_by_text("drive reacted").wait_for()
     assert not page.get_by_text("NOT DELIVERED").is_visible()
+
+
+@pytest.mark.heavy
+def test_the_steps_of_a_new_rig(page, served, rigs, monkeypatch):
+    def box(label):
+        return page.get_by_role("textbox", name=re.compile(f"^{label}"))
+
+    page.goto("/")
+    page.get_by_role("link", name="Add a rig").click()
+    page.get_by_label("Name in reports").fill("Bench 3")
+    assert page.get_by_label("Id:").input_value() == "bench-3"
+    page.get_by_label("Profile:").select_option("maxon/epos4")
+    box("Interface:").fill("socketcan")
+    box("Highest speed").fill("95 rpmm")
+    page.get_by_role("button", name="Save the rig").click()
+    page.get_by_text("entries need a correction").wait_for()
+    assert "is no unit of a speed" in box("Highest speed").locator("xpath=..").inner_text()
+    assert not (rigs / "bench-3.yaml").exists()
+    monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, sent: {"document": {
+        "found": [{"address": 3, "title": HOSTILE, "identity": HOSTILE, "simulated": False, "profile": "maxon/epos4",
+                   "why": HOSTILE, "fields": {"node": "3"}}], "remarks": [HOSTILE]}})
+    page.get_by_role("button", name="Scan for the drive").click()
+    page.get_by_text("confirm that no other master is active").wait_for()
+    page.get_by_label("No other master is active").check()
+    page.get_by_role("button", name="Scan for the drive").click()
+    page.get_by_role("button", name="Use this drive").click()
+    assert box("Node:").input_value() == "3"
+    for label, text in (("Lowest speed", "5 rpm"), ("Highest speed", "95 rpm"), ("Highest torque, either", "400"),
+                        ("Longest run", "15 min"), ("Deceleration of a stop", "2"),
+                        ("Highest torque of the sign", "200"), ("Farthest travel", "3")):
+        box(label).fill(text)
+    for one in page.locator("[name=accept]").all():
+        one.check()
+    page.get_by_role("button", name="Check").click()
+    page.get_by_text("The file is complete.").wait_for()
+    page.get_by_role("img", name="Window of motion: 0.524 to 9.95 rad/s, at most 400 N·m").wait_for()
+    page.get_by_role("button", name="Save the rig").click()
+    page.wait_for_url("**/start/bench-3")
+    page.get_by_role("button", name="Start: preflight, then the code").wait_for()
+    assert "speed_max_rad_s:         \"95 rpm\"" in (rigs / "bench-3.yaml").read_text()
+    assert page.evaluate("window.pwned") is None
 
 
 def test_the_steps_of_a_torque_calibration(page, served, monkeypatch):

@@ -1,0 +1,188 @@
+"""A rig that is added in the browser: profiles to choose from, the draft of its file with every mistake, its file.
+
+Nothing here opens a bus. A scan is `tdhil scan` in a process of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from drivers import CommunicationLost
+from profiles import DataFileError, Profile, load_profile, profile_names
+from tdhil.buses import FoundDrive, bus_named
+from tdhil.config import Limits, Rig, parse_rig
+from tdhil.errors import MessageCode, UsageError
+from tdhil.service.schemas import (
+    DraftBody,
+    DraftProblemView,
+    DraftView,
+    FieldView,
+    FoundDriveView,
+    NewRigView,
+    ProfileView,
+    ScanView,
+)
+from tdhil.service.start_request import NEW_RIG_MOTIONS
+from tdhil.session import LIMIT_KEYS, STRING_KEYS, RigEntries, blank_rig, by_hand, doubtful
+
+SCAN_LIMIT_S: Final = 120.0
+"""Longest scan, s; a serial line with all its settings takes most of it."""
+DRAFT: Final = "rig.yaml"
+"""Name of the draft in the places of its mistakes."""
+
+
+def new_rig_view() -> NewRigView:
+    """Return the fields of the machine, and every profile that ships with what it asks of the person."""
+    return NewRigView(_machine_fields(), [_view(load_profile(name)) for name in sorted(profile_names())])
+
+
+def _view(profile: Profile) -> ProfileView:
+    return ProfileView(
+        profile.name, profile.title, profile.bus, bus_named(profile.bus).title, profile.experimental,
+        by_hand(profile), {name: entry.source for name, entry in doubtful(profile)}, profile.rated_torque_by_hand,
+        [FieldView(f"parameters.{one.name}", one.title) for one in profile.untold], _address_fields(profile.bus),
+    )
+
+
+def _address_fields(bus: str) -> list[FieldView]:
+    """Return the fields of the drive's address: keys of the bus's section with one value, and its keys beside it."""
+    known = bus_named(bus)
+    model = known.section_model
+    fields = [] if model is None else [
+        FieldView(name, field.description or "") for name, field in model.model_fields.items()
+        if field.default is None]
+    beside = known.rig_keys(FoundDrive(bus, 1, "", "", False))
+    return fields + [FieldView(name, f"number of the drive: {known.address_word}") for name in beside]
+
+
+def _machine_fields() -> list[FieldView]:
+    """Return the fields of the machine: limits, and the keys of a drill string."""
+    return ([FieldView(f"limits.{name}", Limits.model_fields[name].description or "") for name in LIMIT_KEYS]
+            + [FieldView(name, Rig.model_fields[name].description or "") for name in STRING_KEYS])
+
+
+def draft_of(body: DraftBody) -> DraftView:
+    """Return the text of the file, and every mistake with its field. Nothing is written. Raises UsageError."""
+    profile = _profile(body.profile)
+    if body.motion not in NEW_RIG_MOTIONS:
+        raise UsageError(f"must be {' or '.join(NEW_RIG_MOTIONS)}", where="motion", entry=MessageCode.REQUEST_WRONG)
+    if body.load not in ("none", "string"):
+        raise UsageError("must be none or string", where="load", entry=MessageCode.REQUEST_WRONG)
+    fields = {one.name for one in _address_fields(profile.bus)}
+    if unknown := sorted(set(body.address) - fields):
+        raise UsageError(f"{unknown[0]}: not a key of this bus", where="address", entry=MessageCode.REQUEST_WRONG)
+    known = RigEntries(
+        name=body.name.strip() or None, address=_given(body.address), limits=_given(body.limits, LIMIT_KEYS),
+        string=_given(body.string, STRING_KEYS) if body.load == "string" else {},
+        drive_data={"rated_torque_nm": body.rated_torque_nm.strip()} if body.rated_torque_nm.strip() else {},
+        parameters=_given(body.parameters, tuple(one.name for one in profile.untold)),
+        gear_ratio=body.gear_ratio.strip() or None,
+        accept_unverified=tuple(one for one in body.accept_unverified if one in dict(doubtful(profile))),
+        motion=body.motion,
+    )
+    text = blank_rig(profile, profile.name, body.load, known, "tdhil serve")
+    problems = _missing(profile, body, known)
+    view: dict[str, float] = {}
+    try:
+        rig = parse_rig(text, DRAFT)
+    except DataFileError as error:
+        missing = {problem.field for problem in problems}
+        problems += [one for problem in error.problems if (one := _problem_of(problem.message, profile)).field
+                     not in missing and one.field not in ("limits", "load")]
+    else:
+        if rig.limits is not None:
+            view = {name: value for name in (*LIMIT_KEYS, "watchdog_s")
+                    if isinstance(value := getattr(rig.limits, name), float)}
+    return DraftView(text, problems, view)
+
+
+def _profile(name: str) -> Profile:
+    """Return a profile that ships. Raises UsageError: no path comes over HTTP."""
+    if name not in profile_names():
+        raise UsageError("is no profile that ships", where="profile", next_step="See the list of profiles",
+                         entry=MessageCode.REQUEST_WRONG)
+    return load_profile(name)
+
+
+def _given(typed: Mapping[str, str], known: tuple[str, ...] | None = None) -> dict[str, str]:
+    return {name: text.strip() for name, text in typed.items() if text.strip() and (known is None or name in known)}
+
+
+def _missing(profile: Profile, body: DraftBody, known: RigEntries) -> list[DraftProblemView]:
+    """Return the entries that a real drive needs and the draft does not have."""
+    found = [] if known.name else [DraftProblemView("name", "The rig needs its own name, such as bench 3.")]
+    if not known.address:
+        found.append(DraftProblemView("address", "Without an address the embedded simulator runs. Type the drive's."))
+    found += [DraftProblemView(f"limits.{name}", "A real drive does not move without it.") for name in LIMIT_KEYS
+              if name not in known.limits]
+    if body.load == "string":
+        found += [DraftProblemView(name, "A drill string needs it.") for name in STRING_KEYS
+                  if name not in known.string]
+    if profile.rated_torque_by_hand and not known.drive_data:
+        found.append(DraftProblemView("rated_torque_nm", "The drive does not report it: type it from the name plate."))
+    found += [DraftProblemView(f"parameters.{one.name}", "The drive does not report it over the bus.")
+              for one in profile.untold if one.name not in known.parameters]
+    open_entries = [name for name, _ in doubtful(profile) if name not in known.accept_unverified]
+    if open_entries:
+        found.append(DraftProblemView("accept_unverified", "Compare these entries with the manual, and accept them:"
+                                      f" {', '.join(open_entries)}."))
+    return found
+
+
+def _problem_of(message: str, profile: Profile) -> DraftProblemView:
+    """Return a mistake in the file with its field of the form. ``message``: "limits.torque_nm: must be …"."""
+    key, found, text = message.partition(": ")
+    if not found:
+        key, text = "", message
+    section, _, inner = key.partition(".")
+    bus = bus_named(profile.bus)
+    if section == bus.section and inner:
+        key = f"address.{inner}"
+    elif key in bus.rig_keys(FoundDrive(profile.bus, 1, "", "", False)):
+        key = f"address.{key}"
+    return DraftProblemView(key.removeprefix("drive_data."), f"{text[:1].upper()}{text[1:]}.")
+
+
+def scan_for(body: DraftBody) -> ScanView:
+    """Scan for the drives at the address of a draft, by `tdhil scan`. Raises UsageError and CommunicationLost."""
+    profile = _profile(body.profile)
+    address = _given(body.address)
+    if not address:
+        raise UsageError("name the interface or the line first", where="address", entry=MessageCode.BUS_NOT_CONFIGURED)
+    text = "\n".join(one for one in blank_rig(profile, profile.name, "none", RigEntries(address=address)).splitlines()
+                     if not one.startswith("load:"))
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / DRAFT
+        place.write_text(text + "\n", encoding="utf-8")
+        command = [sys.executable, "-m", "tdhil", "scan", "--rig", str(place), "--json"]
+        try:
+            done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
+                                  timeout=SCAN_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            raise CommunicationLost(f"the scan did not end within {SCAN_LIMIT_S:.0f} s", where="scan",
+                                    next_step="Check the interface, and narrow the address") from None
+    try:
+        document: dict[str, Any] = json.loads(done.stdout)
+    except ValueError:
+        document = {}
+    if done.returncode != 0 or "found" not in document:
+        said = str((document.get("error") or {}).get("message") or " ".join(done.stderr.split())[-400:] or "no reply")
+        raise CommunicationLost(said, where="scan", next_step="Check the drive's supply, the wiring and the address")
+    return ScanView([
+        FoundDriveView(one["address"], one["title"], one["identity"], one["simulated"], one["profile"], one["why"],
+                       {**{name: str(value) for name, value in one["line"].items()},
+                        **_address_of(profile.bus, one["address"])})
+        for one in document["found"]], list(document.get("remarks", [])))
+
+
+def _address_of(bus: str, number: int) -> dict[str, str]:
+    """Return the fields of the address that name this drive on its bus."""
+    known = bus_named(bus)
+    beside = known.rig_keys(FoundDrive(bus, number, "", "", False))
+    return {name: str(value) for name, value in (beside or {known.address_word: number}).items()}

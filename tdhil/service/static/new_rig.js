@@ -1,0 +1,170 @@
+// A new rig in six steps: profile, address with a scan, settings by hand, machine limits with their picture, check, save.
+"use strict";
+(() => {
+  const { Refused, byId, call, el, pages, show, waiting } = window.tdhil;
+  const SCAN_MS = 130000;            // the service ends a scan after 120 s
+
+  /** Picture of the limits: the window in which speed and torque stay, and the torque of the first motion. */
+  function windowPicture(limits) {
+    const { speed_min_rad_s: low, speed_max_rad_s: high, torque_nm: torque, probe_torque_nm: probe, quick_stop_rad_s2: brake } = limits;
+    const W = 420, H = 200, left = 60, top = 14, right = 14, bottom = 44;
+    const from = Math.min(0, low), x = (speed) => left + (W - left - right) * (speed - from) / (high * 1.1 - from);
+    const y = (nm) => top + (H - top - bottom) * (1 - (nm + 1.15 * torque) / (2.3 * torque));
+    const NS = "http://www.w3.org/2000/svg";
+    const draw = (tag, attributes, text) => {
+      const one = document.createElementNS(NS, tag);
+      for (const [name, value] of Object.entries(attributes)) one.setAttribute(name, value);
+      if (text !== undefined) one.textContent = text;
+      return one;
+    };
+    const round = (value) => Number(value.toPrecision(3)).toString();
+    const svg = draw("svg", { viewBox: `0 0 ${W} ${H}`, class: "window", role: "img", "aria-label": `Window of motion: ${round(low)} to ${round(high)} rad/s, at most ${round(torque)} N·m either way` });
+    svg.append(
+      draw("rect", { x: x(low), y: y(torque), width: x(high) - x(low), height: y(-torque) - y(torque), class: "inside" }),
+      draw("line", { x1: left, x2: W - right, y1: y(0), y2: y(0), class: "axis" }),
+      draw("line", { x1: x(0), x2: x(0), y1: top, y2: H - bottom, class: "axis" }),
+      draw("line", { x1: x(0), x2: x(0), y1: y(Math.min(probe, torque)), y2: y(0), class: "probe" }));
+    for (const nm of [torque, 0, -torque]) svg.append(draw("text", { x: left - 6, y: y(nm) + 4, "text-anchor": "end" }, round(nm)));
+    for (const speed of [low, high]) svg.append(draw("text", { x: x(speed), y: H - bottom + 16, "text-anchor": "middle" }, round(speed)));
+    svg.append(draw("text", { x: (left + W - right) / 2, y: H - 8, "text-anchor": "middle" }, "speed, rad/s"),
+      draw("text", { x: 14, y: (top + H - bottom) / 2, "text-anchor": "middle", transform: `rotate(-90 14 ${(top + H - bottom) / 2})` }, "torque, N·m"));
+    return el("figure", {}, svg, el("figcaption", { class: "dim" },
+      `Shaded: the window of a run. Thick: the sign probe, the first motion, with at most ${round(probe)} N·m. A stop from the highest speed takes ${round(high / brake)} s.`));
+  }
+
+  async function newRigPage() {
+    const form = byId("new-rig");
+    if (!form) return;
+    const said = byId("new-rig-said"), field = (name) => form.elements[name];
+    field("name").addEventListener("input", () => {
+      if (!field("id").dataset.typed) field("id").value = field("name").value.trim().toLowerCase().replace(/[^a-z0-9_.]+/g, "-").replace(/^[^a-z0-9]+|-+$/g, "").slice(0, 64);
+    });
+    field("id").addEventListener("input", () => { field("id").dataset.typed = "by hand"; });
+    const { machine, profiles } = await call("GET", "/new-rig");
+    const byName = new Map(profiles.map((one) => [one.name, one]));
+    const input = (name, label) => el("label", { "data-field": name }, label, el("input", { name, autocomplete: "off", autocapitalize: "none", spellcheck: "false" }));
+
+    const capital = (text) => `${text.charAt(0).toUpperCase()}${text.slice(1)}`;
+    /** Label of a key of the machine: "N·m; highest torque" is "Highest torque, N·m". */
+    const meaning = ({ description }) => (description.includes("; ") ? capital(`${description.split("; ").slice(1).join("; ")}, ${description.split("; ")[0]}`) : capital(description));
+    const place = (one) => capital(`${one.name.replaceAll("_", " ")}: ${one.description}`);
+    const buses = [...new Set(profiles.map((one) => one.bus_title))];
+    show(field("profile"), ...buses.map((bus) => el("optgroup", { label: bus }, ...profiles.filter((one) => one.bus_title === bus)
+      .map((one) => el("option", { value: one.name }, `${one.title} (${one.name})`)))));
+    show(byId("machine"), ...machine.map((one) => input(one.name, meaning(one))));
+
+    const chosen = () => byName.get(field("profile").value);
+    function profileChanged() {
+      const one = chosen();
+      show(byId("address"), ...one.address.map((key) => input(`address.${key.name}`, place(key))));
+      show(byId("parameters"), ...one.parameters.map((key) => input(key.name, `${key.description}, which the drive does not report`)));
+      byId("profile-hint").textContent = one.experimental ? "This profile was made from documents. Nobody has reported a run with it yet." : "";
+      byId("rated").hidden = !one.rated_torque_by_hand;
+      const doubts = Object.entries(one.unverified);
+      show(byId("by-hand"),
+        one.by_hand.length ? el("p", {}, "Make these settings at the drive. A run is refused until it reads them:") : el("p", {}, "This profile asks for no settings by hand."),
+        one.by_hand.length ? el("ul", {}, ...one.by_hand.map((text) => el("li", {}, text))) : null,
+        doubts.length ? el("p", { "data-field": "accept_unverified" }, "These entries of the profile are not verified on a drive. Compare each with the drive's manual, and accept it:") : null,
+        ...doubts.map(([name, source]) => el("label", { class: "check" }, el("input", { type: "checkbox", name: "accept", value: name }), `${name}: ${source}`)));
+    }
+    function loadChanged() {
+      const string = field("load").value === "string";
+      for (const one of byId("machine").children) if (!one.dataset.field.startsWith("limits.")) one.hidden = !string;
+    }
+    field("profile").addEventListener("change", profileChanged);
+    field("load").addEventListener("change", loadChanged);
+    field("profile").value = byName.has("generic/cia402") ? "generic/cia402" : profiles[0].name;
+    profileChanged();
+    loadChanged();
+
+    function draft() {
+      const found = { address: {}, limits: {}, string: {}, accept_unverified: [...form.querySelectorAll("[name=accept]:checked")].map((one) => one.value), alone: field("alone").checked };
+      for (const name of ["profile", "name", "load", "gear_ratio", "motion"]) found[name] = field(name).value.trim();
+      found.rated_torque_nm = byId("rated").hidden ? "" : field("rated_torque_nm").value.trim();
+      found.parameters = Object.fromEntries([...form.querySelectorAll("#parameters input")].map((one) => [one.name.replace("parameters.", ""), one.value.trim()]));
+      for (const one of form.querySelectorAll("#address input")) found.address[one.name.replace("address.", "")] = one.value.trim();
+      for (const one of byId("machine").querySelectorAll("input")) {
+        if (one.name.startsWith("limits.")) found.limits[one.name.replace("limits.", "")] = one.value.trim();
+        else found.string[one.name] = one.value.trim();
+      }
+      return found;
+    }
+    function unmark() {
+      form.querySelectorAll("[aria-invalid]").forEach((one) => { one.removeAttribute("aria-invalid"); one.removeAttribute("aria-describedby"); });
+      form.querySelectorAll(".wrong").forEach((one) => one.remove());
+      said.hidden = true;
+    }
+    /** Mark each mistake at its field. Return those that belong to no field. */
+    function mark(problems) {
+      const rest = [];
+      let first = null;
+      problems.forEach((one, k) => {
+        const input = form.elements[one.field === "address" ? (form.querySelector("#address input") || {}).name : one.field];
+        const place = input ? input.closest("label") : form.querySelector(`[data-field="${CSS.escape(one.field)}"]`);
+        if (!place) { rest.push(one.message); return; }
+        const note = el("span", { class: "alarm wrong", id: `wrong-${k}` }, one.message);
+        place.append(note);
+        if (input) { input.setAttribute("aria-invalid", "true"); input.setAttribute("aria-describedby", note.id); }
+        first = first || input || place;
+      });
+      if (first && first.focus) { first.focus(); first.scrollIntoView({ block: "center" }); }
+      return rest;
+    }
+    const picture = (limits) => show(byId("window"), Object.keys(limits).length ? windowPicture(limits) : null);
+    async function check() {
+      unmark();
+      const found = await call("POST", "/new-rig/draft", draft());
+      picture(found.limits);
+      show(byId("draft"),
+        el("p", { class: found.problems.length ? "alarm" : "verdict good" }, found.problems.length ? `${found.problems.length} ${found.problems.length === 1 ? "entry needs" : "entries need"} a correction. Each is marked at its field.` : "The file is complete."),
+        el("label", {}, "rig.yaml", el("textarea", { name: "text", rows: "24", readonly: "", spellcheck: "false" }, found.text)));
+      const rest = mark(found.problems);
+      if (rest.length) { said.textContent = rest.join(" "); said.hidden = false; }
+      return found;
+    }
+    const refused = (error) => { said.textContent = error instanceof Refused ? error.message : "No answer from tdhil serve."; said.hidden = false; };
+    form.addEventListener("submit", async (event) => {
+      event.preventDefault();
+      const save = event.submitter && event.submitter.value === "save";
+      try {
+        const found = await check();
+        if (!save || found.problems.length) return;
+        const made = await call("POST", "/rigs", { id: field("id").value.trim(), text: found.text });
+        location.assign(made.motion === "never" ? "/" : `/start/${encodeURIComponent(made.id)}`);
+      } catch (error) {
+        refused(error);
+      }
+    });
+    byId("machine").addEventListener("change", async () => {          // the picture alone: a mistake is marked by Check
+      try { picture((await call("POST", "/new-rig/draft", draft())).limits); } catch (error) { refused(error); }
+    });
+    byId("scan").addEventListener("click", async () => {
+      unmark();
+      const over = waiting(byId("scan-said"), "Scanning");
+      byId("scan").disabled = true;
+      try {
+        const { found, remarks } = await call("POST", "/new-rig/scan", draft(), {}, SCAN_MS);
+        over();
+        show(byId("scan-said"), ...found.map((one) => el("article", { class: "card" },
+          el("p", {}, el("strong", {}, one.title || "a drive without a name"), ` · ${one.identity}${one.simulated ? " · SIMULATED" : ""}`),
+          el("p", { class: "dim" }, `profile ${one.profile || "none"} (${one.why})`),
+          el("button", { type: "button", class: "quiet", onclick: () => {
+            if (one.profile && byName.has(one.profile) && one.profile !== field("profile").value) {
+              const typed = draft().address;
+              field("profile").value = one.profile;
+              profileChanged();
+              for (const [name, text] of Object.entries(typed)) if (field(`address.${name}`)) field(`address.${name}`).value = text;
+            }
+            for (const [name, text] of Object.entries(one.fields)) if (field(`address.${name}`)) field(`address.${name}`).value = text;
+          } }, "Use this drive"))),
+          found.length ? null : el("p", {}, "No drive replied."), ...remarks.map((text) => el("p", { class: "dim" }, text)));
+      } catch (error) {
+        over();
+        show(byId("scan-said"), el("p", { class: "alarm" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+      } finally {
+        byId("scan").disabled = false;
+      }
+    });
+  }
+  pages["new-rig"] = newRigPage;
+})();
