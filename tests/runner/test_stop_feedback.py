@@ -2,9 +2,9 @@
 
 import pytest
 
-from drivers.drive import PowerState
+from drivers.drive import PositionReading, PowerState
 from drivers.errors import CommunicationLost
-from tdhil.runner.stop import LONGEST_GAP_CYCLES, LONGEST_GAP_S
+from tdhil.runner.stop import LONGEST_GAP_CYCLES, LONGEST_GAP_S, POSITION_EVERY_S
 from tests.runner.fake_drive import PERIOD_S, FakeDrive, lost
 from tests.runner.stop_calls import LAG_S, SILENT, asked
 
@@ -81,3 +81,32 @@ def test_silence_is_told(world):
     here.turn(5.0)
     here.drive.misbehave = lambda drive, sample: sample._replace(fresh=False)
     assert here.stop_sequence().run().trouble == ("no feedback from the drive any more",)
+
+
+class Asked(FakeDrive):
+    """Reports its angle to a single request only; ``error``: what such a request raises."""
+
+    turned_rad = 0.0
+    readings = 0
+    error: BaseException | None = None
+
+    def _move(self, command):
+        super()._move(command)
+        self.turned_rad += self.speed * PERIOD_S
+
+    def read_position(self):
+        self.readings += 1
+        if self.error is not None:
+            raise self.error
+        return PositionReading(self.clock.now_s(), 0.001, self.turned_rad, None, "6064h")
+
+
+@pytest.mark.parametrize("error", [None, CommunicationLost("no reply"), KeyboardInterrupt()])
+def test_a_position_by_single_requests_is_asked_for_at_intervals(world, error):
+    here = world(Asked())
+    here.turn(5.0)
+    here.drive.error, begun_s = error, here.bench.now_s
+    report = here.stop_sequence().run()
+    took_s = here.bench.now_s - begun_s
+    assert report.confirmed and here.drive.disabled_at == [0.0]
+    assert took_s / POSITION_EVERY_S / 3 < here.drive.readings <= took_s / POSITION_EVERY_S + 1
