@@ -15,7 +15,7 @@ import canopen
 from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
 
 from drivers.canopen.bus import CanLink
-from drivers.cia402 import Objects, name
+from drivers.cia402 import Objects, is_answer, name
 from drivers.errors import CommunicationLost, ObjectRefused
 from profiles import MessageCode
 
@@ -29,23 +29,6 @@ class _LinkNetwork(canopen.Network):  # type: ignore[misc]
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         self._link.send(can_id, bytes(data))
-
-
-_ANSWERS = {0: 1, 1: 3, 2: 2, 3: 0}
-"""Command specifier of the request → that of its response (CiA 301): segment and initiate, download and upload."""
-_INITIATE = (1, 2)
-_ABORT = 0x80
-
-
-def is_answer(request: bytes, response: bytes) -> bool:
-    """Return whether the frame answers the request. Late answers and answers to other clients do not."""
-    if len(response) != 8:
-        return False
-    command = request[0] >> 5
-    same_object = response[1:4] == request[1:4]
-    if response[0] == _ABORT:
-        return same_object or command not in _INITIATE
-    return response[0] >> 5 == _ANSWERS.get(command) and (same_object or command not in _INITIATE)
 
 
 class _PumpingClient(SdoClient):  # type: ignore[misc]

@@ -1,7 +1,7 @@
 """The contract between a CiA 402 drive and the bus that carries it.
 
 A bus carries two things: objects (read and written one by one), and one cyclic frame in each direction. It also lets
-the drive supervise the host. `drivers.cia402.drive` does everything else with these. A new bus fills in the twelve
+the drive supervise the host. `drivers.cia402.drive` does everything else with these. A new bus fills in the eleven
 abstract methods of `Cia402Bus`; the other methods have a default for a bus on which nothing else can happen::
 
     take → map_cyclic → arm → start → (listen_until → begin → send → receive) … → release → close
@@ -13,6 +13,7 @@ bus treats them like any other mode.
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -64,6 +65,8 @@ class Traffic(NamedTuple):
     wall_jumps: int = 0
 
 
+PAUSE_S = 0.01
+"""Wall time between two objects for a drive that needs it, s."""
 FeedbackSetting = tuple[str, int, int, bytes]
 """Object that defines content or timing of the feedback: title, index, sub-index, required bytes."""
 
@@ -145,12 +148,13 @@ class Cia402Bus(ABC):
     def listen_until(self, tick_s: float) -> None:
         """Wait until this control time, s, and handle incoming frames meanwhile."""
 
-    @abstractmethod
     def begin(self, try_again: bool) -> float:
         """Begin a cycle: raise the errors so far, and feed the watchdog if it is due. Return the control time, s.
 
-        ``try_again``: transmit even after an error of the bus.
+        ``try_again``: transmit even after an error of the bus. By default the setpoints themselves feed the watchdog.
         """
+        self.check()
+        return self.clock.now_s()
 
     @abstractmethod
     def send(self, setpoints: CycleSetpoints) -> None:
@@ -206,7 +210,8 @@ class Cia402Bus(ABC):
 
     def pause(self) -> None:
         """Wait a short wall time for a drive that needs it between two objects."""
-        return
+        if not self.clock.stepped:
+            time.sleep(PAUSE_S)
 
     def reach(self) -> None:
         """Put a drive that left operation into a state in which its objects can be read, and feed its watchdog."""
@@ -239,7 +244,10 @@ class Cia402Bus(ABC):
     # -- afterwards ------------------------------------------------------------------------------------------
 
     def release(self) -> None:
-        """Put the drive into the state in which it is configured, after it was disabled. Raises CommunicationLost."""
+        """Put the drive into the state in which it is configured, after it was disabled.
+
+        Raises CommunicationLost, or DriveFault if the drive refuses.
+        """
         self.take()
 
     @abstractmethod

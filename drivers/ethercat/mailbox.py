@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
-from drivers.cia402 import Objects, name
+from drivers.cia402 import ABORT, Objects, download, is_answer, name, upload, value_of
 from drivers.clock import Clock
 from drivers.drive import FrameTap, RawFrame
 from drivers.errors import CommunicationLost, ObjectRefused
@@ -31,27 +31,13 @@ ANSWER_S, TRIES = 0.7, 3
 """Waiting time for an answer at standstill, s, and number of attempts."""
 _PAUSE_S = 0.0005
 _FULL = 1 << 3
-_ABORT = 0x80
-_UPLOAD, _UPLOAD_SEGMENT, _UPLOADED, _SEGMENT_UPLOADED = 0x40, 0x60, 2, 0
+_UPLOAD_SEGMENT = 0x60
 _ABORTS = {
     0x06010000: "access not supported", 0x06010001: "write only", 0x06010002: "read only",
     0x06020000: "the drive has no such object", 0x06040041: "can't be mapped", 0x06040042: "the PDO is too long",
     0x06070010: "wrong length", 0x06090011: "the drive has no such sub-index", 0x06090030: "value out of range",
     0x08000020: "can't be stored", 0x08000021: "local control", 0x08000022: "not in this state",
 }
-
-
-def upload(index: int, sub: int) -> bytes:
-    """Return the request to read an object."""
-    return bytes((_UPLOAD, index & 0xFF, index >> 8, sub, 0, 0, 0, 0))
-
-
-def download(index: int, sub: int, data: bytes) -> bytes:
-    """Return the request to write an object: expedited up to four bytes, else normal."""
-    place = bytes((index & 0xFF, index >> 8, sub))
-    if 0 < len(data) <= 4:
-        return bytes((0x23 | 4 - len(data) << 2,)) + place + data.ljust(4, b"\0")
-    return b"\x21" + place + len(data).to_bytes(4, "little") + data
 
 
 def abort_text(code: int) -> str:
@@ -107,7 +93,7 @@ class Mailbox:
         if (sdo := self.pump()) is not None:
             self.on_answer(sdo)
 
-    def call(self, sdo: bytes, fits: Callable[[bytes], bool], answer_s: float, tries: int = 1) -> bytes:
+    def call(self, sdo: bytes, answer_s: float, tries: int = 1) -> bytes:
         """Send a request and wait for its answer. Raises CommunicationLost without one."""
         for _ in range(tries):
             with suppress(CommunicationLost):          # sent again, or reported below
@@ -116,7 +102,7 @@ class Mailbox:
                 end_s = time.monotonic() + answer_s
                 while time.monotonic() < end_s:
                     found = self.pump()
-                    if found is not None and fits(found):
+                    if found is not None and is_answer(sdo, found[:8]):
                         return found
                     if found is not None:
                         self.on_answer(found)
@@ -148,51 +134,25 @@ class CoeObjects(Objects):
 
     def read_bytes(self, index: int, subindex: int = 0) -> bytes:
         """Return the bytes of an object."""
-        answer = self._call(upload(index, subindex), index, subindex)
+        answer = self._call(upload(index, subindex), self._tries, name(index, subindex))
         data = value_of(answer)
         if answer[0] & 2:
             return data
-        size, toggle = int.from_bytes(answer[4:8], "little"), 0
-        while len(data) < size:
+        size, toggle, last = int.from_bytes(answer[4:8], "little"), 0, False
+        while len(data) < size and not last:
             request = bytes((_UPLOAD_SEGMENT | toggle, 0, 0, 0, 0, 0, 0, 0))
-            segment = self._mailbox.call(request, lambda found: found[0] >> 5 in (_SEGMENT_UPLOADED, _ABORT >> 5),
-                                         self._answer_s)
-            self._refuse_abort(segment, index, subindex)
+            segment = self._call(request, 1, name(index, subindex))
             data += segment[1 : 8 - (segment[0] >> 1 & 7)] if len(segment) == 8 else segment[1:]
-            toggle ^= 0x10
-            if segment[0] & 1:
-                break
+            toggle, last = toggle ^ 0x10, bool(segment[0] & 1)
         return data[:size]
 
     def write_bytes(self, index: int, subindex: int, data: bytes, shown: str = "") -> None:
         """Write raw bytes."""
-        self._call(download(index, subindex, data), index, subindex, f" (value {shown})" if shown else "")
+        said = f" (value {shown})" if shown else ""
+        self._call(download(index, subindex, data), self._tries, name(index, subindex), said)
 
-    def _call(self, sdo: bytes, index: int, sub: int, shown: str = "") -> bytes:
-        command = _UPLOADED if sdo[0] == _UPLOAD else 3
-
-        def fits(found: bytes) -> bool:
-            return len(found) >= 8 and found[1:4] == sdo[1:4] and found[0] >> 5 in (command, _ABORT >> 5)
-
-        answer = self._mailbox.call(sdo, fits, self._answer_s, self._tries)
-        self._refuse_abort(answer, index, sub, shown)
+    def _call(self, sdo: bytes, tries: int, where: str, said: str = "") -> bytes:
+        answer = self._mailbox.call(sdo, self._answer_s, tries)
+        if answer[0] == ABORT:
+            raise ObjectRefused(abort_text(int.from_bytes(answer[4:8], "little")) + said, where=where)
         return answer
-
-    def _refuse_abort(self, answer: bytes, index: int, sub: int, shown: str = "") -> None:
-        if answer[0] == _ABORT:
-            code = int.from_bytes(answer[4:8], "little")
-            raise ObjectRefused(abort_text(code) + shown, where=name(index, sub))
-
-
-def value_of(answer: bytes) -> bytes:
-    """Return the data in the first answer to an upload."""
-    if not answer[0] & 2:
-        return answer[8 : 8 + int.from_bytes(answer[4:8], "little")]
-    return answer[4 : 8 - (answer[0] >> 2 & 3 if answer[0] & 1 else 0)]
-
-
-def answered(sdo: bytes) -> tuple[int, int, bytes | None] | None:
-    """Return index, sub-index and data of an answer to an upload; data None: refused. None for other answers."""
-    if len(sdo) < 8 or sdo[0] >> 5 not in (_UPLOADED, _ABORT >> 5):
-        return None
-    return int.from_bytes(sdo[1:3], "little"), sdo[3], None if sdo[0] == _ABORT else value_of(sdo)

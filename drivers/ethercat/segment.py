@@ -6,6 +6,7 @@ watchdog go through the registers (`drivers.ethercat.station`), in the same way 
 
 from __future__ import annotations
 
+from contextlib import closing
 from typing import Any
 
 from drivers.errors import PreflightRefused
@@ -93,11 +94,8 @@ def open_segment(interface: str, position: int = 0, alias: int | None = None) ->
 
     Raises PreflightRefused, and CommunicationLost if pysoem is missing.
     """
-    look = RawSegment(interface)
-    try:
+    with closing(RawSegment(interface)) as look:
         refuse_driven(look)
-    finally:
-        look.close()
     master = new_master()
     try:
         master.open(interface)
@@ -120,5 +118,3 @@ def new_master() -> Any:
                                entry=MessageCode.PREFLIGHT_REFUSED) from error
     pysoem.settings.timeouts.ret = FRAME_US
     return pysoem.Master()
-
-

@@ -5,8 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.canopen.bus import CanLink
-from drivers.canopen.sdo import SdoObjects, is_answer
+from drivers.canopen.sdo import SdoObjects
 from drivers.cia402.objects import name
+from drivers.cia402.sdo_message import is_answer
 from drivers.clock import SteppedClock
 from drivers.errors import CommunicationLost, ObjectRefused
 

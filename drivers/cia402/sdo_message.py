@@ -1,0 +1,57 @@
+"""SDO messages (CiA 301): requests, and what an answer to one of them holds. Pure.
+
+A frame of CANopen and a mailbox message of EtherCAT (CoE) carry them alike. CoE also has a normal transfer: the data
+follow the first eight bytes.
+
+::
+
+    command u8, index u16, sub-index u8, four bytes of data or the length [, data]
+"""
+
+UPLOAD, ABORT = 0x40, 0x80
+_ANSWERS = {0: 1, 1: 3, 2: 2, 3: 0}
+"""Command specifier of the request → that of its response: segment and initiate, download and upload."""
+_INITIATE = (1, 2)
+_UPLOADED = 2
+
+
+def upload(index: int, sub: int) -> bytes:
+    """Return the request to read an object."""
+    return bytes((UPLOAD, index & 0xFF, index >> 8, sub, 0, 0, 0, 0))
+
+
+def download(index: int, sub: int, data: bytes) -> bytes:
+    """Return the request to write an object: expedited up to four bytes, else normal."""
+    place = bytes((index & 0xFF, index >> 8, sub))
+    if 0 < len(data) <= 4:
+        return bytes((0x23 | 4 - len(data) << 2,)) + place + data.ljust(4, b"\0")
+    return b"\x21" + place + len(data).to_bytes(4, "little") + data
+
+
+def is_answer(request: bytes, response: bytes) -> bool:
+    """Return whether eight bytes answer the request. Late answers and answers to other clients do not."""
+    if len(response) != 8:
+        return False
+    command = request[0] >> 5
+    same_object = response[1:4] == request[1:4]
+    if response[0] == ABORT:
+        return same_object or command not in _INITIATE
+    return response[0] >> 5 == _ANSWERS.get(command) and (same_object or command not in _INITIATE)
+
+
+def value_of(answer: bytes) -> bytes:
+    """Return the data in the first answer to an upload."""
+    if not answer[0] & 2:
+        return answer[8 : 8 + int.from_bytes(answer[4:8], "little")]
+    return answer[4 : 8 - (answer[0] >> 2 & 3 if answer[0] & 1 else 0)]
+
+
+def uploaded(message: bytes) -> tuple[int, int, bytes | None] | None:
+    """Return index, sub-index and data of an answer to an upload; data None: refused.
+
+    None for other messages, and for an answer whose data come in segments.
+    """
+    if len(message) < 8 or message[0] >> 5 not in (_UPLOADED, ABORT >> 5):
+        return None
+    data = None if message[0] == ABORT else value_of(message)
+    return None if data == b"" else (int.from_bytes(message[1:3], "little"), message[3], data)
