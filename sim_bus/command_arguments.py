@@ -26,6 +26,15 @@ class Unusable(Exception):
     """An input of the user that can't be used. The text is the line to print."""
 
 
+def add_drive_arguments(group: argparse._ArgumentGroup, fault: str, stepped: str) -> None:
+    """Add the options of a CiA 402 drive with its shaft. ``fault``: an example of a fault; ``stepped``: help."""
+    group.add_argument("--profile", metavar="NAME",
+                       help="the drive to be: a profile that ships, or a YAML file (default: our own EDS)")
+    add_rig_arguments(group)
+    add_fault_argument(group, fault)
+    group.add_argument("--stepped", action="store_true", help=stepped)
+
+
 def add_rig_arguments(group: argparse._ArgumentGroup) -> None:
     """Add the options of the shaft and of its trace."""
     group.add_argument("--plant", metavar="FILE", type=Path, help="YAML with other parameters of the rig")

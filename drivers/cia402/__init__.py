@@ -29,9 +29,9 @@ if TYPE_CHECKING:
         cyclic_objects as cyclic_objects,
     )
     from drivers.cia402.quick_stop import Cia402Target as Cia402Target
+    from drivers.cia402.sdo_client import SdoClient as SdoClient
     from drivers.cia402.sdo_message import (
-        ABORT as ABORT, UPLOAD as UPLOAD, download as download, is_answer as is_answer, upload as upload,
-        uploaded as uploaded, value_of as value_of,
+        download as download, is_answer as is_answer, upload as upload, uploaded as uploaded,
     )
     from drivers.cia402.state_machine import State as State, decode as decode
     from drivers.cia402.supervision import DriveWatch as DriveWatch, Group as Group
@@ -51,7 +51,8 @@ else:
         "process_data": "CONTROLWORD CyclicObjects MODE MODE_DISPLAY STATUSWORD TARGET_TORQUE TORQUE_DEMAND bits_of "
                         "cyclic_objects",
         "quick_stop": "Cia402Target",
-        "sdo_message": "ABORT UPLOAD download is_answer upload uploaded value_of",
+        "sdo_client": "SdoClient",
+        "sdo_message": "download is_answer upload uploaded",
         "state_machine": "State decode",
         "supervision": "DriveWatch Group",
         "watchdog": "arm",

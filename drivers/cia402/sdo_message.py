@@ -8,7 +8,8 @@ follow the first eight bytes.
     command u8, index u16, sub-index u8, four bytes of data or the length [, data]
 """
 
-UPLOAD, ABORT = 0x40, 0x80
+UPLOAD, UPLOAD_SEGMENT, ABORT = 0x40, 0x60, 0x80
+_TOGGLE = 0x10
 _ANSWERS = {0: 1, 1: 3, 2: 2, 3: 0}
 """Command specifier of the request → that of its response: segment and initiate, download and upload."""
 _INITIATE = (1, 2)
@@ -36,7 +37,9 @@ def is_answer(request: bytes, response: bytes) -> bool:
     same_object = response[1:4] == request[1:4]
     if response[0] == ABORT:
         return same_object or command not in _INITIATE
-    return response[0] >> 5 == _ANSWERS.get(command) and (same_object or command not in _INITIATE)
+    if response[0] >> 5 != _ANSWERS.get(command):
+        return False
+    return same_object if command in _INITIATE else not (request[0] ^ response[0]) & _TOGGLE
 
 
 def value_of(answer: bytes) -> bytes:

@@ -16,10 +16,10 @@ Source: ETG.1000.6, mailbox and CoE; CiA 301, SDO.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 
-from drivers.cia402 import ABORT, Objects, download, is_answer, name, upload, value_of
+from drivers.cia402 import SdoClient, is_answer
 from drivers.clock import Clock
 from drivers.drive import FrameTap, RawFrame
 from drivers.errors import CommunicationLost, ObjectRefused
@@ -31,18 +31,6 @@ ANSWER_S, TRIES = 0.7, 3
 """Waiting time for an answer at standstill, s, and number of attempts."""
 _PAUSE_S = 0.0005
 _FULL = 1 << 3
-_UPLOAD_SEGMENT = 0x60
-_ABORTS = {
-    0x06010000: "access not supported", 0x06010001: "write only", 0x06010002: "read only",
-    0x06020000: "the drive has no such object", 0x06040041: "can't be mapped", 0x06040042: "the PDO is too long",
-    0x06070010: "wrong length", 0x06090011: "the drive has no such sub-index", 0x06090030: "value out of range",
-    0x08000020: "can't be stored", 0x08000021: "local control", 0x08000022: "not in this state",
-}
-
-
-def abort_text(code: int) -> str:
-    """Return an abort code with its meaning (CiA 301)."""
-    return f"SDO abort {code:08X}h" + (f", {_ABORTS[code]}" if code in _ABORTS else "")
 
 
 class Mailbox:
@@ -115,44 +103,13 @@ class Mailbox:
             self._tap(RawFrame(self._clock.now_s(), outgoing, 0 if outgoing else 1, message))
 
 
-class CoeObjects(Objects):
+class CoeObjects(SdoClient):
     """The object dictionary of one slave, by CoE."""
 
     def __init__(self, mailbox: Mailbox) -> None:
-        super().__init__()
+        super().__init__(ANSWER_S, (TRIES, 1), normal=True)
         self._mailbox = mailbox
-        self._answer_s, self._tries = ANSWER_S, TRIES
 
-    @contextmanager
-    def answered_within(self, answer_s: float) -> Iterator[None]:
-        """Send each request once and wait at most ``answer_s`` of wall time: a shaft may be turning meanwhile."""
-        before, (self._answer_s, self._tries) = (self._answer_s, self._tries), (answer_s, 1)
-        try:
-            yield
-        finally:
-            self._answer_s, self._tries = before
-
-    def read_bytes(self, index: int, subindex: int = 0) -> bytes:
-        """Return the bytes of an object."""
-        answer = self._call(upload(index, subindex), self._tries, name(index, subindex))
-        data = value_of(answer)
-        if answer[0] & 2:
-            return data
-        size, toggle, last = int.from_bytes(answer[4:8], "little"), 0, False
-        while len(data) < size and not last:
-            request = bytes((_UPLOAD_SEGMENT | toggle, 0, 0, 0, 0, 0, 0, 0))
-            segment = self._call(request, 1, name(index, subindex))
-            data += segment[1 : 8 - (segment[0] >> 1 & 7)] if len(segment) == 8 else segment[1:]
-            toggle, last = toggle ^ 0x10, bool(segment[0] & 1)
-        return data[:size]
-
-    def write_bytes(self, index: int, subindex: int, data: bytes, shown: str = "") -> None:
-        """Write raw bytes."""
-        said = f" (value {shown})" if shown else ""
-        self._call(download(index, subindex, data), self._tries, name(index, subindex), said)
-
-    def _call(self, sdo: bytes, tries: int, where: str, said: str = "") -> bytes:
-        answer = self._mailbox.call(sdo, self._answer_s, tries)
-        if answer[0] == ABORT:
-            raise ObjectRefused(abort_text(int.from_bytes(answer[4:8], "little")) + said, where=where)
-        return answer
+    def call(self, request: bytes, where: str, answer_s: float, tries: int) -> bytes:
+        """Send a request and wait for its answer. Raises CommunicationLost without one."""
+        return self._mailbox.call(request, answer_s, tries)

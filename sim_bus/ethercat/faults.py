@@ -1,21 +1,12 @@
 """Scripted faults of one simulated EtherCAT drive; each sets something and restores it. All times are plant time."""
 
-from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
-from sim_bus.drive_faults import FaultAct, FaultSchedule, InjectedFault, changed, of_drive, once
+from sim_bus.drive_faults import FaultAct, FaultSchedule, InjectedFault, changed, of_bus, of_drive, once
 from sim_bus.ethercat.slave import Cia402Slave
-from sim_bus.fault_script import (
-    FaultKind,
-    Kinds,
-    Scripted,
-    error_code,
-    number,
-    object_place,
-    plain,
-    share,
-)
+from sim_bus.fault_script import FaultKind, Kinds, Scripted, error_code, number, plain, share
 from sim_bus.sdo_server import Meddling
 
 _SEED = 0xFA17
@@ -27,23 +18,15 @@ _LRD, _LWR, _LRW = 10, 11, 12
 Misbehaviour = FaultAct["Faults"]
 
 
-def _part(name: str) -> Callable[[str], Misbehaviour]:
+def _part(name: str, part: float) -> Misbehaviour:
     """Return a fault that affects a share of the frames, given by the name of the attribute."""
-    def make(text: str) -> Misbehaviour:
-        part = share(text)
-        return changed(lambda line: line, name, lambda _: part)
-
-    return make
+    return changed(lambda line: line, name, lambda _: part)
 
 
-def _transfers(how: Meddling) -> Callable[[str], Misbehaviour]:
+def _transfers(how: Meddling, index: int, sub: int) -> Misbehaviour:
     """Return a fault that affects all transfers of an object."""
-    def make(text: str) -> Misbehaviour:
-        key = object_place(text)
-        return Misbehaviour(lambda line: line.slave.coe.sdo.meddling.update({key: how}),
-                            lambda line: line.slave.coe.sdo.meddling.pop(key, None))
-
-    return make
+    return Misbehaviour(lambda line: line.slave.coe.sdo.meddling.update({(index, sub): how}),
+                        lambda line: line.slave.coe.sdo.meddling.pop((index, sub), None))
 
 
 def _of_drive(fault: InjectedFault) -> Misbehaviour:
@@ -61,44 +44,24 @@ def _jump(line: "Faults", jump_s: float) -> None:
     line.slave.esc.clock_ns = max(0, line.slave.esc.clock_ns + round(1e9 * jump_s))
 
 
-def _failed(line: "Faults", code: int) -> None:
-    line.slave.report(code)
-    line.slave.application.fault()
-
-
 def _slave(line: "Faults") -> Cia402Slave:
     return line.slave
 
 
 KINDS: Kinds[Misbehaviour] = Kinds({
-    "bus-dead": FaultKind(12, "nothing gets through any more: cable cut", plain(lambda: _part("loss")("1"))),
-    "frame-loss": FaultKind(17, "this share of all frames is lost, either way", _part("loss"), "1%", "SHARE"),
-    "frozen-feedback": FaultKind(19, "the inputs keep their last values",
-                                 plain(lambda: changed(_slave, "frozen", lambda line: line.slave.inputs()))),
-    "node-reset": FaultKind(21, "the drive restarts: INIT, its torque is off, the shaft coasts",
-                            plain(lambda: Misbehaviour(lambda line: line.slave.restart()))),
-    "emcy": FaultKind(23, "an emergency message, with the drive still enabled",
-                      once(error_code, lambda line, code: line.slave.report(code)), "7305h", "CODE"),
-    "drive-fault": FaultKind(23, "emergency message and fault state, after the drive's own fault reaction",
-                             once(error_code, _failed), "3210h", "CODE"),
-    "sdo-abort": FaultKind(24, "the drive aborts every transfer of an object", _transfers(Meddling.ABORTED), "6072h",
-                           "OBJECT"),
-    "sdo-timeout": FaultKind(25, "the drive doesn't answer when asked for an object",
-                             _transfers(Meddling.UNANSWERED), "6072h", "OBJECT"),
-    "wrong-identity": FaultKind(29, "1018h:1, the vendor, is another one",
-                                plain(lambda: _transfers(Meddling.OTHERWISE)("1018h:1"))),
-    "fault-at-start": FaultKind(30, "the drive is in fault when the host comes", once(error_code, _failed), "3210h",
-                                "CODE"),
-    "write-not-kept": FaultKind(45, "a write to an object is answered and not kept", _transfers(Meddling.NOT_KEPT),
-                                "6080h", "OBJECT"),
-    "reads-back-otherwise": FaultKind(45, "an object reads back as something else", _transfers(Meddling.OTHERWISE),
-                                      "6072h", "OBJECT"),
+    **of_bus(
+        dead=lambda: _part("loss", 1.0), lossy=lambda part: _part("loss", part), loss="1%",
+        restart=lambda: Misbehaviour(lambda line: line.slave.restart()), restarts="INIT",
+        transfers=_transfers,
+    ),
+    "frozen-feedback": FaultKind(19, "the inputs keep their last values", plain(
+        lambda: changed(_slave, "inputs", lambda line: partial(bytes, line.slave.inputs())))),
     "watchdog-not-armed": FaultKind(50, "writes to registers 0400h to 0421h are answered and not kept", plain(
         lambda: changed(lambda line: line.slave.esc, "locked", lambda _: range(0x0400, 0x0422)))),
     "mailbox-timeout": FaultKind(0, "no message in the mailbox is answered",
-                                 plain(lambda: changed(lambda line: line.slave.coe, "silent", lambda _: True))),
+                                 plain(lambda: changed(_slave, "mailbox", lambda _: lambda message: None))),
     "wrong-working-counter": FaultKind(0, "this share of the process data comes back with a working counter of 0",
-                                       _part("uncounted"), "1%", "SHARE"),
+                                       lambda v: _part("uncounted", share(v)), "1%", "SHARE"),
     "al-error": FaultKind(0, "the slave leaves OPERATIONAL with this AL status code",
                           once(error_code, lambda line, code: line.slave.al_error(code)), "001Bh", "CODE"),
     "sm-watchdog": FaultKind(0, "the watchdog of the process data expires, though they come",
