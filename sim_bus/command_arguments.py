@@ -71,8 +71,16 @@ def add_fault_argument(group: argparse._ArgumentGroup, such_as: str) -> None:
                        help=f"a scripted fault, such as {such_as}; repeatable; 'list' shows them all")
 
 
-def until_stopped(simulate: Callable[[threading.Event], None]) -> int:
-    """Run ``simulate`` until SIGINT or SIGTERM. Return the exit code. An error of use ends with one line."""
+def until_stopped(
+    namespace: argparse.Namespace, listing: Callable[[], str], simulate: Callable[[threading.Event], None]
+) -> int:
+    """Run ``simulate`` until SIGINT or SIGTERM. Return the exit code. An error of use ends with one line.
+
+    For ``--fault list``, print the ``listing`` of the faults instead.
+    """
+    if "list" in namespace.fault:
+        print(listing())  # noqa: T201
+        return EXIT_OK
     stop = threading.Event()
     try:
         with _signals(stop):

@@ -7,13 +7,17 @@ one drive.
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
+import numpy as np
+
 from sim_bus.fault_script import STOP, Cast, FaultKind, Passing, Scripted, error_code, object_place, plain, share
 from sim_bus.object_drive import ObjectDrive
 from sim_bus.reports import Lie, lying
 from sim_bus.sdo_server import Meddling
-from sim_bus.timed_drive import TimedDrive
 
 _PROFILE_VELOCITY = 3
+_SEED = 0xFA17
+"""Part of the seed by which faults differ from the noise of the drive."""
+
 M = TypeVar("M")
 """Type of a fault on the bus."""
 
@@ -66,10 +70,11 @@ def once(parse: Callable[[str], V], act: Callable[[P, V], None]) -> Callable[[st
 class FaultSchedule(Generic[F]):
     """Script of one drive; `happen_to` activates it."""
 
-    def __init__(self, script: tuple[Scripted, ...], make: Callable[[Scripted], F]) -> None:
+    def __init__(self, script: tuple[Scripted, ...], make: Callable[[Scripted], F], seed: int) -> None:
         self.cast: Cast[F] = Cast(script, make)
+        self.rng = np.random.default_rng((seed, _SEED))
 
-    def happen_to(self, drive: TimedDrive) -> None:
+    def happen_to(self, drive: ObjectDrive) -> None:
         """Apply the faults to this drive from now on."""
         self._drive = drive
         drive.on_time = self.moved
@@ -80,6 +85,11 @@ class FaultSchedule(Generic[F]):
     def waiting(self) -> tuple[str, ...]:
         """Faults that have not begun yet, as they were written."""
         return self.cast.waiting
+
+    def end(self) -> None:
+        """Advance to the end of a rehearsal in stepped time, after the host has left for good."""
+        if self.cast.all and self._drive.stepped and self._drive.cycled:
+            self._drive.run_out()
 
     def moved(self, now_us: int) -> None:
         """Begin and end the faults that are due at this plant time, µs."""

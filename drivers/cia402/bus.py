@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 from drivers.cia402.objects import Objects
 from drivers.cia402.process_data import CyclicObjects, Reported
+from drivers.cia402.state_machine import ENABLE_OPERATION
 from drivers.cia402.supervision import DriveWatch, Group
 from drivers.clock import Clock, Ticks
 from drivers.drive import DriveLimits, Identity
@@ -38,6 +39,15 @@ class CycleSetpoints(NamedTuple):
     mode: int                      # 6060h
     offset: int                    # torque offset, if mapped
     mode_changes: bool
+
+    @property
+    def enables(self) -> bool:
+        """True if the controlword enables the operation."""
+        return self.word & ENABLE_OPERATION == ENABLE_OPERATION
+
+    def stopped(self, word: int) -> CycleSetpoints:
+        """Return setpoints with this controlword, and torque, speed and torque offset of zero; the mode stays."""
+        return self._replace(word=word, torque=0, speed=0, offset=0)
 
 
 class CycleInputs(NamedTuple):

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from drivers.cia402.objects import Objects, name
-from drivers.cia402.sdo_message import ABORT, UPLOAD_SEGMENT, download, upload, value_of
+from drivers.cia402.sdo_message import ABORT, UPLOAD_SEGMENT, abort_text, download, upload, value_of
 from drivers.errors import ObjectRefused
 
 _FRAME, _SEGMENT = 8, 7
@@ -78,8 +78,6 @@ class SdoClient(Objects):
     def _transfer(self, request: bytes, where: str, what: str, *, segment: int = 0) -> bytes:
         answer = self.call(request, where, self._answer_s, self._tries[segment])
         if answer[0] == ABORT:
-            from canopen.sdo import SdoAbortedError  # it knows the text of each code
-
-            error = SdoAbortedError(int.from_bytes(answer[4:8], "little"))
+            error = abort_text(int.from_bytes(answer[4:8], "little"))
             raise ObjectRefused(f"the drive refused {what}: {error}", where=where)
         return answer

@@ -38,7 +38,7 @@ ANSWER_SHARE, CYCLE_SHARE = 0.5, 0.2
 """Longest wait for the frame of a cycle, and for the answer of a register, as shares of the period."""
 SYNC0_SHARE = 0.5
 """Distance of SYNC0 behind the frame, as a share of the period: as far from the frames as possible on both sides."""
-QUICK_STOP, ENABLE_OPERATION, FIRST_WORDS = 0x0002, 0x000F, 0x000F
+QUICK_STOP = 0x0002
 NO_SETPOINTS = cia402.CycleSetpoints(0, 0, 0, 0, 0, False)
 SETPOINTS, FEEDBACK = 2, 3
 """Identifiers of the process data in the log: the sync managers."""
@@ -56,13 +56,14 @@ class EthercatBus(cia402.Cia402Bus):
         tap: FrameTap | None = None,
     ) -> None:
         self._segment, self._station, self._profile, self._tap = segment, segment.station, profile, tap
-        self._mailbox = Mailbox(segment.station, clock, tap)
+        self._mailbox = Mailbox(segment.station, clock)
         self._slave_watch = SlaveWatch(segment.station.place, clock)
         super().__init__(CoeObjects(self._mailbox), self._slave_watch, clock, period_s)
         self.place = segment.station.place
         self._slave_watch.on_restart = self.reported.restarted
         self._mailbox.on_emergency = self._slave_watch.on_emcy
         self._mailbox.on_answer = self._on_answer
+        self._mailbox.on_message = self._seen
         self._watchdog = ProcessDataWatchdog(segment.station)
         self._setpoints = NO_SETPOINTS
         self._outputs = cia402.CyclicLayout((), ())
@@ -75,7 +76,8 @@ class EthercatBus(cia402.Cia402Bus):
     def take(self) -> None:
         """Put the slave into PRE-OP. Raises DriveFault if it refuses."""
         self._station.wait_us = REGISTER_US
-        self._stop_clock()
+        if self._clocks:
+            self._segment.slave.dc_sync(False, 0)
         self._station.reach(PRE_OP)
 
     def confirm(self, identity: Identity) -> None:
@@ -107,22 +109,17 @@ class EthercatBus(cia402.Cia402Bus):
 
     def arm(self, table: PreflightTable, limits: DriveLimits) -> float:
         """Set the period of the cycle, arm the watchdog of the process data and read it back."""
-        self._set_cycle(table)
-        return self._watchdog.arm(table, self.objects, self._profile, limits, self.period_s)
-
-    def _set_cycle(self, table: PreflightTable) -> None:
         objects, period_us = self.objects, round(self.period_s * 1e6)
         if self.clock.stepped:
             for title, sub, value, bits in (("simulator's cycle", 3, period_us, 32), ("stepped time", 2, 1, 8)):
                 back = objects.change(MARKER_INDEX, sub, value, bits)
                 table.row(title, str(value), str(back), back == value, cia402.name(MARKER_INDEX, sub))
         cia402.note_period(table, self.period_s, "60C2h", self._set_interpolation, "the frames")
-        self._clocks = (
-            not self.clock.stepped and self._profile.cyclic.distributed_clocks
-            and has_clocks(self._station)
-        )
+        wanted = self._profile.cyclic.distributed_clocks and not self.clock.stepped
+        self._clocks = wanted and has_clocks(self._station)
         table.note("distributed clocks", "SYNC0 in the middle of the cycle" if self._clocks else "not used",
                    "register 0008h")
+        return self._watchdog.arm(table, objects, self._profile, limits, self.period_s)
 
     def setting(self, index: int) -> tuple[str, cia402.Group] | None:
         """Return an empty title for the timing, which is not read back in motion."""
@@ -135,10 +132,12 @@ class EthercatBus(cia402.Cia402Bus):
         """
         if self._inputs is None:
             return                                     # the mapping was refused: nothing may move
-        self._hold(0)
+        self._setpoints = self._setpoints.stopped(0)
         try:
             self._segment.map(self._outputs.size, self._inputs.size)
-            self._start_clock()
+            if self._clocks:
+                self._segment.master.config_dc()
+                self._segment.slave.dc_sync(True, round(self.period_s * 1e9))
             self._station.reach(SAFE_OP)
             self._watchdog.check_trigger()
             self._station.reach(OP, self._frame)
@@ -162,15 +161,6 @@ class EthercatBus(cia402.Cia402Bus):
     def _set_interpolation(self) -> int:
         return cia402.set_interpolation(self.objects, self.period_s)
 
-    def _start_clock(self) -> None:
-        if self._clocks:
-            self._segment.master.config_dc()
-            self._segment.slave.dc_sync(True, round(self.period_s * 1e9))
-
-    def _stop_clock(self) -> None:
-        if self._clocks:
-            self._segment.slave.dc_sync(False, 0)
-
     # -- the cycle -------------------------------------------------------------------------------------------
 
     def listen_until(self, tick_s: float) -> None:
@@ -186,7 +176,7 @@ class EthercatBus(cia402.Cia402Bus):
         self.ticks.check()
         self._setpoints = setpoints
         self._transmit()
-        if self._al_state != OP and not self._asked and setpoints.word & FIRST_WORDS != ENABLE_OPERATION:
+        if self._al_state != OP and not self._asked and not setpoints.enables:
             self.put(0x6040, 0, setpoints.word.to_bytes(2, "little"))
 
     def receive(self, now_s: float, sync: bool) -> cia402.CycleInputs:
@@ -212,14 +202,10 @@ class EthercatBus(cia402.Cia402Bus):
         self.reported.take_slow(now_s, shown, demand)
         return cia402.CycleInputs(age_s, True, False, status, torque, speed, angle)
 
-    def _hold(self, word: int) -> None:
-        """Set this controlword for the next frames, and torque, speed and torque offset to zero; the mode stays."""
-        self._setpoints = self._setpoints._replace(word=word, torque=0, speed=0, offset=0)
-
     def _transmit(self) -> None:
         data = self._outputs.pack(self._setpoints)
         self._segment.slave.output = data
-        self._seen(SETPOINTS, data)
+        self._seen(True, SETPOINTS, data)
         self._segment.master.send_processdata()
         self._sent = True
 
@@ -231,13 +217,13 @@ class EthercatBus(cia402.Cia402Bus):
         if master.receive_processdata(wait_us) != master.expected_wkc:
             return None
         data: bytes = self._segment.slave.input
-        self._seen(FEEDBACK, data)
+        self._seen(False, FEEDBACK, data)
         return data
 
     def _from_memory(self) -> bytes | None:
         """Return the inputs without a frame that carries setpoints; None without an answer."""
         with suppress(CommunicationLost):
-            start, length = self._station.sync_manager(FEEDBACK)
+            start, length, _ = self._station.sync_manager(FEEDBACK)
             if self._inputs is not None and length == self._inputs.size:
                 return self._station.read(start, length)
         return None
@@ -259,9 +245,9 @@ class EthercatBus(cia402.Cia402Bus):
         self._transmit()
         self._take()
 
-    def _seen(self, identifier: int, data: bytes) -> None:
+    def _seen(self, outgoing: bool, identifier: int, data: bytes) -> None:
         if self._tap is not None:
-            self._tap(RawFrame(self.clock.now_s(), identifier == SETPOINTS, identifier, data))
+            self._tap(RawFrame(self.clock.now_s(), outgoing, identifier, data))
 
     def feed(self) -> None:
         """Feed the watchdog: exchange the setpoints of the last cycle. In stepped time only a cycle does."""
@@ -290,18 +276,19 @@ class EthercatBus(cia402.Cia402Bus):
 
     def ask(self, index: int, sub: int) -> None:
         """Send a read request without waiting. A full mailbox counts as a missing answer."""
-        with suppress(CommunicationLost):
-            self._mailbox.post(cia402.upload(index, sub))
-            self._asked = round(MAILBOX_S / self.period_s) + 1
+        self._post(cia402.upload(index, sub))
 
     def put(self, index: int, sub: int, data: bytes) -> None:
         """Send a write request without waiting. The controlword is also set in the process data, which would overwrite
         it.
         """
         if (index, sub) == (0x6040, 0):
-            self._hold(int.from_bytes(data, "little"))
+            self._setpoints = self._setpoints.stopped(int.from_bytes(data, "little"))
+        self._post(cia402.download(index, sub, data))
+
+    def _post(self, request: bytes) -> None:
         with suppress(CommunicationLost, ObjectRefused):
-            self._mailbox.post(cia402.download(index, sub, data))
+            self._mailbox.post(request)
             self._asked = round(MAILBOX_S / self.period_s) + 1
 
     def _on_answer(self, sdo: bytes) -> None:
@@ -312,13 +299,13 @@ class EthercatBus(cia402.Cia402Bus):
 
     def disable_setpoints(self) -> int:
         """Set the process data to quick stop and setpoints of zero, which they keep. No PDO is switched off."""
-        self._hold(QUICK_STOP)
+        self._setpoints = self._setpoints.stopped(QUICK_STOP)
         return 0
 
     def reach(self) -> None:
         """Make the objects readable, and feed the watchdog without setpoints that drive the shaft."""
-        if self._setpoints.word & FIRST_WORDS == ENABLE_OPERATION:
-            self._hold(QUICK_STOP)
+        if self._setpoints.enables:
+            self._setpoints = self._setpoints.stopped(QUICK_STOP)
         with suppress(CommunicationLost):
             if self._station.al_status().state == INIT:
                 self._station.ask_for(PRE_OP)

@@ -21,7 +21,6 @@ from contextlib import suppress
 
 from drivers.cia402 import SdoClient, is_answer
 from drivers.clock import Clock
-from drivers.drive import FrameTap, RawFrame
 from drivers.errors import CommunicationLost, ObjectRefused
 from drivers.ethercat.station import SYNC_MANAGER_BYTES, SYNC_MANAGERS, Station, not_answered
 
@@ -34,19 +33,21 @@ _FULL = 1 << 3
 
 
 class Mailbox:
-    """The mailbox of one slave. ``tap`` gets every message; its identifier is the number of the sync manager."""
+    """The mailbox of one slave."""
 
-    def __init__(self, station: Station, clock: Clock, tap: FrameTap | None = None) -> None:
-        self._station, self._clock, self._tap = station, clock, tap
+    def __init__(self, station: Station, clock: Clock) -> None:
+        self._station, self._clock = station, clock
         (self._out, self._out_size), (self._in, self._in_size) = (0, 0), (0, 0)
         self.on_emergency: Callable[[bytes], None] = lambda data: None
         """Called with the eight bytes of an emergency message."""
         self.on_answer: Callable[[bytes], None] = lambda sdo: None
         """Called with each SDO answer that no request waits for."""
+        self.on_message: Callable[[bool, int, bytes], None] = lambda outgoing, manager, message: None
+        """Called with each message and the number of its sync manager."""
 
     def find(self) -> None:
         """Read addresses and lengths of the two mailboxes. Raises CommunicationLost if the slave has none."""
-        (self._out, self._out_size), (self._in, self._in_size) = map(self._station.sync_manager, (0, 1))
+        (self._out, self._out_size, _), (self._in, self._in_size, _) = map(self._station.sync_manager, (0, 1))
         if not self._out_size or not self._in_size:
             raise not_answered("the slave has no mailbox in this state", self._station.place)
 
@@ -58,7 +59,7 @@ class Mailbox:
         if len(message) > self._out_size:
             raise ObjectRefused(f"{len(sdo)} bytes do not fit into the mailbox", where=self._station.place)
         self._station.write(self._out, message.ljust(self._out_size, b"\0"))
-        self._seen(True, message)
+        self.on_message(True, 0, message)
 
     def pump(self) -> bytes | None:
         """Take one message out if there is one. Return its SDO part; emergency messages are passed on."""
@@ -68,7 +69,7 @@ class Mailbox:
             return None
         data = self._station.read(self._in, self._in_size)
         message = data[: 6 + int.from_bytes(data[:2], "little")]
-        self._seen(False, message)
+        self.on_message(False, 1, message)
         if message[5] & 0xF != COE or len(message) < 8:
             return None
         service, rest = message[7] >> 4, message[8:]
@@ -97,10 +98,6 @@ class Mailbox:
                     else:
                         time.sleep(0.0 if self._clock.stepped else _PAUSE_S)
         raise not_answered("no answer to an SDO request (CoE)", self._station.place)
-
-    def _seen(self, outgoing: bool, message: bytes) -> None:
-        if self._tap is not None:
-            self._tap(RawFrame(self._clock.now_s(), outgoing, 0 if outgoing else 1, message))
 
 
 class CoeObjects(SdoClient):

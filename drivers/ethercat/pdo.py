@@ -60,37 +60,27 @@ def map_cyclic(
 
 def settings(objects: Objects, profile: EthercatProfile) -> list[FeedbackSetting]:
     """Return the objects that define the content of the feedback: assignment and mapping of the TxPDOs."""
-    places = [(INPUTS, sub) for sub in range(1 + len(profile.cyclic.tx_pdos))]
-    for pdo in profile.cyclic.tx_pdos:
-        places += [(pdo, sub) for sub in range(1 + objects.read(pdo, 0))]
-    return [("the content of the feedback", index, sub, objects.read_bytes(index, sub)) for index, sub in places]
+    return [
+        ("the content of the feedback", index, sub, objects.read_bytes(index, sub))
+        for index in (INPUTS, *profile.cyclic.tx_pdos) for sub in range(1 + objects.read(index, 0))
+    ]
 
 
 def _mapped(
     objects: Objects, profile: EthercatProfile, assign: int, pdos: Sequence[int], wanted: Sequence[Mapped]
 ) -> list[Mapped]:
     """Map the wanted objects in the first PDO, unless all are fixed, and assign. Return the content read back."""
-    if profile.cyclic.fixed:
-        _assign(objects, assign, pdos)
-    else:
-        _map(objects, assign, pdos[0], [mapping_entry(one) for one in wanted])
-    return [mapped_object(one) for pdo in pdos for one in read_entries(objects, pdo)]
-
-
-def _map(objects: Objects, assign: int, pdo: int, wanted: Sequence[int]) -> None:
-    former, before = read_entries(objects, pdo), read_entries(objects, assign)
-
-    def write(entries: Sequence[int], pdos: Sequence[int]) -> None:
-        objects.write(assign, 0, 0, 8)
-        write_entries(objects, pdo, entries)
-        write_entries(objects, assign, pdos, 16)
-
-    objects.on_restore(lambda: write(former, before))
-    write(wanted, [pdo])
-
-
-def _assign(objects: Objects, assign: int, pdos: Sequence[int]) -> None:
+    fixed, pdo = profile.cyclic.fixed, pdos[0]
+    former = [] if fixed else read_entries(objects, pdo)
     before = read_entries(objects, assign)
-    if before != list(pdos):
-        objects.on_restore(lambda: write_entries(objects, assign, before, 16))
-        write_entries(objects, assign, pdos, 16)
+
+    def write(entries: Sequence[int], assigned: Sequence[int]) -> None:
+        if not fixed:
+            objects.write(assign, 0, 0, 8)
+            write_entries(objects, pdo, entries)
+        write_entries(objects, assign, assigned, 16)
+
+    if not fixed or before != list(pdos):
+        objects.on_restore(lambda: write(former, before))
+        write([mapping_entry(one) for one in wanted], pdos)
+    return [mapped_object(one) for number in pdos for one in read_entries(objects, number)]

@@ -5,23 +5,16 @@ from __future__ import annotations
 from drivers.cia402 import DriveWatch, Objects, arm
 from drivers.drive import DriveLimits
 from drivers.errors import DriveFault, PreflightRefused
-from drivers.ethercat.station import (
-    INIT,
-    OP,
-    SM_WATCHDOG,
-    WATCHDOG_DIVIDER,
-    WATCHDOG_TICK_S,
-    WATCHDOG_TIME,
-    WATCHDOG_TRIGGER,
-    AlStatus,
-    Station,
-)
+from drivers.ethercat.station import INIT, OP, SM_WATCHDOG, AlStatus, Station
 from drivers.preflight import DIES, PreflightTable
 from profiles import MessageCode
 from profiles.ethercat import EthercatProfile
 
-OUTPUT_MANAGER = 2
-"""Sync manager of the setpoints."""
+WATCHDOG_DIVIDER, WATCHDOG_TIME = 0x0400, 0x0420
+WATCHDOG_TICK_S = 40e-9
+"""Clock period of the divider 0400h, s (25 MHz); the divider counts two periods more."""
+OUTPUT_MANAGER, WATCHDOG_TRIGGER = 2, 1 << 6
+"""Sync manager of the setpoints, and the bit of its control byte: writing to it triggers the watchdog."""
 READ_BACK_S = 0.5
 """Time between two read-backs of the watchdog's registers, s."""
 
@@ -65,6 +58,12 @@ class SlaveWatch(DriveWatch):
 # ns, the drive leaves OP with AL status code 001Bh. CiA 402 drives then react as 6007h states.
 
 
+def watchdog_s(station: Station) -> tuple[float, int]:
+    """Return the time of the process data's watchdog, s, and its divider."""
+    divider = station.number(WATCHDOG_DIVIDER)
+    return station.number(WATCHDOG_TIME) * (divider + 2) * WATCHDOG_TICK_S, divider
+
+
 class ProcessDataWatchdog:
     """The registers of the watchdog of one slave."""
 
@@ -95,22 +94,20 @@ class ProcessDataWatchdog:
                                    next_step="Lower limits.watchdog_s", entry=MessageCode.WATCHDOG_NOT_ARMED)
         objects.on_restore(lambda: station.write(WATCHDOG_TIME, before))
         station.write(WATCHDOG_TIME, counts.to_bytes(2, "little"))
-        back = self._read()
-        self._wanted = back
-        return f"{back[1] * (back[0] + 2) * WATCHDOG_TICK_S * 1e3:.6g} ms", back[1] == counts
+        self._wanted = self._read()
+        return f"{watchdog_s(station)[0] * 1e3:.6g} ms", self._wanted[1] == counts
 
     def _read(self) -> tuple[int, int]:
         return self._station.number(WATCHDOG_DIVIDER), self._station.number(WATCHDOG_TIME)
 
     def check_trigger(self) -> None:
         """Refuse a sync manager of the setpoints that does not trigger the watchdog. Raises PreflightRefused."""
-        if self._wanted is None or self._station.sync_manager_control(OUTPUT_MANAGER) & WATCHDOG_TRIGGER:
-            return
-        raise PreflightRefused(
-            "the setpoints do not trigger the watchdog: bit 6 of register 0814h is 0", where=self._station.place,
-            next_step="The drive's SII describes its sync manager 2 so; see its manual for another watchdog",
-            entry=MessageCode.WATCHDOG_NOT_ARMED,
-        )
+        if self._wanted is not None and not self._station.sync_manager(OUTPUT_MANAGER)[2] & WATCHDOG_TRIGGER:
+            raise PreflightRefused(
+                "the setpoints do not trigger the watchdog: bit 6 of register 0814h is 0", where=self._station.place,
+                next_step="The drive's SII describes its sync manager 2 so; see its manual for another watchdog",
+                entry=MessageCode.WATCHDOG_NOT_ARMED,
+            )
 
     def look(self, now_s: float, watch: DriveWatch) -> None:
         """Read the registers back in motion, every `READ_BACK_S`. Raises CommunicationLost without an answer."""

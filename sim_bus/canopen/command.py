@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from sim_bus.command_arguments import (
-    EXIT_OK,
     Unusable,
     add_drive_arguments,
     host_and_port,
@@ -38,11 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """Simulate until SIGINT or SIGTERM. Print one line ``ready: …`` on stdout. Return the exit code."""
-    if "list" in namespace.fault:
-        from sim_bus.canopen.faults import listing
-
-        print(listing())  # noqa: T201
-        return EXIT_OK
+    from sim_bus.canopen.faults import listing
 
     def simulate(stop: threading.Event) -> None:
         from profiles import load_canopen_profile
@@ -62,7 +57,7 @@ def run(namespace: argparse.Namespace) -> int:
             simulator.run(stop)
             never_came(simulator.faults_waiting)
 
-    return until_stopped(simulate)
+    return until_stopped(namespace, listing, simulate)
 
 
 @contextlib.contextmanager

@@ -437,22 +437,18 @@ make, parse_all, listed, listing = KINDS.make, KINDS.parse_all, KINDS.listed, KI
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_SEED = 0xFA17
-
-
 class Faults(FaultSchedule[Misbehaviour]):
     """Script of one drive. `attach` activates it; then `came` gets the frames."""
 
     def __init__(self, script: tuple[Scripted, ...], seed: int = 0) -> None:
-        super().__init__(script, make)
-        self._rng = np.random.default_rng((seed, _SEED))
+        super().__init__(script, make, seed)
         self._ends_cycles = False          # True after the host was informed
 
     def attach(self, node: Cia402Node, sender: Sender) -> None:
         """Apply the faults to this node from now on."""
         self._node = node
         self._put: Callable[[int, bytes], None] = sender.put
-        scene = Scene(node, sender.put, self._rng)
+        scene = Scene(node, sender.put, self.rng)
         for fault in self.cast.all:
             fault.scene = scene
         sender.script = self._outgoing

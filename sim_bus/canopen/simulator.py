@@ -107,8 +107,8 @@ class Simulator:
 
     def end(self) -> None:
         """Advance to the end of a rehearsal, after the host has left for good."""
-        if self._faults is not None and self.node.stepped and self.node.cycled:
-            self.node.run_out()
+        if self._faults is not None:
+            self._faults.end()
 
     def close_trace(self) -> None:
         """Close the trace; safe to repeat."""

@@ -4,7 +4,6 @@ import argparse
 import threading
 
 from sim_bus.command_arguments import (
-    EXIT_OK,
     Unusable,
     add_drive_arguments,
     never_came,
@@ -30,10 +29,6 @@ def run(namespace: argparse.Namespace) -> int:
     """Simulate until SIGINT or SIGTERM. Print one line ``ready: …`` on stdout. Return the exit code."""
     from sim_bus.ethercat.faults import listing, parse_all
 
-    if "list" in namespace.fault:
-        print(listing())  # noqa: T201
-        return EXIT_OK
-
     def simulate(stop: threading.Event) -> None:
         from profiles import load_ethercat_profile
         from sim_bus.ethercat.simulator import Simulator, raw_socket
@@ -48,4 +43,4 @@ def run(namespace: argparse.Namespace) -> int:
             simulator.run(line, stop)
             never_came(simulator.faults_waiting)
 
-    return until_stopped(simulate)
+    return until_stopped(namespace, listing, simulate)

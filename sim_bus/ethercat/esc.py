@@ -322,11 +322,6 @@ class Esc:
             self.memory[_SII_DATA:_SII_DATA + 4] = self.eeprom[at:at + 4].ljust(4, b"\xff")
         self.set_word(_SII_CONTROL, _SII_REFUSED if control & _SII_WRITE else 0)
 
-    @property
-    def watchdog_s(self) -> float:
-        """Return the time of the process data watchdog (0400h, 0420h), s; 0 if it is off."""
-        return (self.word(_DIVIDER) + 2) * _WATCHDOG_UNIT_S * self.word(_WATCHDOG)
-
     def stop_watchdog(self) -> None:
         """End the watchdog: no outputs are expected."""
         self._unfed_s = None
@@ -343,7 +338,8 @@ class Esc:
         self.clock_ns += 1000 * duration_us
         if self._unfed_s is not None:
             self._unfed_s += 1e-6 * duration_us
-            if 0.0 < self.watchdog_s < self._unfed_s:
+            longest_s = (self.word(_DIVIDER) + 2) * _WATCHDOG_UNIT_S * self.word(_WATCHDOG)
+            if 0.0 < longest_s < self._unfed_s:
                 self.expire_watchdog()
 
     def _tell_time(self) -> None:

@@ -2,14 +2,11 @@
 
 from functools import partial
 
-import numpy as np
-
-from sim_bus.drive_faults import FaultAct, FaultSchedule, InjectedFault, changed, of_bus, of_drive, once
+from sim_bus.drive_faults import FaultAct, FaultSchedule, changed, of_bus, of_drive, once
 from sim_bus.ethercat.slave import Cia402Slave
 from sim_bus.fault_script import FaultKind, Kinds, Scripted, error_code, number, plain, share
 from sim_bus.sdo_server import Meddling
 
-_SEED = 0xFA17
 _FIRST, _LENGTH, _HEAD = 16, slice(22, 24), 26
 """Places of the first datagram in a frame: its command, its length, its data."""
 
@@ -27,10 +24,6 @@ def _transfers(how: Meddling, index: int, sub: int) -> Misbehaviour:
     """Return a fault that affects all transfers of an object."""
     return Misbehaviour(lambda line: line.slave.coe.sdo.meddling.update({(index, sub): how}),
                         lambda line: line.slave.coe.sdo.meddling.pop((index, sub), None))
-
-
-def _of_drive(fault: InjectedFault) -> Misbehaviour:
-    return Misbehaviour(lambda line: fault.begin(line.slave), lambda line: fault.end(line.slave))
 
 
 def _garbage(line: "Faults") -> bytes:
@@ -69,7 +62,7 @@ KINDS: Kinds[Misbehaviour] = Kinds({
     "sii-garbage": FaultKind(0, "the identity in the EEPROM reads as ones, and its checksum is wrong",
                              plain(lambda: changed(lambda line: line.slave.esc, "eeprom", _garbage))),
     "clock-jump": FaultKind(0, "the distributed clock jumps by so many seconds", once(number, _jump), "1", "SECONDS"),
-    **of_drive(_of_drive),
+    **of_drive(lambda fault: Misbehaviour(lambda line: fault.begin(line.slave), lambda line: fault.end(line.slave))),
 })
 parse_all, listed, listing = KINDS.parse_all, KINDS.listed, KINDS.listing
 
@@ -78,11 +71,9 @@ class Faults(FaultSchedule[Misbehaviour]):
     """Script of one drive, between host and slave."""
 
     def __init__(self, script: tuple[Scripted, ...], slave: Cia402Slave, seed: int) -> None:
-        super().__init__(script, KINDS.make)
+        super().__init__(script, KINDS.make, seed)
         self.slave: Cia402Slave = slave
-        self.scripted = bool(script)
         self.loss = self.uncounted = 0.0
-        self._rng = np.random.default_rng((seed, _SEED))
         for fault in self.cast.all:
             fault.place = self
         if script:
@@ -105,4 +96,4 @@ class Faults(FaultSchedule[Misbehaviour]):
         return answered
 
     def _happens(self, part: float) -> bool:
-        return part > 0.0 and bool(self._rng.random() < part)
+        return part > 0.0 and bool(self.rng.random() < part)

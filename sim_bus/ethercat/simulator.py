@@ -64,8 +64,7 @@ class Simulator:
                         stop.wait(_POLL_S)          # the interface is down: nothing comes
                     self.idle(time.monotonic())
                     self.trace.flush()
-            if self._faults.scripted and self.slave.stepped and self.slave.cycled:
-                self.slave.run_out()
+            self._faults.end()
 
 
 def raw_socket(interface: str) -> socket.socket:

@@ -59,7 +59,18 @@ class Cia402Slave(ObjectDrive):
         self.received = ProcessData(self.store, outputs=True, writable=self._configurable, usual=pdos[0],
                                     setters=self.setters)
         self.sent = ProcessData(self.store, outputs=False, writable=self._configurable, usual=pdos[1])
-        self._bind()
+        short = datatypes.UNSIGNED8
+        for index, sub, data_type, writable, name, value in (
+            *((0x1C00, sub, short, False, "SyncManager type", sub or 4) for sub in (1, 2, 3, 4, 0)),
+            (0x60C2, 1, short, True, "Interpolation time period", 1),
+            (0x60C2, 2, datatypes.INTEGER8, True, "Interpolation time index", -3),
+            (0x60C2, 0, short, False, "Entries", 2),
+            (MARKER_INDEX, 5, datatypes.VISIBLE_STRING, True, "Text for segmented transfers", ""),
+        ):
+            self.store.add(index, sub, data_type, writable=writable, mappable=False, name=name, default=value)
+        self.add_period()
+        self.store.restore()
+        self.bind_marker(self.store)
         areas = (Area(0x1000, MAILBOX, 0x26, 1), Area(0x1000 + MAILBOX, MAILBOX, 0x22, 2),
                  Area(_OUTPUTS_AT, self.received.data.size, 0x64, 3), Area(_INPUTS_AT, self.sent.data.size, 0x20, 4))
         identity = [int(self.store.number(key_of(0x1018, sub))) for sub in (1, 2, 3, 4)]
@@ -80,6 +91,10 @@ class Cia402Slave(ObjectDrive):
         """Advance the plant and all timers."""
         super().advance_us(duration_us)
         self.esc.pass_time(duration_us)
+
+    def send_emergency(self, message: bytes) -> None:
+        """Put an emergency message into the mailbox."""
+        self.coe.emergency(message)
 
     # -- the slave controller's other side ---------------------------------------------------------------
 
@@ -174,23 +189,3 @@ class Cia402Slave(ObjectDrive):
         self.esc.set_word(AL_STATUS_CODE, code)
         if code:
             self.note(f"AL status code {code:04X}h")
-
-    # -- objects -----------------------------------------------------------------------------------------
-
-    def send_emergency(self, message: bytes) -> None:
-        """Put an emergency message into the mailbox."""
-        self.coe.emergency(message)
-
-    def _bind(self) -> None:
-        short = datatypes.UNSIGNED8
-        for index, sub, data_type, writable, name, value in (
-            *((0x1C00, sub, short, False, "SyncManager type", sub or 4) for sub in (1, 2, 3, 4, 0)),
-            (0x60C2, 1, short, True, "Interpolation time period", 1),
-            (0x60C2, 2, datatypes.INTEGER8, True, "Interpolation time index", -3),
-            (0x60C2, 0, short, False, "Entries", 2),
-            (MARKER_INDEX, 5, datatypes.VISIBLE_STRING, True, "Text for segmented transfers", ""),
-        ):
-            self.store.add(index, sub, data_type, writable=writable, mappable=False, name=name, default=value)
-        self.add_period()
-        self.store.restore()
-        self.bind_marker(self.store)
