@@ -1,5 +1,4 @@
-"""NMT, slave side (CiA 301): states as a heartbeat shows them, and the master's commands."""
-
+"""Heartbeat, guarding and NMT, slave side (CiA 301)."""
 
 from enum import IntEnum
 
