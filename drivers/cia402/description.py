@@ -1,4 +1,4 @@
-"""What a drive reports about itself, for a scan on any bus. Nothing is written."""
+"""Description that a drive gives of itself, for a scan on any bus. Nothing is written."""
 
 from __future__ import annotations
 
