@@ -136,11 +136,11 @@ def station_of(stations: Sequence[Station], interface: str, position: int, alias
     if len(found) == 1:
         return found[0]
     wanted = f"at position {position}" if alias is None else f"with station alias {alias}"
-    raise PreflightRefused(
-        f"{len(found) or 'no'} slaves are {wanted}; {len(stations)} answer", where=interface,
-        next_step="See tdhil scan; positions begin at 0",
-        entry=MessageCode.NODE_ID_CONFLICT if found else MessageCode.NO_DRIVE_FOUND,
-    )
+    text, next_step = f"slaves are {wanted}; {len(stations)} answer", "See tdhil scan; positions begin at 0"
+    if found:
+        raise PreflightRefused(f"{len(found)} {text}", where=interface, next_step=next_step,
+                               entry=MessageCode.NODE_ID_CONFLICT)
+    raise PreflightRefused(f"no {text}", where=interface, next_step=next_step, entry=MessageCode.NO_DRIVE_FOUND)
 
 
 def has_clocks(station: Station) -> bool:
