@@ -89,6 +89,7 @@ class CyclicLayout:
         placed = sorted((one for one in {*wanted} if one in self._at), key=self._at.__getitem__)
         self._packed = [wanted.index(one) for one in placed]
         self._unpacked = [placed.index(one) if one in placed else None for one in wanted]
+        self._in_order = placed == [*wanted]
         known: dict[Mapped, ObjectType] = {CONTROLWORD: "u16", STATUSWORD: "u16", **(kinds or {})}
         layout, end = "<", 0
         for one in placed:
@@ -103,9 +104,11 @@ class CyclicLayout:
 
     def pack(self, values: Sequence[int]) -> bytes:
         """Return the data with these values of the wanted objects; all other bits are 0."""
-        return self._struct.pack(*[values[number] for number in self._packed])
+        return self._struct.pack(*map(values.__getitem__, self._packed))
 
     def unpack(self, data: bytes) -> tuple[Any, ...]:
         """Return the values of the wanted objects, in counts; None for an object without a place."""
         found = self._struct.unpack_from(data)
+        if self._in_order:                 # as in each TPDO1, for which each cycle waits
+            return found
         return tuple(None if number is None else found[number] for number in self._unpacked)
