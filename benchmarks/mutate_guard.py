@@ -200,6 +200,13 @@ SUBJECTS = {
         "test_other_master.py", "test_quick_stop.py", "test_late_host.py",
     ),
     "cia402/bus": _driver("cia402/bus", "test_cia402_without_bus.py"),
+    "cia402/cycle_period": _driver("cia402/cycle_period", "test_preflight.py", "test_ethercat_drive.py"),
+    "cia402/description": _driver("cia402/description", "test_ethercat_drive.py"),
+    "cia402/mapping": _driver(
+        "cia402/mapping", "test_cyclic_layout.py", "test_objects.py", "test_pdo_mapping.py", "test_ethercat_drive.py",
+    ),
+    "cia402/sdo_client": _driver("cia402/sdo_client", "test_cyclic_layout.py", "test_sdo.py", "test_ethercat_drive.py"),
+    "cia402/sdo_message": _driver("cia402/sdo_message", "test_cyclic_layout.py", "test_sdo.py"),
     "cia402/objects": _driver("cia402/objects", "test_objects.py", "test_sdo.py", "test_cia402_without_bus.py"),
     "cia402/preflight": _driver(
         "cia402/preflight", "test_preflight.py", "test_profile_preflight.py", "test_filters.py",

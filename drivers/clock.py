@@ -102,6 +102,10 @@ def quantile(ordered: list[float], share: float) -> float:
     return ordered[max(0, math.ceil(share * len(ordered)) - 1)] if ordered else 0.0
 
 
+FOLLOW_GAIN, FOLLOW_STEP = 0.05, 0.01
+"""Share of the deviation from another clock that one tick corrects, and its limit as a share of the period."""
+
+
 class Ticks:
     """A tick every ``period_s``. ``longest_stall_s``: a longer delay is an error; 0: no delay is an error."""
 
@@ -186,6 +190,6 @@ class Ticks:
         """
         self._next_s = max(self._next_s, self._clock.now_s())
 
-    def shift(self, by_s: float) -> None:
-        """Move the next tick, for a loop that follows the clock of its bus."""
-        self._next_s += by_s
+    def follow(self, behind: float) -> None:
+        """Move the next tick towards the clock of the bus. ``behind``: deviation of this tick, in periods."""
+        self._next_s -= max(-FOLLOW_STEP, min(FOLLOW_STEP, FOLLOW_GAIN * behind)) * self._period_s

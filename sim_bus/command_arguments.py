@@ -26,6 +26,15 @@ class Unusable(Exception):
     """An input of the user that can't be used. The text is the line to print."""
 
 
+def add_drive_arguments(group: argparse._ArgumentGroup, fault: str, stepped: str) -> None:
+    """Add the options of a CiA 402 drive with its shaft. ``fault``: an example of a fault; ``stepped``: help."""
+    group.add_argument("--profile", metavar="NAME",
+                       help="the drive to be: a profile that ships, or a YAML file (default: our own EDS)")
+    add_rig_arguments(group)
+    add_fault_argument(group, fault)
+    group.add_argument("--stepped", action="store_true", help=stepped)
+
+
 def add_rig_arguments(group: argparse._ArgumentGroup) -> None:
     """Add the options of the shaft and of its trace."""
     group.add_argument("--plant", metavar="FILE", type=Path, help="YAML with other parameters of the rig")
@@ -62,8 +71,16 @@ def add_fault_argument(group: argparse._ArgumentGroup, such_as: str) -> None:
                        help=f"a scripted fault, such as {such_as}; repeatable; 'list' shows them all")
 
 
-def until_stopped(simulate: Callable[[threading.Event], None]) -> int:
-    """Run ``simulate`` until SIGINT or SIGTERM. Return the exit code. An error of use ends with one line."""
+def until_stopped(
+    namespace: argparse.Namespace, listing: Callable[[], str], simulate: Callable[[threading.Event], None]
+) -> int:
+    """Run ``simulate`` until SIGINT or SIGTERM. Return the exit code. An error of use ends with one line.
+
+    For ``--fault list``, print the ``listing`` of the faults instead.
+    """
+    if "list" in namespace.fault:
+        print(listing())  # noqa: T201
+        return EXIT_OK
     stop = threading.Event()
     try:
         with _signals(stop):

@@ -7,11 +7,17 @@ one drive.
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-from sim_bus.fault_script import STOP, Cast, FaultKind, Passing, Scripted, plain, share
+import numpy as np
+
+from sim_bus.fault_script import STOP, Cast, FaultKind, Passing, Scripted, error_code, object_place, plain, share
+from sim_bus.object_drive import ObjectDrive
 from sim_bus.reports import Lie, lying
-from sim_bus.timed_drive import TimedDrive
+from sim_bus.sdo_server import Meddling
 
 _PROFILE_VELOCITY = 3
+_SEED = 0xFA17
+"""Part of the seed by which faults differ from the noise of the drive."""
+
 M = TypeVar("M")
 """Type of a fault on the bus."""
 
@@ -64,10 +70,11 @@ def once(parse: Callable[[str], V], act: Callable[[P, V], None]) -> Callable[[st
 class FaultSchedule(Generic[F]):
     """Script of one drive; `happen_to` activates it."""
 
-    def __init__(self, script: tuple[Scripted, ...], make: Callable[[Scripted], F]) -> None:
+    def __init__(self, script: tuple[Scripted, ...], make: Callable[[Scripted], F], seed: int) -> None:
         self.cast: Cast[F] = Cast(script, make)
+        self.rng = np.random.default_rng((seed, _SEED))
 
-    def happen_to(self, drive: TimedDrive) -> None:
+    def happen_to(self, drive: ObjectDrive) -> None:
         """Apply the faults to this drive from now on."""
         self._drive = drive
         drive.on_time = self.moved
@@ -78,6 +85,11 @@ class FaultSchedule(Generic[F]):
     def waiting(self) -> tuple[str, ...]:
         """Faults that have not begun yet, as they were written."""
         return self.cast.waiting
+
+    def end(self) -> None:
+        """Advance to the end of a rehearsal in stepped time, after the host has left for good."""
+        if self.cast.all and self._drive.stepped and self._drive.cycled:
+            self._drive.run_out()
 
     def moved(self, now_us: int) -> None:
         """Begin and end the faults that are due at this plant time, µs."""
@@ -91,27 +103,45 @@ class FaultSchedule(Generic[F]):
 class InjectedFault:
     """A fault without effect; a subclass overrides the methods that it needs."""
 
-    def begin(self, drive: TimedDrive) -> None:
+    def begin(self, drive: ObjectDrive) -> None:
         """Begin the fault."""
 
-    def end(self, drive: TimedDrive) -> None:
+    def end(self, drive: ObjectDrive) -> None:
         """End the fault."""
+
+
+class Emcy(InjectedFault):
+    """Emergency message without any other effect."""
+
+    def __init__(self, code: int) -> None:
+        self._code = code
+
+    def begin(self, drive: ObjectDrive) -> None:
+        drive.emergency.report(self._code, drive.error_register)
+
+
+class FaultReaction(Emcy):
+    """Fault of the drive: emergency message, its own fault reaction (605Eh), fault state."""
+
+    def begin(self, drive: ObjectDrive) -> None:
+        super().begin(drive)
+        drive.application.fault()
 
 
 class Deaf(InjectedFault):
     """State machine that ignores all commands."""
 
-    def begin(self, drive: TimedDrive) -> None:
+    def begin(self, drive: ObjectDrive) -> None:
         drive.application.deaf = True
 
-    def end(self, drive: TimedDrive) -> None:
+    def end(self, drive: ObjectDrive) -> None:
         drive.application.deaf = False
 
 
 class SafeTorqueOff(Deaf):
     """STO: torque off at once, and no enabling while it lasts. The shaft coasts."""
 
-    def begin(self, drive: TimedDrive) -> None:
+    def begin(self, drive: ObjectDrive) -> None:
         drive.application.power_off()
         super().begin(drive)
 
@@ -119,10 +149,10 @@ class SafeTorqueOff(Deaf):
 class ModeKept(InjectedFault):
     """Mode change without effect: 6060h is accepted, and 6061h still shows the old mode."""
 
-    def begin(self, drive: TimedDrive) -> None:
+    def begin(self, drive: ObjectDrive) -> None:
         drive.application.keeps_mode = True
 
-    def end(self, drive: TimedDrive) -> None:
+    def end(self, drive: ObjectDrive) -> None:
         drive.application.keeps_mode = False
 
 
@@ -131,7 +161,7 @@ class ModeLost(ModeKept):
     6060h.
     """
 
-    def begin(self, drive: TimedDrive) -> None:
+    def begin(self, drive: ObjectDrive) -> None:
         drive.application.set_mode(_PROFILE_VELOCITY)
         super().begin(drive)
 
@@ -142,13 +172,13 @@ class LimitedTorque(InjectedFault):
     def __init__(self, share: float) -> None:
         self._share = share
 
-    def begin(self, drive: TimedDrive) -> None:
+    def begin(self, drive: ObjectDrive) -> None:
         limits = drive.inverter.control.limits
         self._before = limits.torque_forward_nm, limits.torque_reverse_nm
         limits.torque_forward_nm *= self._share
         limits.torque_reverse_nm *= self._share
 
-    def end(self, drive: TimedDrive) -> None:
+    def end(self, drive: ObjectDrive) -> None:
         limits = drive.inverter.control.limits
         limits.torque_forward_nm, limits.torque_reverse_nm = self._before
 
@@ -159,7 +189,7 @@ class LoadLost(InjectedFault):
     def __init__(self, share: float) -> None:
         self._share = share
 
-    def begin(self, drive: TimedDrive) -> None:
+    def begin(self, drive: ObjectDrive) -> None:
         drive.inverter.lose_load(self._share)
 
 
@@ -169,16 +199,53 @@ class Lying(InjectedFault):
     def __init__(self, lie: Lie) -> None:
         self._lie = lie
 
-    def begin(self, drive: TimedDrive) -> None:
+    def begin(self, drive: ObjectDrive) -> None:
         self._lie.begin(drive.inverter.lies)
 
-    def end(self, drive: TimedDrive) -> None:
+    def end(self, drive: ObjectDrive) -> None:
         self._lie.end(drive.inverter.lies)
+
+
+def of_bus(
+    *,
+    dead: Callable[[], M],
+    lossy: Callable[[float], M],
+    loss: str,
+    restart: Callable[[], M],
+    restarts: str,
+    transfers: Callable[[Meddling, int, int], M],
+) -> dict[str, FaultKind[M]]:
+    """Return the faults that each CiA 402 bus has: of its frames, of the transfers of an object.
+
+    ``loss``: usual share of lost frames; ``restarts``: sign of a restart; ``transfers``: effect, index and subindex.
+    """
+    def transfer(row: int, summary: str, how: Meddling, usual: str) -> FaultKind[M]:
+        return FaultKind(row, summary, lambda v: transfers(how, *object_place(v)), usual, "OBJECT")
+
+    return {
+        "bus-dead": FaultKind(12, "nothing gets through any more: adapter unplugged, cable cut", plain(dead)),
+        "frame-loss": FaultKind(17, "this share of all frames is lost, either way", lambda v: lossy(share(v)), loss,
+                                "SHARE"),
+        "node-reset": FaultKind(21, f"the drive restarts ({restarts}); its torque is off, the shaft coasts",
+                                plain(restart)),
+        "sdo-abort": transfer(24, "the drive aborts every transfer of an object", Meddling.ABORTED, "6072h"),
+        "sdo-timeout": transfer(25, "the drive doesn't answer when asked for an object", Meddling.UNANSWERED, "6072h"),
+        "wrong-identity": FaultKind(29, "1018h:1, the vendor, is another one",
+                                    plain(lambda: transfers(Meddling.OTHERWISE, 0x1018, 1))),
+        "write-not-kept": transfer(45, "a write to an object is answered and not kept", Meddling.NOT_KEPT, "6080h"),
+        "reads-back-otherwise": transfer(45, "an object reads back as something else", Meddling.OTHERWISE, "6072h"),
+    }
 
 
 def of_drive(act: Callable[[InjectedFault], M]) -> dict[str, FaultKind[M]]:
     """Return the table as faults of one bus. ``act`` converts a fault into one of the bus."""
     return {
+        "emcy": FaultKind(23, "an emergency message, with the drive still enabled",
+                          lambda v: act(Emcy(error_code(v))), "7305h", "CODE"),
+        "drive-fault": FaultKind(23, "emergency message and fault state, after the drive's own fault reaction",
+                                 lambda v: act(FaultReaction(error_code(v))), "3210h", "CODE"),
+        "fault-at-start": FaultKind(30, "the drive is in fault when the host comes",
+                                    lambda v: act(FaultReaction(error_code(v))), "3210h", "CODE"),
         "stuck-state": FaultKind(31, "the controlword is ignored", plain(lambda: act(Deaf()))),
         "mode-not-followed": FaultKind(32, "6061h doesn't follow 6060h", plain(lambda: act(ModeKept()))),
         "mode-lost": FaultKind(82, "the drive goes over to mode 3 by itself, and stays there",

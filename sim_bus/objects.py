@@ -33,6 +33,9 @@ FORMATS = {
 }
 """`struct` formats of the data types that a PDO may carry."""
 
+TEXT_LIMIT = 512
+"""Largest length of a text that a host may write, bytes."""
+
 Value = int | float | str
 
 
@@ -99,6 +102,10 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
             raise TypeError(f"object {key >> 8:04X}h:{key & 0xFF} is no number")
         return value
 
+    def getter(self, key: int) -> Callable[[], float]:
+        """Return the function that reads a numeric object at the fastest."""
+        return self.live.get(key) or (lambda: self.number(key))
+
     def variable(self, index: int, subindex: int) -> ODVariable:
         """Return the object's description. Raises the SDO abort for a missing object."""
         found = self.object_dictionary.get(index)
@@ -146,6 +153,11 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
         variable = self.variable(index, subindex)
         if check_writable and not variable.writable:
             raise SdoAbortedError(ABORT_WRITE_READ_ONLY)
+        if variable.data_type == datatypes.VISIBLE_STRING:
+            if len(data) > TEXT_LIMIT or not data.isascii():
+                raise SdoAbortedError(ABORT_LENGTH)
+            self.values[key_of(index, subindex)] = data.decode("ascii")
+            return
         if 8 * len(data) != len(variable):
             raise SdoAbortedError(ABORT_LENGTH)
         if variable.data_type in objectdictionary.FLOAT_TYPES:
@@ -167,7 +179,8 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
             hook(value)
         self.values[key] = value
 
-    def add(self, index: int, subindex: int, data_type: int, *, writable: bool, mappable: bool, name: str) -> None:
+    def add(self, index: int, subindex: int, data_type: int, *, writable: bool, mappable: bool, name: str,
+            default: Value | None = None) -> None:
         """Add an object, or replace one. Without a default its live getter is read."""
         variable = ODVariable(name, index, subindex)
         variable.data_type = data_type
@@ -185,6 +198,9 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
             known.add_member(variable)
         for table in (self.live, self.hooks, self.float_hooks, self.values, self._factory):
             table.pop(key_of(index, subindex), None)
+        if default is not None:
+            self.set_default(index, subindex, default)
+            self.values[key_of(index, subindex)] = default
 
     def remove(self, index: int) -> None:
         """Remove an object with all its subindices: SDO then aborts with 06020000h."""

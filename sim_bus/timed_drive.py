@@ -15,7 +15,8 @@ from sim_bus.objects import ObjectStore, key_of
 from sim_bus.params import RigParams
 from sim_bus.trace import ROW_PERIOD_US, ShaftTrace
 
-_CHUNK_US = 2_000
+CHUNK_US = 2_000
+"""Step of plant time that no cycle of a host sets, µs."""
 _RUN_OUT_US, _REST_US = 120_000_000, 1_500_000
 _AT_REST_RAD_S = 0.02
 
@@ -60,8 +61,8 @@ class TimedDrive:
         end_us = self.time_us + _RUN_OUT_US
         quiet_us = 0
         while quiet_us < _REST_US and self.time_us < end_us:
-            self.advance_us(_CHUNK_US)
-            quiet_us = 0 if abs(self.inverter.speed_rad_s) > _AT_REST_RAD_S else quiet_us + _CHUNK_US
+            self.advance_us(CHUNK_US)
+            quiet_us = 0 if abs(self.inverter.speed_rad_s) > _AT_REST_RAD_S else quiet_us + CHUNK_US
 
     def note(self, event: str) -> None:
         """Add an event to the trace, or a change of state if ``event`` is empty."""

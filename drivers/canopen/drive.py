@@ -37,6 +37,9 @@ from drivers.cia402 import (
     Group,
     Traffic,
     answer_time_s,
+    download,
+    upload,
+    uploaded,
 )
 from drivers.clock import Clock
 from drivers.drive import DriveLimits, FrameTap, Identity
@@ -62,7 +65,6 @@ DOUBLED_ANSWERS = 3
 """Number of doubled answers that shows two nodes with one node-ID. `Cia402Drive.connect` sends about ten requests."""
 TPDO_COMMUNICATION, TPDO_MAPPING = 0x1800, 0x1A00
 _NO_WORD = b""
-_UPLOAD, _ABORT = 2, 4
 
 
 class CanopenBus(Cia402Bus):
@@ -87,7 +89,7 @@ class CanopenBus(Cia402Bus):
             self._foreign_traffic.own_questions()
         self._objects.on_answer(self._on_sdo_answer)
         self._foreign_traffic.on_write = self._on_foreign_write
-        self._watch.on_boot_up = self.reported.restarted
+        self._watch.on_restart = self.reported.restarted
         self._link.handlers[0x080 + node] = self._watch.on_emcy
         self._rpdo1_id, self._tpdo1_id = 0x200 + node, 0x180 + node
         self._rpdo2_id, self._tpdo2_id = 0x300 + node, 0x280 + node
@@ -146,7 +148,7 @@ class CanopenBus(Cia402Bus):
         )
         for number, cob_id in others.items():
             self._foreign_traffic.own(cob_id & 0x7FF, rpdo_kind(number, cob_id & 0x7FF))
-        self._rpdos = {1: self._rpdo1_id, **({2: self._rpdo2_id} if self._shape.second else {}), **others}
+        self._rpdos = {1: self._rpdo1_id, **({2: self._rpdo2_id} if self._shape.mode_and_offset else {}), **others}
         self._slow = self._new_slow(carried)
         self.angle_mapped = carried.position is not None
         return arming.feedback_frames(self._objects)
@@ -239,10 +241,10 @@ class CanopenBus(Cia402Bus):
 
     def send(self, setpoints: CycleSetpoints) -> None:
         """Send RPDO2 if it is needed, and RPDO1; they act at the next SYNC."""
-        shape, (word, torque, speed, mode, offset, mode_changes) = self._shape, setpoints
-        if (mode_changes and shape.mode) or shape.offset is not None:
-            self._link.send(self._rpdo2_id, shape.slow_setpoints(mode, offset))
-        self._link.send(self._rpdo1_id, shape.setpoints(word, torque, speed), self.ticks.check)
+        shape = self._shape
+        if (setpoints.mode_changes and shape.mode) or shape.offset is not None:
+            self._link.send(self._rpdo2_id, shape.rpdo2.pack(setpoints))
+        self._link.send(self._rpdo1_id, shape.rpdo1.pack(setpoints), self.ticks.check)
 
     def receive(self, now_s: float, sync: bool) -> CycleInputs:
         """Send SYNC and read the feedback that belongs to it."""
@@ -327,12 +329,11 @@ class CanopenBus(Cia402Bus):
 
     def ask(self, index: int, sub: int) -> None:
         """Send an upload request (SDO) without waiting."""
-        self._link.send(0x600 + self._node, bytes((_UPLOAD << 5, index & 0xFF, index >> 8, sub, 0, 0, 0, 0)))
+        self._link.send(0x600 + self._node, upload(index, sub))
 
     def put(self, index: int, sub: int, data: bytes) -> None:
         """Send an expedited download request (SDO) without waiting."""
-        command = 0x23 | (4 - len(data)) << 2
-        self._link.send(0x600 + self._node, bytes((command, index & 0xFF, index >> 8, sub)) + data.ljust(4, b"\0"))
+        self._link.send(0x600 + self._node, download(index, sub, data))
 
     def disable_setpoints(self) -> int:
         """Switch every RPDO off (bit 31 of its COB-ID)."""
@@ -402,13 +403,9 @@ class CanopenBus(Cia402Bus):
 
     def _on_sdo_answer(self, data: bytes) -> None:
         """Handle an SDO answer of the drive, to this or another client (upload, expedited; abort)."""
-        if len(data) != 8:
-            return
-        index, sub, command = int.from_bytes(data[1:3], "little"), data[3], data[0] >> 5
-        if command == _ABORT:
-            self.on_answer(index, sub, None)
-        elif command == _UPLOAD and data[0] & 0x02:
-            self.on_answer(index, sub, data[4 : 8 - (data[0] >> 2 & 3 if data[0] & 1 else 0)])
+        found = uploaded(data) if len(data) == 8 else None
+        if found is not None:
+            self.on_answer(*found)
 
     def _on_slow_feedback(self, data: bytes) -> None:
         if self._remapped:

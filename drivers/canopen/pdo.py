@@ -11,16 +11,15 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from struct import Struct
 
 from drivers.cia402 import (
-    LAYOUTS,
-    MODE,
     MODE_DISPLAY,
     STATUSWORD,
     TORQUE_DEMAND,
+    CyclicLayout,
     CyclicObjects,
-    bits_of,
+    Mapped,
+    angle_object,
     cyclic_objects,
 )
 from profiles import CYCLES_END, LAST_CYCLE_OVER
@@ -39,18 +38,7 @@ from profiles.canopen import CanopenProfile, Position
 # ‰ is of the rated torque (6076h); the velocity's LSB is the profile's. `FrameShape` holds the differences of a drive.
 
 
-RPDO1 = Struct("<Hhi")
-TPDO1 = Struct("<Hhi")
-RPDO2 = Struct("<b")
-RPDO2_OFFSET = Struct("<h")
-RPDO2_MODE_OFFSET = Struct("<bh")
 PDO_BYTES = 8
-
-
-def mapping_entry(mapped: tuple[int, int, int]) -> int:
-    """Convert an object to the u32 of a PDO mapping parameter (CiA 301: index, subindex, length in bits)."""
-    index, subindex, bits = mapped
-    return index << 16 | subindex << 8 | bits
 
 
 def consumer_heartbeat(node: int, time_ms: int) -> int:
@@ -60,45 +48,30 @@ def consumer_heartbeat(node: int, time_ms: int) -> int:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-RPDO1_SPEED = Struct("<Hi")
-"""6040h controlword u16 | 60FFh target velocity i32."""
-
-RPDO1_VL = Struct("<Hh")
-"""6040h controlword u16 | 6042h vl target velocity i16."""
-
-_FEEDBACK = {"i16": TPDO1, "i32": Struct("<Hii"), "f32": Struct("<Hfi")}
-_FEEDBACK_VL = {"i16": Struct("<Hhh"), "i32": Struct("<Hih"), "f32": Struct("<Hfh")}
-
 
 @dataclass(frozen=True)
 class FrameShape(CyclicObjects):
     """Frames that a drive receives and sends: its cyclic objects, and how they are packed."""
-
-    feedback: Struct = TPDO1                           # statusword, torque, speed; wide: both TPDOs combined
 
     @property
     def wide(self) -> bool:
         """True for a torque of 32 bits: the statusword then comes in TPDO2."""
         return self.torque[2] == 32
 
-    def setpoints(self, word: int, torque_raw: int, speed_raw: int) -> bytes:
-        """Return the data of RPDO1."""
-        if self.target_torque:
-            return RPDO1.pack(word, torque_raw, speed_raw)
-        if self.vl:
-            return RPDO1_VL.pack(word, speed_raw)
-        return RPDO1_SPEED.pack(word, speed_raw)
+    @cached_property
+    def rpdo1(self) -> CyclicLayout:
+        """Layout of RPDO1; its values are the setpoints of a cycle."""
+        return CyclicLayout(self.targets, self.setpoints)
 
-    @property
-    def second(self) -> tuple[tuple[int, int, int], ...]:
-        """Objects in RPDO2; () if there is none."""
-        return (MODE,) * self.mode + (() if self.offset is None else (self.offset,))
+    @cached_property
+    def rpdo2(self) -> CyclicLayout:
+        """Layout of RPDO2; its values are the setpoints of a cycle."""
+        return CyclicLayout(self.mode_and_offset, self.setpoints)
 
-    def slow_setpoints(self, code: int, offset_raw: int) -> bytes:
-        """Return the data of RPDO2."""
-        if self.offset is None:
-            return RPDO2.pack(code)
-        return RPDO2_MODE_OFFSET.pack(code, offset_raw) if self.mode else RPDO2_OFFSET.pack(offset_raw)
+    @cached_property
+    def feedback(self) -> CyclicLayout:
+        """Layout of statusword, torque, speed; wide: of both TPDOs combined."""
+        return CyclicLayout(self.actual, self.actual, self.kinds())
 
     def data_size(self) -> int:
         """Return the length of TPDO1, bytes."""
@@ -124,11 +97,11 @@ class Slow:
         return whole if whole.size + 2 * shape.wide <= PDO_BYTES else cls(False, position, shape.wide)
 
     @property
-    def mapped(self) -> tuple[tuple[int, int, int], ...]:
+    def mapped(self) -> tuple[Mapped, ...]:
         """Index, subindex, bits of each object, the statusword among them."""
-        position = self.position
-        angle = () if position is None else ((position.index, position.sub, bits_of(position.type)),)
-        return (STATUSWORD,) * self.wide + (MODE_DISPLAY,) + (TORQUE_DEMAND,) * self.demand + angle
+        angle = angle_object(self.position)
+        carried = (STATUSWORD,) * self.wide + (MODE_DISPLAY,) + (TORQUE_DEMAND,) * self.demand
+        return carried if angle is None else (*carried, angle)
 
     @property
     def size(self) -> int:
@@ -136,17 +109,16 @@ class Slow:
         return self.layout.size
 
     @cached_property
-    def layout(self) -> Struct:
-        """Binary layout of mode display, demand and angle, if they are mapped."""
-        angle = "" if self.position is None else LAYOUTS[self.position.type].format.lstrip("<")
-        return Struct("<b" + "h" * self.demand + angle)
+    def layout(self) -> CyclicLayout:
+        """Layout of mode display, demand and angle, without the statusword of a wide shape."""
+        angle = angle_object(self.position)
+        kinds = {} if angle is None or self.position is None else {angle: self.position.type}
+        return CyclicLayout(self.mapped[self.wide :], (MODE_DISPLAY, TORQUE_DEMAND, angle), kinds)
 
     def unpack(self, data: bytes) -> tuple[int, int | None, float | None]:
         """Return mode display, demand, angle in counts; None for a value that is not carried."""
-        values = self.layout.unpack(data)
-        return (
-            values[0], values[1] if self.demand else None, None if self.position is None else float(values[-1]),
-        )
+        shown, demand, angle = self.layout.unpack(data)
+        return shown, demand, None if angle is None else float(angle)
 
 
 STANDARD = FrameShape()
@@ -154,9 +126,7 @@ STANDARD = FrameShape()
 
 def shape_of(profile: CanopenProfile) -> FrameShape:
     """Return the frame shape that the profile describes."""
-    content, actual = cyclic_objects(profile), profile.torque.actual
-    feedback = (_FEEDBACK_VL if content.vl else _FEEDBACK)["i16" if actual is None else actual.type]
-    return FrameShape(content.target_torque, content.mode, content.torque, content.vl, feedback=feedback)
+    return FrameShape(**vars(cyclic_objects(profile)))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

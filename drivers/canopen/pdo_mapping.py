@@ -7,8 +7,8 @@ enable.
 
 from dataclasses import dataclass
 
-from drivers.canopen.pdo import STANDARD, FrameShape, Slow, mapping_entry
-from drivers.cia402 import CONTROLWORD, STATUSWORD, TARGET_TORQUE, Objects, name
+from drivers.canopen.pdo import STANDARD, FrameShape, Slow
+from drivers.cia402 import Mapped, Objects, mapping_entry, name, read_entries, write_entries
 from drivers.errors import PreflightRefused
 from profiles import MessageCode
 
@@ -29,7 +29,7 @@ class PdoMapping:
     receive: bool                  # True for an RPDO, which the drive receives
     number: int
     sync_type: int
-    mapped: tuple[tuple[int, int, int], ...]
+    mapped: tuple[Mapped, ...]
 
     @property
     def communication(self) -> int:
@@ -52,12 +52,11 @@ def slow_syncs(period_s: float) -> int:
 
 
 def layout(carried: Slow, shape: FrameShape = STANDARD, slow: int = SLOW_SYNCS) -> tuple[PdoMapping, ...]:
-    """Return RPDO1, TPDO1, RPDO2 (`FrameShape.second`), TPDO2 with the ``carried`` objects; ``slow``: `slow_syncs`."""
-    targets = (TARGET_TORQUE, shape.target_speed) if shape.target_torque else (shape.target_speed,)
-    first = (STATUSWORD,) * (not shape.wide) + (shape.torque, shape.actual_speed)
-    modes = (PdoMapping(True, 2, 1, shape.second),) if shape.second else ()
+    """Return RPDO1, TPDO1, RPDO2 (`mode_and_offset`), TPDO2 with the ``carried`` objects; ``slow``: `slow_syncs`."""
+    feedback = shape.actual[shape.wide :]
+    modes = (PdoMapping(True, 2, 1, shape.mode_and_offset),) if shape.mode_and_offset else ()
     return (
-        PdoMapping(True, 1, 1, (CONTROLWORD, *targets)), PdoMapping(False, 1, 1, first), *modes,
+        PdoMapping(True, 1, 1, shape.targets), PdoMapping(False, 1, 1, feedback), *modes,
         PdoMapping(False, 2, 1 if shape.wide else slow, carried.mapped),
     )
 
@@ -74,10 +73,11 @@ def write_pdo(objects: Objects, node: int, pdo: PdoMapping) -> None:
     """
     identifier = pdo.identifier(node)
     wanted = [mapping_entry(mapped) for mapped in pdo.mapped]
-    former = (_entries(objects, pdo), objects.read(pdo.communication, 2), objects.read(pdo.communication, 1))
+    communication = pdo.communication
+    former = read_entries(objects, pdo.mapping), objects.read(communication, 2), objects.read(communication, 1)
     objects.on_restore(lambda: _write(objects, pdo, *former))
     _write(objects, pdo, wanted, pdo.sync_type, identifier)
-    found = _entries(objects, pdo)
+    found = read_entries(objects, pdo.mapping)
     if found != wanted:
         raise PreflightRefused(
             f"the PDO mapping reads back as {[f'{entry:08X}h' for entry in found]}",
@@ -121,17 +121,9 @@ def switch_off_others(objects: Objects, ours: tuple[PdoMapping, ...]) -> dict[in
     return found
 
 
-def _entries(objects: Objects, pdo: PdoMapping) -> list[int]:
-    """Return the mapped entries; entries beyond the count are ignored."""
-    return [objects.read(pdo.mapping, 1 + k) for k in range(objects.read(pdo.mapping, 0))]
-
-
 def _write(objects: Objects, pdo: PdoMapping, entries: list[int], sync_type: int, cob_id: int) -> None:
     objects.write(pdo.communication, 1, DISABLED | cob_id, 32)
-    objects.write(pdo.mapping, 0, 0, 8)
-    for position, entry in enumerate(entries, start=1):
-        objects.write(pdo.mapping, position, entry, 32)
-    objects.write(pdo.mapping, 0, len(entries), 8)
+    write_entries(objects, pdo.mapping, entries)
     objects.write(pdo.communication, 2, sync_type, 8)
     if not cob_id & DISABLED:
         objects.write(pdo.communication, 1, cob_id, 32)

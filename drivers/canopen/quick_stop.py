@@ -11,13 +11,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from drivers.canopen.bus import CanLink
-from drivers.canopen.pdo import mapping_entry
 from drivers.canopen.pdo_mapping import DISABLED
 from drivers.canopen.sdo import SdoObjects
-from drivers.cia402 import Cia402Target, name
+from drivers.cia402 import CONTROLWORD, Cia402Target, mapping_entry, name
 from drivers.clock import Clock
-from drivers.errors import DriveFault, ObjectRefused
-from profiles import MARKER_INDEX
+from drivers.errors import DriveFault
 from profiles.canopen import CanopenProfile
 
 if TYPE_CHECKING:
@@ -27,7 +25,6 @@ BY_SDO_TRIES, BY_RPDO_TRIES = 3, 6
 """Attempts by SDO alone, then attempts with a burst of RPDOs; after them the RPDO is switched off."""
 BURST, BURST_PAUSE_S = 200, 0.0005
 _RPDOS = 4
-_CONTROLWORD = 0x6040
 
 
 class CanopenTarget(Cia402Target):
@@ -55,15 +52,9 @@ class CanopenTarget(Cia402Target):
         """Handle frames for this wall time, s."""
         self._link.pump_until(lambda: False, time_s)
 
-    def keep_time(self) -> None:
-        """Let a simulated drive in stepped time advance by itself; otherwise it would never reach standstill."""
-        try:
-            stepped = self._objects.read_if_there(MARKER_INDEX, 2)
-            self._link.pump_until(lambda: self._syncs > 0, 0.2 if stepped else 0.0)
-            if stepped and not self._syncs:
-                self._objects.write(MARKER_INDEX, 2, 0, 8)
-        except ObjectRefused:
-            return
+    def stepped_by_another(self, stepped: bool) -> bool:
+        """Return whether another master sends SYNC, by which a drive in stepped time advances."""
+        return self._link.pump_until(lambda: self._syncs > 0, 0.2 if stepped else 0.0)
 
     def remarks(self) -> tuple[str, ...]:
         """Return remarks on another master, and on changes made in the drive."""
@@ -112,7 +103,7 @@ class CanopenTarget(Cia402Target):
             at, place = 0, None
             for sub in range(1, min(count, 8) + 1):
                 entry = self._objects.read(0x1600 + number, sub)
-                if entry == mapping_entry((_CONTROLWORD, 0, 16)):
+                if entry == mapping_entry(CONTROLWORD):
                     place = at
                 at += entry & 0xFF
             if place is not None and at % 8 == 0 and at <= 64:

@@ -1,144 +1,62 @@
-"""Reading and writing of objects by SDO, over `CanLink`.
-
-The SDO client of the canopen package does the transfers (CiA 301, SDO upload and download, expedited and segmented).
-Only its waiting is replaced: it takes frames off the link instead of sleeping on a queue that another thread fills.
-"""
+"""Reading and writing of objects by SDO, over `CanLink` (CiA 301)."""
 
 from __future__ import annotations
 
-import queue
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any
-
-import canopen
-from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
+from collections.abc import Callable
 
 from drivers.canopen.bus import CanLink
-from drivers.cia402 import Objects, name
-from drivers.errors import CommunicationLost, ObjectRefused
+from drivers.cia402 import SdoClient, is_answer
+from drivers.errors import CommunicationLost
 from profiles import MessageCode
 
-
-class _LinkNetwork(canopen.Network):  # type: ignore[misc]
-    """A canopen network without a bus of its own: it transmits through the link."""
-
-    def __init__(self, link: CanLink) -> None:
-        super().__init__()
-        self._link = link
-
-    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        self._link.send(can_id, bytes(data))
+ANSWER_S, TRIES = 0.5, 3
+"""Waiting time for an answer at standstill, s, and number of attempts."""
+TIMED_OUT = bytes((0x80, 0, 0, 0)) + (0x05040000).to_bytes(4, "little")
+"""Abort of a transfer whose answer is missing."""
 
 
-_ANSWERS = {0: 1, 1: 3, 2: 2, 3: 0}
-"""Command specifier of the request → that of its response (CiA 301): segment and initiate, download and upload."""
-_INITIATE = (1, 2)
-_ABORT = 0x80
-
-
-def is_answer(request: bytes, response: bytes) -> bool:
-    """Return whether the frame answers the request. Late answers and answers to other clients do not."""
-    if len(response) != 8:
-        return False
-    command = request[0] >> 5
-    same_object = response[1:4] == request[1:4]
-    if response[0] == _ABORT:
-        return same_object or command not in _INITIATE
-    return response[0] >> 5 == _ANSWERS.get(command) and (same_object or command not in _INITIATE)
-
-
-class _PumpingClient(SdoClient):  # type: ignore[misc]
-    """SDO client that takes frames off the link while it waits for a response."""
-
-    RESPONSE_TIMEOUT = 0.5
-    MAX_RETRIES = 3
-
-    def __init__(self, link: CanLink, node: int) -> None:
-        super().__init__(0x600 + node, 0x580 + node, canopen.ObjectDictionary())
-        self.network = _LinkNetwork(link)
-        self._link = link
-        self._asked = bytes(8)
-        self._answers = 0              # number of answers to the current request
-        self.doubled = 0               # number of answers to requests that were already answered
-        self.aside: Callable[[bytes], None] = lambda data: None
-        link.handlers[self.tx_cobid] = self._take
-
-    def send_request(self, request: bytes) -> None:
-        self._link.drain()  # frames in the buffer answer an older request
-        self.responses: queue.Queue[bytes] = queue.Queue()
-        self._asked = bytes(request)
-        self._answers = 0
-        super().send_request(request)
-
-    def _take(self, data: bytes) -> None:
-        self.aside(data)
-        if is_answer(self._asked, data):
-            self._answers += 1
-            self.doubled += self._answers > 1
-            self.responses.put(data)
-
-    def read_response(self) -> Any:
-        self._link.await_answer(lambda: not self.responses.empty(), self.RESPONSE_TIMEOUT)
-        if self.responses.empty():
-            raise SdoCommunicationError("No SDO response received")
-        return super().read_response()
-
-
-class SdoObjects(Objects):
+class SdoObjects(SdoClient):
     """The object dictionary of one node, by SDO.
 
     Raises ObjectRefused when the drive aborts a transfer and CommunicationLost when it doesn't answer.
     """
 
     def __init__(self, link: CanLink, node: int) -> None:
-        super().__init__()
-        self._client = _PumpingClient(link, node)
+        super().__init__(ANSWER_S, (TRIES, TRIES), normal=False)
+        self._link = link
         self._node = node
+        self._asked = bytes(8)
+        self._answer: bytes | None = None      # first answer to the current request
+        self.doubled = 0               # number of answers to requests that were already answered
+        self._aside: Callable[[bytes], None] = lambda data: None
+        link.handlers[0x580 + node] = self._take
 
     def on_answer(self, take: Callable[[bytes], None]) -> None:
         """Register ``take``, which is called with every SDO answer of the drive, including answers to other clients."""
-        self._client.aside = take
+        self._aside = take
 
-    @property
-    def doubled(self) -> int:
-        """Number of requests that were answered twice."""
-        return self._client.doubled
-
-    @contextmanager
-    def answered_within(self, answer_s: float) -> Iterator[None]:
-        """Send each request once and wait at most ``answer_s`` of wall time: a shaft may be turning meanwhile."""
-        client = self._client
-        usual = client.RESPONSE_TIMEOUT, client.MAX_RETRIES
-        client.RESPONSE_TIMEOUT, client.MAX_RETRIES = answer_s, 1
-        try:
-            yield
-        finally:
-            client.RESPONSE_TIMEOUT, client.MAX_RETRIES = usual
-
-    def read_bytes(self, index: int, subindex: int = 0) -> bytes:
-        try:
-            return bytes(self._client.upload(index, subindex))
-        except SdoAbortedError as error:
-            raise ObjectRefused(f"the drive refused the read request: {error}", where=name(index, subindex)) from error
-        except SdoCommunicationError as error:
-            raise self._silent(index, subindex) from error
-
-    def write_bytes(self, index: int, subindex: int, data: bytes, shown: str = "") -> None:
-        """Write raw bytes. ``shown`` is the value for messages."""
-        try:
-            self._client.download(index, subindex, data)
-        except SdoAbortedError as error:
-            raise ObjectRefused(
-                f"the drive refused the value {shown or data.hex(' ')}: {error}", where=name(index, subindex)
-            ) from error
-        except SdoCommunicationError as error:
-            raise self._silent(index, subindex) from error
-
-    def _silent(self, index: int, subindex: int) -> CommunicationLost:
-        return CommunicationLost(
+    def call(self, request: bytes, where: str, answer_s: float, tries: int) -> bytes:
+        """Send a request and take frames off the link until it is answered."""
+        for _ in range(tries):
+            self._send(request)
+            self._link.await_answer(lambda: self._answer is not None, answer_s)
+            if self._answer is not None:
+                return self._answer
+        self._send(TIMED_OUT)
+        raise CommunicationLost(
             f"node {self._node} does not answer SDO requests",
-            where=name(index, subindex),
+            where=where,
             next_step="Check that the drive is powered, its node-ID and bit rate, the cable and its termination",
             entry=MessageCode.NODE_SILENT,
         )
+
+    def _send(self, request: bytes) -> None:
+        self._link.drain()  # frames in the buffer answer an older request
+        self._asked, self._answer = request, None
+        self._link.send(0x600 + self._node, request)
+
+    def _take(self, data: bytes) -> None:
+        self._aside(data)
+        if is_answer(self._asked, data):
+            self.doubled += self._answer is not None
+            self._answer = self._answer or data

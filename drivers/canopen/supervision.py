@@ -6,9 +6,9 @@ from collections import Counter, deque
 from collections.abc import Callable
 
 from drivers.canopen.bus import CanLink
-from drivers.cia402 import HOST_SILENT, DriveWatch, emcy_text
+from drivers.cia402 import DriveWatch
 from drivers.clock import Clock
-from drivers.errors import CommunicationLost, DriveFault
+from drivers.errors import CommunicationLost
 from profiles import MessageCode
 from profiles.canopen import CanopenProfile
 
@@ -30,30 +30,22 @@ host's heartbeat). The time between the frames does not matter: CAN's checksum e
 START_GRACE_S = 0.5
 """Time after the start of the node, s, in which a heartbeat may still report pre-operational: it was in transit."""
 
-HOST_LOST = 0x8130
-"""EMCY of a drive that lost its host: life guard error or heartbeat error (CiA 301)."""
-
 
 class NodeWatch(DriveWatch):
-    """Supervision of one node. ``allowed_silence_s`` is the longest time without a heartbeat (0 = not supervised).
+    """Supervision of one node. Its sign of life is its heartbeat.
 
     With node guarding, `Guarding` passes the answers on as if they were heartbeats.
     """
 
     def __init__(self, node: int, clock: Clock) -> None:
-        super().__init__(f"node {node}")
+        super().__init__(f"node {node}", clock)
         self._node = node
-        self._clock = clock
-        self._heard_s: float | None = None
         self._foreign_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
         self.foreign: Counter[str] = Counter()     # foreign frames since the start, by kind
         self._contradicted_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
         self._started_s = 0.0
         self._operational = False
-        self.allowed_silence_s = 0.0
-        self.emcy_code = 0
         self.nmt_state: int | None = None      # latest state that the drive reported; None before
-        self.on_boot_up: Callable[[], None] = lambda: None
         self.sign_of_life: Callable[[], tuple[str, str]] = lambda: ("heartbeat has been missing", "1017h")
 
     def on_heartbeat(self, data: bytes) -> None:
@@ -61,61 +53,16 @@ class NodeWatch(DriveWatch):
         if not data:
             return
         state = data[0] & 0x7F
-        self._heard_s = self._clock.now_s()
+        self.heard()
         self.nmt_state = state
         if state == BOOT_UP:
-            self.on_boot_up()
-        if not self.expect_operational:
+            self.restarted(" (boot-up message)")
+        elif not self.expect_operational:
             return
-        if state == BOOT_UP:
-            self.keep(
-                "boot-up",
-                DriveFault(
-                    "the drive restarted during the run (boot-up message)",
-                    where=f"node {self._node}",
-                    next_step="tdhil does not enable it again. Find the cause of the restart, then start again",
-                    entry=MessageCode.DRIVE_RESTARTED,
-                ),
-            )
         elif state == OPERATIONAL:
             self._operational = True
         elif self._operational or self._clock.now_s() - self._started_s > START_GRACE_S:
-            self.keep(
-                "nmt",
-                CommunicationLost(
-                    f"another master put the drive into NMT state {_NMT_NAMES.get(state, state)}",
-                    where=f"node {self._node}",
-                    next_step="Disconnect the second master from the bus, and start again",
-                    entry=MessageCode.FOREIGN_MASTER,
-                ),
-            )
-
-    def on_emcy(self, data: bytes) -> None:
-        """Handle 080h + node: error code u16, error register u8, manufacturer's bytes; code 0 = no error left."""
-        if len(data) < 2:
-            return
-        code = int.from_bytes(data[:2], "little")
-        self.emcy_code = code
-        if code == HOST_LOST and self.expect_operational:
-            self.keep(
-                HOST_SILENT,
-                CommunicationLost(
-                    f"the drive's watchdog has tripped: {emcy_text(code)}",
-                    where=f"host or bus, reported by node {self._node}",
-                    next_step="This host was silent for too long (frozen, asleep, overloaded) or its frames were lost",
-                    entry=MessageCode.WATCHDOG_ACTED,
-                ),
-            )
-        elif code and self.expect_operational:
-            extra = data[3:].hex(" ")
-            self.keep(
-                "emcy",
-                DriveFault(
-                    emcy_text(code) + (f" (manufacturer's bytes {extra})" if any(data[3:]) else ""),
-                    where=f"node {self._node}",
-                    next_step="See the drive's fault list, remove the cause, then start with --reset-fault",
-                ),
-            )
+            self.taken_out(f"NMT state {_NMT_NAMES.get(state, state)}")
 
     def on_foreign(self, kind: str, why: str = "") -> None:
         """Handle a frame of a kind that only this host sends: another master drives this drive, or is about to.
@@ -148,45 +95,17 @@ class NodeWatch(DriveWatch):
                 ),
             )
 
-    def check(self) -> None:
-        """Raise the oldest error that was not raised yet."""
-        if self.overdue and self._heard_s is not None:
-            missing, where = self.sign_of_life()
-            self.keep(
-                "heartbeat",
-                CommunicationLost(
-                    f"the drive's {missing} for {self._clock.now_s() - self._heard_s:.2f} s",
-                    where=f"node {self._node}, {where}",
-                    next_step="Check the drive's supply and the bus. The drive's own watchdog stops the shaft",
-                    entry=MessageCode.FEEDBACK_LOST,
-                ),
-            )
-        if self._troubles:
-            super().check()
-
-    @property
-    def quiet(self) -> bool:
-        """True if `check` has nothing to raise."""
-        return not (self._troubles or self.overdue)
-
-    @property
-    def overdue(self) -> bool:
-        """True if the drive's heartbeat has been missing for too long, in the frames read so far."""
-        silent_s = 0.0 if self._heard_s is None else self._clock.now_s() - self._heard_s
-        return 0.0 < self.allowed_silence_s < silent_s
+    def silence(self) -> tuple[str, str, str]:
+        """Return what is missing: the heartbeat, or the answers to node guarding."""
+        missing, where = self.sign_of_life()
+        return f"the drive's {missing}", f"{self.place}, {where}", "Check the drive's supply and the bus"
 
     def start(self, allowed_silence_s: float) -> None:
         """Treat silence, boot-up, EMCY and foreign NMT commands as errors from now on."""
-        self._heard_s = self._started_s = self._clock.now_s()
+        self._started_s = self._clock.now_s()
         self._operational = False
         self.foreign.clear()
-        self.allowed_silence_s = allowed_silence_s
         super().start(allowed_silence_s)
-
-    def stop(self) -> None:
-        """End the supervision."""
-        super().stop()
-        self.allowed_silence_s = 0.0
 
     def _no_accident(self, seen_s: deque[float]) -> bool:
         """Count one more event. Return whether `FOREIGN_FRAMES` came within `FOREIGN_S`."""

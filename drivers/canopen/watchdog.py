@@ -7,7 +7,7 @@ from contextlib import suppress
 
 from drivers.canopen.pdo import FrameShape, Slow, consumer_heartbeat
 from drivers.canopen.pdo_mapping import layout, slow_syncs, switch_off_others, write_pdo, written
-from drivers.cia402 import ANSWER_S, FeedbackSetting, Objects, arm, name
+from drivers.cia402 import ANSWER_S, FeedbackSetting, Objects, arm, name, note_period, with_angle
 from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.preflight import DIES, PreflightTable
 from profiles import MARKER_INDEX, MessageCode
@@ -28,23 +28,18 @@ def map_pdos(
     carried = Slow.fitting(demand, position, shape)
     *pdos, slow = layout(carried, shape, slow_syncs(period_s))
     others: dict[int, int] = {}
-    taken: list[Slow] = []             # accepted by the drive
+
+    def write_slow(angle: Position | None) -> Slow:
+        found = carried if angle == carried.position else Slow(demand, None, shape.wide)
+        write_pdo(objects, node, layout(found, shape, slow_syncs(period_s))[-1])
+        return found
 
     def work() -> tuple[str, bool]:
+        nonlocal carried
         for pdo in pdos:
             write_pdo(objects, node, pdo)
-        try:
-            write_pdo(objects, node, slow)
-        except PreflightRefused as error:
-            if carried.position is None:
-                raise
-            less = Slow(demand, None, shape.wide)
-            write_pdo(objects, node, layout(less, shape, slow_syncs(period_s))[-1])
-            table.note("angle in the cycle", f"not mapped ({error.what}); it is read on request only", error.where)
-            taken.append(less)
-            return "as wanted, without the angle", True
-        taken.append(carried)
-        return "as wanted", True
+        carried, done = with_angle(table, carried.position, write_slow)
+        return done, True
 
     table.attempt("PDO mapping", ", ".join(map(written, (*pdos, slow))), "1600h, 1A00h", work)
     try:
@@ -54,7 +49,7 @@ def map_pdos(
     if others:
         on = ", ".join(f"RPDO{number} ({cob_id & 0x7FF:X}h)" for number, cob_id in others.items())
         table.row("other RPDOs", "off", f"off (were on: {on})", True, "1400h and on")
-    return taken[0] if taken else carried, others
+    return carried, others
 
 
 def set_period(objects: Objects, profile: CanopenProfile, period_s: float) -> int:
@@ -98,14 +93,10 @@ def set_timing(
     """Set cycle period 1006h, stepped time of a simulated peer, heartbeat 1017h. Return whether there is a
     heartbeat.
     """
-    period_us = round(period_s * 1e6)
-    try:
-        back = set_period(objects, profile, period_s)
-        table.row("cycle", f"{period_us} µs", f"{back} µs", back == period_us, "1006h")
-    except ObjectRefused:
-        table.note("cycle", f"{period_us} µs; the drive has no 1006h and follows SYNC only", "1006h")
+    note_period(table, period_s, "1006h", lambda: set_period(objects, profile, period_s), "SYNC only")
     if stepped:
         if not profile.cyclic.has_period:
+            period_us = round(period_s * 1e6)
             back = objects.change(MARKER_INDEX, 3, period_us, 32)
             table.row("simulator's cycle", f"{period_us} µs", f"{back} µs", back == period_us, name(MARKER_INDEX, 3))
         on = objects.change(MARKER_INDEX, 2, 1, 8)

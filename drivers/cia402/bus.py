@@ -1,7 +1,7 @@
 """The contract between a CiA 402 drive and the bus that carries it.
 
 A bus carries two things: objects (read and written one by one), and one cyclic frame in each direction. It also lets
-the drive supervise the host. `drivers.cia402.drive` does everything else with these. A new bus fills in the twelve
+the drive supervise the host. `drivers.cia402.drive` does everything else with these. A new bus fills in the eleven
 abstract methods of `Cia402Bus`; the other methods have a default for a bus on which nothing else can happen::
 
     take → map_cyclic → arm → start → (listen_until → begin → send → receive) … → release → close
@@ -13,6 +13,7 @@ bus treats them like any other mode.
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -20,6 +21,7 @@ from typing import NamedTuple
 
 from drivers.cia402.objects import Objects
 from drivers.cia402.process_data import CyclicObjects, Reported
+from drivers.cia402.state_machine import ENABLE_OPERATION
 from drivers.cia402.supervision import DriveWatch, Group
 from drivers.clock import Clock, Ticks
 from drivers.drive import DriveLimits, Identity
@@ -37,6 +39,15 @@ class CycleSetpoints(NamedTuple):
     mode: int                      # 6060h
     offset: int                    # torque offset, if mapped
     mode_changes: bool
+
+    @property
+    def enables(self) -> bool:
+        """True if the controlword enables the operation."""
+        return self.word & ENABLE_OPERATION == ENABLE_OPERATION
+
+    def stopped(self, word: int) -> CycleSetpoints:
+        """Return setpoints with this controlword, and torque, speed and torque offset of zero; the mode stays."""
+        return self._replace(word=word, torque=0, speed=0, offset=0)
 
 
 class CycleInputs(NamedTuple):
@@ -64,6 +75,8 @@ class Traffic(NamedTuple):
     wall_jumps: int = 0
 
 
+PAUSE_S = 0.01
+"""Wall time between two objects for a drive that needs it, s."""
 FeedbackSetting = tuple[str, int, int, bytes]
 """Object that defines content or timing of the feedback: title, index, sub-index, required bytes."""
 
@@ -145,12 +158,13 @@ class Cia402Bus(ABC):
     def listen_until(self, tick_s: float) -> None:
         """Wait until this control time, s, and handle incoming frames meanwhile."""
 
-    @abstractmethod
     def begin(self, try_again: bool) -> float:
         """Begin a cycle: raise the errors so far, and feed the watchdog if it is due. Return the control time, s.
 
-        ``try_again``: transmit even after an error of the bus.
+        ``try_again``: transmit even after an error of the bus. By default the setpoints themselves feed the watchdog.
         """
+        self.check()
+        return self.clock.now_s()
 
     @abstractmethod
     def send(self, setpoints: CycleSetpoints) -> None:
@@ -206,7 +220,8 @@ class Cia402Bus(ABC):
 
     def pause(self) -> None:
         """Wait a short wall time for a drive that needs it between two objects."""
-        return
+        if not self.clock.stepped:
+            time.sleep(PAUSE_S)
 
     def reach(self) -> None:
         """Put a drive that left operation into a state in which its objects can be read, and feed its watchdog."""
@@ -239,7 +254,10 @@ class Cia402Bus(ABC):
     # -- afterwards ------------------------------------------------------------------------------------------
 
     def release(self) -> None:
-        """Put the drive into the state in which it is configured, after it was disabled. Raises CommunicationLost."""
+        """Put the drive into the state in which it is configured, after it was disabled.
+
+        Raises CommunicationLost, or DriveFault if the drive refuses.
+        """
         self.take()
 
     @abstractmethod

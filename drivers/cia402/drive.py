@@ -57,7 +57,7 @@ from drivers.drive import (
     Preflight,
     Sample,
 )
-from drivers.errors import CommandRejected, CommunicationLost, PreflightRefused
+from drivers.errors import CommandRejected, CommunicationLost, DriveFault, PreflightRefused
 from drivers.own_limits import OwnLimits
 from drivers.preflight import PreflightTable
 from drivers.undo_journal import UndoJournal
@@ -647,7 +647,7 @@ class Cia402Drive:
             if self._taken and disabled:
                 self._bus.release()
                 left = self._bus.objects.restore()
-        except CommunicationLost as error:
+        except (CommunicationLost, DriveFault) as error:
             left = (str(error),)
         finally:
             self._bus.close()

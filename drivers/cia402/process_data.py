@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from struct import Struct, error
 
 from drivers.cia402.state_machine import (
@@ -25,7 +25,7 @@ from drivers.cia402.state_machine import (
 )
 from drivers.drive import Mode, PowerState, Sample
 from drivers.errors import CommandRejected, ObjectRefused
-from profiles.cia402 import Cia402Profile, ObjectType
+from profiles.cia402 import Cia402Profile, ObjectType, Position
 
 RPM = 2.0 * math.pi / 60.0
 """rad/s in one rev/min."""
@@ -113,6 +113,7 @@ class CyclicObjects:
     torque: tuple[int, int, int] = TORQUE_ACTUAL       # index, subindex, bits of the reported torque
     vl: bool = False                                   # speed setpoint in 6042h, reported speed in 6044h
     offset: tuple[int, int, int] | None = None         # index, subindex, bits of a torque offset in use
+    torque_type: ObjectType = "i16"                    # data type of the reported torque
 
     @property
     def target_speed(self) -> tuple[int, int, int]:
@@ -124,12 +125,41 @@ class CyclicObjects:
         """Index, subindex, bits of the reported speed."""
         return VL_ACTUAL if self.vl else VELOCITY_ACTUAL
 
+    @property
+    def targets(self) -> tuple[tuple[int, int, int], ...]:
+        """Objects that each cycle must set: controlword, torque, speed."""
+        return (CONTROLWORD, *(TARGET_TORQUE,) * self.target_torque, self.target_speed)
+
+    @property
+    def mode_and_offset(self) -> tuple[tuple[int, int, int], ...]:
+        """Further setpoints of the cycle; () if there is none."""
+        return (MODE,) * self.mode + (() if self.offset is None else (self.offset,))
+
+    @property
+    def actual(self) -> tuple[tuple[int, int, int], ...]:
+        """Feedback of one instant: statusword, torque, speed."""
+        return STATUSWORD, self.torque, self.actual_speed
+
+    def kinds(self, position: Position | None = None) -> dict[tuple[int, int, int], ObjectType]:
+        """Return the data types of torque and angle, which their lengths do not show."""
+        known = {self.torque: self.torque_type}
+        if position is not None:
+            known[position.index, position.sub, bits_of(position.type)] = position.type
+        return known
+
+    @property
+    def setpoints(self) -> tuple[tuple[int, int, int] | None, ...]:
+        """Objects of the setpoints, in the order of `drivers.cia402.bus.CycleSetpoints`; None: no torque offset."""
+        return CONTROLWORD, TARGET_TORQUE, self.target_speed, MODE, self.offset
+
 
 def cyclic_objects(profile: Cia402Profile) -> CyclicObjects:
     """Return the cyclic objects that the profile describes, without a torque offset."""
     actual = profile.torque.actual
-    torque = TORQUE_ACTUAL if actual is None else (actual.index, actual.sub, bits_of(actual.type))
-    return CyclicObjects(bool(profile.modes.torque), profile.modes.mapped, torque, profile.speed.vl)
+    content = CyclicObjects(bool(profile.modes.torque), profile.modes.mapped, vl=profile.speed.vl)
+    if actual is None:
+        return content
+    return replace(content, torque=(actual.index, actual.sub, bits_of(actual.type)), torque_type=actual.type)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ from drivers.drive import Identity, PowerRequest, PowerState
 from drivers.errors import DriveFault, ObjectRefused
 from drivers.preflight import PreflightTable
 from drivers.quick_stop import BLANK_WORDS, Seen
+from profiles import MARKER_INDEX
 from profiles.cia402 import Cia402Profile
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -154,8 +155,16 @@ class Cia402Target:
         """Wait between two objects, s."""
         self._clock.wait_until(self._clock.now_s() + time_s)
 
+    def stepped_by_another(self, stepped: bool) -> bool:
+        """Return whether another master's cycles advance a drive in stepped time."""
+        return False
+
     def keep_time(self) -> None:
         """Let a simulated drive in stepped time advance by itself; otherwise it would never reach standstill."""
+        with suppress(ObjectRefused):
+            stepped = bool(self._objects.read_if_there(MARKER_INDEX, 2))
+            if not self.stepped_by_another(stepped) and stepped:
+                self._objects.write(MARKER_INDEX, 2, 0, 8)
 
     def poll(self) -> Seen:
         """Read 6041h and 606Ch."""

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from enum import Enum
 
 from drivers.cia402.objects import name
-from drivers.clock import LOWER_THE_RATE
-from drivers.errors import CommunicationLost, TdhilError
+from drivers.clock import LOWER_THE_RATE, Clock
+from drivers.errors import CommunicationLost, DriveFault, TdhilError
 from profiles import MessageCode
 
 HOST_SILENT = "host silent"
@@ -24,6 +24,8 @@ OF_A_SILENT_HOST = ("heartbeat", "nmt", *OF_A_LATE_HOST)
 
 MOST_REMARKS = 20
 """Largest number of different remarks in one run."""
+HOST_LOST = 0x8130
+"""Error code of a drive that lost its host: life guard error or heartbeat error (CiA 301)."""
 
 # EMCY error code classes (CiA 301) and the CiA 402 codes a field engineer meets first.
 _EMCY_CLASSES = {
@@ -62,10 +64,18 @@ def emcy_text(code: int) -> str:
 
 
 class DriveWatch:
-    """Errors of one drive during a run, and remarks. ``place``: name of the drive on its bus."""
+    """Errors of one drive during a run, and remarks. ``place``: name of the drive on its bus.
 
-    def __init__(self, place: str) -> None:
+    ``allowed_silence_s`` is the longest time without a sign of life (`heard`), s; 0: not supervised.
+    """
+
+    def __init__(self, place: str, clock: Clock) -> None:
         self.place = place
+        self._clock = clock
+        self._heard_s: float | None = None
+        self.allowed_silence_s = 0.0
+        self.emcy_code = 0             # latest error code that the drive reported; 0: no error
+        self.on_restart: Callable[[], None] = lambda: None
         self._troubles: list[tuple[str, TdhilError]] = []
         self._raised: set[str] = set()
         self._told: list[str] = []
@@ -79,19 +89,45 @@ class DriveWatch:
 
     def start(self, allowed_silence_s: float) -> None:
         """Treat what happens to the drive as errors from now on. ``allowed_silence_s``: 0 = not supervised."""
+        self.heard()
+        self.allowed_silence_s = allowed_silence_s
         self.expect_operational = True
 
     def stop(self) -> None:
         """End the supervision."""
         self.expect_operational = False
+        self.allowed_silence_s = 0.0
+
+    def heard(self) -> None:
+        """Record a sign of life of the drive."""
+        self._heard_s = self._clock.now_s()
+
+    @property
+    def overdue(self) -> bool:
+        """True if the drive's sign of life has been missing for too long, in the frames read so far."""
+        return 0.0 < self.allowed_silence_s < self._silent_s
+
+    @property
+    def _silent_s(self) -> float:
+        return 0.0 if self._heard_s is None else self._clock.now_s() - self._heard_s
+
+    def silence(self) -> tuple[str, str, str]:
+        """Return what is missing, where, and what to check. A bus with another sign of life overrides this."""
+        return "the drive has been silent", self.place, "Check the drive's supply and the bus"
 
     @property
     def quiet(self) -> bool:
         """True if `check` has nothing to raise."""
-        return not self._troubles
+        return not (self._troubles or self.overdue)
 
     def check(self) -> None:
         """Raise the oldest error that was not raised yet."""
+        if self.overdue:
+            what, where, look = self.silence()
+            self.keep("heartbeat", CommunicationLost(
+                f"{what} for {self._silent_s:.2f} s", where=where,
+                next_step=f"{look}. The drive's own watchdog stops the shaft", entry=MessageCode.FEEDBACK_LOST,
+            ))
         if self._troubles:
             kind, trouble = self._troubles.pop(0)
             raise self._of_host(kind, trouble) if kind in OF_A_SILENT_HOST else trouble
@@ -99,6 +135,47 @@ class DriveWatch:
     def interference(self, what: str, where: str, next_step: str, *, kind: str) -> None:
         """Record that another master changes or drives this drive; `check` raises it once for each ``kind``."""
         self.keep(kind, CommunicationLost(what, where=where, next_step=next_step))
+
+    def on_emcy(self, data: bytes) -> None:
+        """Handle an emergency message (CiA 301): error code u16, error register u8, manufacturer's bytes; code 0 = no
+        error left.
+        """
+        if len(data) < 2:
+            return
+        code = self.emcy_code = int.from_bytes(data[:2], "little")
+        if code == HOST_LOST and self.expect_operational:
+            self.watchdog_acted(emcy_text(code))
+        elif code and self.expect_operational:
+            extra = f" (manufacturer's bytes {data[3:].hex(' ')})" if any(data[3:]) else ""
+            self.keep("emcy", DriveFault(
+                emcy_text(code) + extra, where=self.place,
+                next_step="See the drive's fault list, remove the cause, then start with --reset-fault",
+            ))
+
+    def watchdog_acted(self, reported: str) -> None:
+        """Record that the drive reports the end of its watchdog's time."""
+        self.keep(HOST_SILENT, CommunicationLost(
+            f"the drive's watchdog has tripped: {reported}", where=f"host or bus, reported by {self.place}",
+            next_step="This host was silent for too long (frozen, asleep, overloaded) or its frames were lost",
+            entry=MessageCode.WATCHDOG_ACTED,
+        ))
+
+    def restarted(self, shown_by: str) -> None:
+        """Record that the drive has started again; ``shown_by``: the sign of it, in words."""
+        self.on_restart()
+        if self.expect_operational:
+            self.keep("boot-up", DriveFault(
+                f"the drive restarted during the run{shown_by}", where=self.place,
+                next_step="tdhil does not enable it again. Find the cause of the restart, then start again",
+                entry=MessageCode.DRIVE_RESTARTED,
+            ))
+
+    def taken_out(self, state: str) -> None:
+        """Record that another master took the drive out of operation; ``state``: the state that it shows."""
+        self.keep("nmt", CommunicationLost(
+            f"another master put the drive into {state}", where=self.place,
+            next_step="Disconnect the second master from the bus, and start again", entry=MessageCode.FOREIGN_MASTER,
+        ))
 
     def thin_feedback(self, missed: int, cycles: int, period_s: float, where: str) -> None:
         """Record that ``missed`` of the last cycles brought no feedback."""

@@ -11,14 +11,14 @@ if TYPE_CHECKING:
         FoundSlave as FoundSlave, found_slave as found_slave, objects_of as objects_of, stations_at as stations_at,
     )
     from drivers.ethercat.segment import EthercatSegment as EthercatSegment, open_segment as open_segment
-    from drivers.ethercat.station import (
-        Station as Station, has_clocks as has_clocks, station_of as station_of, watchdog_s as watchdog_s,
-    )
+    from drivers.ethercat.station import Station as Station, has_clocks as has_clocks, station_of as station_of
+    from drivers.ethercat.supervision import watchdog_s as watchdog_s
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "drive": "EthercatDrive",
         "quick_stop": "EthercatTarget open_target",
         "scan": "FoundSlave found_slave objects_of stations_at",
         "segment": "EthercatSegment open_segment",
-        "station": "Station has_clocks station_of watchdog_s",
+        "station": "Station has_clocks station_of",
+        "supervision": "watchdog_s",
     })

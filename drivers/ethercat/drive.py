@@ -19,8 +19,8 @@ from drivers import cia402
 from drivers.clock import Clock
 from drivers.drive import DriveLimits, FrameTap, Identity, RawFrame
 from drivers.errors import CommunicationLost, DriveFault, ObjectRefused, PreflightRefused
-from drivers.ethercat.mailbox import CoeObjects, Mailbox, answered, download, upload
-from drivers.ethercat.pdo import FeedbackImage, Image, SetpointImage, map_images, settings
+from drivers.ethercat.mailbox import CoeObjects, Mailbox
+from drivers.ethercat.pdo import map_cyclic, settings
 from drivers.ethercat.segment import EthercatSegment
 from drivers.ethercat.station import CYCLE_US, INIT, OP, PRE_OP, REGISTER_US, SAFE_OP, has_clocks
 from drivers.ethercat.supervision import ProcessDataWatchdog, SlaveWatch
@@ -30,8 +30,6 @@ from profiles import MARKER_INDEX, MessageCode
 from profiles.cia402 import Position
 from profiles.ethercat import EthercatProfile
 
-INTERPOLATION = 0x60C2
-"""Period of the setpoints in the cyclic synchronous modes: value (u8), exponent of ten (i8), in s."""
 MAILBOX_S = 0.05
 """Interval between two queries of the mailbox for emergency messages, s."""
 STEPPED_ANSWER_US = 200_000
@@ -40,9 +38,8 @@ ANSWER_SHARE, CYCLE_SHARE = 0.5, 0.2
 """Longest wait for the frame of a cycle, and for the answer of a register, as shares of the period."""
 SYNC0_SHARE = 0.5
 """Distance of SYNC0 behind the frame, as a share of the period: as far from the frames as possible on both sides."""
-CLOCK_GAIN, CLOCK_STEP = 0.05, 0.01
-"""Share of the deviation from the segment's clock that one tick corrects, and its limit as a share of the period."""
-QUICK_STOP, ENABLE_OPERATION, FIRST_WORDS = 0x0002, 0x000F, 0x000F
+QUICK_STOP = 0x0002
+NO_SETPOINTS = cia402.CycleSetpoints(0, 0, 0, 0, 0, False)
 SETPOINTS, FEEDBACK = 2, 3
 """Identifiers of the process data in the log: the sync managers."""
 
@@ -59,19 +56,18 @@ class EthercatBus(cia402.Cia402Bus):
         tap: FrameTap | None = None,
     ) -> None:
         self._segment, self._station, self._profile, self._tap = segment, segment.station, profile, tap
-        self._mailbox = Mailbox(segment.station, clock, tap)
+        self._mailbox = Mailbox(segment.station, clock)
         self._slave_watch = SlaveWatch(segment.station.place, clock)
         super().__init__(CoeObjects(self._mailbox), self._slave_watch, clock, period_s)
         self.place = segment.station.place
         self._slave_watch.on_restart = self.reported.restarted
-        self._mailbox.on_emergency = self._slave_watch.on_emergency
+        self._mailbox.on_emergency = self._slave_watch.on_emcy
         self._mailbox.on_answer = self._on_answer
+        self._mailbox.on_message = self._seen
         self._watchdog = ProcessDataWatchdog(segment.station)
-        self._content = cia402.CyclicObjects()
-        self._images = (Image({}, 0), Image({}, 0))
-        self._setpoints = SetpointImage(self._images[0], self._content)
-        self._feedback: FeedbackImage | None = None         # None: nothing can be decoded
-        self._position: Position | None = None
+        self._setpoints = NO_SETPOINTS
+        self._outputs = cia402.CyclicLayout((), ())
+        self._inputs: cia402.CyclicLayout | None = None     # None: nothing can be decoded
         self._asked, self._looked_s, self._al_state = 0, 0.0, OP
         self._sent, self._fed, self._clocks = False, True, False
 
@@ -80,7 +76,8 @@ class EthercatBus(cia402.Cia402Bus):
     def take(self) -> None:
         """Put the slave into PRE-OP. Raises DriveFault if it refuses."""
         self._station.wait_us = REGISTER_US
-        self._stop_clock()
+        if self._clocks:
+            self._segment.slave.dc_sync(False, 0)
         self._station.reach(PRE_OP)
 
     def confirm(self, identity: Identity) -> None:
@@ -98,79 +95,49 @@ class EthercatBus(cia402.Cia402Bus):
         self, table: PreflightTable, content: cia402.CyclicObjects, demand: bool, position: Position | None
     ) -> Sequence[cia402.FeedbackSetting]:
         """Map and assign the PDOs, in PRE-OP."""
-        objects, profile = self.objects, self._profile
-        self._content = content
-        mapped: list[Position | None] = []
+        self._setpoints, self.angle_mapped = NO_SETPOINTS, False
 
         def work() -> tuple[str, bool]:
-            for angle in dict.fromkeys((position, None)):
-                try:
-                    self._images = map_images(objects, profile, content, demand, angle)
-                except PreflightRefused:
-                    if angle is None:
-                        raise
-                    continue
-                mapped.append(angle)
-                break
-            return "as wanted" if mapped[0] == position else "as wanted, without the angle", True
+            (self._outputs, inputs), done = cia402.with_angle(
+                table, position, lambda angle: map_cyclic(self.objects, self._profile, content, demand, angle))
+            angle, self._inputs = cia402.angle_object(position), inputs
+            self.angle_mapped = angle is not None and not inputs.missing([angle])
+            return done, True
 
-        table.attempt("PDO mapping", "setpoints and feedback", "1C12h, 1C13h", work)
-        carried = mapped[0] if mapped else None
-        place = None if carried is None else (carried.index, carried.sub)
-        self._position = carried if place in self._images[1].offsets else None
-        self.angle_mapped = self._position is not None
-        actual = profile.torque.actual
-        self._setpoints = SetpointImage(self._images[0], content)
-        kind = "i16" if actual is None else actual.type
-        self._feedback = FeedbackImage(self._images[1], content, self._position, kind)
-        return settings(objects, profile) if mapped else ()
+        mapped = table.attempt("PDO mapping", "setpoints and feedback", "1C12h, 1C13h", work)
+        return settings(self.objects, self._profile) if mapped else ()
 
     def arm(self, table: PreflightTable, limits: DriveLimits) -> float:
         """Set the period of the cycle, arm the watchdog of the process data and read it back."""
-        self._set_cycle(table)
-        return self._watchdog.arm(table, self.objects, self._profile, limits, self.period_s)
-
-    def _set_cycle(self, table: PreflightTable) -> None:
         objects, period_us = self.objects, round(self.period_s * 1e6)
         if self.clock.stepped:
             for title, sub, value, bits in (("simulator's cycle", 3, period_us, 32), ("stepped time", 2, 1, 8)):
                 back = objects.change(MARKER_INDEX, sub, value, bits)
                 table.row(title, str(value), str(back), back == value, cia402.name(MARKER_INDEX, sub))
-        try:
-            found = self._set_interpolation()
-            table.row("cycle", f"{period_us} µs", f"{found} µs", found == period_us, "60C2h")
-        except ObjectRefused:
-            table.note("cycle", f"{period_us} µs; the drive has no 60C2h and follows the frames", "60C2h")
-        self._clocks = (
-            not self.clock.stepped and self._profile.cyclic.distributed_clocks
-            and has_clocks(self._station)
-        )
+        cia402.note_period(table, self.period_s, "60C2h", self._set_interpolation, "the frames")
+        wanted = self._profile.cyclic.distributed_clocks and not self.clock.stepped
+        self._clocks = wanted and has_clocks(self._station)
         table.note("distributed clocks", "SYNC0 in the middle of the cycle" if self._clocks else "not used",
                    "register 0008h")
-
-    def _set_interpolation(self) -> int:
-        """Write 60C2h. Return the period read back, µs. Raises ObjectRefused."""
-        value, exponent = interpolation(self.period_s)
-        exponent = self.objects.change(INTERPOLATION, 2, exponent, 8)
-        value = self.objects.change(INTERPOLATION, 1, value, 8)
-        exponent -= 256 if exponent > 127 else 0
-        return round(value * 10.0 ** (exponent + 6))
+        return self._watchdog.arm(table, objects, self._profile, limits, self.period_s)
 
     def setting(self, index: int) -> tuple[str, cia402.Group] | None:
         """Return an empty title for the timing, which is not read back in motion."""
-        return ("", cia402.Group.REST) if index == INTERPOLATION else None
+        return ("", cia402.Group.REST) if index == cia402.INTERPOLATION else None
 
     def start(self) -> None:
         """Bring the slave to OP with setpoints of zero, and supervise it.
 
         Raises PreflightRefused if it does not get there.
         """
-        if self._feedback is None or not self._images[1].offsets:
+        if self._inputs is None:
             return                                     # the mapping was refused: nothing may move
-        self._setpoints.stop(0)
+        self._setpoints = self._setpoints.stopped(0)
         try:
-            self._segment.map(self._images[0].size, self._images[1].size)
-            self._start_clock()
+            self._segment.map(self._outputs.size, self._inputs.size)
+            if self._clocks:
+                self._segment.master.config_dc()
+                self._segment.slave.dc_sync(True, round(self.period_s * 1e9))
             self._station.reach(SAFE_OP)
             self._watchdog.check_trigger()
             self._station.reach(OP, self._frame)
@@ -191,14 +158,8 @@ class EthercatBus(cia402.Cia402Bus):
             self._set_interpolation()
         return ()
 
-    def _start_clock(self) -> None:
-        if self._clocks:
-            self._segment.master.config_dc()
-            self._segment.slave.dc_sync(True, round(self.period_s * 1e9))
-
-    def _stop_clock(self) -> None:
-        if self._clocks:
-            self._segment.slave.dc_sync(False, 0)
+    def _set_interpolation(self) -> int:
+        return cia402.set_interpolation(self.objects, self.period_s)
 
     # -- the cycle -------------------------------------------------------------------------------------------
 
@@ -208,19 +169,14 @@ class EthercatBus(cia402.Cia402Bus):
             time.sleep(self.period_s)
         self.clock.wait_until(tick_s)
 
-    def begin(self, try_again: bool) -> float:
-        """Raise the errors so far. The setpoints themselves feed the watchdog. Return the control time, s."""
-        self.check()
-        return self.clock.now_s()
-
     def send(self, setpoints: cia402.CycleSetpoints) -> None:
         """Send the process data. Outside of OP the drive ignores them: then the controlword is also sent by SDO, to
         stop.
         """
         self.ticks.check()
-        self._setpoints.pack(setpoints)
+        self._setpoints = setpoints
         self._transmit()
-        if self._al_state != OP and not self._asked and setpoints.word & FIRST_WORDS != ENABLE_OPERATION:
+        if self._al_state != OP and not self._asked and not setpoints.enables:
             self.put(0x6040, 0, setpoints.word.to_bytes(2, "little"))
 
     def receive(self, now_s: float, sync: bool) -> cia402.CycleInputs:
@@ -235,20 +191,21 @@ class EthercatBus(cia402.Cia402Bus):
                 self._transmit()
             data = self._take()
             if self._clocks and data is not None:
-                self._follow_clock(self._segment.master.dc_time)
+                periods = self._segment.master.dc_time / (self.period_s * 1e9)
+                self.ticks.follow(periods % 1.0 - SYNC0_SHARE)
         self._look(now_s)
         age_s = 0.0 if self.clock.stepped else self.clock.now_s() - now_s
-        if data is None or self._feedback is None or len(data) < self._feedback.size:
+        if data is None or self._inputs is None or len(data) < self._inputs.size:
             return cia402.CycleInputs(age_s)
         self._slave_watch.heard()
-        status, torque, speed, shown, demand, angle = self._feedback.unpack(data)
+        status, torque, speed, shown, demand, angle = self._inputs.unpack(data)
         self.reported.take_slow(now_s, shown, demand)
         return cia402.CycleInputs(age_s, True, False, status, torque, speed, angle)
 
     def _transmit(self) -> None:
-        data = bytes(self._setpoints.data)
+        data = self._outputs.pack(self._setpoints)
         self._segment.slave.output = data
-        self._seen(SETPOINTS, data)
+        self._seen(True, SETPOINTS, data)
         self._segment.master.send_processdata()
         self._sent = True
 
@@ -260,20 +217,14 @@ class EthercatBus(cia402.Cia402Bus):
         if master.receive_processdata(wait_us) != master.expected_wkc:
             return None
         data: bytes = self._segment.slave.input
-        self._seen(FEEDBACK, data)
+        self._seen(False, FEEDBACK, data)
         return data
-
-    def _follow_clock(self, dc_time_ns: int) -> None:
-        """Shift the next tick towards the middle between two SYNC0, which follow the segment's clock."""
-        period_ns = self.period_s * 1e9
-        behind = dc_time_ns / period_ns % 1.0 - SYNC0_SHARE
-        self.ticks.shift(-max(-CLOCK_STEP, min(CLOCK_STEP, CLOCK_GAIN * behind)) * self.period_s)
 
     def _from_memory(self) -> bytes | None:
         """Return the inputs without a frame that carries setpoints; None without an answer."""
         with suppress(CommunicationLost):
-            start, length = self._station.sync_manager(FEEDBACK)
-            if length == self._images[1].size:
+            start, length, _ = self._station.sync_manager(FEEDBACK)
+            if self._inputs is not None and length == self._inputs.size:
                 return self._station.read(start, length)
         return None
 
@@ -294,13 +245,13 @@ class EthercatBus(cia402.Cia402Bus):
         self._transmit()
         self._take()
 
-    def _seen(self, identifier: int, data: bytes) -> None:
+    def _seen(self, outgoing: bool, identifier: int, data: bytes) -> None:
         if self._tap is not None:
-            self._tap(RawFrame(self.clock.now_s(), identifier == SETPOINTS, identifier, data))
+            self._tap(RawFrame(self.clock.now_s(), outgoing, identifier, data))
 
     def feed(self) -> None:
         """Feed the watchdog: exchange the setpoints of the last cycle. In stepped time only a cycle does."""
-        if self._fed and self._feedback is not None and not self.clock.stepped:
+        if self._fed and self._inputs is not None and not self.clock.stepped:
             self._frame()
         else:
             self.feed_between()
@@ -325,40 +276,36 @@ class EthercatBus(cia402.Cia402Bus):
 
     def ask(self, index: int, sub: int) -> None:
         """Send a read request without waiting. A full mailbox counts as a missing answer."""
-        with suppress(CommunicationLost):
-            self._mailbox.post(upload(index, sub))
-            self._asked = round(MAILBOX_S / self.period_s) + 1
+        self._post(cia402.upload(index, sub))
 
     def put(self, index: int, sub: int, data: bytes) -> None:
         """Send a write request without waiting. The controlword is also set in the process data, which would overwrite
         it.
         """
         if (index, sub) == (0x6040, 0):
-            self._setpoints.stop(int.from_bytes(data, "little"))
+            self._setpoints = self._setpoints.stopped(int.from_bytes(data, "little"))
+        self._post(cia402.download(index, sub, data))
+
+    def _post(self, request: bytes) -> None:
         with suppress(CommunicationLost, ObjectRefused):
-            self._mailbox.post(download(index, sub, data))
+            self._mailbox.post(request)
             self._asked = round(MAILBOX_S / self.period_s) + 1
 
     def _on_answer(self, sdo: bytes) -> None:
-        found = answered(sdo)
+        found = cia402.uploaded(sdo)
         if found is not None:
             self._asked = 0
             self.on_answer(*found)
 
     def disable_setpoints(self) -> int:
         """Set the process data to quick stop and setpoints of zero, which they keep. No PDO is switched off."""
-        self._setpoints.stop(QUICK_STOP)
+        self._setpoints = self._setpoints.stopped(QUICK_STOP)
         return 0
-
-    def pause(self) -> None:
-        """Wait 10 ms of wall time for a drive that needs it between two objects."""
-        if not self.clock.stepped:
-            time.sleep(0.01)
 
     def reach(self) -> None:
         """Make the objects readable, and feed the watchdog without setpoints that drive the shaft."""
-        if self._setpoints.word & FIRST_WORDS == ENABLE_OPERATION:
-            self._setpoints.stop(QUICK_STOP)
+        if self._setpoints.enables:
+            self._setpoints = self._setpoints.stopped(QUICK_STOP)
         with suppress(CommunicationLost):
             if self._station.al_status().state == INIT:
                 self._station.ask_for(PRE_OP)
@@ -367,29 +314,13 @@ class EthercatBus(cia402.Cia402Bus):
     def changed(self, index: int, sub: int) -> None:
         """Ignore the feedback from now on if its mapping was changed: it cannot be decoded."""
         if index in (0x1C13, *self._profile.cyclic.tx_pdos):
-            self._feedback = None
+            self._inputs = None
 
     # -- afterwards ------------------------------------------------------------------------------------------
-
-    def release(self) -> None:
-        """Put the slave into PRE-OP, where its settings are restored. Raises CommunicationLost."""
-        try:
-            self.take()
-        except DriveFault as error:
-            raise CommunicationLost(error.what, where=error.where, next_step=error.next_step) from error
 
     def close(self) -> None:
         """Close the interface."""
         self._segment.close()
-
-
-def interpolation(period_s: float) -> tuple[int, int]:
-    """Return value and exponent of 60C2h for a period, s. Raises ObjectRefused if there is none."""
-    for exponent in (-3, -4, -5, -6):
-        value = period_s / 10.0**exponent
-        if 1 <= round(value) <= 0xFF and abs(value - round(value)) < 1e-6:
-            return round(value), exponent
-    raise ObjectRefused(f"{period_s * 1e6:g} µs can't be written", where="60C2h")
 
 
 class EthercatDrive(cia402.Cia402Drive):

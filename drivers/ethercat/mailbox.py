@@ -16,12 +16,11 @@ Source: ETG.1000.6, mailbox and CoE; CiA 301, SDO.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 
-from drivers.cia402 import Objects, name
+from drivers.cia402 import SdoClient, is_answer
 from drivers.clock import Clock
-from drivers.drive import FrameTap, RawFrame
 from drivers.errors import CommunicationLost, ObjectRefused
 from drivers.ethercat.station import SYNC_MANAGER_BYTES, SYNC_MANAGERS, Station, not_answered
 
@@ -31,48 +30,24 @@ ANSWER_S, TRIES = 0.7, 3
 """Waiting time for an answer at standstill, s, and number of attempts."""
 _PAUSE_S = 0.0005
 _FULL = 1 << 3
-_ABORT = 0x80
-_UPLOAD, _UPLOAD_SEGMENT, _UPLOADED, _SEGMENT_UPLOADED = 0x40, 0x60, 2, 0
-_ABORTS = {
-    0x06010000: "access not supported", 0x06010001: "write only", 0x06010002: "read only",
-    0x06020000: "the drive has no such object", 0x06040041: "can't be mapped", 0x06040042: "the PDO is too long",
-    0x06070010: "wrong length", 0x06090011: "the drive has no such sub-index", 0x06090030: "value out of range",
-    0x08000020: "can't be stored", 0x08000021: "local control", 0x08000022: "not in this state",
-}
-
-
-def upload(index: int, sub: int) -> bytes:
-    """Return the request to read an object."""
-    return bytes((_UPLOAD, index & 0xFF, index >> 8, sub, 0, 0, 0, 0))
-
-
-def download(index: int, sub: int, data: bytes) -> bytes:
-    """Return the request to write an object: expedited up to four bytes, else normal."""
-    place = bytes((index & 0xFF, index >> 8, sub))
-    if 0 < len(data) <= 4:
-        return bytes((0x23 | 4 - len(data) << 2,)) + place + data.ljust(4, b"\0")
-    return b"\x21" + place + len(data).to_bytes(4, "little") + data
-
-
-def abort_text(code: int) -> str:
-    """Return an abort code with its meaning (CiA 301)."""
-    return f"SDO abort {code:08X}h" + (f", {_ABORTS[code]}" if code in _ABORTS else "")
 
 
 class Mailbox:
-    """The mailbox of one slave. ``tap`` gets every message; its identifier is the number of the sync manager."""
+    """The mailbox of one slave."""
 
-    def __init__(self, station: Station, clock: Clock, tap: FrameTap | None = None) -> None:
-        self._station, self._clock, self._tap = station, clock, tap
+    def __init__(self, station: Station, clock: Clock) -> None:
+        self._station, self._clock = station, clock
         (self._out, self._out_size), (self._in, self._in_size) = (0, 0), (0, 0)
         self.on_emergency: Callable[[bytes], None] = lambda data: None
         """Called with the eight bytes of an emergency message."""
         self.on_answer: Callable[[bytes], None] = lambda sdo: None
         """Called with each SDO answer that no request waits for."""
+        self.on_message: Callable[[bool, int, bytes], None] = lambda outgoing, manager, message: None
+        """Called with each message and the number of its sync manager."""
 
     def find(self) -> None:
         """Read addresses and lengths of the two mailboxes. Raises CommunicationLost if the slave has none."""
-        (self._out, self._out_size), (self._in, self._in_size) = map(self._station.sync_manager, (0, 1))
+        (self._out, self._out_size, _), (self._in, self._in_size, _) = map(self._station.sync_manager, (0, 1))
         if not self._out_size or not self._in_size:
             raise not_answered("the slave has no mailbox in this state", self._station.place)
 
@@ -84,7 +59,7 @@ class Mailbox:
         if len(message) > self._out_size:
             raise ObjectRefused(f"{len(sdo)} bytes do not fit into the mailbox", where=self._station.place)
         self._station.write(self._out, message.ljust(self._out_size, b"\0"))
-        self._seen(True, message)
+        self.on_message(True, 0, message)
 
     def pump(self) -> bytes | None:
         """Take one message out if there is one. Return its SDO part; emergency messages are passed on."""
@@ -94,7 +69,7 @@ class Mailbox:
             return None
         data = self._station.read(self._in, self._in_size)
         message = data[: 6 + int.from_bytes(data[:2], "little")]
-        self._seen(False, message)
+        self.on_message(False, 1, message)
         if message[5] & 0xF != COE or len(message) < 8:
             return None
         service, rest = message[7] >> 4, message[8:]
@@ -107,7 +82,7 @@ class Mailbox:
         if (sdo := self.pump()) is not None:
             self.on_answer(sdo)
 
-    def call(self, sdo: bytes, fits: Callable[[bytes], bool], answer_s: float, tries: int = 1) -> bytes:
+    def call(self, sdo: bytes, answer_s: float, tries: int = 1) -> bytes:
         """Send a request and wait for its answer. Raises CommunicationLost without one."""
         for _ in range(tries):
             with suppress(CommunicationLost):          # sent again, or reported below
@@ -116,7 +91,7 @@ class Mailbox:
                 end_s = time.monotonic() + answer_s
                 while time.monotonic() < end_s:
                     found = self.pump()
-                    if found is not None and fits(found):
+                    if found is not None and is_answer(sdo, found[:8]):
                         return found
                     if found is not None:
                         self.on_answer(found)
@@ -124,75 +99,14 @@ class Mailbox:
                         time.sleep(0.0 if self._clock.stepped else _PAUSE_S)
         raise not_answered("no answer to an SDO request (CoE)", self._station.place)
 
-    def _seen(self, outgoing: bool, message: bytes) -> None:
-        if self._tap is not None:
-            self._tap(RawFrame(self._clock.now_s(), outgoing, 0 if outgoing else 1, message))
 
-
-class CoeObjects(Objects):
+class CoeObjects(SdoClient):
     """The object dictionary of one slave, by CoE."""
 
     def __init__(self, mailbox: Mailbox) -> None:
-        super().__init__()
+        super().__init__(ANSWER_S, (TRIES, 1), normal=True)
         self._mailbox = mailbox
-        self._answer_s, self._tries = ANSWER_S, TRIES
 
-    @contextmanager
-    def answered_within(self, answer_s: float) -> Iterator[None]:
-        """Send each request once and wait at most ``answer_s`` of wall time: a shaft may be turning meanwhile."""
-        before, (self._answer_s, self._tries) = (self._answer_s, self._tries), (answer_s, 1)
-        try:
-            yield
-        finally:
-            self._answer_s, self._tries = before
-
-    def read_bytes(self, index: int, subindex: int = 0) -> bytes:
-        """Return the bytes of an object."""
-        answer = self._call(upload(index, subindex), index, subindex)
-        data = value_of(answer)
-        if answer[0] & 2:
-            return data
-        size, toggle = int.from_bytes(answer[4:8], "little"), 0
-        while len(data) < size:
-            request = bytes((_UPLOAD_SEGMENT | toggle, 0, 0, 0, 0, 0, 0, 0))
-            segment = self._mailbox.call(request, lambda found: found[0] >> 5 in (_SEGMENT_UPLOADED, _ABORT >> 5),
-                                         self._answer_s)
-            self._refuse_abort(segment, index, subindex)
-            data += segment[1 : 8 - (segment[0] >> 1 & 7)] if len(segment) == 8 else segment[1:]
-            toggle ^= 0x10
-            if segment[0] & 1:
-                break
-        return data[:size]
-
-    def write_bytes(self, index: int, subindex: int, data: bytes, shown: str = "") -> None:
-        """Write raw bytes."""
-        self._call(download(index, subindex, data), index, subindex, f" (value {shown})" if shown else "")
-
-    def _call(self, sdo: bytes, index: int, sub: int, shown: str = "") -> bytes:
-        command = _UPLOADED if sdo[0] == _UPLOAD else 3
-
-        def fits(found: bytes) -> bool:
-            return len(found) >= 8 and found[1:4] == sdo[1:4] and found[0] >> 5 in (command, _ABORT >> 5)
-
-        answer = self._mailbox.call(sdo, fits, self._answer_s, self._tries)
-        self._refuse_abort(answer, index, sub, shown)
-        return answer
-
-    def _refuse_abort(self, answer: bytes, index: int, sub: int, shown: str = "") -> None:
-        if answer[0] == _ABORT:
-            code = int.from_bytes(answer[4:8], "little")
-            raise ObjectRefused(abort_text(code) + shown, where=name(index, sub))
-
-
-def value_of(answer: bytes) -> bytes:
-    """Return the data in the first answer to an upload."""
-    if not answer[0] & 2:
-        return answer[8 : 8 + int.from_bytes(answer[4:8], "little")]
-    return answer[4 : 8 - (answer[0] >> 2 & 3 if answer[0] & 1 else 0)]
-
-
-def answered(sdo: bytes) -> tuple[int, int, bytes | None] | None:
-    """Return index, sub-index and data of an answer to an upload; data None: refused. None for other answers."""
-    if len(sdo) < 8 or sdo[0] >> 5 not in (_UPLOADED, _ABORT >> 5):
-        return None
-    return int.from_bytes(sdo[1:3], "little"), sdo[3], None if sdo[0] == _ABORT else value_of(sdo)
+    def call(self, request: bytes, where: str, answer_s: float, tries: int) -> bytes:
+        """Send a request and wait for its answer. Raises CommunicationLost without one."""
+        return self._mailbox.call(request, answer_s, tries)

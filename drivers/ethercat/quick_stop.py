@@ -7,15 +7,14 @@ controlword with the next frame. Then the slave is put into SAFE-OP, where it ta
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 
 from drivers.cia402 import Cia402Target
 from drivers.clock import Clock
-from drivers.errors import ObjectRefused
 from drivers.ethercat.mailbox import CoeObjects, Mailbox
-from drivers.ethercat.raw import RawSegment, RawStation
+from drivers.ethercat.raw import RawSegment
 from drivers.ethercat.segment import open_segment
 from drivers.ethercat.station import INIT, OP, SAFE_OP, Station, station_of
-from profiles import MARKER_INDEX
 from profiles.ethercat import EthercatProfile
 
 BY_SDO_TRIES = 5
@@ -36,14 +35,6 @@ class EthercatTarget(Cia402Target):
             self._station.ask_for(SAFE_OP)
             self._said.append("setpoints of another master reversed the quick stop: the drive was put into SAFE-OP")
 
-    def keep_time(self) -> None:
-        """Let a simulated drive in stepped time advance by itself; otherwise it would never reach standstill."""
-        try:
-            if self._objects.read_if_there(MARKER_INDEX, 2):
-                self._objects.write(MARKER_INDEX, 2, 0, 8)
-        except ObjectRefused:
-            return
-
 
 def open_target(
     interface: str, position: int, alias: int | None, profile: EthercatProfile, clock: Clock
@@ -52,15 +43,11 @@ def open_target(
 
     Raises PreflightRefused, and CommunicationLost if no slave answers.
     """
-    look = RawSegment(interface)
-    try:
-        stations = [RawStation(look, number) for number in range(look.count())]
-        station = station_of(stations, interface, position, alias)
+    with ExitStack() as failed:
+        look = failed.enter_context(closing(RawSegment(interface)))
+        station = station_of(look.stations(), interface, position, alias)
         if station.al_status().state != INIT:
+            failed.pop_all()
             return EthercatTarget(station, profile, clock, look.close)
-    except BaseException:
-        look.close()
-        raise
-    look.close()
     segment = open_segment(interface, position, alias)
     return EthercatTarget(segment.station, profile, clock, segment.close)

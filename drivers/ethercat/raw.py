@@ -80,12 +80,11 @@ class RawSegment:
                     return frame[begin : begin + size], int.from_bytes(frame[begin + size : begin + size + 2], "little")
         return None
 
-    def count(self) -> int:
-        """Return the number of slaves; 0 if none answers."""
-        try:
-            return self.exchange(BRD, 0, AL_STATUS, bytes(2))[1]
-        except CommunicationLost:
-            return 0
+    def stations(self) -> list[Station]:
+        """Return the slaves by their position; none if none answers."""
+        with contextlib.suppress(CommunicationLost):
+            return [RawStation(self, position) for position in range(self.exchange(BRD, 0, AL_STATUS, bytes(2))[1])]
+        return []
 
     def close(self) -> None:
         """Close the socket."""
@@ -115,8 +114,7 @@ def refuse_driven(segment: RawSegment) -> None:
 
     A host that died leaves SAFE-OP behind, where a slave takes no setpoints. Raises PreflightRefused.
     """
-    for position in range(segment.count()):
-        station = RawStation(segment, position)
+    for station in segment.stations():
         found = station.al_status()
         if found.state == OP:
             raise PreflightRefused(
@@ -136,5 +134,3 @@ def unusable(interface: str, error: Exception) -> PreflightRefused:
         text, step = "this system has no raw sockets", "EtherCAT needs Linux"
     return PreflightRefused(f"the interface can't be opened ({text})", where=interface, next_step=step,
                             entry=MessageCode.BUS_UNUSABLE)
-
-

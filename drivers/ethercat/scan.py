@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, replace
 
+from drivers.cia402 import Description, describe
 from drivers.clock import MonotonicClock
 from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.ethercat.mailbox import CoeObjects, Mailbox
-from drivers.ethercat.raw import RawSegment, RawStation, refuse_driven
+from drivers.ethercat.raw import RawSegment, refuse_driven
 from drivers.ethercat.segment import open_segment
 from drivers.ethercat.station import ALIAS, INIT, Station, not_answered
-from profiles import MARKER_INDEX, MARKER_TEXT, visible
 
 
-@dataclass(frozen=True)
-class FoundSlave:
-    """A slave that answered. ``device_type`` (1000h) and ``identity`` (1018h) are None without a mailbox."""
+@dataclass(frozen=True, kw_only=True)
+class FoundSlave(Description):
+    """A slave that answered. ``device_type`` (1000h) is None without a mailbox, and the description is empty."""
 
     position: int
     alias: int
     state: str
     device_type: int | None = None
-    identity: tuple[int | None, ...] = (None,) * 4
-    title: str = ""
-    simulated: bool = False
 
 
 @contextmanager
@@ -34,24 +31,17 @@ def stations_at(interface: str) -> Iterator[tuple[Sequence[Station], str]]:
 
     The text is empty if no other master drives a slave. Raises CommunicationLost if no slave answers.
     """
-    look = RawSegment(interface)
-    try:
-        count, driven = look.count(), ""
-        if not count:
+    with closing(RawSegment(interface)) as look:
+        stations = look.stations()
+        if not stations:
             raise not_answered("no EtherCAT slave answers", interface)
         try:
             refuse_driven(look)
         except PreflightRefused as error:
-            driven = f"{error.where}: {error.what}"
-            yield [RawStation(look, position) for position in range(count)], driven
+            yield stations, f"{error.where}: {error.what}"
             return
-    finally:
-        look.close()
-    segment = open_segment(interface)
-    try:
+    with closing(open_segment(interface)) as segment:
         yield segment.stations, ""
-    finally:
-        segment.close()
 
 
 def objects_of(station: Station) -> CoeObjects:
@@ -61,21 +51,10 @@ def objects_of(station: Station) -> CoeObjects:
 
 def found_slave(position: int, station: Station, driven: bool = False) -> FoundSlave:
     """Return the description that a slave reports. Reads only; the mailbox of a ``driven`` slave is not used."""
-    state, alias = station.al_status(), station.number(ALIAS)
-    known = FoundSlave(position, alias, state.text)
-    if driven or state.state == INIT:
-        return known
-    objects = objects_of(station)
-    with suppress(CommunicationLost, ObjectRefused):
-        device_type = objects.read(0x1000)
-        identity = tuple(objects.read_if_there(0x1018, sub) for sub in (1, 2, 3, 4))
-        marked = _text(objects, MARKER_INDEX, 1) == MARKER_TEXT
-        return FoundSlave(position, alias, state.text, device_type, identity, _text(objects, 0x1008), marked)
-    return known
-
-
-def _text(objects: CoeObjects, index: int, sub: int = 0) -> str:
-    try:
-        return visible(objects.read_bytes(index, sub).decode("ascii", "replace").rstrip("\0 "))
-    except ObjectRefused:
-        return ""
+    state = station.al_status()
+    found = FoundSlave(position=position, alias=station.number(ALIAS), state=state.text)
+    if not driven and state.state != INIT:
+        objects = objects_of(station)
+        with suppress(CommunicationLost, ObjectRefused):
+            return replace(found, device_type=objects.read(0x1000), **vars(describe(objects)))
+    return found

@@ -6,6 +6,7 @@ watchdog go through the registers (`drivers.ethercat.station`), in the same way 
 
 from __future__ import annotations
 
+from contextlib import closing
 from typing import Any
 
 from drivers.errors import PreflightRefused
@@ -67,7 +68,8 @@ class EthercatSegment:
         try:
             self.master.config_map()
         except Exception as error:                     # pysoem's ConfigMapError lists errors of the mailbox
-            raise PreflightRefused(f"the process data can't be mapped ({_told(error)})", where=self.station.place,
+            said = ", ".join(str(getattr(one, "desc", one)) for one in getattr(error, "error_list", [error]))
+            raise PreflightRefused(f"the process data can't be mapped ({said})", where=self.station.place,
                                    entry=MessageCode.PDO_NOT_POSSIBLE) from error
         found = len(self.slave.output), len(self.slave.input)
         if found != (outputs, inputs):
@@ -84,21 +86,21 @@ class EthercatSegment:
             self.master.close()
 
 
-def _told(error: Exception) -> str:
-    return ", ".join(str(getattr(one, "desc", one)) for one in getattr(error, "error_list", [error]))
-
-
 def open_segment(interface: str, position: int = 0, alias: int | None = None) -> EthercatSegment:
     """Check the AL states, then open an interface with pysoem. A segment that another master drives is left unchanged.
 
-    Raises PreflightRefused, and CommunicationLost if pysoem is missing.
+    Raises PreflightRefused, also without the package pysoem.
     """
-    look = RawSegment(interface)
-    try:
+    with closing(RawSegment(interface)) as look:
         refuse_driven(look)
-    finally:
-        look.close()
-    master = new_master()
+    try:
+        import pysoem
+    except ImportError as error:
+        raise PreflightRefused("EtherCAT needs the package pysoem", where="pysoem",
+                               next_step="Install it: pip install 'tdhil[ethercat]'",
+                               entry=MessageCode.PREFLIGHT_REFUSED) from error
+    pysoem.settings.timeouts.ret = FRAME_US
+    master = pysoem.Master()
     try:
         master.open(interface)
     except (ConnectionError, OSError) as error:
@@ -108,17 +110,3 @@ def open_segment(interface: str, position: int = 0, alias: int | None = None) ->
     except BaseException:
         master.close()
         raise
-
-
-def new_master() -> Any:
-    """Return a master of pysoem. Raises PreflightRefused without the package."""
-    try:
-        import pysoem
-    except ImportError as error:
-        raise PreflightRefused("EtherCAT needs the package pysoem", where="pysoem",
-                               next_step="Install it: pip install 'tdhil[ethercat]'",
-                               entry=MessageCode.PREFLIGHT_REFUSED) from error
-    pysoem.settings.timeouts.ret = FRAME_US
-    return pysoem.Master()
-
-

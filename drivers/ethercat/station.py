@@ -20,14 +20,9 @@ from profiles import MessageCode
 
 FEATURES, ALIAS = 0x0008, 0x0012
 AL_CONTROL, AL_STATUS = 0x0120, 0x0130
-WATCHDOG_DIVIDER, WATCHDOG_TIME = 0x0400, 0x0420
-WATCHDOG_TICK_S = 40e-9
-"""Clock period of the divider 0400h, s (25 MHz); the divider counts two periods more."""
 SYNC_MANAGERS, SYNC_MANAGER_BYTES = 0x0800, 8
 """Address of the first sync manager's registers, and their length, bytes: start address u16, length u16, control u8,
 status u8, activation u8, PDI control u8."""
-WATCHDOG_TRIGGER = 1 << 6
-"""Bit of a sync manager's control byte: writing to it triggers the watchdog."""
 HAS_CLOCKS = 1 << 2
 """Bit of 0008h: the slave controller has distributed clocks."""
 
@@ -54,10 +49,6 @@ _CODES = {
 SM_WATCHDOG = 0x001B
 
 
-def _nothing() -> None:
-    return None
-
-
 class AlStatus(NamedTuple):
     """AL state of a slave. ``code``: AL status code, meaningful with ``error``."""
 
@@ -68,17 +59,13 @@ class AlStatus(NamedTuple):
     @property
     def text(self) -> str:
         """The state in words, with the AL status code if there is an error."""
-        return state_name(self.state) + (f", AL status code {code_text(self.code)}" if self.error else "")
+        meaning = _CODES.get(self.code, "see the manual of the drive")
+        return state_name(self.state) + (f", AL status code {self.code:04X}h ({meaning})" if self.error else "")
 
 
 def state_name(state: int) -> str:
     """Return the name of an AL state."""
     return _NAMES.get(state, f"state {state:X}h")
-
-
-def code_text(code: int) -> str:
-    """Return an AL status code with its meaning (ETG.1000.6)."""
-    return f"{code:04X}h ({_CODES.get(code, 'see the manual of the drive')})"
 
 
 class Station(ABC):
@@ -112,12 +99,13 @@ class Station(ABC):
             self.write(AL_CONTROL, (found.state | ERROR_OR_ACKNOWLEDGE).to_bytes(2, "little"))
         self.write(AL_CONTROL, state.to_bytes(2, "little"))
 
-    def reach(self, state: int, keep_on: Callable[[], None] = _nothing, within_s: float = STATE_S) -> None:
+    def reach(self, state: int, keep_on: Callable[[], None] | None = None) -> None:
         """Request an AL state and wait for it; ``keep_on`` is called meanwhile. Raises DriveFault if refused."""
         self.ask_for(state)
-        end_s = time.monotonic() + within_s
+        end_s = time.monotonic() + STATE_S
         while True:
-            keep_on()
+            if keep_on is not None:
+                keep_on()
             found = self.al_status()
             if found.state == state and not found.error:
                 return
@@ -129,14 +117,10 @@ class Station(ABC):
                 )
             time.sleep(_PAUSE_S)
 
-    def sync_manager(self, number: int) -> tuple[int, int]:
-        """Return start address and length, bytes, of a sync manager."""
-        data = self.read(SYNC_MANAGERS + number * SYNC_MANAGER_BYTES, 4)
-        return int.from_bytes(data[:2], "little"), int.from_bytes(data[2:4], "little")
-
-    def sync_manager_control(self, number: int) -> int:
-        """Return the control byte of a sync manager."""
-        return self.number(SYNC_MANAGERS + number * SYNC_MANAGER_BYTES + 4, 1)
+    def sync_manager(self, number: int) -> tuple[int, int, int]:
+        """Return start address, length in bytes, and control byte of a sync manager."""
+        data = self.read(SYNC_MANAGERS + number * SYNC_MANAGER_BYTES, 5)
+        return int.from_bytes(data[:2], "little"), int.from_bytes(data[2:4], "little"), data[4]
 
 
 def not_answered(what: str, place: str) -> CommunicationLost:
@@ -147,23 +131,16 @@ def not_answered(what: str, place: str) -> CommunicationLost:
 
 def station_of(stations: Sequence[Station], interface: str, position: int, alias: int | None) -> Station:
     """Return the slave at the position, or with the configured station alias. Raises PreflightRefused."""
-    found = [number for number, one in enumerate(stations)
+    found = [one for number, one in enumerate(stations)
              if (number == position if alias is None else one.number(ALIAS) == alias)]
-    if len(found) != 1:
-        wanted = f"at position {position}" if alias is None else f"with station alias {alias}"
-        what, next_step = f"are {wanted}; {len(stations)} answer", "See tdhil scan; positions begin at 0"
-        if found:
-            raise PreflightRefused(f"{len(found)} slaves {what}", where=interface, next_step=next_step,
-                                   entry=MessageCode.NODE_ID_CONFLICT)
-        raise PreflightRefused(f"no slaves {what}", where=interface, next_step=next_step,
-                               entry=MessageCode.NO_DRIVE_FOUND)
-    return stations[found[0]]
-
-
-def watchdog_s(station: Station) -> tuple[float, int]:
-    """Return the time of the process data's watchdog, s, and its divider."""
-    divider = station.number(WATCHDOG_DIVIDER)
-    return station.number(WATCHDOG_TIME) * (divider + 2) * WATCHDOG_TICK_S, divider
+    if len(found) == 1:
+        return found[0]
+    wanted = f"at position {position}" if alias is None else f"with station alias {alias}"
+    text, next_step = f"slaves are {wanted}; {len(stations)} answer", "See tdhil scan; positions begin at 0"
+    if found:
+        raise PreflightRefused(f"{len(found)} {text}", where=interface, next_step=next_step,
+                               entry=MessageCode.NODE_ID_CONFLICT)
+    raise PreflightRefused(f"no {text}", where=interface, next_step=next_step, entry=MessageCode.NO_DRIVE_FOUND)
 
 
 def has_clocks(station: Station) -> bool:

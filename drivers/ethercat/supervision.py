@@ -2,75 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from drivers.cia402 import HOST_SILENT, DriveWatch, Objects, arm, emcy_text
-from drivers.clock import Clock
+from drivers.cia402 import DriveWatch, Objects, arm
 from drivers.drive import DriveLimits
-from drivers.errors import CommunicationLost, DriveFault, PreflightRefused
-from drivers.ethercat.station import (
-    INIT,
-    OP,
-    SM_WATCHDOG,
-    WATCHDOG_DIVIDER,
-    WATCHDOG_TICK_S,
-    WATCHDOG_TIME,
-    WATCHDOG_TRIGGER,
-    AlStatus,
-    Station,
-)
+from drivers.errors import DriveFault, PreflightRefused
+from drivers.ethercat.station import INIT, OP, SM_WATCHDOG, AlStatus, Station
 from drivers.preflight import DIES, PreflightTable
 from profiles import MessageCode
 from profiles.ethercat import EthercatProfile
 
-OUTPUT_MANAGER = 2
-"""Sync manager of the setpoints."""
+WATCHDOG_DIVIDER, WATCHDOG_TIME = 0x0400, 0x0420
+WATCHDOG_TICK_S = 40e-9
+"""Clock period of the divider 0400h, s (25 MHz); the divider counts two periods more."""
+OUTPUT_MANAGER, WATCHDOG_TRIGGER = 2, 1 << 6
+"""Sync manager of the setpoints, and the bit of its control byte: writing to it triggers the watchdog."""
 READ_BACK_S = 0.5
 """Time between two read-backs of the watchdog's registers, s."""
 
 
 class SlaveWatch(DriveWatch):
-    """Supervision of one slave. ``allowed_silence_s``: longest time without a right working counter, s; 0: not
-    supervised.
-    """
+    """Supervision of one slave. Its sign of life is a cycle with the right working counter."""
 
-    def __init__(self, place: str, clock: Clock) -> None:
-        super().__init__(place)
-        self._clock = clock
-        self._heard_s = 0.0
-        self.allowed_silence_s = 0.0
-        self.on_restart: Callable[[], None] = lambda: None
-
-    def start(self, allowed_silence_s: float) -> None:
-        """Treat silence, AL states other than OP and emergency messages as errors from now on."""
-        self._heard_s, self.allowed_silence_s = self._clock.now_s(), allowed_silence_s
-        super().start(allowed_silence_s)
-
-    def heard(self) -> None:
-        """Record a cycle with the right working counter."""
-        self._heard_s = self._clock.now_s()
-
-    def check(self) -> None:
-        """Raise the oldest error that was not raised yet."""
-        silent_s = self._clock.now_s() - self._heard_s
-        if self.expect_operational and 0.0 < self.allowed_silence_s < silent_s:
-            self.keep("heartbeat", CommunicationLost(
-                f"no frame came back with the right working counter for {silent_s:.2f} s", where=self.place,
-                next_step="Check the cable and the drive's supply. The drive's own watchdog stops the shaft",
-                entry=MessageCode.FEEDBACK_LOST,
-            ))
-        super().check()
+    def silence(self) -> tuple[str, str, str]:
+        """Return what is missing."""
+        return ("no frame came back with the right working counter", self.place,
+                "Check the cable and the drive's supply")
 
     def on_al_status(self, found: AlStatus) -> None:
         """Handle the AL state of one cycle."""
         if (found.state == OP and not found.error) or not self.expect_operational:
             return
         if found.error and found.code == SM_WATCHDOG:
-            self.keep(HOST_SILENT, CommunicationLost(
-                f"the drive's watchdog has tripped: {found.text}", where=f"host or bus, reported by {self.place}",
-                next_step="This host was silent for too long (frozen, asleep, overloaded) or its frames were lost",
-                entry=MessageCode.WATCHDOG_ACTED,
-            ))
+            self.watchdog_acted(found.text)
         elif found.error:
             self.keep("al", DriveFault(
                 f"the drive left OP: {found.text}", where=self.place,
@@ -78,37 +40,28 @@ class SlaveWatch(DriveWatch):
                 entry=MessageCode.STATE_LEFT,
             ))
         elif found.state == INIT:
-            self.on_restart()
-            self.keep("boot-up", DriveFault(
-                "the drive restarted during the run, or another master set it to INIT", where=self.place,
-                next_step="tdhil does not enable it again. Find the cause, then start again",
-                entry=MessageCode.DRIVE_RESTARTED,
-            ))
+            self.restarted(", or another master set it to INIT")
         else:
-            self.keep("nmt", CommunicationLost(
-                f"another master put the drive into {found.text}", where=self.place,
-                next_step="Disconnect the second master from the segment, and start again",
-                entry=MessageCode.FOREIGN_MASTER,
-            ))
+            self.taken_out(found.text)
 
-    def on_emergency(self, data: bytes) -> None:
-        """Handle an emergency message: error code u16, error register u8, manufacturer's bytes; code 0: no error left.
+    def on_emcy(self, data: bytes) -> None:
+        """Handle an emergency message.
 
         Codes A0xxh report a refused change of the AL state (ETG.1000.6); the AL status code states the reason.
         """
-        code = int.from_bytes(data[:2], "little")
-        if code and code >> 8 != 0xA0 and self.expect_operational:
-            extra = data[3:].hex(" ")
-            self.keep("emcy", DriveFault(
-                emcy_text(code) + (f" (manufacturer's bytes {extra})" if any(data[3:]) else ""), where=self.place,
-                next_step="Find the cause at the drive, then start again with --reset-fault",
-                entry=MessageCode.DRIVE_FAULT,
-            ))
+        if data[1:2] != b"\xa0":
+            super().on_emcy(data)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The watchdog of the process data: each write to sync manager 2 triggers it. Without one for 0420h x (0400h + 2) x 40
 # ns, the drive leaves OP with AL status code 001Bh. CiA 402 drives then react as 6007h states.
+
+
+def watchdog_s(station: Station) -> tuple[float, int]:
+    """Return the time of the process data's watchdog, s, and its divider."""
+    divider = station.number(WATCHDOG_DIVIDER)
+    return station.number(WATCHDOG_TIME) * (divider + 2) * WATCHDOG_TICK_S, divider
 
 
 class ProcessDataWatchdog:
@@ -141,22 +94,20 @@ class ProcessDataWatchdog:
                                    next_step="Lower limits.watchdog_s", entry=MessageCode.WATCHDOG_NOT_ARMED)
         objects.on_restore(lambda: station.write(WATCHDOG_TIME, before))
         station.write(WATCHDOG_TIME, counts.to_bytes(2, "little"))
-        back = self._read()
-        self._wanted = back
-        return f"{back[1] * (back[0] + 2) * WATCHDOG_TICK_S * 1e3:.6g} ms", back[1] == counts
+        self._wanted = self._read()
+        return f"{watchdog_s(station)[0] * 1e3:.6g} ms", self._wanted[1] == counts
 
     def _read(self) -> tuple[int, int]:
         return self._station.number(WATCHDOG_DIVIDER), self._station.number(WATCHDOG_TIME)
 
     def check_trigger(self) -> None:
         """Refuse a sync manager of the setpoints that does not trigger the watchdog. Raises PreflightRefused."""
-        if self._wanted is None or self._station.sync_manager_control(OUTPUT_MANAGER) & WATCHDOG_TRIGGER:
-            return
-        raise PreflightRefused(
-            "the setpoints do not trigger the watchdog: bit 6 of register 0814h is 0", where=self._station.place,
-            next_step="The drive's SII describes its sync manager 2 so; see its manual for another watchdog",
-            entry=MessageCode.WATCHDOG_NOT_ARMED,
-        )
+        if self._wanted is not None and not self._station.sync_manager(OUTPUT_MANAGER)[2] & WATCHDOG_TRIGGER:
+            raise PreflightRefused(
+                "the setpoints do not trigger the watchdog: bit 6 of register 0814h is 0", where=self._station.place,
+                next_step="The drive's SII describes its sync manager 2 so; see its manual for another watchdog",
+                entry=MessageCode.WATCHDOG_NOT_ARMED,
+            )
 
     def look(self, now_s: float, watch: DriveWatch) -> None:
         """Read the registers back in motion, every `READ_BACK_S`. Raises CommunicationLost without an answer."""

@@ -8,10 +8,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from sim_bus.command_arguments import (
-    EXIT_OK,
     Unusable,
-    add_fault_argument,
-    add_rig_arguments,
+    add_drive_arguments,
     host_and_port,
     never_came,
     number_from,
@@ -34,20 +32,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                        help="open a socketcand hub there and be on it; port 0 takes any free one")
     group.add_argument("--node", metavar="N", type=number_from(1, 127, "a node ID"), default=1,
                        help="node ID, 1 to 127 (default 1)")
-    group.add_argument("--profile", metavar="NAME",
-                       help="the drive to be: a profile that ships, or a YAML file (default: our own EDS)")
-    add_rig_arguments(group)
-    add_fault_argument(group, "heartbeat-lost@hold+2s")
-    group.add_argument("--stepped", action="store_true", help="plant time moves with SYNC, by the period of 1006h")
+    add_drive_arguments(group, "heartbeat-lost@hold+2s", "plant time moves with SYNC, by the period of 1006h")
 
 
 def run(namespace: argparse.Namespace) -> int:
     """Simulate until SIGINT or SIGTERM. Print one line ``ready: …`` on stdout. Return the exit code."""
-    if "list" in namespace.fault:
-        from sim_bus.canopen.faults import listing
-
-        print(listing())  # noqa: T201
-        return EXIT_OK
+    from sim_bus.canopen.faults import listing
 
     def simulate(stop: threading.Event) -> None:
         from profiles import load_canopen_profile
@@ -67,7 +57,7 @@ def run(namespace: argparse.Namespace) -> int:
             simulator.run(stop)
             never_came(simulator.faults_waiting)
 
-    return until_stopped(simulate)
+    return until_stopped(namespace, listing, simulate)
 
 
 @contextlib.contextmanager

@@ -14,21 +14,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from profiles import CYCLE_ID, CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
-from sim_bus.canopen import services as emcy
 from sim_bus.canopen.node import SYNC, Cia402Node
 from sim_bus.canopen.sender import Sender
-from sim_bus.drive_faults import FaultSchedule, InjectedFault, of_drive
+from sim_bus.drive_faults import FaultSchedule, InjectedFault, of_bus, of_drive
 from sim_bus.fault_script import (
     FaultKind,
     Kinds,
     Passing,
     Scripted,
-    error_code,
     object_place,
     plain,
     seconds,
     share,
 )
+from sim_bus.sdo_server import Meddling
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Effects of a scripted fault: it changes frames on their way in or out, or changes the drive itself.
@@ -68,24 +67,6 @@ class Misbehaviour(Passing):
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Faults of the drive itself and of its load.
-
-
-class Emcy(Misbehaviour):
-    """Emergency message without any other effect."""
-
-    def __init__(self, code: int) -> None:
-        self._code = code
-
-    def begin(self) -> None:
-        self.scene.node.emergency.report(self._code, emcy.GENERIC)
-
-
-class FaultReaction(Emcy):
-    """Fault of the drive: emergency message, its own fault reaction (605Eh), fault state."""
-
-    def begin(self) -> None:
-        super().begin()
-        self.scene.node.application.fault()
 
 
 class Restart(Misbehaviour):
@@ -224,7 +205,7 @@ class SecondNode(Misbehaviour):
     """Second drive with the same node-ID: it answers too, and reports that it is switched off."""
 
     def begin(self) -> None:
-        if self.scene.node.sync_seen:
+        if self.scene.node.cycled:
             self.scene.put(_HEARTBEAT + self.scene.node.id, b"\0")     # a drive that was just switched on
 
     def outgoing(self, can_id: int, data: bytes) -> Frames:
@@ -243,13 +224,13 @@ class SecondMaster(Misbehaviour):
 
     def begin(self) -> None:
         node = self.scene.node
-        if not node.sync_seen:
+        if not node.cycled:
             for word in (0x06, 0x07, 0x0F):
                 node.application.write_controlword(word)
 
     def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
         node = self.scene.node
-        if can_id == SYNC_ID and node.sync_seen:
+        if can_id == SYNC_ID and node.cycled:
             self.scene.put(SYNC_ID, b"")
             self.scene.foreign(0x200 + node.id, bytes.fromhex("0f00") + bytes(6))
         return ((can_id, data),)
@@ -305,7 +286,7 @@ class ForeignSetpoints(Misbehaviour):
 
     def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
         node = self.scene.node
-        if can_id == SYNC_ID and node.sync_seen:
+        if can_id == SYNC_ID and node.cycled:
             if self._again and int(node.store.number(0x1403 << 8 | 1)) >> 31:
                 switch_on = bytes.fromhex("23031401") + (0x500 + node.id).to_bytes(4, "little")
                 self.scene.foreign(_REQUEST + node.id, switch_on)
@@ -318,7 +299,7 @@ class SdoMaster(Misbehaviour):
 
     def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
         node = self.scene.node
-        if can_id != SYNC_ID or not node.sync_seen:
+        if can_id != SYNC_ID or not node.cycled:
             return ((can_id, data),)
         wishes = [(_REQUEST + node.id, bytes.fromhex(one)) for one in ("23ff6000f4010000", "2b4060000f000000")]
         for wish in wishes:
@@ -407,12 +388,19 @@ def _written(text: str) -> tuple[int, int, int, int]:
     return index, sub, number, size
 
 
+TRANSFERS: dict[Meddling, type[Answers]] = {
+    Meddling.ABORTED: Aborted, Meddling.UNANSWERED: Unanswered, Meddling.NOT_KEPT: NotKept,
+    Meddling.OTHERWISE: Otherwise,
+}
+"""Fault of the transfers of an object, by its effect."""
+
 _LONG, _SHORT = {0x1006, 0x1016, 0x6080, 0x6085, 0x60FF}, {0x100D, 0x6060}
 
 KINDS: Kinds[Misbehaviour] = Kinds({
-    "bus-dead": FaultKind(12, "nothing gets through any more: adapter unplugged, cable cut", plain(Dead)),
-    "frame-loss": FaultKind(17, "this share of all frames is lost, either way",
-                            lambda v: Lossy(share(v)), "5%", "SHARE"),
+    **of_bus(
+        dead=Dead, lossy=Lossy, loss="5%", restart=Restart, restarts="boot-up message",
+        transfers=lambda how, index, sub: TRANSFERS[how](index, sub),
+    ),
     "duplicate-frames": FaultKind(18, "this share of the feedback comes twice",
                                   lambda v: Doubled(share(v)), "10%", "SHARE"),
     "reordered-frames": FaultKind(18, "this share of the feedback comes after that of the next cycle",
@@ -421,18 +409,8 @@ KINDS: Kinds[Misbehaviour] = Kinds({
     "feedback-lost": FaultKind(19, "no TPDO comes any more; the heartbeat goes on",
                                plain(lambda: Without(0x180, 0x280))),
     "heartbeat-lost": FaultKind(20, "the drive's heartbeat ends", plain(lambda: Without(0x700))),
-    "node-reset": FaultKind(21, "the drive restarts (boot-up message); its torque is off, the shaft coasts",
-                            plain(Restart)),
     "foreign-nmt-stop": FaultKind(22, "a third party sends NMT stop", plain(lambda: ForeignNmt(2))),
     "foreign-nmt-preop": FaultKind(22, "a third party sends NMT pre-operational", plain(lambda: ForeignNmt(128))),
-    "emcy": FaultKind(23, "an emergency message, with the drive still enabled",
-                      lambda v: Emcy(error_code(v)), "7305h", "CODE"),
-    "drive-fault": FaultKind(23, "emergency message and fault state, after the drive's own fault reaction",
-                             lambda v: FaultReaction(error_code(v)), "3210h", "CODE"),
-    "sdo-abort": FaultKind(24, "the drive aborts every transfer of an object",
-                           lambda v: Aborted(*object_place(v)), "6072h", "OBJECT"),
-    "sdo-timeout": FaultKind(25, "the drive doesn't answer when asked for an object",
-                             lambda v: Unanswered(*object_place(v)), "6072h", "OBJECT"),
     "second-master": FaultKind(26,
                                "another host: from the start the drive is enabled already; later, foreign setpoints",
                           plain(SecondMaster)),
@@ -450,14 +428,6 @@ KINDS: Kinds[Misbehaviour] = Kinds({
                                    lambda v: ForeignSetpoints(_again(v)), "once", "once|again"),
     "sdo-master": FaultKind(60, "another master writes controlword and speed by SDO, in every cycle",
                             plain(SdoMaster)),
-    "wrong-identity": FaultKind(29, "1018h:1, the vendor, is another one",
-                                plain(lambda: Otherwise(0x1018, 1))),
-    "fault-at-start": FaultKind(30, "the drive is in fault when the host comes",
-                                lambda v: FaultReaction(error_code(v)), "3210h", "CODE"),
-    "write-not-kept": FaultKind(45, "a write to an object is answered and not kept",
-                                lambda v: NotKept(*object_place(v)), "6080h", "OBJECT"),
-    "reads-back-otherwise": FaultKind(45, "an object reads back as something else",
-                                      lambda v: Otherwise(*object_place(v)), "6072h", "OBJECT"),
     "watchdog-not-armed": FaultKind(50, "the write to 1016h:1 is answered and not kept",
                                     plain(lambda: NotKept(0x1016, 1))),
 })
@@ -467,22 +437,18 @@ make, parse_all, listed, listing = KINDS.make, KINDS.parse_all, KINDS.listed, KI
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_SEED = 0xFA17
-
-
 class Faults(FaultSchedule[Misbehaviour]):
     """Script of one drive. `attach` activates it; then `came` gets the frames."""
 
     def __init__(self, script: tuple[Scripted, ...], seed: int = 0) -> None:
-        super().__init__(script, make)
-        self._rng = np.random.default_rng((seed, _SEED))
+        super().__init__(script, make, seed)
         self._ends_cycles = False          # True after the host was informed
 
     def attach(self, node: Cia402Node, sender: Sender) -> None:
         """Apply the faults to this node from now on."""
         self._node = node
         self._put: Callable[[int, bytes], None] = sender.put
-        scene = Scene(node, sender.put, self._rng)
+        scene = Scene(node, sender.put, self.rng)
         for fault in self.cast.all:
             fault.scene = scene
         sender.script = self._outgoing

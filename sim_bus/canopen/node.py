@@ -10,13 +10,10 @@ from collections.abc import Callable
 from struct import error as StructError
 
 from profiles.canopen import CanopenProfile
-from sim_bus.application_objects import ApplicationObjects
-from sim_bus.canopen import services as emcy
 from sim_bus.canopen.pdo import ReceivePdo, TransmitPdo
 from sim_bus.canopen.profile_emulation import apply_on_canopen
 from sim_bus.canopen.sender import PassiveNetwork, Sender
 from sim_bus.canopen.services import (
-    Emergency,
     HeartbeatConsumer,
     HeartbeatProducer,
     LifeGuard,
@@ -24,10 +21,10 @@ from sim_bus.canopen.services import (
     NmtCommand,
     NmtState,
 )
-from sim_bus.objects import ObjectStore, generic_eds, key_of
+from sim_bus.emergency import COMMUNICATION, HOST_LOST, PDO_TOO_SHORT
+from sim_bus.object_drive import ObjectDrive
+from sim_bus.objects import key_of
 from sim_bus.params import RigParams
-from sim_bus.profile_emulation import WornProfile
-from sim_bus.timed_drive import TimedDrive
 from sim_bus.trace import ShaftTrace
 
 SYNC = 0x080
@@ -37,29 +34,21 @@ MANUFACTURER_AREA = (0x2000, 0x5FFD)      # the marker is unchanged
 Route = Callable[[bytes | bytearray], None]
 
 
-class Cia402Node(TimedDrive):
+class Cia402Node(ObjectDrive):
     """A CiA 402 slave over a simulated inverter, with our own EDS or with a ``profile``."""
 
     def __init__(self, sender: Sender, params: RigParams, *, node_id: int, seed: int, trace: ShaftTrace,
                  stepped: bool, profile: CanopenProfile | None = None) -> None:
-        super().__init__(params, seed=seed, trace=trace, stepped=stepped)
+        super().__init__(params, node_id=node_id, seed=seed, trace=trace, stepped=stepped, profile=profile)
         self.id = node_id
-        self.sync_seen = False
         self._send = sender.send
-        self.store = ObjectStore(node_id, generic_eds())
         self.network = PassiveNetwork(sender)
         self.network.add_node(self.store)
-        self.emergency = Emergency(self.store, lambda data: sender.send(0x080 + node_id, data))
         self.profile = profile
         self._guard = LifeGuard()
-        worn = WornProfile(profile, self.application) if profile is not None else None
-        self._objects = ApplicationObjects(self.store, self.application, worn.units if worn else None)
-        if profile is not None and worn is not None:
-            worn.apply(self.store)
-            apply_on_canopen(profile, self.store, self._guard, self._set_period)
-        self._receive = [
-            ReceivePdo(self.store, n, self._objects.setters, self._route, self._short_pdo) for n in range(4)
-        ]
+        if profile is not None:
+            apply_on_canopen(profile, self, self._guard)
+        self._receive = [ReceivePdo(self.store, n, self.setters, self._route, self._short_pdo) for n in range(4)]
         self._transmit = [TransmitPdo(self.store, n, self._route) for n in range(4)]
         self.nmt = Nmt()
         self._operational = False
@@ -69,10 +58,7 @@ class Cia402Node(TimedDrive):
         self._sync_receive: list[ReceivePdo] = []
         self._sync_transmit: list[TransmitPdo] = []
         self._event_transmit: list[TransmitPdo] = []
-        self._period_us = 0
         self._bind()
-        self.application.on_event = self.note
-        self.application.on_fault_reset = self.emergency.reset
 
     # -- frames ------------------------------------------------------------------------------------------
 
@@ -103,14 +89,11 @@ class Cia402Node(TimedDrive):
         self.nmt.state = NmtState.PRE_OPERATIONAL
         self._changed_state()
 
-    def pass_cycle(self) -> None:
-        """Handle a SYNC that the drive did not receive: in stepped time one period passes, without any other effect."""
-        self.sync_seen = True
-        if self.stepped and self._period_us:
-            self.advance_us(self._period_us)
+    def send_emergency(self, message: bytes) -> None:
+        """Send an EMCY."""
+        self._send(0x080 + self.id, message)
 
     def _on_sync(self) -> None:
-        self.sync_seen = True
         if self._operational:
             for receive in self._sync_receive:
                 receive.on_sync()
@@ -118,8 +101,7 @@ class Cia402Node(TimedDrive):
                 data = transmit.at_sync()
                 if data is not None:
                     self._send(transmit.can_id, data)
-        if self.stepped and self._period_us:
-            self.advance_us(self._period_us)
+        self.pass_cycle()
 
     def _on_nmt(self, data: bytes | bytearray) -> None:
         if len(data) < 2 or data[1] not in {0, self.id}:
@@ -193,9 +175,7 @@ class Cia402Node(TimedDrive):
     def _host_lost(self, event: str) -> None:
         """React to a silent host: EMCY 8130h, the reaction of 6007h, and 1029h:1 for the NMT state."""
         self.note(event)
-        self.emergency.report(emcy.HEARTBEAT_LOST, emcy.COMMUNICATION)
-        self.application.warning = True
-        self.application.abort_connection()
+        self.lose_host()
         behaviour = self.store.number(key_of(0x1029, 1))
         if self.nmt.state is NmtState.OPERATIONAL and behaviour != 1:
             self.nmt.state = NmtState.STOPPED if behaviour == 2 else NmtState.PRE_OPERATIONAL
@@ -209,25 +189,22 @@ class Cia402Node(TimedDrive):
             return
         self.application.abort_connection()
         if self._faulted():
-            self.emergency.report(emcy.HEARTBEAT_LOST, emcy.COMMUNICATION)
+            self.emergency.report(HOST_LOST, COMMUNICATION)
 
     def _faulted(self) -> bool:
         return self.application.state.name.startswith("FAULT")
 
     def _short_pdo(self) -> None:
-        self.emergency.report(emcy.PDO_TOO_SHORT, emcy.COMMUNICATION, lasting=False)
+        self.emergency.report(PDO_TOO_SHORT, COMMUNICATION, lasting=False)
 
     # -- configuration -----------------------------------------------------------------------------------
 
     def _bind(self) -> None:
         hooks = self.store.hooks
-        hooks[key_of(0x1006)] = self._set_period
+        hooks[key_of(0x1006)] = self.set_period
         hooks[key_of(0x1016, 1)] = self._set_consumer
         hooks[key_of(0x1017)] = self._producer.configure
         self.bind_marker(self.store)
-
-    def _set_period(self, period_us: int) -> None:
-        self._period_us = period_us
 
     def _set_consumer(self, value: int) -> None:
         self._consumer.configure(value)

@@ -4,25 +4,23 @@
 
     COB-ID (sub 1)     bit 31: 1 = PDO does not exist · bit 30: no RTR (TPDO) · bit 29: must be 0 · bits 0..10 CAN-ID
     type (sub 2)       0 at the next SYNC after a change · 1..240 every n-th SYNC · 254, 255 by event
-    mapping entry      index << 16 | subindex << 8 | bits
 
 The order of a mapping is that of CiA 301: bit 31 set, count 0, entries, count, bit 31 cleared. Every other order is
-refused.
+refused (`sim_bus.mapping`).
 """
 
 from collections.abc import Callable
-from struct import Struct
 
 from canopen.sdo import SdoAbortedError
 
 from sim_bus import objects as od
+from sim_bus.mapping import LAST_DUMMY, EntryList, MappedData, Setter
 from sim_bus.objects import FORMATS, ObjectStore, key_of
 
 INVALID = 1 << 31
 EXTENDED = 1 << 29
-_LAST_DUMMY = 0x0007
-Setter = Callable[[int], None]
-Getter = Callable[[], float]
+ENTRIES = 8
+"""Number of entries of one PDO."""
 
 
 class Pdo:
@@ -34,23 +32,15 @@ class Pdo:
         self.store = store
         self.cob_id = INVALID
         self.transmission = 255
-        self.count = 0
-        self.entries = [0] * 8
         self._on_change = on_change
         live, hooks = store.live, store.hooks
         live[key_of(communication, 1)] = lambda: self.cob_id
         live[key_of(communication, 2)] = lambda: self.transmission
-        live[key_of(mapping, 0)] = lambda: self.count
         hooks[key_of(communication, 1)] = self._set_cob_id
         hooks[key_of(communication, 2)] = self._set_transmission
-        hooks[key_of(mapping, 0)] = self._set_count
-        for number in range(8):
-            self._bind_entry(key_of(mapping, number + 1), number)
+        self.mapping = EntryList(store, mapping, ENTRIES, locked=self._locked, check=self._check,
+                                 changed=self._set_count)
         self._communication, self._mapping = communication, mapping
-
-    def _bind_entry(self, key: int, number: int) -> None:
-        self.store.live[key] = lambda: self.entries[number]
-        self.store.hooks[key] = lambda value: self._set_entry(number, value)
 
     @property
     def valid(self) -> bool:
@@ -69,14 +59,14 @@ class Pdo:
 
     def clear(self) -> None:
         """Disable the PDO and empty its mapping."""
-        self.cob_id, self.count = INVALID, 0
+        self.cob_id, self.mapping.count = INVALID, 0
         self.compile()
 
     def load(self) -> None:
         """Load the defaults of the object dictionary."""
         default = self.store.default
-        self.entries = [default(key_of(self._mapping, number + 1)) for number in range(8)]
-        self.count = default(key_of(self._mapping, 0))
+        count, *entries = [default(key_of(self._mapping, sub)) for sub in range(ENTRIES + 1)]
+        self.mapping.load(entries, count)
         self.transmission = default(key_of(self._communication, 2))
         self.cob_id = default(key_of(self._communication, 1))
         self.compile()
@@ -102,39 +92,22 @@ class Pdo:
         self.compile()
         self._on_change()
 
-    def _set_count(self, value: int) -> None:
-        if self.valid and value != self.count:
-            raise SdoAbortedError(od.ABORT_STATE)
-        bits = 0
-        for entry in self.entries[:value]:
-            self._check(entry)
-            bits += entry & 0xFF
-        if bits > 64:
+    def _locked(self, sub: int, value: int) -> bool:
+        return self.valid and bool(sub or value != self.mapping.count)
+
+    def _set_count(self) -> None:
+        if sum(entry & 0xFF for entry in self.mapping.used) > 64:
             raise SdoAbortedError(od.ABORT_PDO_TOO_LONG)
-        self.count = value
         self.compile()
 
-    def _set_entry(self, number: int, value: int) -> None:
-        if self.valid or self.count:
-            raise SdoAbortedError(od.ABORT_STATE)
-        if value:
-            self._check(value)
-        self.entries[number] = value
-
     def _check(self, entry: int) -> None:
-        if entry >> 16 <= _LAST_DUMMY:
+        if entry >> 16 <= LAST_DUMMY:
             variable = self.store.variable(entry >> 16, entry >> 8 & 0xFF)
             mappable = self.receives and variable.data_type in FORMATS and entry & 0xFF == len(variable)
         else:
             mappable = self.store.mappable(entry, receives=self.receives)
         if not mappable:
             raise SdoAbortedError(od.ABORT_NOT_MAPPABLE)
-
-    def _layout(self) -> tuple[Struct, list[int]]:
-        """Return the frame's binary layout and the keys of its objects."""
-        keys = [entry >> 8 for entry in self.entries[: self.count]]
-        formats = [FORMATS[self.store.variable(key >> 8, key & 0xFF).data_type] for key in keys]
-        return Struct("<" + "".join(formats)), keys
 
 
 class ReceivePdo(Pdo):
@@ -145,50 +118,32 @@ class ReceivePdo(Pdo):
     def __init__(self, store: ObjectStore, number: int, setters: dict[int, Setter], on_change: Callable[[], None],
                  on_short: Callable[[], None]) -> None:
         self._fast = setters
-        self._setters: list[Setter] = []
-        self._struct = Struct("<")
+        self._data = MappedData(store, ())
         self._on_short = on_short
         self._latched: bytes | bytearray | None = None
         self._acts_at_sync = False
         super().__init__(store, 0x1400 + number, 0x1600 + number, on_change)
 
     def compile(self) -> None:
-        self._struct, keys = self._layout()
-        self._setters = [self._setter(key) for key in keys]
+        self._data = MappedData(self.store, self.mapping.used, self._fast)
         self._acts_at_sync = self.synchronous
         self._latched = None
 
     def receive(self, data: bytes | bytearray) -> None:
         """Take a frame: it acts now, or at the next SYNC."""
-        if len(data) < self._struct.size:
+        if len(data) < self._data.size:
             self._on_short()
         elif self._acts_at_sync:
             self._latched = data
         else:
-            self._apply(data)
+            self._data.act(data)
 
     def on_sync(self) -> None:
         """Let the latched frame act."""
         data = self._latched
         if data is not None:
             self._latched = None
-            self._apply(data)
-
-    def _apply(self, data: bytes | bytearray) -> None:
-        for setter, value in zip(self._setters, self._struct.unpack_from(data), strict=True):
-            setter(value)
-
-    def _setter(self, key: int) -> Setter:
-        if key >> 8 <= _LAST_DUMMY:
-            return _discard
-        return self._fast.get(key) or (lambda value: self._write(key, value))
-
-    def _write(self, key: int, value: int) -> None:
-        """Write a value. A value out of range is dropped, because a PDO cannot be refused."""
-        try:
-            self.store.write(key, value)
-        except SdoAbortedError:
-            return
+            self._data.act(data)
 
 
 class TransmitPdo(Pdo):
@@ -197,8 +152,7 @@ class TransmitPdo(Pdo):
     def __init__(self, store: ObjectStore, number: int, on_change: Callable[[], None]) -> None:
         self.inhibit_us = 0
         self.event_us = 0
-        self._getters: list[Getter] = []
-        self._struct = Struct("<")
+        self._data = MappedData(store, ())
         self._syncs = 0
         self._sent = b""
         self._sent_us = 0
@@ -208,14 +162,13 @@ class TransmitPdo(Pdo):
         store.hooks[key_of(communication, 5)] = self._set_event
 
     def compile(self) -> None:
-        self._struct, keys = self._layout()
-        self._getters = [self._getter(key) for key in keys]
+        self._data = MappedData(self.store, self.mapping.used)
         self._syncs = 0
         self._sent = b""
 
     def pack(self) -> bytes:
         """Return the frame's data at this instant."""
-        return self._struct.pack(*[getter() for getter in self._getters])
+        return self._data.pack()
 
     def at_sync(self) -> bytes | None:
         """Return the frame to send at this SYNC, if any."""
@@ -245,9 +198,6 @@ class TransmitPdo(Pdo):
         self._sent, self._sent_us = data, now_us
         return data
 
-    def _getter(self, key: int) -> Getter:
-        return self.store.live.get(key) or (lambda: self.store.number(key))
-
     def _set_inhibit(self, value: int) -> None:
         if self.valid:
             raise SdoAbortedError(od.ABORT_STATE)
@@ -255,7 +205,3 @@ class TransmitPdo(Pdo):
 
     def _set_event(self, value: int) -> None:
         self.event_us = 1000 * value
-
-
-def _discard(_value: int) -> None:
-    """Discard the value of a dummy entry."""

@@ -1,26 +1,19 @@
 """Changes that a profile makes on CANopen: the watchdog, the period of stepped time, and the default mapping."""
 
-from collections.abc import Callable
-
 from canopen.objectdictionary import datatypes
 
-from profiles import MARKER_INDEX
 from profiles.canopen import CanopenProfile
 from sim_bus.canopen.services import LifeGuard
+from sim_bus.object_drive import ObjectDrive
 from sim_bus.objects import ObjectStore, key_of
 
 
-def apply_on_canopen(
-    profile: CanopenProfile, store: ObjectStore, guard: LifeGuard, set_period: Callable[[int], None]
-) -> None:
-    """Add and remove the objects of the communication area, after `WornProfile.apply`."""
-    watchdog = profile.watchdog
+def apply_on_canopen(profile: CanopenProfile, drive: ObjectDrive, guard: LifeGuard) -> None:
+    """Add and remove the objects of the communication area, after those of the profile on any bus."""
+    watchdog, store = profile.watchdog, drive.store
     if not profile.cyclic.has_period:
         store.remove(0x1006)
-        store.add(MARKER_INDEX, 3, datatypes.UNSIGNED32, writable=True, mappable=False, name="Stepped period")
-        store.set_default(MARKER_INDEX, 3, 0)
-        store.values[key_of(MARKER_INDEX, 3)] = 0
-        store.hooks[key_of(MARKER_INDEX, 3)] = set_period
+        drive.add_period()
     if watchdog.kind != "heartbeat" or watchdog.consumer_index != 0x1016:
         store.remove(0x1016)
     if watchdog.kind == "node_guarding":

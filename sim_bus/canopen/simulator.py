@@ -22,10 +22,10 @@ from sim_bus.canopen.faults import Faults
 from sim_bus.canopen.node import Cia402Node
 from sim_bus.canopen.sender import BUS_ERRORS, Sender
 from sim_bus.fault_script import Scripted
+from sim_bus.own_time import OwnTime
 from sim_bus.params import RigParams
 from sim_bus.trace import ShaftTrace
 
-_CHUNK_US = 2_000
 _POLL_OWN_TIME_S = 0.005
 _POLL_STEPPED_S = 0.05
 _RETRY_S = 0.05
@@ -38,7 +38,6 @@ class Simulator:
                  trace: Path | None = None, stepped: bool = False, silence_s: float = 1.0,
                  profile: CanopenProfile | None = None, faults: tuple[Scripted, ...] = ()) -> None:
         self._bus = bus
-        self._silence_s = silence_s
         self._sender = Sender(bus, self._on_send_failed)
         self._trace = ShaftTrace(trace)
         self.node = Cia402Node(
@@ -47,9 +46,7 @@ class Simulator:
         self._faults = Faults(faults, seed) if faults else None
         if self._faults is not None:
             self._faults.attach(self.node, self._sender)
-        self._wall_s = 0.0                 # wall time up to which the plant has run, in its own time
-        self._running_on = False           # stepped, but the host is silent
-        self._silent_s = 0.0
+        self._time = OwnTime(self.node, silence_s)
 
     @property
     def speed_rad_s(self) -> float:
@@ -71,9 +68,9 @@ class Simulator:
         with self._trace:
             self.begin()
             while not stop.is_set():
-                own_time = self._running_on or not self.node.stepped
-                timeout_s = _POLL_OWN_TIME_S if own_time else min(_POLL_STEPPED_S, self._silence_s)
-                before_s = time.monotonic() if own_time or self._silent_s else 0.0
+                own_time = self._time.runs
+                timeout_s = _POLL_OWN_TIME_S if own_time else min(_POLL_STEPPED_S, self._time.silence_s)
+                before_s = time.monotonic() if own_time or self._time.silent_s else 0.0
                 try:
                     message = self._bus.recv(timeout_s)
                 except BUS_ERRORS as error:
@@ -88,23 +85,16 @@ class Simulator:
     def begin(self) -> None:
         """Switch the drive on; it sends its boot-up message."""
         self.node.boot()
-        self._wall_s = time.monotonic()
+        self._time.follow(time.monotonic())
 
     def hear(self, message: can.Message) -> None:
         """Take one frame from the bus. The drive's replies have been sent when this returns."""
         if message.is_extended_id or message.is_error_frame:
             return
-        node = self.node
-        self._silent_s = 0.0
+        node, identifier = self.node, message.arbitration_id
         if self._sender.lost:
             self._sender.revive()
-        if self._running_on:
-            self._follow_wall_clock()
-            self._running_on = False
-            node.note("frames are back: stepped again")
-        elif not node.stepped:
-            self._follow_wall_clock()
-        was_stepped, identifier = node.stepped, message.arbitration_id
+        self._time.heard(time.monotonic())
         if message.is_remote_frame:
             node.on_remote(identifier)
         elif identifier == CYCLE_ID:
@@ -114,13 +104,11 @@ class Simulator:
             self._faults.came(identifier, bytes(message.data))
         else:
             node.on_frame(identifier, bytes(message.data))
-        if was_stepped and not node.stepped:
-            self._wall_s = time.monotonic()
 
     def end(self) -> None:
         """Advance to the end of a rehearsal, after the host has left for good."""
-        if self._faults is not None and self.node.stepped and self.node.sync_seen:
-            self.node.run_out()
+        if self._faults is not None:
+            self._faults.end()
 
     def close_trace(self) -> None:
         """Close the trace; safe to repeat."""
@@ -128,44 +116,27 @@ class Simulator:
 
     def _nothing_came(self, timeout_s: float, before_s: float, stop: threading.Event) -> None:
         self._trace.flush()
-        if self._running_on or not self.node.stepped:
+        if self._time.runs:
             if time.monotonic() - before_s < 0.5 * timeout_s:
                 stop.wait(timeout_s)          # the bus returned at once, like a closed socketcand client
-            self._follow_wall_clock()
+            self._time.follow(time.monotonic())
             return
         # The first empty wait counts as a whole one. Later ones are measured, because a dead bus returns at once.
-        waited_s = time.monotonic() - before_s if self._silent_s else timeout_s
+        waited_s = time.monotonic() - before_s if self._time.silent_s else timeout_s
         if waited_s < 0.5 * timeout_s:
             stop.wait(timeout_s)
             waited_s += timeout_s
         # A process without processor time can't know whether other stations are silent: no wait counts for more than
         # its length.
-        self._silent_s += min(waited_s, timeout_s)
-        if self._silent_s >= self._silence_s:
-            self._run_on("host silent: running on in own time")
-
-    def _run_on(self, why: str) -> None:
-        self._silent_s = 0.0
-        if self.node.stepped and self.node.sync_seen and not self._running_on:
-            self._running_on = True
-            self._wall_s = time.monotonic()
-            self.node.note(why)
+        self._time.waited(min(waited_s, timeout_s), time.monotonic())
 
     def _bus_ended(self, error: BaseException, stop: threading.Event) -> None:
-        self._run_on(f"bus lost ({error}): running on in own time")
-        stop.wait(_POLL_OWN_TIME_S if self._running_on or not self.node.stepped else _RETRY_S)
-        if self._running_on or not self.node.stepped:
-            self._follow_wall_clock()
+        self._time.run_on(f"bus lost ({error}): running on in own time", time.monotonic())
+        stop.wait(_POLL_OWN_TIME_S if self._time.runs else _RETRY_S)
+        self._time.follow(time.monotonic())
 
     def _on_send_failed(self, error: BaseException) -> None:
         self.node.note(f"sending failed: {error}")
-
-    def _follow_wall_clock(self) -> None:
-        """Advance the plant to the monotonic clock, in whole chunks."""
-        behind = int((time.monotonic() - self._wall_s) * 1e6) // _CHUNK_US
-        for _ in range(behind):
-            self.node.advance_us(_CHUNK_US)
-        self._wall_s += behind * _CHUNK_US * 1e-6
 
 
 class Embedded:

@@ -29,23 +29,21 @@ class CoeServer:
         self.sdo = SdoServer(store, mailbox_size - _HEAD)
         self._post = post
         self._counter = self._last_counter = 0
-        self.silent = False
-        """Scripted: no message is answered."""
 
     def reset(self) -> None:
         """Reset the mailbox."""
         self._counter = self._last_counter = 0
         self.sdo.reset()
 
-    def emergency(self, code: int, register: int) -> None:
-        """Report an error of the drive to the master; 0 and 0: no error left."""
-        self._send(_EMERGENCY, code.to_bytes(2, "little") + bytes((register, 0, 0, 0, 0, 0)))
+    def emergency(self, message: bytes) -> None:
+        """Send the eight bytes of an emergency message to the master."""
+        self._send(_EMERGENCY, message)
 
     def take(self, message: bytes) -> None:
         """Take one message from the master. A repeated message is dropped."""
         length, _address, _channel, kind = _MAILBOX.unpack_from(message)
         counter = kind >> 4 & 7
-        if self.silent or (counter and counter == self._last_counter):
+        if counter and counter == self._last_counter:
             return
         self._last_counter = counter
         body = message[_MAILBOX.size:_MAILBOX.size + length]

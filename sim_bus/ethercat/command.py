@@ -4,10 +4,8 @@ import argparse
 import threading
 
 from sim_bus.command_arguments import (
-    EXIT_OK,
     Unusable,
-    add_fault_argument,
-    add_rig_arguments,
+    add_drive_arguments,
     never_came,
     number_from,
     ready,
@@ -23,21 +21,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                        help="the Ethernet interface to answer on, such as one end of a veth pair (needs CAP_NET_RAW)")
     group.add_argument("--alias", metavar="N", type=number_from(0, 65535, "an alias"), default=0,
                        help="configured station alias, 0 to 65535 (default 0)")
-    group.add_argument("--profile", metavar="NAME",
-                       help="the drive to be: a profile that ships, or a YAML file (default: our own EDS)")
-    add_rig_arguments(group)
-    add_fault_argument(group, "frame-loss@hold+2s=1%%")
-    group.add_argument("--stepped", action="store_true",
-                       help="plant time moves with the process data, by the period of 5FFEh:3")
+    add_drive_arguments(group, "frame-loss@hold+2s=1%%",
+                        "plant time moves with the process data, by the period of 5FFEh:3")
 
 
 def run(namespace: argparse.Namespace) -> int:
     """Simulate until SIGINT or SIGTERM. Print one line ``ready: …`` on stdout. Return the exit code."""
     from sim_bus.ethercat.faults import listing, parse_all
-
-    if "list" in namespace.fault:
-        print(listing())  # noqa: T201
-        return EXIT_OK
 
     def simulate(stop: threading.Event) -> None:
         from profiles import load_ethercat_profile
@@ -53,4 +43,4 @@ def run(namespace: argparse.Namespace) -> int:
             simulator.run(line, stop)
             never_came(simulator.faults_waiting)
 
-    return until_stopped(simulate)
+    return until_stopped(namespace, listing, simulate)

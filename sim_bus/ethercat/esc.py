@@ -10,7 +10,6 @@ Knows no state machine, no mailbox protocol and no drive: they are behind `Pdi`.
 
 from collections import deque
 from collections.abc import Callable, Container
-from enum import IntEnum
 from struct import Struct
 from typing import Protocol
 
@@ -50,23 +49,16 @@ _DELIVERED = {
 """Contents of the registers after power-on."""
 
 
-class EscCommand(IntEnum):
-    """Datagram commands: auto-increment, station, broadcast, logical; read, write, both; read multiple write."""
+_BY_POSITION, _BY_STATION, _BROADCAST, _LOGICAL = range(4)
+"""Addressing of a datagram."""
+_NOP, _ARMW, _FRMW = 0, 13, 14
+"""Commands beside the twelve of `_access`: none; read one slave and write the others, by position or by station."""
 
-    NOP, APRD, APWR, APRW, FPRD, FPWR, FPRW, BRD, BWR, BRW, LRD, LWR, LRW, ARMW, FRMW = range(15)
 
-
-_READS = {
-    EscCommand.APRD, EscCommand.APRW, EscCommand.FPRD, EscCommand.FPRW, EscCommand.BRD, EscCommand.BRW,
-    EscCommand.LRD, EscCommand.LRW,
-}
-_WRITES = {
-    EscCommand.APWR, EscCommand.APRW, EscCommand.FPWR, EscCommand.FPRW, EscCommand.BWR, EscCommand.BRW,
-    EscCommand.LWR, EscCommand.LRW,
-}
-_LOGICAL = {EscCommand.LRD, EscCommand.LWR, EscCommand.LRW}
-_BY_POSITION = {EscCommand.APRD, EscCommand.APWR, EscCommand.APRW, EscCommand.ARMW}
-_BROADCAST = {EscCommand.BRD, EscCommand.BWR, EscCommand.BRW}
+def _access(command: int) -> tuple[int, bool, bool]:
+    """Return addressing, and whether the command reads and writes: APRD APWR APRW, FPRD …, BRD …, LRD LWR LRW."""
+    addressing, how = divmod(command - 1, 3)
+    return addressing, how != 1, how != 0
 
 
 class Pdi(Protocol):
@@ -163,9 +155,10 @@ class Esc:
                 break
             body, counter = data[begin:at - 2], int.from_bytes(data[at - 2:at], "little")
             gained = 0
-            if command in _LOGICAL:
-                gained = self._logical(command, position | offset << 16, body)
-            elif EscCommand.NOP < command <= EscCommand.FRMW:
+            addressing, reads, writes = _access(command)
+            if addressing == _LOGICAL:
+                gained = self._logical(reads, writes, position | offset << 16, body)
+            elif _NOP < command <= _FRMW:
                 gained, position = self._physical(command, position, offset, body)
             _DATAGRAM.pack_into(data, begin - _DATAGRAM.size, command, index, position, offset, length, event)
             data[begin:at - 2] = body
@@ -177,38 +170,39 @@ class Esc:
         """Execute a datagram with a physical address. Return the increment of the working counter, and the position
         that leaves.
         """
-        if command in _BY_POSITION:
+        addressing, reads, writes = _access(command)
+        multiple, step = command in (_ARMW, _FRMW), 2 if reads and writes else 1
+        if addressing == _BY_POSITION or command == _ARMW:
             addressed, position = position == 0, (position + 1) & 0xFFFF
-        elif command in _BROADCAST:
+        elif addressing == _BROADCAST:
             addressed, position = True, (position + 1) & 0xFFFF
         else:
             alias = self.memory[_DL_ALIAS] & 1 and position == self.word(0x0012)
             addressed = position == self.word(_STATION) or bool(alias)
-        reads, writes = command in _READS and addressed, command in _WRITES and addressed
-        if command in (EscCommand.ARMW, EscCommand.FRMW):
+        if multiple:
             reads, writes = addressed, not addressed
         sent, gained = bytes(body), 0
-        if reads and (found := self._read(offset, len(body))) is not None:
-            body[:] = bytes(a | b for a, b in zip(body, found, strict=True)) if command in _BROADCAST else found
+        if reads and addressed and (found := self._read(offset, len(body))) is not None:
+            body[:] = bytes(a | b for a, b in zip(body, found, strict=True)) if addressing == _BROADCAST else found
             gained = 1
-        if writes and self._write(offset, sent):
-            gained += 2 if command in (EscCommand.APRW, EscCommand.FPRW, EscCommand.BRW) else 1
+        if writes and (addressed or multiple) and self._write(offset, sent):
+            gained += step
         return gained, position
 
-    def _logical(self, command: int, logical: int, body: bytearray) -> int:
+    def _logical(self, reads: bool, writes: bool, logical: int, body: bytearray) -> int:
         """Execute a datagram with a logical address. Return the increment of the working counter. Reads come first."""
         sent, was_read, was_written = bytes(body), False, False
         for fmmu in self._fmmus:
             at, place = fmmu.part(logical, len(body))
             count = place.stop - place.start
-            if count and fmmu.reads and command in _READS and (found := self._read(at, count)) is not None:
+            if count and fmmu.reads and reads and (found := self._read(at, count)) is not None:
                 body[place] = found
                 was_read = True
         for fmmu in self._fmmus:
             at, place = fmmu.part(logical, len(body))
-            if sent[place] and fmmu.writes and command in _WRITES:
+            if sent[place] and fmmu.writes and writes:
                 was_written |= self._write(at, sent[place])
-        return was_read + (2 if command == EscCommand.LRW else 1) * was_written
+        return was_read + (2 if reads and writes else 1) * was_written
 
     # -- memory ------------------------------------------------------------------------------------------
 
@@ -328,11 +322,6 @@ class Esc:
             self.memory[_SII_DATA:_SII_DATA + 4] = self.eeprom[at:at + 4].ljust(4, b"\xff")
         self.set_word(_SII_CONTROL, _SII_REFUSED if control & _SII_WRITE else 0)
 
-    @property
-    def watchdog_s(self) -> float:
-        """Return the time of the process data watchdog (0400h, 0420h), s; 0 if it is off."""
-        return (self.word(_DIVIDER) + 2) * _WATCHDOG_UNIT_S * self.word(_WATCHDOG)
-
     def stop_watchdog(self) -> None:
         """End the watchdog: no outputs are expected."""
         self._unfed_s = None
@@ -349,7 +338,8 @@ class Esc:
         self.clock_ns += 1000 * duration_us
         if self._unfed_s is not None:
             self._unfed_s += 1e-6 * duration_us
-            if 0.0 < self.watchdog_s < self._unfed_s:
+            longest_s = (self.word(_DIVIDER) + 2) * _WATCHDOG_UNIT_S * self.word(_WATCHDOG)
+            if 0.0 < longest_s < self._unfed_s:
                 self.expire_watchdog()
 
     def _tell_time(self) -> None:

@@ -7,7 +7,6 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from struct import pack, pack_into
 from typing import NamedTuple
 
@@ -27,23 +26,12 @@ class Area(NamedTuple):
     kind: int
 
 
-@dataclass(frozen=True)
-class PdoEntry:
-    """One entry of a PDO."""
+class SiiPdo(NamedTuple):
+    """One PDO of a SyncManager. ``entries``: index << 16 | subindex << 8 | bits, and the data type."""
 
-    index: int
-    subindex: int
-    data_type: int
-    bits: int
-
-
-@dataclass(frozen=True)
-class SiiPdo:
-    """One PDO of a SyncManager."""
-
-    index: int
+    number: int
     manager: int
-    entries: Sequence[PdoEntry]
+    entries: Sequence[tuple[int, int]]
 
 
 def checksum(head: bytes) -> int:
@@ -81,5 +69,7 @@ def _category(kind: int, content: bytes) -> bytes:
 
 
 def _pdo(pdo: SiiPdo) -> bytes:
-    entries = b"".join(pack("<HBBBBH", one.index, one.subindex, 0, one.data_type, one.bits, 0) for one in pdo.entries)
-    return pack("<HBBBBH", pdo.index, len(pdo.entries), pdo.manager, 0, 0, 0) + entries
+    entries = b"".join(
+        pack("<HBBBBH", one >> 16, one >> 8 & 0xFF, 0, data_type, one & 0xFF, 0) for one, data_type in pdo.entries
+    )
+    return pack("<HBBBBH", pdo.number, len(pdo.entries), pdo.manager, 0, 0, 0) + entries

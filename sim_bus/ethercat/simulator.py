@@ -11,10 +11,10 @@ from sim_bus.ethercat.esc import ETHERTYPE
 from sim_bus.ethercat.faults import Faults
 from sim_bus.ethercat.slave import Cia402Slave
 from sim_bus.fault_script import Scripted
+from sim_bus.own_time import OwnTime
 from sim_bus.params import RigParams
 from sim_bus.trace import ShaftTrace
 
-_CHUNK_US = 2_000
 _POLL_S = 0.005
 _FRAME_SIZE = 2048
 
@@ -22,8 +22,7 @@ _FRAME_SIZE = 2048
 class Simulator:
     """A simulated drive. Its caller states the time: `answer` and `idle` wait for nothing and read no clock.
 
-    Only the host's outputs advance stepped time. After ``silence_s`` without a frame the drive continues in its own
-    time, so that its watchdog acts. New frames return it to stepped time.
+    Only the host's outputs advance stepped time, unless it is silent for ``silence_s`` (`OwnTime`).
     """
 
     def __init__(self, params: RigParams | None = None, *, seed: int = 0, trace: Path | None = None,
@@ -33,9 +32,7 @@ class Simulator:
         self.slave = Cia402Slave(params or RigParams(), seed=seed, trace=self.trace, stepped=stepped, alias=alias,
                                  profile=profile)
         self._faults = Faults(faults, self.slave, seed)
-        self._silence_s = silence_s
-        self._silent_s = self._last_s = self._plant_s = 0.0
-        self._running_on = False
+        self._time = OwnTime(self.slave, silence_s)
 
     @property
     def faults_waiting(self) -> tuple[str, ...]:
@@ -44,32 +41,14 @@ class Simulator:
 
     def answer(self, frame: bytes, now_s: float) -> bytes:
         """Return the frame as it comes back at ``now_s`` of the caller's clock; empty if it is lost."""
-        self._follow(now_s)
-        self._silent_s = 0.0
-        if self._running_on:
-            self._running_on = False
-            self.slave.note("frames are back: stepped again")
+        self.slave.esc.fine_ns = round(1e9 * self._time.heard(now_s))
         return self._faults.answer(frame)
 
     def idle(self, now_s: float, waited_s: float = _POLL_S) -> None:
         """Record that no frame has come for ``waited_s``. A shorter time counts if the caller had no processor time."""
-        self._silent_s += waited_s
-        if self.slave.stepped and self.slave.cycled and self._silent_s >= self._silence_s and not self._running_on:
-            self._running_on, self._plant_s = True, now_s
-            self.slave.note("host silent: running on in own time")
-        self._follow(now_s)
-
-    def _follow(self, now_s: float) -> None:
-        """Advance the plant in its own time to the caller's clock, in whole chunks."""
-        slave, before_s, self._last_s = self.slave, self._last_s, now_s
-        if not before_s or (slave.stepped and not self._running_on):
-            self._plant_s, slave.esc.fine_ns = now_s, 0
-            return
-        chunks = int((now_s - self._plant_s) * 1e6) // _CHUNK_US
-        for _ in range(chunks):
-            slave.advance_us(_CHUNK_US)
-        self._plant_s += chunks * _CHUNK_US * 1e-6
-        slave.esc.fine_ns = round(1e9 * (now_s - self._plant_s))
+        if not self._time.runs:
+            self._time.waited(waited_s, now_s)
+        self.slave.esc.fine_ns = round(1e9 * self._time.follow(now_s))
 
     def run(self, line: socket.socket, stop: threading.Event) -> None:
         """Serve a raw socket until ``stop`` is set. Then advance to the end of a rehearsal and close the trace."""
@@ -85,8 +64,7 @@ class Simulator:
                         stop.wait(_POLL_S)          # the interface is down: nothing comes
                     self.idle(time.monotonic())
                     self.trace.flush()
-            if self._faults.scripted and self.slave.stepped and self.slave.cycled:
-                self.slave.run_out()
+            self._faults.end()
 
 
 def raw_socket(interface: str) -> socket.socket:

@@ -5,23 +5,20 @@ a frame with outputs 1. gets the reported values as its inputs, 2. makes its out
 exactly 5FFEh:3 (µs), in equal steps of at most the control period.
 """
 
-from contextlib import suppress
 from enum import IntEnum
 
 from canopen.objectdictionary import datatypes
-from canopen.sdo import SdoAbortedError
 
 from profiles import MARKER_INDEX
 from profiles.ethercat import EthercatProfile
-from sim_bus.application_objects import ApplicationObjects
+from sim_bus.emergency import COMMUNICATION, GENERIC
 from sim_bus.ethercat.coe import CoeServer
 from sim_bus.ethercat.esc import AL_STATUS, AL_STATUS_CODE, Esc
 from sim_bus.ethercat.process_data import ProcessData
 from sim_bus.ethercat.sii import Area, eeprom
-from sim_bus.objects import ABORT_LENGTH, ObjectStore, generic_eds, key_of
+from sim_bus.object_drive import ObjectDrive
+from sim_bus.objects import key_of
 from sim_bus.params import RigParams
-from sim_bus.profile_emulation import WornProfile
-from sim_bus.timed_drive import TimedDrive
 from sim_bus.trace import ShaftTrace
 
 MAILBOX = 128
@@ -30,14 +27,6 @@ MAILBOX = 128
 _OUTPUTS_AT, _INPUTS_AT = 0x1200, 0x1400
 _CAN_ONLY = (0x1005, 0x1006, 0x1014, 0x1016, 0x1017, 0x1029, 0x1200,
              *(base + number for base in (0x1400, 0x1600, 0x1800, 0x1A00) for number in range(4)))
-_TEXT, _TEXT_LIMIT = key_of(MARKER_INDEX, 5), 512
-"""Object for segmented transfers: a text, and its largest length in bytes."""
-
-HOST_LOST = 0x8130
-"""Error code if the process data end while torque may flow (CiA 301: heartbeat error)."""
-
-_GENERIC, _COMMUNICATION = 0x01, 0x10
-
 
 class AlState(IntEnum):
     """States of the slave, with their codes in 0120h and 0130h."""
@@ -54,53 +43,40 @@ WATCHDOG, OUTPUTS_WRONG, INPUTS_WRONG = 0x001B, 0x001D, 0x001E
 _ERROR = 0x10
 
 
-class SlaveObjects(ObjectStore):
-    """The objects, with a text of any length to write and read back."""
-
-    def set_data(self, index: int, subindex: int, data: bytes, check_writable: bool = False) -> None:
-        """Handle an SDO download."""
-        if key_of(index, subindex) != _TEXT:
-            super().set_data(index, subindex, data, check_writable)
-        elif len(data) > _TEXT_LIMIT or not data.isascii():
-            raise SdoAbortedError(ABORT_LENGTH)
-        else:
-            self.values[_TEXT] = data.decode("ascii")
-
-
-class Cia402Slave(TimedDrive):
+class Cia402Slave(ObjectDrive):
     """A CiA 402 drive on EtherCAT over a simulated inverter, with our own EDS or with a ``profile``."""
+
+    error_register = GENERIC | COMMUNICATION
 
     def __init__(self, params: RigParams, *, seed: int, trace: ShaftTrace, stepped: bool, alias: int = 0,
                  profile: EthercatProfile | None = None) -> None:
-        super().__init__(params, seed=seed, trace=trace, stepped=stepped)
+        super().__init__(params, node_id=1, seed=seed, trace=trace, stepped=stepped, profile=profile)
         self.state = AlState.INIT
-        self.cycled = False
-        """True after outputs have come."""
-        self.period_us = 0
-        """5FFEh:3: period of a cycle in stepped time."""
-        self.frozen: bytes | None = None
-        """Scripted: constant inputs, independent of the drive."""
-        self.fault_code = self._register = 0
         self._outputs_came = self._op_requested = False
-        self.store = SlaveObjects(1, generic_eds())
         for index in _CAN_ONLY:
             self.store.remove(index)
-        worn = WornProfile(profile, self.application) if profile else None
-        self._setters = ApplicationObjects(self.store, self.application, worn.units if worn else None).setters
-        if worn is not None:
-            worn.apply(self.store)
         pdos = (profile.cyclic.rx_pdos[0], profile.cyclic.tx_pdos[0]) if profile else (0x1600, 0x1A00)
-        self.received = ProcessData(self.store, outputs=True, writable=self._configurable, usual=pdos[0])
+        self.received = ProcessData(self.store, outputs=True, writable=self._configurable, usual=pdos[0],
+                                    setters=self.setters)
         self.sent = ProcessData(self.store, outputs=False, writable=self._configurable, usual=pdos[1])
-        self._bind()
+        short = datatypes.UNSIGNED8
+        for index, sub, data_type, writable, name, value in (
+            *((0x1C00, sub, short, False, "SyncManager type", sub or 4) for sub in (1, 2, 3, 4, 0)),
+            (0x60C2, 1, short, True, "Interpolation time period", 1),
+            (0x60C2, 2, datatypes.INTEGER8, True, "Interpolation time index", -3),
+            (0x60C2, 0, short, False, "Entries", 2),
+            (MARKER_INDEX, 5, datatypes.VISIBLE_STRING, True, "Text for segmented transfers", ""),
+        ):
+            self.store.add(index, sub, data_type, writable=writable, mappable=False, name=name, default=value)
+        self.add_period()
+        self.store.restore()
+        self.bind_marker(self.store)
         areas = (Area(0x1000, MAILBOX, 0x26, 1), Area(0x1000 + MAILBOX, MAILBOX, 0x22, 2),
-                 Area(_OUTPUTS_AT, self.received.size, 0x64, 3), Area(_INPUTS_AT, self.sent.size, 0x20, 4))
+                 Area(_OUTPUTS_AT, self.received.data.size, 0x64, 3), Area(_INPUTS_AT, self.sent.data.size, 0x20, 4))
         identity = [int(self.store.number(key_of(0x1018, sub))) for sub in (1, 2, 3, 4)]
         self.esc = Esc(self, eeprom(identity, alias, str(self.store.values[key_of(0x1008)]), areas,
                                     [self.received.delivered(), self.sent.delivered()]))
         self.coe = CoeServer(self.store, self.esc.post, MAILBOX)
-        self.application.on_event = self.note
-        self.application.on_fault_reset = lambda: self.report(0)
         self.note("power on")
 
     def answer(self, frame: bytes) -> bytes:
@@ -111,16 +87,14 @@ class Cia402Slave(TimedDrive):
             self.pass_cycle()
         return answered
 
-    def pass_cycle(self) -> None:
-        """Advance by one period in stepped time after the host has sent its outputs, whether or not they arrived."""
-        self.cycled = True
-        if self.stepped and self.period_us:
-            self.advance_us(self.period_us)
-
     def advance_us(self, duration_us: int) -> None:
         """Advance the plant and all timers."""
         super().advance_us(duration_us)
         self.esc.pass_time(duration_us)
+
+    def send_emergency(self, message: bytes) -> None:
+        """Put an emergency message into the mailbox."""
+        self.coe.emergency(message)
 
     # -- the slave controller's other side ---------------------------------------------------------------
 
@@ -134,19 +108,12 @@ class Cia402Slave(TimedDrive):
         self._outputs_came = True
         if self._op_requested:
             self._enter(AlState.OPERATIONAL)
-        if self.state is not AlState.OPERATIONAL:
-            return
-        for key, value in self.received.unpack(data):
-            setter = self._setters.get(key)
-            if setter is not None:
-                setter(int(value))
-            else:
-                with suppress(SdoAbortedError):      # a value out of range is dropped: a PDO cannot be refused
-                    self.store.write(key, int(value))
+        if self.state is AlState.OPERATIONAL:
+            self.received.data.act(data)
 
     def inputs(self) -> bytes:
         """Return the process data inputs at this moment."""
-        return self.sent.pack() if self.frozen is None else self.frozen
+        return self.sent.data.pack()
 
     def watchdog_expired(self) -> None:
         """React to outputs that have not come for the time of 0420h."""
@@ -195,8 +162,8 @@ class Cia402Slave(TimedDrive):
             return 0 if fits and managers[0].host_writes and not managers[1].host_writes else MAILBOX_WRONG
         for data, code in ((self.received, OUTPUTS_WRONG), (self.sent, INPUTS_WRONG)):
             one = managers[data.manager]
-            fits = not one.mailbox and one.host_writes is data.outputs and one.length == data.size
-            if one.enabled is not (data.size > 0) or (one.enabled and not fits):
+            fits = not one.mailbox and one.host_writes is data.outputs and one.length == data.data.size
+            if one.enabled is not (data.data.size > 0) or (one.enabled and not fits):
                 return code
         return 0
 
@@ -214,39 +181,11 @@ class Cia402Slave(TimedDrive):
             self.application.warning = False
         elif before is AlState.OPERATIONAL:
             self.esc.stop_watchdog()
-            if self.application.energised:         # reaction of 6007h if torque may flow
-                self.report(HOST_LOST)
-                self.application.warning = True
-                self.application.abort_connection()
+            if self.application.energised:         # torque may flow
+                self.lose_host()
 
     def _tell(self, code: int) -> None:
         self.esc.set_word(AL_STATUS, self.state | _ERROR * (code > 0))
         self.esc.set_word(AL_STATUS_CODE, code)
         if code:
             self.note(f"AL status code {code:04X}h")
-
-    # -- objects -----------------------------------------------------------------------------------------
-
-    def report(self, code: int) -> None:
-        """Report an error of the drive in 603Fh, 1001h and an emergency message; 0: no error left."""
-        if code or self.fault_code:
-            self.fault_code, self._register = code, (_GENERIC | _COMMUNICATION) * (code > 0)
-            self.coe.emergency(code, self._register)
-
-    def _bind(self) -> None:
-        store, short, live, hooks = self.store, datatypes.UNSIGNED8, self.store.live, self.store.hooks
-        live[key_of(0x1001)], live[key_of(0x603F)] = lambda: self._register, lambda: self.fault_code
-        added: list[tuple[int, int, int, str, int | str]] = [
-            *((0x1C00, sub, short, "SyncManager type", sub or 4) for sub in (1, 2, 3, 4, 0)),
-            (0x60C2, 1, short, "Interpolation time period", 1),
-            (0x60C2, 2, datatypes.INTEGER8, "Interpolation time index", -3), (0x60C2, 0, short, "Entries", 2),
-            (MARKER_INDEX, 3, datatypes.UNSIGNED32, "Stepped period", 0),
-            (MARKER_INDEX, 5, datatypes.VISIBLE_STRING, "Text", ""),
-        ]
-        for index, sub, data_type, name, value in added:
-            writable = index != 0x1C00 and (index, sub) != (0x60C2, 0)
-            store.add(index, sub, data_type, writable=writable, mappable=False, name=name)
-            store.set_default(index, sub, value)
-        hooks[key_of(MARKER_INDEX, 3)] = lambda value: setattr(self, "period_us", value)
-        store.restore()
-        self.bind_marker(store)

@@ -4,7 +4,6 @@ import argparse
 import threading
 
 from sim_bus.command_arguments import (
-    EXIT_OK,
     Unusable,
     add_fault_argument,
     add_rig_arguments,
@@ -41,11 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """Simulate until SIGINT or SIGTERM. Print one line ``ready: …`` on stdout. Return the exit code."""
-    if "list" in namespace.fault:
-        from sim_bus.modbus.faults import listing
-
-        print(listing())  # noqa: T201
-        return EXIT_OK
+    from sim_bus.modbus.faults import listing
 
     def simulate(stop: threading.Event) -> None:
         from profiles import load_modbus_profile
@@ -83,4 +78,4 @@ def run(namespace: argparse.Namespace) -> int:
             finally:
                 listener.close()
 
-    return until_stopped(simulate)
+    return until_stopped(namespace, listing, simulate)

@@ -33,13 +33,13 @@ from drivers import (
     CommunicationLost,
     DataFileError,
     MonotonicClock,
-    ObjectRefused,
     PreflightRefused,
     Problem,
     TdhilError,
+    cia402,
 )
 from drivers import canopen as driver
-from profiles import MARKER_INDEX, MARKER_TEXT, DataModel, Finding, Profile, load_profile, profile_names, visible
+from profiles import DataModel, Finding, Profile, load_profile, profile_names
 from profiles.canopen import CanopenProfile
 from profiles.quantities import BIT_RATE, TIME, read
 from tdhil.buses.bus import Bus, Connection, FoundDrive, Line, Opening, PeerPlan, ProfileTable, ValueSeen, one_host
@@ -616,25 +616,10 @@ def identify_all(link: driver.CanLink, heard: driver.Heard) -> tuple[FoundDrive,
 
 
 def _identify(link: driver.CanLink, node: int, heard: driver.Heard, profiles: list[CanopenProfile]) -> FoundDrive:
-    objects = driver.SdoObjects(link, node)
-    values: list[int | None] = []
-    title, simulated = "", False
-    try:
-        values += [objects.read_if_there(0x1018, sub) for sub in (1, 2, 3, 4)]
-        title = _text(objects, 0x1008)
-        simulated = _text(objects, MARKER_INDEX, 1) == MARKER_TEXT
-    except CommunicationLost:
-        values += [None] * (4 - len(values))           # it answered once and then no more: show the known values
-    profile, why = match(heard.device_types[node], values[:3], profiles)
-    return FoundDrive("canopen", node, title, identity_text(values) or "not reported (1018h)", simulated, profile, why,
-                      heard.states.get(node, ""))
-
-
-def _text(objects: driver.SdoObjects, index: int, sub: int = 0) -> str:
-    try:
-        return visible(objects.read_bytes(index, sub).decode("ascii", "replace").rstrip("\0 "))
-    except ObjectRefused:
-        return ""
+    found = cia402.describe(driver.SdoObjects(link, node))
+    profile, why = match(heard.device_types[node], found.identity[:3], profiles)
+    return FoundDrive("canopen", node, found.title, identity_text(found.identity) or "not reported (1018h)",
+                      found.simulated, profile, why, heard.states.get(node, ""))
 
 
 LISTEN_S = 1.0

@@ -123,7 +123,7 @@ class MemoryObjects(Objects):
 
 class MemoryBus(Cia402Bus):
     def __init__(self, drive, profile, clock, period_s, tap):
-        super().__init__(MemoryObjects(drive), DriveWatch("memory"), clock, period_s)
+        super().__init__(MemoryObjects(drive), DriveWatch("memory", clock), clock, period_s)
         self._drive, self._profile, self._tap = drive, profile, tap
         self._frame, self._enabled, self._fed = None, True, True
 

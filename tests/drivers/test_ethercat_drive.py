@@ -6,11 +6,11 @@ import struct
 
 import pytest
 
+from drivers.cia402.cycle_period import interpolation
 from drivers.clock import SteppedClock
 from drivers.drive import Outcome, PowerState
 from drivers.errors import CommunicationLost, DriveFault, PreflightRefused
 from drivers.ethercat import raw
-from drivers.ethercat.drive import interpolation
 from drivers.ethercat.quick_stop import EthercatTarget
 from drivers.ethercat.scan import found_slave
 from drivers.ethercat.segment import EthercatSegment
@@ -394,7 +394,7 @@ def wired(monkeypatch):
 @pytest.mark.parametrize(("status", "driven"), [(8, True), (4, False), (0x14, False), (2, False), (1, False)])
 def test_a_segment_that_another_master_drives_is_refused(wired, status, driven):
     segment = wired(status=status)
-    assert segment.count() == 1
+    assert len(segment.stations()) == 1
     if driven:
         with pytest.raises(PreflightRefused, match="another master drives this segment"):
             raw.refuse_driven(segment)
@@ -404,7 +404,7 @@ def test_a_segment_that_another_master_drives_is_refused(wired, status, driven):
 
 def test_a_segment_without_slaves(wired):
     segment = wired(answers=False)
-    assert segment.count() == 0
+    assert segment.stations() == []
     with pytest.raises(CommunicationLost, match="no frame comes back"):
         raw.RawStation(segment, 0).al_status()
 

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.canopen import pdo as objects
-from drivers.canopen.pdo import Slow, consumer_heartbeat, mapping_entry
+from drivers.canopen.pdo import STANDARD, Slow, consumer_heartbeat
 from drivers.canopen.pdo_mapping import layout
+from drivers.cia402.mapping import mapping_entry
 from drivers.cia402.process_data import Units, encode_speed, encode_torque
 from drivers.errors import CommandRejected
 from profiles.canopen import STANDARD_POSITION
@@ -72,10 +72,10 @@ def test_known_counts():
 
 def test_bytes_of_the_cyclic_frames():
     # 6040h = 000Fh · 6071h = -2 ‰ · 60FFh = 100 000
-    assert objects.RPDO1.pack(0x000F, -2, 100_000).hex() == "0f00feffa0860100"
+    assert STANDARD.rpdo1.pack((0x000F, -2, 100_000, 0, 0)).hex() == "0f00feffa0860100"
     # 6041h = 1237h · 6077h = 300 ‰ · 606Ch = -1
-    assert objects.TPDO1.unpack(bytes.fromhex("37122c01ffffffff")) == (0x1237, 300, -1)
-    assert objects.RPDO2.pack(-1).hex() == "ff"
+    assert STANDARD.feedback.unpack(bytes.fromhex("37122c01ffffffff")) == (0x1237, 300, -1)
+    assert STANDARD.rpdo2.pack((0, 0, 0, -1, 0)).hex() == "ff"
     assert Slow().unpack(b"\x0a") == (10, None, None)
     assert Slow(demand=True).unpack(bytes.fromhex("0a18fc")) == (10, -1000, None)
     assert Slow(demand=True, position=STANDARD_POSITION).unpack(bytes.fromhex("0a18fcfeffffff")) == (10, -1000, -2.0)
@@ -87,8 +87,8 @@ def test_bytes_of_the_cyclic_frames():
 def test_bytes_of_any_frame(word, torque, speed):
     by_hand = bytes([word & 255, word >> 8]) + torque.to_bytes(2, "little", signed=True)
     by_hand += speed.to_bytes(4, "little", signed=True)
-    assert objects.RPDO1.pack(word, torque, speed) == by_hand
-    assert objects.TPDO1.unpack(by_hand) == (word, torque, speed)
+    assert STANDARD.rpdo1.pack((word, torque, speed, 0, 0)) == by_hand
+    assert STANDARD.feedback.unpack(by_hand) == (word, torque, speed)
 
 
 def test_mapping_entries():
@@ -110,7 +110,7 @@ def test_mapping_and_frames_are_of_one_length():
 
 
 def check_lengths(slow):
-    structs = [objects.RPDO1, objects.TPDO1, objects.RPDO2, slow]
+    structs = [STANDARD.rpdo1, STANDARD.feedback, STANDARD.rpdo2, slow]
     for pdo, codec in zip(layout(slow), structs, strict=True):
         assert sum(mapping_entry(mapped) & 0xFF for mapped in pdo.mapped) == 8 * codec.size
 

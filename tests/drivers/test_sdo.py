@@ -1,12 +1,14 @@
 """Objects over a hand-typed SDO server: what is asked, what is refused, what must not be taken for an answer."""
 
 import pytest
+from canopen.sdo import SdoAbortedError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.canopen.bus import CanLink
-from drivers.canopen.sdo import SdoObjects, is_answer
+from drivers.canopen.sdo import SdoObjects
 from drivers.cia402.objects import name
+from drivers.cia402.sdo_message import abort_text, is_answer
 from drivers.clock import SteppedClock
 from drivers.errors import CommunicationLost, ObjectRefused
 
@@ -36,6 +38,11 @@ def test_widths_and_signs(objects, peer, bits, value, raw):
 def test_segmented_upload(objects, peer, length):
     peer.objects[0x1008, 0] = bytes(range(length))
     assert objects.read_bytes(0x1008) == bytes(range(length))
+
+
+def test_the_text_of_an_abort_is_that_of_the_standard():
+    for code in (*SdoAbortedError.CODES, 0x12345678):
+        assert abort_text(code) == str(SdoAbortedError(code))
 
 
 @pytest.mark.parametrize("code", [0x06010002, 0x06020000, 0x06090030, 0x08000022])

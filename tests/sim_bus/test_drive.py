@@ -247,7 +247,7 @@ def test_trace_and_silence(bench: Open, tmp_path: Path) -> None:
     path = tmp_path / "shaft.csv"
     simulated, host = bench(trace=path)
     watched(host, 3)
-    simulated.simulator._silence_s = 0.05          # from here on: before, a busy computer's host may take his time
+    simulated.simulator._time.silence_s = 0.05          # from here on: before, a busy computer's host may take his time
     deadline = time.monotonic() + 120.0
     while "state: switch on disabled" not in path.read_text() and time.monotonic() < deadline:
         time.sleep(0.02)                                                    # the host says nothing

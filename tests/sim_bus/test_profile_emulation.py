@@ -125,7 +125,7 @@ def test_a_silent_host_stops_the_shaft(bench: Open, tmp_path: Path, reaction: in
     s120_in_motion(host)
     assert simulated.simulator.speed_rad_s == pytest.approx(6.2831853, abs=0.05)
     begin_s = simulated.simulator.time_s
-    simulated.simulator._silence_s = 0.05          # from here on: before, a busy computer's host may take his time
+    simulated.simulator._time.silence_s = 0.05          # from here on: before, a busy computer's host may take his time
     wait_for("the stop", lambda: abs(simulated.simulator.speed_rad_s) <= (0.05 if reaction != 2 else 5.9))
     wait_for("what comes of it", lambda: f",{events[-1]}\n" in path.read_text(encoding="utf-8"))
     simulated.close()

@@ -96,7 +96,7 @@ def run_into(trouble: Callable[[], None], folder: Path, drive: Drive, interface:
             wait_for("motion", lambda: drive.simulator.speed_rad_s > TURNING_RAD_S or over.is_set())
             if over.is_set():
                 return
-            drive.simulator._silence_s = 1.0           # from here on: he may be gone, and the drive has to see it
+            drive.simulator._time.silence_s = 1.0           # from here on: he may be gone, and the drive has to see it
             trouble()
             due_s = drive.simulator.time_s + NOTICED_S
             wait_for("the end", lambda: over.is_set() or drive.simulator.time_s > due_s)
