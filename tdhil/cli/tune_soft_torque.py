@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 
 IDENTIFIED = ("inertia_kg_m2", "viscous_nm_s_rad", "coulomb_nm", "speed_lag_s", "torque_lag_s", "gear_ratio")
 """Keys of the result that `tdhil evaluate` needs."""
-CONTROL_PERIOD_S, DEAD_TIME_PERIODS = 0.002, 10.0
-"""Assumed control period of an inverter's speed loop, s; and the reserve of dead time, in such periods."""
+DEAD_TIME_PERIODS = 10.0
+"""Reserve of dead time, in control periods."""
 STATED_LAG_TOLERANCE, ASSUMED_LAG_TOLERANCE = 0.1, 0.5
 """Relative uncertainty of each lag that was not measured."""
 MOST_DEPTHS = 60
@@ -271,6 +271,7 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
 
 def _required(result: Mapping[str, Any], namespace: argparse.Namespace) -> RequiredMargins:
     """Return the requested margins, or the usual ones: ten control periods of dead time."""
+    from tdhil.estimation import CONTROL_PERIOD_S
     from tdhil.soft_torque import RequiredMargins
 
     if namespace.margins is not None:
