@@ -6,13 +6,14 @@ stable beside stick-slip. So a disturbance moves the bit from one to the other, 
 of chance over a range of set speeds.
 
 The observer of the run estimates the disturbing torque in each cycle. Trials are simulated with this record: shifted in
-time and with either sign, so that each trial gets another course of the same spectrum. The range begins at the lowest
-set speed at which one of the trials turns, and ends at the highest at which one of them sticks.
+time and with either sign, so that each trial gets another course of the same spectrum. An outcome of the run agrees
+with the prediction if it occurs in one of the simulated trials at a set speed nearby.
 """
 
 from __future__ import annotations
 
-from math import ceil
+from dataclasses import dataclass
+from math import ceil, inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,31 +25,50 @@ from tdhil.soft_torque.uncertainty import Interval
 from tdhil.soft_torque.virtual_string import SpeedProgram
 
 TRIALS, TRIAL_SEED = 24, 11
-"""Number of simulated trials at each set speed, and the seed of their shifts. A set speed with an outcome in 1 of 24
-trials is inside the range, so that the range covers about 95 %."""
+"""Number of simulated trials at each set speed, and the seed of their shifts. An outcome with a probability of 10 %
+occurs in one or more of them in 92 % of the cases."""
 BELOW_SHARE, STEP_RPM = 0.6, 1.0
 """Lowest simulated set speed as a share of the predicted one; and distance of the set speeds, rpm."""
 LONGEST_SAMPLE_S = 0.1
 """Longest sampling time of the disturbance, s. The observer follows within 0.2 s."""
 
 
-def disturbed_range(
+@dataclass(frozen=True)
+class DisturbedTrials:
+    """Simulated trials under the observed torque."""
+
+    speeds_rpm: Array
+    """Set speeds, (N,)."""
+    turning: NDArray[np.int_]
+    """Number of the `TRIALS` at each set speed in which the bit turns, (N,)."""
+
+    def distance_rpm(self, critical_rpm: Interval) -> float:
+        """Return how far the bracket of a critical speed is from outcomes that occur in the simulation, rpm.
+
+        ``critical_rpm``: the trial at ``low`` stuck, and the trial at ``value`` turned.
+        """
+        turn, stick = self.speeds_rpm[self.turning > 0], self.speeds_rpm[self.turning < TRIALS]
+        return float(max(np.abs(turn - critical_rpm.value).min(initial=inf),
+                         np.abs(stick - critical_rpm.low).min(initial=inf)))
+
+    def turning_at(self, speed_rpm: float) -> int:
+        """Return the number of trials in which the bit turns, at the simulated set speed nearest to ``speed_rpm``."""
+        return int(self.turning[np.argmin(np.abs(self.speeds_rpm - speed_rpm))])
+
+
+def disturbed_trials(
     string: DrillString, drive: TopDrive, law: SpeedController, program: SpeedProgram, predicted_rpm: Interval,
     unknown_nm: Array, period_s: float,
-) -> Interval:
-    """Return the predicted critical speed, rpm, with the range in which it lies under the disturbance.
+) -> DisturbedTrials:
+    """Return simulated trials at set speeds around the predicted critical speed.
 
-    ``unknown_nm``: unknown torque of the observer at each cycle of ``period_s``, N·m at the main shaft. The range
-    contains ``predicted_rpm``. Raises ValueError if no bit is stated.
+    ``unknown_nm``: unknown torque of the observer at each cycle of ``period_s``, N·m at the main shaft. Raises
+    ValueError if no bit is stated.
     """
     lowest, highest = BELOW_SHARE * predicted_rpm.low, max(program.highest_rad_s / RPM, predicted_rpm.high)
     speeds_rpm = np.linspace(lowest, highest, ceil((highest - lowest) / STEP_RPM) + 1)
     turns = _turning_trials(string, drive, law, program, speeds_rpm, unknown_nm, period_s)
-    turn, stick = speeds_rpm[turns.any(axis=0)], speeds_rpm[~turns.all(axis=0)]
-    return Interval(
-        predicted_rpm.value,
-        min(predicted_rpm.low, float(turn[0]) if turn.size else predicted_rpm.low),
-        max(predicted_rpm.high, float(stick[-1]) if stick.size else predicted_rpm.high))
+    return DisturbedTrials(speeds_rpm, turns.sum(axis=0))
 
 
 def _turning_trials(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from profiles import MessageCode, TdhilError
 from tdhil.soft_torque.controller import SpeedController, TopDrive
-from tdhil.soft_torque.disturbed_cure import disturbed_range
+from tdhil.soft_torque.disturbed_cure import TRIALS, DisturbedTrials, disturbed_trials
 from tdhil.soft_torque.drill_string import DrillString, StringTolerance
 from tdhil.soft_torque.simulation import LONGEST_TICK_S, RPM, Array, Begin, simulate
 from tdhil.soft_torque.tuned_figures import lowest_modes_below_hz
@@ -296,8 +296,8 @@ def evaluate(rows: Array, case: EvaluationCase, program: SpeedProgram, contradic
     reached = float(set_rad_s.max())
     disturbed = None
     if critical is not None and _distance_rpm(critical, case.prediction.cure_rpm) > TOLERANCE_RPM:
-        disturbed = disturbed_range(case.string, case.meant, case.law, program, case.prediction.cure_rpm,
-                                    column["unknown_nm"][coupled], period_s)
+        disturbed = disturbed_trials(case.string, case.meant, case.law, program, case.prediction.cure_rpm,
+                                     column["unknown_nm"][coupled], period_s)
     outcome, why = _verdict(case, program, clamped, foreign, did_stick, critical, decay, unknown, reached, disturbed)
     if contradiction:
         outcome, why = EvaluationOutcome.INVALID, contradiction
@@ -313,12 +313,11 @@ def evaluate(rows: Array, case: EvaluationCase, program: SpeedProgram, contradic
 def _verdict(
     case: EvaluationCase, program: SpeedProgram, clamped: int, foreign: float, did_stick: bool,
     critical: Interval | None,
-    decay: tuple[Interval, float] | None, unknown_nm: float, reached: float, disturbed_rpm: Interval | None,
+    decay: tuple[Interval, float] | None, unknown_nm: float, reached: float, disturbed: DisturbedTrials | None,
 ) -> tuple[EvaluationOutcome, str]:
     """Return the verdict with its reason.
 
-    ``disturbed_rpm``: range of the critical speed under the unknown torque. It is computed for a critical speed that is
-    not near the prediction.
+    ``disturbed``: simulated trials under the unknown torque, for a critical speed that is not near the prediction.
     """
     predicted, damping = case.prediction.cure_rpm, case.prediction.least_damping
     if clamped:
@@ -336,10 +335,11 @@ def _verdict(
                     f"the run ended at {reached / RPM:.0f} rpm, before the bit had ended turning")
         return EvaluationOutcome.NOT_FOUND, "the bit never ended turning, up to the highest set speed"
     words = f"critical speed {critical.value:.1f} rpm, predicted {predicted.low:.0f} to {predicted.high:.0f}"
-    if disturbed_rpm is not None:
-        words += (f", and {disturbed_rpm.low:.0f} to {disturbed_rpm.high:.0f} under the {unknown_nm:.0f} N·m rms of "
-                  "torque that was not commanded")
-    if _distance_rpm(critical, disturbed_rpm or predicted) > TOLERANCE_RPM:
+    if disturbed is not None:
+        words += (f"; under the {unknown_nm:.0f} N·m rms of torque that was not commanded, the bit turns in "
+                  f"{disturbed.turning_at(critical.value)} of {TRIALS} simulated trials at the first speed, and in "
+                  f"{disturbed.turning_at(critical.low)} at {critical.low:.1f} rpm")
+    if disturbed is not None and disturbed.distance_rpm(critical) > TOLERANCE_RPM:
         return EvaluationOutcome.DIFFERS, words
     if decay is None:
         return EvaluationOutcome.AS_PREDICTED, words
