@@ -101,7 +101,7 @@ class _Spectra:
     mean_rad_s: float
 
 
-def bit_noise(record: SurfaceRecord, string: DrillString, inertia: Interval) -> BitNoise:
+def bit_noise_in(record: SurfaceRecord, string: DrillString, inertia: Interval) -> BitNoise:
     """Return the random torque of the bit. Raises SeverityRefused if the record does not determine it.
 
     ``string``: with its bit, whose friction slope and correlation time are used. ``inertia``: J at the main shaft.
