@@ -194,8 +194,8 @@ def _refuse_low(case: EvaluationCase, window: RigWindow, lowest_rad_s: float) ->
     """
     if lowest_rad_s <= 0.0:
         raise EvaluationRefused(
-            f"a top drive of {case.meant.inertia_kg_m2:.4g} kg·m² at the main shaft is so light beside this string and "
-            f"bit that the {case.prediction.kind} controller would let it be about to turn back before the bit turns",
+            f"a top drive of {case.meant.inertia_kg_m2:.4g} kg·m² at the main shaft is light beside this string and "
+            f"bit: with the {case.prediction.kind} controller it would be about to turn back before the bit turns",
             where="--use", next_step="Take a stiffer one; or tune for a heavier machine, with its own result, and name "
             "this rig's by --result: the string's torques are scaled to it")
     raise EvaluationRefused(
