@@ -17,7 +17,7 @@ from tdhil.errors import ExitCode, MessageCode, UsageError
 if TYPE_CHECKING:
     from tdhil.recording import Recording
     from tdhil.soft_torque import (
-        BitNoise,
+        BitNoiseEstimate,
         DrillString,
         Interval,
         Severity,
@@ -71,7 +71,7 @@ def run(namespace: argparse.Namespace) -> int:
     console = stderr_console()
     paths = [namespace.log] if namespace.against is None else [namespace.log, namespace.against]
     found: list[tuple[Severity, str]] = []
-    noises: list[BitNoise | str] = []
+    noises: list[BitNoiseEstimate | str] = []
     warnings: list[str] = []
     simulated = False
     for path in paths:
@@ -94,7 +94,7 @@ def run(namespace: argparse.Namespace) -> int:
 def _assess(
     path: Path, namespace: argparse.Namespace, result: Mapping[str, Any], string: DrillString, inertia: Interval,
     expected: tuple[TopDrive, SpeedController] | None, warnings: list[str],
-) -> tuple[Severity, BitNoise | str, bool]:
+) -> tuple[Severity, BitNoiseEstimate | str, bool]:
     """Return severity and bit noise of one recording, and whether it is simulated; add warnings.
 
     A text in place of the bit noise is the reason why the record does not determine it.
@@ -109,7 +109,7 @@ def _assess(
     warnings += remarks
     found = severity(record, string, inertia, expected)
     try:
-        noise: BitNoise | str = bit_noise_in(record, string, inertia)
+        noise: BitNoiseEstimate | str = bit_noise_in(record, string, inertia)
     except SeverityRefused as refused:
         noise = str(refused)
     return found, noise, recorded.recording.simulated

@@ -19,7 +19,7 @@ from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED
 from tdhil.report.html import write_blocks
 from tdhil.report.plots import DARK, OURS, QUIET, envelope
-from tdhil.soft_torque import AT_RISK_INDEX, RPM, STICK_SLIP_INDEX, BitNoise, DrillString, Interval, Severity
+from tdhil.soft_torque import AT_RISK_INDEX, RPM, STICK_SLIP_INDEX, BitNoiseEstimate, DrillString, Interval, Severity
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
@@ -47,8 +47,8 @@ _EXPLAINED = {
 
 
 def severity_document(
-    found: Sequence[tuple[Severity, str]], noises: Sequence[BitNoise | str], string: DrillString, inertia: Interval, *,
-    simulated: bool, warnings: tuple[str, ...],
+    found: Sequence[tuple[Severity, str]], noises: Sequence[BitNoiseEstimate | str], string: DrillString,
+    inertia: Interval, *, simulated: bool, warnings: tuple[str, ...],
 ) -> dict[str, Any]:
     """Return plain data for `json.dumps`, at the main shaft; one record, or two, the second of which is later.
 
@@ -81,7 +81,7 @@ def _record(one: Severity, name: str) -> dict[str, Any]:
     }
 
 
-def _noise(found: BitNoise | str) -> dict[str, Any]:
+def _noise(found: BitNoiseEstimate | str) -> dict[str, Any]:
     if isinstance(found, str):
         return {"bit_noise": None, "bit_noise_refused": found}
     return {

@@ -67,7 +67,7 @@ MOST_CORRELATION_SPREAD = 3.0
 
 
 @dataclass(frozen=True)
-class BitNoise:
+class BitNoiseEstimate:
     """Random torque of the bit in one record."""
 
     rms_nm: Interval
@@ -87,7 +87,7 @@ class BitNoise:
 
 
 @dataclass(frozen=True)
-class _Spectra:
+class _ReportSpectra:
     """Segments of the reported signals: spectra (segments, frequencies), and densities of their white noise."""
 
     hertz: Array
@@ -101,7 +101,7 @@ class _Spectra:
     mean_rad_s: float
 
 
-def bit_noise_in(record: SurfaceRecord, string: DrillString, inertia: Interval) -> BitNoise:
+def bit_noise_in(record: SurfaceRecord, string: DrillString, inertia: Interval) -> BitNoiseEstimate:
     """Return the random torque of the bit. Raises SeverityRefused if the record does not determine it.
 
     ``string``: with its bit, whose friction slope and correlation time are used. ``inertia``: J at the main shaft.
@@ -130,8 +130,8 @@ def bit_noise_in(record: SurfaceRecord, string: DrillString, inertia: Interval) 
             "tolerances in string.yaml")
     wide = COVERAGE_K * value.correlation_log_sd
     correlation = Interval(value.correlation_s, value.correlation_s * exp(-wide), value.correlation_s * exp(wide))
-    hertz = spectra.hertz
-    return BitNoise(rms, correlation, (float(hertz[0]), float(hertz[-1])), len(spectra.speed), value.report_share)
+    band_hz = float(spectra.hertz[0]), float(spectra.hertz[-1])
+    return BitNoiseEstimate(rms, correlation, band_hz, len(spectra.speed), value.report_share)
 
 
 def with_noise(string: DrillString, rms_nm: Interval, correlation_s: float) -> DrillString:
@@ -146,7 +146,7 @@ def with_noise(string: DrillString, rms_nm: Interval, correlation_s: float) -> D
 # Spectra of the record.
 
 
-def _spectra(record: SurfaceRecord, string: DrillString, inertia: Interval) -> _Spectra:
+def _spectra(record: SurfaceRecord, string: DrillString, inertia: Interval) -> _ReportSpectra:
     """Return the segments in which the bit turns and never nearly stops."""
     mode = string_modes_hz(string)[0]
     period_s, highest = 1.0 / mode, HIGHEST_MODE_SHARE * mode
@@ -184,7 +184,7 @@ def _spectra(record: SurfaceRecord, string: DrillString, inertia: Interval) -> _
             f"{LEAST_SEGMENTS}, which is {needed_s:.0f} s without a pause", next_step="Name a longer record of steady "
             "rotation at a set speed above the critical one")
     speeds, torques, speed_noise, torque_noise, means = zip(*rows, strict=True)
-    return _Spectra(hertz[band], np.array(speeds), np.array(torques), per_density, float(np.median(speed_noise)),
+    return _ReportSpectra(hertz[band], np.array(speeds), np.array(torques), per_density, float(np.median(speed_noise)),
                     float(np.median(torque_noise)), float(np.mean(means)))
 
 
@@ -212,7 +212,7 @@ def _carried_down(string: DrillString, s: ComplexArray, speed: ComplexArray, tor
 
 
 @dataclass(frozen=True)
-class _Fitted:
+class _FittedNoise:
     rms: float
     correlation_s: float
     log_sd: float
@@ -221,7 +221,9 @@ class _Fitted:
     misfit: float
 
 
-def _fitted(spectra: _Spectra, string: DrillString, inertia: float, record: SurfaceRecord, held_s: float) -> _Fitted:
+def _fitted(
+    spectra: _ReportSpectra, string: DrillString, inertia: float, record: SurfaceRecord, held_s: float
+) -> _FittedNoise:
     """Return the best σ, and θ if the spectrum determines it; else θ is ``held_s``."""
     from scipy.optimize import minimize
 
@@ -271,7 +273,7 @@ def _fitted(spectra: _Spectra, string: DrillString, inertia: float, record: Surf
         spread = np.diag([1.0 / max(information(best)[0, 0], 1e-12), 0.0])
     model = density(best) + reports
     misfit = weight * NEIGHBOURS * float(np.mean((seen / model - 1.0) ** 2))
-    return _Fitted(exp(best[0]), exp(best[1]), sqrt(max(0.0, spread[0, 0])), sqrt(max(0.0, spread[1, 1])),
+    return _FittedNoise(exp(best[0]), exp(best[1]), sqrt(max(0.0, spread[0, 0])), sqrt(max(0.0, spread[1, 1])),
                    float(np.median(reports / model)), misfit)
 
 
