@@ -31,6 +31,9 @@ BELOW_SHARE, STEP_RPM = 0.6, 1.0
 """Lowest simulated set speed as a share of the predicted one; and distance of the set speeds, rpm."""
 LONGEST_SAMPLE_S = 0.1
 """Longest sampling time of the disturbance, s. The observer follows within 0.2 s."""
+KEPT_EVERY_S = 0.05
+"""Shortest distance, s, of the samples in which a standstill of the bit is searched. A bit that sticks stands for some
+tenths of a second."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,8 @@ def _turning_trials(
     target = np.tile(speeds_rpm * RPM, (TRIALS, 1))
     tick_s = coarse_tick_s(string)
     trace = simulate(string, [(drive, law)] * TRIALS, Begin("stuck", target), target, 1.0, program.trial_s,
-                     keep_every_s=tick_s, longest_tick_s=tick_s, disturbance=TopDisturbance(courses, each * period_s))
+                     keep_every_s=max(tick_s, KEPT_EVERY_S), longest_tick_s=tick_s,
+                     disturbance=TopDisturbance(courses, each * period_s))
     at = np.arange(len(trace.time_s))[:, None, None]
     since = at - np.maximum.accumulate(np.where(trace.bit_rad_s == 0.0, at, -1), axis=0)
     calm = program.calm_s / (trace.time_s[1] - trace.time_s[0])
