@@ -112,7 +112,8 @@ def judged(number: int) -> dict[str, Any]:
     seen = found.damping_interval
     return row | {
         "outcome": found.outcome.value, "reason": found.why, "unknown_nm": found.unknown_rms_nm,
-        "critical_rpm": None if found.critical_rpm is None else found.critical_rpm.value,
+        "critical_rpm": None if found.critical_rpm is None else [found.critical_rpm.low, found.critical_rpm.high],
+        "predicted_rpm": [case.prediction.cure_rpm.low, case.prediction.cure_rpm.high],
         "damping": None if seen is None else [seen.value, seen.low, seen.high]}
 
 

@@ -16,7 +16,15 @@ from tdhil.errors import ExitCode, MessageCode, UsageError
 
 if TYPE_CHECKING:
     from tdhil.recording import Recording
-    from tdhil.soft_torque import DrillString, Interval, Severity, SpeedController, SurfaceRecord, TopDrive
+    from tdhil.soft_torque import (
+        BitNoiseEstimate,
+        DrillString,
+        Interval,
+        Severity,
+        SpeedController,
+        SurfaceRecord,
+        TopDrive,
+    )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,13 +71,16 @@ def run(namespace: argparse.Namespace) -> int:
     console = stderr_console()
     paths = [namespace.log] if namespace.against is None else [namespace.log, namespace.against]
     found: list[tuple[Severity, str]] = []
+    noises: list[BitNoiseEstimate | str] = []
     warnings: list[str] = []
     simulated = False
     for path in paths:
-        severity, simulated = _assess(path, namespace, result, string, inertia,
-                                      expected if path == paths[-1] else None, warnings)
+        severity, noise, simulated = _assess(path, namespace, result, string, inertia,
+                                             expected if path == paths[-1] else None, warnings)
         found.append((severity, str(path)))
-    document = severity_document(found, string, inertia, simulated=simulated, warnings=tuple(dict.fromkeys(warnings)))
+        noises.append(noise)
+    document = severity_document(found, noises, string, inertia, simulated=simulated,
+                                 warnings=tuple(dict.fromkeys(warnings)))
     if namespace.json:
         print_json(document)
     else:
@@ -83,17 +94,25 @@ def run(namespace: argparse.Namespace) -> int:
 def _assess(
     path: Path, namespace: argparse.Namespace, result: Mapping[str, Any], string: DrillString, inertia: Interval,
     expected: tuple[TopDrive, SpeedController] | None, warnings: list[str],
-) -> tuple[Severity, bool]:
-    """Return the result of one recording, and whether it is simulated; add warnings."""
+) -> tuple[Severity, BitNoiseEstimate | str, bool]:
+    """Return severity and bit noise of one recording, and whether it is simulated; add warnings.
+
+    A text in place of the bit noise is the reason why the record does not determine it.
+    """
     from tdhil.session import require_file
-    from tdhil.soft_torque import severity
+    from tdhil.soft_torque import SeverityRefused, bit_noise_in, severity
 
     require_file(path)
     recorded = read_recorded(namespace, path)
     warnings += [f"{path.name}: {one}" for one in (*(recorded.assumed or ()), *recorded.problems)]
     record, remarks = _surface(recorded.recording, result, namespace)
     warnings += remarks
-    return severity(record, string, inertia, expected), recorded.recording.simulated
+    found = severity(record, string, inertia, expected)
+    try:
+        noise: BitNoiseEstimate | str = bit_noise_in(record, string, inertia)
+    except SeverityRefused as refused:
+        noise = str(refused)
+    return found, noise, recorded.recording.simulated
 
 
 def _inertia(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[float, Interval]:

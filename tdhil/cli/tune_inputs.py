@@ -14,6 +14,7 @@ from tdhil.errors import MessageCode, UsageError
 
 if TYPE_CHECKING:
     from profiles import Profile
+    from tdhil.soft_torque import Interval
 
 
 def require_result(path: Path) -> None:
@@ -67,6 +68,33 @@ def read_impedance(path: Path, result: Mapping[str, Any]) -> Mapping[str, Any]:
             raise UsageError(f"{key} is not a number", where=f"--impedance {path}",
                              entry=MessageCode.WRONG_KIND_OF_FILE)
     return found
+
+
+def read_bit_noise(path: Path) -> tuple[Interval, float]:
+    """Return rms in N·m and correlation time in s of the bit's random torque, from `tdhil severity --json`.
+
+    Of two records, the later one counts. Raises UsageError for another file, TuningRefused if the record does not
+    determine it.
+    """
+    from tdhil.soft_torque import Interval, TuningRefused
+
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        found = document["records"][-1]
+        noise, why = found["bit_noise"], found["bit_noise_refused"]
+        if noise is not None:
+            values = [float(noise["rms_nm"][key]) for key in ("value", "low", "high")]
+            correlation_s = float(noise["correlation_s"]["value"])
+            if not (0.0 < values[1] <= values[0] <= values[2] and 0.0 < correlation_s <= 60.0):
+                raise ValueError("rms or correlation time is not positive")
+    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
+        raise UsageError(f"is not a result of tdhil severity ({str(error)[:80]})", where=f"--bit-noise {path}",
+                         next_step="tdhil severity drilling.csv --result result.json --string string.yaml --json > "
+                         "severity.json", entry=MessageCode.WRONG_KIND_OF_FILE) from None
+    if noise is None:
+        raise TuningRefused(f"the record does not determine the bit noise: {why}", where=f"--bit-noise {path}",
+                            next_step="Leave the option out: string.yaml states the noise, or 8 % of coulomb_nm counts")
+    return Interval(*values), correlation_s
 
 
 def measured_lags(measured: Mapping[str, Any]) -> tuple[list[float], list[list[float]]]:

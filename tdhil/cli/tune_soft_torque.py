@@ -23,6 +23,7 @@ from tdhil.cli.tune_inputs import (
     measured_lags,
     positive_number,
     profile_for,
+    read_bit_noise,
     read_impedance,
     read_result,
     require_result,
@@ -49,8 +50,8 @@ if TYPE_CHECKING:
 
 IDENTIFIED = ("inertia_kg_m2", "viscous_nm_s_rad", "coulomb_nm", "speed_lag_s", "torque_lag_s", "gear_ratio")
 """Keys of the result that `tdhil evaluate` needs."""
-CONTROL_PERIOD_S, DEAD_TIME_PERIODS = 0.002, 10.0
-"""Assumed control period of an inverter's speed loop, s; and the reserve of dead time, in such periods."""
+DEAD_TIME_PERIODS = 10.0
+"""Reserve of dead time, in control periods."""
 STATED_LAG_TOLERANCE, ASSUMED_LAG_TOLERANCE = 0.1, 0.5
 """Relative uncertainty of each lag that was not measured."""
 MOST_DEPTHS = 60
@@ -72,6 +73,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--impedance", type=Path, metavar="z.json|z.mcap",
                         help="result of identify --impedance: adds the drive's present gains for comparison, and its "
                         "inner lags")
+    parser.add_argument("--bit-noise", type=Path, metavar="severity.json",
+                        help="result of tdhil severity --json on a record of steady drilling: the bit's random torque, "
+                             "instead of bottom.noise_nm of string.yaml")
     parser.add_argument("--loop", choices=("drive", "bus"), default="drive",
                         help="place of the speed loop: in the drive (default), or in a host over the bus")
     parser.add_argument("--inner-lags", type=amount(TIME), nargs="+", metavar="S",
@@ -182,6 +186,9 @@ def _check(namespace: argparse.Namespace) -> None:
     if namespace.depths is not None and namespace.string is None:
         raise UsageError("--depths needs the string: its topmost section gets longer", where="--depths",
                          next_step="--string string.yaml", entry=MessageCode.STRING_MISSING)
+    if namespace.bit_noise is not None and namespace.string is None:
+        raise UsageError("--bit-noise needs the string with its bit", where="--bit-noise",
+                         next_step="--string string.yaml", entry=MessageCode.STRING_MISSING)
     check_inner_lags(namespace)
 
 
@@ -194,6 +201,8 @@ def _check_files(namespace: argparse.Namespace) -> None:
         load_string(namespace.string)
     if namespace.impedance is not None:
         require_result(namespace.impedance)
+    if namespace.bit_noise is not None:
+        read_bit_noise(namespace.bit_noise)
 
 
 def depths(text: str) -> tuple[float, ...]:
@@ -256,6 +265,8 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
         raise TuningRefused("the interval of J reaches down to zero", where=str(namespace.result),
                             next_step="Identify again, for longer", entry=MessageCode.NO_INERTIA_TO_TUNE)
     string, of_string, drawn = string_for(result, namespace, square**0.5)
+    if namespace.bit_noise is not None:
+        string = _with_measured_noise(string, namespace)
     lags, of_lags, lags_from = _lags(result, namespace, measured)
     drive = TopDrive(value, square * estimated(result, "viscous_nm_s_rad"),
                      square**0.5 * estimated(result, "coulomb_nm"), lags)
@@ -271,6 +282,7 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
 
 def _required(result: Mapping[str, Any], namespace: argparse.Namespace) -> RequiredMargins:
     """Return the requested margins, or the usual ones: ten control periods of dead time."""
+    from tdhil.estimation import CONTROL_PERIOD_S
     from tdhil.soft_torque import RequiredMargins
 
     if namespace.margins is not None:
@@ -287,6 +299,16 @@ def _required(result: Mapping[str, Any], namespace: argparse.Namespace) -> Requi
     period: Any = (result.get("cycle") or {}).get("period_s")
     control_s = float(period) if namespace.loop == "bus" and is_number(period) else CONTROL_PERIOD_S
     return RequiredMargins(dead_time_s=DEAD_TIME_PERIODS * control_s)
+
+
+def _with_measured_noise(string: DrillString, namespace: argparse.Namespace) -> DrillString:
+    """Return the string with the bit's random torque of the record. Raises UsageError without a bit."""
+    from tdhil.soft_torque import with_noise
+
+    if string.bit is None:
+        raise UsageError("no bit is stated in string.yaml, so its random torque has no effect", where="--bit-noise",
+                         next_step="State bottom.coulomb_nm in string.yaml", entry=MessageCode.STRING_MISSING)
+    return with_noise(string, *read_bit_noise(namespace.bit_noise))
 
 
 def string_for(
@@ -428,6 +450,9 @@ def _tuned_for(
         if any(one.compensated_share for one in tuning.tuned):
             warnings.append("inertia compensation needs the derivative of the measured speed in the drive; few drives "
                             "have it, and a feed-forward of the set speed's acceleration is not it")
+    if namespace.bit_noise is not None and (bit := tuning.case.string.bit) is not None:
+        warnings.append(f"the bit noise of {bit.noise_nm:.0f} N·m rms is that of the record in "
+                        f"{namespace.bit_noise.name}; it holds for its bit, formation and weight on bit")
     if not namespace.inner_lags and namespace.impedance is None:
         warnings.append("the lags inside the loop are assumed; they decide how much of J can be compensated: state "
                         "them with --inner-lags")

@@ -14,6 +14,7 @@ from tdhil.estimation.friction_levels import (
 )
 from tdhil.estimation.identification import identify as identify
 from tdhil.estimation.paper_method import STEP_S as STEP_S, line_fit as line_fit, paper_estimate as paper_estimate
+from tdhil.estimation.impedance import CONTROL_PERIOD_S as CONTROL_PERIOD_S
 from tdhil.estimation.result import (
     BudgetLine as BudgetLine, Compliant as Compliant, DistortionTest as DistortionTest, Estimate as Estimate,
     FrequencyResponse as FrequencyResponse, FrictionPoint as FrictionPoint,

@@ -24,6 +24,13 @@ multiplies its lines by (1 − e^(−jωh))/(jωh). Both reports' lines are Gaus
 stated lags, the skew and the delay d have priors. The weights are estimates: E S⁻¹ = ν/(ν − 2) Σ⁻¹, and an estimator
 with these weights scatters more than the best one by ν/(ν − 1). The information is divided by both factors, and
 Student's t has its degrees of freedom.
+
+**The gain that the drive has.** A drive computes its integral from samples, every h. Two rules are common: the sum of
+all samples before the present one, and the same with the present one. Their transfer functions are I h/(z − 1) and
+I h z/(z − 1) with z = e^(sh). The series in s h begins with I/s − I h/2 and with I/s + I h/2. So the string sees
+P − I h/2 or P + I h/2, and P is the gain in the drive's parameters. Z itself is as measured. Neither h nor the rule is
+reported. P therefore has a further contribution: a rectangular distribution of half-width I h/2, with the longest usual
+h. The next term, I s h²/12, is an inertia of I h²/12; it is negligible.
 """
 
 from __future__ import annotations
@@ -66,6 +73,8 @@ _REFERENCE_GAIN = 10.83        # gain of −2 ln L from which a reference filter
 _SMALL_FILTER_LOSS = 3.84      # rise of −2 ln L by which the data contradict a filter: probability 0.05 by chance
 _SMALL_FILTERS_S = tuple(0.01 * k for k in range(1, 16))
 _POINTS = 49                   # points of the curve
+CONTROL_PERIOD_S = 0.002
+"""Assumed control period of an inverter's speed loop, s: the longest that is usual, and the simulated drive's."""
 
 
 def measure_impedance(case: PeriodicCase) -> DriveImpedance:
@@ -517,7 +526,8 @@ def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProbl
         lambda theta: np.array([
             theta[GAIN], theta[INTEGRAL], theta[TORQUE_LAG] + theta[SPEED_FILTER], theta[TORQUE_LAG],
             theta[SPEED_FILTER], theta[INERTIA], theta[VISCOUS],
-        ])
+        ]),
+        np.array([_sampled_integral_sd(fitted.theta), *([0.0] * 6)]),
     )
     if not gains[0].bounded:
         return replace(bare, reason="the data leave the loop's gain open", advice=_MORE)
@@ -537,6 +547,11 @@ def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProbl
         viscous_nm_s_rad=viscous,
         points=_points(case, asked, problem, fitted, spread),
     )
+
+
+def _sampled_integral_sd(theta: FloatArray) -> float:
+    """Return the standard uncertainty of P from the drive's unknown rule of integration, N·m·s/rad."""
+    return float(theta[INTEGRAL]) * 0.5 * CONTROL_PERIOD_S / math.sqrt(3.0)
 
 
 def _not_below_zero(one: Estimate) -> Estimate:
@@ -647,7 +662,8 @@ def _seen(problem: ImpedanceProblem, fitted: FittedImpedance) -> dict[float, tup
 
 
 def _conditions(case: PeriodicCase, asked: ImpedanceInput) -> tuple[str, ...]:
-    found = ["P, I and Z in the scale of the drive's own torque", "first-order lags in loop and reports"]
+    found = ["P, I and Z in the scale of the drive's own torque", "first-order lags in loop and reports",
+             f"P for a drive that integrates every {1e3 * CONTROL_PERIOD_S:g} ms or faster"]
     if asked.by == REFERENCE:
         declared = asked.reference_filter_s
         found.append(f"a reference filter of {declared:g} s" if declared > 0.0 else "no reference filter")

@@ -19,7 +19,7 @@ from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED
 from tdhil.report.html import write_blocks
 from tdhil.report.plots import DARK, OURS, QUIET, envelope
-from tdhil.soft_torque import AT_RISK_INDEX, RPM, STICK_SLIP_INDEX, DrillString, Interval, Severity
+from tdhil.soft_torque import AT_RISK_INDEX, RPM, STICK_SLIP_INDEX, BitNoiseEstimate, DrillString, Interval, Severity
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
@@ -41,16 +41,20 @@ _EXPLAINED = {
     "downhole speed": "from torque and speed at the top by the two travelling waves; ± is half of peak to peak",
     "string torque": "T − J α at the top of the string",
     "|r|": "share of a wave from below that the top drive sends back: 1 is a wall, 0 takes it all",
+    "bit noise": "random torque of the bit in steady rotation; tdhil tune --bit-noise uses it",
     "in brackets": "95 % interval over J, length, shear modulus and wear of the string",
 }
 
 
 def severity_document(
-    found: Sequence[tuple[Severity, str]], string: DrillString, inertia: Interval, *, simulated: bool,
-    warnings: tuple[str, ...],
+    found: Sequence[tuple[Severity, str]], noises: Sequence[BitNoiseEstimate | str], string: DrillString,
+    inertia: Interval, *, simulated: bool, warnings: tuple[str, ...],
 ) -> dict[str, Any]:
-    """Return plain data for `json.dumps`, at the main shaft; one record, or two, the second of which is later."""
-    records = [_record(one, name) for one, name in found]
+    """Return plain data for `json.dumps`, at the main shaft; one record, or two, the second of which is later.
+
+    ``noises``: bit noise of each record, or the reason why the record does not determine it.
+    """
+    records = [_record(one, name) | _noise(noise) for (one, name), noise in zip(found, noises, strict=True)]
     return {
         "kind": "severity", "records": records, "sentence": _sentence(records), "simulated": simulated,
         "string": {"name": string.name, "impedance_nm_s_rad": string.impedance_nm_s_rad, "echo_s": string.echo_s},
@@ -74,6 +78,19 @@ def _record(one: Severity, name: str) -> dict[str, Any]:
             "coherence": check.coherence, "expected": check.expected, "verdict": check.verdict,
         },
         "reflection_refused": one.reflection_refused or None,
+    }
+
+
+def _noise(found: BitNoiseEstimate | str) -> dict[str, Any]:
+    if isinstance(found, str):
+        return {"bit_noise": None, "bit_noise_refused": found}
+    return {
+        "bit_noise": {
+            "rms_nm": asdict(found.rms_nm), "correlation_s": asdict(found.correlation_s),
+            "correlation_measured": found.correlation_measured, "from_hz": found.band_hz[0],
+            "to_hz": found.band_hz[1], "segments": found.segments, "report_share": found.report_share,
+        },
+        "bit_noise_refused": None,
     }
 
 
@@ -133,6 +150,7 @@ def _rows(records: Sequence[Part]) -> Iterator[tuple[str, list[str]]]:
                              for one in records]
     yield "string torque", [_with(one["string_torque_swing_nm"], 0, " N·m", "±") for one in records]
     yield "|r| of the top drive", [_reflection(one) for one in records]
+    yield "bit noise", [_noise_words(one) for one in records]
 
 
 def _episodes(one: Part) -> str:
@@ -148,6 +166,15 @@ def _period(one: Part) -> str:
     if part is None:
         return "nothing that repeats"
     return f"every {_with(part, 2, ' s')}, {1.0 / part['value']:.3f} Hz, {one['cycles']} cycles"
+
+
+def _noise_words(one: Part) -> str:
+    found = one["bit_noise"]
+    if found is None:
+        return f"not known: {one['bit_noise_refused']}"
+    time_s = found["correlation_s"]
+    measured = "" if found["correlation_measured"] else ", as stated"
+    return f"{_with(found['rms_nm'], 0, ' N·m')} rms, correlation time {time_s['value']:.2f} s{measured}"
 
 
 def _reflection(one: Part) -> str:

@@ -64,6 +64,9 @@ if TYPE_CHECKING:
         STICK_SLIP_INDEX as STICK_SLIP_INDEX, Severity as Severity, SeverityRefused as SeverityRefused,
         SurfaceRecord as SurfaceRecord, severity as severity,
     )
+    from tdhil.soft_torque.bit_noise import (
+        BitNoiseEstimate as BitNoiseEstimate, bit_noise_in as bit_noise_in, with_noise as with_noise,
+    )
     from tdhil.soft_torque.virtual_string import (
         COLUMNS as COLUMNS, ProgramCourse as ProgramCourse, HostController as HostController, HostLoop as HostLoop,
         RotorObserver as RotorObserver, Phase as Phase, SpeedProgram as SpeedProgram, IdentifiedRig as IdentifiedRig,
@@ -95,6 +98,7 @@ else:
         "speed_torque_map": "OperatorMap operator_map",
         "torsional_severity": "AT_RISK_INDEX ReflectionCheck STICK_SLIP_INDEX Severity SeverityCourse SeverityRefused "
                               "StickSlipEpisode SurfaceRecord severity",
+        "bit_noise": "BitNoiseEstimate bit_noise_in with_noise",
         "virtual_string": "COLUMNS ProgramCourse HostController HostLoop RotorObserver Phase SpeedProgram "
                           "IdentifiedRig VirtualString",
     })

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from profiles import MessageCode, TdhilError
 from tdhil.soft_torque.controller import SpeedController, TopDrive
+from tdhil.soft_torque.disturbed_cure import TRIALS, DisturbedTrials, disturbed_trials
 from tdhil.soft_torque.drill_string import DrillString, StringTolerance
 from tdhil.soft_torque.simulation import LONGEST_TICK_S, RPM, Array, Begin, simulate
 from tdhil.soft_torque.tuned_figures import lowest_modes_below_hz
@@ -193,8 +194,8 @@ def _refuse_low(case: EvaluationCase, window: RigWindow, lowest_rad_s: float) ->
     """
     if lowest_rad_s <= 0.0:
         raise EvaluationRefused(
-            f"a top drive of {case.meant.inertia_kg_m2:.4g} kg·m² at the main shaft is so light beside this string and "
-            f"bit that the {case.prediction.kind} controller would let it be about to turn back before the bit turns",
+            f"a top drive of {case.meant.inertia_kg_m2:.4g} kg·m² at the main shaft is light beside this string and "
+            f"bit: with the {case.prediction.kind} controller it would be about to turn back before the bit turns",
             where="--use", next_step="Take a stiffer one; or tune for a heavier machine, with its own result, and name "
             "this rig's by --result: the string's torques are scaled to it")
     raise EvaluationRefused(
@@ -293,7 +294,11 @@ def evaluate(rows: Array, case: EvaluationCase, program: SpeedProgram, contradic
     clamped = int(column["clamped"].sum())
     foreign = unknown / max(1e-9, float(np.sqrt(np.mean(net[coupled] ** 2)))) if coupled.any() else 0.0
     reached = float(set_rad_s.max())
-    outcome, why = _verdict(case, program, clamped, foreign, did_stick, critical, decay, unknown, reached)
+    disturbed = None
+    if critical is not None and _distance_rpm(critical, case.prediction.cure_rpm) > TOLERANCE_RPM:
+        disturbed = disturbed_trials(case.string, case.meant, case.law, program, case.prediction.cure_rpm,
+                                     column["unknown_nm"][coupled], period_s)
+    outcome, why = _verdict(case, program, clamped, foreign, did_stick, critical, decay, unknown, reached, disturbed)
     if contradiction:
         outcome, why = EvaluationOutcome.INVALID, contradiction
     return Evaluation(
@@ -308,8 +313,12 @@ def evaluate(rows: Array, case: EvaluationCase, program: SpeedProgram, contradic
 def _verdict(
     case: EvaluationCase, program: SpeedProgram, clamped: int, foreign: float, did_stick: bool,
     critical: Interval | None,
-    decay: tuple[Interval, float] | None, unknown_nm: float, reached: float,
+    decay: tuple[Interval, float] | None, unknown_nm: float, reached: float, disturbed: DisturbedTrials | None,
 ) -> tuple[EvaluationOutcome, str]:
+    """Return the verdict with its reason.
+
+    ``disturbed``: simulated trials under the unknown torque, for a critical speed that is not near the prediction.
+    """
     predicted, damping = case.prediction.cure_rpm, case.prediction.least_damping
     if clamped:
         return EvaluationOutcome.INVALID, f"the torque limit cut the virtual string's torque off in {clamped} cycles"
@@ -325,9 +334,12 @@ def _verdict(
             return (EvaluationOutcome.NOT_FOUND,
                     f"the run ended at {reached / RPM:.0f} rpm, before the bit had ended turning")
         return EvaluationOutcome.NOT_FOUND, "the bit never ended turning, up to the highest set speed"
-    off = max(predicted.low - critical.value, critical.low - predicted.high, 0.0)
     words = f"critical speed {critical.value:.1f} rpm, predicted {predicted.low:.0f} to {predicted.high:.0f}"
-    if off > TOLERANCE_RPM:
+    if disturbed is not None:
+        words += (f"; under the {unknown_nm:.0f} N·m rms of torque that was not commanded, the bit turns in "
+                  f"{disturbed.turning_at(critical.value)} of {TRIALS} simulated trials at the first speed, and in "
+                  f"{disturbed.turning_at(critical.low)} at {critical.low:.1f} rpm")
+    if disturbed is not None and disturbed.distance_rpm(critical) > TOLERANCE_RPM:
         return EvaluationOutcome.DIFFERS, words
     if decay is None:
         return EvaluationOutcome.AS_PREDICTED, words
@@ -339,6 +351,11 @@ def _verdict(
     if seen.high - seen.low > OPEN_DAMPING:
         words += f"; {of_damping} is too uncertain to compare"
     return EvaluationOutcome.AS_PREDICTED, words
+
+
+def _distance_rpm(critical: Interval, predicted: Interval) -> float:
+    """Return the distance of the bracket of a critical speed from a predicted interval, rpm; 0 if they meet."""
+    return max(predicted.low - critical.value, critical.low - predicted.high, 0.0)
 
 
 def _rms(values: Array) -> float | None:

@@ -180,6 +180,22 @@ class Begin:
     """Initial speed of the top, (loops, speeds)."""
 
 
+@dataclass(frozen=True)
+class TopDisturbance:
+    """Torque that accelerates the rotor besides drive and string, N·m: (loops, samples), held for ``every_s`` each.
+
+    The record repeats after its last sample.
+    """
+
+    torque_nm: Array
+    every_s: float
+
+    def at(self, time_s: float) -> Array:
+        """Return the torque of every loop at that time, (loops, 1)."""
+        found: Array = self.torque_nm[:, int(time_s / self.every_s) % self.torque_nm.shape[1], None]
+        return found
+
+
 def simulate(
     strings: Strings,
     loops: Sequence[Loop],
@@ -191,11 +207,13 @@ def simulate(
     longest_tick_s: float = LONGEST_TICK_S,
     hold_s: float = 0.0,
     seeds: Sequence[int] | None = None,
+    disturbance: TopDisturbance | None = None,
 ) -> SimulationTrace:
     """Simulate every loop at every set speed, and return the stored signals.
 
     After ``hold_s``, the set speed ramps from its value in ``begin`` to ``target_rad_s``, shape (loops, speeds).
-    ``seeds``: seeds of the bit noise, one for each loop; None: no noise. All durations are for the first string.
+    ``seeds``: seeds of the bit noise, one for each loop; None: no noise. ``disturbance``: torque on
+    the rotors. All durations are for the first string.
     Raises ValueError if a bit is not stated.
     """
     every_string = [strings] * len(loops) if isinstance(strings, DrillString) else list(strings)
@@ -234,7 +252,8 @@ def simulate(
         if tick >= held_ticks and not arrived:
             set_speed = set_speed + np.clip(target_rad_s - set_speed, -step, step)
             arrived = bool(np.array_equal(set_speed, target_rad_s))
-        top_wave, mean_top = top.step(pipe.at_top(), set_speed)
+        other_nm = 0.0 if disturbance is None else disturbance.at(tick * grid.tick_s)
+        top_wave, mean_top = top.step(pipe.at_top(), set_speed, other_nm)
         pipe.tick(top_wave, None if noise is None else noise.at(tick))
         bit_speed = pipe.bit_rad_s
         still = bit_speed == 0.0
@@ -438,12 +457,16 @@ class _Top:
         self._state[:, 1] = torque
         self._state[:, 4 : self._size] = torque[:, None, :]
 
-    def step(self, arriving: Array, set_speed: Array) -> tuple[Array, Array]:
-        """Advance by one tick. Return (wave that goes down, mean speed of the top over the tick)."""
+    def step(self, arriving: Array, set_speed: Array, other_nm: Array | float = 0.0) -> tuple[Array, Array]:
+        """Advance by one tick, with a further torque on the rotor.
+
+        Return (wave that goes down, mean speed of the top over the tick).
+        """
         state, size = self._state, self._size
         wave = arriving.reshape(set_speed.shape)
         state[:, size] = wave
-        state[:, size + 1] = -self._dry * np.minimum(np.maximum(state[:, 0] / SLIDING_BLUR_RAD_S, -1.0), 1.0)
+        dry = -self._dry * np.minimum(np.maximum(state[:, 0] / SLIDING_BLUR_RAD_S, -1.0), 1.0)
+        state[:, size + 1] = dry + other_nm
         state[:, size + 2] = set_speed
         after = self._step @ state
         state[:, :size] = after
@@ -455,7 +478,7 @@ class _Top:
 def _top_step(drive: TopDrive, controller: SpeedController, grid: Grid, most_lags: int) -> Array:
     """Return the transition matrix of one tick.
 
-    States: ω, I ∫e dt, filtered ω, ∫ω dt, lags. Inputs: wave, dry friction, set speed.
+    States: ω, I ∫e dt, filtered ω, ∫ω dt, lags. Inputs: wave, dry friction with other torques, set speed.
     """
     from scipy.linalg import expm
 

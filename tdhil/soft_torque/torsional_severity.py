@@ -235,7 +235,7 @@ def severity(
     by_inertia = [medians([_windows(one, string, end, period, step) for one in stretches])
                   for end in (inertia.low, inertia.high)]
     by_string = [[medians([_windows(one, end, inertia.value, period, step) for one in stretches]) for end in pair]
-                 for pair in _ends_of(string)]
+                 for pair in string_ends(string)]
     index_of, swing, torque = (
         in_squares(Interval(value[at], min(value[at], *(one[at] for one in by_inertia)),
                             max(value[at], *(one[at] for one in by_inertia))),
@@ -256,6 +256,26 @@ def severity(
         period_s=period_found, cycles=len(cycles), downhole_rad_s=swing, torque_nm=torque, window_s=period,
         reflection=check, reflection_refused=refused,
         course=_course(stretches, found, inertia.value))
+
+
+def turning_spans(
+    record: SurfaceRecord, string: DrillString, inertia_kg_m2: float
+) -> tuple[tuple[float, float, float], ...]:
+    """Return (begin, end, largest severity index) of the spans of rotation, s in the record's time.
+
+    A span ends where the string stops turning, and where stick-slip begins or ends. Raises SeverityRefused.
+    """
+    period = 1.0 / string_modes_hz(string)[0]
+    spans = []
+    for stretch in _stretches(record, period):
+        step = float(stretch.time_s[1] - stretch.time_s[0])
+        found = _windows(stretch, string, inertia_kg_m2, period, step)
+        high = found.used & (np.nan_to_num(found.index) >= STICK_SLIP_INDEX)
+        state = np.where(found.used, np.where(high, 2, 1), 0)
+        edges = np.flatnonzero(np.diff(np.concatenate([[-1], state, [-1]])))
+        spans += [(float(stretch.time_s[a]), float(stretch.time_s[b - 1]), float(np.nanmax(found.index[a:b])))
+                  for a, b in pairwise(edges.tolist()) if state[a] > 0]
+    return tuple(spans)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -367,7 +387,7 @@ def _windows(stretch: _GaplessPart, string: DrillString, inertia: float, period_
     return _Windows(bit, swing, torque_swing, index, stuck, used)
 
 
-def _ends_of(string: DrillString) -> list[tuple[DrillString, DrillString]]:
+def string_ends(string: DrillString) -> list[tuple[DrillString, DrillString]]:
     """Return the string at both ends of each tolerance on which the downhole speed depends."""
     tolerance = string.tolerance
 

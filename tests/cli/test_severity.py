@@ -41,6 +41,7 @@ def test_one_record(bench, capsys):
     (found,) = json.loads(out)["records"]
     assert found["level"] == "stick-slip"
     assert found["period_s"]["value"] == pytest.approx(8.16, rel=0.005)
+    assert found["bit_noise"] is None and "without stick-slip" in found["bit_noise_refused"]
     # ω_b = τ/ζ sin ΩT, by hand
     assert found["downhole_swing_rpm"]["value"] == pytest.approx(
         5600.0 / 296.5 * np.sin(2.0 * np.pi / 8.16 * 0.944) * 30.0 / np.pi, rel=0.05)

@@ -408,3 +408,35 @@ def test_the_old_call_means_soft_torque(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["tune", "--help"])
     assert "speed|verify|soft-torque" in capsys.readouterr().out
+
+
+def noisy(tmp_path, noise, why=None):
+    path = tmp_path / "severity.json"
+    path.write_text(json.dumps({"kind": "severity", "records": [{"bit_noise": noise, "bit_noise_refused": why}]}))
+    return path
+
+
+NOISE = {"rms_nm": interval(310.0, 250.0, 400.0), "correlation_s": interval(0.3, 0.2, 0.45)}
+
+
+@pytest.mark.heavy
+def test_the_bit_noise_of_a_record_replaces_the_assumed_one(tuned, tmp_path):
+    code, document, _ = tuned("--bit-noise", str(noisy(tmp_path, NOISE)))
+    assert code == 0
+    assert document["string"]["bit"]["noise_nm"] == 310.0
+    assert document["string"]["bit"]["noise_correlation_s"] == 0.3
+    assert any("bit noise of 310 N·m rms" in text for text in document["warnings"])
+
+
+@pytest.mark.parametrize(("noise", "string", "code", "message"), [
+    (None, STRING_YAML, 11, "does not determine the bit noise: the record has 3 segments"),
+    ({"rms_nm": {}}, STRING_YAML, 2, "is not a result of tdhil severity"),
+    (NOISE, None, 2, "--bit-noise needs the string"),
+])
+def test_a_bit_noise_that_is_none_is_refused(tmp_path, capsys, noise, string, code, message):
+    (tmp_path / "result.json").write_text(json.dumps(result()), encoding="utf-8")
+    named = [] if string is None else ["--string", str(string)]
+    seen = main(["tune", str(tmp_path / "result.json"), *named, "--no-simulation", "--bit-noise",
+                 str(noisy(tmp_path, noise, "the record has 3 segments"))])
+    assert seen == code
+    assert message in " ".join(capsys.readouterr().err.split())

@@ -75,7 +75,9 @@ class Machine:
         return self.control * (0.5 + sum(keep / (1.0 - keep) for keep in kept))
 
     def law(self, s):
-        return (self.gain + self.integral / s) * self.torque_loop(s)
+        """Sampled, it sums up the errors before the present one."""
+        summed = 1.0 / s if self.control == 0.0 else self.control / (np.exp(s * self.control) - 1.0)
+        return (self.gain + self.integral * summed) * self.torque_loop(s)
 
     def impedance(self, hertz):
         s = 2j * np.pi * np.asarray(hertz)

@@ -19,9 +19,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MOST_EXCEPTIONS = 5
 
-CEILINGS = {
-    ("tdhil/soft_torque", "long"): 1,
-}
+CEILINGS: dict[tuple[str, str], int] = {}
 """Findings left in each room, by kind. Each was counted before the room was reworded."""
 
 

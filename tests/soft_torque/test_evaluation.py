@@ -20,6 +20,7 @@ from tdhil.soft_torque import (
     Phase,
     Prediction,
     RigWindow,
+    SpeedController,
     SpeedProgram,
     case_of,
     evaluate,
@@ -217,3 +218,29 @@ def test_the_torque_of_the_highest_set_speed_counts_before_motion():
     tight = replace(WINDOW, torque_nm=1.1 * program.peak_nm)
     with pytest.raises(EvaluationRefused, match="would be cut off"):
         program_for(CASE, tight)
+
+
+@pytest.mark.heavy
+def test_the_unknown_torque_widens_the_predicted_critical_speed():
+    """A bench of 32 kg·m²: disturbances of 106 N·m rms at the main shaft let the bit turn from 39 rpm on, at times."""
+    law = SpeedController(738.3, 638.5)
+    predicted = replace(PREDICTED, cure_rpm=Interval(52.5, 51.6, 53.4), least_damping=Interval(0.120, 0.114, 0.127))
+    case, program = replace(CASE, law=law, prediction=predicted), SpeedProgram(44.0 * RPM, 74.0 * RPM)
+    random = np.random.default_rng(0)
+
+    def log(turns_from_rpm, trials, unknown_nm):
+        table = rows(turns_from_rpm, trials, damping=0.12)
+        table[:, COLUMNS.index("drive_nm")] *= 3.0
+        slow = np.zeros(len(table))
+        for k in range(1, len(slow)):
+            slow[k] = 0.82 * slow[k - 1] + random.normal(0.0, 0.57)
+        table[:, COLUMNS.index("unknown_nm")] = unknown_nm * slow
+        return table
+
+    lower = (50.1, 47.5, 48.4)
+    assert evaluate(log(48.0, lower, 0.0), case, program).outcome is EvaluationOutcome.DIFFERS
+    found = evaluate(log(48.0, lower, 106.0), case, program)
+    assert found.outcome is EvaluationOutcome.AS_PREDICTED, found.why
+    assert "torque that was not commanded" in found.why
+    above = evaluate(log(60.0, (64.0, 59.0, 61.0), 106.0), case, program)      # no disturbance explains this
+    assert above.outcome is EvaluationOutcome.DIFFERS

@@ -22,7 +22,7 @@ from tdhil.soft_torque import (
     reflection_at,
     simulate,
 )
-from tdhil.soft_torque.simulation import _Top
+from tdhil.soft_torque.simulation import TopDisturbance, _Top
 from tests.soft_torque.cases import (
     BIT,
     DRIVE,
@@ -262,3 +262,16 @@ def test_a_string_on_the_wall_holds_what_it_was_wound_up_to():
     free = simulate(STRING, [(DRIVE, SOFT_025)], Begin("turning", start), start, 1.0, 1.0, 0.5)
     drag_nm = 5.0 * 120.0 * RPM      # drag of 1,000 m, by which this string is shorter than the reference case
     assert trace.top_torque_nm[0, 0, 0] - free.top_torque_nm[0, 0, 0] == pytest.approx(friction_nm - drag_nm, rel=0.01)
+
+
+def test_a_torque_on_the_rotor_is_balanced_by_the_drive():
+    """At rest in the end, the drive's torque changes by the disturbance. A record repeats after its last sample."""
+    start = np.array([[10.0]])
+    quiet, pushed = (
+        simulate(string_with(**SMOOTH), [(DRIVE, SOFT_025)], Begin("turning", start), start, 1.0, 40.0,
+                 disturbance=TopDisturbance(np.full((1, 1), push), 0.5)) for push in (0.0, 300.0))
+    change = quiet.top_torque_nm[:, 0, 0] - pushed.top_torque_nm[:, 0, 0]
+    assert change[-1] == pytest.approx(300.0, abs=3.0)
+    assert pushed.top_rad_s[-1, 0, 0] == pytest.approx(10.0, abs=0.01)
+    record = TopDisturbance(np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), 0.5)
+    assert [record.at(time_s).ravel().tolist() for time_s in (0.0, 0.6, 1.6)] == [[1.0, 4.0], [2.0, 5.0], [1.0, 4.0]]
