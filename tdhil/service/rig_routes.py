@@ -194,6 +194,10 @@ async def calibration(site: Site, request: Request, body: CalibrationBody) -> Ca
             if site.store.request(run).rig != which.id:
                 raise UsageError(f"is not a run of rig {which.id}", where=f"run {run}",
                                  next_step="Calibrate each drive by its own two runs", entry=MessageCode.REQUEST_WRONG)
+            if site.store.request(run).uploaded is not None:
+                raise UsageError("is an uploaded recording: it is not certain that it is of this drive",
+                                 where=f"run {run}", next_step="Calibrate with tdhil calibrate torque",
+                                 entry=MessageCode.REQUEST_WRONG)
             if not site.store.status(run).ended or not (site.store.place(run) / "run.mcap").is_file():
                 raise UsageError("the run has no finished log", where=f"run {run}",
                                  next_step="Wait until it has ended", entry=MessageCode.NOT_READY)
