@@ -120,7 +120,8 @@ def _surface(
     good = recording.fresh & np.isfinite(recording.speed_rad_s) & np.isfinite(recording.torque_nm)
     time_s = recording.time_s[good]
     kept = np.concatenate([[True], np.diff(time_s) > 0.0]) if len(time_s) else np.zeros(0, dtype=bool)
-    ratio = recording.gear_ratio if namespace.gear_ratio is not None or recording.gear_ratio != 1.0 else result["gear_ratio"]
+    own = namespace.gear_ratio is not None or recording.gear_ratio != 1.0
+    ratio = recording.gear_ratio if own else result["gear_ratio"]
     lags, remarks = [], []
     for name, own in (("speed_lag_s", recording.lag_prior.speed_lag_s),
                       ("torque_lag_s", recording.lag_prior.torque_lag_s)):

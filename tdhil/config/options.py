@@ -2,9 +2,9 @@
 
 A row is a field of one of four dataclasses: `RunOptions` (also possible in rig.yaml), `Overrides` and `RunDetails`
 (for one run only), and `TraceOptions` (for a trace of another tool). The field's annotation is the option's type, its
-default the option's default; `option` has the rest. The command line, the schema of rig.yaml, the keywords of `tdhil.run`, the service's API and forms, and the rows
-of docs/reference/rig.md are made from `OPTIONS`. No large library is imported here, because ``--help`` reads this
-table.
+default the option's default; `option` has the rest. The command line, the schema of rig.yaml, the keywords of
+`tdhil.run`, the service's API and forms, and the rows of docs/reference/rig.md are made from this table. No large
+library is imported here, because ``--help`` reads it.
 """
 
 from collections.abc import Iterator, Mapping
@@ -454,11 +454,13 @@ class RunDetails(_Said):
     """Details of one run: notes for its log, faults to rehearse, priority of its control loop."""
 
     operator: str | None = option(
-        "--operator", group=Topic.OUTPUT, metavar="NAME", api=True, longest=500, form=Form("Operator", ("run", "upload")),
+        "--operator", group=Topic.OUTPUT, metavar="NAME", api=True, longest=500,
+        form=Form("Operator", ("run", "upload")),
         help="name of the operator, for log and report",
     )
     note: str | None = option(
-        "--note", group=Topic.OUTPUT, metavar="TEXT", api=True, longest=500, form=Form("Note", ("run", "upload"), wide=True),
+        "--note", group=Topic.OUTPUT, metavar="TEXT", api=True, longest=500,
+        form=Form("Note", ("run", "upload"), wide=True),
         help="remark on this run, for log and report",
     )
     faults: tuple[str, ...] = option(

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     )
     from tdhil.report.console import PlainConsole as PlainConsole, stderr_console as stderr_console
     from tdhil.report.document import (
-        SIMULATED as SIMULATED, rehearsal_of as rehearsal_of, result_document as result_document, run_facts as run_facts,
-        text_of as text_of,
+        SIMULATED as SIMULATED, rehearsal_of as rehearsal_of, result_document as result_document,
+        run_facts as run_facts, text_of as text_of,
     )
     from tdhil.report.verification import (
         print_verification as print_verification, verification_document as verification_document,

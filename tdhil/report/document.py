@@ -24,8 +24,8 @@ UPLOADED = "UPLOADED"
 
 
 def uploaded_of(run: Mapping[str, Any]) -> dict[str, str] | None:
-    """Return where an uploaded recording comes from: name and SHA-256 of the file, who uploaded it and when, and the rig
-    as this person stated it. None for a run that the service or the command line made.
+    """Return the source of an uploaded recording: name and SHA-256 of the file, who uploaded it and when, and the rig as
+    this person stated it. None for a run that the service or the command line made.
     """
     found = run.get("uploaded")
     if not isinstance(found, Mapping):
@@ -37,7 +37,7 @@ def uploaded_rows(uploaded: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     """Return the source of an uploaded recording as names and texts."""
     if uploaded is None:
         return []
-    return [("uploaded file", uploaded["file"]), ("SHA-256 of the uploaded file", uploaded["sha256"]),
+    return [("uploaded file", uploaded["file"]), ("its SHA-256", uploaded["sha256"]),
             ("uploaded by", f"{uploaded['by']}, {uploaded['at']}"), ("rig, as stated", uploaded["rig"] or "none")]
 
 

@@ -173,7 +173,8 @@ class Site:
     def trend_rows(self, rig: str, *, archived: bool = False) -> list[dict[str, Any]]:
         """Return the rows of a rig's history, each with the time of the run's request, as on every page.
 
-        An uploaded recording has no row: its identity is that which a person stated. Archived runs are included only with ``archived``.
+        An uploaded recording has no row, since its identity is only stated by a person. Archived runs are included only
+        with ``archived``.
         """
         runs = self.list_runs(rig, "done", TREND_RUNS, archived=archived)
         return [{**row, "date": _local(one.asked)} for one in runs

@@ -20,6 +20,10 @@ _COLUMNS: Final = next(one.name for one in OF_A_TRACE if one.joined)
 _RATED: Final = next(one.name for one in OF_A_TRACE if one.flag == "--rated-torque")
 
 
+_LAGS: Final = (("speed_lag_s", "speed_lag_sd_s"), ("torque_lag_s", "torque_lag_sd_s"))
+"""Each stated lag, with its standard uncertainty."""
+
+
 def field_of(quantity: str) -> str:
     """Return the name of the field for a mistake in the columns, such as ``columns.speed``."""
     return _RATED if quantity == "rated" else f"{_COLUMNS}.{quantity}" if quantity else _COLUMNS
@@ -62,9 +66,7 @@ def upload_options(body: Mapping[str, Any], kind: str) -> tuple[dict[str, Any], 
             wrong.append((name, f"must be {' or '.join(option.allowed)}"))
         elif text := limits_in_words(option, found[name]):
             wrong.append((name, text))
-    for lag in ("speed_lag_s", "torque_lag_s"):
-        if (sd := lag.replace("_lag_", "_lag_sd_")) in found and lag not in found:
-            wrong.append((sd, f"needs the value: {label_of(lag)}"))
+    wrong += [(sd, f"needs the value: {label_of(lag)}") for lag, sd in _LAGS if sd in found and lag not in found]
     return found, wrong
 
 

@@ -59,7 +59,8 @@ def read_upload(kind: str, options: Mapping[str, Any]) -> RunRecord:
     record.require_motion()
     if is_evaluation(record.configuration) or is_verification(record.configuration):
         raise UsageError("this log contains a virtual string or steps of the speed loop, and no motion for J",
-                         where=LOG, next_step="Evaluate it in a terminal: tdhil replay", entry=MessageCode.REQUEST_WRONG)
+                         where=LOG, next_step="Evaluate it in a terminal: tdhil replay",
+                         entry=MessageCode.REQUEST_WRONG)
     return record
 
 
@@ -67,7 +68,8 @@ def preview_of(kind: str, options: Mapping[str, Any], *, readable: bool = True) 
     """Return the preview: for a trace its table and a guess of the columns, for a log its run; and the reading.
 
     ``reading`` is None if the file can't be read with these columns: ``mistakes`` has each wrong field with the reason,
-    or ``problem`` the error of the file. Without ``columns`` the guess is used. ``readable``: False if a value is wrong; then only the table is returned.
+    or ``problem`` the error of the file. Without ``columns`` the guess is used. ``readable``: False if a value is
+    wrong; then only the table is returned.
     """
     found: dict[str, Any] = {"kind": kind, "table": None, "run": None, "reading": None, "problem": None,
                              "mistakes": []}

@@ -18,7 +18,8 @@ from tdhil.errors import UsageError
 from tdhil.numerics import prepare
 from tdhil.service.run_state import Told
 
-NICE: Final = {"plan": 5, "trend": 5, "report": 5, "preview": 5, "pace": 0}     # a page waits for these; a run by the clock has 0
+NICE: Final = {"plan": 5, "trend": 5, "report": 5, "preview": 5, "upload": 10, "pace": 0}
+"""Nice values of the tasks for which a page waits. A run by the clock has 0."""
 USUAL_NICE: Final = 19
 
 

@@ -32,8 +32,8 @@ _LONG_NAMES = {
 class RunRecord:
     """One run or one trace. ``configuration``: that of the run, as in its log; ``log``: the file.
 
-    ``assumed``: assumptions in reading a foreign trace, None for the log of a run; ``problems``: parts of the file that were
-    skipped, one line each; ``stored_result``: the result document that the run itself wrote to its log;
+    ``assumed``: assumptions in reading a foreign trace, None for the log of a run; ``problems``: parts of the file that
+    were skipped, one line each; ``stored_result``: the result document that the run itself wrote to its log;
     ``virtual_string``: one row per cycle, with the columns of `tdhil.recording.VIRTUAL_COLUMNS`.
     """
 
@@ -183,7 +183,8 @@ def trace_arguments(given: Mapping[str, Any], source: str) -> dict[str, Any]:
 
     lags = ("speed_lag_s", "speed_lag_sd_s", "torque_lag_s", "torque_lag_sd_s")
     found = {one.name: given.get(one.name) for one in OF_A_TRACE if one.name not in lags}
-    return {**found, "lags": stated_lags(*(given.get(name) for name in lags), source)}
+    speed_s, speed_sd_s, torque_s, torque_sd_s = (given.get(name) for name in lags)
+    return {**found, "lags": stated_lags(speed_s, speed_sd_s, torque_s, torque_sd_s, source)}
 
 
 def check_lags(given: Mapping[str, Any]) -> None:

@@ -1,7 +1,7 @@
 """Survey of a CSV trace before its columns are known: header, first rows, and a guess of the columns and units.
 
-The guess is a proposal for a person, who confirms or corrects it. `tdhil replay` never guesses a name: there the columns
-have their usual names, or are named.
+The guess is a proposal for a person, who confirms or corrects it. `tdhil replay` never guesses a name: there the
+columns have their usual names, or are named.
 """
 
 import re

@@ -4,6 +4,7 @@
   const { API, Refused, asked, axis, badge, byId, call, colour, csrf, el, inSpeedUnit, markWrong, number, onSpeedUnit, pages, rehearsal, show, span, speedUnit, submits, unmark, waiting, when } = window.tdhil;
   const QUANTITIES = ["time", "speed", "torque"];
   const BUSY = ["delayed", "identifying"];
+  const HEIGHTS = [150, 180];  // of the charts, px; the lower one has the time axis with its label
   const LOST = "No answer from tdhil serve.";
   const LONG_MS = 600000;      // the preview of a large file, or a second one behind it
   const mebi = (bytes) => (bytes < 1e5 ? `${number(bytes / 1024, 2)} KiB` : `${number(bytes / 2 ** 20, 3)} MiB`);
@@ -35,7 +36,7 @@
     const draw = () => {
       charts.forEach((one) => one.destroy());
       charts = [[speed.map((one) => (one === null ? null : inSpeedUnit(one))), speedUnit(), "--speed", "speed"], [torque, "N·m", "--torque", "torque"]].map(([values, unit, name, label], k) => new uPlot({
-        width: where.clientWidth || 320, height: 150, legend: { show: false }, cursor: { sync: { key: "preview" }, drag: { x: false, y: false } },
+        width: where.clientWidth || 320, height: HEIGHTS[k], legend: { show: false }, cursor: { sync: { key: "preview" }, drag: { x: false, y: false } },
         scales: { x: { time: false } },
         axes: [axis({ size: k ? 40 : 24, ...(k ? { label: "time, s", labelSize: 18 } : {}) }), axis({ size: 62, label: `${label}, ${unit}`, labelSize: 20 })],
         series: [{}, { stroke: colour(name), width: 1, points: { show: false } }],
@@ -43,13 +44,14 @@
     };
     show(where, ...places);
     draw();
-    new ResizeObserver(() => charts.forEach((one) => one.setSize({ width: where.clientWidth || 320, height: 150 }))).observe(where);
+    new ResizeObserver(() => charts.forEach((one, k) => one.setSize({ width: where.clientWidth || 320, height: HEIGHTS[k] }))).observe(where);
     return draw;
   }
 
   /** Length, rate, gaps, ranges and warnings of a reading. */
   function figures(reading) {
-    const range = (one, of = (value) => value) => (one ? `${number(of(one.min), 3)} to ${number(of(one.max), 3)}` : "–");
+    const short = (value) => String(Number(value.toPrecision(3)));
+    const range = (one, of = (value) => value) => (one ? `${short(of(one.min))} to ${short(of(one.max))}` : "–");
     const rows = [
       ["length", span(reading.duration_s)], ["samples", String(reading.samples)],
       ["rate", reading.rate_hz === null ? "–" : `${number(reading.rate_hz, 3)} Hz`],
@@ -81,7 +83,7 @@
   function uploadPage() {
     if (!byId("choose")) return;
     const form = byId("mapping"), said = byId("choose-said"), file = byId("file");
-    let limit = Infinity, open = null, asking = 0, redraw = () => {}, read = null;
+    let limit = Infinity, open = null, waits = [], asking = 0, redraw = () => {}, read = null;
     const report = (error, where = said) => { where.textContent = error instanceof Refused ? error.message : LOST; where.hidden = false; };
     const field = (name) => form.elements[name];
 
@@ -147,7 +149,8 @@
       history.replaceState(null, "", `/upload?upload=${upload.id}`);
       byId("preview").hidden = false;
       byId("upload-name").textContent = upload.name;
-      byId("upload-about").textContent = `${upload.kind === "log" ? "Log of tdhil" : "Trace in CSV"}, ${mebi(upload.size_bytes)}, uploaded by ${upload.by}, ${when(upload.at)}. SHA-256 ${upload.sha256}`;
+      show(byId("upload-about"), `${upload.kind === "log" ? "Log of tdhil" : "Trace in CSV"}, ${mebi(upload.size_bytes)}, uploaded by ${upload.by}, ${when(upload.at)}. SHA-256 `, el("code", {}, upload.sha256));
+      others();
       byId("of-trace").hidden = upload.kind !== "trace";
       form.hidden = false;
       show(byId("identifying"));
@@ -188,9 +191,15 @@
       const found = await call("GET", "/uploads");
       limit = found.limit_bytes;
       byId("limit").textContent = `at most ${mebi(limit)}`;
-      byId("waiting").hidden = !found.uploads.length;
-      show(byId("uploads"), ...found.uploads.map((one) => el("li", {}, el("button", { type: "button", class: "quiet", onclick: () => present(one) }, one.name), ` ${mebi(one.size_bytes)}, ${one.by}, ${when(one.at)}`, one.state === "waiting" ? "" : `, ${one.state}`)));
-      return found.uploads;
+      waits = found.uploads;
+      others();
+      return waits;
+    }
+    /** The uploads that wait, without the one that is open. */
+    function others() {
+      const found = waits.filter((one) => !open || one.id !== open.id);
+      byId("waiting").hidden = !found.length;
+      show(byId("uploads"), ...found.map((one) => el("li", {}, el("button", { type: "button", class: "quiet", onclick: () => present(one) }, one.name), ` ${mebi(one.size_bytes)}, ${one.by}, ${when(one.at)}`, one.state === "waiting" ? "" : `, ${one.state}`)));
     }
 
     async function take(chosenFile) {
