@@ -24,8 +24,8 @@ UPLOADED = "UPLOADED"
 
 
 def uploaded_of(run: Mapping[str, Any]) -> dict[str, str] | None:
-    """Return the source of an uploaded recording: name and SHA-256 of the file, who uploaded it and when, and the rig as
-    this person stated it. None for a run that the service or the command line made.
+    """Return the source of an uploaded recording: name and SHA-256 of the file, who uploaded it and when, and the rig
+    as this person stated it. None for a run that the service or the command line made.
     """
     found = run.get("uploaded")
     if not isinstance(found, Mapping):

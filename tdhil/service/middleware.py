@@ -20,7 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from drivers import CommunicationLost, DataFileError, PreflightRefused
 from tdhil.config import OPTION
-from tdhil.errors import CsvUnusable, ExitCode, LogError, MessageCode, TdhilError, UsageError
+from tdhil.errors import CsvMisnamed, CsvUnusable, ExitCode, LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.access import token_in
 from tdhil.service.run_channel import RunRefused
 from tdhil.service.run_state import (
@@ -116,7 +116,8 @@ def status_of(error: BaseException) -> int:
     for kind, status in (
         (NotThere, 404), (NotLoggedIn, 401), (TooManyTries, 429), (NotAllowed, 403),
         (TooLarge, 413), (TooSlow, 408), (PreflightRefused, 409), (UsageError, 422), (DataFileError, 422),
-        (CsvUnusable, 422), (NotReacting, 504), (CommunicationLost, 503), (NoRoom, 507), (LogError, 503),
+        (CsvMisnamed, 422), (CsvUnusable, 422), (NotReacting, 504), (CommunicationLost, 503), (NoRoom, 507),
+        (LogError, 503),
     ):
         if isinstance(error, kind):
             return status
