@@ -23,6 +23,7 @@ from tdhil.errors import TdhilError
 from tdhil.service.access import Access
 from tdhil.service.answers import KeptAnswers
 from tdhil.service.fleets import Fleets
+from tdhil.service.limits import UPLOAD_LIMIT
 from tdhil.service.live_feed import Feeds
 from tdhil.service.records import RunRecords
 from tdhil.service.run_channel import lives
@@ -31,7 +32,7 @@ from tdhil.service.schemas import ReplayView, RigView, RunView, adapter
 from tdhil.service.start_request import RigFile
 from tdhil.service.store import Summary, read_json
 from tdhil.service.supervisor import Supervisor
-from tdhil.service.uploads import TRACE, UPLOAD_LIMIT, Uploads
+from tdhil.service.uploads import TRACE, Uploads
 
 T = TypeVar("T")
 STOPS: Final = 16

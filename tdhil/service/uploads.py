@@ -28,11 +28,10 @@ from typing import Any, BinaryIO, Final, Literal
 
 from profiles import visible
 from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
+from tdhil.service.limits import MEBIBYTE, UPLOAD_LIMIT
 from tdhil.service.run_state import Conflict, NoRoom, NotThere, Status, Told, TooLarge, now
 from tdhil.service.store import Store, StoredRequest, read_json, write_json
 
-UPLOAD_LIMIT: Final = 256 * 2**20
-"""Largest uploaded file, bytes, unless `tdhil serve --upload-limit` states another one."""
 AT_ONCE: Final = 2
 """Largest number of uploads that are received at the same time."""
 WAITING: Final = 8
@@ -350,7 +349,7 @@ def _no_room() -> NoRoom:
 
 def too_large(limit: int) -> TooLarge:
     """Return the refusal of a file above the limit."""
-    return TooLarge(f"the file is larger than the limit of {limit // 2**20} MiB", where=FOLDER,
+    return TooLarge(f"the file is larger than the limit of {limit // MEBIBYTE} MiB", where=FOLDER,
                     next_step="Export the part with the motion, or raise tdhil serve --upload-limit")
 
 

@@ -32,6 +32,7 @@ from tdhil.service.access import SOCKET_LOOK_S, Access, principal, require
 from tdhil.service.accounts import Role
 from tdhil.service.door import NO_DESCRIPTOR, Seldom
 from tdhil.service.foxglove import PROTOCOLS, Relay, Running
+from tdhil.service.limits import UPLOAD_LIMIT
 from tdhil.service.live_feed import Feed
 from tdhil.service.middleware import RequestGuard, error_response, off, status_of, told_of
 from tdhil.service.page_routes import Pages
@@ -40,7 +41,6 @@ from tdhil.service.run_state import NotLoggedIn, NotThere
 from tdhil.service.schemas import API, SOCKETS
 from tdhil.service.site import Site
 from tdhil.service.supervisor import Supervisor
-from tdhil.service.uploads import UPLOAD_LIMIT
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 SUBJECTS: Final = (rig_routes, run_routes, file_routes, upload_routes, fleet_routes, auth_routes, service_routes)

@@ -1,65 +1,31 @@
-"""Uploads over HTTP: what is received, what is refused and leaves nothing, and the run that is made from a recording."""
+"""Uploads over HTTP: what is received, what is refused and leaves nothing, and the run that is made from it."""
 
 from __future__ import annotations
 
 import asyncio
 import errno
 import hashlib
-import json
-import os
-import threading
 from collections import namedtuple
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 from starlette.requests import ClientDisconnect
 from starlette.testclient import TestClient
 
-from tdhil.errors import TdhilError
 from tdhil.service import upload_routes, uploads
-from tdhil.service.run_channel import RunRefused
-from tdhil.service.run_state import Told
 from tdhil.service.schemas import API
 from tdhil.service.uploads import KEPT_FREE, WAITING, shown_name
-from tdhil.service.worker import WORK
-from tests.service.conftest import URL, Service, wait_for
+from tests.service.conftest import URL, Service, play_uploads, wait_for
 
 TRACE = b"t_s;n_rpm;m_pct\n" + b"".join(f"{k / 100};{40 + k % 7};{20 + k % 5}\n".encode() for k in range(300))
 COLUMNS = ["time=t_s:s", "speed=n_rpm:rpm", "torque=m_pct:%"]
 MAPPING = {"columns": COLUMNS, "rated_torque_nm": "480 Nm"}
-FACTS = {"verdict": "valid", "exit_code": 0, "simulated": False, "rehearsal": None, "identity": "",
-         "said": {"operator": "Anna"}}
-RESULT = {"verdict": "valid", "inertia_kg_m2": {"value": 104.0, "low_total": 100.0, "high_total": 108.0}}
-_CWD = threading.Lock()
 
 
 @pytest.fixture
 def work(service: Service, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The worker in this process; the identification itself is played."""
-    done: list[str] = []
-
-    def found(what: str, run: str | None, asked: dict[str, Any]) -> dict[str, Any]:
-        done.append(what)
-        if what == "upload":
-            place = Path(asked["place"])
-            if asked["options"].get("note") == "fails":
-                raise RunRefused(Told("CsvUnusable", "no row", "no row", "", "", 10, "TDH-1001"))
-            (place / "run.mcap").write_bytes(b"log")
-            (place / "result.json").write_text(json.dumps(RESULT))
-            return {"document": FACTS}
-        before = Path.cwd()
-        with _CWD:
-            try:
-                return WORK[what](asked)
-            except TdhilError as error:
-                raise RunRefused(Told.of(error)) from error
-            finally:
-                os.chdir(before)
-
-    monkeypatch.setattr(service.supervisor, "work", found)
-    return done
+    return play_uploads(service, monkeypatch)
 
 
 def send(call: Any, data: Any = TRACE, name: str = "trace.csv", expect: int = 201, **more: Any) -> Any:
@@ -308,7 +274,7 @@ def test_a_hostile_name_is_escaped_on_the_page(call, client, work):
 
 @pytest.mark.parametrize(("data", "said"), [
     (b"x\n1\n2\n", "no table"), (b"\x00\x01\x02" * 500, "neither text"), (b"\x89MCAP0\r\n", ""),
-    ("t_s;n_rpm;m_nm\n".encode() + b"0;nan;nan\n" * 50, ""), (b"PK\x03\x04" + b"x" * 99, "spreadsheet"),
+    (b"t_s;n_rpm;m_nm\n" + b"0;nan;nan\n" * 50, ""), (b"PK\x03\x04" + b"x" * 99, "spreadsheet"),
 ])
 def test_a_file_that_is_no_recording_says_so_in_its_preview(call, work, data, said):
     upload = send(call, data)["id"]
