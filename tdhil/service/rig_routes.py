@@ -24,6 +24,7 @@ from tdhil.service.schemas import (
     StoppedView,
     TrendView,
 )
+from tdhil.service.site import TREND_RUNS
 from tdhil.service.start_request import EDITABLE, RigFile, options_of, require_motion, require_unwatched
 
 if TYPE_CHECKING:
@@ -118,8 +119,12 @@ async def trend(site: Site, request: Request, body: None) -> TrendView:
     if not found:
         nothing = {"rig": which.id, "logs": 0, "results": 0, "notes": ["no run has a result yet"], "quantities": []}
         return TrendView(which.id, nothing)
-    asked = {"rows": found, "rig": which.id}
-    return TrendView(which.id, await site.work("trend", None, asked))
+    from tdhil.fleet import counted
+
+    document = await site.work("trend", None, {"rows": found, "rig": which.id})
+    left = await off(lambda: sum(one.uploaded for one in site.list_runs(which.id, None, TREND_RUNS, archived=archived)))
+    notes = [f"{counted(left, 'uploaded recording')}: left out"] if left else []
+    return TrendView(which.id, {**document, "notes": [*document["notes"], *notes]} if left else document)
 
 
 async def start(site: Site, request: Request, body: dict[str, Any]) -> tuple[int, RunView]:
