@@ -37,7 +37,7 @@ AT_ONCE: Final = 2
 WAITING: Final = 8
 """Largest number of uploads that wait to be identified."""
 KEPT_S: Final = 86_400.0
-"""Time after which an upload that nobody identified is deleted, s."""
+"""Time after which an upload that was not identified is deleted, s."""
 KEPT_FREE: Final = 500_000_000
 """Disk space that an upload leaves free, bytes. A run needs 200 MB for its log, so an upload stops no run."""
 LONGEST_NAME: Final = 200
@@ -135,11 +135,11 @@ class Uploads:
     def __init__(self, store: Store, note: Callable[..., None], limit: int = UPLOAD_LIMIT) -> None:
         self._store, self._note, self.limit = store, note, limit
         self.folder = store.folder / FOLDER
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()         # an upload becomes a run, or is found, but never in between
         self._memory = _Memory()
 
     def start(self) -> None:
-        """Delete what a service that ended left half received, and uploads that nobody identified in time."""
+        """Delete half received files of a service that ended, and uploads that were not identified in time."""
         if self.folder.is_dir():
             for one in self.folder.iterdir():
                 if not _ID.fullmatch(one.name) or read_json(one / _ABOUT) is None:
@@ -217,15 +217,16 @@ class Uploads:
 
     def get(self, upload: str) -> Upload:
         """Return one upload, also for some time after it became a run. Raises NotThere."""
-        if (finished := self._memory.finished.get(upload)) is not None:
-            return finished
-        plain = read_json(self.place(upload) / _ABOUT)
-        try:
-            found = Upload(id=upload, **(plain or {}))
-        except TypeError:
-            raise _not_there(upload) from None
-        state, error = self._memory.states.get(upload, ("waiting", None))
-        return replace(found, state=state, error=error)
+        with self._lock:
+            if (finished := self._memory.finished.get(upload)) is not None:
+                return finished
+            plain = read_json(self.place(upload) / _ABOUT)
+            try:
+                found = Upload(id=upload, **(plain or {}))
+            except TypeError:
+                raise _not_there(upload) from None
+            state, error = self._memory.states.get(upload, ("waiting", None))
+            return replace(found, state=state, error=error)
 
     def place(self, upload: str) -> Path:
         """Return the folder of an upload. Raises NotThere, also for a name that is not an id."""
@@ -275,7 +276,7 @@ class Uploads:
         exists as a whole or not at all. Raises NoRoom and LogError.
         """
         folder = self.place(upload.id)
-        with _disk(upload.name):
+        with self._lock, _disk(upload.name):
             run = self._store.new_id()
             try:
                 at = now()
@@ -292,7 +293,6 @@ class Uploads:
                 with suppress(OSError):
                     (self._store.runs / run).rmdir()
                 raise
-        with self._lock:
             self._memory.states.pop(upload.id, None)
             finished = self._memory.finished
             finished[upload.id] = replace(upload, state="done", run=run)

@@ -73,13 +73,14 @@ RESULT = {"verdict": "valid", "inertia_kg_m2": {"value": 104.0, "low_total": 100
 _CWD = threading.Lock()
 
 
-def play_uploads(service: Service, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The worker in this process; the identification of an upload is played. Its note `fails` makes it fail."""
+def play_uploads(service: Service, monkeypatch: pytest.MonkeyPatch, *, played: bool = True) -> list[str]:
+    """The worker in this process. With `played` the identification of an upload is played; its note `fails` makes it
+    fail."""
     done: list[str] = []
 
     def found(what: str, run: str | None, asked: dict[str, Any]) -> dict[str, Any]:
         done.append(what)
-        if what == "upload":
+        if what == "upload" and played:
             place = Path(asked["place"])
             if asked["options"].get("note") == "fails":
                 raise RunRefused(Told("CsvUnusable", "no row", "no row", "", "", 10, "TDH-1001"))
@@ -89,7 +90,7 @@ def play_uploads(service: Service, monkeypatch: pytest.MonkeyPatch) -> list[str]
         before = Path.cwd()
         with _CWD:
             try:
-                return WORK[what](asked)
+                return WORK[what](asked if run is None else {"folder": str(service.store.place(run)), **asked})
             except TdhilError as error:
                 raise RunRefused(Told.of(error)) from error
             finally:

@@ -297,12 +297,14 @@ def test_a_log_has_its_own_motion_and_takes_no_options_of_a_trace(call, work):
     assert error["fields"][0]["option"] == "gear_ratio"
 
 
-# -- the whole way, with the worker process
+# -- the whole way
 
 
 @pytest.mark.heavy
-def test_an_identified_trace_is_marked_as_uploaded_in_every_document(call, service, client):
+def test_an_identified_trace_is_marked_as_uploaded_in_every_document(call, service, client, monkeypatch):
     import numpy as np
+
+    play_uploads(service, monkeypatch, played=False)
 
     time_s = np.arange(0.0, 80.0, 0.05)
     speed = 4.0 + np.where(time_s % 20 < 10, 0.5, -0.5) * np.minimum(1.0, (time_s % 10) / 2)
