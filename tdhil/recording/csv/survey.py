@@ -148,7 +148,7 @@ def _unit_text(name: str, below: str) -> str:
     if below and not is_missing(below):
         return below
     found = [unit.symbol for quantity in QUANTITIES if (unit := unit_in_name(quantity, name)) is not None]
-    return split_name(name)[1] or max(found, key=len, default="")      # the end of `n_rad_s` is also a second
+    return split_name(name)[1] or max(found, key=len, default="")      # rad_s also ends like a second
 
 
 def guess_columns(
