@@ -243,7 +243,7 @@ class Client:
             time.sleep(every_s)
 
     def download(self, run: str, name: str, path: str | Path) -> Path:
-        """Save ``log.mcap``, ``report.html``, ``report.pdf``, ``result.json`` or ``recording.csv`` of a run as a new
+        """Save ``log.mcap``, ``report.html``, ``report.pdf``, ``result.json`` or ``trace.csv`` of a run as a new
         file.
         """
         target = Path(path)

@@ -583,7 +583,7 @@ ROUTES: Final = (
           errors=(404,)),
     Route("GET", "/runs/{run}/pictures/{number}", "picture", "One of the pictures", "viewer", {200: "image/svg+xml"},
           errors=(404,)),
-    Route("GET", "/runs/{run}/recording.csv", "recording", "The uploaded trace, as it was received", "viewer",
+    Route("GET", "/runs/{run}/trace.csv", "recording", "The uploaded trace, as it was received", "viewer",
           _file("text/csv"), errors=(404,), headers=_RANGE),
     Route("GET", "/uploads", "uploads", "Uploads that wait to be identified", "operator", {200: UploadsView}),
     Route("POST", "/uploads", "upload", "Upload a log of tdhil, or a trace in CSV, as the body", "operator",

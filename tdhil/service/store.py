@@ -3,7 +3,7 @@
 ::
 
     runs/<id>/request.json, state.json, connection.json, confirm.json, signed_off.json, annotations.json,
-              result.json, run.mcap, report.html, replays/, recording.csv and excitation.yaml of an uploaded trace
+              result.json, run.mcap, report.html, replays/, trace.csv and excitation.yaml of an uploaded trace
     uploads/<id>/     `uploads.Uploads`
     index.sqlite
 """

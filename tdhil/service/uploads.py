@@ -3,7 +3,7 @@
 ::
 
     uploads/.<id>/                                 while it is received; deleted if the upload is cut off
-    uploads/<id>/upload.json, run.mcap | recording.csv
+    uploads/<id>/upload.json, run.mcap | trace.csv
     runs/<id of a run>/                            the same folder, once it is identified
 
 Nothing here concerns a drive. An uploaded recording becomes a run that has already ended, so it never waits for a code,
@@ -46,7 +46,7 @@ FINISHED: Final = 100
 """Number of identified uploads whose run is remembered."""
 FOLDER: Final = "uploads"
 LOG: Final = "run.mcap"
-TRACE: Final = "recording.csv"
+TRACE: Final = "trace.csv"
 """File of a trace, as it was received."""
 MOTION: Final = "excitation.yaml"
 _ID: Final = re.compile(r"[0-9a-f]{16}")

@@ -63,7 +63,7 @@ def test_a_trace_becomes_a_run_that_has_ended_and_concerns_no_rig(call, service,
     rig = call("GET", "/rigs/a", 200)
     assert (rig["state"], rig["last"], rig["run"]) == ("free", None, None)
     assert call("GET", "/rigs/a/trend", 200)["trend"]["logs"] == 0
-    assert call("GET", f"/runs/{run['id']}/recording.csv", 200).content == TRACE
+    assert call("GET", f"/runs/{run['id']}/trace.csv", 200).content == TRACE
     assert not (service.store.place(run["id"]) / "upload.json").exists()
     wait_for("the audit", lambda: {"recording uploaded", "upload identified"} <= {
         one.what for one in service.audit.entries()})
@@ -89,7 +89,7 @@ def test_without_a_rig_its_page_has_a_title_and_its_lists_a_row(call, client, se
     assert "Uploaded recording" in text and "UPLOADED" in text and "trace.csv" in text
     assert call("GET", f"/runs/{run}", 200)["rig"] == ""
     assert call("GET", "/runs", 200)[0]["id"] == run
-    assert 'attachment; filename="' in client.get(f"{API}/runs/{run}/recording.csv").headers["content-disposition"]
+    assert 'attachment; filename="' in client.get(f"{API}/runs/{run}/trace.csv").headers["content-disposition"]
 
 
 def test_a_preview_shows_table_guess_and_reading(call, work):
