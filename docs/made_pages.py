@@ -273,6 +273,8 @@ The body of an error has the keys of the [errors](python/errors.md): `kind`, `me
 |---|---|
 | 405 | the address does not take this method; `Allow` lists those that it takes |
 | 409 | another process holds the drive; the body names the `holder` |
+| 408, to an upload | the upload is too slow |
+| 413 | the uploaded file is larger than the limit |
 | 429 | too many requests; `Retry-After` says when to try again |
 | 504, to a stop | the process of the run does not react; the body says what the service does |
 | 507 | the disk is full; no run starts |

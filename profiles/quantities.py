@@ -137,8 +137,9 @@ _ENDINGS: Final = {
 
 def unit_of(text: str) -> Unit | None:
     """Return the unit that ``text`` spells: ``rpm``, ``1/min``, ``N.m``, ``kg m^2``; None if it is unknown."""
-    bare = _IGNORED.sub("", text.replace("¹", "1").replace("²", "2").replace("μ", "µ"))
-    return _CASE_COUNTS[bare] if bare in _CASE_COUNTS else _UNITS.get(bare.casefold())
+    bare = _IGNORED.sub("", text.replace("¹", "1").replace("²", "2"))
+    folded = bare.casefold().replace("\u03bc", "\u00b5")       # casefold makes a Greek mu of the micro sign
+    return _CASE_COUNTS[bare] if bare in _CASE_COUNTS else _UNITS.get(folded)
 
 
 def split(text: str) -> tuple[float, str] | None:

@@ -151,9 +151,9 @@ def _found(
             "the counts per turn of the drive's position are taken as exact: a wrong number would be a wrong factor",)
     ratio = 1.0
     if namespace.at == "main":
-        if record is None and namespace.gear is None:
+        if record is None and namespace.gear_ratio is None:
             raise UsageError("needs the gear ratio, from a log or by --gear", where="--at main")
-        ratio = namespace.gear if record is None else record.recording.gear_ratio
+        ratio = namespace.gear_ratio if record is None else record.recording.gear_ratio
     count = TurnsCount(
         namespace.turns, namespace.turns_sd, namespace.seconds, namespace.seconds_sd, namespace.speed,
         namespace.speed_sd, getattr(namespace, "from"), namespace.to)

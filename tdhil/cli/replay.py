@@ -7,12 +7,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from profiles.quantities import SHARE, TIME, TORQUE
-from tdhil.cli.arguments import add_option, add_settings, amount, settings_in
+from tdhil.cli.arguments import add_option, add_settings, settings_in
 from tdhil.cli.results import print_result, save_report
-from tdhil.config import OPTION, expectations_in, expectations_of
+from tdhil.config import OF_A_TRACE, OPTION, expectations_in, expectations_of
 from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.session import (
+    check_lags,
     conclude_evaluation,
     conclude_verification,
     is_evaluation,
@@ -22,16 +22,12 @@ from tdhil.session import (
     read,
     require_file,
     sha256_of_log,
+    trace_arguments,
     with_calibration,
 )
 
 if TYPE_CHECKING:
     from tdhil.session import EvaluationConclusion, RunRecord, VerificationConclusion
-
-_TRACE_ONLY = (
-    "columns", "excitation", "rated_torque", "torque_limit", "gear", "torque_scale_sd",
-    "speed_lag", "speed_lag_sd", "torque_lag", "torque_lag_sd", "skew_sd",
-)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of replay. A default of None means: not given."""
@@ -54,22 +50,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_trace_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options for reading a trace in CSV. A default of None means: not given."""
     trace = parser.add_argument_group("a trace in CSV (a run.mcap contains all this)")
-    trace.add_argument("--columns", nargs="+", metavar="QUANTITY=NAME:UNIT",
-                       help="such as time=t_s speed=n_rpm:rpm torque=m_pct:%%; default: time_s speed_rad_s torque_nm")
-    trace.add_argument("--excitation", type=Path, metavar="excitation.yaml",
-                       help="the periodic motion that was run: period, lines, mean speeds, start times")
-    for flag, unit, metavar, text in (
-        ("--rated-torque", TORQUE, "NM", "torque that is 100 %%, N·m, for torque in %% or ‰"),
-        ("--torque-limit", TORQUE, "NM", "the drive's torque limit, N·m: a trace that is clipped there is refused"),
-        ("--gear", None, "RATIO", "i = ω_motor/ω_main (default 1)"),
-        ("--torque-scale-sd", SHARE, "SHARE", "relative standard uncertainty of the torque scale (default 0.03)"),
-        ("--speed-lag", TIME, "S", "time constant of the filter on the reported speed"),
-        ("--speed-lag-sd", TIME, "S", "its standard deviation (default a tenth of it)"),
-        ("--torque-lag", TIME, "S", "time constant of the filter on the reported torque"),
-        ("--torque-lag-sd", TIME, "S", "its standard deviation (default a tenth of it)"),
-        ("--skew-sd", TIME, "S", "time offset between speed and torque, 1 sd (default a sample, or 10 ms)"),
-    ):
-        trace.add_argument(flag, type=float if unit is None else amount(unit), metavar=metavar, help=text)
+    for option in OF_A_TRACE:
+        if option.joined:
+            trace.add_argument(option.flag, dest=option.name, nargs="+", metavar=option.metavar,
+                               help=option.help_text.replace("%", "%%"))
+        else:
+            add_option(trace, option)
 
 
 def run(namespace: argparse.Namespace) -> int:
@@ -94,23 +80,13 @@ def read_recorded(namespace: argparse.Namespace, path: Path) -> RunRecord:
     """
     trace: dict[str, Any] = {}
     if is_log(path):
-        for name in _TRACE_ONLY:
-            if getattr(namespace, name) is not None:
-                raise UsageError("is for a trace in CSV; this log has its own", where=f"--{name.replace('_', '-')}",
+        for option in OF_A_TRACE:
+            if getattr(namespace, option.name) is not None:
+                raise UsageError("is for a trace in CSV; this log has its own", where=option.flag,
                                  entry=MessageCode.OPTION_FOR_CSV_ONLY)
     else:
-        from tdhil.session import stated_lags
-
-        trace = {
-            "columns": namespace.columns, "excitation": namespace.excitation,
-            "rated_torque_nm": namespace.rated_torque, "torque_limit_nm": namespace.torque_limit,
-            "gear_ratio": namespace.gear, "torque_scale_rel_sd": namespace.torque_scale_sd,
-            "lags": stated_lags(
-                namespace.speed_lag, namespace.speed_lag_sd, namespace.torque_lag, namespace.torque_lag_sd,
-                "the command line",
-            ),
-            "skew_sd_s": namespace.skew_sd,
-        }
+        given = {option.name: getattr(namespace, option.name) for option in OF_A_TRACE}
+        trace = trace_arguments(given, "the command line")
     return read(path, **trace)
 
 
@@ -188,19 +164,8 @@ def _said(namespace: argparse.Namespace) -> dict[str, str]:
 
 def check_trace(namespace: argparse.Namespace) -> None:
     """Check numbers that are impossible for a trace. Raises UsageError with the option."""
-    for name, low, high, wanted in (
-        ("rated_torque", 1e-9, 1e9, "a positive number of N·m"),
-        ("torque_limit", 1e-9, 1e9, "a positive number of N·m"),
-        ("gear", 1e-6, 1e6, "a positive number"),
-        ("torque_scale_sd", 0.0, 1.0, "a share from 0 to below 1"),
-        *((lag, 0.0, 1e6, "a time in s, not negative")
-          for lag in ("speed_lag", "speed_lag_sd", "torque_lag", "torque_lag_sd", "skew_sd")),
-    ):
-        value = getattr(namespace, name)
-        if value is not None and not low <= value < high:      # refuses NaN too
-            raise UsageError(f"{value:g}: must be {wanted}", where=f"--{name.replace('_', '-')}",
-                             entry=MessageCode.VALUE_NOT_ALLOWED)
-    for lag in ("speed_lag", "torque_lag"):
-        if getattr(namespace, lag) is None and getattr(namespace, f"{lag}_sd") is not None:
-            flag = lag.replace("_", "-")
-            raise UsageError(f"needs --{flag}, the value of this standard deviation", where=f"--{flag}-sd")
+    for option in OF_A_TRACE:
+        value = getattr(namespace, option.name)
+        if option.kind is float and value is not None and (wanted := option.refusal(value)):
+            raise UsageError(f"{value:g}: must be {wanted}", where=option.flag, entry=MessageCode.VALUE_NOT_ALLOWED)
+    check_lags({option.name: getattr(namespace, option.name) for option in OF_A_TRACE})

@@ -13,7 +13,7 @@ DATA = Path("tdhil-data")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of serve."""
-    from tdhil.service import HOST, PORT
+    from tdhil.service import HOST, MEBIBYTE, PORT, UPLOAD_LIMIT
 
     parser.add_argument("--rigs", type=Path, metavar="DIR",
                         help="folder with a rig.yaml for each rig (default: two simulated rigs)")
@@ -22,6 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--logs", type=Path, metavar="DIR", action="append", default=[],
                         help="folder of logs that the page Fleet may identify again, besides the service's own "
                              "runs; repeatable")
+    parser.add_argument("--upload-limit", type=int, metavar="MIB", default=UPLOAD_LIMIT // MEBIBYTE,
+                        help="largest recording that may be uploaded, MiB (default %(default)s)")
     parser.add_argument("--host", default=HOST, metavar="ADDRESS",
                         help=f"address to listen on (default {HOST}: this computer only; others need users and TLS)")
     parser.add_argument("--port", type=int, default=PORT, metavar="N", help=f"TCP port (default {PORT}; 0: any "
@@ -86,10 +88,13 @@ def _add_accounts(kinds: argparse._SubParsersAction[argparse.ArgumentParser], ki
 def run(namespace: argparse.Namespace) -> int:
     """Serve until Ctrl-C or SIGTERM, which also stop all runs."""
     from tdhil.errors import UsageError
-    from tdhil.service import Tls, check_idle, serve
+    from tdhil.service import MEBIBYTE, MOST_UPLOAD, Tls, check_idle, serve
 
     if not 0 <= namespace.port <= 65535:
         raise UsageError("must be 0 to 65535", where=f"--port {namespace.port}", entry=MessageCode.VALUE_NOT_ALLOWED)
+    if not 1 <= namespace.upload_limit <= MOST_UPLOAD // MEBIBYTE:
+        raise UsageError(f"must be 1 to {MOST_UPLOAD // MEBIBYTE}", where=f"--upload-limit {namespace.upload_limit}",
+                         entry=MessageCode.VALUE_NOT_ALLOWED)
     cert, key = namespace.tls_cert, namespace.tls_key
     if (cert is None) != (key is None):
         raise UsageError("needs --tls-cert and --tls-key together", where="--tls-cert" if key is None else "--tls-key",
@@ -104,7 +109,7 @@ def run(namespace: argparse.Namespace) -> int:
     return serve(namespace.rigs, namespace.data, namespace.host, namespace.port, say, viewers=viewers,
                  mqtt=namespace.mqtt, webhook=namespace.webhook, mail=namespace.mail,
                  tls=None if cert is None else Tls(cert, key), names=namespace.allowed_host,
-                 logs=namespace.logs)
+                 logs=namespace.logs, upload_limit=namespace.upload_limit * MEBIBYTE)
 
 
 def run_accounts(namespace: argparse.Namespace) -> int:

@@ -139,13 +139,14 @@ def _surface(
     good = recording.fresh & np.isfinite(recording.speed_rad_s) & np.isfinite(recording.torque_nm)
     time_s = recording.time_s[good]
     kept = np.concatenate([[True], np.diff(time_s) > 0.0]) if len(time_s) else np.zeros(0, dtype=bool)
-    ratio = recording.gear_ratio if namespace.gear is not None or recording.gear_ratio != 1.0 else result["gear_ratio"]
+    recorded = namespace.gear_ratio is not None or recording.gear_ratio != 1.0
+    ratio = recording.gear_ratio if recorded else result["gear_ratio"]
     lags, remarks = [], []
     for name, own in (("speed_lag_s", recording.lag_prior.speed_lag_s),
                       ("torque_lag_s", recording.lag_prior.torque_lag_s)):
         stated = result.get(name)
         value = stated.get("value") if isinstance(stated, dict) else None
-        if getattr(namespace, name.removesuffix("_s")) is not None or value is None:
+        if getattr(namespace, name) is not None or value is None:
             value = own
         if value is None:
             remarks.append(f"The lag of the reported {name.split('_')[0]} is not known and counts as 0: state it with "

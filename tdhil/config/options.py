@@ -1,10 +1,10 @@
 """Table of a run's options. Each option is declared here once; everything that takes options is made from it.
 
-A row is a field of one of three dataclasses: `RunOptions` (also possible in rig.yaml), `Overrides` and `RunDetails`
-(for one run only). The field's annotation is the option's type, its default the option's default; `option` has the
-rest. The command line, the schema of rig.yaml, the keywords of `tdhil.run`, the service's API and forms, and the rows
-of docs/reference/rig.md are made from `OPTIONS`. No large library is imported here, because ``--help`` reads this
-table.
+A row is a field of one of four dataclasses: `RunOptions` (also possible in rig.yaml), `Overrides` and `RunDetails`
+(for one run only), and `TraceOptions` (for a trace of another tool). The field's annotation is the option's type, its
+default the option's default; `option` has the rest. The command line, the schema of rig.yaml, the keywords of
+`tdhil.run`, the service's API and forms, and the rows of docs/reference/rig.md are made from this table. No large
+library is imported here, because ``--help`` reads it.
 """
 
 from collections.abc import Iterator, Mapping
@@ -16,7 +16,7 @@ from types import MappingProxyType, NoneType, UnionType
 from typing import Any, Final, Literal, Protocol, Self, Union, get_args, get_origin, get_type_hints
 
 from drivers import own_limits
-from profiles.quantities import FREQUENCY, FRICTION, INERTIA, MINUTE, PERCENT, SHARE, SPEED, TIME, Unit
+from profiles.quantities import FREQUENCY, FRICTION, INERTIA, MINUTE, PERCENT, SHARE, SPEED, TIME, TORQUE, Unit
 from tdhil.config.registry import BUSES, DEFAULT_BUS, DEFAULT_EXCITATION, EXCITATIONS, MODELS, RegistryEntry
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -70,6 +70,7 @@ class Topic(Enum):
     OVERRIDES = "overrides"
     OUTPUT = "log and output"
     SIMULATED = "simulated rig"
+    TRACE = "trace"
 
 
 _LIMITS: Final = {"gt": ("greater than", gt), "ge": ("at least", ge), "lt": ("less than", lt), "le": ("at most", le)}
@@ -77,8 +78,8 @@ _LIMITS: Final = {"gt": ("greater than", gt), "ge": ("at least", ge), "lt": ("le
 
 @dataclass(frozen=True)
 class Form:
-    """Field of the service's forms. ``parts``: its places among ``run``, ``simulated``, ``real``, ``rehearsal`` and
-    ``replay``.
+    """Field of the service's forms. ``parts``: its places among ``run``, ``simulated``, ``real``, ``rehearsal``,
+    ``replay``, ``upload`` and ``trace``.
 
     ``unit``: unit of a number that is entered without one. ``hint``: shown in the empty field instead of the default.
     """
@@ -176,14 +177,14 @@ def option(
     return field(default=default, metadata={"row": row})
 
 
-def _rows(table: type) -> Iterator[Option]:
-    """Yield the options that the fields of a dataclass declare."""
+def _rows(table: type, *, by_field: bool = False) -> Iterator[Option]:
+    """Yield the options that the fields of a dataclass declare. ``by_field``: each is named as its field."""
     hints = get_type_hints(table)
     for one in fields(table):
         if (row := one.metadata.get("row")) is None:
             continue
         kind, known = _kind(hints[one.name])
-        name = one.name if row["at"] else row["flag"].removeprefix("--").replace("-", "_")
+        name = one.name if by_field or row["at"] else row["flag"].removeprefix("--").replace("-", "_")
         default = None if kind is tuple or one.default is MISSING else one.default
         yield Option(name=name, keyword=one.name, kind=kind, known=known, default=default, **row)
 
@@ -271,7 +272,7 @@ class RunOptions:
     tolerance: float = option(
         "--tolerance", "run.tolerance", 0.05, group=Topic.RESULT, common=True, unit=SHARE, metavar="SHARE", api=True,
         gt=0, lt=1,
-        form=Form("Tolerance: half-width of the interval, ± % of J", ("run", "replay"), PERCENT),
+        form=Form("Tolerance: half-width of the interval, ± % of J", ("run", "replay", "upload"), PERCENT),
         asked_again="requested half-width of the interval",
         help="acquire until the half-width of the interval is this share of J, such as 1% or 0.01",
         more="requested half-width of the interval, as a share of J (`0.01`; on the command line `1%` too); a wider "
@@ -298,7 +299,7 @@ class RunOptions:
     )
     model: str = option(
         "--model", "run.model", "auto", group=Topic.RESULT, choices=MODELS, api=True, asked_again="model of the shaft",
-        form=Form("Model", ("replay",)), help="model of the shaft (default {default}: the simplest that fits)",
+        form=Form("Model", ("replay", "upload")), help="model of the shaft (default {default}: the simplest that fits)",
         more="model of the shaft",
     )
     confidence: float = option(
@@ -453,11 +454,13 @@ class RunDetails(_Said):
     """Details of one run: notes for its log, faults to rehearse, priority of its control loop."""
 
     operator: str | None = option(
-        "--operator", group=Topic.OUTPUT, metavar="NAME", api=True, longest=500, form=Form("Operator"),
+        "--operator", group=Topic.OUTPUT, metavar="NAME", api=True, longest=500,
+        form=Form("Operator", ("run", "upload")),
         help="name of the operator, for log and report",
     )
     note: str | None = option(
-        "--note", group=Topic.OUTPUT, metavar="TEXT", api=True, longest=500, form=Form("Note", wide=True),
+        "--note", group=Topic.OUTPUT, metavar="TEXT", api=True, longest=500,
+        form=Form("Note", ("run", "upload"), wide=True),
         help="remark on this run, for log and report",
     )
     faults: tuple[str, ...] = option(
@@ -476,10 +479,76 @@ class RunDetails(_Said):
     )
 
 
+@dataclass(frozen=True)
+class TraceOptions(_Said):
+    """Options for reading a trace of another tool in CSV. A log of tdhil contains all of this.
+
+    They are no options of a run, so `OPTIONS` does not have them.
+    """
+
+    columns: tuple[str, ...] = option(
+        "--columns", group=Topic.TRACE, default=(), metavar="QUANTITY=NAME:UNIT", api=True,
+        unset="time_s speed_rad_s torque_nm",
+        help="such as time=t_s speed=n_rpm:rpm torque=m_pct:%; default: {default}",
+    )
+    excitation: str | None = option(
+        "--excitation", group=Topic.TRACE, metavar="excitation.yaml", is_file=True, api=True, longest=20_000,
+        form=Form("Periodic motion: the content of an excitation.yaml", ("trace",), hint="unknown", wide=True),
+        help="the periodic motion that was run: period, lines, mean speeds, start times",
+    )
+    rated_torque_nm: float | None = option(
+        "--rated-torque", group=Topic.TRACE, unit=TORQUE, metavar="NM", gt=0, lt=1e9, api=True,
+        form=Form("Rated torque, N·m", ("trace",), hint="for a torque in % or ‰"),
+        help="torque that is 100 %, N·m, for torque in % or ‰",
+    )
+    torque_limit_nm: float | None = option(
+        "--torque-limit", group=Topic.TRACE, unit=TORQUE, metavar="NM", gt=0, lt=1e9, api=True,
+        form=Form("Torque limit of the drive, N·m", ("trace",), hint="unknown"),
+        help="the drive's torque limit, N·m: a trace that is clipped there is refused",
+    )
+    gear_ratio: float | None = option(
+        "--gear", group=Topic.TRACE, metavar="RATIO", ge=1e-6, lt=1e6, api=True, unset="1",
+        form=Form("Gear ratio, ω_motor/ω_main", ("trace",), hint="1"),
+        help="i = ω_motor/ω_main (default {default})",
+    )
+    torque_scale_rel_sd: float | None = option(
+        "--torque-scale-sd", group=Topic.TRACE, unit=SHARE, metavar="SHARE", ge=0, lt=1, api=True, unset="0.03",
+        form=Form("Standard uncertainty of the torque scale, %", ("trace",), PERCENT, hint="3"),
+        help="relative standard uncertainty of the torque scale (default {default})",
+    )
+    speed_lag_s: float | None = option(
+        "--speed-lag", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=1e6, api=True,
+        form=Form("Filter on the reported speed, s", ("trace",), hint="unknown"),
+        help="time constant of the filter on the reported speed",
+    )
+    speed_lag_sd_s: float | None = option(
+        "--speed-lag-sd", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=1e6, api=True, unset="a tenth of it",
+        form=Form("Its standard uncertainty, s", ("trace",), hint="a tenth of it"),
+        help="its standard deviation (default {default})",
+    )
+    torque_lag_s: float | None = option(
+        "--torque-lag", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=1e6, api=True,
+        form=Form("Filter on the reported torque, s", ("trace",), hint="unknown"),
+        help="time constant of the filter on the reported torque",
+    )
+    torque_lag_sd_s: float | None = option(
+        "--torque-lag-sd", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=1e6, api=True, unset="a tenth of it",
+        form=Form("Its standard uncertainty, s", ("trace",), hint="a tenth of it"),
+        help="its standard deviation (default {default})",
+    )
+    skew_sd_s: float | None = option(
+        "--skew-sd", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=1e6, api=True, unset="a sample, or 10 ms",
+        form=Form("Time offset between speed and torque, 1 sd, s", ("trace",), hint="a sample, or 0.01"),
+        help="time offset between speed and torque, 1 sd (default {default})",
+    )
+
+
 RESOLVED: Final = tuple(_rows(RunOptions))
 """The options that `resolve` decides: those of `RunOptions`."""
 OPTIONS: Final = (*RESOLVED, *_rows(Overrides), *_rows(RunDetails))
-"""All rows of the table."""
+"""All rows of the table that are options of a run."""
+OF_A_TRACE: Final = tuple(_rows(TraceOptions, by_field=True))
+"""Options for reading a trace of another tool."""
 OPTION: Final = MappingProxyType({one.name: one for one in OPTIONS})
 ASKED_AGAIN: Final = tuple(sorted((one for one in OPTIONS if one.asked_again), key=lambda one: one.name))
 """Options that a replay, a comparison or a fleet may set differently from the run."""
@@ -496,7 +565,7 @@ def is_name(flag: str, value: str) -> bool:
 
 def form_options(part: str) -> list[Option]:
     """Return the options of one part of a form."""
-    return [one for one in OPTIONS if one.form is not None and part in one.form.parts]
+    return [one for one in (*OPTIONS, *OF_A_TRACE) if one.form is not None and part in one.form.parts]
 
 
 def _shown(value: Any) -> str:

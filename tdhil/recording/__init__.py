@@ -9,7 +9,9 @@ if TYPE_CHECKING:
     from tdhil.recording.csv import (
         Bench as Bench, REFERENCE_FLAG as REFERENCE_FLAG, ReferenceTrace as ReferenceTrace,
         TIME_AND_TORQUE as TIME_AND_TORQUE, USUAL as USUAL, parse_columns as parse_columns,
-        read_recording as read_recording, read_reference as read_reference,
+        TraceSurvey as TraceSurvey, column_mistakes as column_mistakes,
+        read_recording as read_recording, read_reference as read_reference, survey_trace as survey_trace,
+        units_of as units_of,
     )
     from tdhil.recording.log_format import (
         CAN as CAN, CHANNELS as CHANNELS, CLASSES as CLASSES, COMMAND as COMMAND, EXCITATION as EXCITATION,
@@ -34,12 +36,13 @@ if TYPE_CHECKING:
     )
     from tdhil.recording.run_log import RunEnd as RunEnd, RunLog as RunLog, find_ended as find_ended
     from tdhil.recording.salvage import Salvage as Salvage, examine as examine, write_copy as write_copy
+    from tdhil.recording.trace_log import write_trace_log as write_trace_log
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "builder": "RecordingBuilder RecordingPart",
         "csv": (
             "Bench USUAL parse_columns read_recording REFERENCE_FLAG ReferenceTrace TIME_AND_TORQUE "
-            "read_reference"
+            "read_reference TraceSurvey column_mistakes survey_trace units_of"
         ),
         "log_format": "CAN CHANNELS CLASSES COMMAND EXCITATION FRAME_CHANNELS LiveInertia RAW_FRAMES SAMPLE "
                       "VIRTUAL_COLUMNS VIRTUAL_STRING schema_name",
@@ -52,4 +55,5 @@ else:
                      "SteppedSetpoint TorqueAnswer ABORTED aborted_stage before_abort",
         "run_log": "RunEnd RunLog find_ended",
         "salvage": "Salvage examine write_copy",
+        "trace_log": "write_trace_log",
     })

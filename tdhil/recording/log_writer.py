@@ -323,7 +323,8 @@ class RunWriter:
 
     ``queue_size``: number of records; None: the default of stepped or real time. ``block``: a full queue makes the
     caller wait (stepped time); otherwise the record is dropped, counted in ``dropped``, and the drop is logged as an
-    event (real time).
+    event (real time). ``keep_up``: with ``block``, no sample is taken while the file is behind. False for a copy of
+    data that exist elsewhere: a killed process loses the queue.
 
     Raises `LogUnopened` and, if less than ``min_free_bytes`` are free, `LogRefused`.
 
@@ -343,6 +344,7 @@ class RunWriter:
         overwrite: bool = True,
         opener: Callable[[Path], RawFile] | None = None,
         frames: int = CAN,
+        keep_up: bool = True,
     ) -> None:
         self.path = path
         self._raised = self._closing = False
@@ -359,7 +361,7 @@ class RunWriter:
         except OSError as error:
             kind = LogRefused if error.errno in _FULL else LogUnopened
             raise self._error(kind, "the log can't be opened", error) from error
-        self._block = block
+        self._block = block and keep_up
         self._pump = Pump(self._backlog, container, Syncer(file), epoch_ns, frames)
         self._thread = Thread(target=self._pump.run, name="tdhil-log", daemon=True)
         self._thread.start()

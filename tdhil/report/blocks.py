@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from tdhil.recording import Recording
 from tdhil.report.acceptance import acceptance_rows, signature_rows
 from tdhil.report.card import COMPLIANT, estimate_text, inertia_text, minutes, plus_minus, rounded, sentence
-from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows
+from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows, uploaded_rows
 from tdhil.report.labels import (
     ACCELERATION_REGRESSION,
     ESTIMATES,
@@ -108,7 +108,7 @@ class ReportSection:
 
 @dataclass(frozen=True)
 class Report:
-    """Complete report. ``simulated`` is '' for a real drive."""
+    """Complete report. ``simulated`` is the banner of `marks`, '' without a mark."""
 
     title: str
     subtitle: str
@@ -120,11 +120,14 @@ class Report:
 
 
 def _simulated(document: Part) -> str:
-    if not document["simulated"]:
+    if not (found := marks(document)):
         return ""
-    faults = ", ".join(document.get("rehearsed_faults") or ())
-    told = f"; rehearsed: {faults}. This result is no history of the rig" if faults else ""
-    return f"{marks(document)}: drive and rig are simulated, nothing real turned{told}"
+    said = ["drive and rig are simulated, nothing real turned"] if document["simulated"] else []
+    if faults := ", ".join(document.get("rehearsed_faults") or ()):
+        said.append(f"rehearsed: {faults}. This result is no history of the rig")
+    if document.get("uploaded"):
+        said.append("tdhil serve did not make this recording. It was uploaded, and is no history of a rig")
+    return f"{found}: {'; '.join(said)}"
 
 
 def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
@@ -253,6 +256,7 @@ def _run_rows(document: Part, recording: Recording) -> Iterator[tuple[str, str]]
         yield "limits", _limits(limits)
     if rig.get("load"):
         yield "load", {"none": "none", "string": "drill string"}.get(rig["load"], rig["load"])
+    yield from uploaded_rows(document.get("uploaded"))
     yield "gear, motor to main shaft", f"{document['gear_ratio']:g}"
     if recording.excitation is not None:
         yield "excitation", _excitation(recording)

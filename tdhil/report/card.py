@@ -14,7 +14,7 @@ from rich.text import Text
 
 from tdhil.report.acceptance import acceptance_rows
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows
+from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows, uploaded_rows
 from tdhil.report.labels import (
     ACCELERATION_REGRESSION,
     ESTIMATES,
@@ -267,6 +267,8 @@ def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
     rows.add_row("model", document["model"])
     if document.get("rehearsed_faults") and not document.get("rehearsal"):
         rows.add_row("rehearsed", ", ".join(document["rehearsed_faults"]))
+    for title, text in uploaded_rows(document.get("uploaded")):
+        rows.add_row(title, Text(text, overflow="fold"))
     for title, text in (*rehearsal_rows(document.get("rehearsal")), *acceptance_rows(document.get("acceptance"))):
         rows.add_row(title, Text(text, style=_TEST_STYLE.get(text, "")))
     body: list[RenderableType] = [rows, Text()]
@@ -278,7 +280,7 @@ def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
     body += [Text(f"! {warning}", style="yellow") for warning in coded_warnings(document)]
     body.append(Text(f"log: {document['log']}", style="dim", overflow="fold"))
     title = "J at the motor shaft" if narrow else "moment of inertia at the motor shaft"
-    title += f" · {marks(document)}" if document["simulated"] else ""
+    title += f" · {found}" if (found := marks(document)) else ""
     return Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue")
 
 

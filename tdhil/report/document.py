@@ -19,6 +19,27 @@ SIMULATED = "SIMULATED"
 REHEARSAL = "FAULT REHEARSAL"
 """Mark of a run of the simulated drive with scripted faults (`--fault`). Its result does not count for the rig."""
 
+UPLOADED = "UPLOADED"
+"""Mark of a recording that was uploaded to the service, which did not make the run itself."""
+
+
+def uploaded_of(run: Mapping[str, Any]) -> dict[str, str] | None:
+    """Return the source of an uploaded recording: name and SHA-256 of the file, who uploaded it and when, and the rig
+    as this person stated it. None for a run that the service or the command line made.
+    """
+    found = run.get("uploaded")
+    if not isinstance(found, Mapping):
+        return None
+    return {name: text_of(found.get(name)) or "" for name in ("file", "sha256", "by", "at", "rig")}
+
+
+def uploaded_rows(uploaded: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """Return the source of an uploaded recording as names and texts."""
+    if uploaded is None:
+        return []
+    return [("uploaded file", uploaded["file"]), ("its SHA-256", uploaded["sha256"]),
+            ("uploaded by", f"{uploaded['by']}, {uploaded['at']}"), ("rig, as stated", uploaded["rig"] or "none")]
+
 
 def rehearsed_faults(run: Mapping[str, Any]) -> list[str]:
     """Return the faults that were scripted in this run, as the user wrote them; ``run``: the log's configuration."""
@@ -55,10 +76,11 @@ def rehearsal_rows(rehearsal: Mapping[str, Any] | None) -> list[tuple[str, str]]
 
 
 def marks(document: Mapping[str, Any]) -> str:
-    """Return the suffix of a title for a run without a real drive: simulated, and rehearsal of a fault."""
-    if not document["simulated"]:
-        return ""
-    return f"{SIMULATED} · {REHEARSAL}" if document.get("rehearsed_faults") else SIMULATED
+    """Return the suffix of a title, '' for a run on a real drive: simulated, rehearsal of a fault, uploaded."""
+    found = [SIMULATED] if document["simulated"] else []
+    found += [REHEARSAL] if document["simulated"] and document.get("rehearsed_faults") else []
+    found += [UPLOADED] if document.get("uploaded") else []
+    return " · ".join(found)
 
 
 def run_facts(recording: Recording, run: Mapping[str, Any], log: str) -> dict[str, Any]:
@@ -124,6 +146,7 @@ def result_document(
         "simulated": recording.simulated,
         "rehearsed_faults": rehearsed_faults(run),
         "rehearsal": rehearsal_of(run),
+        "uploaded": uploaded_of(run),
         "complete": recording.complete,
         "ended": _mapping(run.get("ended")),
         **provenance(run),

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from tdhil.service.audit import Audit as Audit, ChainHead as ChainHead
     from tdhil.service.client import Client as Client, ServiceError as ServiceError
     from tdhil.service.console import attend as attend
+    from tdhil.service.limits import MEBIBYTE as MEBIBYTE, MOST_UPLOAD as MOST_UPLOAD, UPLOAD_LIMIT as UPLOAD_LIMIT
     from tdhil.service.run_state import Conflict as Conflict, NotAllowed as NotAllowed, NotThere as NotThere
     from tdhil.service.server import (
         HOST as HOST, PORT as PORT, Tls as Tls, check_idle as check_idle, require_folder as require_folder,
@@ -24,6 +25,7 @@ else:
         "audit": "Audit ChainHead",
         "client": "Client ServiceError",
         "console": "attend",
+        "limits": "MEBIBYTE MOST_UPLOAD UPLOAD_LIMIT",
         "run_state": "Conflict NotAllowed NotThere",
         "server": "HOST PORT Tls check_idle require_folder serve",
     })

@@ -82,7 +82,10 @@ def _route(path: str, method: str, one: Part, schemas: Part) -> ApiRoute:
     parameters = tuple(
         ApiField(each["name"], f"{each['in']}, {_kind(each['schema'])[0]}", each.get("description", ""),
                  bool(each.get("required"))) for each in one.get("parameters", ()))
-    body = one.get("requestBody", {}).get("content", {}).get("application/json", {}).get("schema", {})
+    content = one.get("requestBody", {}).get("content", {})
+    body = content.get("application/json", {}).get("schema", {})
+    if content and not body:
+        body = {"description": f"the bytes of the file ({next(iter(content))})"}
     named = body.get("$ref", "").rpartition("/")[2]
     body = schemas[named] if named else body
     what = "WebSocket" if "x-websocket" in one else method.upper()

@@ -9,7 +9,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 from urllib.parse import quote, urlencode
 
 from drivers import CommunicationLost
@@ -177,6 +177,49 @@ class Client:
             found = self._object("GET", f"/runs/{quote(run, safe='')}/replays/{found['name']}")
         return found
 
+    def uploads(self) -> dict[str, Any]:
+        """Return the uploads that wait to be identified, and ``limit_bytes``, the largest file."""
+        return self._object("GET", "/uploads")
+
+    def upload(self, path: str | Path) -> dict[str, Any]:
+        """Upload a log of tdhil, or a trace in CSV. Return it with its ``id``. Raises UsageError for a larger file than
+        the limit, and OSError for a file that can't be read.
+        """
+        source = Path(path)
+        size, limit = source.stat().st_size, self.uploads()["limit_bytes"]
+        if size > limit:
+            raise UsageError(f"{size} bytes: the service takes {limit} at most", where=source.name,
+                             next_step="Export the part with the motion")
+        headers = {"Content-Type": "application/octet-stream", "Content-Length": str(size)}
+        with source.open("rb") as file, self._open(
+                "POST", f"/uploads?{urlencode({'name': source.name})}", file, headers) as answer:
+            found: dict[str, Any] = json.loads(answer.read())
+        return found
+
+    def preview(self, upload: str, **mapping: Any) -> dict[str, Any]:
+        """Return what an upload contains, and how it is read with this mapping: ``columns`` such as
+        ``["time=t:ms", "speed=n:rpm", "torque=m:Nm"]``, and the other options of ``tdhil replay`` for a trace.
+        """
+        return self._object("POST", f"/uploads/{quote(upload, safe='')}/preview", mapping)
+
+    def identify_upload(self, upload: str, *, rig: str = "", **mapping: Any) -> dict[str, Any]:
+        """Identify an upload. Return its run when this is done. ``rig``: the rig as you state it.
+
+        ``mapping``: as in `preview`, and ``model``, ``tolerance``, ``confidence``, ``operator``, ``note``. Raises
+        ServiceError if the recording can't be identified.
+        """
+        found = self._object("POST", f"/uploads/{quote(upload, safe='')}/identify", {"rig": rig, **mapping})
+        while found["state"] in ("delayed", "identifying"):
+            time.sleep(0.2)
+            found = self._object("GET", f"/uploads/{quote(upload, safe='')}")
+        if found["run"] is None:
+            raise ServiceError(200, {"error": found["error"]})
+        return self.run(found["run"])
+
+    def delete_upload(self, upload: str) -> None:
+        """Delete an upload that waits to be identified."""
+        self._object("POST", f"/uploads/{quote(upload, safe='')}/delete", {})
+
     def fleet(self, folder: str = "", *, below: str = "", **settings: Any) -> dict[str, Any]:
         """Identify many logs again: the service's own runs, or a folder of ``--logs``. Return when the work has ended.
 
@@ -212,7 +255,9 @@ class Client:
             time.sleep(every_s)
 
     def download(self, run: str, name: str, path: str | Path) -> Path:
-        """Save ``log.mcap``, ``report.html``, ``report.pdf`` or ``result.json`` of a run as a new file."""
+        """Save ``log.mcap``, ``report.html``, ``report.pdf``, ``result.json`` or ``trace.csv`` of a run as a new
+        file.
+        """
         target = Path(path)
         with self._open("GET", f"/runs/{quote(run, safe='')}/{quote(name, safe='')}") as answer, \
                 target.open("xb") as file:
@@ -238,9 +283,10 @@ class Client:
             return json.loads(answer.read())
 
     def _open(
-        self, method: str, path: str, body: Mapping[str, Any] | None = None, headers: Mapping[str, str] | None = None
+        self, method: str, path: str, body: Mapping[str, Any] | IO[bytes] | None = None,
+        headers: Mapping[str, str] | None = None,
     ) -> Any:
-        data = None if body is None else json.dumps(body).encode()
+        data = json.dumps(body).encode() if isinstance(body, Mapping) else body
         request = urllib.request.Request(
             f"{self._url}{_API}{path}", data, {**self._headers, **(headers or {})}, method=method
         )

@@ -5,7 +5,8 @@ complete header (plain HTTP), or with its first byte (TLS). So thousands of idle
 
 * Waiting connections and served connections have a limit each, for one address and for all addresses.
 * If a limit is reached, the oldest idle connection is closed, and the new one is accepted.
-* A header, or the rest of a request, takes at most `HEADERS_S`.
+* A header, or the rest of a request, takes at most `HEADERS_S`. The handler of an upload admits its connection, and
+  limits its time itself, by the received bytes.
 * Half of the process's descriptors stay free of connections: a Stop needs some for sockets and files of its own.
 """
 
@@ -38,6 +39,8 @@ MOST_DESCRIPTORS: Final = 65_536
 """Largest number of descriptors to use, even if the system grants more."""
 MOST: Final = 4096
 """Largest number of connections of each kind, for any number of descriptors."""
+ADMITTED: Final = "tdhil.admitted"
+"""Key in the ASGI scope of a request whose handler limits the time of its body itself."""
 PAUSE_S: Final = 0.05
 """Pause if the system has no descriptor and no connection can be closed, s."""
 NO_DESCRIPTOR: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
@@ -125,15 +128,19 @@ class _Served:
 
     @property
     def rank(self) -> int:
-        """Order in which connections are closed to make room: 0 idle, 1 a download or a WebSocket, 2 a change."""
+        """Order in which connections are closed to make room: 0 idle, 1 a download, an upload or a WebSocket, 2 a
+        change.
+        """
         if self.transport is None:
             return 0
         upgraded = self.transport.get_protocol() is not self.protocol
         if upgraded:
             return 1                   # a WebSocket
         cycle = self.protocol.cycle
-        if cycle is None or cycle.response_complete or cycle.more_body:
+        if cycle is None or cycle.response_complete:
             return 0
+        if cycle.more_body:
+            return 1 if self.protocol.scope.get(ADMITTED) else 0
         return 1 if self.protocol.scope["method"] in ("GET", "HEAD") else 2
 
     def close(self) -> None:

@@ -15,6 +15,7 @@ from tdhil.service.middleware import off
 from tdhil.service.routing import api
 from tdhil.service.run_state import NotThere
 from tdhil.service.schemas import PictureView
+from tdhil.service.uploads import TRACE
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -36,6 +37,7 @@ def routes(site: Site) -> list[Route]:
         api(site, "report_pdf", report_pdf),
         api(site, "result", result),
         api(site, "samples", samples),
+        api(site, "recording", recording),
         api(site, "pictures", pictures),
         api(site, "picture", picture),
     ]
@@ -93,6 +95,11 @@ async def samples(site: Site, request: Request, body: None) -> Response:
     return await _file(site, request, "samples.csv", "text/csv")
 
 
+async def recording(site: Site, request: Request, body: None) -> Response:
+    """Return the uploaded trace of a run, as it was received."""
+    return await _file(site, request, TRACE, "text/csv")
+
+
 async def pictures(site: Site, request: Request, body: None) -> list[PictureView]:
     """Return the headings of the report's pictures."""
     found = await _shown(site, request.path_params["run"])
@@ -128,7 +135,7 @@ async def _file(site: Site, request: Request, name: str, media: str, *, shown: b
     rig = (await off(lambda: site.store.request(run))).rig
     if request.method == "GET":
         site.supervisor.note(who, f"downloaded {name}", run, rig)
-    called = f"{rig}-{run}-{name}"
+    called = f"{rig}-{run}-{name}" if rig else f"{run}-{name}"
     grows = name == "run.mcap" and not (await off(lambda: site.store.status(run))).ended
     if grows and ("range" not in request.headers or "if-range" in request.headers):
         said = {"content-disposition": f'attachment; filename="{called}"'}

@@ -302,8 +302,12 @@ class _Teller:
 
 
 def _own_logs(store: Store, *, archived: bool) -> tuple[str, ...]:
-    """Return the logs of the service's runs, from the folder of the service; archived ones only with ``archived``."""
+    """Return the logs of the service's runs, from the folder of the service; archived ones only with ``archived``.
+
+    Uploaded recordings are left out: the table of a fleet has no mark for them.
+    """
     runs = sorted(one for one in store.ids() if archived or not store.annotations(one).archived)
+    runs = [one for one in runs if not (read_json(store.place(one) / "request.json") or {}).get("uploaded")]
     return tuple(str(path) for one in runs if (path := store.runs / one / "run.mcap").is_file())
 
 

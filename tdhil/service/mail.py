@@ -106,7 +106,7 @@ class Mail:
     def _written(self, message: Mapping[str, Any]) -> EmailMessage:
         """Return the e-mail on a message of `notifications`."""
         found, event = EmailMessage(), str(message["event"])
-        marks = "".join(f" {mark.upper()}" for mark in ("simulated", "rehearsal") if message.get(mark))
+        marks = "".join(f" {mark.upper()}" for mark in ("simulated", "rehearsal", "uploaded") if message.get(mark))
         figure = _figure(message)
         found["Subject"] = visible(
             f"tdhil: {message['rig']}{marks}: {_EVENTS.get(event, event)}{f', {figure}' if figure else ''}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from functools import partial
@@ -20,7 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from drivers import CommunicationLost, DataFileError, PreflightRefused
 from tdhil.config import OPTION
-from tdhil.errors import ExitCode, LogError, MessageCode, TdhilError, UsageError
+from tdhil.errors import CsvMisnamed, CsvUnusable, ExitCode, LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.access import token_in
 from tdhil.service.run_channel import RunRefused
 from tdhil.service.run_state import (
@@ -31,10 +31,13 @@ from tdhil.service.run_state import (
     NotReacting,
     NotThere,
     Told,
+    TooLarge,
     TooManyTries,
+    TooSlow,
 )
-from tdhil.service.schemas import OPTIONS, ErrorView, FieldError, Route, adapter, plain
+from tdhil.service.schemas import FILE, OBJECTS, ErrorView, FieldError, Route, adapter, plain
 from tdhil.service.start_request import ValuesWrong
+from tdhil.service.upload_request import label_of
 
 T = TypeVar("T")
 BODY_LIMIT: Final = 64 * 1024
@@ -112,8 +115,9 @@ def status_of(error: BaseException) -> int:
         return int(error.status_code)
     for kind, status in (
         (NotThere, 404), (NotLoggedIn, 401), (TooManyTries, 429), (NotAllowed, 403),
-        (PreflightRefused, 409), (UsageError, 422), (DataFileError, 422), (NotReacting, 504), (CommunicationLost, 503),
-        (NoRoom, 507), (LogError, 503),
+        (TooLarge, 413), (TooSlow, 408), (PreflightRefused, 409), (UsageError, 422), (DataFileError, 422),
+        (CsvMisnamed, 422), (CsvUnusable, 422), (NotReacting, 504), (CommunicationLost, 503), (NoRoom, 507),
+        (LogError, 503),
     ):
         if isinstance(error, kind):
             return status
@@ -132,13 +136,17 @@ def told_of(error: BaseException) -> ErrorView:
     if not isinstance(error, TdhilError):
         return ErrorView(Told("InternalError", "internal error", "internal error", "", _BROKEN_HINT, 1,
                               MessageCode.INTERNAL_ERROR.code))
-    wrong = [_field_of(name, text) for name, text in error.fields] if isinstance(error, ValuesWrong) else None
+    wrong = fields_of(error.fields) if isinstance(error, ValuesWrong) else None
     return ErrorView(Told.of(error), getattr(error, "holder", None) if isinstance(error, Conflict) else None, wrong)
 
 
-def _field_of(name: str, text: str) -> FieldError:
-    form = OPTION[name].form if name in OPTION else None
-    return FieldError(name, name if form is None else form.label, text)
+def fields_of(wrong: Sequence[tuple[str, str]]) -> list[FieldError]:
+    """Return wrong values, each with its label on the form."""
+    found = []
+    for name, text in wrong:
+        form = OPTION[name].form if name in OPTION else None
+        found.append(FieldError(name, label_of(name) if form is None else form.label, text))
+    return found
 
 
 def error_response(error: BaseException, status: int | None = None, headers: Mapping[str, str] = _NONE) -> Response:
@@ -150,8 +158,8 @@ def error_response(error: BaseException, status: int | None = None, headers: Map
 
 
 async def body_of(request: Request, route: Route) -> Any:
-    """Return the checked body of the request. Raises UsageError."""
-    if route.method == "GET":
+    """Return the checked body of the request; None for a file, which its handler receives. Raises UsageError."""
+    if route.method == "GET" or route.body == FILE:
         return None
     data = b""
     async for piece in request.stream():
@@ -170,7 +178,7 @@ async def body_of(request: Request, route: Route) -> Any:
     if not isinstance(sent, dict):
         raise UsageError("must be an object", where="body", next_step='Send an object, such as {"seed": 7}',
                          entry=MessageCode.REQUEST_WRONG)
-    if route.body == OPTIONS:
+    if route.body in OBJECTS:
         return sent
     try:
         return adapter(route.body).validate_json(json.dumps(sent), strict=True)

@@ -88,7 +88,7 @@ class Notifier:
                 continue
             self._known.add(one.id)
             yield message_of(one)
-            if one.state == State.DONE and not one.rehearsal:
+            if one.state == State.DONE and not one.rehearsal and not one.uploaded:
                 yield from changes_of(one, *self._trends(one.rig, one.id))
 
     def _deliver(self, body: Mapping[str, Any]) -> None:
@@ -110,6 +110,7 @@ def message_of(run: Summary) -> dict[str, Any]:
     return {
         "event": "run.ended" if run.state in _GOOD else "run.failed", "run": run.id, "rig": run.rig, "state": run.state,
         "asked": run.asked, "ended": run.ended, "simulated": run.simulated, "rehearsal": run.rehearsal,
+        "uploaded": run.uploaded,
         "exit_code": run.exit_code, "verdict": run.verdict, "inertia_kg_m2": run.inertia_kg_m2,
         "low_kg_m2": run.low_kg_m2, "high_kg_m2": run.high_kg_m2, "path": f"/runs/{run.id}",
     }

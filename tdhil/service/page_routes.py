@@ -56,6 +56,7 @@ class Pages:
             self._page("/rigs/{rig}/file", "rig_file.html", "rigs"),
             self._page("/start/{rig}", "start.html", "rigs"),
             self._page("/runs", "runs.html", "runs"),
+            self._page("/upload", "upload.html", "runs"),
             self._page("/runs/{run}", "run.html", "runs"),
             self._page("/runs/{run}/live", "live.html", "runs"),
             self._page("/calibrate/{rig}", "calibrate.html", "rigs"),

@@ -135,6 +135,8 @@ class RunRecords:
             self._require_settled(run)
             if request.rehearsal:
                 raise Conflict("faults were rehearsed in this run: it is no acceptance of a rig", where=where)
+            if request.uploaded is not None:
+                raise Conflict("this recording was uploaded: it is no acceptance of a rig", where=where)
             present, digest = self.acceptance(run)
             if (before := self.signature(run)) is not None:
                 raise Conflict(f"the acceptance is signed already: by {before.name}, {before.at}", where=where,

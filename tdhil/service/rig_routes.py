@@ -24,6 +24,7 @@ from tdhil.service.schemas import (
     StoppedView,
     TrendView,
 )
+from tdhil.service.site import TREND_RUNS
 from tdhil.service.start_request import EDITABLE, RigFile, options_of, require_motion, require_unwatched
 
 if TYPE_CHECKING:
@@ -118,8 +119,12 @@ async def trend(site: Site, request: Request, body: None) -> TrendView:
     if not found:
         nothing = {"rig": which.id, "logs": 0, "results": 0, "notes": ["no run has a result yet"], "quantities": []}
         return TrendView(which.id, nothing)
-    asked = {"rows": found, "rig": which.id}
-    return TrendView(which.id, await site.work("trend", None, asked))
+    from tdhil.fleet import counted
+
+    document = await site.work("trend", None, {"rows": found, "rig": which.id})
+    left = await off(lambda: sum(one.uploaded for one in site.list_runs(which.id, None, TREND_RUNS, archived=archived)))
+    notes = [f"{counted(left, 'uploaded recording')}: left out"] if left else []
+    return TrendView(which.id, {**document, "notes": [*document["notes"], *notes]} if left else document)
 
 
 async def start(site: Site, request: Request, body: dict[str, Any]) -> tuple[int, RunView]:
@@ -194,6 +199,10 @@ async def calibration(site: Site, request: Request, body: CalibrationBody) -> Ca
             if site.store.request(run).rig != which.id:
                 raise UsageError(f"is not a run of rig {which.id}", where=f"run {run}",
                                  next_step="Calibrate each drive by its own two runs", entry=MessageCode.REQUEST_WRONG)
+            if site.store.request(run).uploaded is not None:
+                raise UsageError("is an uploaded recording: it is not certain that it is of this drive",
+                                 where=f"run {run}", next_step="Calibrate with tdhil calibrate torque",
+                                 entry=MessageCode.REQUEST_WRONG)
             if not site.store.status(run).ended or not (site.store.place(run) / "run.mcap").is_file():
                 raise UsageError("the run has no finished log", where=f"run {run}",
                                  next_step="Wait until it has ended", entry=MessageCode.NOT_READY)

@@ -112,11 +112,13 @@ async def compare(site: Site, request: Request, body: None) -> CompareView:
 
 
 def _asked_at(site: Site, which: list[str], comparison: dict[str, Any]) -> dict[str, Any]:
-    """Return the comparison with the time of each run's request, as on every page."""
-    times = [site.store.request(one).asked for one in which]
+    """Return the comparison with the time of each run's request, as on every page, and whether it was uploaded."""
+    requests = [site.store.request(one) for one in which]
+    times = [one.asked for one in requests]
     return {
         **comparison,
-        "results": [{**one, "date": at} for one, at in zip(comparison["results"], times, strict=False)],
+        "results": [{**one, "date": of.asked, "uploaded": of.uploaded is not None}
+                    for one, of in zip(comparison["results"], requests, strict=False)],
         "settings": [{**one, "values": times, "differs": True} if one["name"] == "date" else one
                      for one in comparison["settings"]],
     }

@@ -6,7 +6,8 @@
                                                                              ↘ refused | stopped | failed
     whenever the run's process or the drive is lost:                           interrupted | stop_not_confirmed
 
-There is no queue of motions and no pause. An ended run stays ended.
+There is no queue of motions and no pause. An ended run stays ended. A run that is made from an uploaded recording has
+one state, done.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from enum import StrEnum
 from typing import Any
 
 from drivers import CommunicationLost, PreflightRefused
-from tdhil.errors import HIGHEST_SIGNAL, SIGNALS, ExitCode, MessageCode, TdhilError
+from tdhil.errors import HIGHEST_SIGNAL, SIGNALS, ExitCode, MessageCode, TdhilError, UsageError
 
 
 class State(StrEnum):
@@ -166,6 +167,11 @@ class Status:
     def begun(run: str, rig: str, at: str) -> Status:
         return Status(run, rig, (Entered(State.REQUESTED, at),))
 
+    @staticmethod
+    def of_uploaded(run: str, rig: str, at: str, **known: Any) -> Status:
+        """Return the status of a run that is made from an uploaded recording: it has ended, and nothing moved."""
+        return Status(run, rig, (Entered(State.DONE, at),), **known)
+
     @property
     def state(self) -> State:
         return self.history[-1].state
@@ -256,8 +262,11 @@ def iso(time_s: float) -> str:
 #     │   └── TooManyTries            too many passwords; retry after ``wait_s``                exit 4, HTTP 429
 #     │       └── TooManyRuns         too many runs that show a code                            exit 4, HTTP 429
 #     ├── NoRoom                      the disk is full                                          exit 4, HTTP 507
+#     ├── UsageError
+#     │   └── TooLarge                the uploaded file is larger than the limit                exit 2, HTTP 413
 #     ├── CommunicationLost
-#     │   └── NotReacting             the run's process is suspended                            exit 5, HTTP 504
+#     │   ├── NotReacting             the run's process is suspended                            exit 5, HTTP 504
+#     │   └── TooSlow                 an upload takes too long                                  exit 5, HTTP 408
 #     └── PreflightRefused
 #         └── Conflict                another run uses the rig; the code is void                exit 4, HTTP 409
 
@@ -313,6 +322,16 @@ class NotReacting(CommunicationLost):
     """The run's process is suspended and does not carry out the request."""
 
     entry = MessageCode.RUN_NOT_REACTING
+
+
+class TooLarge(UsageError):
+    """The uploaded file is larger than the limit."""
+
+    entry = MessageCode.REQUEST_WRONG
+
+
+class TooSlow(CommunicationLost):
+    """An upload takes longer than its size allows."""
 
 
 class Conflict(PreflightRefused):

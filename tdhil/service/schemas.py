@@ -22,6 +22,8 @@ from tdhil.service.foxglove import PROTOCOLS
 from tdhil.service.run_state import Check, Confirmation, Entered, State, Stop, Told, Watch
 from tdhil.service.start_request import TAKEN, option_schema
 from tdhil.service.store import Summary
+from tdhil.service.upload_request import ACCEPTED
+from tdhil.service.uploads import Upload
 from tdhil.version import __version__
 
 # For mypy these are plain dataclasses; pydantic makes the schemas from their annotations.
@@ -144,7 +146,8 @@ class RunView:
     """A run without its samples. ``result``: document of `tdhil identify --json`; ``files``: names for downloads.
 
     ``operator``, ``note``: as edited later, else as in ``options``. ``edits``: each later edit, with old and new value.
-    ``signature``: under its acceptance.
+    ``signature``: under its acceptance. ``uploaded``: source of an uploaded recording (file, sha256, by, at, rig as
+    stated, kind, size_bytes); None for a run of this service.
     """
 
     id: str
@@ -182,6 +185,15 @@ class RunView:
     archived: bool = False
     edits: list[AnnotationEdit] = field(default_factory=list)
     signature: AcceptanceSignature | None = None
+    uploaded: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class UploadsView:
+    """The uploads that wait to be identified, the newest first. ``limit_bytes``: largest file."""
+
+    limit_bytes: int
+    uploads: list[Upload]
 
 
 @dataclass(frozen=True)
@@ -356,6 +368,17 @@ class FieldError:
     option: str
     label: str
     message: str
+
+
+@dataclass(frozen=True)
+class PreviewView:
+    """Content of an upload. ``preview``: the table of a trace with a guess of its columns, or the run of a log; and
+    ``reading``: length, rate, gaps, ranges and a plot, with this mapping. ``wrong``: every wrong value of the mapping.
+    """
+
+    upload: str
+    preview: dict[str, Any]
+    wrong: list[FieldError]
 
 
 @dataclass(frozen=True)
@@ -564,6 +587,12 @@ class Nothing:
 
 OPTIONS: Final = "Options"
 """Body of a request for a run: an object with the command line's options."""
+RECORDING: Final = "Recording"
+"""Body of a request about an upload: an object with the options of `tdhil replay`, and the rig."""
+OBJECTS: Final = frozenset({OPTIONS, RECORDING})
+"""Bodies that are objects with options. Their handlers check them."""
+FILE: Final = "File"
+"""Body of an upload: the bytes of a file. Its handler receives and limits them."""
 
 
 @dataclass(frozen=True)
@@ -661,6 +690,20 @@ ROUTES: Final = (
           errors=(404,)),
     Route("GET", "/runs/{run}/pictures/{number}", "picture", "One of the pictures", "viewer", {200: "image/svg+xml"},
           errors=(404,)),
+    Route("GET", "/runs/{run}/trace.csv", "recording", "The uploaded trace, as it was received", "viewer",
+          _file("text/csv"), errors=(404,), headers=_RANGE),
+    Route("GET", "/uploads", "uploads", "Uploads that wait to be identified", "operator", {200: UploadsView}),
+    Route("POST", "/uploads", "upload", "Upload a log of tdhil, or a trace in CSV, as the body", "operator",
+          {201: Upload}, FILE, (403, 408, 409, 413, 422, 503, 507),
+          query={"name": "name of the file, for display"}),
+    Route("GET", "/uploads/{upload}", "one_upload", "One upload, and the run that was made from it", "operator",
+          {200: Upload}, errors=(404,)),
+    Route("POST", "/uploads/{upload}/preview", "preview", "Read an upload with this mapping; nothing is stored",
+          "operator", {200: PreviewView}, RECORDING, (403, 404, 422)),
+    Route("POST", "/uploads/{upload}/identify", "identify_upload", "Identify an upload; it becomes a run that has"
+          " ended", "operator", {202: Upload}, RECORDING, (403, 404, 409, 422)),
+    Route("POST", "/uploads/{upload}/delete", "delete_upload", "Delete an upload", "operator", {200: UploadsView},
+          Nothing, (403, 404, 409)),
     Route("GET", "/rigs/{rig}/faults", "faults", "Faults that can be rehearsed on a simulated rig", "viewer",
           {200: list[FaultView]}, errors=(403, 404)),
     Route("GET", "/fleets", "fleets", "Fleet requests (many logs identified again), the newest first", "viewer",
@@ -747,6 +790,12 @@ def document() -> dict[str, Any]:
             return {"type": "object", "description": "the command line's options, such as "
                     '{"seed": 7, "tolerance": 0.01}; numbers in SI, or a text with a unit',
                     "properties": {name: option_schema(one) for name, one in TAKEN.items()}}
+        if kind == RECORDING:
+            return {"type": "object", "description": "options of `tdhil replay` for a trace, such as "
+                    '{"columns": ["time=t:s", "speed=n:rpm", "torque=m:Nm"]}; numbers in SI, or a text with a unit',
+                    "properties": {
+                        "rig": {"type": "string", "description": "rig of the recording as you state it, '' for none"},
+                        **{name: option_schema(one) for name, one in ACCEPTED.items()}}}
         found = adapter(kind).json_schema(mode=mode, ref_template="#/components/schemas/{model}")
         schemas.update(found.pop("$defs", {}))
         if isinstance(kind, type) and found.get("type") == "object":
@@ -776,7 +825,10 @@ def document() -> dict[str, Any]:
             "operationId": route.name, "summary": route.summary, "parameters": parameters, "responses": responses,
             **security(route.role),
         }
-        if route.body is not None:
+        if route.body == FILE:
+            described["requestBody"] = {"content": {"application/octet-stream": {
+                "schema": {"type": "string", "format": "binary"}}}}
+        elif route.body is not None:
             described["requestBody"] = {"content": {"application/json": {"schema": schema(route.body, "validation")}}}
         paths.setdefault(f"{API}{route.path}", {})[route.method.lower()] = described
     for one in SOCKETS:

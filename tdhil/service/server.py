@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tdhil.errors import ExitCode, MessageCode, UsageError
+from tdhil.service.limits import UPLOAD_LIMIT
 
 if TYPE_CHECKING:
     import uvicorn
@@ -114,7 +115,7 @@ def _names(host: str, more: Sequence[str]) -> frozenset[str]:
 def serve(
     rigs: Path | None, data: Path, host: str, port: int, say: Say, *, viewers: frozenset[str] = frozenset(),
     mqtt: str | None = None, webhook: str | None = None, mail: str | None = None, tls: Tls | None = None,
-    names: Sequence[str] = (), logs: Sequence[Path] = (),
+    names: Sequence[str] = (), logs: Sequence[Path] = (), upload_limit: int = UPLOAD_LIMIT,
 ) -> int:
     """Serve until SIGINT or SIGTERM; then live runs are stopped first. Return the exit code.
 
@@ -122,7 +123,8 @@ def serve(
     ``mqtt``: the address of a broker that receives states and results.
     ``webhook``: the address that receives a message for each ended run and each change of a rig; ``mail``: the mail
     server and the recipients of the same messages.
-    ``names``: more names of this host; ``logs``: folders of logs for fleet requests, besides the service's runs.
+    ``names``: more names of this host; ``logs``: folders of logs for fleet requests, besides the service's runs;
+    ``upload_limit``: largest uploaded recording, bytes.
 
     Raises UsageError for unusable arguments or unreadable accounts, and LogUnopened for a folder that can't be made.
     """
@@ -169,7 +171,7 @@ def serve(
     supervisor = Supervisor(store, Rigs(rigs), Audit(store.folder / "audit"), Index(store), say=say)
     room = Room.of(raise_limit())
     web = Web(supervisor, hosts=allowed, viewers=viewers, access=Access(store.folder, login=accounts, say=say),
-              logs={str(one): one for one in logs})
+              logs={str(one): one for one in logs}, upload_limit=upload_limit)
     publisher = None if broker is None else Publisher(broker, web.told, say)
     listening = _listen(host, port)
     at = listening.getsockname()[1]

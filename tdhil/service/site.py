@@ -23,6 +23,7 @@ from tdhil.errors import TdhilError
 from tdhil.service.access import Access
 from tdhil.service.answers import KeptAnswers
 from tdhil.service.fleets import Fleets
+from tdhil.service.limits import UPLOAD_LIMIT
 from tdhil.service.live_feed import Feeds
 from tdhil.service.records import RunRecords
 from tdhil.service.run_channel import lives
@@ -31,6 +32,7 @@ from tdhil.service.schemas import ReplayView, RigView, RunView, adapter
 from tdhil.service.start_request import RigFile
 from tdhil.service.store import Summary, read_json
 from tdhil.service.supervisor import Supervisor
+from tdhil.service.uploads import TRACE, Uploads
 
 T = TypeVar("T")
 STOPS: Final = 16
@@ -39,6 +41,8 @@ LEASES: Final = 8
 """Number of threads for leases of watched runs, in addition to the web's other threads."""
 
 
+NO_RIG: Final = "Uploaded recording"
+"""Title of a run without a rig."""
 TREND_RUNS: Final = 1000
 """Number of latest runs in a trend."""
 
@@ -65,17 +69,18 @@ class Metrics:
 class Site:
     """All parts of one service. ``access``: roles and logins.
 
-    ``logs``: folders, by name, whose logs may be identified again.
+    ``logs``: folders, by name, whose logs may be identified again. ``upload_limit``: largest uploaded file, bytes.
     """
 
     def __init__(
         self, supervisor: Supervisor, *, access: Access | None = None,
-        logs: Mapping[str, Path] = MappingProxyType({}),
+        logs: Mapping[str, Path] = MappingProxyType({}), upload_limit: int = UPLOAD_LIMIT,
     ) -> None:
         self.supervisor, self.store = supervisor, supervisor.store
         self.access = access or Access(self.store.folder)
         self.access.changed = lambda what, name: supervisor.note("terminal", what, None, None, name=name)
         self.fleets = Fleets(self.store, logs, supervisor.turning)
+        self.uploads = Uploads(self.store, supervisor.note, upload_limit)
         self.feeds = Feeds()
         self.metrics = Metrics()
         self.relays = 0
@@ -89,6 +94,7 @@ class Site:
         self._answers = KeptAnswers(self.store.runs)
         self._works = anyio.CapacityLimiter(1)         # computations that a page waits for, one at a time
         self._replays = anyio.CapacityLimiter(1)       # slow computations, so that no plan waits for them
+        self._previews = anyio.CapacityLimiter(1)      # a large upload takes long to read
 
     def begin_stops(self) -> None:
         """Start the threads for stops: on a busy computer, a thread may take 200 ms to start."""
@@ -107,8 +113,10 @@ class Site:
         if (kept := self._answers.get(key)) is not None:
             return kept
         work, limiter = partial(self.supervisor.work, what, run, asked), self._works
-        if what in ("replay", "calibrate"):
+        if what in ("replay", "calibrate", "upload"):
             limiter = self._replays
+        if what == "preview":
+            limiter = self._previews
         found: dict[str, Any] = (await anyio.to_thread.run_sync(work, limiter=limiter))["document"]
         self._answers.put(key, found)
         return found
@@ -136,7 +144,8 @@ class Site:
         return RigView(
             rig.id, rig.name, state, simulated, rig.motion, problem, None if holder is None else str(holder), run,
             blocked, drive, profile, limits,
-            next((one for one in last if one.inertia_kg_m2 is not None and not one.rehearsal), None),
+            next((one for one in last if one.inertia_kg_m2 is not None and not (one.rehearsal or one.uploaded)),
+                 None),
         )
 
     def list_runs(
@@ -165,7 +174,8 @@ class Site:
     def trend_rows(self, rig: str, *, archived: bool = False) -> list[dict[str, Any]]:
         """Return the rows of a rig's history, each with the time of the run's request, as on every page.
 
-        Archived runs are included only with ``archived``.
+        An uploaded recording has no row, since its identity is only stated by a person. Archived runs are included only
+        with ``archived``.
         """
         runs = self.list_runs(rig, "done", TREND_RUNS, archived=archived)
         return [{**row, "date": _local(one.asked)} for one in runs
@@ -191,11 +201,11 @@ class Site:
         """Return the view of a run. ``status``: the status that the run itself has just reported. Raises NotThere."""
         request, folder = self.store.request(run), self.store.place(run)
         status = status or self.store.status(run)
-        rig_name = request.rig
+        rig_name = request.rig or NO_RIG
         with suppress(TdhilError):
             rig_name = self.supervisor.rigs.get(request.rig).name
         annotations = self.store.annotations(run)
-        found = [name for name in ("run.mcap", "recovered.mcap", "report.html", "result.json", "report.pdf")
+        found = [name for name in ("run.mcap", TRACE, "recovered.mcap", "report.html", "result.json", "report.pdf")
                  if (folder / name).is_file()]
         return RunView(
             request.id, request.rig, rig_name, status.state, status.stage, status.at,
@@ -207,7 +217,7 @@ class Site:
             lives(folder), request.rehearsal, None if status.rehearsal is None else dict(status.rehearsal),
             annotations.text("operator", request.options), annotations.text("note", request.options),
             list(annotations.tags), annotations.archived, list(annotations.edits),
-            self.records.signature(run),
+            self.records.signature(run), None if request.uploaded is None else dict(request.uploaded),
         )
 
     def told(self) -> dict[str, Any]:

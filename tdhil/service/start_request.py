@@ -66,14 +66,14 @@ def options_of(asked: Mapping[str, Any]) -> dict[str, Any]:
         if value is None:
             continue
         try:
-            found[name] = _value(TAKEN[name], value)
+            found[name] = value_of(TAKEN[name], value)
         except UsageError as error:
             wrong.append((name, error.what))
     try:
         expectations_of({}, RunDetails.of(found).expect)
     except UsageError as error:
         wrong.append((OPTION["expect"].name, error.what))
-    wrong += [(name, _limits_in_words(name, found.get(name)) or text) for name, text in wrong_values(found)]
+    wrong += [(name, limits_in_words(OPTION.get(name), found.get(name)) or text) for name, text in wrong_values(found)]
     if wrong:
         raise ValuesWrong(wrong)
     return found
@@ -85,9 +85,8 @@ LARGEST: Final = 1e15
 """An upper limit above this value only comes from the number's type. It is not printed."""
 
 
-def _limits_in_words(name: str, value: Any) -> str:
+def limits_in_words(option: Option | None, value: Any) -> str:
     """Return as text which limits a number exceeds, in the unit of the form's field; '' if none."""
-    option = OPTION.get(name)
     if option is None or not option.limits or isinstance(value, bool) or not isinstance(value, int | float):
         return ""
     if not option.refusal(value):
@@ -120,9 +119,14 @@ class ValuesWrong(UsageError):
         super().__init__("; ".join((what, *(f"{other}: {text}" for other, text in more))), where=name)
 
 
-def _value(option: Option, value: Any) -> Any:
-    """Parse a value as on the command line. The checks of rig.yaml follow later."""
+def value_of(option: Option, value: Any) -> Any:
+    """Parse a value as on the command line. The checks of its limits follow later. Raises UsageError."""
     where = option.name
+    if option.kind is float and option.unit is None:
+        try:
+            return float(value if isinstance(value, str) or not isinstance(value, bool) else "")
+        except (TypeError, ValueError):
+            raise UsageError("must be a number", where=where, entry=MessageCode.REQUEST_WRONG) from None
     if option.unit is not None:
         if isinstance(value, str):
             try:
@@ -165,6 +169,8 @@ def option_schema(option: Option) -> dict[str, Any]:
         found: dict[str, Any] = {"type": "array", "items": text}
     elif option.unit is not None:
         found = {"type": ["number", "string"], "x-unit": option.unit.symbol}
+    elif option.kind is float:
+        found = {"type": ["number", "string"]}
     else:
         found = text if option.kind is str else {"type": {bool: "boolean", int: "integer"}[option.kind]}
     return {**found, "description": option.help_text, **({} if option.default is None else {"default": option.default})}

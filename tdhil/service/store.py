@@ -3,7 +3,8 @@
 ::
 
     runs/<id>/request.json, state.json, connection.json, confirm.json, signed_off.json, annotations.json,
-              result.json, run.mcap, report.html, replays/
+              result.json, run.mcap, report.html, replays/, trace.csv and excitation.yaml of an uploaded trace
+    uploads/<id>/     `uploads.Uploads`
     index.sqlite
 """
 
@@ -97,7 +98,11 @@ def _sync_folder(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class StoredRequest:
-    """Request of a run, file request.json. ``options`` as received, ``motion`` as in the rig's file."""
+    """Request of a run, file request.json. ``options`` as received, ``motion`` as in the rig's file.
+
+    ``uploaded``: source of an uploaded recording, as in `Upload.source`, with its rig as stated, kind and size. The rig
+    is '' if none was stated.
+    """
 
     id: str
     rig: str
@@ -109,6 +114,7 @@ class StoredRequest:
     simulated: bool
     motion: str
     idempotency_key: str | None = None
+    uploaded: Mapping[str, Any] | None = None
 
     @property
     def rehearsal(self) -> bool:
@@ -138,6 +144,7 @@ class Summary:
     repeatability_rel: float | None = None
     exit_code: int | None = None
     rehearsal: bool = False                # whether a fault of the simulated drive was rehearsed
+    uploaded: bool = False                 # whether the recording was uploaded: no history of a rig
     operator: str | None = None            # as edited later, else as recorded; `note` too
     note: str | None = None
     tags: tuple[str, ...] = ()
@@ -170,6 +177,7 @@ def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any]
         request.simulated if status.simulated is None else status.simulated,
         (result or {}).get("verdict"), inertia.get("value"), inertia.get("low_total"), inertia.get("high_total"),
         inertia.get("repeatability_rel"), status.exit_code, request.rehearsal,
+        request.uploaded is not None,
         annotations.text("operator", request.options) or None, annotations.text("note", request.options) or None,
         annotations.tags, annotations.archived,
     )
@@ -181,7 +189,7 @@ def _plain_row(summary: Summary) -> dict[str, Any]:
 
 
 def _summary_of_row(plain: Mapping[str, Any]) -> Summary:
-    flags = {name: bool(plain[name]) for name in ("simulated", "rehearsal", "archived")}
+    flags = {name: bool(plain[name]) for name in ("simulated", "rehearsal", "uploaded", "archived")}
     return Summary(**{**plain, **flags, "tags": tuple(filter(None, plain["tags"].split(", ")))})
 
 
@@ -291,6 +299,16 @@ class Store:
         self.save(status)
         return status
 
+    def adopt(self, folder: Path, request: StoredRequest, status: Status) -> None:
+        """Make this folder the folder of an ended run. Its place, which `new_id` made, is still empty. Raises OSError.
+
+        The last step is a rename, so the run exists as a whole or not at all.
+        """
+        write_json(folder / "request.json", asdict(request))
+        write_json(folder / "state.json", status.plain())
+        folder.replace(self.runs / request.id)
+        _sync_folder(self.runs)
+
     def save(self, status: Status) -> None:
         """Write the status; on a full disk, into the reserved space. Raises OSError without reserved space."""
         folder, plain = self.runs / status.id, status.plain()
@@ -340,7 +358,7 @@ class Store:
 _COLUMNS: Final = tuple(Summary.__dataclass_fields__)
 _SEARCHED: Final = "searched"
 """Column with the text of a row in lower case, so that a search calls no function for each row."""
-_VERSION: Final = 4
+_VERSION: Final = 5
 
 
 class Index:

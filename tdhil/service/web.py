@@ -27,11 +27,21 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
-from tdhil.service import auth_routes, file_routes, fleet_routes, new_rig_routes, rig_routes, run_routes, service_routes
+from tdhil.service import (
+    auth_routes,
+    file_routes,
+    fleet_routes,
+    new_rig_routes,
+    rig_routes,
+    run_routes,
+    service_routes,
+    upload_routes,
+)
 from tdhil.service.access import SOCKET_LOOK_S, Access, principal, require
 from tdhil.service.accounts import Role
 from tdhil.service.door import NO_DESCRIPTOR, Seldom
 from tdhil.service.foxglove import PROTOCOLS, Relay, Running
+from tdhil.service.limits import UPLOAD_LIMIT
 from tdhil.service.live_feed import Feed
 from tdhil.service.middleware import RequestGuard, error_response, off, status_of, told_of
 from tdhil.service.page_routes import Pages
@@ -42,7 +52,8 @@ from tdhil.service.site import Site
 from tdhil.service.supervisor import Supervisor
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
-SUBJECTS: Final = (new_rig_routes, rig_routes, run_routes, file_routes, fleet_routes, auth_routes, service_routes)
+SUBJECTS: Final = (
+    new_rig_routes, rig_routes, run_routes, file_routes, upload_routes, fleet_routes, auth_routes, service_routes)
 _GONE: Final = suppress(WebSocketDisconnect, RuntimeError)
 """Context for messages to a socket, whose other end may disconnect at any time."""
 
@@ -51,14 +62,15 @@ class Web(Site):
     """Web application of one supervisor. ``hosts``: accepted host names.
 
     ``viewers``: origins (``http://localhost:8080``) whose pages may only read logs by the Foxglove protocol.
-    ``access``, ``logs``: as in `Site`.
+    ``access``, ``logs``, ``upload_limit``: as in `Site`.
     """
 
     def __init__(
         self, supervisor: Supervisor, *, hosts: frozenset[str] = LOOPBACK, viewers: frozenset[str] = frozenset(),
         access: Access | None = None, logs: Mapping[str, Path] = MappingProxyType({}),
+        upload_limit: int = UPLOAD_LIMIT,
     ) -> None:
-        super().__init__(supervisor, access=access, logs=logs)
+        super().__init__(supervisor, access=access, logs=logs, upload_limit=upload_limit)
         self._complain = Seldom(supervisor.say)
         self._pages = Pages(self)
         self.app = Starlette(
@@ -76,6 +88,7 @@ class Web(Site):
         await off(service_routes.openapi_text)         # takes 0.4 s: done now, so that no stop waits for it
         await anyio.to_thread.run_sync(self.access.start)
         await anyio.to_thread.run_sync(self.supervisor.start)
+        await anyio.to_thread.run_sync(self.uploads.start)
         try:
             yield
         finally:

@@ -18,8 +18,8 @@ from tdhil.errors import UsageError
 from tdhil.numerics import prepare
 from tdhil.service.run_state import Told
 
-NICE: Final = {"plan": 5, "trend": 5, "report": 5, "scan": 0, "pace": 0}
-"""Niceness of the tasks that a page waits for. A run by the clock has 0."""
+NICE: Final = {"plan": 5, "trend": 5, "report": 5, "preview": 5, "upload": 10, "scan": 0, "pace": 0}
+"""Nice values of the tasks for which a page waits. A run by the clock has 0."""
 USUAL_NICE: Final = 19
 
 
@@ -44,11 +44,11 @@ def replay(asked: dict[str, Any]) -> dict[str, Any]:
     """Identify a run's log again, with another model, tolerance or confidence."""
     from tdhil.api import identify
     from tdhil.config import ASKED_AGAIN
-    from tdhil.session import read
+    from tdhil.service.upload_work import read_marked
 
     os.chdir(asked["folder"])
     given = {one.name: value for one in ASKED_AGAIN if (value := asked.get(one.name)) is not None}
-    return {"document": identify(read("run.mcap"), **given).to_dict()}
+    return {"document": identify(read_marked(), **given).to_dict()}
 
 
 def report(asked: dict[str, Any]) -> dict[str, Any]:
@@ -143,9 +143,26 @@ def scan(asked: dict[str, Any]) -> dict[str, Any]:
     return {"document": plain(scan_for(adapter(DraftBody).validate_python(asked["draft"])), ScanView)}
 
 
+def preview(asked: dict[str, Any]) -> dict[str, Any]:
+    """Return what an uploaded recording contains, and how it is read with the requested mapping."""
+    from tdhil.service.upload_work import preview_of
+
+    os.chdir(asked["place"])
+    return {"document": preview_of(asked["kind"], asked["options"], readable=asked["read"])}
+
+
+def upload(asked: dict[str, Any]) -> dict[str, Any]:
+    """Identify an uploaded recording. Write log, result and report beside it."""
+    from tdhil.service.upload_work import identify_upload
+
+    os.chdir(asked["place"])
+    return {"document": identify_upload(asked["kind"], asked["options"], asked["source"])}
+
+
 WORK: Final = {
     "plan": plan, "scan": scan, "pace": pace, "replay": replay, "report": report, "samples": samples,
-    "recover": recover, "trend": trend, "compare": compare, "calibrate": calibrate,
+    "recover": recover, "trend": trend, "compare": compare, "calibrate": calibrate, "preview": preview,
+    "upload": upload,
 }
 
 

@@ -54,8 +54,8 @@ if TYPE_CHECKING:
         by_hand as by_hand, starter as starter, to_fill_in as to_fill_in,
     )
     from tdhil.session.run_record import (
-        RunRecord as RunRecord, ByKeyword as ByKeyword, is_log as is_log, read as read,
-        require_file as require_file,
+        RunRecord as RunRecord, ByKeyword as ByKeyword, check_lags as check_lags, is_log as is_log, read as read,
+        require_file as require_file, trace_arguments as trace_arguments, write_as_log as write_as_log,
     )
     from tdhil.session.run_session import (
         OperatorInterface as OperatorInterface, RunRequest as RunRequest,
@@ -102,7 +102,8 @@ else:
         "pace": "PaceMeasured measure_pace",
         "rehearsal": "ANY_FAULT REQUIRED Rehearsal RehearsalVerdict RequiredReaction judge_rehearsal required_reaction",
         "rig_text": "LIMIT_KEYS STRING_KEYS RigEntries blank_rig by_hand starter to_fill_in",
-        "run_record": "RunRecord ByKeyword is_log read require_file",
+        "run_record": "RunRecord ByKeyword check_lags is_log read require_file trace_arguments "
+                      "write_as_log",
         "run_session": "OperatorInterface RunRequest RunSession",
         "speed_calibration": "SECONDS_SD SPEED_REL_SD TURNS_SD TurnsCount add_speed_calibration check_speed_place "
                              "speed_by_position speed_by_turns",

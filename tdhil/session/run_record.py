@@ -32,8 +32,8 @@ _LONG_NAMES = {
 class RunRecord:
     """One run or one trace. ``configuration``: that of the run, as in its log; ``log``: the file.
 
-    ``assumed``: assumptions in reading a foreign trace, None for a tdhil log; ``problems``: parts of the file that were
-    skipped, one line each; ``stored_result``: the result document that the run itself wrote to its log;
+    ``assumed``: assumptions in reading a foreign trace, None for the log of a run; ``problems``: parts of the file that
+    were skipped, one line each; ``stored_result``: the result document that the run itself wrote to its log;
     ``virtual_string``: one row per cycle, with the columns of `tdhil.recording.VIRTUAL_COLUMNS`.
     """
 
@@ -117,12 +117,8 @@ class RunRecord:
         return {name: getattr(self.recording, name) for name in _UNITS}
 
 
-_KEYWORDS = {
-    "-i": "interface", "-c": "channel", "-b": "bitrate",
-    "--columns": "columns", "--rated-torque": "rated_torque_nm", "--torque-limit": "torque_limit_nm",
-    "--gear": "gear_ratio", "--torque-scale-sd": "torque_scale_rel_sd", "--skew-sd": "skew_sd_s",
-}
-"""Python keywords of the flags outside the table of options: those of `read`, and short ones of python-can."""
+_KEYWORDS = {"-i": "interface", "-c": "channel", "-b": "bitrate"}
+"""Python keywords of the short flags of python-can, which are outside the table of options."""
 
 
 class ByKeyword(ContextDecorator):
@@ -134,10 +130,11 @@ class ByKeyword(ContextDecorator):
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         if isinstance(error, TdhilError):
             from tdhil.buses import all_buses
-            from tdhil.config import OPTIONS
+            from tdhil.config import OF_A_TRACE, OPTIONS
 
             of_buses = {flag: name for bus in all_buses() for name, flag in bus.flags.items()}
-            error.spelling = {**of_buses, **{option.flag: option.keyword for option in OPTIONS}, **_KEYWORDS}
+            own = {option.flag: option.keyword for option in (*OF_A_TRACE, *OPTIONS)}
+            error.spelling = {**of_buses, **own, **_KEYWORDS}
 
 
 @ByKeyword()
@@ -177,6 +174,30 @@ def read(
     )
 
 
+def trace_arguments(given: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """Return the keywords of `read` for a trace. ``given``: values of `tdhil.config.OF_A_TRACE` by name, None without
+    one; ``source``: of the stated lags, as text.
+    """
+    from tdhil.config import OF_A_TRACE
+    from tdhil.session.task import stated_lags
+
+    lags = ("speed_lag_s", "speed_lag_sd_s", "torque_lag_s", "torque_lag_sd_s")
+    found = {one.name: given.get(one.name) for one in OF_A_TRACE if one.name not in lags}
+    speed_s, speed_sd_s, torque_s, torque_sd_s = (given.get(name) for name in lags)
+    return {**found, "lags": stated_lags(speed_s, speed_sd_s, torque_s, torque_sd_s, source)}
+
+
+def check_lags(given: Mapping[str, Any]) -> None:
+    """Raise UsageError for the standard deviation of a lag without the lag; ``given`` as in `trace_arguments`."""
+    from tdhil.config import OF_A_TRACE
+
+    flags = {one.name: one.flag for one in OF_A_TRACE}
+    for lag in ("speed_lag_s", "torque_lag_s"):
+        sd = lag.replace("_lag_", "_lag_sd_")
+        if given.get(lag) is None and given.get(sd) is not None:
+            raise UsageError(f"needs {flags[lag]}, the value of this standard deviation", where=flags[sd])
+
+
 def require_file(path: Path) -> None:
     """Raise UsageError if the file does not exist or is a folder."""
     if path.is_dir():
@@ -212,8 +233,26 @@ def _read_log(path: Path) -> RunRecord:
     if "started" not in configuration and found.epoch_ns:      # a log from before 0.2, of a run in real time
         began = datetime.fromtimestamp(found.epoch_ns / 1e9, UTC).astimezone()
         configuration["started"] = began.isoformat(timespec="seconds")
-    return RunRecord(found.recording, configuration, str(path), None, found.problems, ended, found.result,
-                     found.virtual_string)
+    return RunRecord(found.recording, configuration, str(path), _assumed_in(configuration), found.problems, ended,
+                     found.result, found.virtual_string)
+
+
+def _assumed_in(configuration: Mapping[str, Any]) -> tuple[str, ...] | None:
+    """Return the assumptions in a log that was made from a trace; None for the log of a run. A log is not trusted."""
+    trace = configuration.get("trace")
+    found = trace.get("assumed") if isinstance(trace, Mapping) else None
+    return tuple(str(one)[:500] for one in found[:100]) if isinstance(found, list) else None
+
+
+def write_as_log(record: RunRecord, path: Path, run: Mapping[str, Any]) -> None:
+    """Write the record of a trace as a log of tdhil to ``path``, a new file. ``run``: more of its configuration.
+
+    Raises LogError without disk space, or if the file can't be written.
+    """
+    from tdhil.recording import write_trace_log
+
+    trace = {**run.get("trace", {}), "assumed": list(record.assumed or ())}
+    write_trace_log(path, record.recording, {**record.configuration, **run, "trace": trace})
 
 
 def _read_trace(

@@ -203,7 +203,6 @@ EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
     "buses/canopen.py": ("the flag that means this bus, and to type where a scan found several drives", {"--node"}),
     "cli/main.py": ("arguments that could not be parsed; it loads no table", {"--json"}),
     "cli/profiles.py": ("said before or after its own sub-commands", {"--json"}),
-    "cli/replay.py": ("a file with the excitation of a trace", {"--excitation"}),
     "cli/rig_new.py": ("the profile to begin a rig.yaml for, required", {"--profile"}),
     "cli/study.py": ("a study's settings, by the names of its own schema", {"--seed", "sine"}),
     "cli/tune_soft_torque.py": ("files and profile of a tuning, not of a run", {"--impedance", "--profile"}),
@@ -235,6 +234,9 @@ EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
     "service/static/results.js": (
         "a rehearsal's request; keys of answers; a column of the friction table; the records of a run, edited later", {
             "fault", "faults", "log", "model", "note", "operator", "real_time", "speed", "yes"}),
+    "service/static/upload.js": (
+        "quantities of a trace, a kind of file, a role, keys of a preview", {
+            "drive", "log", "note", "operator", "profile", "rate", "speed", "torque", "trace"}),
     "service/templates/accounts.html": ("a role", {"operator"}),
     "service/templates/run.html": ("what was seen, for a sign-off; the records of a run, edited later", {
         "note", "operator"}),

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
 import shutil
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,13 +19,17 @@ import jsonschema
 import pytest
 from starlette.testclient import TestClient
 
+from tdhil.errors import TdhilError
 from tdhil.service.access import Access
 from tdhil.service.audit import Audit
+from tdhil.service.run_channel import RunRefused
+from tdhil.service.run_state import Told
 from tdhil.service.schemas import API
 from tdhil.service.start_request import Rigs
 from tdhil.service.store import Index, Store
 from tdhil.service.supervisor import Supervisor
 from tdhil.service.web import Web
+from tdhil.service.worker import WORK
 
 FAKE = Path(__file__).with_name("fake_run.py")
 URL = "http://127.0.0.1:8420"
@@ -58,6 +65,39 @@ class Service:
             return state if state in states else None
 
         return str(wait_for(f"{run} {states}", there))
+
+
+FACTS = {"verdict": "valid", "exit_code": 0, "simulated": False, "rehearsal": None, "identity": "",
+         "said": {"operator": "Anna"}}
+RESULT = {"verdict": "valid", "inertia_kg_m2": {"value": 104.0, "low_total": 100.0, "high_total": 108.0}}
+_CWD = threading.Lock()
+
+
+def play_uploads(service: Service, monkeypatch: pytest.MonkeyPatch, *, played: bool = True) -> list[str]:
+    """The worker in this process. With `played` the identification of an upload is played; its note `fails` makes it
+    fail."""
+    done: list[str] = []
+
+    def found(what: str, run: str | None, asked: dict[str, Any]) -> dict[str, Any]:
+        done.append(what)
+        if what == "upload" and played:
+            place = Path(asked["place"])
+            if asked["options"].get("note") == "fails":
+                raise RunRefused(Told("CsvUnusable", "no row", "no row", "", "", 10, "TDH-1001"))
+            (place / "run.mcap").write_bytes(b"log")
+            (place / "result.json").write_text(json.dumps(RESULT))
+            return {"document": FACTS}
+        before = Path.cwd()
+        with _CWD:
+            try:
+                return WORK[what](asked if run is None else {"folder": str(service.store.place(run)), **asked})
+            except TdhilError as error:
+                raise RunRefused(Told.of(error)) from error
+            finally:
+                os.chdir(before)
+
+    monkeypatch.setattr(service.supervisor, "work", found)
+    return done
 
 
 @pytest.fixture

@@ -116,7 +116,7 @@ def test_every_route_for_everybody(guarded, monkeypatch):
         "a machine": (guarded.of_token("operator"), 1),
         **{f"session {role}": (guarded.sessions[role], rank) for rank, role in enumerate(ROLES)},
     }
-    filled = {"rig": "a", "run": run, "replay": "001", "number": "0", "fleet": "none",
+    filled = {"rig": "a", "run": run, "replay": "001", "number": "0", "fleet": "none", "upload": "none",
               "user": "no-one", "token": "none"}
     wrong: list[Any] = []
     for template, methods in guarded.document["paths"].items():
@@ -153,7 +153,7 @@ def test_who_may_what_is_as_it_was_agreed(guarded):
     sees and stops; what else somebody may, stands here."""
     least = {
         "operator": {"start", "confirm", "renew", "ask_replay", "calibration", "ask_fleet", "stop_fleet", "pace",
-                     "annotate"},
+                     "annotate", "uploads", "upload", "one_upload", "preview", "identify_upload", "delete_upload"},
         "engineer": {"edit_rig", "sign_off", "archive", "sign_acceptance", "add_rig", "draft_rig", "scan_bus"},
         "admin": {"audit", "delete_run", "accounts", "add_user", "set_password", "remove_user", "add_token",
                   "remove_token"},

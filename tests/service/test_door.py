@@ -36,6 +36,11 @@ async def answer(request: Request) -> Response:
     return PlainTextResponse("stopped")
 
 
+async def upload(request: Request) -> Response:
+    request.scope[door_module.ADMITTED] = True
+    return await answer(request)
+
+
 class Served:
     """A door before a small application, in a thread; its clock is the test's."""
 
@@ -52,7 +57,8 @@ class Served:
         assert self._ready.wait(HANGS_S)
 
     async def _serve(self) -> None:
-        routes = [Route("/stop", answer, methods=["POST"]), Route("/stop", answer)]
+        routes = [Route("/stop", answer, methods=["POST"]), Route("/stop", answer),
+                  Route("/upload", upload, methods=["POST"])]
         config = uvicorn.Config(Starlette(routes=routes), http="h11", ws="none", lifespan="off", log_level="critical")
         config.load()
         state = uvicorn.server.ServerState()
@@ -180,6 +186,16 @@ def test_a_body_that_is_not_completed_in_time_ends_its_connection(served):
     served.time_s = 1.0 + HEADERS_S
     wait_for("its end", lambda: is_closed(slow))
     wait_for("its place", lambda: served.door.served == 0)
+
+
+def test_an_admitted_upload_may_take_longer_and_is_closed_to_make_room_only(served):
+    slow = served.connect(sent=HEADER.replace(b"/stop", b"/upload").replace(b"Length: 0", b"Length: 9") + b"\r\nhalf")
+    wait_for("it", lambda: any(one.rank == 1 for one in served.door._served))
+    served.time_s = 10.0 * HEADERS_S
+    assert stops(served.connect())
+    assert not is_closed(slow)
+    slow.sendall(b"whole")
+    assert answered(slow)
 
 
 def test_connections_that_were_served_make_room_the_oldest_idle_one_first(served):

@@ -27,7 +27,7 @@ from drivers import PreflightRefused
 from tdhil.service.store import write_json
 from tdhil.session import hold
 from tests.recording.test_log_tail import write
-from tests.service.conftest import Service, wait_for
+from tests.service.conftest import Service, play_uploads, wait_for
 
 CHROMIUM = os.environ.get("TDHIL_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = [
@@ -38,7 +38,8 @@ pytestmark = [
     pytest.mark.skipif(find_spec("playwright") is None, reason="no playwright: pip install -e '.[browser]'"),
 ]
 HOSTILE = "<script>window.pwned=1</script><b id=x>bold</b>"
-PAGES = ("/", "/new-rig", "/start/a", "/calibrate/a", "/rehearse/a", "/rigs/a", "/runs", "/fleets", "/audit", "/docs")
+PAGES = ("/", "/new-rig", "/start/a", "/calibrate/a", "/rehearse/a", "/rigs/a", "/runs", "/upload", "/fleets", "/audit",
+         "/docs")
 PLAN = {
     "excitation": "multisine", "mode": "torque", "duration_s": 100.0, "expected_half_width": 0.021, "stopping": None,
     "speed_rad_s": {"min": 1.0, "max": 5.0}, "torque_nm": {"min": -10.0, "max": 50.0},
@@ -844,6 +845,62 @@ def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypat
     page.wait_for_url(re.compile("/runs/[^/]+$"))                          # by itself: the page becomes the result
     begun = served.service.store.request(served.service.store.ids()[0])
     assert begun.options["fault"] == ["internal-limit@speed+1.5s=20%"]
+
+
+TRACE = "Zeit;Drehzahl soll;Drehzahl ist;Drehmoment\nms;U/min;U/min;%\n" + "".join(
+    f"{10 * k};40,0;{40 + k % 7},5;{20 + k % 5},25\n" for k in range(400))
+
+
+@pytest.mark.heavy
+def test_a_trace_is_added_with_its_columns_corrected_and_becomes_a_marked_run(page, served, monkeypatch):
+    play_uploads(served.service, monkeypatch)
+    page.goto("/runs")
+    page.get_by_role("link", name="Add a recording").click()
+    page.locator("#limit").get_by_text("256 MiB").wait_for()
+    page.set_input_files("#file", {"name": HOSTILE, "mimeType": "text/csv", "buffer": b""})
+    page.get_by_text("This file is empty").wait_for()
+    page.set_input_files("#file", {"name": "<b id=x>7</b>.csv", "mimeType": "text/csv", "buffer": TRACE.encode()})
+    speed, rated = page.locator("[name='columns.speed']"), page.get_by_label("Rated torque, N·m")
+    page.get_by_text("Torque in % needs the rated torque").wait_for()
+    assert rated.get_attribute("aria-invalid") == "true" and page.locator(".mini canvas").count() == 0
+    assert (speed.input_value(), page.locator("[name='unit.time']").input_value()) == ("Drehzahl ist", "ms")
+    assert page.locator("#table th.mapped small").all_inner_texts() == ["time", "speed", "torque"]
+    speed.select_option("Zeit")                     # wrong, and marked at once with all that is wrong
+    page.get_by_text("This column is already that of time").wait_for()
+    page.get_by_role("button", name="Identify").click()
+    page.locator(".wrong").nth(1).wait_for()
+    assert served.service.store.ids() == []
+    speed.select_option("Drehzahl ist")
+    rated.fill("480")
+    rated.press("Tab")
+    page.locator(".mini canvas").nth(1).wait_for()
+    page.get_by_text("100 Hz").wait_for()
+    page.get_by_label("Rig, as you state it").select_option("a")
+    page.get_by_role("button", name="Identify").click()
+    page.wait_for_url(re.compile(r"/runs/\d{8}-"))
+    page.get_by_text("J = 104.0").wait_for()
+    assert page.locator("h1 .badge").all_inner_texts() == ["UPLOADED"]
+    assert page.locator("b#x").count() == 0
+    page.goto("/runs")
+    page.locator("#runs .badge", has_text="UPLOADED").wait_for()
+
+
+@pytest.mark.heavy
+def test_an_upload_that_waits_is_opened_again_and_deleted_by_keyboard(page, served, monkeypatch):
+    play_uploads(served.service, monkeypatch)
+    page.goto("/upload")
+    page.set_input_files("#file", {"name": "x.csv", "mimeType": "text/csv", "buffer": TRACE.encode()})
+    page.locator("#table table").wait_for()
+    page.goto("/upload")
+    page.on("dialog", lambda asked: asked.accept())
+    waits = page.get_by_role("button", name="x.csv")
+    waits.focus()
+    page.keyboard.press("Enter")
+    page.locator("#table table").wait_for()
+    page.get_by_role("button", name="Delete this upload").press("Enter")
+    page.wait_for_url("**/upload")
+    waits.wait_for(state="detached")
+    assert not any((served.service.store.folder / "uploads").iterdir())
 
 
 @pytest.mark.heavy

@@ -194,6 +194,7 @@
     };
   }
   const rehearsal = (yes) => (yes ? el("span", { class: "badge" }, "REHEARSAL") : null);
+  const uploaded = (yes) => (yes ? el("span", { class: "badge" }, "UPLOADED") : null);
   const badge = (simulated) => (simulated ? el("span", { class: "badge" }, "SIMULATED") : null);
 
   // -- rigs
@@ -260,8 +261,8 @@
     return found;
   }
 
-  /** Mark the fields whose values were refused, each with its reason, and go to the first one. */
-  function markWrong(form, fields) {
+  /** Mark the fields whose values were refused, each with its reason, and go to the first one if `go`. */
+  function markWrong(form, fields, go = true) {
     const known = fields.filter((one) => form.elements[one.option]);
     known.forEach((one) => {
       const field = form.elements[one.option], note = el("span", { class: "alarm wrong", id: `wrong-${one.option}` }, one.message);
@@ -271,7 +272,7 @@
       const closed = field.closest("details");
       if (closed) closed.open = true;
     });
-    if (known.length) form.elements[known[0].option].focus();
+    if (known.length && go) form.elements[known[0].option].focus();
     return known.length;
   }
   function unmark(form) {
@@ -785,7 +786,7 @@
   });
 
   const pages = { login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inertia, interval, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, waiting, when, zone };
+  window.tdhil = { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, csrf, el, every, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);

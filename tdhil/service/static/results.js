@@ -1,7 +1,7 @@
 // Results: one run, a comparison, a rig over time, many logs. As in app.js, data from elsewhere are inserted as text.
 "use strict";
 (() => {
-  const { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, may, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, waiting, when, zone } = window.tdhil;
+  const { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, may, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, uploaded, waiting, when, zone } = window.tdhil;
 
   // -- one run
 
@@ -233,6 +233,7 @@
 
   // -- lists
 
+  const NO_RIG = "Uploaded recording";         // as the title of its page
   function runsPage() {
     const chosen = new Set(), link = byId("compare");
     link.addEventListener("click", () => location.assign(`/compare?runs=${[...chosen].sort().join()}${form.elements.archived.checked ? "&archived=true" : ""}`));
@@ -251,10 +252,10 @@
       const order = (a, b) => (a === null) - (b === null) || (typeof a === "number" ? a - b : String(a).localeCompare(String(b)));
       const runs = [...found].sort((a, b) => (value(a) === null || value(b) === null ? order(value(a), value(b)) : (down ? -1 : 1) * order(value(a), value(b))) || (a.id < b.id ? 1 : -1));
       show(byId("runs"), ...(runs.length ? runs.map((one) => {
-        const box = el("input", { type: "checkbox", "aria-label": `compare ${one.rig}, ${when(one.asked)}`, checked: chosen.has(one.id), disabled: one.verdict === null });
+        const box = el("input", { type: "checkbox", "aria-label": `compare ${one.rig || NO_RIG}, ${when(one.asked)}`, checked: chosen.has(one.id), disabled: one.verdict === null });
         box.addEventListener("change", () => choose(one.id, box.checked));
         return el("tr", {}, el("td", { class: "pick" }, box),
-          el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}`, "aria-label": `${one.rig}, ${when(one.asked)}` }, one.rig), " ", badge(one.simulated) || "", " ", rehearsal(one.rehearsal) || ""),
+          el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}`, "aria-label": `${one.rig || NO_RIG}, ${when(one.asked)}` }, one.rig || NO_RIG), " ", badge(one.simulated) || "", " ", rehearsal(one.rehearsal) || "", " ", uploaded(one.uploaded) || ""),
           el("td", {}, when(one.asked)), el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict || ""),
           el("td", {}, said(one) || "", ...(one.tags.length ? [" ", ...tags(one.tags)] : []), ...(one.archived ? [" ", el("span", { class: "badge" }, "ARCHIVED")] : [])));
       }) : [el("tr", {}, el("td", { colspan: 7, class: "dim" }, form.elements.text.value || form.elements.state.value ? "no run matches" : "no run yet"))]));
@@ -384,7 +385,7 @@
       const { runs: ids, comparison } = await call("GET", `/runs/compare?runs=${encodeURIComponent(runs)}${archivedToo("&")}`, undefined, {}, 300000);
       const names = comparison.results.map((one, k) => `${one.rig || "?"}, ${when(one.date) || ids[k]}`);
       const dot = (k) => el("span", { class: `dot c${k}`, "aria-hidden": "true" });
-      const heads = ids.map((id, k) => el("th", { scope: "col" }, dot(k), " ", el("a", { href: `/runs/${id}` }, names[k]), " ", badge(comparison.results[k].simulated) || "", " ", rehearsal(comparison.results[k].rehearsed_faults) || ""));
+      const heads = ids.map((id, k) => el("th", { scope: "col" }, dot(k), " ", el("a", { href: `/runs/${id}` }, names[k]), " ", badge(comparison.results[k].simulated) || "", " ", rehearsal(comparison.results[k].rehearsed_faults) || "", " ", uploaded(comparison.results[k].uploaded) || ""));
       const said = comparison.differences.map((one, k) => {
         const told = one.quantities.find((other) => other.column === "inertia_kg_m2");
         return el("p", { class: told && told.differs ? "now alarm" : "now" }, dot(0), " ", names[0], " and ", dot(k + 1), ` ${names[k + 1]}: ${one.text}.`);
