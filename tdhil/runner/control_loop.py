@@ -9,7 +9,7 @@ from typing import TypeVar
 from drivers import Command, Drive, DriveFault, KeptAlive, Mode, ModeNotConfirmed, PowerState, Sample, Telling
 from profiles import MessageCode
 from tdhil.recording import RunLog
-from tdhil.runner.background import Background, WorkerProcess
+from tdhil.runner.background import Background, BackgroundProcess
 from tdhil.runner.guard import Guard
 from tdhil.runner.settings import StopRequest
 
@@ -44,7 +44,7 @@ class ControlLoop:
         self.before: Sample | None = None            # the sample before ``last``
         self.observer: Watcher | None = None         # called by a stage after every cycle, after the guard
         self.quiet = False                         # the operator is being asked: the display stays off the terminal
-        self.worker_process: WorkerProcess | None = None     # long computations in real time; None: a thread
+        self.worker_process: BackgroundProcess | None = None     # long computations in real time; None: a thread
         self.remarks: list[str] = []       # actions of others on the drive's bus
         self._telling = drive if isinstance(drive, Telling) else None
         self._stop_request = stop_request
@@ -140,7 +140,7 @@ class ControlLoop:
 
         In stepped time the drive needs no setpoints, and a number of cycles that depends on the computer's speed would
         not repeat. So only keep-alive messages are sent, which do not advance time. In real time a worker process runs
-        the ``work`` if it is ready and accepts it (`background.WorkerProcess.ask`). Otherwise a thread does, which
+        the ``work`` if it is ready and accepts it (`background.BackgroundProcess.ask`). Otherwise a thread does, which
         shares the interpreter, and cycles are late. On a computer with one processor they may be late in any case.
         Lateness alone does not end the run meanwhile.
 

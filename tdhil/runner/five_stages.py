@@ -16,7 +16,7 @@ from tdhil.config import OPTION, identified_before_echo
 from tdhil.estimation import torque_answer
 from tdhil.recording import ImpedanceInput, LagPrior, RunLog
 from tdhil.runner import preconditions, stage_log
-from tdhil.runner.background import WorkerProcess, begin
+from tdhil.runner.background import BackgroundProcess, begin
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import PlanRefused
 from tdhil.runner.guard import Guard
@@ -75,7 +75,7 @@ class Runner:
         self._book = StageBook(drive, log, display, say)
         self._stop: StopSequence | None = None
         self._before_echo = False
-        self._worker_process: WorkerProcess | None = None
+        self._worker_process: BackgroundProcess | None = None
 
     def run(self) -> RunOutcome:
         """Connect, run five stages, stop, close."""

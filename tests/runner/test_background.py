@@ -19,7 +19,7 @@ import pytest
 from drivers.drive import Command, Mode
 from tdhil.errors import Interrupted
 from tdhil.runner import background, stage_planner
-from tdhil.runner.background import Gone, WorkerProcess, begin
+from tdhil.runner.background import BackgroundProcess, Gone, begin
 from tdhil.runner.excitation import PlanRefused
 from tdhil.runner.settings import ExcitationRequest
 
@@ -314,4 +314,4 @@ def test_stepped_time_has_none(world, monkeypatch):
 def test_a_worker_process_without_a_python_is_an_os_error(monkeypatch):
     monkeypatch.setattr(sys, "executable", "")
     with pytest.raises(OSError, match="is unknown"):
-        WorkerProcess()
+        BackgroundProcess()
