@@ -1,6 +1,6 @@
-"""A Python process that computes for this one: start, messages, end. `process_pool` and `runner.background` use it.
+"""A Python process that computes for this one: start, messages, end.
 
-The process is a new program: it inherits neither sockets nor signal handlers nor threads. It receives one request at a
+`tdhil.process_pool` and `tdhil.runner.background` use it. The process is a new program: it inherits neither sockets nor signal handlers nor threads. It receives one request at a
 time over stdin and answers over stdout. A message is a pickle behind its length. The process shares nothing else, so it
 can be killed at any time. The end of its stdin ends it, also during work, for any end of the host. Its process group is
 its own, so that Ctrl-C in the terminal reaches only the host.

@@ -53,20 +53,20 @@ LONGEST_SEARCH: Final = 200
 def routes(site: Site) -> list[Route]:
     """Return the routes. ``compare`` comes before ``run``, since the path of ``run`` matches it, too."""
     return [
-        api(site, "runs", runs),
-        api(site, "compare", compare),
-        api(site, "run", run),
-        api(site, "confirm", confirm),
-        api(site, "renew", renew),
-        api(site, "stop", stop),
-        api(site, "sign_off", sign_off),
-        api(site, "annotate", annotate),
-        api(site, "archive", archive),
-        api(site, "delete_run", delete_run),
-        api(site, "acceptance", acceptance),
-        api(site, "sign_acceptance", sign_acceptance),
-        api(site, "ask_replay", ask_replay),
-        api(site, "replay", replay),
+        api(site, runs),
+        api(site, compare),
+        api(site, run),
+        api(site, confirm),
+        api(site, renew),
+        api(site, stop),
+        api(site, sign_off),
+        api(site, annotate),
+        api(site, archive),
+        api(site, delete_run),
+        api(site, acceptance),
+        api(site, sign_acceptance),
+        api(site, ask_replay),
+        api(site, replay),
     ]
 
 

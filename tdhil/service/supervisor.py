@@ -385,7 +385,8 @@ class Supervisor:
             seen, said = _stop_seen([sys.executable, "-m", "tdhil.service.drive_stop", str(kept), *identity])
             if same:
                 return seen, said
-            return False, (f"{said}, on the connection that the run used ({_address_in(kept)}); {changed}, so tdhil"
+            address = (read_json(kept) or {}).get("address") or "unknown"
+            return False, (f"{said}, on the connection that the run used ({address}); {changed}, so tdhil"
                            " can't know whether this is still the rig's shaft")
         if not same:
             return False, f"{changed}, and the run stored no address of its drive: no stop was sent"
@@ -645,7 +646,3 @@ def _stop_seen(command: list[str]) -> tuple[bool, str]:
         return False, (f"the drive there has another identity ({found.get('identity')}) than the drive of the run:"
                        " tdhil stop acted on ITS shaft, not on that of the run")
     return False, "tdhil stop did NOT confirm standstill"
-
-
-def _address_in(kept: Path) -> str:
-    return str((read_json(kept) or {}).get("address") or "unknown")

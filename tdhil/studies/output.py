@@ -333,12 +333,8 @@ def _html(chapters: Sequence[Chapter], folder: Path) -> str:
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["shown"] = shown
     template = environment.from_string(_TEMPLATE)
-    return template.render(chapters=chapters, tally=tally(chapters), marks=MARKS, relative=_relative(folder),
-                           style=Markup(STYLE))
-
-
-def _relative(folder: Path):  # type: ignore[no-untyped-def]
-    return lambda path: path.relative_to(folder).as_posix()
+    return template.render(chapters=chapters, tally=tally(chapters), marks=MARKS, style=Markup(STYLE),
+                           relative=lambda path: path.relative_to(folder).as_posix())
 
 
 def _markdown(chapters: Sequence[Chapter], folder: Path) -> str:

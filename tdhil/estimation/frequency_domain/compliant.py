@@ -61,7 +61,7 @@ from tdhil.estimation.frequency_domain.shafts import (
     shaft_model,
 )
 from tdhil.estimation.friction_levels import Levels, ViscousConstraint, coulomb_level
-from tdhil.estimation.result import REJECT_P, BudgetLine, Compliant, Estimate, Refusal, rejects
+from tdhil.estimation.result import DOUBT_P, REJECT_P, BudgetLine, Compliant, Estimate, Refusal, rejects
 from tdhil.estimation.spectrum import SpectralLine
 from tdhil.recording import Pipe
 
@@ -670,7 +670,7 @@ def _caveats(chosen: Chosen, found: CompliantResult) -> tuple[str, ...]:
         said.append(CodedText(
             "first-order lags do not explain the reports; filters of two poles and moving averages do",
             MessageCode.LAGS_NOT_FIRST_ORDER))
-    if fit.residual is not None and REJECT_P <= fit.residual.p_value < 0.01:
+    if fit.residual is not None and REJECT_P <= fit.residual.p_value < DOUBT_P:
         said.append(CodedText(
             f"the residuals are only just consistent with the model (p = {fit.residual.p_value:.2g})",
             MessageCode.BARELY_CONSISTENT))

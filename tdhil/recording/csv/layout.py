@@ -63,11 +63,9 @@ def unit_of(quantity: str, text: str) -> ColumnUnit | None:
     if (also := _ALSO[quantity].get(word)) is not None:
         return also
     known = quantities.unit_of(inner if quantity != "time" else inner.casefold())
-    return _in_trace(known) if known is not None and known.dimension == quantity else None
-
-
-def _in_trace(unit: quantities.Unit) -> ColumnUnit:
-    return ColumnUnit(unit.dimension, unit.symbol, unit.times / unit.over)
+    if known is None or known.dimension != quantity:
+        return None
+    return ColumnUnit(known.dimension, known.symbol, known.times / known.over)
 
 
 def split_name(name: str) -> tuple[str, str]:

@@ -133,7 +133,8 @@ def run_speed(
     low_rad_s, high_rad_s = mean_speeds(limits)
     tolerance_rad_s = max(2.0 * speed_resolution_rad_s, 0.01 * high_rad_s)
     rate = (limits.speed_max_rad_s - limits.speed_min_rad_s) / FIRST_RAMP_S
-    start = loop.switch_mode(Command(Mode.SPEED, 0.0, 0.0)) if _in_torque(loop) else None
+    in_torque = loop.last is not None and loop.last.mode is Mode.TORQUE
+    start = loop.switch_mode(Command(Mode.SPEED, 0.0, 0.0)) if in_torque else None
     speed_now = max(0.0, start.speed_rad_s) if start else 0.0
     unit_check = SpeedUnitCheck(loop, limits, assumptions, speed_resolution_rad_s, witness)
     unit_check.ramp(speed_now, low_rad_s, rate)
@@ -248,10 +249,6 @@ def _course(low: list[Sample], ramp: list[Sample], high: _Held, speeds_rad_s: tu
 def _samples(held: list[Sample], torque_offset_nm: float) -> Samples:
     fresh = trace(held)
     return Samples(fresh.time_s, fresh.speed_rad_s, fresh.torque_nm - torque_offset_nm)
-
-
-def _in_torque(loop: ControlLoop) -> bool:
-    return loop.last is not None and loop.last.mode is Mode.TORQUE
 
 
 def ramp_speed(loop: ControlLoop, start_rad_s: float, end_rad_s: float, rate_rad_s2: float) -> list[Sample]:
