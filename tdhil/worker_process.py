@@ -1,9 +1,10 @@
 """A Python process that computes for this one: start, messages, end.
 
-`tdhil.process_pool` and `tdhil.runner.background` use it. The process is a new program: it inherits neither sockets nor signal handlers nor threads. It receives one request at a
-time over stdin and answers over stdout. A message is a pickle behind its length. The process shares nothing else, so it
-can be killed at any time. The end of its stdin ends it, also during work, for any end of the host. Its process group is
-its own, so that Ctrl-C in the terminal reaches only the host.
+`tdhil.process_pool` and `tdhil.runner.background` use it. The process is a new program: it inherits neither sockets
+nor signal handlers nor threads. It receives one request at a time over stdin and answers over stdout. A message is a
+pickle behind its length. The process shares nothing else, so it can be killed at any time. The end of its stdin ends
+it, also during work, for any end of the host. Its process group is its own, so that Ctrl-C in the terminal reaches only
+the host.
 
 Two kinds of process differ by nature and do not use it. The service's computations (`tdhil.service.worker`) and its
 fleets take one request in JSON and end with the answer, which a page receives as it is. The process of a run is none

@@ -607,7 +607,7 @@ class Cia402Drive:
         self._bus.stop_feeding()
 
     def remarks(self) -> tuple[str, ...]:
-        """Return remarks on foreign traffic since the last call; see `drivers.drive.Telling`."""
+        """Return remarks on foreign traffic since the last call; see `drivers.drive.ReportsOthers`."""
         return self._bus.watch.remarks()
 
     def summary(self) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from threading import Event
 from typing import TypeVar
 
-from drivers import Command, Drive, DriveFault, KeptAlive, Mode, ModeNotConfirmed, PowerState, Sample, Telling
+from drivers import Command, Drive, DriveFault, KeptAlive, Mode, ModeNotConfirmed, PowerState, ReportsOthers, Sample
 from profiles import MessageCode
 from tdhil.recording import RunLog
 from tdhil.runner.background import Background, BackgroundProcess
@@ -46,7 +46,7 @@ class ControlLoop:
         self.quiet = False                         # the operator is being asked: the display stays off the terminal
         self.worker_process: BackgroundProcess | None = None     # long computations in real time; None: a thread
         self.remarks: list[str] = []       # actions of others on the drive's bus
-        self._telling = drive if isinstance(drive, Telling) else None
+        self._reports_others = drive if isinstance(drive, ReportsOthers) else None
         self._stop_request = stop_request
         self._watch = watch
 
@@ -62,8 +62,8 @@ class ControlLoop:
         sample = self.drive.exchange(command)
         self.log.cycle(command, sample)
         self.before, self.last = self.last, sample
-        if self._telling is not None:
-            for line in self._telling.remarks():
+        if self._reports_others is not None:
+            for line in self._reports_others.remarks():
                 self._note(line)
         self.guard.check_sample(command, sample)
         if self.guard.pace_is_due():
@@ -80,8 +80,8 @@ class ControlLoop:
         try:
             self.guard.observer.see(command, sample)
             self.log.cycle(command, sample)
-            if self._telling is not None:
-                for line in self._telling.remarks():
+            if self._reports_others is not None:
+                for line in self._reports_others.remarks():
                     self._note(line)
             if self._watch is not None:
                 self._watch(command, sample)

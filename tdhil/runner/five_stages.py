@@ -99,7 +99,7 @@ class Runner:
                 with suppress(Exception):
                     self._display.stopped(report.confirmed)
             with suppress(Exception):
-                stage_log.tell(self._drive, self._log.configure, self._say)
+                stage_log.report_others(self._drive, self._log.configure, self._say)
             with suppress(Exception):
                 self._log.configure(counters=asdict(self._drive.counters))
             try:

@@ -14,7 +14,7 @@ from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.access import principal
 from tdhil.service.accounts import ROLES
 from tdhil.service.attendance import LEASE_S
-from tdhil.service.middleware import off, told_of
+from tdhil.service.middleware import error_view, off
 from tdhil.service.routing import api
 from tdhil.service.run_state import NotThere, State, now
 from tdhil.service.schemas import (
@@ -264,12 +264,12 @@ async def _replay_later(site: Site, which: str, view: ReplayView) -> None:
         found = await site.work("replay", which, view.asked)
         done = ReplayView(view.name, view.asked, view.at, view.by, "done", found)
     except TdhilError as error:
-        done = ReplayView(view.name, view.asked, view.at, view.by, "failed", error=told_of(error).error)
+        done = ReplayView(view.name, view.asked, view.at, view.by, "failed", error=error_view(error).error)
     path = site.store.place(which) / "replays" / f"{view.name}.json"
     try:
         await off(lambda: write_json(path, plain(done, ReplayView)))
     except OSError as error:
-        lost = told_of(LogError(f"the replay can't be written ({error.strerror or error})", where=path.name)).error
+        lost = error_view(LogError(f"the replay can't be written ({error.strerror or error})", where=path.name)).error
         site.waiting_replays[which, view.name] = ReplayView(
             view.name, view.asked, view.at, view.by, "failed", error=lost)
     else:

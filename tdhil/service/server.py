@@ -165,7 +165,7 @@ def serve(
     room = Room.of(raise_limit())
     web = Web(supervisor, hosts=allowed, viewers=viewers, access=Access(store.folder, login=accounts, say=say),
               logs={str(one): one for one in logs})
-    publisher = None if broker is None else Publisher(broker, web.told, say)
+    publisher = None if broker is None else Publisher(broker, web.broker_messages, say)
     notifier = None if hook is None else Notifier(hook, lambda: web.list_runs(None, None, RUNS), web.trends_around, say)
     listening = _listen(host, port)
     at = listening.getsockname()[1]

@@ -224,10 +224,10 @@ class Supervisor:
             try:
                 self._begin(run)
             except OSError as error:
-                told = Told.of(Conflict(f"the run's process can't be started ({error})", where=f"run {run}"))
+                reported = Told.of(Conflict(f"the run's process can't be started ({error})", where=f"run {run}"))
                 with suppress(OSError):
-                    self.store.save(way_to(self.store.status(run), State.FAILED, now(), error=told, exit_code=1))
-                raise Conflict(told.what, where=told.where) from error
+                    self.store.save(way_to(self.store.status(run), State.FAILED, now(), error=reported, exit_code=1))
+                raise Conflict(reported.what, where=reported.where) from error
         self.note(who, "asked", run, rig.id, options=options)
         return Asked(request, new=True)
 
@@ -504,12 +504,13 @@ class Supervisor:
         state = State.INTERRUPTED if seen else State.STOP_NOT_CONFIRMED
         what = f"the process of the run was lost while it was {status.state}; {said}"
         next_step = "" if seen else "Use the hard-wired stop. Check that every shaft is at standstill, then sign it off"
-        told = Told("CommunicationLost", what, what, f"run {run}", next_step, int(ExitCode.COMMUNICATION),
+        reported = Told("CommunicationLost", what, what, f"run {run}", next_step, int(ExitCode.COMMUNICATION),
                     MessageCode.COMMUNICATION_LOST.code)
         by, asked = self._stops.pop(run, (status.stop.by, status.stop.asked))
         first = {} if status.stop.asked is not None else {"by": by, "asked": asked}
         stop = replace(status.stop, confirmed=seen, at_rest=now() if seen else None, **first)
-        status = way_to(status, state, now(), error=told, exit_code=int(told.exit_code), stop=stop, confirmation=None)
+        status = way_to(status, state, now(), error=reported, exit_code=int(reported.exit_code), stop=stop,
+                        confirmation=None)
         self._save(status)
         self.store.release(run)
         self.say(f"run {run}: {what}")
@@ -518,15 +519,15 @@ class Supervisor:
 
     def _save(self, status: Status) -> None:
         """Save the status, with retries until it is saved. While the disk is full, the rig stays blocked."""
-        told = False
+        logged = False
         while not self._end.is_set():
             try:
                 self.store.save(status)
                 return
             except OSError as error:
-                if not told:
+                if not logged:
                     self.say(f"run {status.id}: its end can't be written yet: {error}")
-                told = True
+                logged = True
                 self._end.wait(1.0)
 
     def _recover(self, run: str) -> None:

@@ -86,9 +86,9 @@ class StudyBar:
         self._bar.update(self._task, completed=float(index), name=name, description="")
         self._told_s = time.monotonic()
         with self._bar:
-            yield lambda share, text: self._tell(index, name, share, text)
+            yield lambda share, text: self._show(index, name, share, text)
 
-    def _tell(self, index: int, name: str, share: float, text: str) -> None:
+    def _show(self, index: int, name: str, share: float, text: str) -> None:
         self._bar.update(self._task, completed=index + share, description=text)
         if not self._console.is_terminal and time.monotonic() - self._told_s >= LINE_EVERY_S:
             self._told_s = time.monotonic()

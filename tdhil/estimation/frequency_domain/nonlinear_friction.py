@@ -368,7 +368,7 @@ def identify_bent(case: PeriodicCase, rigid: RigidResult) -> Finding | None:
         model=MODEL,
         bent=True,
         preface=f"the residuals {speak} straight friction (p = {against:.1g}); ",
-        warnings=(*finding.warnings, _told(found[0], motion)),
+        warnings=(*finding.warnings, _bend_words(found[0], motion)),
     )
 
 
@@ -405,7 +405,7 @@ def _budget(
     return (*lines, BudgetLine("friction's shape", 0.5 * grown, "other shapes that the data allow"), scale)
 
 
-def _told(best: BentFit, motion: ShaftMotion) -> str:
+def _bend_words(best: BentFit, motion: ShaftMotion) -> str:
     width = best.bend.width_rad_s
     shape = "with the square of speed" if width is None else f"by a bell of about {width:.2g} rad/s (Stribeck)"
     return CodedText(

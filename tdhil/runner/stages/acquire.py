@@ -186,7 +186,7 @@ class _SegmentCourse:
             segment = replace(segment, periods=segment.settle_periods + counted)
         transition = self._plan.transition(follower.wanted_rad_s, index)
         follower.follow(transition.reference, transition.duration_s)
-        self._tell(segment.recorded(follower.time_s + self._loop.period_s))
+        self._announce_with(segment.recorded(follower.time_s + self._loop.period_s))
         self._start_s = follower.time_s + self._loop.period_s
         self._index, self._segment = index, segment
         self._run_periods(0)
@@ -202,7 +202,7 @@ class _SegmentCourse:
         self._done.pop()
         already = self._segment.periods
         segment = self._segment = replace(self._segment, periods=already + periods)
-        self._tell(segment.recorded(self._start_s))
+        self._announce_with(segment.recorded(self._start_s))
         self._run_periods(already)
 
     def others(self) -> list[int]:
@@ -221,7 +221,7 @@ class _SegmentCourse:
                 self._watch.period_ended(motion, max(0.0, self._end_s - follower.time_s))
         self._done.append(self._recorded())
 
-    def _tell(self, planned: Segment) -> None:
+    def _announce_with(self, planned: Segment) -> None:
         self._announce(Excitation(self._plan.kind, self._plan.mode, (*self._done, planned)))
 
     def _recorded(self) -> Segment:

@@ -105,7 +105,7 @@ class SpeedResult:
     @property
     def disturbed(self) -> str:
         """Return a description of the disturbance for the guard; empty if there is none."""
-        return "" if self.swing is None else self.swing.told
+        return "" if self.swing is None else self.swing.words
 
     @property
     def levels(self) -> tuple[Level, ...]:

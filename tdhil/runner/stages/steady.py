@@ -154,7 +154,7 @@ class Swing:
     regular: float
 
     @property
-    def told(self) -> str:
+    def words(self) -> str:
         """Return the oscillation in words."""
         every = f" every {self.period_s:.1f} s" if self.regular >= STICK_SLIP_REGULAR else ""
         return (
