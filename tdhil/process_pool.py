@@ -125,7 +125,7 @@ class Pool(Generic[Task, Result]):
                         continue
                     answers.unregister(worker.process.stdout)
                     self._workers.remove(worker)
-                    loss, outside = worker.bury(late, self._limits)
+                    loss, outside = worker.reason_of_end(late, self._limits)
                     stillborn = 0 if worker.awake else stillborn + 1
                     if stillborn > _STARTS * self._jobs:
                         raise TdhilError(f"the processes end before they begin: {loss.text}", where="process pool",
@@ -204,7 +204,7 @@ class _Worker:
             message = self.process.kept()
         return _PART if message is None else result_in(message)
 
-    def bury(self, late: bool, limits: TaskLimits) -> tuple[Loss, bool]:
+    def reason_of_end(self, late: bool, limits: TaskLimits) -> tuple[Loss, bool]:
         """Return the reason of the process's end, and whether it was killed from outside."""
         if late:
             self.kill()

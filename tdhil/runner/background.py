@@ -134,13 +134,13 @@ class Background(Generic[T]):
 
     def _run(self) -> None:
         try:
-            self._found.append(self._reckon())
+            self._found.append(self._result())
         except BaseException as error:         # raised by `result`
             self._failure = error
         finally:
             self.ended.set()
 
-    def _reckon(self) -> T:
+    def _result(self) -> T:
         if self._worker_process is not None:
             try:
                 return self._worker_process.ask(self._work)
@@ -174,7 +174,7 @@ def _in_a_thread(work: Background[Any]) -> Iterator[None]:
                 sys.setswitchinterval(_usual_s.pop())
 
 
-def goes_on() -> bool:
+def thread_computes() -> bool:
     """Return whether a dropped computation still runs in a thread of this process.
 
     The process must then not end in the usual way: on exit the C library ends OpenBLAS, which has been observed to

@@ -17,9 +17,9 @@ def main() -> None:
 
 def _load() -> None:
     from tdhil.runner import adaptive_duration, interim, stage_planner  # noqa: F401
-    from tdhil.runner.preconditions import quieten
+    from tdhil.runner.preconditions import load_before_motion
 
-    quieten()
+    load_before_motion()
 
 
 def _take_second_place() -> None:

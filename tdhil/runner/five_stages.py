@@ -26,7 +26,7 @@ from tdhil.runner.preconditions import (
     choose_mode,
     choose_rate,
     keep_within,
-    quieten,
+    load_before_motion,
     refuse_slow_reference,
     refuse_with_string,
     with_known_lag,
@@ -239,7 +239,7 @@ class Runner:
     def _make_ready(self) -> str:
         """Load modules and start the worker process. Return why there is no worker process; empty if there is one."""
         stop_request = self._stop_request
-        self._worker_process, why = begin(quieten, lambda: stop_request.signum is not None)
+        self._worker_process, why = begin(load_before_motion, lambda: stop_request.signum is not None)
         stop_request.check()
         return why
 

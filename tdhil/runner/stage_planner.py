@@ -15,7 +15,7 @@ from tdhil.recording import FloatArray, LagPrior, RunLog, SteppedSetpoint
 from tdhil.runner.adaptive_duration import Decision, Enough
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.design import DesignKnowledge, NoiseDensity, assumed_noise, measured_noise
-from tdhil.runner.excitation import MotionLimits, Plan, PlanRefused, RigGuess, SwingPlan, leaves_time_before_echo
+from tdhil.runner.excitation import MotionLimits, Plan, PlanRefused, RigGuess, SpeedChangePlan, leaves_time_before_echo
 from tdhil.runner.guard import LIGHTEN, Guard
 from tdhil.runner.interim import Identify
 from tdhil.runner.planning import Planned, as_followed, plan_acquisition
@@ -68,7 +68,7 @@ class StagePlanner:
         assumed = assumed_noise(limits.torque_nm, limits.speed_max_rad_s)
         theta = DesignKnowledge(assumed, prior).theta(model)
 
-        work = partial(_reckon, request, mode, room, model, prior, assumed, speed.steady, theta, course,
+        work = partial(_planned_stage, request, mode, room, model, prior, assumed, speed.steady, theta, course,
                        left_s, limits.has_drill_string)
         try:
             planned = loop.compute(work, keep)
@@ -124,7 +124,7 @@ class StagePlanner:
         assert isinstance(planned.plan, Plan)
         return Enough(rule, planned.plan, lambda: self._log.recording(complete=True), note, identify=identify)
 
-    def _note_following(self, plan: Plan | SwingPlan) -> None:
+    def _note_following(self, plan: Plan | SpeedChangePlan) -> None:
         """Log the data that identification needs for the effect of a stepped, slowly sampled setpoint on J."""
         following, ramp = plan.guess.following, plan.limits.acceleration_rad_s2
         if math.isfinite(ramp):
@@ -143,7 +143,7 @@ class StagePlanner:
         self._say(text)
 
 
-def _reckon(
+def _planned_stage(
     request: ExcitationRequest,
     mode: Mode,
     room: MotionLimits,

@@ -14,7 +14,7 @@ from drivers import Command, Mode, Sample
 from tdhil.recording import Excitation, Segment
 from tdhil.runner.adaptive_duration import Decision, Enough
 from tdhil.runner.control_loop import ControlLoop
-from tdhil.runner.excitation import CALM_S, Plan, PlannedSegment, RigGuess, SpeedChange, SwingPlan
+from tdhil.runner.excitation import CALM_S, Plan, PlannedSegment, RigGuess, SpeedChange, SpeedChangePlan
 from tdhil.runner.guard import kept_within
 from tdhil.runner.interim import InertiaWatch
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
@@ -239,10 +239,10 @@ class _SegmentCourse:
 _LONGEST = 2.0            # longest coasting, multiple of the planned one: the friction may be overestimated
 
 
-def run_swings(
+def run_speed_changes(
     loop: ControlLoop,
     limits: MachineLimits,
-    plan: SwingPlan,
+    plan: SpeedChangePlan,
     control: MeanSpeedControl | None,
     assumptions: ControlAssumptions,
     announce: Announce,
@@ -283,7 +283,7 @@ def _coast(loop: ControlLoop, way: SpeedChange, follower: Follower, assumptions:
 def run_plan(
     loop: ControlLoop,
     limits: MachineLimits,
-    plan: Plan | SwingPlan,
+    plan: Plan | SpeedChangePlan,
     control: MeanSpeedControl | None,
     assumptions: ControlAssumptions,
     announce: Announce,
@@ -292,7 +292,7 @@ def run_plan(
     watch: InertiaWatch | None = None,
 ) -> None:
     """Run a plan of either family of excitations. Raises what the bench raises."""
-    if isinstance(plan, SwingPlan):
-        run_swings(loop, limits, plan, control, assumptions, announce)
+    if isinstance(plan, SpeedChangePlan):
+        run_speed_changes(loop, limits, plan, control, assumptions, announce)
     else:
         run_acquire(loop, limits, plan, control, announce, enough, speed_resolution_rad_s, watch)

@@ -39,7 +39,7 @@ from tdhil.runner.stages.steady import (
 from tdhil.runner.string_release import SwingDamper
 
 LEVEL_S = 6.0             # s; duration of an operating point
-RESTLESS_LEVEL_S = 24.0
+OSCILLATING_LEVEL_S = 24.0
 """Duration of an operating point with a string that keeps oscillating, s: some periods, to average them out."""
 
 FIRST_RAMP_S = 8.0
@@ -272,10 +272,10 @@ def _settle_and_hold(
         calmed = calm_string(loop, limits, speed_rad_s, tolerance_rad_s)
         later, asked_later = hold_damped(loop, calmed.damper, lags_s)
         before_level()
-        restless = calmed.swing.restless(limits)
-        level, asked = hold_damped(loop, calmed.damper, RESTLESS_LEVEL_S if restless else LEVEL_S)
+        keeps_oscillating = calmed.swing.keeps_oscillating(limits)
+        level, asked = hold_damped(loop, calmed.damper, OSCILLATING_LEVEL_S if keeps_oscillating else LEVEL_S)
         setpoints = [*calmed.setpoints_rad_s, *asked_later, *asked]
-        return _Held([*calmed.samples, *later], level, setpoints, calmed.swing if restless else None)
+        return _Held([*calmed.samples, *later], level, setpoints, calmed.swing if keeps_oscillating else None)
     command = Command(Mode.SPEED, speed_rad_s, 0.0)
     settling = wait_until_steady(loop, command, speed_rad_s, tolerance_rad_s, timeout_s=60.0)
     settling += loop.hold(command, lags_s)

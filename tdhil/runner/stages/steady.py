@@ -162,7 +162,7 @@ class Swing:
             " rad/s, and the oscillation does not decay"
         )
 
-    def restless(self, limits: MachineLimits) -> bool:
+    def keeps_oscillating(self, limits: MachineLimits) -> bool:
         """Return whether the string oscillates more than a calm string."""
         return self.torque_nm > CALM_SHARE * limits.torque_nm
 
@@ -246,7 +246,7 @@ def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, t
     left = swing_of(samples[-2 * window :], loop.period_s)
     mean = _mean_speed(samples[-window:])
     torque, helps = loop.guard.torque_told(
-        float(trace(samples[-window:]).torque_nm.mean()), samples[-1].limit_active, left.restless(limits)
+        float(trace(samples[-window:]).torque_nm.mean()), samples[-1].limit_active, left.keeps_oscillating(limits)
     )
     raise LimitHit(
         f"the string did not settle at {target_rad_s:.3f} rad/s within {MOST_CALMING_S:g} s (mean speed {mean:.3f}"
