@@ -216,14 +216,14 @@ class Web(Site):
         relay = Relay(rig_id, lambda: self._running(rig_id), socket.send_text, socket.send_bytes, rig.simulated)
         self.relays += 1
 
-        async def tell(scope: anyio.CancelScope) -> None:
+        async def send_news(scope: anyio.CancelScope) -> None:
             with _GONE:
                 await relay.run()
             scope.cancel()
 
         try:
             async with anyio.create_task_group() as both:
-                both.start_soon(tell, both.cancel_scope)
+                both.start_soon(send_news, both.cancel_scope)
                 with _GONE:
                     while (message := await socket.receive())["type"] != "websocket.disconnect":
                         said = message.get("text")

@@ -205,14 +205,14 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
         raise Refused("the lines before the echo leave the inertia open", _WORDS.if_wide,
                       entry=MessageCode.NOT_IDENTIFIABLE)
     speed_lag, torque_lag, skew = lags_of(fitted, confidence)
-    told = f"to {100.0 * pipe.rel_sd:.2g} % (1 sd), as {pipe.source or 'stated'}"
+    tolerance = f"to {100.0 * pipe.rel_sd:.2g} % (1 sd), as {pipe.source or 'stated'}"
     return replace(
         finding,
         inertia=inertia,
         conditions=(
             f"next to nothing comes back from below within {shaft.echo_s:.2f} s, and what does dies away within"
             f" {_LASTS_S:g} s",
-            f"the pipe's resistance to waves is {pipe.impedance_nm_s_rad:.4g} N·m·s/rad {told}",
+            f"the pipe's resistance to waves is {pipe.impedance_nm_s_rad:.4g} N·m·s/rad {tolerance}",
             *(() if answer is None else (_FOLLOWS,)),
             *of_reports(case.recording.lag_prior),
         ),

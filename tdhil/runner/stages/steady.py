@@ -87,7 +87,7 @@ def wait_until_steady(
         if good >= BLOCKS:
             return seen
     torque_nm = sum(sample.torque_nm for sample in block) / len(block)
-    torque, helps = loop.guard.torque_told(torque_nm, block[-1].limit_active)
+    torque, helps = loop.guard.torque_words(torque_nm, block[-1].limit_active)
     approach_s = approaching_s(means, target_rad_s)
     if approach_s is not None:
         torque += f". The speed approaches its setpoint with a time constant of {approach_s:.0f} s"
@@ -245,7 +245,7 @@ def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, t
                 return Calmed(samples, setpoints, left, damper)
     left = swing_of(samples[-2 * window :], loop.period_s)
     mean = _mean_speed(samples[-window:])
-    torque, helps = loop.guard.torque_told(
+    torque, helps = loop.guard.torque_words(
         float(trace(samples[-window:]).torque_nm.mean()), samples[-1].limit_active, left.keeps_oscillating(limits)
     )
     raise LimitHit(
