@@ -120,7 +120,7 @@ SUBJECTS = {
         within="Follower run_acquire _dither_of _SegmentCourse",
     ),
     "acquire pulses": _run(
-        "stages/acquire", "test_kept_within.py", "test_pulses.py", within="_LONGEST run_swings _calm _coast"
+        "stages/acquire", "test_kept_within.py", "test_pulses.py", within="_LONGEST run_speed_changes _calm _coast"
     ),
     "canopen/drive": _driver(
         "canopen/drive", "test_preflight.py", "test_trouble.py", "test_late_host.py", "test_drive_faults.py",

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
         FrameTap as FrameTap, Identity as Identity, KeptAlive as KeptAlive, Mode as Mode, Outcome as Outcome,
         Paced as Paced, Polled as Polled, PositionReading as PositionReading, Positioned as Positioned,
         PowerState as PowerState, Preflight as Preflight, RawFrame as RawFrame, Rehearsed as Rehearsed,
-        RemovesTorque as RemovesTorque, ReportingFilters as ReportingFilters, Sample as Sample,
-        StopsFeeding as StopsFeeding, Telling as Telling, Timed as Timed,
+        RemovesTorque as RemovesTorque, ReportingFilters as ReportingFilters, ReportsOthers as ReportsOthers,
+        Sample as Sample, StopsFeeding as StopsFeeding, Timed as Timed,
     )
     from drivers.errors import (
         CommandRejected as CommandRejected, CommunicationLost as CommunicationLost, DataFileError as DataFileError,
@@ -38,7 +38,7 @@ else:
         "clock": "Clock LOWER_THE_RATE MonotonicClock SteppedClock quantile",
         "drive": "Check Command Counters Drive DriveLimits FrameTap Identity KeptAlive Mode Outcome Paced Polled "
                  "PositionReading Positioned PowerState Preflight RawFrame Rehearsed RemovesTorque ReportingFilters "
-                 "Sample StopsFeeding Telling Timed",
+                 "ReportsOthers Sample StopsFeeding Timed",
         "errors": "CommandRejected CommunicationLost DataFileError DriveFault LimitHit ModeNotConfirmed ObjectRefused "
                   "PreflightRefused Problem ReportsContradict StopNotConfirmed TdhilError",
         "preflight": "ACCEPTED_BY ANY_CLIENT NOTHING_STOPS_IT NO_WATCHDOG_FLAG SHARED_FLAG PreflightTable",

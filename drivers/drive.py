@@ -212,8 +212,8 @@ class Drive(Protocol):
 
     ``close`` restores changed settings and returns, one line each, those that could not be restored.
 
-    A drive may also be `Polled`, `Telling`, `Positioned`, `Paced`, `KeptAlive`, `Rehearsed` and `Timed`, and one that
-    `StopsFeeding`.
+    A drive may also be `Polled`, `ReportsOthers`, `Positioned`, `Paced`, `KeptAlive`, `Rehearsed` and `Timed`, and
+    one that `StopsFeeding`.
     """
 
     @property
@@ -254,7 +254,7 @@ class Polled(Protocol):
 
 
 @runtime_checkable
-class Telling(Protocol):
+class ReportsOthers(Protocol):
     """A drive that detects foreign traffic on its bus that does not end a run.
 
     ``remarks`` returns the remarks since the last call; ``summary`` returns those on the whole run. One line each; a

@@ -317,8 +317,8 @@ class Cia402Profile(DriveProfile):
         return self
 
     def parameter(self, name: str) -> Parameter:
-        """Return the parameter of that name. Raises KeyError if there is none; references are checked on loading."""
-        return {one.name: one for one in self.parameters}[name]
+        """Return the parameter of that name. Raises UsageError; references are checked on loading."""
+        return self.named(self.parameters, name)
 
     def entries(self) -> tuple[tuple[str, ProfileEntry], ...]:
         """Return (name, entry) for all entries of the profile that have a source and a confidence."""

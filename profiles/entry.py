@@ -2,10 +2,12 @@
 
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
 
 from pydantic import Field, model_validator
 
+from profiles.errors import UsageError
+from profiles.messages import MessageCode
 from profiles.model import DataModel, refuse_if
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -77,6 +79,17 @@ class SpeedControllerParameters(DataModel):
 
 # ---------------------------------------------------------------------------------------------------------------------
 
+
+class NamedParameter(Protocol):
+    """Setting of a drive, with the name that other entries of the profile use for it."""
+
+    @property
+    def name(self) -> str: ...
+
+
+Setting = TypeVar("Setting", bound=NamedParameter)
+
+
 class DriveProfile(DataModel):
     """Common part of every profile; the schema of each bus is in a module of its name."""
 
@@ -91,6 +104,15 @@ class DriveProfile(DataModel):
     def entries(self) -> tuple[tuple[str, ProfileEntry], ...]:
         """Return (name, entry) for all entries of the profile that have a source and a confidence."""
         raise NotImplementedError
+
+    def named(self, parameters: Sequence[Setting], name: str) -> Setting:
+        """Return the parameter of that name. Raises UsageError if there is none."""
+        found = next((one for one in parameters if one.name == name), None)
+        if found is None:
+            raise UsageError(f"the profile has no parameter {name!r}", where=self.name,
+                             next_step=f"Parameters: {', '.join(one.name for one in parameters) or 'none'}",
+                             entry=MessageCode.UNKNOWN_PROFILE_ENTRY)
+        return found
 
     def below(self, confidence: Confidence) -> tuple[str, ...]:
         """Return the names of the entries of exactly this confidence."""

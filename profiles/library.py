@@ -20,7 +20,7 @@ Profile = CanopenProfile | EthercatProfile | ModbusProfile
 
 _ROOT = Path(__file__).parent
 _SUFFIXES = (".yaml", ".yml")
-SCHEMAS: dict[str, type[CanopenProfile] | type[EthercatProfile] | type[ModbusProfile]] = {
+SCHEMAS: dict[str, type[Profile]] = {
     "canopen": CanopenProfile, "ethercat": EthercatProfile, "modbus": ModbusProfile,
 }
 """Schema of a profile, by its bus."""

@@ -397,8 +397,8 @@ class ModbusProfile(DriveProfile):
         return self
 
     def parameter(self, name: str) -> Parameter:
-        """Return the parameter of that name. Raises an error if there is none; references are checked on loading."""
-        return next(one for one in self.parameters if one.name == name)
+        """Return the parameter of that name. Raises UsageError; references are checked on loading."""
+        return self.named(self.parameters, name)
 
     def entries(self) -> tuple[tuple[str, ProfileEntry], ...]:
         """Return (name, entry) for all entries with a source and a confidence. A missing echo is an

@@ -1,8 +1,4 @@
-"""A pool of worker processes that continues if a task ends or blocks its process.
-
-Each worker process is a Python in a process group of its own, so that Ctrl-C in the terminal reaches only the host.
-It receives one task at a time over stdin and sends the result over stdout. It shares nothing else, so it can be killed
-at any time. The end of its stdin ends it, also during a task, for any end of the host.
+"""A pool of worker processes that continues if a task ends or blocks its process (`tdhil.worker_process`).
 
 A task has a time limit: the host kills the process. It also has a memory limit, which the process sets itself. A task
 that ends its process or exceeds its time is tried once more, after all others, and then becomes a `Loss`. A process
@@ -14,35 +10,29 @@ all waiting tasks. joblib does the same. With twenty logs, one of which kills it
 
 from __future__ import annotations
 
-import io
 import math
 import os
-import pickle
-import queue
 import signal
-import subprocess
-import sys
-import threading
 import time
-import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from selectors import EVENT_READ, DefaultSelector
-from struct import Struct
 from typing import Any, Final, Generic, Self, TypeVar
 
 from tdhil.errors import MessageCode, TdhilError
-from tdhil.numerics import ONE_THREAD, prepare
+from tdhil.worker_process import WorkerProcess, result_in
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-_PROGRAM: Final = "import sys; sys.path[:] = {path!r}; from tdhil.process_pool import serve; serve({memory!r})"
-_LENGTH: Final = Struct("<Q")
+# The comment names the pool in lists of processes.
+_PROGRAM: Final = "from tdhil.worker_process import serve; serve(memory_bytes={memory!r})    # tdhil.process_pool"
 _TRIES: Final = 2
 _KILLS: Final = 5
+_END_S: Final = 5.0             # longest time for the end of a process that has closed its stdout, s
 _ASK_S: Final = 0.2             # interval of the check for a stop, s
 _START_S: Final = 60.0          # longest time for the start of a process, on a busy machine, s
 _STARTS: Final = 3              # consecutive processes that end before a task: the fault is not a task's
@@ -102,7 +92,7 @@ class Pool(Generic[Task, Result]):
         with DefaultSelector() as answers:
             for worker in self._workers:
                 worker.job = None
-                answers.register(worker.stdout, EVENT_READ, worker)
+                answers.register(worker.process.stdout, EVENT_READ, worker)
             while True:
                 if stop is not None and stop():
                     return
@@ -118,7 +108,7 @@ class Pool(Generic[Task, Result]):
                 ready = {key.data for key, _ in answers.select(wait_s)}
                 now_s = time.monotonic()
                 for worker in ready.difference(busy):
-                    answers.unregister(worker.stdout)      # an idle process that has ended
+                    answers.unregister(worker.process.stdout)      # an idle process that has ended
                     self._workers.remove(worker)
                     worker.kill()
                 for worker in busy:
@@ -133,9 +123,9 @@ class Pool(Generic[Task, Result]):
                         result: Result = answer
                         yield job.task, result
                         continue
-                    answers.unregister(worker.stdout)
+                    answers.unregister(worker.process.stdout)
                     self._workers.remove(worker)
-                    loss, outside = worker.bury(late, self._limits)
+                    loss, outside = worker.reason_of_end(late, self._limits)
                     stillborn = 0 if worker.awake else stillborn + 1
                     if stillborn > _STARTS * self._jobs:
                         raise TdhilError(f"the processes end before they begin: {loss.text}", where="process pool",
@@ -163,12 +153,12 @@ class Pool(Generic[Task, Result]):
             if worker is None:
                 worker = _Worker(self._limits)
                 self._workers.append(worker)
-                answers.register(worker.stdout, EVENT_READ, worker)
+                answers.register(worker.process.stdout, EVENT_READ, worker)
             worker.give(self._function, job, self._limits.time_s)
 
     def pids(self) -> list[int]:
         """Return the ids of the present worker processes."""
-        return [worker.pid for worker in self._workers]
+        return [worker.process.pid for worker in self._workers]
 
     def close(self) -> None:
         """End all worker processes at once. Tasks in progress are dropped."""
@@ -194,75 +184,45 @@ class _Worker:
         self.deadline_s = 0.0
         self.awake = False
         self._time_s = 0.0
-        self._buffer = bytearray()
-        group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _PROGRAM.format(path=sys.path, memory=limits.memory_bytes)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=os.environ | ONE_THREAD, **group,
-        )
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._stdin, self.stdout = self._process.stdin, self._process.stdout
-        self.pid = self._process.pid
+        self.process = WorkerProcess(_PROGRAM.format(memory=limits.memory_bytes))
 
     def give(self, function: Callable[[Any], Any], job: _Job[Any], limit_s: float | None) -> None:
         time_s = math.inf if limit_s is None else limit_s
         self.job, self._time_s = job, time_s
         self.deadline_s = time.monotonic() + (time_s if self.awake else max(time_s, _START_S))
         with suppress(BrokenPipeError):        # an ended process is found by the end of its stdout
-            data = pickle.dumps((function, job.task))
-            self._stdin.write(_LENGTH.pack(len(data)) + data)
-            self._stdin.flush()
+            self.process.send(partial(function, job.task))
 
     def take(self) -> Any:
         """Return the result; `_PART` if incomplete, `_DEAD` if the process has ended. Raises the function's error."""
-        assert isinstance(self.stdout, io.BufferedReader)
-        more = self.stdout.read1(2**16)
-        if not more:
+        try:
+            message = self.process.received()
+        except EOFError:
             return _DEAD
-        self._buffer += more
-        data = self._whole()
-        if data is not None and not self.awake:        # message: ready; more may have come with it
+        if message is not None and not self.awake:     # message: ready; more may have come with it
             self.awake, self.deadline_s = True, time.monotonic() + self._time_s
-            data = self._whole()
-        if data is None:
-            return _PART
-        failed, answer = pickle.loads(data)
-        if failed:
-            raise answer
-        return answer
+            message = self.process.kept()
+        return _PART if message is None else result_in(message)
 
-    def _whole(self) -> bytes | None:
-        """Return the first message in the buffer; None if it is incomplete."""
-        if len(self._buffer) < _LENGTH.size:
-            return None
-        end = _LENGTH.size + _LENGTH.unpack_from(self._buffer)[0]
-        if len(self._buffer) < end:
-            return None
-        data = bytes(self._buffer[_LENGTH.size:end])
-        del self._buffer[:end]
-        return data
-
-    def bury(self, late: bool, limits: TaskLimits) -> tuple[Loss, bool]:
+    def reason_of_end(self, late: bool, limits: TaskLimits) -> tuple[Loss, bool]:
         """Return the reason of the process's end, and whether it was killed from outside."""
         if late:
             self.kill()
             return Loss("TimeLimit", f"no result within {limits.time_s:g} s, in each of {_TRIES} tries"), False
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(5.0)            # it has closed its stdout, so it is about to end
-        self.kill()
-        code = self._process.returncode
+        self.process.wait(_END_S)
+        code = self.kill()
         outside = code in (-int(getattr(signal, "SIGKILL", 9)), -int(signal.SIGTERM))
-        told = f"exit code {code}" if code >= 0 else _signal_name(-code)
+        reason = f"exit code {code}" if code >= 0 else _signal_name(-code)
         tries = _KILLS if outside else _TRIES
-        return Loss("ProcessDied", f"its process ended ({told}), in each of {tries} tries"), outside
+        return Loss("ProcessDied", f"its process ended ({reason}), in each of {tries} tries"), outside
 
-    def kill(self) -> None:
-        self._process.kill()
-        self._process.wait()
-        for pipe in (self._stdin, self.stdout):
-            with suppress(OSError):            # a part of a task may be unwritten
-                pipe.close()
+    def kill(self) -> int:
+        """Kill the process, if it has not ended, and return its exit code."""
+        self.process.kill()
+        code = self.process.wait(None)
+        assert code is not None
+        self.process.close()
+        return code
 
 
 def _signal_name(number: int) -> str:
@@ -270,57 +230,3 @@ def _signal_name(number: int) -> str:
         return signal.Signals(number).name
     except ValueError:
         return f"signal {number}"
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Code of a worker process
-
-
-def serve(memory_bytes: int | None) -> None:
-    """Compute one task after the other, until the host closes the pipe or ends."""
-    prepare()
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)                               # other output goes to stderr
-    limited = memory_bytes is None
-    tasks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    threading.Thread(target=_listen, args=(sys.stdin.buffer, tasks), daemon=True).start()
-    with suppress(BrokenPipeError):
-        answers.write(_LENGTH.pack(0))         # message: ready
-        answers.flush()
-        while True:
-            function, task = pickle.loads(tasks.get())
-            if memory_bytes is not None and not limited:       # set after the function has loaded its modules
-                _limit_memory(memory_bytes)
-                limited = True
-            try:
-                answer = pickle.dumps((False, function(task)))
-            except Exception as error:
-                error.add_note("In a process of its own:\n" + traceback.format_exc())
-                answer = pickle.dumps((True, error))
-            answers.write(_LENGTH.pack(len(answer)) + answer)
-            answers.flush()
-
-
-def _listen(stdin: io.BufferedReader, tasks: queue.SimpleQueue[bytes]) -> None:
-    """Put received tasks into the queue. The end of the host ends this process, also during a task."""
-    while True:
-        head = stdin.read(_LENGTH.size)
-        if len(head) < _LENGTH.size:
-            os._exit(0)
-        tasks.put(stdin.read(_LENGTH.unpack(head)[0]))
-
-
-def _limit_memory(memory_bytes: int) -> None:
-    """Limit the additional address space, bytes. Above the limit, Python raises MemoryError. Without effect if the
-    system has no such limit.
-    """
-    try:
-        import resource
-
-        with open("/proc/self/statm", encoding="ascii") as file:  # noqa: PTH123
-            now = int(file.read().split()[0]) * resource.getpagesize()
-        _, hard = resource.getrlimit(resource.RLIMIT_AS)
-        wanted = now + memory_bytes
-        resource.setrlimit(resource.RLIMIT_AS, (wanted if hard < 0 else min(wanted, hard), hard))
-    except (ImportError, OSError, ValueError):
-        return

@@ -390,7 +390,7 @@ class CanopenBus(Cia402Bus):
         if len(data) < 2 or data[1] not in (0, self._node):
             return
         name = NMT_COMMANDS.get(data[0], f"command {data[0]:02X}h")
-        self.watch.tell(f"another master sent NMT {name} to {'all nodes' if data[1] == 0 else 'the drive'}")
+        self.watch.remark(f"another master sent NMT {name} to {'all nodes' if data[1] == 0 else 'the drive'}")
         state = {0x02: "stopped", ENTER_PRE_OPERATIONAL: "pre-operational"}.get(data[0])
         if state is not None and self.watch.expect_operational:       # a reset is detected by the boot-up message
             self.watch.interference(

@@ -8,7 +8,7 @@ Only this host may send these frames to this drive. If one is received, another 
     RPDOs            setpoints
     600h + node      SDO requests: a tool that reads does no harm; a tool that writes may
 
-A single frame is reported (`NodeWatch.tell`). The second frame of a kind, at any time in the run, ends the run
+A single frame is reported (`NodeWatch.remark`). The second frame of a kind, at any time in the run, ends the run
 (`NodeWatch`). A tool that writes driving objects (6040h, 6060h, 6071h, 60FFh) repeatedly counts as a second master too.
 """
 
@@ -121,10 +121,10 @@ class ForeignTraffic:
             if self.feeds_by_heartbeat:
                 self._foreign(kind, f"another node sends {kind}: it would feed the drive's watchdog if this host fails")
             else:
-                self._watch.tell(f"another node sends {kind}")
+                self._watch.remark(f"another node sends {kind}")
 
     def _foreign(self, kind: str, why: str = "") -> None:
-        self._watch.tell(f"{kind} came from another master")
+        self._watch.remark(f"{kind} came from another master")
         self._watch.on_foreign(kind, why)
 
     # -- a tool's SDO ------------------------------------------------------------------------------------------
@@ -141,7 +141,7 @@ class ForeignTraffic:
             size = 4 - (data[0] >> 2 & 3) if data[0] & _SIZED else 4
             value = int.from_bytes(data[4 : 4 + size], "little")
         self._last[key] = value
-        self._watch.tell(f"another master wrote {_shown(index, sub, value)} by SDO")
+        self._watch.remark(f"another master wrote {_shown(index, sub, value)} by SDO")
         self.on_write(index, sub)
         driving = sum(count for (one, _), count in self._writes.items() if one in DRIVING)
         if index in DRIVING and driving >= FOREIGN_WRITES:

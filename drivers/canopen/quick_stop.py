@@ -69,8 +69,8 @@ class CanopenTarget(Cia402Target):
         self._link.close()
 
     def _burst(self) -> None:
-        frames = [
-            (cob_id & 0x7FF, self._packed(offset, length))
+        frames = [       # each RPDO: zeros, with the controlword in its place; offset and length in bits
+            (cob_id & 0x7FF, (self._word << offset).to_bytes(length // 8, "little"))
             for _, cob_id, offset, length in self._rpdos()
         ]
         if not frames:
@@ -79,10 +79,6 @@ class CanopenTarget(Cia402Target):
             for identifier, data in frames:
                 self._link.send(identifier, data)
             self._link.pump_until(lambda: False, BURST_PAUSE_S)
-
-    def _packed(self, offset: int, length: int) -> bytes:
-        """Return an RPDO of zeros with the controlword in its place; offset and length in bits."""
-        return (self._word << offset).to_bytes(length // 8, "little")
 
     def _switch_off_rpdos(self) -> None:
         for index, cob_id, _, _ in self._rpdos():

@@ -455,7 +455,7 @@ class Cia402Drive:
         """
         self._standing.by_object = True
         done = self._bus.disable_setpoints()
-        self._bus.watch.tell(
+        self._bus.watch.remark(
             f"the quick stop was reversed or not executed: {done} RPDOs were switched off, and it was sent by SDO"
         )
         self._bus.ticks.put_off()
@@ -607,7 +607,7 @@ class Cia402Drive:
         self._bus.stop_feeding()
 
     def remarks(self) -> tuple[str, ...]:
-        """Return remarks on foreign traffic since the last call; see `drivers.drive.Telling`."""
+        """Return remarks on foreign traffic since the last call; see `drivers.drive.ReportsOthers`."""
         return self._bus.watch.remarks()
 
     def summary(self) -> tuple[str, ...]:

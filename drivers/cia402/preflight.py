@@ -81,7 +81,7 @@ def find_units(
 ) -> tuple[Units, float]:
     """Return the scaling of speed and torque, and the rated torque, N·m."""
     where = name(profile.torque.rated.index, profile.torque.rated.sub)
-    agreed_nm = agreed_rated_torque(table, _told(objects, profile), rated_torque_nm, where)
+    agreed_nm = agreed_rated_torque(table, _reported_rated_torque(objects, profile), rated_torque_nm, where)
     rated_nm = 1.0 if agreed_nm is None else agreed_nm       # refused; the following rows still need a scale
     speed = speed_unit(table, objects, profile)
     target = profile.torque.rated_per_lsb * rated_nm
@@ -91,7 +91,7 @@ def find_units(
     return Units(speed, actual.per_lsb * (rated_nm if actual.unit == "rated" else 1.0), target), rated_nm
 
 
-def _told(objects: Objects, profile: Cia402Profile) -> float | None:
+def _reported_rated_torque(objects: Objects, profile: Cia402Profile) -> float | None:
     """Return the rated torque that the drive reports, N·m; None if it reports none or 0."""
     place, per_lsb = profile.torque.rated, profile.torque.rated_torque_nm_per_lsb
     if per_lsb is None:

@@ -78,7 +78,7 @@ class DriveWatch:
         self.on_restart: Callable[[], None] = lambda: None
         self._troubles: list[tuple[str, TdhilError]] = []
         self._raised: set[str] = set()
-        self._told: list[str] = []
+        self._remarks: list[str] = []
         self._said: set[str] = set()
         self.expect_operational = False
         self.host_stood_still: Callable[[], str] = lambda: ""
@@ -189,18 +189,18 @@ class DriveWatch:
             ),
         )
 
-    def tell(self, text: str) -> None:
+    def remark(self, text: str) -> None:
         """Add a remark; each text once."""
         if text not in self._said and len(self._said) < MOST_REMARKS:
             self._said.add(text)
-            self._told.append(text)
+            self._remarks.append(text)
 
     def remarks(self) -> tuple[str, ...]:
         """Return the remarks since the last call, one line each."""
-        if not self._told:
+        if not self._remarks:
             return ()
-        told, self._told = tuple(self._told), []
-        return told
+        remarks, self._remarks = tuple(self._remarks), []
+        return remarks
 
     def keep(self, kind: str, trouble: TdhilError) -> None:
         """Keep an error until `check` raises it; each kind once."""
@@ -363,7 +363,7 @@ class ReadBack:
         if data is None:
             one.refused += 1
             if one.refused == GIVE_UP:
-                self._watch.tell(f"the drive refuses to read {name(index, sub)} in motion; it is not supervised")
+                self._watch.remark(f"the drive refuses to read {name(index, sub)} in motion; it is not supervised")
                 self._drop(one)
         else:
             self._answered = True
@@ -417,7 +417,7 @@ class ReadBack:
         self._silent += 1
         if not self._answered and self._silent >= GIVE_UP:
             self._over = True
-            self._watch.tell("the drive answers no SDO requests in motion: watchdog and limits were not read back")
+            self._watch.remark("the drive answers no SDO requests in motion: watchdog and limits were not read back")
         elif self._answered and self._silent >= LOST:
             self._over = True
             self._watch.interference(

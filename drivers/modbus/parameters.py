@@ -170,7 +170,7 @@ def find_filters(table: PreflightTable, profile: ModbusProfile, found: Parameter
             parameter = profile.parameter(entry.parameter or "")
             value, where, how = found.values.get(parameter.name), where_of(parameter), parameter.title
             if value is None or not math.isfinite(value) or value < 0.0:
-                table.note(title, "the drive does not tell", where, entry.advice or "")
+                table.note(title, "the drive does not report it", where, entry.advice or "")
                 continue
             hertz = parameter.unit == "hz"
             lag_s = value if not hertz else 1.0 / (2.0 * math.pi * value) if value > 0.0 else 0.0

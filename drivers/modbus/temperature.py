@@ -28,7 +28,7 @@ class Heat:
         self._numbers = [one for one in profile.temperatures if one not in self._in_status]
         self._limit_c: float | None = None
         self._watched: list[Temperature] = []
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._next_s = 0.0
         self._polls = 0
 
@@ -90,9 +90,9 @@ class Heat:
         self._judge(one, from_words(words, register.type, self._order))
 
     def _judge(self, one: Temperature, counts: int) -> None:
-        if one.title in self._told or not self._too_hot(one, counts):
+        if one.title in self._reported or not self._too_hot(one, counts):
             return
-        self._told.add(one.title)
+        self._reported.add(one.title)
         limit = self._limit_of(one)
         beyond = "" if limit is None else f", beyond the limit of {_text(one, limit)}"
         raise LimitHit(

@@ -193,12 +193,12 @@ def _write(
     table.attempt("watchdog", wanted, where_of(parameter), fed, parameter.advice or DIES)
 
 
-def is_off(access: RegisterAccess, parameter: Parameter, told: Mapping[str, float]) -> bool:
+def is_off(access: RegisterAccess, parameter: Parameter, stated: Mapping[str, float]) -> bool:
     """Return whether the time-out is 0, which switches it off, or the drive refuses to report it.
 
-    ``told``: values by name, for a time-out without a register, such as a 0 in rig.yaml.
+    ``stated``: values by name, for a time-out without a register, such as a 0 in rig.yaml.
     """
-    return told.get(parameter.name) == 0.0 if parameter.register_ is None else not counts_of(access, parameter)
+    return stated.get(parameter.name) == 0.0 if parameter.register_ is None else not counts_of(access, parameter)
 
 
 def counts_of(access: RegisterAccess, parameter: Parameter) -> int | None:

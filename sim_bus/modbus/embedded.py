@@ -13,7 +13,6 @@ import numpy as np
 
 from profiles.modbus import BusLine, ModbusProfile
 from sim_bus.fault_script import Scripted
-from sim_bus.modbus.codec import DriveReply
 from sim_bus.modbus.faults import Faults, tells_stage, wrongs_of
 from sim_bus.modbus.machine import Machine
 from sim_bus.modbus.wrong_maps import Wrong
@@ -155,7 +154,7 @@ class EmbeddedModbusDrive:
             self._free_s = acts_s
             return None, acts_s
         reply = self._faults.request(pdu, connection)
-        heard = _heard(reply)
+        heard = None if reply.crc_bits else reply.pdu      # a host's receiver drops a frame with a wrong CRC
         if unit == _BROADCAST or heard is None:
             self._free_s = acts_s
             return None, acts_s
@@ -189,8 +188,3 @@ class EmbeddedModbusDrive:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _heard(reply: DriveReply) -> bytes | None:
-    """Return the reply as a host's receiver passes it on."""
-    return None if reply.crc_bits else reply.pdu

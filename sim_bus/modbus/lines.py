@@ -305,7 +305,7 @@ class RtuListener:
         except OSError as error:
             raise TdhilError(f"the line has gone: {error.strerror}", where=self.reached_by,
                              entry=MessageCode.SIMULATOR_UNUSABLE) from error
-        for request in self._requests(data):
+        for request in self._receiver.feed(data, time.monotonic()):
             reply = serve(request)
             if reply.pdu is not None:
                 frame = rtu_reply(request, reply.pdu, reply.crc_bits)
@@ -323,9 +323,6 @@ class RtuListener:
             if fd >= 0:
                 os.close(fd)
         self._fd = self._slave = -1
-
-    def _requests(self, data: bytes) -> Iterator[ReceivedRequest]:
-        return self._receiver.feed(data, time.monotonic())
 
 
 def _write(fd: int, frame: bytes) -> None:

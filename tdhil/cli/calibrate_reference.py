@@ -45,7 +45,7 @@ def run_without_body(namespace: argparse.Namespace, confidence: float) -> int:
         for log in namespace.logs:
             check_report_path(namespace.report, log)
     document = _KINDS[kind](namespace, confidence)
-    return _told(namespace, document)
+    return _print_result(namespace, document)
 
 
 def require_new(path: Path | None) -> None:
@@ -55,7 +55,7 @@ def require_new(path: Path | None) -> None:
                          next_step="Name another file, or move that one away")
 
 
-def _told(namespace: argparse.Namespace, document: Mapping[str, Any]) -> int:
+def _print_result(namespace: argparse.Namespace, document: Mapping[str, Any]) -> int:
     from tdhil.report import PlainConsole, print_factor, stderr_console, write_factor_report
     from tdhil.session import save_calibration
 

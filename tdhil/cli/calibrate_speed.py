@@ -13,6 +13,7 @@ from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.errors import ExitCode, UsageError
+from tdhil.file_hash import sha256_of
 
 if TYPE_CHECKING:
     from tdhil.calibration import SpeedCalibration
@@ -62,7 +63,6 @@ def run_speed(namespace: argparse.Namespace) -> int:
         drive_identity,
         drive_settings,
         require_file,
-        sha256_of_log,
     )
 
     _check(namespace)
@@ -77,7 +77,7 @@ def run_speed(namespace: argparse.Namespace) -> int:
     document = speed_document(
         found, inputs, {} if record is None else drive_identity(record.configuration),
         {} if record is None else drive_settings(record.configuration, record.recording),
-        log=None if record is None else {"log": record.log, "sha256": sha256_of_log(record), "date": started},
+        log=None if record is None else {"log": record.log, "sha256": sha256_of(Path(record.log)), "date": started},
         date=started or datetime.now().astimezone().isoformat(timespec="seconds"), confidence=_confidence(namespace),
         simulated=record is not None and record.recording.simulated, warnings=warnings)
     if namespace.json:

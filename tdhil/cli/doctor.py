@@ -164,7 +164,11 @@ def run(namespace: argparse.Namespace) -> int:
             print(one.text, flush=True)  # noqa: T201
     code = ExitCode.REFUSED if any(one.grade == "bad" for one in found) else ExitCode.OK
     if namespace.json:
-        _dump(found, registers, code)
+        print_json({
+            "checks": [asdict(one) for one in found],
+            "registers": [one.plain() for one in registers],
+            "exit_code": int(code),
+        })
     else:
         _show_registers(registers)
         bad = sum(one.grade == "bad" for one in found)
@@ -246,11 +250,3 @@ def _show_registers(registers: list[ValueSeen]) -> None:
     for one in registers:
         table.add_row(*one.cells())
     PlainConsole().print(table)
-
-
-def _dump(found: list[DoctorFinding], registers: list[ValueSeen], code: int) -> None:
-    print_json({
-        "checks": [asdict(one) for one in found],
-        "registers": [one.plain() for one in registers],
-        "exit_code": int(code),
-    })

@@ -86,7 +86,7 @@ def run_watch(namespace: argparse.Namespace) -> int:
         print(f"watching {folder}, table {request.out}; Ctrl-C ends it", file=sys.stderr)  # noqa: T201
     while True:
         for row in watch.look(at_once=namespace.once):
-            _tell(row, namespace.json)
+            _print_row(row, namespace.json)
         if namespace.once:
             return int(ExitCode.OK)
         time.sleep(namespace.every)
@@ -127,7 +127,7 @@ def _stamp(log: str) -> tuple[int, int]:
     return found.st_size, found.st_mtime_ns
 
 
-def _tell(row: FleetRow, as_json: bool) -> None:
+def _print_row(row: FleetRow, as_json: bool) -> None:
     from tdhil.report import SIMULATED, PlainConsole
 
     if as_json:

@@ -205,7 +205,7 @@ def _hear_no_more() -> None:
 def leave(code: int) -> NoReturn:
     """End the process at once, even if an abandoned computation continues in a thread."""
     background = sys.modules.get("tdhil.runner.background")
-    if background is not None and background.goes_on():
+    if background is not None and background.thread_computes():
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError, AttributeError):     # full, closed, or missing
                 stream.flush()

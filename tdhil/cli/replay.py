@@ -11,6 +11,7 @@ from tdhil.cli.arguments import add_option, add_settings, settings_in
 from tdhil.cli.results import print_result, save_report
 from tdhil.config import OF_A_TRACE, OPTION, expectations_in, expectations_of
 from tdhil.errors import ExitCode, MessageCode, UsageError
+from tdhil.file_hash import sha256_of
 from tdhil.session import (
     check_lags,
     conclude_evaluation,
@@ -21,7 +22,6 @@ from tdhil.session import (
     load_calibration,
     read,
     require_file,
-    sha256_of_log,
     trace_arguments,
     with_calibration,
 )
@@ -124,7 +124,7 @@ def _identify(namespace: argparse.Namespace, recorded: RunRecord) -> int:
     if namespace.torque_calibration is not None:
         path = namespace.torque_calibration
         changed = with_calibration(recorded.configuration, recorded.recording, load_calibration(path), str(path),
-                                   sha256_of_log(recorded))
+                                   sha256_of(Path(recorded.log)))
         recorded = replace(recorded, configuration=changed)
     result = identify(recorded, **settings_in(namespace))
     console = stderr_console()

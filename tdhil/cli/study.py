@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tdhil.config import Rig, RunOptions
     from tdhil.recording import Recording, Stage
     from tdhil.runner import Idle, RunOutcome, Task
-    from tdhil.runner.excitation import Plan, SwingPlan
+    from tdhil.runner.excitation import Plan, SpeedChangePlan
     from tdhil.studies import Chapter, FieldRun, RunProgress, Study, StudyOutcome
 
 
@@ -155,7 +155,7 @@ class _ProgressDisplay:
         """Report the end of the run."""
         self._report(1.0)
 
-    def planned(self, plan: Plan | SwingPlan) -> None:
+    def planned(self, plan: Plan | SpeedChangePlan) -> None:
         """Note the duration of the run."""
         self._expected_s = BEFORE_ACQUIRE_S + plan.duration_s + 5.0
 

@@ -131,14 +131,14 @@ def run(namespace: argparse.Namespace) -> int:
         result = read_result(namespace.result)
     case, lags_from = case_of(result, namespace)
     profile = profile_for(namespace, result)
-    with _progress(stderr, "tuning") as tell:
-        tuning = tune(case, None if namespace.no_simulation else Search(), tell)
+    with _progress(stderr, "tuning") as progress:
+        tuning = tune(case, None if namespace.no_simulation else Search(), progress)
         tuned_for = _tuned_for(result, namespace, tuning, lags_from, profile)
         document = tuning_document(tuning, tuned_for)
         if namespace.depths is not None:
-            document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, profile, tell)
+            document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, profile, progress)
         if namespace.report is not None:
-            tell("the operator's map: set speed and bit torque")
+            progress("the operator's map: set speed and bit torque")
             found = operator_map(tuning)
             document["map"] = None if found is None else map_document(found)
     if namespace.json:
@@ -223,7 +223,8 @@ def depths(text: str) -> tuple[float, ...]:
 
 
 def _schedule(
-    case: TuneCase, namespace: argparse.Namespace, ratio: float, profile: Profile | None, tell: Callable[[str], None]
+    case: TuneCase, namespace: argparse.Namespace, ratio: float, profile: Profile | None,
+    progress: Callable[[str], None],
 ) -> dict[str, Any]:
     """Return gains over depth: soft ones, which any drive accepts, or compensated ones with --compensate."""
     from tdhil.report import schedule_document
@@ -235,7 +236,7 @@ def _schedule(
         raise UsageError(str(error), where="--depths", next_step="Begin deeper than that",
                          entry=MessageCode.VALUE_NOT_ALLOWED) from None
     found = schedule(case, namespace.depths, "compensated" if namespace.compensate else "soft",
-                     simulated=not namespace.no_simulation, report=tell)
+                     simulated=not namespace.no_simulation, report=progress)
     parameters = profile.speed_controller if profile is not None and namespace.loop == "drive" else None
 
     def settings(law: SpeedController) -> Sequence[DriveSetting]:

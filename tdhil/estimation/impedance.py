@@ -57,8 +57,10 @@ REFERENCE: Final = "reference"
     INERTIA, VISCOUS, GAIN, INTEGRAL, TORQUE_LAG, SPEED_FILTER, SPEED_REPORT, TORQUE_REPORT, DELAY, SKEW,
     REFERENCE_FILTER,
 ) = range(11)
-_SIZE: Final = 11
+_SIZE: Final = 11              # number of parameters: those of the line above
 _LAG_BOUND_S, _INNER_BOUND_S, _DELAY_BOUND_S = 3.0, 0.5, 0.5
+"""Bounds of the fit, s: lags of the reports and of the reference, lags inside the drive's loop, delay and time offset.
+They keep the descent from running away: a parameter at its bound has no standard deviation."""
 _SIGNALS = 2                   # speed and torque
 _LEAST_PERIODS = 5             # fewest periods in a row: an excited line then has at least four lines beside it
 _BESIDE = 5                    # most noise lines used on either side of an excited line

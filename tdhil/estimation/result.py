@@ -129,7 +129,11 @@ class ResidualTest:
 
 
 REJECT_P = 0.001
+"""Probability of the residuals below which a model is rejected: one correct model in a thousand. A larger value rejects
+more correct models; `docs/explanation/models.md` has the rule."""
 DOUBT_P = 0.01
+"""Probability below which a model is only just allowed. Curved friction is tried then, and the model of a record
+without periodic excitation is rejected."""
 
 
 def rejects(test: ResidualTest | None, least_p: float = REJECT_P) -> bool:

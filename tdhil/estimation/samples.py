@@ -19,7 +19,7 @@ from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 
 _NATURAL = 3.0            # times the duration of a rounded crest
 _SHARE_OF_CYCLE = 0.1     # share of the fastest line's cycle
-_LEAST_SAMPLES = 8
+_LEAST_SAMPLES = 8        # shortest run of equal values that is examined. A choice: rounding makes shorter ones
 _LOOKED_AT = 200_000      # samples used to find the smallest step
 _PERIODIC = ("multisine", "sine")
 

@@ -15,7 +15,7 @@ from typing import Any, Final, Protocol
 from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
 from tdhil.fleet.rows import FleetRow, FleetSettings, failure_row, row_key
 from tdhil.fleet.table import Journal, check_table_path, write_table
-from tdhil.fleet.task import Done, LogTask, content_hash, identify_log, remote, sidecar_of, told_of
+from tdhil.fleet.task import Done, LogTask, content_hash, identify_log, named_errors, remote, sidecar_of
 from tdhil.process_pool import Loss, Pool, TaskLimits
 
 _SLOWEST: Final = 5
@@ -248,7 +248,7 @@ def _stamp(log: str) -> Stamp:
     if "://" in log:
         with suppress(OSError, TdhilError):
             system, inside = remote(log)
-            with told_of(log):
+            with named_errors(log):
                 return int(system.info(inside)["size"] or 0), int(system.ukey(inside), 16) >> 196
         return None
     path = Path(log)
@@ -334,7 +334,7 @@ def _remote(root: str) -> list[str]:
     """Return the logs below a URL that fsspec can list."""
     system, inside = remote(root)
     try:
-        with told_of(root):
+        with named_errors(root):
             names = [inside] if system.isfile(inside) else system.find(inside)
     except (OSError, LogError) as error:
         raise UsageError(f"can't be listed: {error}", where=root) from error

@@ -202,7 +202,7 @@ def local_copy(log: str) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="tdhil-fleet-") as folder:
         target = Path(folder) / log.rsplit("/", 1)[-1]
         system, inside = remote(log)
-        with told_of(log), system.open(inside, "rb") as source, target.open("wb") as file:
+        with named_errors(log), system.open(inside, "rb") as source, target.open("wb") as file:
             while block := source.read(_BLOCK):
                 file.write(block)
         yield target
@@ -213,7 +213,7 @@ def remote(url: str) -> tuple[Any, str]:
     from importlib import import_module
 
     try:
-        with told_of(url):
+        with named_errors(url):
             system, inside = import_module("fsspec").core.url_to_fs(url)
     except ImportError as error:
         extra = "s3" if url.startswith(("s3://", "s3a://")) else "cluster"
@@ -224,7 +224,7 @@ def remote(url: str) -> tuple[Any, str]:
 
 
 @contextmanager
-def told_of(url: str) -> Iterator[None]:
+def named_errors(url: str) -> Iterator[None]:
     """Convert errors of libraries behind fsspec (no credentials, no network) to a LogError."""
     try:
         yield

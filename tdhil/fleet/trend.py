@@ -119,11 +119,11 @@ def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str
         drives = {newest[0]}
     calibrations = sorted({row.torque_calibration or "" for _, row in kept})
     if len(calibrations) > 1:
-        told = ", ".join(one[:10] or "none" for one in calibrations)
-        notes.append(f"runs with different torque calibrations ({told}): each has a torque scale of its own, which"
+        dates = ", ".join(one[:10] or "none" for one in calibrations)
+        notes.append(f"runs with different torque calibrations ({dates}): each has a torque scale of its own, which"
                      " stays in their differences")
     if any((one or "assumed").startswith("assumed") for one in drives):
-        notes.append("the drive tells no serial number: runs on this rig are taken for runs on one drive")
+        notes.append("the drive reports no serial number: runs on this rig are taken for runs on one drive")
     return {
         "rig": rig, "logs": len(mine), "results": len(kept), "notes": notes,
         "simulated": any(row.simulated for _, row in kept),
@@ -309,10 +309,10 @@ def _differences(first: FleetRow, other: FleetRow) -> dict[str, Any]:
         before, after = measured(first, quantity), measured(other, quantity)
         if before is None or after is None:
             continue
-        told = difference(before, after)
+        change = difference(before, after)
         found["quantities"].append({
-            "name": quantity.name, "column": quantity.column, "unit": quantity.unit, **asdict(told),
-            "differs": told.differs,
+            "name": quantity.name, "column": quantity.column, "unit": quantity.unit, **asdict(change),
+            "differs": change.differs,
         })
     return found | {"text": _compare_text(first, other, found["quantities"])}
 
@@ -322,12 +322,12 @@ def _compare_text(first: FleetRow, other: FleetRow, quantities: Sequence[Mapping
     if inertia is None:
         without = first if first.inertia_kg_m2 is None else other
         return f"the inertia can't be compared: {without.log} has no result that stands ({without.verdict})"
-    told = Difference(**{name: inertia[name] for name in Difference.__dataclass_fields__})
-    scale = "the torque scale is one drive's and cancels" if told.shared_scale else (
+    change = Difference(**{name: inertia[name] for name in Difference.__dataclass_fields__})
+    scale = "the torque scale is one drive's and cancels" if change.shared_scale else (
         "two torque calibrations: the scale of each is in it" if first.torque_calibration != other.torque_calibration
         else "two drives: the torque scale of each is in it")
-    if told.shared_scale and not (first.drive_serial and other.drive_serial):
+    if change.shared_scale and not (first.drive_serial and other.drive_serial):
         scale = "no serial numbers: taken for one drive, whose torque scale cancels"
-    says = "differ" if told.differs else "do not differ significantly"
+    says = "differ" if change.differs else "do not differ significantly"
     parts = "".join(f"; {row.log}: {row.part_text}" for row in (first, other) if row.part_text is not None)
-    return f"the inertias {says}: {_change_text(told, 'kg·m²')} at {told.confidence:.0%}; {scale}{parts}"
+    return f"the inertias {says}: {_change_text(change, 'kg·m²')} at {change.confidence:.0%}; {scale}{parts}"

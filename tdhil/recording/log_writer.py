@@ -190,7 +190,7 @@ class Pump:
         self._frames: list[RawFrame] = []      # frames of the present cycle
         self._chunk_ns: int | None = None      # log time of the open chunk's first sample
         self._opened_s: float | None = None    # when the open chunk was first seen, wall time
-        self._told = 0                         # number of dropped records that have been logged
+        self._drops_logged = 0                         # number of dropped records that have been logged
 
     def run(self) -> None:
         """Run the thread. No exception leaves it. At its end no caller is left waiting."""
@@ -283,9 +283,9 @@ class Pump:
             frames, self._frames = self._frames, []
             self._container.add(self._channel, self._log_ns(frames[0][0]), pack_frames(frames))
         dropped = self._backlog.dropped
-        if dropped > self._told:
-            text = f"{dropped - self._told} records found no place in the log's queue; {dropped} so far"
-            self._told = dropped
+        if dropped > self._drops_logged:
+            text = f"{dropped - self._drops_logged} records found no place in the log's queue; {dropped} so far"
+            self._drops_logged = dropped
             event = event_message(Event(self._time_s, "dropped", text))
             self._container.add(event.channel, self._log_ns(self._time_s), event.payload)
             self._put_log(self._log_ns(self._time_s), event.payload)

@@ -66,6 +66,7 @@ def acceptance_rows(acceptance: Part | None) -> list[tuple[str, str]]:
 
 
 SIGNATURE_LINE: Final = "______________________________"
+"""Line to sign on, of every page that a person signs."""
 
 
 def signature_rows(acceptance: Part) -> list[tuple[str, str]]:
@@ -124,8 +125,8 @@ def _causes(rows: Sequence[Accepted]) -> Iterable[str]:
         failed = [one for one in failed if one.name not in _WITH_TORQUE]
     for one in failed:
         assert one.value is not None
-        told = f"{one.value / one.expected:.3g} times the expected value" if one.expected else f"{one.value:.3g}"
-        yield f"the {one.label} is {told}{_HINTS.get(one.name, '')}"
+        ratio = f"{one.value / one.expected:.3g} times the expected value" if one.expected else f"{one.value:.3g}"
+        yield f"the {one.label} is {ratio}{_HINTS.get(one.name, '')}"
 
 
 _HINTS: Final = {

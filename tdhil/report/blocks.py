@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from tdhil.recording import Recording
 from tdhil.report.acceptance import acceptance_rows, signature_rows
-from tdhil.report.card import COMPLIANT, estimate_text, inertia_text, minutes, plus_minus, rounded, sentence
+from tdhil.report.card import COMPLIANT, estimate_text, in_degrees, inertia_text, minutes, plus_minus, rounded, sentence
 from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows, uploaded_rows
 from tdhil.report.labels import (
     ACCELERATION_REGRESSION,
@@ -396,8 +396,8 @@ def _friction(document: Part) -> Table:
 def _harmonics(harmonics: Sequence[Part]) -> Iterator[Block]:
     """Yield the orders of the torque that depends on the angle, the largest first."""
     rows = [
-        (f"{one['order']}", *rounded(*(one["amplitude_nm"][key] for key in _ENDS)),
-         *rounded(*(math.degrees(one["phase_rad"][key]) for key in _ENDS)))
+        (f"{one['order']}", *rounded(*(one["amplitude_nm"][key] for key in ("value", "low", "high"))),
+         *rounded(**in_degrees(one["phase_rad"])))
         for one in harmonics
     ]
     heads = (("order", 0.1), ("amplitude, N·m", 0.18), ("from", 0.14), ("to", 0.14), ("phase, °", 0.16), ("from", 0.14),
@@ -406,9 +406,6 @@ def _harmonics(harmonics: Sequence[Part]) -> Iterator[Block]:
     yield Text("Torque a·cos(nθ + φ) against positive rotation, with order n and the angle θ of the motor shaft since "
                "the first reading. J and friction are without it. Cogging has the orders of slots and poles; an "
                "eccentric or unbalanced part has order 1.")
-
-
-_ENDS = ("value", "low", "high")
 
 
 def _lines(document: Part) -> Table:

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tdhil.report.acceptance import SIGNATURE_LINE
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Report, ReportSection, Table, shown_date
 from tdhil.report.card import sentence, with_interval
 from tdhil.report.document import SIMULATED
@@ -77,7 +78,7 @@ def date_and_signature(document: Part) -> ReportSection:
     """Return the last section of the page."""
     return ReportSection("Date and signature", (Pairs((
         ("date of calibration", shown_date(document["date"])), ("conditions", "temperature, warm-up: ____________"),
-        ("signature", "______________________"))),))
+        ("signature", SIGNATURE_LINE))),))
 
 
 def result_rows(quantities: Iterable[tuple[str, Part, str]]) -> Table:

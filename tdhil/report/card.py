@@ -171,12 +171,13 @@ def harmonic_rows(document: Mapping[str, Any]) -> Iterator[Row]:
     """Yield the torque that depends on the shaft's angle, a row for each order; a document before 0.4 has none."""
     title = TORQUE_OVER_ANGLE
     for one in document.get("harmonics") or ():
-        amplitude, phase = estimate_text(one["amplitude_nm"], "N·m"), _degrees(one["phase_rad"])
+        amplitude, phase = estimate_text(one["amplitude_nm"], "N·m"), in_degrees(one["phase_rad"])
         yield title, f"order {one['order']}: {amplitude}, phase {_plus_minus(phase)}°"
         title = ""
 
 
-def _degrees(part: Mapping[str, Any]) -> dict[str, float]:
+def in_degrees(part: Mapping[str, Any]) -> dict[str, float]:
+    """Return an angle with its interval, converted from rad to degrees."""
     return {key: math.degrees(part[key]) for key in ("value", "low", "high")}
 
 
@@ -267,10 +268,9 @@ def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
     rows.add_row("model", document["model"])
     if document.get("rehearsed_faults") and not document.get("rehearsal"):
         rows.add_row("rehearsed", ", ".join(document["rehearsed_faults"]))
-    for title, text in uploaded_rows(document.get("uploaded")):
-        rows.add_row(title, Text(text, overflow="fold"))
-    for title, text in (*rehearsal_rows(document.get("rehearsal")), *acceptance_rows(document.get("acceptance"))):
-        rows.add_row(title, Text(text, style=_TEST_STYLE.get(text, "")))
+    for title, text in (*uploaded_rows(document.get("uploaded")), *rehearsal_rows(document.get("rehearsal")),
+                        *acceptance_rows(document.get("acceptance"))):
+        rows.add_row(title, Text(text, style=_TEST_STYLE.get(text, ""), overflow="fold"))
     body: list[RenderableType] = [rows, Text()]
     if inertia is not None and document["budget"]:
         body += [budget_table(document["budget"], inertia["value"], not narrow), Text()]

@@ -15,7 +15,7 @@ from tdhil.recording import FloatArray, Recording
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, shown_date
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED, rehearsal_rows, run_facts
-from tdhil.report.html import sha256_of, write_blocks
+from tdhil.report.html import log_hash, write_blocks
 from tdhil.report.plots import DARK, OURS, QUIET, envelope
 from tdhil.soft_torque import COLUMNS, RPM, Phase
 
@@ -133,7 +133,7 @@ def write_evaluation_report(document: Part, rows: FloatArray, path: Path) -> Pat
 
     Raises UsageError if it cannot be written.
     """
-    return write_blocks(evaluation_report(document, rows, sha256_of(Path(document["log"]))), path)
+    return write_blocks(evaluation_report(document, rows, log_hash(document)), path)
 
 
 def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Report:

@@ -163,8 +163,8 @@ def _magnitude(axes: Axes, found: Part, name: str, colour: str, alone: bool = Tr
     for key, label, shade, mark in (("noise_rel", "noise", QUIET, "v"), ("distortion_rel", "distortion", PAPER, "^")):
         size = [line["magnitude"]["value"] * line[key] for line in lines]
         if alone and any(one > 0.0 for one in size):
-            told = label if key == "noise_rel" or found["distortion"]["detected"] else f"{label} (not detected)"
-            axes.plot(hertz, [one if one > 0.0 else math.nan for one in size], mark, color=shade, ms=5, label=told,
+            entry = label if key == "noise_rel" or found["distortion"]["detected"] else f"{label} (not detected)"
+            axes.plot(hertz, [one if one > 0.0 else math.nan for one in size], mark, color=shade, ms=5, label=entry,
                       mfc=shade if key == "noise_rel" or found["distortion"]["detected"] else "none")
     axes.set_yscale("log")
     axes.set_ylabel("|ω/T|, rad/(s·N·m)")

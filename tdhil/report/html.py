@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from hashlib import file_digest
 from html import unescape
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from tdhil.errors import MessageCode, UsageError
+from tdhil.file_hash import sha256_of
 from tdhil.recording import Recording
 from tdhil.report.blocks import WIDTH_IN, Picture, Report, report_of
 from tdhil.report.page import inline_svg, require_extra
@@ -62,7 +62,7 @@ def write_report(document: Mapping[str, Any], recording: Recording, path: Path) 
     The path differs if such a file was created meanwhile. Raises UsageError if the report cannot be written.
     """
     try:
-        return _put(report_of(document, recording, sha256_of(Path(document["log"]))), path)
+        return _put(report_of(document, recording, log_hash(document)), path)
     except OSError as error:      # of the file, or of a module or a font that cannot be read without a file descriptor
         raise UsageError(
             f"can't be written ({error.strerror or error})",
@@ -95,12 +95,11 @@ def _put(report: Report, path: Path) -> Path:
     return path
 
 
-def sha256_of(path: Path) -> str:
-    """Return the file's hash in hex; '' if it can't be read."""
+def log_hash(document: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of the document's log in hex; '' if it can't be read, since a report needs no log."""
     try:
-        with path.open("rb") as file:
-            return file_digest(file, "sha256").hexdigest()
-    except OSError:
+        return sha256_of(Path(document["log"]))
+    except UsageError:
         return ""
 
 

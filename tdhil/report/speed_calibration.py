@@ -62,10 +62,10 @@ def print_speed_calibration(document: Part, console: PlainConsole) -> None:
             style="bold"))
         rows.add_row("", "true speed = κ · reported speed: the drive reports"
                          f" {abs(error):.2g} % too {'much' if error > 0.0 else 'little'} speed")
-    told = document["inputs"]
-    if told:
-        rows.add_row("counted", f"{told['counted_turns']:g} turns of the {told['at']} shaft in"
-                                f" {told['seconds']:.5g} s, {abs(told['speed_rad_s']):.5g} rad/s reported")
+    inputs = document["inputs"]
+    if inputs:
+        rows.add_row("counted", f"{inputs['counted_turns']:g} turns of the {inputs['at']} shaft in"
+                                f" {inputs['seconds']:.5g} s, {abs(inputs['speed_rad_s']):.5g} rad/s reported")
     if document["log"] is not None:
         rows.add_row("log", Path(document["log"]["log"]).name)
     body: list[Any] = [rows]

@@ -53,7 +53,7 @@ def calibration_document(
     ``at``: the shaft for which the bodies were stated; every inertia is at the motor shaft. ``date``: of the
     calibration.
     """
-    told = [{**run, **asdict(point)} for run, point in zip(runs, found.points, strict=True)] if found.points else [
+    points = [{**run, **asdict(point)} for run, point in zip(runs, found.points, strict=True)] if found.points else [
         dict(run) for run in runs]
     return {
         "kind": "torque_calibration",
@@ -64,7 +64,7 @@ def calibration_document(
         "calibration_factor": quantity(found.factor, confidence),
         "inertia_kg_m2": quantity(found.inertia_kg_m2, confidence),
         "budget": [asdict(line) for line in found.budget],
-        "runs": told,
+        "runs": points,
         "line": None if not math.isfinite(found.slope) else {
             "slope": found.slope, "intercept_kg_m2": found.intercept_kg_m2,
             "covariance": [list(row) for row in found.line_covariance],

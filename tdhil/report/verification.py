@@ -16,7 +16,7 @@ from tdhil.recording import Recording
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, shown_date
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED, only_finite, rehearsal_rows, run_facts
-from tdhil.report.html import sha256_of, write_blocks
+from tdhil.report.html import log_hash, write_blocks
 from tdhil.report.plots import DARK, OURS, QUIET
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ def _ends(part: Part, times: float) -> str:
 
 def write_verification_report(document: Part, path: Path) -> Path:
     """Write the page, HTML or PDF by its name; return where it went. Raises UsageError if it can't be written."""
-    return write_blocks(verification_report(document, sha256_of(Path(document["log"]))), path)
+    return write_blocks(verification_report(document, log_hash(document)), path)
 
 
 def verification_report(document: Part, sha256: str = "") -> Report:

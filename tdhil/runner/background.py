@@ -1,24 +1,22 @@
 """Computations beside the control loop: in a worker process if one is ready, else in a thread of this process.
 
-A process has its own interpreter and priority: no cycle waits for it. It is started, and has loaded all modules, before
-the shaft moves. It receives work as pickles through a pipe, and answers through another. As a new program it inherits
-neither sockets nor signal handlers nor threads. It ends when its pipe is closed, and so whenever this process ends.
-Nothing ever waits for it: when its answer is not needed any more, it is killed.
+A process (`tdhil.worker_process`) has its own interpreter and priority: no cycle waits for it. It is started, and has
+loaded all modules, before the shaft moves. It ends whenever this process ends. Nothing ever waits for it: when its
+answer is not needed any more, it is killed.
 """
 
 from __future__ import annotations
 
-import os
 import pickle
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from threading import Event, Lock, Thread
-from typing import IO, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
-from tdhil.numerics import ONE_THREAD
+from tdhil.worker_process import READY, NotSent, WorkerProcess, result_in
 
 T = TypeVar("T")
 
@@ -31,39 +29,23 @@ NICE = 10
 READY_S = 60.0
 """Wall time for the process to load its modules, s. tdhil waits, because loading would disturb later steps."""
 
-READY = b"ready"
 _REAPED_S = 1.0           # wall time to wait for the end of a killed process, s
-_PROGRAM = (
-    "import pickle, sys\n"
-    "sys.path[:] = pickle.load(sys.stdin.buffer)\n"
-    "from tdhil.runner.background_process import serve\n"
-    "serve()\n"
-)
+_PROGRAM = "from tdhil.runner.background_process import main\nmain()"
 
 
 class Gone(Exception):
     """The process can't answer: it never started, died, or could not read the request."""
 
 
-class WorkerProcess:
-    """A worker process for computations. ``program``: its Python program; tests use another one.
+class BackgroundProcess:
+    """A worker process for one computation at a time, asked by any thread. ``program``: tests use another one.
 
     Raises OSError if it can't be started. The owner calls `end`, and `close` when there is time.
     """
 
     def __init__(self, program: str = _PROGRAM) -> None:
-        if not sys.executable:
-            raise FileNotFoundError("the path of the Python interpreter is unknown")
         self._answering = Lock()
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-c", program],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            env=os.environ | ONE_THREAD, **_out_of_the_way(),      # the other cores are for the control loop
-        )
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._questions: IO[bytes] = self._process.stdin
-        self._answers: IO[bytes] = self._process.stdout
+        self._process = WorkerProcess(program, quiet=True, yields=True)
         self._ready = Event()
         self._began = False
         Thread(target=self._await_ready, name="tdhil-worker", daemon=True).start()
@@ -84,43 +66,32 @@ class WorkerProcess:
         """
         with self._answering:
             try:
-                question = pickle.dumps(work)
-                pickle.dump(question, self._questions)
-                self._questions.flush()
-                kind, answer = pickle.load(self._answers)
-                found = pickle.loads(answer)
+                self._process.send(work)
+                answer = self._process.receive()
             except Exception as error:
                 raise Gone(f"{type(error).__name__}: {error}") from error
-        if kind == "unfit":
-            raise Gone(str(found))
-        if kind == "raised":
-            assert isinstance(found, BaseException)
-            raise found
-        result: T = found
+        try:
+            result: T = result_in(answer)
+        except NotSent as error:
+            raise Gone(str(error)) from error
         return result
 
     def end(self) -> None:
         """Kill the process in any state; returns at once."""
-        with suppress(OSError):
-            self._process.kill()
+        self._process.kill()
 
     def close(self) -> None:
         """Kill the process and close its pipes. This takes two seconds at most."""
         self.end()
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(_REAPED_S)
+        self._process.wait(_REAPED_S)
         if self._answering.acquire(timeout=_REAPED_S):
-            for pipe in (self._questions, self._answers):
-                with suppress(OSError):
-                    pipe.close()
+            self._process.close()
             self._answering.release()
 
     def _await_ready(self) -> None:
         with self._answering:
             try:
-                pickle.dump(sys.path, self._questions)
-                self._questions.flush()
-                self._began = pickle.load(self._answers) == READY
+                self._began = pickle.loads(self._process.receive()) == READY
             except Exception:       # any failure means not ready
                 self._began = False
             finally:
@@ -136,7 +107,7 @@ class Background(Generic[T]):
     """
 
     def __init__(
-        self, work: Callable[[], T], worker_process: WorkerProcess | None = None, *, or_thread: bool = True
+        self, work: Callable[[], T], worker_process: BackgroundProcess | None = None, *, or_thread: bool = True
     ) -> None:
         self.ended = Event()
         self.instead = ""
@@ -163,13 +134,13 @@ class Background(Generic[T]):
 
     def _run(self) -> None:
         try:
-            self._found.append(self._reckon())
+            self._found.append(self._result())
         except BaseException as error:         # raised by `result`
             self._failure = error
         finally:
             self.ended.set()
 
-    def _reckon(self) -> T:
+    def _result(self) -> T:
         if self._worker_process is not None:
             try:
                 return self._worker_process.ask(self._work)
@@ -203,7 +174,7 @@ def _in_a_thread(work: Background[Any]) -> Iterator[None]:
                 sys.setswitchinterval(_usual_s.pop())
 
 
-def goes_on() -> bool:
+def thread_computes() -> bool:
     """Return whether a dropped computation still runs in a thread of this process.
 
     The process must then not end in the usual way: on exit the C library ends OpenBLAS, which has been observed to
@@ -214,14 +185,14 @@ def goes_on() -> bool:
 
 def begin(
     meanwhile: Callable[[], object], stopped: Callable[[], bool], within_s: float = READY_S, program: str = _PROGRAM
-) -> tuple[WorkerProcess | None, str]:
+) -> tuple[BackgroundProcess | None, str]:
     """Return a ready process, or None and the reason. Returns None sooner once ``stopped`` returns True.
 
     It takes as long as Python loads the modules: a second or two, more on a busy computer. ``meanwhile`` runs beside
     it.
     """
     try:
-        worker_process = WorkerProcess(program)
+        worker_process = BackgroundProcess(program)
     except (OSError, ValueError, RuntimeError, subprocess.SubprocessError) as error:
         meanwhile()
         return None, f"it can't be started: {error}"
@@ -244,10 +215,3 @@ def begin(
     worker_process.close()
     return None, "a stop was requested"
 
-
-def _out_of_the_way() -> dict[str, Any]:
-    """Keep Ctrl-C from the process. It stays in the same session: across sessions nice values have no effect."""
-    if sys.platform == "win32":
-        flags = subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW
-        return {"creationflags": flags | subprocess.BELOW_NORMAL_PRIORITY_CLASS}
-    return {"process_group": 0}

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from threading import Event
 from typing import TypeVar
 
-from drivers import Command, Drive, DriveFault, KeptAlive, Mode, ModeNotConfirmed, PowerState, Sample, Telling
+from drivers import Command, Drive, DriveFault, KeptAlive, Mode, ModeNotConfirmed, PowerState, ReportsOthers, Sample
 from profiles import MessageCode
 from tdhil.recording import RunLog
-from tdhil.runner.background import Background, WorkerProcess
+from tdhil.runner.background import Background, BackgroundProcess
 from tdhil.runner.guard import Guard
 from tdhil.runner.settings import StopRequest
 
@@ -44,9 +44,9 @@ class ControlLoop:
         self.before: Sample | None = None            # the sample before ``last``
         self.observer: Watcher | None = None         # called by a stage after every cycle, after the guard
         self.quiet = False                         # the operator is being asked: the display stays off the terminal
-        self.worker_process: WorkerProcess | None = None     # long computations in real time; None: a thread
+        self.worker_process: BackgroundProcess | None = None     # long computations in real time; None: a thread
         self.remarks: list[str] = []       # actions of others on the drive's bus
-        self._telling = drive if isinstance(drive, Telling) else None
+        self._reports_others = drive if isinstance(drive, ReportsOthers) else None
         self._stop_request = stop_request
         self._watch = watch
 
@@ -62,8 +62,8 @@ class ControlLoop:
         sample = self.drive.exchange(command)
         self.log.cycle(command, sample)
         self.before, self.last = self.last, sample
-        if self._telling is not None:
-            for line in self._telling.remarks():
+        if self._reports_others is not None:
+            for line in self._reports_others.remarks():
                 self._note(line)
         self.guard.check_sample(command, sample)
         if self.guard.pace_is_due():
@@ -80,8 +80,8 @@ class ControlLoop:
         try:
             self.guard.observer.see(command, sample)
             self.log.cycle(command, sample)
-            if self._telling is not None:
-                for line in self._telling.remarks():
+            if self._reports_others is not None:
+                for line in self._reports_others.remarks():
                     self._note(line)
             if self._watch is not None:
                 self._watch(command, sample)
@@ -140,7 +140,7 @@ class ControlLoop:
 
         In stepped time the drive needs no setpoints, and a number of cycles that depends on the computer's speed would
         not repeat. So only keep-alive messages are sent, which do not advance time. In real time a worker process runs
-        the ``work`` if it is ready and accepts it (`background.WorkerProcess.ask`). Otherwise a thread does, which
+        the ``work`` if it is ready and accepts it (`background.BackgroundProcess.ask`). Otherwise a thread does, which
         shares the interpreter, and cycles are late. On a computer with one processor they may be late in any case.
         Lateness alone does not end the run meanwhile.
 

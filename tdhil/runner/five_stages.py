@@ -16,7 +16,7 @@ from tdhil.config import OPTION, identified_before_echo
 from tdhil.estimation import torque_answer
 from tdhil.recording import ImpedanceInput, LagPrior, RunLog
 from tdhil.runner import preconditions, stage_log
-from tdhil.runner.background import WorkerProcess, begin
+from tdhil.runner.background import BackgroundProcess, begin
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import PlanRefused
 from tdhil.runner.guard import Guard
@@ -26,7 +26,7 @@ from tdhil.runner.preconditions import (
     choose_mode,
     choose_rate,
     keep_within,
-    quieten,
+    load_before_motion,
     refuse_slow_reference,
     refuse_with_string,
     with_known_lag,
@@ -75,7 +75,7 @@ class Runner:
         self._book = StageBook(drive, log, display, say)
         self._stop: StopSequence | None = None
         self._before_echo = False
-        self._worker_process: WorkerProcess | None = None
+        self._worker_process: BackgroundProcess | None = None
 
     def run(self) -> RunOutcome:
         """Connect, run five stages, stop, close."""
@@ -99,7 +99,7 @@ class Runner:
                 with suppress(Exception):
                     self._display.stopped(report.confirmed)
             with suppress(Exception):
-                stage_log.tell(self._drive, self._log.configure, self._say)
+                stage_log.report_others(self._drive, self._log.configure, self._say)
             with suppress(Exception):
                 self._log.configure(counters=asdict(self._drive.counters))
             try:
@@ -239,7 +239,7 @@ class Runner:
     def _make_ready(self) -> str:
         """Load modules and start the worker process. Return why there is no worker process; empty if there is one."""
         stop_request = self._stop_request
-        self._worker_process, why = begin(quieten, lambda: stop_request.signum is not None)
+        self._worker_process, why = begin(load_before_motion, lambda: stop_request.signum is not None)
         stop_request.check()
         return why
 

@@ -404,7 +404,7 @@ class Guard:
                 next_step="The shaft was stopped. Check whether another master, a tool or a parameter changed it",
             )
 
-    def torque_told(self, torque_nm: float, limit_active: bool, disturbed: bool = False) -> tuple[str, str]:
+    def torque_words(self, torque_nm: float, limit_active: bool, disturbed: bool = False) -> tuple[str, str]:
         """Return two texts: the torque compared with its limit, and advice for a shaft that does not reach its speed.
 
         ``disturbed``: a drill string under load prevents that.
@@ -428,7 +428,7 @@ class Guard:
     def _check_following(self, command: Command, sample: Sample) -> None:
         following = self._following
         if sample.fresh and not following.see(command.speed_rad_s, sample):
-            torque, helps = self.torque_told(following.torque_nm, sample.limit_active)
+            torque, helps = self.torque_words(following.torque_nm, sample.limit_active)
             raise LimitHit(
                 f"the speed does not follow: {command.speed_rad_s:.3f} rad/s commanded,"
                 f" {following.speed_rad_s:.3f} rad/s reported, deviating since {following.since_s:.1f} s and no nearer"

@@ -103,13 +103,13 @@ def live_inertia(found: Identification, recording: Recording, confidence: float)
     time_s = float(recording.time_s[-1]) if len(recording.time_s) else 0.0
     if motion is not None and motion.segments:
         time_s = motion.segments[-1].end_s
-    told = LiveInertia(time_s, counted_periods(motion), confidence, found.verdict.value, found.reason)
+    live = LiveInertia(time_s, counted_periods(motion), confidence, found.verdict.value, found.reason)
     if residual is not None and math.isfinite(residual.p_value):
-        told = replace(told, p_value=residual.p_value)
+        live = replace(live, p_value=residual.p_value)
     if inertia is None:
-        return told
+        return live
     return replace(
-        told, inertia_kg_m2=inertia.value, low_kg_m2=inertia.low, high_kg_m2=inertia.high,
+        live, inertia_kg_m2=inertia.value, low_kg_m2=inertia.low, high_kg_m2=inertia.high,
         low_total_kg_m2=inertia.low_total, high_total_kg_m2=inertia.high_total,
     )
 
@@ -168,7 +168,7 @@ class InertiaWatch:
         if stepped:
             recording = self._log.recording(complete=True)
             self._next_s = now_s + STEPPED_S - 2.0 * loop.period_s     # ends of periods differ by a cycle
-            self._tell(loop.compute_while(partial(interim_answer, recording, asked), lambda: None).found)
+            self._report(loop.compute_while(partial(interim_answer, recording, asked), lambda: None).found)
             return
         if loop.worker_process is None:
             self._give_up("it is not there")
@@ -192,13 +192,13 @@ class InertiaWatch:
             self._give_up(f"{type(error).__name__}: {error}")
             return
         self._next_s = self._began_s + answered.cpu_s / CORE_SHARE
-        self._tell(answered.found)
+        self._report(answered.found)
 
     def _give_up(self, why: str) -> None:
         self._display = None
         self._log.event(self._loop.now_s, "host", f"{NO_ANSWERS} ({why})")
 
-    def _tell(self, found: LiveInertia) -> None:
+    def _report(self, found: LiveInertia) -> None:
         self._log.inertia(found)
         if self._display is not None:
             self._display.inertia(found)

@@ -38,14 +38,14 @@ from tdhil.runner.excitation import (
     PlanRefused,
     PlanRequest,
     RigGuess,
-    SwingKind,
-    SwingPlan,
+    SpeedChangeKind,
+    SpeedChangePlan,
     excitation_kind,
     fit_following,
     held_back_to,
     make_plan,
-    make_swings,
     periodic_kind,
+    plan_speed_changes,
 )
 from tdhil.runner.settings import ExcitationRequest
 from tdhil.runner.stages import RampCourse, reference_plan
@@ -63,7 +63,7 @@ class Planned:
     The half-width is infinite if no interval is expected, and NaN if it is not predicted.
     """
 
-    plan: Plan | SwingPlan
+    plan: Plan | SpeedChangePlan
     known: DesignKnowledge
     half_width: float
     usual_half_width: float
@@ -125,7 +125,7 @@ def plan_acquisition(
     request: ExcitationRequest, mode: str, limits: MotionLimits, guess: RigGuess, known: DesignKnowledge, left_s: float
 ) -> Planned:
     """Plan stage 5; ``left_s`` remains of the run's time limit. Raises PlanRefused with the reason."""
-    if isinstance(excitation_kind(request.kind), SwingKind):
+    if isinstance(excitation_kind(request.kind), SpeedChangeKind):
         return _swings(request, mode, limits, guess, known, left_s)
     wish = request_of(request, mode)
     if request.impedance is not None:
@@ -220,7 +220,7 @@ def refuse_hopeless(
     The message refers to the assumed rig. Everything that depends on the rig is planned once it is known.
     """
     first: PlanRefused | None = None
-    swings = isinstance(excitation_kind(request.kind), SwingKind)
+    swings = isinstance(excitation_kind(request.kind), SpeedChangeKind)
     for rig in _rigs(guess, limits):
         for mode in modes:
             try:
@@ -276,7 +276,7 @@ def _swings(
             f"{request.kind} has no frequency; use --amplitude, --offset, --periods or --max-time",
             "Remove --frequency",
         )
-    plan = make_swings(
+    plan = plan_speed_changes(
         request.kind,
         limits,
         guess,

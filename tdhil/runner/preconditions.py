@@ -91,7 +91,7 @@ class RateChoice:
         return [asdict(one) for one in self.tried]
 
 
-def quieten() -> None:
+def load_before_motion() -> None:
     """Load modules and collect garbage, before anything is armed and before the rate is measured.
 
     Reading scipy from the disk takes seconds, in pieces that block all other threads. Each garbage collection over all

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from drivers import Counters, Drive, Preflight, Rehearsed, Telling
+from drivers import Counters, Drive, Preflight, Rehearsed, ReportsOthers
 from profiles import CodedText, MessageCode
 from tdhil.recording import RunLog, Stage
 from tdhil.runner import preconditions
@@ -18,10 +18,10 @@ from tdhil.runner.task import Display, Say
 
 def summary(drive: Drive) -> tuple[str, ...]:
     """Return the actions of others in the whole run, one line each; none if the drive can't detect them."""
-    return drive.summary() if isinstance(drive, Telling) else ()
+    return drive.summary() if isinstance(drive, ReportsOthers) else ()
 
 
-def tell(drive: Drive, configure: Callable[..., None], say: Callable[[str], None]) -> None:
+def report_others(drive: Drive, configure: Callable[..., None], say: Callable[[str], None]) -> None:
     """Write the actions of others to the log's configuration and to the display, at the end."""
     if lines := summary(drive):
         configure(others=list(lines))

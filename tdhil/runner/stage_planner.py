@@ -15,7 +15,7 @@ from tdhil.recording import FloatArray, LagPrior, RunLog, SteppedSetpoint
 from tdhil.runner.adaptive_duration import Decision, Enough
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.design import DesignKnowledge, NoiseDensity, assumed_noise, measured_noise
-from tdhil.runner.excitation import MotionLimits, Plan, PlanRefused, RigGuess, SwingPlan, leaves_time_before_echo
+from tdhil.runner.excitation import MotionLimits, Plan, PlanRefused, RigGuess, SpeedChangePlan, leaves_time_before_echo
 from tdhil.runner.guard import LIGHTEN, Guard
 from tdhil.runner.interim import Identify
 from tdhil.runner.planning import Planned, as_followed, plan_acquisition
@@ -68,7 +68,7 @@ class StagePlanner:
         assumed = assumed_noise(limits.torque_nm, limits.speed_max_rad_s)
         theta = DesignKnowledge(assumed, prior).theta(model)
 
-        work = partial(_reckon, request, mode, room, model, prior, assumed, speed.steady, theta, course,
+        work = partial(_planned_stage, request, mode, room, model, prior, assumed, speed.steady, theta, course,
                        left_s, limits.has_drill_string)
         try:
             planned = loop.compute(work, keep)
@@ -97,10 +97,10 @@ class StagePlanner:
             f"{plan.kind} in {plan.mode} mode, {plan.duration_s:.0f} s, speed {plan.speed_min_rad_s:.2f} to "
             f"{plan.speed_max_rad_s:.2f} rad/s, torque {plan.torque_min_nm:.0f} to {plan.torque_max_nm:.0f} N·m",
         )
-        self._tell(planned.said())
+        self._report(planned.said())
         before_echo = identified_before_echo(request.kind)
         if speed.swing is not None and not before_echo and leaves_time_before_echo(limits.echo_s):
-            self._tell(
+            self._report(
                 "the string's motion will hide some of these frequencies; --excitation prbs uses only the time before"
                 " an echo, and is more accurate for J above a bit"
             )
@@ -114,23 +114,23 @@ class StagePlanner:
         rule = planned.stopping
         if rule is None:
             return None
-        told: list[dict[str, Any]] = []
+        decisions: list[dict[str, Any]] = []
 
         def note(decision: Decision) -> None:
-            told.append(decision.plain())
-            self._log.configure(stopping=rule.plain() | {"decisions": list(told)})
-            self._tell(decision.why)
+            decisions.append(decision.plain())
+            self._log.configure(stopping=rule.plain() | {"decisions": list(decisions)})
+            self._report(decision.why)
 
         assert isinstance(planned.plan, Plan)
         return Enough(rule, planned.plan, lambda: self._log.recording(complete=True), note, identify=identify)
 
-    def _note_following(self, plan: Plan | SwingPlan) -> None:
+    def _note_following(self, plan: Plan | SpeedChangePlan) -> None:
         """Log the data that identification needs for the effect of a stepped, slowly sampled setpoint on J."""
         following, ramp = plan.guess.following, plan.limits.acceleration_rad_s2
         if math.isfinite(ramp):
-            self._tell(f"the drive's own speed ramp limits the shaft to {ramp:.3g} rad/s²; stage 5 stays below it")
+            self._report(f"the drive's own speed ramp limits the shaft to {ramp:.3g} rad/s²; stage 5 stays below it")
         if following is None:
-            self._tell("the drive's response to its setpoint is not clear; stage 5 assumes that it follows at once")
+            self._report("the drive's response to its setpoint is not clear; stage 5 assumes that it follows at once")
             return
         self._log.learn(
             stepped_setpoint=SteppedSetpoint(
@@ -138,12 +138,12 @@ class StagePlanner:
             )
         )
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         self._log.event(self._loop.now_s, "plan", text)
         self._say(text)
 
 
-def _reckon(
+def _planned_stage(
     request: ExcitationRequest,
     mode: Mode,
     room: MotionLimits,

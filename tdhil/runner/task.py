@@ -12,7 +12,7 @@ from tdhil.recording import Stage
 from tdhil.runner.settings import ControlAssumptions, ExcitationRequest, MachineLimits
 
 if TYPE_CHECKING:       # code that only reads logs does not need these modules
-    from tdhil.runner.excitation import Plan, SwingPlan
+    from tdhil.runner.excitation import Plan, SpeedChangePlan
     from tdhil.runner.stop import StopReport
     from tdhil.soft_torque import EvaluationCase
     from tdhil.speed_loop import StepCase
@@ -35,7 +35,7 @@ class Display(Protocol):
 
     def cycle(self, command: Command, sample: Sample) -> None: ...
 
-    def planned(self, plan: Plan | SwingPlan) -> None: ...
+    def planned(self, plan: Plan | SpeedChangePlan) -> None: ...
 
     def stage_ended(self, stage: Stage) -> None: ...
 

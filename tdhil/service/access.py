@@ -27,7 +27,7 @@ from starlette.requests import HTTPConnection
 from starlette.responses import Response
 
 from tdhil.errors import TdhilError
-from tdhil.service.accounts import ROLES, Accounts, AccountsFile, Role, matches, role_at_least
+from tdhil.service.accounts import ROLES, Accounts, AccountsFile, Role, User, matches, role_at_least
 from tdhil.service.run_state import NotAllowed, NotLoggedIn, TooManyRuns, TooManyTries
 from tdhil.service.schemas import CSRF_HEADER
 from tdhil.service.store import read_json, write_json
@@ -45,7 +45,7 @@ STOPS: Final = frozenset({"stop", "stop_rig"})
 """Routes that are never refused to a known client."""
 _MOST_SESSIONS: Final = 5000
 _PROXIES: Final = ("forwarded", "x-forwarded-for", "x-real-ip", "via")
-_ENGINEER_S: Final = ("accept_unverified", "accept_wider_limit", "accept_speed_unit")
+_ENGINEER_OPTIONS: Final = ("accept_unverified", "accept_wider_limit", "accept_speed_unit")
 Say = Callable[[str], None]
 
 
@@ -251,6 +251,10 @@ class Access:
         if user is None or not good:
             raise NotLoggedIn("name or password is wrong", where="login")
         self.tries.good(name, address)
+        return self.begin_session(user)
+
+    def begin_session(self, user: User) -> tuple[str, Principal]:
+        """Begin a session of a user whose identity was checked. Return the cookie's value and the client."""
         cookie, now_s = secrets.token_urlsafe(32), self._clock()
         with self._lock:
             kept = {one: it for one, it in self._sessions.items() if now_s < it.ends_s + STOPS_S}
@@ -326,7 +330,7 @@ def require(who: Principal, role: Role | None, *, route: str, open_here: bool, c
 
 def require_options(who: Principal, options: Mapping[str, Any]) -> None:
     """Check options that only an engineer may request. Raises NotAllowed."""
-    for name in _ENGINEER_S:
+    for name in _ENGINEER_OPTIONS:
         if options.get(name) and "engineer" not in who.roles:
             raise NotAllowed(f"{who.name} is not an engineer; only an engineer may accept unverified entries",
                              where=name, next_step="Ask an engineer")

@@ -101,7 +101,7 @@ class Board:
             try:
                 self._store.save(status)
             except OSError as error:           # a full disk: the log ends the run, not the status
-                tell(f"the run's status can't be written: {error}")
+                print_line(f"the run's status can't be written: {error}")
                 if self._end:
                     return
                 time.sleep(0.5)
@@ -110,7 +110,7 @@ class Board:
             last = status
 
 
-def tell(text: str) -> None:
+def print_line(text: str) -> None:
     """Print a line for process.log. It is lost if the disk is full."""
     with suppress(OSError, ValueError):
         print(text, file=sys.stderr, flush=True)  # noqa: T201
@@ -396,16 +396,16 @@ class ServiceOperator:
                 needed=lambda: self._board.status.state in (State.AWAITING, State.MOVING),
             )
             self.lease.start()
-        told = {"binding": confirming.binding, "at": now(), "by": confirming.confirmed_by}
-        threading.Thread(target=self._write_down, args=(told,), daemon=True).start()
+        confirmed = {"binding": confirming.binding, "at": now(), "by": confirming.confirmed_by}
+        threading.Thread(target=self._write_down, args=(confirmed,), daemon=True).start()
 
     def _note_watch(self, watch: Watch) -> None:
         self._board.know(watch=watch)
         self._watcher.remark(WATCHED[watch.how] if watch.lost is None else f"{WATCHED[watch.how]}: the run brakes")
 
-    def _write_down(self, told: Mapping[str, Any]) -> None:
+    def _write_down(self, confirmed: Mapping[str, Any]) -> None:
         with suppress(OSError):
-            write_json(self._folder / "confirm.json", told)
+            write_json(self._folder / "confirm.json", confirmed)
 
     def confirm_speed(self, speed_rad_s: float, why: str, idle: Idle) -> None:
         raise PreflightRefused(
@@ -416,7 +416,7 @@ class ServiceOperator:
         )
 
     def say(self, text: str) -> None:
-        tell(text)
+        print_line(text)
 
     def warn(self, text: str) -> None:
-        tell(text)
+        print_line(text)

@@ -29,16 +29,16 @@ T = TypeVar("T")
 def routes(site: Site) -> list[Route]:
     """Return the routes of logins, users and tokens."""
     return [
-        api(site, "me", me),
-        api(site, "login", login),
-        api(site, "logout", logout),
-        api(site, "password", password),
-        api(site, "accounts", accounts),
-        api(site, "add_user", add_user),
-        api(site, "set_password", set_password),
-        api(site, "remove_user", remove_user),
-        api(site, "add_token", add_token),
-        api(site, "remove_token", remove_token),
+        api(site, me),
+        api(site, login),
+        api(site, logout),
+        api(site, password),
+        api(site, accounts),
+        api(site, add_user),
+        api(site, set_password),
+        api(site, remove_user),
+        api(site, add_token),
+        api(site, remove_token),
     ]
 
 

@@ -32,14 +32,14 @@ PICTURE_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; sandbox"
 def routes(site: Site) -> list[Route]:
     """Return the routes of a run's files."""
     return [
-        api(site, "log", log),
-        api(site, "report", report),
-        api(site, "report_pdf", report_pdf),
-        api(site, "result", result),
-        api(site, "samples", samples),
-        api(site, "recording", recording),
-        api(site, "pictures", pictures),
-        api(site, "picture", picture),
+        api(site, log),
+        api(site, report),
+        api(site, report_pdf),
+        api(site, result),
+        api(site, samples),
+        api(site, recording),
+        api(site, pictures),
+        api(site, picture),
     ]
 
 

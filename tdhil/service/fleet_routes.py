@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 def routes(site: Site) -> list[Route]:
     """Return the routes. ``fleet_folders`` comes before ``fleet``, since the path of ``fleet`` matches it, too."""
     return [
-        api(site, "fleets", fleets),
-        api(site, "fleet_folders", fleet_folders),
-        api(site, "ask_fleet", ask_fleet),
-        api(site, "fleet", fleet),
-        api(site, "stop_fleet", stop_fleet),
-        api(site, "fleet_rows", fleet_rows),
-        api(site, "fleet_table", fleet_table),
+        api(site, fleets),
+        api(site, fleet_folders),
+        api(site, ask_fleet),
+        api(site, fleet),
+        api(site, stop_fleet),
+        api(site, fleet_rows),
+        api(site, fleet_table),
     ]
 
 

@@ -219,15 +219,15 @@ class Fleets:
 
     def _gate(self, going: _Going) -> None:
         """Hold the process while a shaft turns. It still finishes its present logs: about 1 s each, at nice 19."""
-        told = None
+        sent = None
         assert going.process.stdin is not None
         while True:
             held = self._turning()
-            if held != told:
+            if held != sent:
                 with suppress(OSError, ValueError):
                     going.process.stdin.write(b"hold\n" if held else b"go\n")
                     going.process.stdin.flush()
-                told = held
+                sent = held
                 with self._lock:
                     going.view = replace(going.view, held=held)
             if going.ended.wait(LOOK_S):

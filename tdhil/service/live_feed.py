@@ -135,7 +135,7 @@ class Feed:
         self.viewers.discard(queue)
 
     async def _run(self) -> None:
-        told_s = 0.0
+        sent_s = 0.0
         while self.viewers:
             news, status = await anyio.to_thread.run_sync(self._look)
             shown = self.picture.take(news, time.monotonic())
@@ -143,9 +143,9 @@ class Feed:
                 self.status = status
                 shown["status"] = status.plain()
             now_s = time.monotonic()
-            if shown or now_s - told_s >= HEARTBEAT_S:
-                told_s = now_s
-                self._tell(self._dated({"type": "news", **shown}))
+            if shown or now_s - sent_s >= HEARTBEAT_S:
+                sent_s = now_s
+                self._publish(self._dated({"type": "news", **shown}))
             await asyncio.sleep(0.0 if news.more else EVERY_S)
 
     def _look(self) -> tuple[LogNews, Status | None]:
@@ -163,7 +163,7 @@ class Feed:
         age_s = self.picture.age_s(time.time(), time.monotonic())
         return {**message, "age_s": None if age_s is None else round(age_s, 3), "time_s": self.picture.last_s}
 
-    def _tell(self, message: dict[str, Any]) -> None:
+    def _publish(self, message: dict[str, Any]) -> None:
         for queue in tuple(self.viewers):
             try:
                 queue.put_nowait(message)

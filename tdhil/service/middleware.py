@@ -122,14 +122,14 @@ def status_of(error: BaseException) -> int:
         if isinstance(error, kind):
             return status
     if isinstance(error, RunRefused):
-        return {int(ExitCode.USAGE): 422, int(ExitCode.REFUSED): 409}.get(int(error.told.exit_code), 500)
+        return {int(ExitCode.USAGE): 422, int(ExitCode.REFUSED): 409}.get(int(error.reported.exit_code), 500)
     return 500
 
 
-def told_of(error: BaseException) -> ErrorView:
+def error_view(error: BaseException) -> ErrorView:
     """Return the reply's body for an error."""
     if isinstance(error, RunRefused):
-        return ErrorView(error.told)
+        return ErrorView(error.reported)
     if isinstance(error, HTTPException):
         return ErrorView(Told("UsageError", error.detail, error.detail, "", "", int(ExitCode.USAGE),
                               MessageCode.REQUEST_WRONG.code))
@@ -154,7 +154,7 @@ def error_response(error: BaseException, status: int | None = None, headers: Map
     headers = {**headers, **({"www-authenticate": "Bearer"} if isinstance(error, NotLoggedIn) else {})}
     if isinstance(error, TooManyTries):
         headers["retry-after"] = f"{error.wait_s:.0f}"
-    return JSONResponse(plain(told_of(error), ErrorView), status or status_of(error), headers=headers)
+    return JSONResponse(plain(error_view(error), ErrorView), status or status_of(error), headers=headers)
 
 
 async def body_of(request: Request, route: Route) -> Any:

@@ -104,7 +104,7 @@ class Publisher:
             raise UsageError("--mqtt needs paho-mqtt, not installed here",
                              next_step="Install: pip install 'tdhil[mqtt]'", entry=MessageCode.PACKAGE_MISSING)
         self._broker, self._look, self._say = broker, look, say
-        self._told: dict[str, str] = {}
+        self._published: dict[str, str] = {}
         self._connected, self._end = threading.Event(), threading.Event()
         self._silent = False               # whether the lost connection was reported
         self._client = self._make()
@@ -157,7 +157,7 @@ class Publisher:
             self._away(str(reason))
             return
         self._silent = False
-        self._told.clear()                 # retained messages may be out of date
+        self._published.clear()            # retained messages may be out of date
         self._connected.set()
         self._say(f"MQTT: states and results are sent to {self._broker}")
 
@@ -174,7 +174,7 @@ class Publisher:
         while not self._end.wait(EVERY_S):
             if self._connected.is_set():
                 try:
-                    self._tell()
+                    self._publish_news()
                     trouble = ""
                 except Exception as error:     # one poll failed: the next poll reports again
                     trouble = f"MQTT: {type(error).__name__}: {error}"
@@ -182,16 +182,16 @@ class Publisher:
                     self._say(trouble)
                 said = trouble
 
-    def _tell(self) -> None:
+    def _publish_news(self) -> None:
         news = {"status": ONLINE} | {
             topic: json.dumps(plain, allow_nan=False) for topic, plain in self._look().items()}
-        gone = dict.fromkeys(self._told.keys() - news.keys(), "")      # an empty message deletes a retained one
+        gone = dict.fromkeys(self._published.keys() - news.keys(), "")      # an empty message deletes a retained one
         for topic, text in (news | gone).items():
-            if self._told.get(topic) != text and self._connected.is_set():
+            if self._published.get(topic) != text and self._connected.is_set():
                 self._publish(topic, text)
-                self._told[topic] = text
+                self._published[topic] = text
         for topic in gone:
-            self._told.pop(topic, None)
+            self._published.pop(topic, None)
 
     def _publish(self, topic: str, text: str) -> Any:
         return self._client.publish(f"{self._broker.prefix}/{topic}", text, qos=1, retain=True)

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 def routes(site: Site) -> list[Route]:
     """Return the routes of a new rig."""
-    return [api(site, "new_rig", new_rig), api(site, "draft_rig", draft_rig), api(site, "scan_bus", scan_bus),
-            api(site, "add_rig", add_rig)]
+    return [api(site, new_rig), api(site, draft_rig), api(site, scan_bus),
+            api(site, add_rig)]
 
 
 async def new_rig(site: Site, request: Request, body: None) -> NewRigView:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from tdhil.errors import LogError, MessageCode
+from tdhil.file_hash import sha256_of
 from tdhil.service.acceptance_signature import (
     FILE,
     LONGEST_NAME,
@@ -27,7 +28,7 @@ from tdhil.service.annotations import LONGEST_TEXT, one_line, tags_of
 from tdhil.service.run_channel import lives
 from tdhil.service.run_state import Conflict, State, now
 from tdhil.service.start_request import ValuesWrong
-from tdhil.service.store import read_json, sha256_of_file, write_json
+from tdhil.service.store import read_json, write_json
 from tdhil.service.supervisor import Supervisor
 
 LOG: Final = "run.mcap"
@@ -88,7 +89,7 @@ class RunRecords:
                 raise Conflict("a sign-off refers to this run: it is kept", where=where, next_step="Archive it")
             if self.signature(run) is not None:
                 raise Conflict("the acceptance of this run is signed: it is kept", where=where, next_step="Archive it")
-            log_sha256 = sha256_of_file(folder / LOG)
+            log_sha256 = sha256_of(folder / LOG, missing="", name=LOG)
             if (found := self._calibration_from(log_sha256)) is not None:
                 raise Conflict(f"the torque calibration {found.name} refers to this run: it is kept", where=where,
                                next_step="Archive it")
@@ -175,7 +176,7 @@ class RunRecords:
         stamp = (looked.st_size, looked.st_mtime_ns, looked.st_ctime_ns)
         known = self._hashes.get(run)
         if known is None or known[0] != stamp:
-            known = self._hashes[run] = (stamp, sha256_of_file(path))
+            known = self._hashes[run] = (stamp, sha256_of(path, missing="", name=LOG))
         return known[1]
 
     # ----------------------------------------------------------------------------------------------------------------

@@ -40,17 +40,17 @@ LARGEST_KG_M2: Final = 1e9
 def routes(site: Site) -> list[Route]:
     """Return the routes of the rigs."""
     return [
-        api(site, "rigs", rigs),
-        api(site, "rig", rig),
-        api(site, "rig_file", rig_file),
-        api(site, "edit_rig", edit_rig),
-        api(site, "trend", trend),
-        api(site, "calibration", calibration),
-        api(site, "plan", plan),
-        api(site, "pace", pace),
-        api(site, "start", start),
-        api(site, "stop_rig", stop_rig),
-        api(site, "faults", faults),
+        api(site, rigs),
+        api(site, rig),
+        api(site, rig_file),
+        api(site, edit_rig),
+        api(site, trend),
+        api(site, calibration),
+        api(site, plan),
+        api(site, pace),
+        api(site, start),
+        api(site, stop_rig),
+        api(site, faults),
     ]
 
 

@@ -6,8 +6,8 @@ checked body. It returns a view, a status with a view, or a whole reply.
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
-from typing import Any, Final
+from collections.abc import Awaitable
+from typing import Any, Final, Protocol
 
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
@@ -20,12 +20,22 @@ from tdhil.service.middleware import body_of, error_response
 from tdhil.service.schemas import API, CSRF_HEADER, plain
 from tdhil.service.site import Site
 
-Handler = Callable[[Site, Request, Any], Awaitable[Any]]
+
+class Handler(Protocol):
+    """Function that answers the requests of one route. Its name is the route's."""
+
+    __name__: str
+
+    def __call__(self, site: Site, request: Request, body: Any, /) -> Awaitable[Any]:
+        """Answer a request with its checked body."""
+
+
 DECLARED: Final = {one.name: one for one in schemas.ROUTES}
 
 
-def api(site: Site, name: str, handler: Handler, *, base: str = API) -> Route:
-    """Return the route declared with this name. It checks role and body, then calls ``handler``."""
+def api(site: Site, handler: Handler, *, base: str = API) -> Route:
+    """Return the route that is declared with the name of ``handler``. It checks role and body, then calls it."""
+    name = handler.__name__
     declared = DECLARED[name]
     first = next(iter(declared.answers))
 

@@ -33,13 +33,13 @@ Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
 class RunRefused(TdhilError):
-    """Refusal by the run. ``told``: the error that the run reported."""
+    """Refusal by the run. ``reported``: the error that the run reported."""
 
-    def __init__(self, told: Told) -> None:
-        super().__init__(told.what, where=told.where, next_step=told.next_step)
-        self.told = told
-        self.exit_code = told.exit_code
-        self.entry = message_of(told.code) or self.entry
+    def __init__(self, reported: Told) -> None:
+        super().__init__(reported.what, where=reported.where, next_step=reported.next_step)
+        self.reported = reported
+        self.exit_code = reported.exit_code
+        self.entry = message_of(reported.code) or self.entry
 
 
 class ChannelListener:

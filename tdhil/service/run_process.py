@@ -28,7 +28,7 @@ from tdhil.service.attendance import (
     Confirming,
     ServiceOperator,
     Watcher,
-    tell,
+    print_line,
 )
 from tdhil.service.run_channel import STOP_FILE, ChannelListener
 from tdhil.service.run_state import State, Status, Told, Watch, end_of, now, way_to
@@ -191,7 +191,7 @@ class RunProcess:
             row = row_of(self.request.id, document, settings=FleetSettings(), torque_scale_rel_sd=torque_scale_rel_sd)
             write_json(self.folder / "row.json", asdict(replace(row, rig=self.request.rig)))
         except Exception as error:             # the result is valid without this row
-            tell(f"the history can't be written: {error}")
+            print_line(f"the history can't be written: {error}")
 
     def _report(self, document: Mapping[str, Any], recording: Any) -> None:
         from tdhil.errors import UsageError
@@ -200,7 +200,7 @@ class RunProcess:
         try:
             write_report(document, recording, Path("report.html"))
         except (UsageError, OSError) as error:
-            tell(f"the report can't be written: {error}")
+            print_line(f"the report can't be written: {error}")
 
     def _ended(self, outcome: RunOutcome, rehearsal: Rehearsal | None) -> int:
         from tdhil.errors import ExitCode, exit_code
@@ -211,11 +211,11 @@ class RunProcess:
         confirmed = None if outcome.stop is None else outcome.stop.confirmed
         if outcome.stop is not None and not outcome.stop.confirmed:
             error, code = not_confirmed(outcome.stop), ExitCode.STOP_NOT_CONFIRMED
-        ended_with, told = int(code), None
+        ended_with, rehearsed = int(code), None
         if rehearsal is not None:
-            ended_with, told = rehearsal.exit_code(int(code)), rehearsal.plain()
+            ended_with, rehearsed = rehearsal.exit_code(int(code)), rehearsal.plain()
         self._end(_cut_short(code, confirmed), ended_with, error=None if error is None else Told.of(error),
-                  rehearsal=told)
+                  rehearsal=rehearsed)
         if confirmed:
             self._conclude_part()
         return ended_with
@@ -235,7 +235,7 @@ class RunProcess:
         except TdhilError:
             return                             # no data to identify from; the error of the run states why
         except Exception as error:
-            tell(f"the part of the run can't be identified: {error}")
+            print_line(f"the part of the run can't be identified: {error}")
             return
         write_json(self.folder / "result.json", found.document)
         self._row(found.document, record.recording.torque_scale_rel_sd)
@@ -250,7 +250,7 @@ class RunProcess:
 
         code = int(exit_code(error))
         if not isinstance(error, TdhilError):
-            tell("".join(traceback.format_exception(error)))
+            print_line("".join(traceback.format_exception(error)))
         self._end(_cut_short(code, None), code, error=Told.of(error))
         return code
 

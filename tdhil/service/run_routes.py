@@ -14,7 +14,7 @@ from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.access import principal
 from tdhil.service.accounts import ROLES
 from tdhil.service.attendance import LEASE_S
-from tdhil.service.middleware import off, told_of
+from tdhil.service.middleware import error_view, off
 from tdhil.service.routing import api
 from tdhil.service.run_state import NotThere, State, now
 from tdhil.service.schemas import (
@@ -53,20 +53,20 @@ LONGEST_SEARCH: Final = 200
 def routes(site: Site) -> list[Route]:
     """Return the routes. ``compare`` comes before ``run``, since the path of ``run`` matches it, too."""
     return [
-        api(site, "runs", runs),
-        api(site, "compare", compare),
-        api(site, "run", run),
-        api(site, "confirm", confirm),
-        api(site, "renew", renew),
-        api(site, "stop", stop),
-        api(site, "sign_off", sign_off),
-        api(site, "annotate", annotate),
-        api(site, "archive", archive),
-        api(site, "delete_run", delete_run),
-        api(site, "acceptance", acceptance),
-        api(site, "sign_acceptance", sign_acceptance),
-        api(site, "ask_replay", ask_replay),
-        api(site, "replay", replay),
+        api(site, runs),
+        api(site, compare),
+        api(site, run),
+        api(site, confirm),
+        api(site, renew),
+        api(site, stop),
+        api(site, sign_off),
+        api(site, annotate),
+        api(site, archive),
+        api(site, delete_run),
+        api(site, acceptance),
+        api(site, sign_acceptance),
+        api(site, ask_replay),
+        api(site, replay),
     ]
 
 
@@ -266,12 +266,12 @@ async def _replay_later(site: Site, which: str, view: ReplayView) -> None:
         found = await site.work("replay", which, view.asked)
         done = ReplayView(view.name, view.asked, view.at, view.by, "done", found)
     except TdhilError as error:
-        done = ReplayView(view.name, view.asked, view.at, view.by, "failed", error=told_of(error).error)
+        done = ReplayView(view.name, view.asked, view.at, view.by, "failed", error=error_view(error).error)
     path = site.store.place(which) / "replays" / f"{view.name}.json"
     try:
         await off(lambda: write_json(path, plain(done, ReplayView)))
     except OSError as error:
-        lost = told_of(LogError(f"the replay can't be written ({error.strerror or error})", where=path.name)).error
+        lost = error_view(LogError(f"the replay can't be written ({error.strerror or error})", where=path.name)).error
         site.waiting_replays[which, view.name] = ReplayView(
             view.name, view.asked, view.at, view.by, "failed", error=lost)
     else:

@@ -144,10 +144,9 @@ def serve(
     if rigs is not None and not rigs.is_dir():
         raise UsageError("this folder does not exist", where=f"--rigs {rigs}", next_step="Name a folder of rig files",
                          entry=MessageCode.FILE_NOT_FOUND)
-    for folder in logs:
-        if not folder.is_dir():
-            raise UsageError("this folder does not exist", where=f"--logs {folder}", next_step="Name a folder of logs",
-                             entry=MessageCode.FILE_NOT_FOUND)
+    if missing := [folder for folder in logs if not folder.is_dir()]:
+        raise UsageError("this folder does not exist", where=f"--logs {missing[0]}", next_step="Name a folder of logs",
+                         entry=MessageCode.FILE_NOT_FOUND)
 
     from tdhil.service.access import Access
     from tdhil.service.audit import Audit
@@ -162,9 +161,7 @@ def serve(
     from tdhil.service.webhook import Webhook
 
     broker = None if mqtt is None else Broker.of(mqtt)
-    receivers: list[Receiver] = [] if webhook is None else [Webhook.of(webhook)]
-    if mail is not None:
-        receivers.append(Mail.of(mail))
+    receivers: list[Receiver] = [kind.of(url) for kind, url in ((Webhook, webhook), (Mail, mail)) if url is not None]
     store = Store(data.resolve())
     store.prepare()
     alone = _alone(store.folder)
@@ -172,7 +169,7 @@ def serve(
     room = Room.of(raise_limit())
     web = Web(supervisor, hosts=allowed, viewers=viewers, access=Access(store.folder, login=accounts, say=say),
               logs={str(one): one for one in logs}, upload_limit=upload_limit)
-    publisher = None if broker is None else Publisher(broker, web.told, say)
+    publisher = None if broker is None else Publisher(broker, web.broker_messages, say)
     listening = _listen(host, port)
     at = listening.getsockname()[1]
     shown = f"[{host}]" if ":" in host else host

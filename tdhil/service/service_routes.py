@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 def routes(site: Site) -> list[Route]:
     """Return the routes. Health and metrics are also at the root, where monitoring systems expect them."""
     return [
-        api(site, "audit", audit),
-        api(site, "health", health),
-        api(site, "health", health, base=""),
-        api(site, "metrics", metrics),
-        api(site, "metrics", metrics, base=""),
-        api(site, "openapi", openapi),
+        api(site, audit),
+        api(site, health),
+        api(site, health, base=""),
+        api(site, metrics),
+        api(site, metrics, base=""),
+        api(site, openapi),
     ]
 
 

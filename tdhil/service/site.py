@@ -220,7 +220,7 @@ class Site:
             self.records.signature(run), None if request.uploaded is None else dict(request.uploaded),
         )
 
-    def told(self) -> dict[str, Any]:
+    def broker_messages(self) -> dict[str, Any]:
         """Return the messages for a broker, by topic: each rig's state and latest result."""
         found: dict[str, Any] = {}
         for rig in self.supervisor.rigs.all():

@@ -21,11 +21,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from hashlib import file_digest
 from pathlib import Path
 from typing import Any, Final
 
-from tdhil.errors import LogUnopened, UsageError
+from tdhil.errors import LogUnopened
 from tdhil.service.annotations import Annotations
 from tdhil.service.run_state import NotThere, State, Status, now
 
@@ -71,17 +70,6 @@ def read_json(path: Path) -> dict[str, Any] | None:
             found = json.loads(path.read_bytes())
             return found if isinstance(found, dict) else None
     return None
-
-
-def sha256_of_file(path: Path) -> str:
-    """Return the SHA-256 of a file in hex; '' without the file. Raises UsageError if it can't be read."""
-    try:
-        with path.open("rb") as file:
-            return file_digest(file, "sha256").hexdigest()
-    except FileNotFoundError:
-        return ""
-    except OSError as error:
-        raise UsageError(f"can't be read ({error.strerror or error})", where=path.name) from error
 
 
 def _sync_folder(folder: Path) -> None:

@@ -233,10 +233,10 @@ class Supervisor:
             try:
                 self._begin(run)
             except OSError as error:
-                told = Told.of(Conflict(f"the run's process can't be started ({error})", where=f"run {run}"))
+                reported = Told.of(Conflict(f"the run's process can't be started ({error})", where=f"run {run}"))
                 with suppress(OSError):
-                    self.store.save(way_to(self.store.status(run), State.FAILED, now(), error=told, exit_code=1))
-                raise Conflict(told.what, where=told.where) from error
+                    self.store.save(way_to(self.store.status(run), State.FAILED, now(), error=reported, exit_code=1))
+                raise Conflict(reported.what, where=reported.where) from error
         self.note(who, "asked", run, rig.id, options=options)
         return Asked(request, new=True)
 
@@ -394,7 +394,8 @@ class Supervisor:
             seen, said = _stop_seen([sys.executable, "-m", "tdhil.service.drive_stop", str(kept), *identity])
             if same:
                 return seen, said
-            return False, (f"{said}, on the connection that the run used ({_address_in(kept)}); {changed}, so tdhil"
+            address = (read_json(kept) or {}).get("address") or "unknown"
+            return False, (f"{said}, on the connection that the run used ({address}); {changed}, so tdhil"
                            " can't know whether this is still the rig's shaft")
         if not same:
             return False, f"{changed}, and the run stored no address of its drive: no stop was sent"
@@ -541,12 +542,13 @@ class Supervisor:
         state = State.INTERRUPTED if seen else State.STOP_NOT_CONFIRMED
         what = f"the process of the run was lost while it was {status.state}; {said}"
         next_step = "" if seen else "Use the hard-wired stop. Check that every shaft is at standstill, then sign it off"
-        told = Told("CommunicationLost", what, what, f"run {run}", next_step, int(ExitCode.COMMUNICATION),
+        reported = Told("CommunicationLost", what, what, f"run {run}", next_step, int(ExitCode.COMMUNICATION),
                     MessageCode.COMMUNICATION_LOST.code)
         by, asked = self._stops.pop(run, (status.stop.by, status.stop.asked))
         first = {} if status.stop.asked is not None else {"by": by, "asked": asked}
         stop = replace(status.stop, confirmed=seen, at_rest=now() if seen else None, **first)
-        status = way_to(status, state, now(), error=told, exit_code=int(told.exit_code), stop=stop, confirmation=None)
+        status = way_to(status, state, now(), error=reported, exit_code=int(reported.exit_code), stop=stop,
+                        confirmation=None)
         self._save(status)
         self.store.release(run)
         self.say(f"run {run}: {what}")
@@ -555,15 +557,15 @@ class Supervisor:
 
     def _save(self, status: Status) -> None:
         """Save the status, with retries until it is saved. While the disk is full, the rig stays blocked."""
-        told = False
+        logged = False
         while not self._end.is_set():
             try:
                 self.store.save(status)
                 return
             except OSError as error:
-                if not told:
+                if not logged:
                     self.say(f"run {status.id}: its end can't be written yet: {error}")
-                told = True
+                logged = True
                 self._end.wait(1.0)
 
     def _recover(self, run: str) -> None:
@@ -683,7 +685,3 @@ def _stop_seen(command: list[str]) -> tuple[bool, str]:
         return False, (f"the drive there has another identity ({found.get('identity')}) than the drive of the run:"
                        " tdhil stop acted on ITS shaft, not on that of the run")
     return False, "tdhil stop did NOT confirm standstill"
-
-
-def _address_in(kept: Path) -> str:
-    return str((read_json(kept) or {}).get("address") or "unknown")

@@ -14,7 +14,7 @@ from tdhil.errors import MessageCode, TdhilError, UsageError
 from tdhil.recording import survey_trace
 from tdhil.service.access import principal
 from tdhil.service.door import ADMITTED, HEADERS_S
-from tdhil.service.middleware import fields_of, off, told_of
+from tdhil.service.middleware import error_view, fields_of, off
 from tdhil.service.routing import api
 from tdhil.service.run_state import TooSlow
 from tdhil.service.schemas import PreviewView, UploadsView
@@ -40,12 +40,12 @@ POLL_S: Final = 0.5
 def routes(site: Site) -> list[Route]:
     """Return the routes of uploads."""
     return [
-        api(site, "uploads", uploads),
-        api(site, "upload", upload),
-        api(site, "one_upload", one_upload),
-        api(site, "preview", preview),
-        api(site, "identify_upload", identify_upload),
-        api(site, "delete_upload", delete_upload),
+        api(site, uploads),
+        api(site, upload),
+        api(site, one_upload),
+        api(site, preview),
+        api(site, identify_upload),
+        api(site, delete_upload),
     ]
 
 
@@ -151,7 +151,7 @@ async def _identify_later(site: Site, found: Upload, rig: str, options: dict[str
         run = await off(lambda: site.uploads.become_run(found, rig, options, who, facts))
         site.supervisor.reindex(run)
     except Exception as error:
-        site.uploads.failed(found.id, told_of(error).error)
+        site.uploads.failed(found.id, error_view(error).error)
         if not isinstance(error, TdhilError):          # a defect: the page has a message, the terminal its cause
             traceback.print_exception(error)
 

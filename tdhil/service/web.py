@@ -43,7 +43,7 @@ from tdhil.service.door import NO_DESCRIPTOR, Seldom
 from tdhil.service.foxglove import PROTOCOLS, Relay, Running
 from tdhil.service.limits import UPLOAD_LIMIT
 from tdhil.service.live_feed import Feed
-from tdhil.service.middleware import RequestGuard, error_response, off, status_of, told_of
+from tdhil.service.middleware import RequestGuard, error_response, error_view, off, status_of
 from tdhil.service.page_routes import Pages
 from tdhil.service.run_channel import tell_viewed
 from tdhil.service.run_state import NotLoggedIn, NotThere
@@ -119,8 +119,8 @@ class Web(Site):
         if isinstance(error, NotLoggedIn) and self.access.login:       # reply to a browser, which gets a page
             there = f"{request.url.path}?{request.url.query}" if request.url.query else request.url.path
             return RedirectResponse(f"/login?{urlencode({'next': there})}", 303)
-        told = told_of(error).error
-        return self._pages.render(request, "error.html", "", status_of(error), told=told)
+        reported = error_view(error).error
+        return self._pages.render(request, "error.html", "", status_of(error), reported=reported)
 
     def _methods(self, request: Request) -> set[str]:
         """Return the methods of an address, from all of its routes."""
@@ -229,14 +229,14 @@ class Web(Site):
         relay = Relay(rig_id, lambda: self._running(rig_id), socket.send_text, socket.send_bytes, rig.simulated)
         self.relays += 1
 
-        async def tell(scope: anyio.CancelScope) -> None:
+        async def send_news(scope: anyio.CancelScope) -> None:
             with _GONE:
                 await relay.run()
             scope.cancel()
 
         try:
             async with anyio.create_task_group() as both:
-                both.start_soon(tell, both.cancel_scope)
+                both.start_soon(send_news, both.cancel_scope)
                 with _GONE:
                     while (message := await socket.receive())["type"] != "websocket.disconnect":
                         said = message.get("text")

@@ -70,13 +70,14 @@ def report(asked: dict[str, Any]) -> dict[str, Any]:
 
 def _signed(document: dict[str, Any]) -> dict[str, Any]:
     """Return the result in the present folder with the signature under its acceptance, if a person signed it."""
+    from tdhil.file_hash import sha256_of
     from tdhil.service.acceptance_signature import FILE, signature_in
-    from tdhil.service.store import read_json, sha256_of_file
+    from tdhil.service.store import read_json
 
     acceptance, signature = document.get("acceptance"), signature_in(read_json(Path(FILE)))
     if not acceptance or signature is None:
         return document
-    problem = signature.problem(acceptance, sha256_of_file(Path("run.mcap")))
+    problem = signature.problem(acceptance, sha256_of(Path("run.mcap"), missing=""))
     return {**document, "acceptance": {**acceptance, "signature": {**asdict(signature), "problem": problem}}}
 
 

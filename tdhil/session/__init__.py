@@ -84,7 +84,6 @@ if TYPE_CHECKING:
         ASSUMED_BODY_REL_SD as ASSUMED_BODY_REL_SD, CalibrationFound as CalibrationFound,
         CalibrationRun as CalibrationRun, document_of_calibration as document_of_calibration,
         find_calibration as find_calibration, find_plan as find_plan, read_pairs as read_pairs,
-        sha256_of_log as sha256_of_log,
     )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
@@ -111,6 +110,6 @@ else:
         "stop_signals": "Ending stop_on_signals",
         "task": "bench_of excitation_request facts machine_limits stated_lags suited",
         "torque_calibration": "ASSUMED_BODY_REL_SD CalibrationFound CalibrationRun document_of_calibration "
-                              "find_calibration find_plan read_pairs sha256_of_log",
+                              "find_calibration find_plan read_pairs",
         "reference_calibration": "find_by_known_pipe find_by_reference known_pipe_of log_of_calibration",
     })

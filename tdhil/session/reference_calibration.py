@@ -6,14 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
-from hashlib import file_digest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tdhil.errors import UsageError
+from tdhil.file_hash import sha256_of
 from tdhil.session.run_record import RunRecord
 from tdhil.session.stored_calibration import drive_identity, drive_settings
-from tdhil.session.torque_calibration import sha256_of_log
 
 if TYPE_CHECKING:
     from tdhil.calibration import KnownPipe
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
 
 def log_of_calibration(record: RunRecord) -> dict[str, Any]:
     """Return log, name, hash and date of a recording, for the document of a calibration."""
-    return {"log": record.log, "name": Path(record.log).name, "sha256": sha256_of_log(record),
+    return {"log": record.log, "name": Path(record.log).name, "sha256": sha256_of(Path(record.log)),
             "date": record.configuration.get("started")}
 
 
@@ -60,18 +59,13 @@ def find_by_reference(
         raise UsageError(str(error), where=str(trace)) from None
     if found.series is not None:
         found = replace(found, series=replace(found.series, time_s=found.series.time_s - float(recording.time_s[0])))
-    digest = _digest(trace)
+    digest = sha256_of(trace)
     run = log_of_calibration(record)
     return reference_document(
         found, {"file": str(trace), "sha256": digest, "at": at, "rel_sd": rel_sd}, (run,),
         drive_identity(record.configuration), drive_settings(record.configuration, recording),
         date=str(run["date"] or datetime.now().astimezone().isoformat(timespec="seconds")), confidence=confidence,
         simulated=recording.simulated, warnings=warnings)
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return file_digest(file, "sha256").hexdigest()
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -157,7 +151,7 @@ def find_by_known_pipe(record: RunRecord, path: Path, confidence: float) -> dict
         refusal = f"the log can't be used: {refused.refusal.reason}", refused.refusal.advice
     run = log_of_calibration(record)
     return known_pipe_document(
-        found, measured, known, refusal, {"file": str(path), "sha256": _digest(path)}, (run,),
+        found, measured, known, refusal, {"file": str(path), "sha256": sha256_of(path)}, (run,),
         drive_identity(record.configuration), drive_settings(record.configuration, recording),
         date=str(run["date"] or datetime.now().astimezone().isoformat(timespec="seconds")), confidence=confidence,
         simulated=recording.simulated)

@@ -267,9 +267,10 @@ def _seen(
         at = f"in stage {outcome.stages[-1].name}" if outcome.stages else "before the first stage"
         return f"ended {at} with exit {code}: {cause}; {stood}{marked}"
     inertia = document.get("inertia_kg_m2")
-    told = "no J"
+    result = "no J"
     if inertia is not None:
-        told = "J " + with_interval(inertia["value"], inertia["low_total"], inertia["high_total"], "kg·m²")
+        result = "J " + with_interval(inertia["value"], inertia["low_total"], inertia["high_total"], "kg·m²")
         if covered is not None:
-            told += f", and the simulated shaft has {truth:g} kg·m²: {'inside' if covered else 'OUTSIDE'} the interval"
-    return f"the run went on to its end (exit {code}): {document['verdict']}, {told}; {stood}{marked}"
+            where = 'inside' if covered else 'OUTSIDE'
+            result += f", and the simulated shaft has {truth:g} kg·m²: {where} the interval"
+    return f"the run went on to its end (exit {code}): {document['verdict']}, {result}; {stood}{marked}"

@@ -119,7 +119,7 @@ class RunSession:
         writer.path = place.path
         if place.live:
             operator_interface.warn(f"another run writes {place.wanted}: the log of this run is {place.path}")
-        self._older_told = False
+        self._older_shown = False
         self._outcome: RunOutcome | None = None
         self.rehearsal: Rehearsal | None = None
         """Verdict on the rehearsed faults, once the run has ended; None without faults."""
@@ -257,8 +257,8 @@ class RunSession:
     def _tell_older(self) -> None:
         """Report once the new place of an older log. Wait until this is certain: a refused run returns the name."""
         older = self._place.older
-        if not self._older_told and older is not None and older.exists():
-            self._older_told = True
+        if not self._older_shown and older is not None and older.exists():
+            self._older_shown = True
             self._operator_interface.say(f"the older {self._place.wanted} was kept as {older}")
 
     def _confirm(self, task: Task, preflight: Preflight, idle: Idle) -> None:

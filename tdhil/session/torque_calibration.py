@@ -6,13 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from hashlib import file_digest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tdhil.errors import UsageError
+from tdhil.file_hash import sha256_of
 from tdhil.session.conclusion import conclude
 from tdhil.session.run_record import RunRecord
 from tdhil.session.stored_calibration import drive_identity, drive_settings, without_calibration
@@ -51,15 +51,6 @@ class CalibrationFound:
     confidence: float
     together: bool
     warnings: tuple[str, ...]
-
-
-def sha256_of_log(record: RunRecord) -> str:
-    """Return the hash of the file, in hex. Raises UsageError if it can't be read any more."""
-    try:
-        with Path(record.log).open("rb") as file:
-            return file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise UsageError(f"can't be read ({error.strerror or error})", where=record.log) from error
 
 
 def _names(runs: Sequence[CalibrationRun]) -> list[str]:
@@ -113,7 +104,7 @@ def document_of_calibration(found: CalibrationFound) -> dict[str, Any]:
 
     first = found.runs[0].record
     runs = tuple(
-        {"log": run.record.log, "name": name, "sha256": sha256_of_log(run.record),
+        {"log": run.record.log, "name": name, "sha256": sha256_of(Path(run.record.log)),
          "date": run.record.configuration.get("started"), "added_kg_m2": run.added_kg_m2,
          "added_sd_kg_m2": run.added_sd_kg_m2}
         for name, run in zip(_names(found.runs), found.runs, strict=True)
@@ -160,7 +151,7 @@ def _require_different(runs: Sequence[CalibrationRun]) -> None:
         raise UsageError("all runs have the same body", next_step="Give the inertia of the body: --added 55")
     seen: dict[str, str] = {}
     for run in runs:
-        digest = sha256_of_log(run.record)
+        digest = sha256_of(Path(run.record.log))
         if digest in seen:
             raise UsageError(f"is the same recording as {seen[digest]}", where=run.record.log,
                              next_step="Name the log of each run once")

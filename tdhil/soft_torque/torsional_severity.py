@@ -418,8 +418,8 @@ def _cycles(stretch: _GaplessPart, windows: _Windows, in_stick_slip: bool, perio
     off = filled - uniform_filter1d(filled, size)
     band = HYSTERESIS * np.nan_to_num(windows.swing, nan=inf)
     side = np.where(off > band, 1, np.where(off < -band, -1, 0))
-    told = np.flatnonzero(side)
-    turns = [(int(a), int(b)) for a, b in pairwise(told) if side[a] < 0 < side[b]]
+    clear = np.flatnonzero(side)
+    turns = [(int(a), int(b)) for a, b in pairwise(clear) if side[a] < 0 < side[b]]
     rises = []
     for a, b in turns:
         at = a + int(np.flatnonzero(off[a:b + 1] <= 0.0)[-1])

@@ -86,9 +86,9 @@ class StudyBar:
         self._bar.update(self._task, completed=float(index), name=name, description="")
         self._told_s = time.monotonic()
         with self._bar:
-            yield lambda share, text: self._tell(index, name, share, text)
+            yield lambda share, text: self._show(index, name, share, text)
 
-    def _tell(self, index: int, name: str, share: float, text: str) -> None:
+    def _show(self, index: int, name: str, share: float, text: str) -> None:
         self._bar.update(self._task, completed=index + share, description=text)
         if not self._console.is_terminal and time.monotonic() - self._told_s >= LINE_EVERY_S:
             self._told_s = time.monotonic()
@@ -333,12 +333,8 @@ def _html(chapters: Sequence[Chapter], folder: Path) -> str:
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["shown"] = shown
     template = environment.from_string(_TEMPLATE)
-    return template.render(chapters=chapters, tally=tally(chapters), marks=MARKS, relative=_relative(folder),
-                           style=Markup(STYLE))
-
-
-def _relative(folder: Path):  # type: ignore[no-untyped-def]
-    return lambda path: path.relative_to(folder).as_posix()
+    return template.render(chapters=chapters, tally=tally(chapters), marks=MARKS, style=Markup(STYLE),
+                           relative=lambda path: path.relative_to(folder).as_posix())
 
 
 def _markdown(chapters: Sequence[Chapter], folder: Path) -> str:

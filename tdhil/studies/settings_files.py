@@ -78,11 +78,11 @@ def with_assignments(settings: M, assignments: Iterable[str]) -> M:
     try:
         return type(settings).model_validate_json(json.dumps(data), strict=True)
     except ValidationError as error:
-        told = [
+        problems = [
             f"{'.'.join(str(part) for part in path)}: {message}" if path else message
             for path, message in messages_of(error, data, type(settings))
         ]
-        raise UsageError("--set " + "; ".join(told), next_step=f"Symbols: {', '.join(SYMBOLS)}",
+        raise UsageError("--set " + "; ".join(problems), next_step=f"Symbols: {', '.join(SYMBOLS)}",
                          entry=MessageCode.STUDY_SETTING_WRONG) from None
 
 

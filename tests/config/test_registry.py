@@ -39,7 +39,7 @@ from tdhil.runner.excitation import (
     Shape,
     SpeedChange,
 )
-from tdhil.runner.excitation.pulses import SwingKind, SwingPlan
+from tdhil.runner.excitation.pulses import SpeedChangeKind, SpeedChangePlan
 from tdhil.runner.excitation.signals import unit_peak
 from tdhil.runner.planning import adaptive, plan_acquisition, refuse_hopeless
 from tdhil.runner.preconditions import refuse_by_plan
@@ -71,7 +71,7 @@ def stairs(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[Sp
 
 
 TWO_TONES = PeriodicKind(shape=two_tones, frequency_hz=0.1)
-STAIRS = SwingKind(ways=stairs, needs_torque_mode=True, why_torque_mode="for the test's sake", with_string=False)
+STAIRS = SpeedChangeKind(ways=stairs, needs_torque_mode=True, why_torque_mode="for the test's sake", with_string=False)
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ def test_what_a_toy_excitation_says_of_itself_is_heeded():
     assert adaptive(ExcitationRequest("two-tones", tolerance=0.01))
     assert not adaptive(ExcitationRequest("stairs", tolerance=0.01))
     planned = plan_acquisition(ExcitationRequest("stairs"), "torque", LIMITS, GUESS, KNOWN, math.inf)
-    assert isinstance(planned.plan, SwingPlan)
+    assert isinstance(planned.plan, SpeedChangePlan)
     with pytest.raises(PlanRefused, match="stairs needs a drive in torque mode: for the test's sake"):
         refuse_hopeless(ExcitationRequest("stairs"), ("speed",), LIMITS, GUESS, KNOWN)
     string = MachineLimits(0.5, 10.0, 400.0, 900.0, load="string", torque_ramp_nm_s=50.0)

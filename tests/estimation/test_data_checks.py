@@ -63,6 +63,21 @@ def rounded(recording, speed_step, torque_step):
                    torque_nm=np.round(recording.torque_nm / torque_step) * torque_step)
 
 
+@pytest.mark.parametrize(("at", "flat"), [(10, False), (14, True)])
+def test_a_top_left_steeply_is_flat_from_three_times_the_step_below(at, flat):
+    """Four samples one step below the top, then far down: 2.5 and 3.5 times as many at the top."""
+    signal = np.tile([*[0.0] * at, *[-1.0] * 4, *(-50.0 - 7.0 * np.arange(20))], 10)
+    assert (flat_share(signal, 1.0) is not None) is flat
+
+
+@pytest.mark.parametrize(("at", "flat"), [(36, False), (44, True)])
+def test_a_smooth_top_is_flat_from_twenty_times_the_step_below(at, flat):
+    """A ramp down and up between the tops has two samples one step below: 18 and 22 times as many at the top."""
+    ramp = -np.arange(1.0, 31.0)
+    signal = np.tile([*[0.0] * at, *ramp, *ramp[-2::-1]], 10)
+    assert (flat_share(signal, 1.0) is not None) is flat
+
+
 @pytest.mark.parametrize(("speed_step", "torque_step"), [(1e-3, 0.1), (0.01, 1.0), (0.1, 5.0)])
 @pytest.mark.parametrize("noise", [0.0, 0.3])
 def test_a_coarsely_rounded_record_is_neither_stuck_nor_spiked(speed_step, torque_step, noise):

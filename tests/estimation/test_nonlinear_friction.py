@@ -14,8 +14,9 @@ from tdhil.estimation.frequency_domain.model import Model
 from tdhil.estimation.frequency_domain.nonlinear_friction import (
     BEND,
     MODEL,
-    Bend,
+    Bell,
     BentShaft,
+    Parabola,
     SegmentWave,
     ShaftMotion,
     bends,
@@ -45,7 +46,7 @@ def test_a_parabola_s_lines_by_hand():
     """ω = m + A cos(Ωt + φ): ω² = m² + A²/2 + 2 m A cos(Ωt + φ) + …, each signal behind its own first-order lag."""
     mean, true, s = 5.0, 1.3 * np.exp(0.7j), 2j * np.pi * 0.2
     reported = true / (1.0 + 0.4 * s)
-    lines, level = SegmentWave((0.2,), np.array([reported]), mean, 10.0).through(Bend(None), FIRST_ORDER)
+    lines, level = SegmentWave((0.2,), np.array([reported]), mean, 10.0).through(Parabola(), FIRST_ORDER)
     assert level == pytest.approx(mean**2 + abs(true) ** 2 / 2.0, rel=1e-12)
     assert lines[0] == pytest.approx(2.0 * mean * true * np.exp(-0.02 * s) / (1.0 + 0.15 * s), rel=1e-12)
 
@@ -57,7 +58,7 @@ def test_backwards_every_bend_is_the_mirror_image():
 
 
 def test_a_small_swing_sees_the_slope_of_a_bell():
-    mean, bend = 2.0, Bend(1.5)
+    mean, bend = 2.0, Bell(1.5)
     slope = (bend.over(np.array([mean + 1e-4])) - bend.over(np.array([mean - 1e-4]))) / 2e-4
     lines, level = SegmentWave((0.1, 0.3), np.array([0.01, 0.02j]), mean, 10.0).through(bend, np.zeros(6))
     assert lines == pytest.approx(slope * np.array([0.01, 0.02j]), abs=1e-4)

@@ -11,6 +11,8 @@ import pytest
 from tdhil.errors import UsageError
 from tdhil.fleet.rows import COLUMNS, FleetRow, FleetSettings, failure_row, row_from_json, row_key, row_of
 from tdhil.fleet.table import Journal, check_table_path, read_table, write_table
+from tdhil.report import result_document
+from tests.report.findings import full, recording
 
 VALUES = {
     str: ["R7", "N·m, \"quoted\"\nsecond line; 'x'", "0012", "nan", "=1+1"],
@@ -45,6 +47,29 @@ def test_a_table_is_read_back_to_the_last_bit(tmp_path, ending):
 def test_a_name_that_is_no_utf_8_has_a_row(tmp_path):
     write_table([FleetRow("R7-\udcff.mcap", "valid")], tmp_path / "fleet.csv")
     assert read_table(tmp_path / "fleet.csv")[0].log == "R7-?.mcap"
+
+
+def leads_somewhere(document, place):
+    """Whether every key of the path is there; a part that this run has not (drive, rig) ends it."""
+    for key in place.split("."):
+        if document is None:
+            return True
+        if isinstance(document, list):
+            document = document[int(key)]
+        elif key in document:
+            document = document[key]
+        else:
+            return False
+    return True
+
+
+def test_every_column_has_its_place_in_the_document():
+    """A misspelt place would be an empty column, with every log."""
+    document = result_document(full(), recording(), {}, "run.mcap")
+    places = [place for one in fields(FleetRow) for place in one.metadata.get("places", ())]
+    assert len(places) > 40
+    assert [place for place in places if not leads_somewhere(document, place)] == []
+    assert not leads_somewhere(document, "inertia_kg_m2.lowest")
 
 
 def test_every_quantity_has_its_unit():

@@ -96,7 +96,7 @@ def test_what_was_left_out_and_assumed_is_said():
     assert "drifts by +" in document["quantities"][0]["text"]
     assert [note.split(":")[0] for note in document["notes"]] == [
         "1 of 24 logs without a result that stands", "1 log without a date",
-        "simulated runs and real ones are mixed", "the drive tells no serial number"]
+        "simulated runs and real ones are mixed", "the drive reports no serial number"]
     two = trend_document([*found[:12], *(replace(row, drive_serial=9) for row in found[12:])], "R7")
     assert any("2 drives" in note for note in two["notes"])
     assert trend_document(found)["rig"] == "R7"      # the only one

@@ -15,6 +15,7 @@ import pytest
 from tdhil import process_pool
 from tdhil.errors import TdhilError
 from tdhil.process_pool import Loss, Pool, TaskLimits
+from tdhil.worker_process import LENGTH, READY
 from tests.process_pool import poison
 
 LIMITS = TaskLimits(60.0, 500_000_000)
@@ -38,8 +39,8 @@ def test_an_answer_that_comes_with_the_first_word_is_not_waited_for():
     fcntl, termios = pytest.importorskip("fcntl"), pytest.importorskip("termios")
     worker = process_pool._Worker(LIMITS)
     worker.give(poison.work, process_pool._Job(7), 30.0)
-    both = 2 * process_pool._LENGTH.size + len(pickle.dumps((False, 7)))
-    while int.from_bytes(fcntl.ioctl(worker.stdout, termios.FIONREAD, bytes(4)), sys.byteorder) < both:
+    both = 2 * LENGTH.size + len(pickle.dumps(READY)) + len(pickle.dumps(("found", pickle.dumps(7))))
+    while int.from_bytes(fcntl.ioctl(worker.process.stdout, termios.FIONREAD, bytes(4)), sys.byteorder) < both:
         time.sleep(0.01)
     assert worker.take() == 7
     worker.kill()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from profiles.errors import DataFileError
+from profiles.errors import DataFileError, UsageError
 from profiles.library import load_canopen_profile, profile_path
 
 S120 = profile_path("siemens/s120-canopen").read_text(encoding="utf-8")
@@ -62,5 +62,5 @@ def test_every_claim_has_its_source_and_its_confidence() -> None:
 def test_a_parameter_by_its_name() -> None:
     profile = load_canopen_profile("siemens/s120-canopen")
     assert profile.parameter("speed_limit").index == 0x243A
-    with pytest.raises(KeyError):
+    with pytest.raises(UsageError, match="s120-canopen: the profile has no parameter 'nothing'"):
         profile.parameter("nothing")

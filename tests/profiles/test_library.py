@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from profiles.canopen import CanopenProfile
 from profiles.errors import DataFileError
-from profiles.library import eds_path, load_profile, profile_names, profile_path
+from profiles.library import SCHEMAS, eds_path, load_profile, profile_names, profile_path
 
 GENERIC = Path(profile_path("generic/cia402")).read_text(encoding="utf-8")
 
@@ -80,7 +80,7 @@ def test_a_copy_of_generic_is_a_profile_of_ones_own(tmp_path: Path) -> None:
         ("confidence: verified", "confidence: sure", "'verified', 'likely' or 'unverified' is wanted"),
         ("eds: cia402.eds", "eds: ../x.eds", "plain name"),
         ("rpm_per_lsb: 0.1", "rpm_per_lsb: 0", "greater than 0"),
-        ("bus: canopen", "bus: profibus", "'canopen', 'ethercat' or 'modbus' is wanted"),
+        ("bus: canopen", "bus: profibus", f"{', '.join(map(repr, [*SCHEMAS][:-1]))} or {[*SCHEMAS][-1]!r} is wanted"),
     ],
 )
 def test_wrong_profiles(tmp_path: Path, old: str, new: str, words: str) -> None:

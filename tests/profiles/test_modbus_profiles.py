@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from profiles.errors import DataFileError
+from profiles.errors import DataFileError, UsageError
 from profiles.library import load_modbus_profile, profile_names, profile_path
 from profiles.modbus import ModbusProfile, Register
 
@@ -178,3 +178,10 @@ def test_an_echo_of_a_setpoint_that_is_not_there(tmp_path: Path) -> None:
 def test_a_canopen_profile_is_not_taken_for_one() -> None:
     with pytest.raises(DataFileError, match="is a profile for canopen"):
         load_modbus_profile("generic/cia402")
+
+
+def test_a_parameter_that_the_profile_has_not_is_an_error_of_the_tree() -> None:
+    profile = load_modbus_profile("generic/modbus")
+    assert all(profile.parameter(one.name) is one for one in profile.parameters)
+    with pytest.raises(UsageError, match="generic/modbus: the profile has no parameter 'nothing'"):
+        profile.parameter("nothing")

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from tdhil.errors import UsageError
+from tdhil.file_hash import sha256_of
 from tdhil.report.blocks import Picture, report_of
 from tdhil.report.document import result_document
-from tdhil.report.html import check_report_path, pictures_in, report_page, sha256_of, write_report
+from tdhil.report.html import check_report_path, pictures_in, report_page, write_report
 from tdhil.report.plots import envelope
 from tests.report.findings import RUN, bare, full, open_sided, recording
 
@@ -126,7 +127,9 @@ def test_it_names_the_log_by_its_hash(tmp_path):
     wanted = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"       # FIPS 180-2, appendix B.1
     assert sha256_of(log) == wanted
     assert wanted in (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert sha256_of(tmp_path / "nowhere") == ""
+    assert sha256_of(tmp_path / "nowhere", missing="") == ""
+    with pytest.raises(UsageError, match="nowhere: can't be read"):
+        sha256_of(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("run", [

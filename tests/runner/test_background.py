@@ -19,14 +19,14 @@ import pytest
 from drivers.drive import Command, Mode
 from tdhil.errors import Interrupted
 from tdhil.runner import background, stage_planner
-from tdhil.runner.background import Gone, WorkerProcess, begin
+from tdhil.runner.background import BackgroundProcess, Gone, begin
 from tdhil.runner.excitation import PlanRefused
 from tdhil.runner.settings import ExcitationRequest
 
 HANGS_S = 60.0
 REST = Command(Mode.SPEED, 0.0, 0.0)
 LIGHT = background._PROGRAM.replace(
-    "from tdhil", "import tdhil.runner.preconditions as rate; rate.quieten = lambda: None\nfrom tdhil"
+    "from tdhil", "import tdhil.runner.preconditions as rate; rate.load_before_motion = lambda: None\nfrom tdhil"
 )
 """Loads no more than it must: these tests are not about cycles that are late."""
 
@@ -284,7 +284,7 @@ def test_a_run_has_one_in_real_time_and_leaves_none_behind(world, monkeypatch, r
     from tdhil.runner import five_stages
 
     monkeypatch.setattr(five_stages, "begin", start)
-    monkeypatch.setattr(five_stages, "quieten", nothing)
+    monkeypatch.setattr(five_stages, "load_before_motion", nothing)
     here = world()
     here.drive.clock.stepped = False
     # The clock of the fake drive steps all the same; the plan is cut short by a stop.
@@ -314,4 +314,4 @@ def test_stepped_time_has_none(world, monkeypatch):
 def test_a_worker_process_without_a_python_is_an_os_error(monkeypatch):
     monkeypatch.setattr(sys, "executable", "")
     with pytest.raises(OSError, match="is unknown"):
-        WorkerProcess()
+        BackgroundProcess()

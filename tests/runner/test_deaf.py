@@ -15,7 +15,7 @@ from drivers.drive import Command, Counters, Mode
 from drivers.errors import CommunicationLost, LimitHit
 from tdhil.errors import Interrupted
 from tdhil.runner import adaptive_duration, background, stage_planner
-from tdhil.runner.background import Background, goes_on
+from tdhil.runner.background import Background, thread_computes
 from tdhil.runner.settings import ExcitationRequest
 from tests.path.path_runs import wait_for
 from tests.runner.run_outcomes import assert_at_rest
@@ -94,7 +94,7 @@ leave(3)
 @pytest.fixture
 def usual_s():
     """Of the interpreter's switches, once no arithmetic of the tests before goes on that nobody waited for."""
-    wait_for("the arithmetic of the tests before", lambda: not goes_on(), hangs_s=IN_VAIN_S)
+    wait_for("the arithmetic of the tests before", lambda: not thread_computes(), hangs_s=IN_VAIN_S)
     return sys.getswitchinterval()
 
 

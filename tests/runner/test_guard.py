@@ -394,5 +394,5 @@ def test_it_is_named_where_its_swing_takes_the_shaft_out_of_the_window(speed, co
     with pytest.raises(LimitHit, match=r"±1200 N·m every 5\.3 s") as hit:
         held.check_sample(Command(Mode.TORQUE, 5.0, commanded), sample(speed))
     assert "off bottom" in hit.value.next_step
-    assert "off bottom" in held.torque_told(100.0, False)[1]
-    assert "off bottom" not in held.torque_told(400.0, False)[1]
+    assert "off bottom" in held.torque_words(100.0, False)[1]
+    assert "off bottom" not in held.torque_words(400.0, False)[1]

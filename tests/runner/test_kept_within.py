@@ -9,11 +9,11 @@ import pytest
 
 from drivers.drive import Mode
 from drivers.errors import CommandRejected
-from tdhil.runner.excitation import MotionLimits, RigGuess, SwingPlan
+from tdhil.runner.excitation import MotionLimits, RigGuess, SpeedChangePlan
 from tdhil.runner.excitation.pulses import CALM_S, SpeedChange
 from tdhil.runner.guard import kept_within
 from tdhil.runner.settings import ControlAssumptions
-from tdhil.runner.stages.acquire import Follower, run_swings
+from tdhil.runner.stages.acquire import Follower, run_speed_changes
 from tdhil.runner.stages.hold import MeanSpeedControl, run_hold
 from tests.runner.fake_drive import LIMITS, NAN, FakeDrive
 
@@ -111,10 +111,10 @@ def test_coasting_ends_where_nothing_slows_the_shaft(world):
     """Friction was taken too high by far: after twice the planned time it is held again."""
     guess = RigGuess(100.0, 2.0, 20.0)
     way = SpeedChange(6.0, 2.0, 5.0, guess, coasting=True)
-    plan = SwingPlan("coast-down", "torque", 6.0, (way,), 2.0, 6.0, 0.0, 100.0, ROOM, guess)
+    plan = SpeedChangePlan("coast-down", "torque", 6.0, (way,), 2.0, 6.0, 0.0, 100.0, ROOM, guess)
     drive = FakeDrive(coulomb=0.0, viscous=0.0)
     longest = 2.0 * CALM_S + 2.0 * way.duration_s
     here = turning(world, drive, speed=6.0, cycles=round((longest + 2.0) / drive.period_s))
-    run_swings(here.bench, LIMITS, plan, None, ControlAssumptions(), lambda _: None)
+    run_speed_changes(here.bench, LIMITS, plan, None, ControlAssumptions(), lambda _: None)
     coasted = sum(command.torque_nm == 0.0 for command in here.drive.commands)
     assert coasted * drive.period_s == pytest.approx(2.0 * way.duration_s, abs=0.1)

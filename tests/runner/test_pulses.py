@@ -13,7 +13,7 @@ from tdhil.estimation import identify
 from tdhil.estimation.result import Options, Verdict
 from tdhil.recording.recording import LagPrior
 from tdhil.runner.design import DesignKnowledge, assumed_noise
-from tdhil.runner.excitation import MotionLimits, PlanRefused, RigGuess, make_swings
+from tdhil.runner.excitation import MotionLimits, PlanRefused, RigGuess, plan_speed_changes
 from tdhil.runner.excitation.pulses import CALM_S, TOTAL_S, coasting_s
 from tdhil.runner.planning import plan_acquisition
 from tdhil.runner.settings import ExcitationRequest
@@ -38,7 +38,7 @@ def test_a_plan_stays_within_window_and_torque(
     limits = MotionLimits(0.05 * window, 1.05 * window, torque, foresight_s)
     guess = RigGuess(inertia, viscous * friction * torque / window, (1.0 - viscous) * friction * torque, rel)
     try:
-        plan = make_swings(kind, limits, guess, mode)
+        plan = plan_speed_changes(kind, limits, guess, mode)
     except PlanRefused:
         return
     beyond = guess.speed_swing_factor(mode) - 1.0
@@ -62,17 +62,17 @@ def test_a_plan_stays_within_window_and_torque(
 
 
 def test_wishes_are_taken_at_their_word_or_refused():
-    plan = make_swings("pulses", LIMITS, GUESS, "torque", amplitude_rad_s=1.0, offset_rad_s=5.0, swings=9)
+    plan = plan_speed_changes("pulses", LIMITS, GUESS, "torque", amplitude_rad_s=1.0, offset_rad_s=5.0, swings=9)
     assert (len(plan.ways), plan.speed_min_rad_s, plan.speed_max_rad_s) == (9, 4.0, 6.0)
-    assert make_swings("pulses", LIMITS, GUESS, "torque").duration_s <= TOTAL_S
+    assert plan_speed_changes("pulses", LIMITS, GUESS, "torque").duration_s <= TOTAL_S
     for wish in ({"amplitude_rad_s": 4.0}, {"amplitude_rad_s": -1.0}, {"offset_rad_s": 9.5}, {"swings": 3},
                  {"time_s": 20.0}, {"amplitude_rad_s": math.nan}):
         with pytest.raises(PlanRefused):
-            make_swings("pulses", LIMITS, GUESS, "torque", **wish)
+            plan_speed_changes("pulses", LIMITS, GUESS, "torque", **wish)
     with pytest.raises(PlanRefused, match="torque mode"):
-        make_swings("coast-down", LIMITS, GUESS, "speed")
+        plan_speed_changes("coast-down", LIMITS, GUESS, "speed")
     with pytest.raises(PlanRefused, match="friction is too low"):
-        make_swings("coast-down", LIMITS, RigGuess(104.0), "torque")
+        plan_speed_changes("coast-down", LIMITS, RigGuess(104.0), "torque")
 
 
 def test_coasting_time_obeys_the_equation_of_motion():

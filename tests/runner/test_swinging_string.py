@@ -243,7 +243,7 @@ def test_yielding_stays_within_its_bounds_and_forward():
 
 def test_a_window_that_a_restless_string_fills_leaves_no_room_to_plan_in():
     here = World(FakeDrive(), LIMITS)
-    here.guard.disturbed = Swing(1200.0, 3.2, 5.3, 0.9).told
+    here.guard.disturbed = Swing(1200.0, 3.2, 5.3, 0.9).words
     speed = SpeedResult(None, None, RigGuess(1500.0, 8.0, 60.0), None, None, (), swing=Swing(1200.0, 3.2, 5.3, 0.9))
     planner = StagePlanner(here.bench, here.log, here.display, print)
     with pytest.raises(LimitHit, match=r"±1200 N·m every 5\.3 s, the top with ±3\.20 rad/s") as hit:

@@ -106,7 +106,7 @@ def publishing(port: int, look: Any, said: list[str], **more: Any) -> Iterator[P
 @pytest.mark.heavy
 def test_states_and_results_are_told_as_they_change(service):
     heard, said = Heard(), []
-    with publishing(heard.port, service.web.told, said):
+    with publishing(heard.port, service.web.broker_messages, said):
         wait_for("the state", lambda: "site/1/rigs/a/state" in heard.last())
         assert heard.last()["site/1/status"] == "online"
         assert json.loads(heard.last()["site/1/rigs/a/state"]) == {
@@ -275,10 +275,10 @@ def test_a_real_broker_keeps_it_for_who_comes_later(service, tmp_path):
     broker = subprocess.Popen(["mosquitto", "-c", str(tmp_path / "m.conf")], stderr=subprocess.DEVNULL)
     try:
         said: list[str] = []
-        with publishing(port, service.web.told, said) as publisher:
+        with publishing(port, service.web.broker_messages, said) as publisher:
             run = service.supervisor.start_run("a", {}, "test").request.id
             service.wait(run, "done")
-            wait_for("the result", lambda: "rigs/a/result" in publisher._told)
+            wait_for("the result", lambda: "rigs/a/result" in publisher._published)
             early, first = viewing(port)          # the broker may get the result after the publisher has noted it
             wait_for("the broker's copy", lambda: "site/1/rigs/a/result" in early)
             first.loop_stop()

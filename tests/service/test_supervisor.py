@@ -326,12 +326,12 @@ def test_what_is_left_of_a_lost_run_is_its_result(service, monkeypatch):
 def test_arithmetic_that_fails_says_why(service, monkeypatch):
     with pytest.raises(RunRefused, match="nosuch") as refused:
         service.supervisor.work("plan", None, {"rig_file": "/nosuch/rig.yaml", "options": {}})
-    assert refused.value.told.exit_code != 0
+    assert refused.value.reported.exit_code != 0
     broken = SimpleNamespace(stdout=b"is not JSON", stderr=b"first\nkilled\n")
     monkeypatch.setattr(supervisor_module.subprocess, "run", lambda *_, **__: broken)
     with pytest.raises(RunRefused) as refused:
         service.supervisor.work("plan", None, {})
-    assert (refused.value.told.message, refused.value.told.what) == ("the work failed", "killed")
+    assert (refused.value.reported.message, refused.value.reported.what) == ("the work failed", "killed")
     broken.stderr = b""
     with pytest.raises(RunRefused):
         service.supervisor.work("plan", None, {})

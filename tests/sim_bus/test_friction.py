@@ -2,7 +2,7 @@
 
 import math
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 import pytest
@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from sim_bus.plant.friction import torque
+from sim_bus.plant import friction as models
+from sim_bus.plant.friction import ShaftParams, torque
 from sim_bus.plant.rigid import Params, ShaftState, friction_torque, step
 
 MODELS = ("coulomb", "stribeck", "dahl", "lugre")
@@ -250,6 +251,11 @@ def test_friction_falls_from_breakaway_to_sliding() -> None:
     assert levels[2] == pytest.approx(60.0 + 20.0 / math.e)
     assert all(a > b for a, b in pairwise(levels))
     assert friction_torque(params, ShaftState(), 300.0) == 80.0
+
+
+def test_every_model_is_in_plant_yaml_and_in_these_tests() -> None:
+    assert set(MODELS) == set(models.MODELS) == set(get_args(ShaftParams.model_fields["friction"].annotation))
+    assert {words["friction"] for words, _ in CASES.values()} == set(MODELS)
 
 
 def test_without_coulomb_friction_no_model_has_any() -> None:

@@ -39,6 +39,7 @@ def defaults(model: type[BaseModel], prefix: str = "") -> dict[str, set[Any]]:
 
 
 DEFAULTS = defaults(RigParams) | {"plant.kind": {"rigid"}}
+FRICTIONS = get_args(Params.model_fields["friction"].annotation)
 UNITS = {"_kg_m2": "kg·m²", "_nm_s_rad": "N·m·s/rad", "_nm_rad": "N·m/rad", "_nm": "N·m", "_rad_s": "rad/s",
          "_rad": "rad", "_m": "m", "_pa": "Pa", "_kg_m3": "kg/m³", "_nm_s_rad_m": "N·m·s/rad per m", "_a": "A",
          "_rpm": "1/min", "_s": "s", "_permille": "‰"}
@@ -91,7 +92,8 @@ def test_a_file_from_before_there_were_kinds_is_rigid() -> None:
     ("kind: string\n  damping_nm_s_rad: 3", "plant.damping_nm_s_rad: belongs to kind: two_mass, and this plant is"),
     ("bottom: {coulomb_nm: 3}", "plant.bottom: belongs to kind: two_mass or string, and this plant is rigid"),
     ("kind: two_mass\n  stiffnes_nm_rad: 3", "unknown key 'stiffnes_nm_rad'; did you mean 'stiffness_nm_rad'?"),
-    ("kind: two_mass\n  bottom:\n    friction: lugr", "plant.bottom.friction: 'coulomb', 'stribeck', 'dahl' or"),
+    ("kind: two_mass\n  bottom:\n    friction: lugr",
+     f"plant.bottom.friction: {', '.join(map(repr, FRICTIONS[:-1]))} or {FRICTIONS[-1]!r} is wanted"),
     ("friction: stribeck\n  static_nm: 10", "plant.static_nm: breakaway torque can't be below coulomb_nm (60)"),
     ("kind: string\n  length_m: 1", "plant.length_m: waves would take"),
 ])

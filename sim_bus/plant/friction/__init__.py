@@ -19,21 +19,24 @@ from collections.abc import Callable
 from sim_bus.plant.friction import coulomb, dahl, lugre, stribeck
 from sim_bus.plant.friction.shaft import Harmonic, MotorEnd, ShaftParams
 
-__all__ = ["Advance", "Harmonic", "MotorEnd", "ShaftParams", "advance", "advance_of", "torque"]
+__all__ = ["MODELS", "Advance", "Harmonic", "MotorEnd", "ShaftParams", "advance", "advance_of", "torque"]
 
 Advance = Callable[[ShaftParams, float, float, float, float], tuple[float, float, float]]
 
-_ADVANCE: dict[str, Advance] = {
-    "coulomb": coulomb.advance, "stribeck": stribeck.advance, "dahl": dahl.advance, "lugre": lugre.advance,
+Torque = Callable[[ShaftParams, float, float, float], float]
+
+MODELS: dict[str, tuple[Advance, Torque]] = {
+    "coulomb": (coulomb.advance, coulomb.torque),
+    "stribeck": (stribeck.advance, stribeck.torque),
+    "dahl": (dahl.advance, dahl.torque),
+    "lugre": (lugre.advance, lugre.torque),
 }
-_TORQUE: dict[str, Callable[[ShaftParams, float, float, float], float]] = {
-    "coulomb": coulomb.torque, "stribeck": stribeck.torque, "dahl": dahl.torque, "lugre": lugre.torque,
-}
+"""Every model by its name in plant.yaml, which `ShaftParams.friction` lists too."""
 
 
 def advance_of(shaft: ShaftParams) -> Advance:
     """Return the solver of this shaft. Without dry friction it is Coulomb's, with F_c = 0."""
-    return _ADVANCE[shaft.friction] if shaft.coulomb_nm > 0.0 else coulomb.advance
+    return MODELS[shaft.friction][0] if shaft.coulomb_nm > 0.0 else coulomb.advance
 
 
 def advance(shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
@@ -45,5 +48,5 @@ def torque(shaft: ShaftParams, speed: float, bristle: float, drive: float = 0.0)
     """Return the dry friction against motion, N·m. At standstill the friction of a model that sticks balances
     ``drive``.
     """
-    of_model = _TORQUE[shaft.friction] if shaft.coulomb_nm > 0.0 else coulomb.torque
+    of_model = MODELS[shaft.friction][1] if shaft.coulomb_nm > 0.0 else coulomb.torque
     return of_model(shaft, speed, bristle, drive)

@@ -96,8 +96,8 @@ def _unbroken(recording: Recording, where: str, start_s: float, end_s: float) ->
     if angle is None or gap_s is None:
         return [(where, start_s, end_s)]
     time = recording.time_s
-    told = time[np.isfinite(angle) & (time >= start_s) & (time <= end_s)]
-    parts = np.split(told, np.flatnonzero(np.diff(told) > gap_s) + 1)
+    reported_s = time[np.isfinite(angle) & (time >= start_s) & (time <= end_s)]
+    parts = np.split(reported_s, np.flatnonzero(np.diff(reported_s) > gap_s) + 1)
     return [(where, float(part[0]), float(part[-1])) for part in parts if len(part)]
 
 

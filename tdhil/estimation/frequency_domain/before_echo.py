@@ -58,7 +58,7 @@ _LATE_S = 3.0             # s after the echo; from then on the instants are fart
 _LASTS_S = 16.0           # s after the echo; duration of its response
 _UNEVEN = 0.01              # sd of r before the echo
 _TOP_SHARE = 0.05           # sd of the friction at the top, as a share of ζ
-_MOST = 5.0
+_MOST = 5.0                 # largest |r|: five times the prior's sd or more, so that the prior holds r
 
 
 class EchoShaft:
@@ -205,14 +205,14 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
         raise Refused("the lines before the echo leave the inertia open", _WORDS.if_wide,
                       entry=MessageCode.NOT_IDENTIFIABLE)
     speed_lag, torque_lag, skew = lags_of(fitted, confidence)
-    told = f"to {100.0 * pipe.rel_sd:.2g} % (1 sd), as {pipe.source or 'stated'}"
+    tolerance = f"to {100.0 * pipe.rel_sd:.2g} % (1 sd), as {pipe.source or 'stated'}"
     return replace(
         finding,
         inertia=inertia,
         conditions=(
             f"next to nothing comes back from below within {shaft.echo_s:.2f} s, and what does dies away within"
             f" {_LASTS_S:g} s",
-            f"the pipe's resistance to waves is {pipe.impedance_nm_s_rad:.4g} N·m·s/rad {told}",
+            f"the pipe's resistance to waves is {pipe.impedance_nm_s_rad:.4g} N·m·s/rad {tolerance}",
             *(() if answer is None else (_FOLLOWS,)),
             *of_reports(case.recording.lag_prior),
         ),
@@ -270,7 +270,7 @@ def problem_of(
 
 
 _OWN_LAG_S, _OWN_LAG_SD_S = 0.01, 0.015      # s; lag of the torque behind its setpoint: 0 to some 40 ms
-_SHAPE_SD = 0.1
+_SHAPE_SD = 0.1             # sd of the report's shape about the measured one, of 0 to 0.5: the torque loop adds its own
 _ANSWER_MISFIT = 0.01       # of the lines, rms: above it the response is not a filter of two poles, and stays unknown
 _LEAST_ANSWER = 0.1         # of the strongest line: weaker lines are not used
 _FOLLOWS = "the drive's torque follows its setpoint within some 40 ms: what its report is late by beyond is its filter"

@@ -61,7 +61,7 @@ from tdhil.estimation.frequency_domain.shafts import (
     shaft_model,
 )
 from tdhil.estimation.friction_levels import Levels, ViscousConstraint, coulomb_level
-from tdhil.estimation.result import REJECT_P, BudgetLine, Compliant, Estimate, Refusal, rejects
+from tdhil.estimation.result import DOUBT_P, REJECT_P, BudgetLine, Compliant, Estimate, Refusal, rejects
 from tdhil.estimation.spectrum import SpectralLine
 from tdhil.recording import Pipe
 
@@ -412,7 +412,7 @@ def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_re
     fixed = alone if chosen.beside is None else _united(alone, inertias(chosen.beside, confidence))
     speed_lag, torque_lag, skew = lags_of(chosen.fit.fitted, confidence)
     *own, by_model = _budget(chosen.fit, alone.inertia, fixed.inertia, confidence)
-    told = own if by_model.half_width_kg_m2 == 0.0 else [*own, by_model]
+    lines = own if by_model.half_width_kg_m2 == 0.0 else [*own, by_model]
     return CompliantResult(
         inertia=fixed.inertia,
         shaft=Compliant(
@@ -428,7 +428,7 @@ def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_re
         speed_lag_s=speed_lag,
         torque_lag_s=torque_lag,
         skew_s=skew,
-        budget=(*told, torque_scale_line(fixed.inertia.value, torque_scale_rel_sd, confidence)),
+        budget=(*lines, torque_scale_line(fixed.inertia.value, torque_scale_rel_sd, confidence)),
         by_model=by_model.half_width_kg_m2 > max(line.half_width_kg_m2 for line in own),
     )
 
@@ -508,13 +508,13 @@ def identify_compliant(
     whose load is declared a string, under auto; it is kept if no other shaft is better. ``plain_lags``: it explains
     the data with first-order lags.
     """
-    told = None
+    result = None
     contradicted = rigid if isinstance(rigid, Finding) and rigid.rejected else None
     is_string = rigid is not None and contradicted is None and case.recording.has_drill_string
     try:
         chosen = _chosen(case)
         if isinstance(chosen, Chosen) and not chosen.rejected:
-            told = result_of(chosen, case.levels, case.options.confidence, case.recording.torque_scale_rel_sd)
+            result = result_of(chosen, case.levels, case.options.confidence, case.recording.torque_scale_rel_sd)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return _OPEN if is_string else rigid or _OPEN
     if isinstance(chosen, Refusal):
@@ -524,7 +524,7 @@ def identify_compliant(
             return rigid or chosen
         advice = f"{contradicted.words.if_rejected}; {chosen.advice}, for a shaft that is not rigid to be identified"
         return replace(contradicted, words=replace(contradicted.words, if_rejected=advice))
-    if told is None:
+    if result is None:
         if is_string and not rejects(chosen.fit.residual):
             return (rigid if plain_lags and _turns_as_one(chosen.fit) else None) or _UNSEEN
         if contradicted is None:
@@ -533,8 +533,8 @@ def identify_compliant(
                 model=name, words=_words(name), residual=chosen.fit.residual)
         words = replace(contradicted.words, if_rejected=_LOOK_FOR)
         return replace(contradicted, words=words, remark=", and two masses or a string do no better")
-    if told.inertia.bounded or _told(told.shaft.total_inertia):
-        return _stands(chosen, told, case, rigid)
+    if result.inertia.bounded or _bounded(result.shaft.total_inertia):
+        return _stands(chosen, result, case, rigid)
     if is_string:
         return (rigid if plain_lags else None) or _UNSEEN
     # a rigid shaft that is only in doubt gives a number, which would be wrong: see `may_swing`
@@ -549,7 +549,7 @@ def _chosen(case: PeriodicCase) -> Chosen | Refusal:
         case.options.model, case.usable, case.constraint, priors, fixed, recording.pipe, recording.has_drill_string)
 
 
-def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Finding | Refusal | None) -> Finding:
+def _stands(chosen: Chosen, result: CompliantResult, case: PeriodicCase, rigid: Finding | Refusal | None) -> Finding:
     """Return the finding of a selected shaft, without J if only the sum of both inertias is known."""
     fit = chosen.fit
     name = name_of(fit, case.options.model)
@@ -558,14 +558,14 @@ def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Fi
         words=_words(name),
         residual=fit.residual,
         conditions=(*_conditions(chosen), *of_reports(case.recording.lag_prior)),
-        viscous_nm_s_rad=told.viscous,
-        coulomb_nm=told.coulomb,
-        speed_lag_s=told.speed_lag_s,
-        torque_lag_s=told.torque_lag_s,
-        skew_s=told.skew_s,
-        compliant=told.shaft,
+        viscous_nm_s_rad=result.viscous,
+        coulomb_nm=result.coulomb,
+        speed_lag_s=result.speed_lag_s,
+        torque_lag_s=result.torque_lag_s,
+        skew_s=result.skew_s,
+        compliant=result.shaft,
         lines=fitted_points(fit.fitted, case.options.confidence),
-        warnings=_caveats(chosen, told),
+        warnings=_caveats(chosen, result),
         curve=ModelCurve(fit.fitted, case.options.confidence, fit.residual),
     )
     if isinstance(rigid, Finding) and rigid.rejected:
@@ -576,17 +576,17 @@ def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Fi
         # a J that does not stand gets no further figures, as for residuals that contradict the model
         return Finding(model=name, words=finding.words, residual=fit.residual, lines=finding.lines, curve=finding.curve,
                        contradiction=_pipe_contradiction(chosen.impedance_ratio))
-    if told.inertia.bounded:
-        words = replace(finding.words, if_wide=_WHICH) if told.by_model else finding.words
-        return replace(finding, inertia=told.inertia, budget=told.budget, words=words)
-    together = _together(told.shaft.total_inertia)
+    if result.inertia.bounded:
+        words = replace(finding.words, if_wide=_WHICH) if result.by_model else finding.words
+        return replace(finding, inertia=result.inertia, budget=result.budget, words=words)
+    together = _together(result.shaft.total_inertia)
     return replace(finding, refusal=Refusal(
         f"{finding.explained}, but cannot separate the inertia of the motor from that of the load{together}",
         "excite lines on both sides of the resonance, and well above it, where the motor turns alone",
     ))
 
 
-def _told(total: Estimate | None) -> bool:
+def _bounded(total: Estimate | None) -> bool:
     return total is not None and total.bounded
 
 
@@ -629,8 +629,8 @@ _OTHER_PIPE = CodedText(
 
 def _conditions(chosen: Chosen) -> tuple[str, ...]:
     if chosen.pipe is not None:
-        told = f"{chosen.pipe.source} says, to {100.0 * chosen.pipe.rel_sd:.2g} % (1 sd)"
-        shaft = f"the motor turns a uniform string whose pipe weighs and yields as {told}"
+        sizes = f"{chosen.pipe.source} says, to {100.0 * chosen.pipe.rel_sd:.2g} % (1 sd)"
+        shaft = f"the motor turns a uniform string whose pipe weighs and yields as {sizes}"
     elif chosen.fit.is_string:
         shaft = "the motor turns a uniform string"
     else:
@@ -651,7 +651,7 @@ def _caveats(chosen: Chosen, found: CompliantResult) -> tuple[str, ...]:
     said += [CodedText(
         "J is the motor's side of the spring, J_r; what a slow motion feels is J_r + J_L",
         MessageCode.MOTOR_SIDE_ONLY)]
-    if not _told(found.shaft.total_inertia):
+    if not _bounded(found.shaft.total_inertia):
         said.append(CodedText(
             "J_r + J_L is left open on one side: a slower line, well below the resonance, would show it",
             MessageCode.TOTAL_INERTIA_OPEN))
@@ -670,7 +670,7 @@ def _caveats(chosen: Chosen, found: CompliantResult) -> tuple[str, ...]:
         said.append(CodedText(
             "first-order lags do not explain the reports; filters of two poles and moving averages do",
             MessageCode.LAGS_NOT_FIRST_ORDER))
-    if fit.residual is not None and REJECT_P <= fit.residual.p_value < 0.01:
+    if fit.residual is not None and REJECT_P <= fit.residual.p_value < DOUBT_P:
         said.append(CodedText(
             f"the residuals are only just consistent with the model (p = {fit.residual.p_value:.2g})",
             MessageCode.BARELY_CONSISTENT))

@@ -46,14 +46,18 @@ from tdhil.recording import FloatArray
 # minimised with these, where the valleys are wide, and the best results are the starts of the real descents.
 
 
-_PER_OCTAVE = 24
+_PER_OCTAVE = 24                         # resonances of the grid: steps of 3 %, finer than _BLUR
 _BEYOND = (0.6, 2.0)                     # ends of the grid, as multiples of the lowest and highest line
 _RATIOS = (0.01, 0.1)                    # damping ratios of the grid, of critical damping
 _SHARES = (0.08, 0.15, 0.22, 0.3, 0.38, 0.46, 0.55, 0.65, 0.8, 1.0)
-_SKEWS = (-0.05, 0.0, 0.05)
+"""String's shares of the load on the grid, from a heavy bit to a free bottom. Neighbours are about `_ALIKE` apart: a
+coarser grid misses valleys, a finer one only costs time."""
+_SKEWS = (-0.05, 0.0, 0.05)              # time offsets of the grid, s; a choice: the descent refines them
 _BLUR = 0.08                             # relative error that is assumed for every line
 _ALIKE = (0.15, 0.12)                    # octaves of the oscillation, share of the string: closer starts are equal
 _TRIED, _KEPT = 24, 5
+"""Starts that are minimised with the larger errors, and the best of them that are minimised as they are. A choice:
+each costs a descent, and with too few the deepest valley is missed."""
 
 
 def compliant_starts(problem: Likelihood, fixed: Fixed) -> list[FloatArray]:

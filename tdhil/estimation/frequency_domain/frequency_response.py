@@ -157,7 +157,7 @@ def measure_response(
         detected, p_value, by_harmonics, by_speed, power[1] / total if total > 0.0 else None, harmonics)
     confidence = case.options.confidence
     lines = tuple(
-        _told(one, harmonics, detected, None if curve is None else complex(value), confidence)
+        _response_line(one, harmonics, detected, None if curve is None else complex(value), confidence)
         for one, value in zip(pooled, fitted, strict=True)
     )
     used = [stretch.segment for stretch, fit in zip(case.stretches, case.fits, strict=True) if len(fit.speed)]
@@ -192,7 +192,7 @@ def _straight(lines: list[_PooledLine]) -> _StraightLine:
     return _StraightLine(float(np.sum(z.imag * omega) / np.sum(omega**2)), float(np.median(z.real)))
 
 
-def _told(
+def _response_line(
     one: _PooledLine, harmonics: tuple[UnexcitedHarmonic, ...], detected: bool, fitted: complex | None,
     confidence: float,
 ) -> ResponseLine:

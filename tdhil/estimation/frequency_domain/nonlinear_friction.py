@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -39,32 +40,56 @@ from tdhil.recording import FloatArray, Segment
 #
 # g is Stribeck's bell, exp(−(ω/ω_s)²), with ω_s on a grid, or the parabola ω |ω| of a fan and of churned oil, which
 # wide bells resemble. One shape with either sign of c is used, not a sum: the speeds of one run can hardly separate
-# two.
+# two. A further shape is a class with `over` and `words`, and its place in `bends`.
 
 
 _WIDTHS = 9               # number of widths tried
 _NARROWEST, _WIDEST = 0.35, 1.0     # of the slowest and of the fastest speed: a narrower or wider bell is not visible
 
 
-@dataclass(frozen=True)
-class Bend:
-    """Shape of nonlinear friction; ``width_rad_s`` None: the parabola."""
+class Bend(Protocol):
+    """Shape of nonlinear friction over speed."""
 
-    width_rad_s: float | None
+    @property
+    def words(self) -> str:
+        """Return how friction bends, for the warning of the result: "it bends …"."""
+        ...
 
     def over(self, speed: FloatArray) -> FloatArray:
         """Return the shape g at speeds, rad/s."""
-        if self.width_rad_s is None:
-            parabola: FloatArray = speed * np.abs(speed)
-            return parabola
+        ...
+
+
+@dataclass(frozen=True)
+class Bell:
+    """Stribeck's bell, exp(−(ω/ω_s)²)."""
+
+    width_rad_s: float
+
+    @property
+    def words(self) -> str:
+        return f"by a bell of about {self.width_rad_s:.2g} rad/s (Stribeck)"
+
+    def over(self, speed: FloatArray) -> FloatArray:
         bell: FloatArray = np.sign(speed) * np.exp(-((speed / self.width_rad_s) ** 2))
         return bell
+
+
+@dataclass(frozen=True)
+class Parabola:
+    """The parabola ω |ω| of a fan and of churned oil."""
+
+    words = "with the square of speed"
+
+    def over(self, speed: FloatArray) -> FloatArray:
+        parabola: FloatArray = speed * np.abs(speed)
+        return parabola
 
 
 def bends(slowest_rad_s: float, fastest_rad_s: float) -> tuple[Bend, ...]:
     """Return all shapes to try for a run between two speeds of one direction, both in magnitude."""
     widths = np.geomspace(_NARROWEST * slowest_rad_s, _WIDEST * fastest_rad_s, _WIDTHS)
-    return (*(Bend(float(width)) for width in widths), Bend(None))
+    return (*(Bell(float(width)) for width in widths), Parabola())
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -272,7 +297,7 @@ _Near = tuple[Bend, Likelihood, Fit]
 
 def _between(tried: list[_Near], near: Callable[[Bend, FloatArray], _Near]) -> list[_Near]:
     """Return the best bell between the neighbours of the grid's best, each started from the best result so far."""
-    bells = [(bend.width_rad_s, fit) for bend, _, fit in tried if bend.width_rad_s is not None]
+    bells = [(bend.width_rad_s, fit) for bend, _, fit in tried if isinstance(bend, Bell)]
     best = min(range(len(bells)), key=lambda number: bells[number][1].objective)
     around = (math.log(bells[max(best - 1, 0)][0]), math.log(bells[min(best + 1, len(bells) - 1)][0]))
     lowest = bells[best][1]
@@ -280,7 +305,7 @@ def _between(tried: list[_Near], near: Callable[[Bend, FloatArray], _Near]) -> l
 
     def objective(log_width: float) -> float:
         nonlocal lowest
-        seen.append(near(Bend(math.exp(log_width)), lowest.theta))
+        seen.append(near(Bell(math.exp(log_width)), lowest.theta))
         fit = seen[-1][2]
         lowest = fit if fit.objective < lowest.objective else lowest
         return fit.objective
@@ -368,7 +393,7 @@ def identify_bent(case: PeriodicCase, rigid: RigidResult) -> Finding | None:
         model=MODEL,
         bent=True,
         preface=f"the residuals {speak} straight friction (p = {against:.1g}); ",
-        warnings=(*finding.warnings, _told(found[0], motion)),
+        warnings=(*finding.warnings, _bend_words(found[0], motion)),
     )
 
 
@@ -405,11 +430,9 @@ def _budget(
     return (*lines, BudgetLine("friction's shape", 0.5 * grown, "other shapes that the data allow"), scale)
 
 
-def _told(best: BentFit, motion: ShaftMotion) -> str:
-    width = best.bend.width_rad_s
-    shape = "with the square of speed" if width is None else f"by a bell of about {width:.2g} rad/s (Stribeck)"
+def _bend_words(best: BentFit, motion: ShaftMotion) -> str:
     return CodedText(
-        f"friction is no straight line over speed: it bends {shape}, which is allowed for; B is its slope between the "
-        f"mean speeds {', '.join(f'{wave.mean:.3g}' for wave in motion.waves)} rad/s",
+        f"friction is no straight line over speed: it bends {best.bend.words}, which is allowed for; B is its slope"
+        f" between the mean speeds {', '.join(f'{wave.mean:.3g}' for wave in motion.waves)} rad/s",
         MessageCode.FRICTION_NOT_LINEAR,
     )

@@ -183,7 +183,7 @@ class RigidShaft:
 
 
 STRING_SHARE, DRAG_SHARE = 6, 7         # positions in m
-_RAYLEIGH = 2.0 / 3.0
+_RAYLEIGH = 2.0 / 3.0                   # part of J_s that takes no part in the oscillation: 1 − 1/3, by Rayleigh
 
 
 class StringShaft:
@@ -282,6 +282,8 @@ class KnownStringShaft(StringShaft):
 
 
 DELAY_SURER = 3.0
+"""Uncertainty of the pipe's impedance over that of its travel time. An assumption: the section of the pipe varies,
+and the wave speed is that of steel."""
 
 
 def _end_and_string(m: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:

@@ -33,12 +33,12 @@ from tdhil.estimation.spectrum import ComplexArray
 from tdhil.recording import FloatArray
 
 SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE, AVERAGE, SKEW = range(6)
-COUNT: Final = 6
+COUNT: Final = 6               # parameters of a ratio: those of the line above
 STRUCTURE: Final = (SPEED_SHAPE, TORQUE_SHAPE, AVERAGE)   # all are zero for first-order lags
 
-LAG_BOUND_S: Final = 2.0
+LAG_BOUND_S: Final = 2.0       # s; five times the longest lag that explains the paper's field slopes, 0.40 s
 SKEW_BOUND_S: Final = 1.0      # s; half an average of 1.4 s, and the skew of the frame itself
-SHAPE_BOUND: Final = 0.5
+SHAPE_BOUND: Final = 0.5       # 0: one pole; 0.25: two equal poles; 0.5: two poles as of Butterworth, ζ = 1/(2√ρ)
 PLAUSIBLE: Final = ((SPEED_LAG, 1.0), (TORQUE_LAG, 1.0), (AVERAGE, 1.0))     # standard deviations about zero: s, s, s²
 _AVERAGE_CYCLES = 0.8          # cycles: an average of w has a zero at 1/w, and lines must be below it
 

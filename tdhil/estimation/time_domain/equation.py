@@ -24,7 +24,6 @@ from tdhil.recording import FloatArray
 
 INERTIA, VISCOUS, SPEED_LAG, TORQUE_LAG, SKEW, SPEED_SHAPE, TORQUE_SHAPE, FORWARD, BACK, BEND = range(10)
 PARAMETERS = 10           # number of parameters of the equation
-MOST_SHAPE = 0.5
 
 
 @dataclass(frozen=True)

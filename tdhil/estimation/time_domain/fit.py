@@ -13,6 +13,7 @@ import numpy as np
 
 from tdhil.estimation.frequency_domain import (
     LAG_BOUND_S,
+    SHAPE_BOUND,
     SKEW_BOUND_S,
     Box,
     Fit,
@@ -23,7 +24,6 @@ from tdhil.estimation.time_domain.equation import (
     BACK,
     FORWARD,
     INERTIA,
-    MOST_SHAPE,
     PARAMETERS,
     SKEW,
     SPEED_LAG,
@@ -163,7 +163,7 @@ def box(inertia: float, middle_rad_s: float, torque_nm: float, priors: tuple[Gau
     """Return the bounds: lags in [0, 2] s, |skew| ≤ 1 s, κ in [0, ½], J ≥ 0; wider if a prior requires it."""
     low, high, scale = np.full(PARAMETERS, -np.inf), np.full(PARAMETERS, np.inf), np.full(PARAMETERS, torque_nm)
     low[INERTIA], low[[SPEED_LAG, TORQUE_LAG, SPEED_SHAPE, TORQUE_SHAPE]] = 0.0, 0.0
-    high[[SPEED_LAG, TORQUE_LAG]], high[[SPEED_SHAPE, TORQUE_SHAPE]] = LAG_BOUND_S, MOST_SHAPE
+    high[[SPEED_LAG, TORQUE_LAG]], high[[SPEED_SHAPE, TORQUE_SHAPE]] = LAG_BOUND_S, SHAPE_BOUND
     low[SKEW], high[SKEW] = -SKEW_BOUND_S, SKEW_BOUND_S
     for prior in priors:
         high[prior.index] = max(high[prior.index], prior.mean + 6.0 * prior.sd)
@@ -235,6 +235,8 @@ def covariance(problem: FitProblem, theta: FloatArray, free: tuple[int, ...]) ->
 
 
 _STARTS = ((0.0, 0.0, 0.0), (0.40, 0.15, 0.0), (0.15, 0.40, 0.0), (0.1, 0.1, 0.0))
+"""Start values of speed lag, torque lag and time offset, s: none; those that explain the paper's field slopes; the same
+exchanged; equal ones, in whose valley the lags cancel."""
 _ROUNDS = 5               # rounds of reweighting
 _NO_LAG = 0.1            # rad at the highest frequency, below which a lag has no effect
 _CLEAR = 20.0            # least power that the speed explains, over that of the residual

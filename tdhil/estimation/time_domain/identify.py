@@ -258,14 +258,14 @@ def _finding(solved: Solved, case: Case) -> Finding:
         conditions=_conditions(case.recording),
         viscous_nm_s_rad=solved.viscous,
         coulomb_nm=solved.coulomb,
-        speed_lag_s=_told(solved.speed_lag_s, LAG_BOUND_S),
-        torque_lag_s=_told(solved.torque_lag_s, LAG_BOUND_S),
-        skew_s=_told(solved.skew_s, SKEW_BOUND_S),
+        speed_lag_s=_unless_open(solved.speed_lag_s, LAG_BOUND_S),
+        torque_lag_s=_unless_open(solved.torque_lag_s, LAG_BOUND_S),
+        skew_s=_unless_open(solved.skew_s, SKEW_BOUND_S),
         budget=(*solved.budget, scale),
     )
 
 
-def _told(estimate: Estimate, bound: float) -> Estimate | None:
+def _unless_open(estimate: Estimate, bound: float) -> Estimate | None:
     """Return None for a lag that the record leaves open up to the bound."""
     return None if max(abs(estimate.low), abs(estimate.high)) >= bound * (1.0 - 1e-6) else estimate
 

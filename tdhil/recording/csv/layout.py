@@ -63,11 +63,9 @@ def unit_of(quantity: str, text: str) -> ColumnUnit | None:
     if (also := _ALSO[quantity].get(word)) is not None:
         return also
     known = quantities.unit_of(inner if quantity != "time" else inner.casefold())
-    return _in_trace(known) if known is not None and known.dimension == quantity else None
-
-
-def _in_trace(unit: quantities.Unit) -> ColumnUnit:
-    return ColumnUnit(unit.dimension, unit.symbol, unit.times / unit.over)
+    if known is None or known.dimension != quantity:
+        return None
+    return ColumnUnit(known.dimension, known.symbol, known.times / known.over)
 
 
 def split_name(name: str) -> tuple[str, str]:
@@ -371,19 +369,19 @@ def _unit(choice: ColumnChoice, name: str, stated: str, where: str, flag: str) -
         if other is not None and other != choice.unit:
             return choice.unit, [f"{quantity} was read in {choice.unit.symbol} as told; the file says {other.symbol}"]
         return choice.unit, []
-    tell = f"Give it behind a colon: {flag} {quantity}='{shown(name)}:{SI[quantity]}'"
+    next_step = f"Give it behind a colon: {flag} {quantity}='{shown(name)}:{SI[quantity]}'"
     odd = stated if below is None and not is_missing(stated) else ""
     if flag == REFERENCE_FLAG and named is None and below is None:
         odd = odd or split_name(name)[1]      # a calibration does not assume a unit if the file states another one
     if odd:
         raise CsvMisnamed(
             f"{shown(odd)!r} is no known unit of {quantity}; there are {', '.join(known_units(quantity))}",
-            where=where, next_step=tell,
+            where=where, next_step=next_step,
         )
     if below is not None and named is not None and below != named:
         raise CsvMisnamed(
             f"the unit of {shown(name)!r} is {named.symbol} by its name but {below.symbol} by the row of units",
-            where=where, next_step=tell,
+            where=where, next_step=next_step,
         )
     unit = below or named
     if unit is None:

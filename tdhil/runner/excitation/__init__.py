@@ -6,8 +6,8 @@ from tdhil.runner.excitation.plan import (
     settling_periods as settling_periods,
 )
 from tdhil.runner.excitation.pulses import (
-    CALM_S as CALM_S, SwingKind as SwingKind, SwingPlan as SwingPlan, SpeedChange as SpeedChange,
-    make_swings as make_swings,
+    CALM_S as CALM_S, SpeedChange as SpeedChange, SpeedChangeKind as SpeedChangeKind,
+    SpeedChangePlan as SpeedChangePlan, plan_speed_changes as plan_speed_changes,
 )
 from tdhil.runner.excitation.reference import (
     DriveMode as DriveMode, ExcitationKind as ExcitationKind, MotionLimits as MotionLimits,

@@ -31,7 +31,7 @@ from tdhil.runner.excitation.reference import (
 
 CALM_S = 3.5              # s; steady time at every speed: the momentum balance needs 2 s or more after the lags
 TOTAL_S = 210.0           # s; about the duration of the usual multisine
-_LEAST_SWINGS = 6         # least number of speed changes
+_LEAST_CHANGES = 6         # least number of speed changes
 _MOST_S = 12.0            # s; longest speed change, for a heavy shaft
 _LEAST_S = 0.5            # s; shortest speed change
 _SHARES = (1.0, 0.6)      # shares of the steepest change: pulses of two strengths
@@ -65,7 +65,7 @@ class SpeedChange:
 
 
 @dataclass(frozen=True)
-class SwingKind(ExcitationKind):
+class SpeedChangeKind(ExcitationKind):
     """Excitation by changes from one steady speed to another.
 
     ``ways``: yields changes without end, from the lowest and the highest speed, rad/s, the largest acceleration of a
@@ -76,7 +76,7 @@ class SwingKind(ExcitationKind):
 
 
 @dataclass(frozen=True)
-class SwingPlan:
+class SpeedChangePlan:
     """Motion of stage 5: steady speed ``start_rad_s``, then every speed change with `CALM_S` of steady speed."""
 
     kind: str
@@ -115,7 +115,7 @@ class SwingPlan:
         return []
 
 
-def make_swings(
+def plan_speed_changes(
     kind: str,
     limits: MotionLimits,
     guess: RigGuess,
@@ -124,12 +124,12 @@ def make_swings(
     offset_rad_s: float | None = None,
     swings: int | None = None,
     time_s: float | None = None,
-) -> SwingPlan:
+) -> SpeedChangePlan:
     """Return a plan of ``swings`` speed changes, or of as many as fit into ``time_s``. Raises PlanRefused.
 
     ``amplitude_rad_s``: half of the difference between the upper and the lower speed; ``offset_rad_s``: their mean.
     """
-    asked = swing_kind(kind)
+    asked = speed_change_kind(kind)
     if asked.needs_torque_mode and mode != "torque":
         raise PlanRefused(f"{kind} needs a drive in torque mode: {asked.why_torque_mode}")
     room = _SpeedRoom(limits, guess, mode)
@@ -142,26 +142,26 @@ def make_swings(
         ways, taken = [], CALM_S
         for way in endless:
             taken += way.duration_s + CALM_S
-            if taken > total and (len(ways) >= _LEAST_SWINGS or time_s is not None):
+            if taken > total and (len(ways) >= _LEAST_CHANGES or time_s is not None):
                 break
             ways.append(way)
-    if len(ways) < _LEAST_SWINGS:
-        needed = CALM_S + sum(way.duration_s + CALM_S for way in islice(_again(ways, endless), _LEAST_SWINGS))
+    if len(ways) < _LEAST_CHANGES:
+        needed = CALM_S + sum(way.duration_s + CALM_S for way in islice(_again(ways, endless), _LEAST_CHANGES))
         raise PlanRefused(
-            f"time: {len(ways)} ways up and down are too few to identify the inertia, {_LEAST_SWINGS} take "
+            f"time: {len(ways)} ways up and down are too few to identify the inertia, {_LEAST_CHANGES} take "
             f"{needed:.0f} s",
-            f"Give --max-time {math.ceil(needed)}s or more, --periods {_LEAST_SWINGS} or more, or remove both",
+            f"Give --max-time {math.ceil(needed)}s or more, --periods {_LEAST_CHANGES} or more, or remove both",
         )
     torques = [torque for way in ways if not way.coasting for torque in (way.reference(0.0)[1],
                way.reference(0.999999 * way.duration_s)[1])]
     lowest = min(torques) if all(not way.coasting for way in ways) else min(0.0, *torques)
-    return SwingPlan(kind, mode, low, tuple(ways), low, high, lowest, max(torques), limits, guess)
+    return SpeedChangePlan(kind, mode, low, tuple(ways), low, high, lowest, max(torques), limits, guess)
 
 
-def swing_kind(name: str) -> SwingKind:
+def speed_change_kind(name: str) -> SpeedChangeKind:
     """Return the kind of that name with changes of speed. Raises PlanRefused if it is not one."""
     kind = excitation_kind(name)
-    if not isinstance(kind, SwingKind):
+    if not isinstance(kind, SpeedChangeKind):
         raise PlanRefused(f"{name} is a periodic excitation")
     return kind
 
@@ -205,8 +205,8 @@ def coasting_s(from_rad_s: float, to_rad_s: float, guess: RigGuess) -> float:
     return guess.inertia_kg_m2 * (from_rad_s - to_rad_s) / mean
 
 
-PULSES = SwingKind(ways=_pulses)
-COAST_DOWN = SwingKind(
+PULSES = SpeedChangeKind(ways=_pulses)
+COAST_DOWN = SpeedChangeKind(
     ways=_coasts,
     needs_torque_mode=True,
     why_torque_mode="a shaft under speed control never coasts",

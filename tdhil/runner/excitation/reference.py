@@ -31,7 +31,7 @@ class PlanRefused(ValueError):
 class ExcitationKind:
     """Properties of an excitation before it is planned; `tdhil.config.registry` lists them by name.
 
-    There are two families: `PeriodicKind` has spectral lines, `SwingKind` changes from one steady speed to another.
+    There are two families: `PeriodicKind` has spectral lines, `SpeedChangeKind` goes from one steady speed to another.
     ``needs_torque_mode``: it is not possible under the drive's speed control; ``why_torque_mode`` is the reason.
     ``with_string``: it is permitted with a drill string on the shaft.
     """

@@ -217,11 +217,11 @@ class IgnoredYield:
             return None
         # the response to the latest command is still missing, and changes from cycle to cycle are torque noise
         until_s = point.time_s - 2.0 * self._lag_s
-        told = _means([(time_s, one) for time_s, one, _ in seen if time_s <= until_s], SMOOTH_S)
+        commanded = _means([(time_s, one) for time_s, one, _ in seen if time_s <= until_s], SMOOTH_S)
         went = [one for _, _, one in seen]
-        mean = math.fsum(abs(one) for one in told) / max(1, len(told))
-        told_range, went_range = max(told) - min(told), max(went) - min(went)
-        noise = max(now.noise_rad_s, YIELD_LEFT * told_range)
+        mean = math.fsum(abs(one) for one in commanded) / max(1, len(commanded))
+        commanded_range, went_range = max(commanded) - min(commanded), max(went) - min(went)
+        noise = max(now.noise_rad_s, YIELD_LEFT * commanded_range)
         clear = max(YIELD_STILL * self._still_rad_s, YIELD_MOVES * noise)
         stands = math.fsum(abs(one) for one in went) / len(went) <= YIELD_STANDS * mean
         torques = [one.torque for one in now.points if point.time_s - one.time_s <= YIELD_S]
@@ -230,8 +230,9 @@ class IgnoredYield:
             return None
         return Contradiction(
             frozenset({Signal.SPEED}),
-            f"the stop commands the shaft to yield to the drill string, with {min(told):.2f} to {max(told):.2f} rad/s"
-            f" within {YIELD_S:g} s, and the reported speed stays at {point.speed:.2f} rad/s",
+            f"the stop commands the shaft to yield to the drill string, with {min(commanded):.2f} to"
+            f" {max(commanded):.2f} rad/s within {YIELD_S:g} s, and the reported speed stays at {point.speed:.2f}"
+            " rad/s",
             "Check the encoder and its cable. Is the shaft held by a brake?", point.time_s,
         )
 

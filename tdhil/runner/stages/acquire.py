@@ -14,7 +14,7 @@ from drivers import Command, Mode, Sample
 from tdhil.recording import Excitation, Segment
 from tdhil.runner.adaptive_duration import Decision, Enough
 from tdhil.runner.control_loop import ControlLoop
-from tdhil.runner.excitation import CALM_S, Plan, PlannedSegment, RigGuess, SpeedChange, SwingPlan
+from tdhil.runner.excitation import CALM_S, Plan, PlannedSegment, RigGuess, SpeedChange, SpeedChangePlan
 from tdhil.runner.guard import kept_within
 from tdhil.runner.interim import InertiaWatch
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
@@ -186,7 +186,7 @@ class _SegmentCourse:
             segment = replace(segment, periods=segment.settle_periods + counted)
         transition = self._plan.transition(follower.wanted_rad_s, index)
         follower.follow(transition.reference, transition.duration_s)
-        self._tell(segment.recorded(follower.time_s + self._loop.period_s))
+        self._announce_with(segment.recorded(follower.time_s + self._loop.period_s))
         self._start_s = follower.time_s + self._loop.period_s
         self._index, self._segment = index, segment
         self._run_periods(0)
@@ -202,7 +202,7 @@ class _SegmentCourse:
         self._done.pop()
         already = self._segment.periods
         segment = self._segment = replace(self._segment, periods=already + periods)
-        self._tell(segment.recorded(self._start_s))
+        self._announce_with(segment.recorded(self._start_s))
         self._run_periods(already)
 
     def others(self) -> list[int]:
@@ -221,7 +221,7 @@ class _SegmentCourse:
                 self._watch.period_ended(motion, max(0.0, self._end_s - follower.time_s))
         self._done.append(self._recorded())
 
-    def _tell(self, planned: Segment) -> None:
+    def _announce_with(self, planned: Segment) -> None:
         self._announce(Excitation(self._plan.kind, self._plan.mode, (*self._done, planned)))
 
     def _recorded(self) -> Segment:
@@ -239,10 +239,10 @@ class _SegmentCourse:
 _LONGEST = 2.0            # longest coasting, multiple of the planned one: the friction may be overestimated
 
 
-def run_swings(
+def run_speed_changes(
     loop: ControlLoop,
     limits: MachineLimits,
-    plan: SwingPlan,
+    plan: SpeedChangePlan,
     control: MeanSpeedControl | None,
     assumptions: ControlAssumptions,
     announce: Announce,
@@ -283,7 +283,7 @@ def _coast(loop: ControlLoop, way: SpeedChange, follower: Follower, assumptions:
 def run_plan(
     loop: ControlLoop,
     limits: MachineLimits,
-    plan: Plan | SwingPlan,
+    plan: Plan | SpeedChangePlan,
     control: MeanSpeedControl | None,
     assumptions: ControlAssumptions,
     announce: Announce,
@@ -292,7 +292,7 @@ def run_plan(
     watch: InertiaWatch | None = None,
 ) -> None:
     """Run a plan of either family of excitations. Raises what the bench raises."""
-    if isinstance(plan, SwingPlan):
-        run_swings(loop, limits, plan, control, assumptions, announce)
+    if isinstance(plan, SpeedChangePlan):
+        run_speed_changes(loop, limits, plan, control, assumptions, announce)
     else:
         run_acquire(loop, limits, plan, control, announce, enough, speed_resolution_rad_s, watch)

@@ -332,12 +332,12 @@ def slow_down(
         return tuple(settled[-loop.cycles(STEADY_S) :]), speed
     while True:
         calmed = calm_string(loop, limits, target, tolerance)
-        restless = calmed.swing.restless(limits)
-        if restless:
+        keeps_oscillating = calmed.swing.keeps_oscillating(limits)
+        if keeps_oscillating:
             speed = replace(speed, swing=widest(speed.swing, calmed.swing))
             loop.guard.disturbed = speed.disturbed
         if slow_speed(limits, speed.wander_rad_s) <= target + tolerance:
-            return tuple(calmed.samples[-loop.cycles(2.0 * WINDOW_S if restless else CALM_S) :]), speed
+            return tuple(calmed.samples[-loop.cycles(2.0 * WINDOW_S if keeps_oscillating else CALM_S) :]), speed
         target = _ramp_to(loop, limits, speed, target)
 
 

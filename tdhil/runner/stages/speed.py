@@ -39,7 +39,7 @@ from tdhil.runner.stages.steady import (
 from tdhil.runner.string_release import SwingDamper
 
 LEVEL_S = 6.0             # s; duration of an operating point
-RESTLESS_LEVEL_S = 24.0
+OSCILLATING_LEVEL_S = 24.0
 """Duration of an operating point with a string that keeps oscillating, s: some periods, to average them out."""
 
 FIRST_RAMP_S = 8.0
@@ -105,7 +105,7 @@ class SpeedResult:
     @property
     def disturbed(self) -> str:
         """Return a description of the disturbance for the guard; empty if there is none."""
-        return "" if self.swing is None else self.swing.told
+        return "" if self.swing is None else self.swing.words
 
     @property
     def levels(self) -> tuple[Level, ...]:
@@ -133,7 +133,8 @@ def run_speed(
     low_rad_s, high_rad_s = mean_speeds(limits)
     tolerance_rad_s = max(2.0 * speed_resolution_rad_s, 0.01 * high_rad_s)
     rate = (limits.speed_max_rad_s - limits.speed_min_rad_s) / FIRST_RAMP_S
-    start = loop.switch_mode(Command(Mode.SPEED, 0.0, 0.0)) if _in_torque(loop) else None
+    in_torque = loop.last is not None and loop.last.mode is Mode.TORQUE
+    start = loop.switch_mode(Command(Mode.SPEED, 0.0, 0.0)) if in_torque else None
     speed_now = max(0.0, start.speed_rad_s) if start else 0.0
     unit_check = SpeedUnitCheck(loop, limits, assumptions, speed_resolution_rad_s, witness)
     unit_check.ramp(speed_now, low_rad_s, rate)
@@ -250,10 +251,6 @@ def _samples(held: list[Sample], torque_offset_nm: float) -> Samples:
     return Samples(fresh.time_s, fresh.speed_rad_s, fresh.torque_nm - torque_offset_nm)
 
 
-def _in_torque(loop: ControlLoop) -> bool:
-    return loop.last is not None and loop.last.mode is Mode.TORQUE
-
-
 def ramp_speed(loop: ControlLoop, start_rad_s: float, end_rad_s: float, rate_rad_s2: float) -> list[Sample]:
     """Ramp the setpoint linearly in speed mode. Return the samples."""
     steps = loop.cycles(abs(end_rad_s - start_rad_s) / rate_rad_s2)
@@ -275,10 +272,10 @@ def _settle_and_hold(
         calmed = calm_string(loop, limits, speed_rad_s, tolerance_rad_s)
         later, asked_later = hold_damped(loop, calmed.damper, lags_s)
         before_level()
-        restless = calmed.swing.restless(limits)
-        level, asked = hold_damped(loop, calmed.damper, RESTLESS_LEVEL_S if restless else LEVEL_S)
+        keeps_oscillating = calmed.swing.keeps_oscillating(limits)
+        level, asked = hold_damped(loop, calmed.damper, OSCILLATING_LEVEL_S if keeps_oscillating else LEVEL_S)
         setpoints = [*calmed.setpoints_rad_s, *asked_later, *asked]
-        return _Held([*calmed.samples, *later], level, setpoints, calmed.swing if restless else None)
+        return _Held([*calmed.samples, *later], level, setpoints, calmed.swing if keeps_oscillating else None)
     command = Command(Mode.SPEED, speed_rad_s, 0.0)
     settling = wait_until_steady(loop, command, speed_rad_s, tolerance_rad_s, timeout_s=60.0)
     settling += loop.hold(command, lags_s)

@@ -87,7 +87,7 @@ def wait_until_steady(
         if good >= BLOCKS:
             return seen
     torque_nm = sum(sample.torque_nm for sample in block) / len(block)
-    torque, helps = loop.guard.torque_told(torque_nm, block[-1].limit_active)
+    torque, helps = loop.guard.torque_words(torque_nm, block[-1].limit_active)
     approach_s = approaching_s(means, target_rad_s)
     if approach_s is not None:
         torque += f". The speed approaches its setpoint with a time constant of {approach_s:.0f} s"
@@ -154,7 +154,7 @@ class Swing:
     regular: float
 
     @property
-    def told(self) -> str:
+    def words(self) -> str:
         """Return the oscillation in words."""
         every = f" every {self.period_s:.1f} s" if self.regular >= STICK_SLIP_REGULAR else ""
         return (
@@ -162,7 +162,7 @@ class Swing:
             " rad/s, and the oscillation does not decay"
         )
 
-    def restless(self, limits: MachineLimits) -> bool:
+    def keeps_oscillating(self, limits: MachineLimits) -> bool:
         """Return whether the string oscillates more than a calm string."""
         return self.torque_nm > CALM_SHARE * limits.torque_nm
 
@@ -245,8 +245,8 @@ def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, t
                 return Calmed(samples, setpoints, left, damper)
     left = swing_of(samples[-2 * window :], loop.period_s)
     mean = _mean_speed(samples[-window:])
-    torque, helps = loop.guard.torque_told(
-        float(trace(samples[-window:]).torque_nm.mean()), samples[-1].limit_active, left.restless(limits)
+    torque, helps = loop.guard.torque_words(
+        float(trace(samples[-window:]).torque_nm.mean()), samples[-1].limit_active, left.keeps_oscillating(limits)
     )
     raise LimitHit(
         f"the string did not settle at {target_rad_s:.3f} rad/s within {MOST_CALMING_S:g} s (mean speed {mean:.3f}"

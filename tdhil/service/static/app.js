@@ -462,12 +462,12 @@
       const last = inertias[inertias.length - 1], known = inertias.filter((one) => one.inertia_kg_m2 !== null).pop();
       byId("inertia").hidden = !known;
       byId("inertia-now").textContent = known ? withUnit(interval(known.inertia_kg_m2, known.low_kg_m2, known.high_kg_m2)) : "–";
-      const told = [`${last.periods} periods`];
-      if (known) told.push(percent((known.high_kg_m2 - known.low_kg_m2) / 2 / known.inertia_kg_m2));
-      if (last.p_value !== null) told.push(`p = ${number(last.p_value, 2)}`);
-      if (last.tolerance !== null && last.least_left_s !== null) told.push(`at least ${span(last.least_left_s)} to ±${Number((100 * last.tolerance).toPrecision(3))} %`);
-      if (last.inertia_kg_m2 === null) told.push(last.reason);
-      byId("inertia-said").textContent = told.join(", ");
+      const words = [`${last.periods} periods`];
+      if (known) words.push(percent((known.high_kg_m2 - known.low_kg_m2) / 2 / known.inertia_kg_m2));
+      if (last.p_value !== null) words.push(`p = ${number(last.p_value, 2)}`);
+      if (last.tolerance !== null && last.least_left_s !== null) words.push(`at least ${span(last.least_left_s)} to ±${Number((100 * last.tolerance).toPrecision(3))} %`);
+      if (last.inertia_kg_m2 === null) words.push(last.reason);
+      byId("inertia-said").textContent = words.join(", ");
       byId("inertia-row").hidden = false;
       if (!known) return;
       drawInertia ||= inertiaPlot(byId("plot-inertia"));

@@ -387,8 +387,8 @@
       const dot = (k) => el("span", { class: `dot c${k}`, "aria-hidden": "true" });
       const heads = ids.map((id, k) => el("th", { scope: "col" }, dot(k), " ", el("a", { href: `/runs/${id}` }, names[k]), " ", badge(comparison.results[k].simulated) || "", " ", rehearsal(comparison.results[k].rehearsed_faults) || "", " ", uploaded(comparison.results[k].uploaded) || ""));
       const said = comparison.differences.map((one, k) => {
-        const told = one.quantities.find((other) => other.column === "inertia_kg_m2");
-        return el("p", { class: told && told.differs ? "now alarm" : "now" }, dot(0), " ", names[0], " and ", dot(k + 1), ` ${names[k + 1]}: ${one.text}.`);
+        const moment = one.quantities.find((other) => other.column === "inertia_kg_m2");
+        return el("p", { class: moment && moment.differs ? "now alarm" : "now" }, dot(0), " ", names[0], " and ", dot(k + 1), ` ${names[k + 1]}: ${one.text}.`);
       });
       const others = comparison.differences.flatMap((one, k) => one.quantities.filter((other) => other.column !== "inertia_kg_m2").map((other) => [
         `${other.name}, ${k + 2} against 1`, other.differs ? "differs" : "no significant difference",

@@ -207,5 +207,5 @@ def cramer_rao(plant: CoveragePlant, periods: int) -> Bounds:
 
 
 def _pooled(sds: list[float | None]) -> float | None:
-    told = [sd for sd in sds if sd is not None]
-    return float(np.sqrt(np.mean(np.square(told)))) if len(told) == len(sds) else None
+    known = [sd for sd in sds if sd is not None]
+    return float(np.sqrt(np.mean(np.square(known)))) if len(known) == len(sds) else None

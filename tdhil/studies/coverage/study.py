@@ -105,28 +105,28 @@ def clopper_pearson(hits: int, tries: int, one_sided: float = ONE_SIDED) -> tupl
 def figures_of(plant: CoveragePlant, runs: Sequence[SimulatedRun], bounds: Bounds) -> PlantFigures:
     """Return the figures, added in the order of the runs' numbers, so that the same runs give the same bits."""
     ordered = sorted(runs, key=lambda run: run.number)
-    told = [
+    answered = [
         (run.value, run.low, run.high)
         for run in ordered
         if run.value is not None and run.low is not None and run.high is not None
     ]
     truth = plant.inertia_kg_m2
-    misses = sum(not low <= truth <= high for _, low, high in told)
-    low, high = clopper_pearson(misses, len(told))
-    error = np.array([value / truth - 1.0 for value, _, _ in told])
+    misses = sum(not low <= truth <= high for _, low, high in answered)
+    low, high = clopper_pearson(misses, len(answered))
+    error = np.array([value / truth - 1.0 for value, _, _ in answered])
     reasons = Counter(f"{run.verdict}: {run.reason}" for run in ordered if run.value is None)
     return PlantFigures(
         plant=plant,
         runs=len(ordered),
-        refused=len(ordered) - len(told),
+        refused=len(ordered) - len(answered),
         misses=misses,
-        miss_rate=misses / len(told) if told else None,
+        miss_rate=misses / len(answered) if answered else None,
         miss_low=low,
         miss_high=high,
-        bias=float(error.mean()) if told else None,
-        bias_error=float(error.std(ddof=1) / np.sqrt(len(told))) if len(told) > 1 else None,
-        rmse=float(np.sqrt(np.mean(error**2))) if told else None,
-        half_width=float(np.mean([0.5 * (top - bottom) / truth for _, bottom, top in told])) if told else None,
+        bias=float(error.mean()) if answered else None,
+        bias_error=float(error.std(ddof=1) / np.sqrt(len(answered))) if len(answered) > 1 else None,
+        rmse=float(np.sqrt(np.mean(error**2))) if answered else None,
+        half_width=float(np.mean([0.5 * (top - bottom) / truth for _, bottom, top in answered])) if answered else None,
         bound=bounds.known / truth if bounds.known is not None else None,
         bound_unknown=bounds.unknown / truth if bounds.unknown is not None else None,
         reasons=tuple(reasons.most_common()),
@@ -288,12 +288,12 @@ def said(found: Sequence[PlantFigures], confidence: float) -> tuple[Statement, .
 
 def _said_of(one: PlantFigures, nominal: float) -> list[Statement]:
     name = one.plant.name
-    told = f"{one.misses} of {one.answered} missed"
+    count = f"{one.misses} of {one.answered} missed"
     statements = [
         Statement(
             f"{name}: lower 99 % bound of the miss rate",
             f"≤ {nominal:.3g}",
-            f"{one.miss_low:.3f} ({told})",
+            f"{one.miss_low:.3f} ({count})",
             covers(one, nominal),
         )
     ]
@@ -302,7 +302,7 @@ def _said_of(one: PlantFigures, nominal: float) -> list[Statement]:
             Statement(
                 f"{name}: the miss rate is not below {0.4 * nominal:.3g} (upper 99 % bound)",
                 f"≥ {0.4 * nominal:.3g}",
-                f"{one.miss_high:.3f} ({told})",
+                f"{one.miss_high:.3f} ({count})",
                 not_too_wide(one, nominal),
             )
         )
@@ -398,7 +398,8 @@ class CoverageStudy:
                 done += len(group)
                 left_s = (time.monotonic() - begun_s) * (total - done) / done
                 of_plant = f"{group[0].plant}: {len(runs[group[0].plant])} of {settings.seeds} runs"
-                progress(0.98 * done / total, f"{of_plant}; {done} of {total} in all, about {_told(left_s)} left")
+                left = _duration_words(left_s)
+                progress(0.98 * done / total, f"{of_plant}; {done} of {total} in all, about {left} left")
         except KeyboardInterrupt:
             done = sum(map(len, runs.values()))     # Ctrl-C may have come between the two
             if done == 0:
@@ -414,7 +415,7 @@ class CoverageStudy:
         return cut_short(outcome, done, total) if interrupted else outcome
 
 
-def _told(duration_s: float) -> str:
+def _duration_words(duration_s: float) -> str:
     return f"{duration_s / 60.0:.0f} min" if duration_s >= 90.0 else f"{duration_s:.0f} s"
 
 
