@@ -88,7 +88,7 @@ def _add_accounts(kinds: argparse._SubParsersAction[argparse.ArgumentParser], ki
 def run(namespace: argparse.Namespace) -> int:
     """Serve until Ctrl-C or SIGTERM, which also stop all runs."""
     from tdhil.errors import UsageError
-    from tdhil.service import MEBIBYTE, MOST_UPLOAD, Tls, check_idle, serve
+    from tdhil.service import MEBIBYTE, MOST_UPLOAD, Receivers, Tls, check_idle, serve
 
     if not 0 <= namespace.port <= 65535:
         raise UsageError("must be 0 to 65535", where=f"--port {namespace.port}", entry=MessageCode.VALUE_NOT_ALLOWED)
@@ -107,7 +107,7 @@ def run(namespace: argparse.Namespace) -> int:
         return check_idle(namespace.data, say)
     viewers = frozenset(one.rstrip("/").lower() for one in namespace.viewer)
     return serve(namespace.rigs, namespace.data, namespace.host, namespace.port, say, viewers=viewers,
-                 mqtt=namespace.mqtt, webhook=namespace.webhook, mail=namespace.mail,
+                 receivers=Receivers(namespace.mqtt, namespace.webhook, namespace.mail),
                  tls=None if cert is None else Tls(cert, key), names=namespace.allowed_host,
                  logs=namespace.logs, upload_limit=namespace.upload_limit * MEBIBYTE)
 

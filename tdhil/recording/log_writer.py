@@ -323,8 +323,8 @@ class RunWriter:
 
     ``queue_size``: number of records; None: the default of stepped or real time. ``block``: a full queue makes the
     caller wait (stepped time); otherwise the record is dropped, counted in ``dropped``, and the drop is logged as an
-    event (real time). ``keep_up``: with ``block``, no sample is taken while the file is behind. False for a copy of
-    data that exist elsewhere: a killed process loses the queue.
+    event (real time). `keep_up`: no sample is taken while the file is behind, usual with ``block``. Set it to False for a
+    copy of data that exist elsewhere: a killed process loses the queue.
 
     Raises `LogUnopened` and, if less than ``min_free_bytes`` are free, `LogRefused`.
 
@@ -344,7 +344,6 @@ class RunWriter:
         overwrite: bool = True,
         opener: Callable[[Path], RawFile] | None = None,
         frames: int = CAN,
-        keep_up: bool = True,
     ) -> None:
         self.path = path
         self._raised = self._closing = False
@@ -361,7 +360,7 @@ class RunWriter:
         except OSError as error:
             kind = LogRefused if error.errno in _FULL else LogUnopened
             raise self._error(kind, "the log can't be opened", error) from error
-        self._block = block and keep_up
+        self.keep_up = block
         self._pump = Pump(self._backlog, container, Syncer(file), epoch_ns, frames)
         self._thread = Thread(target=self._pump.run, name="tdhil-log", daemon=True)
         self._thread.start()
@@ -386,7 +385,7 @@ class RunWriter:
                 self._backlog.end()
         if not self._backlog.put(sample):
             self._refused()
-        elif self._block:
+        elif self.keep_up:
             self._backlog.keep_up(sample[0])
 
     def command(self, time_s: float, command: Command) -> None:

@@ -25,7 +25,8 @@ def write_trace_log(path: Path, recording: Recording, run: Mapping[str, Any]) ->
     Raises LogError: LogRefused without disk space, LogUnopened or LogBroken.
     """
     facts = {name: value for name in FACTS if (value := getattr(recording, name)) is not None}
-    writer = RunWriter(path, epoch_ns=0, block=True, queue_size=QUEUE, overwrite=False, keep_up=False)
+    writer = RunWriter(path, epoch_ns=0, block=True, queue_size=QUEUE, overwrite=False)
+    writer.keep_up = False
     with writer:
         writer.configuration(run, facts)
         writer.excitation(recording.excitation, recording.levels, recording.ramps)

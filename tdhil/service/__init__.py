@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from tdhil.service.limits import MEBIBYTE as MEBIBYTE, MOST_UPLOAD as MOST_UPLOAD, UPLOAD_LIMIT as UPLOAD_LIMIT
     from tdhil.service.run_state import Conflict as Conflict, NotAllowed as NotAllowed, NotThere as NotThere
     from tdhil.service.server import (
-        HOST as HOST, PORT as PORT, Tls as Tls, check_idle as check_idle, require_folder as require_folder,
-        serve as serve,
+        HOST as HOST, PORT as PORT, Receivers as Receivers, Tls as Tls, check_idle as check_idle,
+        require_folder as require_folder, serve as serve,
     )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
@@ -27,5 +27,5 @@ else:
         "console": "attend",
         "limits": "MEBIBYTE MOST_UPLOAD UPLOAD_LIMIT",
         "run_state": "Conflict NotAllowed NotThere",
-        "server": "HOST PORT Tls check_idle require_folder serve",
+        "server": "HOST PORT Receivers Tls check_idle require_folder serve",
     })

@@ -112,17 +112,27 @@ def _names(host: str, more: Sequence[str]) -> frozenset[str]:
     return frozenset(one.lower() for one in ("127.0.0.1", "localhost", "::1", own, *more))
 
 
+@dataclass(frozen=True)
+class Receivers:
+    """Addresses that receive news of the runs.
+
+    ``mqtt``: broker for states and results. ``webhook``: receiver of a message for each ended run and each change of a
+    rig. ``mail``: server and recipients of the same messages.
+    """
+
+    mqtt: str | None = None
+    webhook: str | None = None
+    mail: str | None = None
+
+
 def serve(
     rigs: Path | None, data: Path, host: str, port: int, say: Say, *, viewers: frozenset[str] = frozenset(),
-    mqtt: str | None = None, webhook: str | None = None, mail: str | None = None, tls: Tls | None = None,
-    names: Sequence[str] = (), logs: Sequence[Path] = (), upload_limit: int = UPLOAD_LIMIT,
+    receivers: Receivers | None = None, tls: Tls | None = None, names: Sequence[str] = (), logs: Sequence[Path] = (),
+    upload_limit: int = UPLOAD_LIMIT,
 ) -> int:
     """Serve until SIGINT or SIGTERM; then live runs are stopped first. Return the exit code.
 
     ``viewers``: origins of Foxglove or Lichtblick in a browser, which may read logs as they grow.
-    ``mqtt``: the address of a broker that receives states and results.
-    ``webhook``: the address that receives a message for each ended run and each change of a rig; ``mail``: the mail
-    server and the recipients of the same messages.
     ``names``: more names of this host; ``logs``: folders of logs for fleet requests, besides the service's runs;
     ``upload_limit``: largest uploaded recording, bytes.
 
@@ -160,8 +170,10 @@ def serve(
     from tdhil.service.web import Web
     from tdhil.service.webhook import Webhook
 
-    broker = None if mqtt is None else Broker.of(mqtt)
-    receivers: list[Receiver] = [kind.of(url) for kind, url in ((Webhook, webhook), (Mail, mail)) if url is not None]
+    receivers = receivers or Receivers()
+    broker = None if receivers.mqtt is None else Broker.of(receivers.mqtt)
+    messages: list[Receiver] = [kind.of(url) for kind, url in ((Webhook, receivers.webhook), (Mail, receivers.mail))
+                                if url is not None]
     store = Store(data.resolve())
     store.prepare()
     alone = _alone(store.folder)
@@ -186,7 +198,7 @@ def serve(
     if publisher is not None:
         publisher.start()
     notifiers = [Notifier(one.at(site), lambda: web.list_runs(None, None, RUNS), web.trends_around, say)
-                 for one in receivers]
+                 for one in messages]
     for notifier in notifiers:
         notifier.start()
     try:

@@ -298,7 +298,8 @@ def evaluate(rows: Array, case: EvaluationCase, program: SpeedProgram, contradic
     if critical is not None and _distance_rpm(critical, case.prediction.cure_rpm) > TOLERANCE_RPM:
         disturbed = disturbed_trials(case.string, case.meant, case.law, program, case.prediction.cure_rpm,
                                      column["unknown_nm"][coupled], period_s)
-    outcome, why = _verdict(case, program, clamped, foreign, did_stick, critical, decay, unknown, reached, disturbed)
+    outcome, why = _verdict(case, program, clamped, (unknown, foreign), did_stick, critical, decay, reached,
+                            disturbed)
     if contradiction:
         outcome, why = EvaluationOutcome.INVALID, contradiction
     return Evaluation(
@@ -311,15 +312,16 @@ def evaluate(rows: Array, case: EvaluationCase, program: SpeedProgram, contradic
 
 
 def _verdict(
-    case: EvaluationCase, program: SpeedProgram, clamped: int, foreign: float, did_stick: bool,
-    critical: Interval | None,
-    decay: tuple[Interval, float] | None, unknown_nm: float, reached: float, disturbed: DisturbedTrials | None,
+    case: EvaluationCase, program: SpeedProgram, clamped: int, unknown: tuple[float, float], did_stick: bool,
+    critical: Interval | None, decay: tuple[Interval, float] | None, reached: float, disturbed: DisturbedTrials | None,
 ) -> tuple[EvaluationOutcome, str]:
     """Return the verdict with its reason.
 
+    ``unknown``: torque that was not commanded, in N·m rms and as a share of the torque that moved the shaft.
     ``disturbed``: simulated trials under the unknown torque, for a critical speed that is not near the prediction.
     """
     predicted, damping = case.prediction.cure_rpm, case.prediction.least_damping
+    unknown_nm, foreign = unknown
     if clamped:
         return EvaluationOutcome.INVALID, f"the torque limit cut the virtual string's torque off in {clamped} cycles"
     if foreign > FOREIGN_SHARE:

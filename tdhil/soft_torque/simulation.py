@@ -206,14 +206,13 @@ def simulate(
     keep_every_s: float = 0.1,
     longest_tick_s: float = LONGEST_TICK_S,
     hold_s: float = 0.0,
-    seeds: Sequence[int] | None = None,
-    disturbance: TopDisturbance | None = None,
+    disturbance: Sequence[int] | TopDisturbance | None = None,
 ) -> SimulationTrace:
     """Simulate every loop at every set speed, and return the stored signals.
 
     After ``hold_s``, the set speed ramps from its value in ``begin`` to ``target_rad_s``, shape (loops, speeds).
-    ``seeds``: seeds of the bit noise, one for each loop; None: no noise. ``disturbance``: torque on
-    the rotors. All durations are for the first string.
+    ``disturbance``: seeds of the bit noise, one for each loop, or torque on the rotors; None: neither. All durations
+    are for the first string.
     Raises ValueError if a bit is not stated.
     """
     every_string = [strings] * len(loops) if isinstance(strings, DrillString) else list(strings)
@@ -237,7 +236,11 @@ def simulate(
         speed = now
         held = pipe.turn(now.ravel()).reshape(shape)
     top.begin(speed, held)
-    noise = None if seeds is None else _BitNoise(every_string, grids, seeds, shape[1])
+    top_torque, noise = None, None
+    if isinstance(disturbance, TopDisturbance):
+        top_torque = disturbance
+    elif disturbance is not None:
+        noise = _BitNoise(every_string, grids, disturbance, shape[1])
     tick_s = np.array([one.tick_s for one in grids])[:, None]
     step = ramp_rad_s2 * tick_s
     count, held_ticks = ceil(duration_s / grid.tick_s), round(hold_s / grid.tick_s)
@@ -252,7 +255,7 @@ def simulate(
         if tick >= held_ticks and not arrived:
             set_speed = set_speed + np.clip(target_rad_s - set_speed, -step, step)
             arrived = bool(np.array_equal(set_speed, target_rad_s))
-        other_nm = 0.0 if disturbance is None else disturbance.at(tick * grid.tick_s)
+        other_nm = 0.0 if top_torque is None else top_torque.at(tick * grid.tick_s)
         top_wave, mean_top = top.step(pipe.at_top(), set_speed, other_nm)
         pipe.tick(top_wave, None if noise is None else noise.at(tick))
         bit_speed = pipe.bit_rad_s
@@ -680,7 +683,7 @@ def ends_turning(
     ramp = search.start_ramp_rpm_s * RPM
     duration = search.duration_s + (float(target.max()) / ramp if how == "rest" else 0.0)
     trace = simulate(strings, loops, begin, target, ramp, duration, keep_every_s=duration / 4.0,
-                     longest_tick_s=search.longest_tick_s, seeds=seeds)
+                     longest_tick_s=search.longest_tick_s, disturbance=seeds)
     turned: NDArray[np.bool_] = trace.last_stuck_s < trace.end_s * (1.0 - search.calm_s / duration)
     return turned
 
