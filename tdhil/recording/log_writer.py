@@ -323,8 +323,8 @@ class RunWriter:
 
     ``queue_size``: number of records; None: the default of stepped or real time. ``block``: a full queue makes the
     caller wait (stepped time); otherwise the record is dropped, counted in ``dropped``, and the drop is logged as an
-    event (real time). `keep_up`: no sample is taken while the file is behind, usual with ``block``. Set it to False for a
-    copy of data that exist elsewhere: a killed process loses the queue.
+    event (real time). `keep_up`: no sample is taken while the file is behind, usual with ``block``. Set it to False for
+    a copy of data that exist elsewhere: a killed process loses the queue.
 
     Raises `LogUnopened` and, if less than ``min_free_bytes`` are free, `LogRefused`.
 
