@@ -22,7 +22,7 @@ from tdhil.service.attendance import (
     Lease,
     ServiceOperator,
     Watcher,
-    tell,
+    print_line,
 )
 from tdhil.service.run_state import State, Status, now
 from tdhil.service.store import Store
@@ -331,7 +331,7 @@ def test_a_step_that_cannot_be_ends_no_run(board):
 def test_a_line_for_a_log_that_takes_none_is_nobody_s_error(monkeypatch):
     full = Path("/dev/full").open("w")                     # noqa: SIM115
     monkeypatch.setattr("sys.stderr", full)
-    tell("no space for this")
+    print_line("no space for this")
     monkeypatch.undo()
     with pytest.raises(OSError, match="No space"):
         full.close()
