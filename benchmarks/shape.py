@@ -1,4 +1,4 @@
-"""Counts what the shape of the source is judged by: lines, files, helpers called once, constants, long signatures.
+"""Count the figures of the shape of the source: lines, files, helpers called once, constants, long signatures.
 
     python benchmarks/shape.py                 # the counts
     python benchmarks/shape.py --helpers       # private functions that are named once, with their lengths

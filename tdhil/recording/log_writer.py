@@ -190,7 +190,7 @@ class Pump:
         self._frames: list[RawFrame] = []      # frames of the present cycle
         self._chunk_ns: int | None = None      # log time of the open chunk's first sample
         self._opened_s: float | None = None    # when the open chunk was first seen, wall time
-        self._drops_logged = 0                         # number of dropped records that have been logged
+        self._drops_logged = 0                 # number of dropped records that have been logged
 
     def run(self) -> None:
         """Run the thread. No exception leaves it. At its end no caller is left waiting."""

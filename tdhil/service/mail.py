@@ -15,12 +15,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from email.message import EmailMessage
 from email.utils import formatdate, make_msgid
-from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
 
 from profiles import visible
 from tdhil.errors import MessageCode, UsageError
+from tdhil.service.password_file import read_password
 
 TIMEOUT_S: Final = 20.0
 """Longest wait for each reply of the server, s."""
@@ -78,7 +78,8 @@ class Mail:
                              entry=MessageCode.SERVICE_OPTION_WRONG)
         encrypted = parts.scheme == "smtps"
         return Mail(host, port or (465 if encrypted else 25), recipients, sender,
-                    unquote(user) if user else None, encrypted, _password(environment, user))
+                    unquote(user) if user else None, encrypted,
+                    read_password(PASSWORD_FILE, environment) if user else None)
 
     def at(self, site: str) -> Mail:
         """Return the same with the address of the service's pages."""
@@ -137,15 +138,3 @@ def _figure(message: Mapping[str, Any]) -> str:
         return ""
     interval = "" if low is None or high is None else f" ({low:.4g} to {high:.4g})"
     return f"J = {value:.4g}{interval} kg·m²"
-
-
-def _password(environment: Mapping[str, str], user: str | None) -> str | None:
-    """Return the password from its file. Raises UsageError."""
-    if (name := environment.get(PASSWORD_FILE)) is None or user is None:
-        return None
-    try:
-        return Path(name).read_text(encoding="utf-8").strip()
-    except (OSError, ValueError) as error:
-        raise UsageError(f"can't be read ({error})", where=f"{PASSWORD_FILE} {name}",
-                         next_step="The file must contain only the password, readable by its owner only",
-                         entry=MessageCode.SERVICE_OPTION_WRONG) from None

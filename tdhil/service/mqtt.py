@@ -20,11 +20,11 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import unquote, urlsplit
 
 from tdhil.errors import MessageCode, UsageError
+from tdhil.service.password_file import read_password
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
@@ -74,23 +74,12 @@ class Broker:
         if set(prefix) & set("+#\0") or prefix.startswith("$") or "//" in prefix:
             raise UsageError("a prefix must not contain +, # or //, nor begin with $", where=f"--mqtt …/{prefix}")
         user = unquote(parts.username) if parts.username else environment.get(USER)
+        password = read_password(PASSWORD_FILE, environment)
         return Broker(host, port or PORTS[parts.scheme], parts.scheme == "mqtts", prefix, user,
-                      _password(environment), environment.get(CA_FILE))
+                      environment.get(PASSWORD) if password is None else password, environment.get(CA_FILE))
 
     def __str__(self) -> str:
         return f"{'mqtts' if self.tls else 'mqtt'}://{self.host}:{self.port}/{self.prefix}"
-
-
-def _password(environment: Mapping[str, str]) -> str | None:
-    if (name := environment.get(PASSWORD_FILE)) is None:
-        return environment.get(PASSWORD)
-    try:
-        return Path(name).read_text(encoding="utf-8").rstrip("\r\n")
-    except (OSError, ValueError) as error:
-        raise UsageError(f"can't be read ({getattr(error, 'strerror', None) or 'no text'})",
-                         where=f"{PASSWORD_FILE} {name}",
-                         next_step="The file must contain only the password, readable by its owner only",
-                         entry=MessageCode.SERVICE_OPTION_WRONG) from None
 
 
 class Publisher:

@@ -57,7 +57,7 @@ def _address_fields(bus: str) -> list[FieldView]:
     fields = [] if model is None else [
         FieldView(name, field.description or "") for name, field in model.model_fields.items()
         if field.default is None]
-    beside = known.rig_keys(FoundDrive(bus, 1, "", "", False))
+    beside = _beside(bus)
     return fields + [FieldView(name, f"number of the drive: {known.address_word}") for name in beside]
 
 
@@ -144,7 +144,7 @@ def _problem_of(message: str, profile: Profile) -> DraftProblemView:
     bus = bus_named(profile.bus)
     if section == bus.section and inner:
         key = f"address.{inner}"
-    elif key in bus.rig_keys(FoundDrive(profile.bus, 1, "", "", False)):
+    elif key in _beside(profile.bus):
         key = f"address.{key}"
     return DraftProblemView(key.removeprefix("drive_data."), f"{text[:1].upper()}{text[1:]}.")
 
@@ -155,11 +155,10 @@ def scan_for(body: DraftBody) -> ScanView:
     address = _given(body.address)
     if not address:
         raise UsageError("name the interface or the line first", where="address", entry=MessageCode.BUS_NOT_CONFIGURED)
-    text = "\n".join(one for one in blank_rig(profile, profile.name, "none", RigEntries(address=address)).splitlines()
-                     if not one.startswith("load:"))
+    text = blank_rig(profile, profile.name, "none", RigEntries(address=address))
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / DRAFT
-        place.write_text(text + "\n", encoding="utf-8")
+        place.write_text(text, encoding="utf-8")
         command = [sys.executable, "-m", "tdhil", "scan", "--rig", str(place), "--json"]
         try:
             done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
@@ -183,6 +182,9 @@ def scan_for(body: DraftBody) -> ScanView:
 
 def _address_of(bus: str, number: int) -> dict[str, str]:
     """Return the fields of the address that name this drive on its bus."""
-    known = bus_named(bus)
-    beside = known.rig_keys(FoundDrive(bus, number, "", "", False))
-    return {name: str(value) for name, value in (beside or {known.address_word: number}).items()}
+    return {name: str(value) for name, value in (_beside(bus, number) or {bus_named(bus).address_word: number}).items()}
+
+
+def _beside(bus: str, number: int = 1) -> Mapping[str, Any]:
+    """Return the keys of the address beside the section of the bus, for the drive with this number."""
+    return bus_named(bus).rig_keys(FoundDrive(bus, number, "", "", False))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Final
@@ -40,7 +40,7 @@ def starter(found: FoundDrive, line: Mapping[str, Any], profile: Profile | None)
         f"drive: {found.bus}",
     ]
     if line:
-        parts.append(_section(found.bus, line))
+        parts.append(_section(found.bus, line, _value))
     parts += [f"{key}: {_value(value)}" for key, value in bus_named(found.bus).rig_keys(found).items()]
     if found.profile is not None:
         parts.append(f"profile: {scalar(found.profile)}    # {_comment(found.why)}")
@@ -126,8 +126,7 @@ def _address(profile: Profile, known: Mapping[str, Any]) -> tuple[str, ...]:
         return bus.rig_blank(profile)
     section = {key: value for key, value in known.items() if key in _section_fields(profile.bus)}
     beside = {key: value for key, value in known.items() if key not in section}
-    inner = ", ".join(f"{key}: {_typed(value)}" for key, value in section.items())
-    return (*((f"{bus.section}: {{{inner}}}",) if section else ()),
+    return (*((_section(profile.bus, section, _typed),) if section else ()),
             *(f"{key}: {_typed(value)}" for key, value in beside.items()))
 
 
@@ -167,8 +166,8 @@ def _entry(name: str, known: Mapping[str, Any], description: str | None) -> str:
     return f"#  {name + ':':<24} # {description}"
 
 
-def _section(bus: str, line: Mapping[str, Any]) -> str:
-    return f"{bus_named(bus).section}: {{{', '.join(f'{key}: {_value(value)}' for key, value in line.items())}}}"
+def _section(bus: str, line: Mapping[str, Any], text: Callable[[Any], str]) -> str:
+    return f"{bus_named(bus).section}: {{{', '.join(f'{key}: {text(value)}' for key, value in line.items())}}}"
 
 
 def _value(value: Any) -> str:

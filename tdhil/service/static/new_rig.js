@@ -1,7 +1,7 @@
 // A new rig in six steps: profile, address with a scan, settings by hand, machine limits with their picture, check, save.
 "use strict";
 (() => {
-  const { Refused, byId, call, el, pages, show, waiting } = window.tdhil;
+  const { Refused, byId, call, el, markWrong, pages, show, unmark, waiting } = window.tdhil;
   const SCAN_MS = 130000;            // the service ends a scan after 120 s
 
   /** Picture of the limits: the window in which speed and torque stay, and the torque of the first motion. */
@@ -58,7 +58,7 @@
       const one = chosen();
       show(byId("address"), ...one.address.map((key) => input(`address.${key.name}`, place(key))));
       show(byId("parameters"), ...one.parameters.map((key) => input(key.name, `${key.description}, which the drive does not report`)));
-      byId("profile-hint").textContent = one.experimental ? "This profile was made from documents. Nobody has reported a run with it yet." : "";
+      byId("profile-hint").textContent = one.experimental ? "This profile was made from documents. No run with it was reported yet." : "";
       byId("rated").hidden = !one.rated_torque_by_hand;
       const doubts = Object.entries(one.unverified);
       show(byId("by-hand"),
@@ -89,30 +89,23 @@
       }
       return found;
     }
-    function unmark() {
-      form.querySelectorAll("[aria-invalid]").forEach((one) => { one.removeAttribute("aria-invalid"); one.removeAttribute("aria-describedby"); });
-      form.querySelectorAll(".wrong").forEach((one) => one.remove());
-      said.hidden = true;
-    }
     /** Mark each mistake at its field. Return those that belong to no field. */
     function mark(problems) {
-      const rest = [];
-      let first = null;
-      problems.forEach((one, k) => {
-        const input = form.elements[one.field === "address" ? (form.querySelector("#address input") || {}).name : one.field];
-        const place = input ? input.closest("label") : form.querySelector(`[data-field="${CSS.escape(one.field)}"]`);
-        if (!place) { rest.push(one.message); return; }
-        const note = el("span", { class: "alarm wrong", id: `wrong-${k}` }, one.message);
-        place.append(note);
-        if (input) { input.setAttribute("aria-invalid", "true"); input.setAttribute("aria-describedby", note.id); }
-        first = first || input || place;
-      });
-      if (first && first.focus) { first.focus(); first.scrollIntoView({ block: "center" }); }
+      const first = (form.querySelector("#address input") || {}).name, rest = [];
+      const named = problems.map((one) => ({ option: one.field === "address" ? first : one.field, message: one.message }));
+      const marked = markWrong(form, named);
+      for (const one of named.filter((each) => !form.elements[each.option])) {
+        const place = form.querySelector(`[data-field="${CSS.escape(one.option)}"]`);
+        if (!place) { rest.push(one.message); continue; }
+        place.append(el("span", { class: "alarm wrong" }, one.message));
+        if (!marked) place.scrollIntoView({ block: "center" });
+      }
       return rest;
     }
     const picture = (limits) => show(byId("window"), Object.keys(limits).length ? windowPicture(limits) : null);
     async function check() {
-      unmark();
+      unmark(form);
+      said.hidden = true;
       const found = await call("POST", "/new-rig/draft", draft());
       picture(found.limits);
       show(byId("draft"),
@@ -139,7 +132,8 @@
       try { picture((await call("POST", "/new-rig/draft", draft())).limits); } catch (error) { refused(error); }
     });
     byId("scan").addEventListener("click", async () => {
-      unmark();
+      unmark(form);
+      said.hidden = true;
       const over = waiting(byId("scan-said"), "Scanning");
       byId("scan").disabled = true;
       try {
