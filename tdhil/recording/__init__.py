@@ -7,7 +7,8 @@ from profiles import lazy_names
 if TYPE_CHECKING:
     from tdhil.recording.builder import RecordingBuilder as RecordingBuilder, RecordingPart as RecordingPart
     from tdhil.recording.csv import (
-        Bench as Bench, REFERENCE_FLAG as REFERENCE_FLAG, ReferenceTrace as ReferenceTrace,
+        Bench as Bench, GAP_INTERVALS as GAP_INTERVALS, REFERENCE_FLAG as REFERENCE_FLAG,
+        ReferenceTrace as ReferenceTrace,
         TIME_AND_TORQUE as TIME_AND_TORQUE, USUAL as USUAL, parse_columns as parse_columns,
         TraceSurvey as TraceSurvey, column_mistakes as column_mistakes,
         read_recording as read_recording, read_reference as read_reference, survey_trace as survey_trace,
@@ -41,7 +42,7 @@ else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "builder": "RecordingBuilder RecordingPart",
         "csv": (
-            "Bench USUAL parse_columns read_recording REFERENCE_FLAG ReferenceTrace TIME_AND_TORQUE "
+            "Bench GAP_INTERVALS USUAL parse_columns read_recording REFERENCE_FLAG ReferenceTrace TIME_AND_TORQUE "
             "read_reference TraceSurvey column_mistakes survey_trace units_of"
         ),
         "log_format": "CAN CHANNELS CLASSES COMMAND EXCITATION FRAME_CHANNELS LiveInertia RAW_FRAMES SAMPLE "

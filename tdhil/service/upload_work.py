@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 PLOTTED: Final = 800
 """Number of stretches in the plot of a preview; each has the smallest and the largest value."""
-GAP: Final = 5.0
-"""Number of usual intervals from which an interval counts as a gap, as in the reader of traces."""
 SAID: Final = ("operator", "note")
 
 
@@ -120,10 +118,12 @@ def _run(record: RunRecord) -> dict[str, Any]:
 
 def reading_of(recording: Recording, warnings: Sequence[str]) -> dict[str, Any]:
     """Return length, rate, gaps, ranges, warnings and a thinned plot of a recording. Times are in s."""
+    from tdhil.recording import GAP_INTERVALS
+
     time_s = recording.time_s
     steps = np.diff(time_s)
     usual = float(np.median(steps)) if len(steps) else 0.0
-    at = np.flatnonzero(steps > GAP * usual) if usual > 0.0 else np.empty(0, dtype=np.int64)
+    at = np.flatnonzero(steps > GAP_INTERVALS * usual) if usual > 0.0 else np.empty(0, dtype=np.int64)
     widest = int(np.argmax(steps)) if len(steps) else 0
     return {
         "samples": len(time_s), "duration_s": float(time_s[-1] - time_s[0]) if len(time_s) else 0.0,

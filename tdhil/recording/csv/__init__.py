@@ -5,8 +5,8 @@ from tdhil.recording.csv.layout import (
     parse_columns as parse_columns,
 )
 from tdhil.recording.csv.reader import (
-    Bench as Bench, ReferenceTrace as ReferenceTrace, read_recording as read_recording,
-    read_reference as read_reference,
+    GAP_INTERVALS as GAP_INTERVALS, Bench as Bench, ReferenceTrace as ReferenceTrace,
+    read_recording as read_recording, read_reference as read_reference,
 )
 from tdhil.recording.csv.survey import (
     TraceSurvey as TraceSurvey, column_mistakes as column_mistakes, survey_trace as survey_trace, units_of as units_of,

@@ -146,7 +146,7 @@ class RowReader:
 
 LONGEST_S = 7 * 86400.0
 _MOST_DROPPED = 0.10      # largest share of rows dropped; with more it is not one recording
-_GAP = 5.0                # usual intervals, from which a gap is reported
+GAP_INTERVALS = 5.0       # usual intervals, from which a gap is reported
 
 
 def rising(time_s: FloatArray, lines: LineArray, file: str) -> tuple[BoolArray, list[str]]:
@@ -182,7 +182,7 @@ def rising(time_s: FloatArray, lines: LineArray, file: str) -> tuple[BoolArray, 
             f"the time spans {float(np.sum(steps)):.3g} s, more than a week", where=f"{file}:{line}",
             next_step="Check the unit of time (--columns time=…:ms), and the widest gap, which is at this line",
         )
-    gaps = int(np.sum(steps > _GAP * usual))
+    gaps = int(np.sum(steps > GAP_INTERVALS * usual))
     if gaps:
         plural = "gap" if gaps == 1 else "gaps"
         warnings.append(f"{file}:{line}: {gaps} {plural} in the time, the widest of {steps[widest]:.3g} s here")
