@@ -78,6 +78,16 @@ def holds_a_string(name: str) -> bool:
     return profile.quick_stop.ends == "quick_stop" and profile.watchdog.reaction == "quick_stop"
 
 
+def roomy(profile: str, names: Sequence[str], rated_torque_nm: float) -> str:
+    """Return this profile, or the next whose object of the rated torque can hold it. An EPOS4 ends at 4,295 N·m."""
+    at = names.index(profile)
+    for name in (*names[at:], *names[:at]):
+        per_count_nm = getattr(getattr(load_profile(name), "torque", None), "rated_torque_nm_per_lsb", None)
+        if per_count_nm is None or rated_torque_nm / per_count_nm < 2.0**32:
+            return name
+    raise AssertionError("no profile holds this rated torque")
+
+
 def draw(seed: int) -> Rig:
     """The rig of this seed."""
     rng = np.random.default_rng([seed, 202611])
@@ -115,6 +125,7 @@ def draw(seed: int) -> Rig:
             "length_m": length_m, "outer_diameter_m": 0.127, "inner_diameter_m": 0.1086})
     noisy = between(rng, 0.2, 1.0)
     rated = round_up(torque * rng.uniform(1.0, 3.0))
+    profile = roomy(profile, fits, rated)
     gain = inertia * rng.uniform(2.0, 4.0)
     bottom_load = rng.uniform(0.0, 0.02) * torque if shaft != "rigid" and rng.random() < 0.5 else 0.0
     whole = {

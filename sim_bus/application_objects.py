@@ -19,6 +19,7 @@ from math import floor, pi
 
 from canopen.sdo import SdoAbortedError
 
+from profiles import MessageCode, TdhilError
 from profiles.cia402 import Cia402Profile
 from sim_bus.cia402 import Application, ApplicationSettings
 from sim_bus.inverter import RPM
@@ -101,6 +102,20 @@ def profile_units(drive: DriveParams, profile: Cia402Profile, scales: dict[str, 
 
 # ---------------------------------------------------------------------------------------------------------------------
 
+def rated_torque_counts(rated_torque_nm: float, per_count_nm: float) -> int:
+    """Return the value of 6076h (UNSIGNED32) for a rated torque. Raises TdhilError if the object cannot hold it."""
+    counts, most = round(rated_torque_nm / per_count_nm), (1 << 32) - 1
+    if counts > most:
+        raise TdhilError(
+            f"6076h cannot hold the rated torque of {rated_torque_nm:g} N·m: it counts {per_count_nm:g} N·m, and ends"
+            f" at {most * per_count_nm:.0f} N·m",
+            where="--plant: drive.rated_torque_nm",
+            next_step="Simulate a rig that fits this drive, or take another profile",
+            entry=MessageCode.SIMULATOR_UNUSABLE,
+        )
+    return counts
+
+
 def clamped(value: float, bits: int) -> int:
     """Return the nearest integer that a signed field of ``bits`` can hold."""
     counts, top = round(value), (1 << bits - 1) - 1
@@ -149,7 +164,7 @@ class ApplicationObjects:
         torque = min(65535, round(drive.torque_limit_nm / units.max_torque))
         speed = max(1, round(drive.speed_limit_rpm * RPM / units.motor_speed))
         store.set_default(0x6075, 0, round(1000.0 * drive.rated_current_a))
-        store.set_default(0x6076, 0, round(drive.rated_torque_nm / units.rated_torque))
+        store.set_default(0x6076, 0, rated_torque_counts(drive.rated_torque_nm, units.rated_torque))
         store.set_default(0x6072, 0, torque)
         store.set_default(0x6080, 0, speed)
         store.variable(0x6072, 0).max = torque

@@ -225,7 +225,7 @@ def ramp(end, count=30, start=0.0):
 
 @pytest.mark.parametrize(("mode", "limit"), [(Mode.TORQUE, 400.0), (Mode.SPEED, 10.0)])
 def test_feedback_that_stands_still_while_the_setpoint_moves_is_frozen(mode, limit):
-    enough, little = 0.11 * limit, 0.09 * limit
+    enough, little = 0.2 * limit, 0.09 * limit
     times = [0.02 * k for k in range(30)]
     with pytest.raises(CommunicationLost, match=r"frozen at 5.000 rad/s and 90.0 N·m for 0.5 s"):
         feed([(t, s, 5.0, 90.0) for t, s in zip(times, ramp(enough), strict=True)], mode)
@@ -235,6 +235,16 @@ def test_feedback_that_stands_still_while_the_setpoint_moves_is_frozen(mode, lim
         feed([(t, s, 5.0, 90.0) for t, s in zip(times, [*ramp(enough, 15), *ramp(0.0, 15, enough)], strict=True)], mode)
     feed([(t, s, 5.0, 90.0) for t, s in zip(times, ramp(little), strict=True)], mode)
     feed([(t, s, 5.0, 90.0) for t, s in zip(times[:24], ramp(enough, 24), strict=True)], mode)   # not for long enough
+
+
+@pytest.mark.parametrize(("mode", "limit"), [(Mode.TORQUE, 400.0), (Mode.SPEED, 10.0)])
+def test_coarse_reports_of_a_steady_shaft_may_repeat_until_the_setpoint_steps(mode, limit):
+    """A drive that reports whole revolutions per minute repeats them at a steady speed. Its answer comes later."""
+    steady, step = [(0.02 * k, 0.0, 5.0, 90.0) for k in range(50)], 0.2 * limit
+    answered = [(1.0 + 0.02 * k, step, 5.0, 90.0 + max(0, k - 11)) for k in range(50)]
+    feed(steady + answered, mode)
+    with pytest.raises(CommunicationLost, match="frozen"):
+        feed(steady + [(1.0 + 0.02 * k, step, 5.0, 90.0) for k in range(14)], mode)
 
 
 def test_any_change_says_that_it_is_not_frozen():

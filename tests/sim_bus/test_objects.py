@@ -8,7 +8,9 @@ import can
 import canopen
 import pytest
 
+from profiles import TdhilError
 from profiles.simulator_marker import MARKER_INDEX, MARKER_TEXT
+from sim_bus.application_objects import rated_torque_counts
 from sim_bus.objects import generic_eds
 
 Open = Callable[..., tuple[Any, Any]]
@@ -183,3 +185,10 @@ def test_malformed_frames_do_no_harm(bench: Open) -> None:
     answers = [host.wait(0x581)]
     while answers[-1][:4] != struct.pack("<BHB", 0x43, 0x6502, 0):
         answers.append(host.wait(0x581))
+
+
+def test_a_rated_torque_that_6076h_cannot_hold_is_refused_in_words():
+    """An EPOS4 counts µN·m in 32 bits."""
+    assert rated_torque_counts(4294.0, 1e-6) == 4_294_000_000
+    with pytest.raises(TdhilError, match=r"6076h cannot hold the rated torque of 7580 N·m: .* ends at 4295 N·m"):
+        rated_torque_counts(7580.0, 1e-6)

@@ -69,7 +69,7 @@ class Observer:
         self._point_s = max(POINT_S, period_s)
         self._still_rad_s = max(STILL_SHARE * limits.speed_max_rad_s, 3.0 * speed_resolution_rad_s)
         self._bounds = ShaftBounds(limits, self._lag_s)
-        self._frozen = RepeatedFeedback(limits)
+        self._frozen = RepeatedFeedback(limits, assumptions.reaction_s)
         self._torques = TorqueFollowing(limits, self._lag_s)
         self._angles = PositionWay(self._lag_s, speed_resolution_rad_s, self._still_rad_s)
         self._turns: Unwrapped | None = None

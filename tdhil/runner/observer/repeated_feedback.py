@@ -11,15 +11,22 @@ FROZEN_S, FROZEN_SHARE = 0.5, 0.1
 """Limits of frozen feedback (row 19): speed and torque stay equal to the last bit for this time, s, while the
 setpoint changes by this share of its limit. Such values are repeated, not measured."""
 
+ANSWER_S = 0.25
+"""Time for the first effect of a setpoint on the reports, s. A coarse report of a steady shaft may repeat for longer
+than `FROZEN_S` before the setpoint moves. This time covers a slow line and one count of the torque; a lag delays the
+end of a response, not its begin. `tests/runner/test_guard.py` has the reports that were called frozen without it."""
+
 
 class RepeatedFeedback:
     """Detection of feedback that repeats its last values, as a gateway does."""
 
-    def __init__(self, limits: MachineLimits) -> None:
+    def __init__(self, limits: MachineLimits, answer_s: float = ANSWER_S) -> None:
         self._limits = limits
+        self._answer_s = max(ANSWER_S, answer_s)
         self._seen: tuple[float, float] | None = None
         self._mode: Mode | None = None
         self._since_s = self._lowest = self._highest = 0.0
+        self._moved_s: float | None = None
 
     def see(self, command: Command, sample: Sample, offset_nm: float) -> tuple[str, str] | None:
         """Return cause and next step if the feedback has repeated for long enough; else None."""
@@ -32,9 +39,14 @@ class RepeatedFeedback:
         if seen != self._seen or command.mode is not self._mode or sample.limit_active:
             self._seen, self._mode, self._since_s = seen, command.mode, sample.time_s
             self._lowest = self._highest = setpoint
+            self._moved_s = None
             return None
         self._lowest, self._highest = min(self._lowest, setpoint), max(self._highest, setpoint)
-        if self._highest - self._lowest <= FROZEN_SHARE * limit or self.repeats_s(sample.time_s) < FROZEN_S:
+        if self._highest - self._lowest <= FROZEN_SHARE * limit:
+            return None
+        if self._moved_s is None:
+            self._moved_s = sample.time_s
+        if self.repeats_s(sample.time_s) < FROZEN_S or sample.time_s - self._moved_s < self._answer_s:
             return None
         return self.words("while the setpoint moved")
 
