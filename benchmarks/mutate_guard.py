@@ -107,7 +107,7 @@ SUBJECTS = {
     },
     "standstill": _run("standstill", "test_standstill.py", "test_stop_feedback.py"),
     "control_loop": _run("control_loop", "test_control_loop.py", "test_deaf.py", "test_run_goes_wrong.py"),
-    "steady": _run("stages/steady", "test_steady.py"),
+    "steady": _run("stages/steady", "test_steady.py", "test_swinging_string.py"),
     "setup": _run("stages/setup", *_RUNS, "test_run_refused.py"),
     "speed": _run("stages/speed", *_RUNS),
     "torque": _run("stages/torque", *_RUNS, "test_braking_probe.py"),

@@ -148,13 +148,9 @@ class ControlLoop:
         ``work``. A process is killed. A thread continues beside the stop, and its result is dropped.
         """
         background = Background(work, None if self.drive.clock.stepped else self.worker_process)
-        reported = False
         self.guard.reckoning = True
         try:
             while not background.ended.is_set():
-                if background.instead and not reported:
-                    self.no_worker_process(background.instead)
-                    reported = True
                 if self.drive.clock.stepped:
                     self._wait_alive(background.ended)
                 else:
@@ -164,8 +160,8 @@ class ControlLoop:
             raise
         finally:
             self.guard.reckoning = False
-        if background.instead and not reported:
-            self.no_worker_process(background.instead)
+            if background.instead:
+                self.no_worker_process(background.instead)
         return background.result()
 
     def no_worker_process(self, why: str) -> None:

@@ -457,21 +457,19 @@ class _ModeShown:
     def __init__(self) -> None:
         self._commanded: Mode | None = None
         self._seen = False                 # the commanded mode was displayed since it was commanded
-        self._other_since_s: float | None = None
-        self._others = 0
+        self._other: tuple[float, int] | None = None   # since when another mode is displayed, s, and for how many cycles
 
     def see(self, commanded: Mode, sample: Sample) -> bool:
         """Return False once another mode has been displayed for too long."""
         if commanded is not self._commanded:
-            self._commanded, self._seen, self._other_since_s = commanded, False, None
+            self._commanded, self._seen, self._other = commanded, False, None
         if sample.mode is commanded:
-            self._seen, self._other_since_s = True, None
+            self._seen, self._other = True, None
             return True
-        if self._other_since_s is None:
-            self._other_since_s, self._others = sample.time_s, 0
-        self._others += 1
+        since_s, cycles = self._other or (sample.time_s, 0)
+        self._other = since_s, cycles + 1
         allowed_s = MODE_LOST_S if self._seen else MODE_SWITCH_S
-        return self._others <= MODE_CYCLES or sample.time_s - self._other_since_s < allowed_s
+        return cycles < MODE_CYCLES or sample.time_s - since_s < allowed_s
 
 
 class _Following:

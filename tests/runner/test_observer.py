@@ -357,6 +357,26 @@ def test_the_first_contradiction_stays():
     assert bench.observer.doubt is first
 
 
+def test_a_torque_beyond_its_limit_is_false_even_at_rest():
+    """Nothing else contradicts it there: static friction may hold any torque."""
+    bench = Bench(PLAIN, lie=changed("torque_nm", offset=1.3 * LIMITS.torque_nm))
+    bench.hold(0.2, 0.0)
+    assert bench.observer.doubt.signals == frozenset({Signal.TORQUE})
+    assert "520 N·m is beyond the torque limit of 400 N·m" in bench.observer.doubt.what
+    within = Bench(PLAIN, lie=changed("torque_nm", offset=1.2 * LIMITS.torque_nm))
+    within.hold(0.2, 0.0)
+    assert within.observer.doubt is None             # a ripple may exceed the limit
+
+
+@pytest.mark.parametrize("speed", [0.0, 4.0])
+def test_a_stop_knows_whether_the_shaft_turned_when_it_began(speed):
+    bench = Bench(PLAIN)
+    bench.ramp(speed)
+    bench.hold(1.0, speed)
+    bench.observer.begin_stop()
+    assert bench.observer.turned is (speed > 0.0)
+
+
 def test_a_contradiction_says_what_why_and_what_next():
     bench = Bench(PLAIN).begun()
     bench.lie = JUMPS["lost"]
@@ -487,6 +507,15 @@ def test_a_sensor_that_is_dead_in_the_stop_is_seen_in_two_ways(value, rig):
     how = bench.quick_stop(20.0)
     assert len(how.split("; ")) >= 2, how
     assert bench.fastest <= 1.2 * LIMITS.speed_max_rad_s
+
+
+def test_with_a_dead_sensor_a_tenth_of_the_torque_limit_counts_as_pushing():
+    """The friction of a shaft whose speed is unknown may be less than was learned: it holds 155 N·m here, not 100."""
+    bench = Bench(STIFF).begun()
+    bench.sensor = lambda _: 0.0
+    bench.hold(0.3, 5.0)
+    bench.stuck_nm = 100.0
+    assert "push the shaft on" in bench.quick_stop(4.0)
 
 
 def test_one_way_is_not_enough():
