@@ -457,7 +457,7 @@ class _ModeShown:
     def __init__(self) -> None:
         self._commanded: Mode | None = None
         self._seen = False                 # the commanded mode was displayed since it was commanded
-        self._other: tuple[float, int] | None = None   # since when another mode is displayed, s, and for how many cycles
+        self._other: tuple[float, int] | None = None   # another mode: displayed since, s, and in how many cycles
 
     def see(self, commanded: Mode, sample: Sample) -> bool:
         """Return False once another mode has been displayed for too long."""
