@@ -109,7 +109,11 @@ SUBJECTS = {
     "control_loop": _run("control_loop", "test_control_loop.py", "test_deaf.py", "test_run_goes_wrong.py"),
     "steady": _run("stages/steady", "test_steady.py", "test_swinging_string.py"),
     "setup": _run("stages/setup", *_RUNS, "test_run_refused.py"),
-    "speed": _run("stages/speed", *_RUNS),
+    "speed": Subject(
+        "tdhil/runner/stages/speed.py",
+        (*(f"runner/{name}" for name in _RUNS), "runner/test_swinging_string.py", "runner/test_speed_witness.py",
+         "faults/test_speed_unit.py"),
+    ),
     "torque": _run("stages/torque", *_RUNS, "test_braking_probe.py"),
     "hold": _run(
         "stages/hold", "test_kept_within.py", *_RUNS, "test_control.py",
@@ -347,6 +351,7 @@ EQUIVALENT = {
         "a stop is seen once more by the Runner, before it moves anything; here it only comes sooner",
     "service/attendance.py, _write: self._wake.clear()":
         "the thread then writes the same status again and again: a core is lost, and nothing else",
+    "guard.py, _side_of: return 0.0": _ONLY_SOONER,
     "canopen/drive.py, check: if watch.quiet:": _ONLY_SOONER,
     "canopen/drive.py, check: return": _ONLY_SOONER,
     "string_release.py, __init__: self._mean_nm = self._smooth_nm = 0.0 (last)": "the first step sets both",

@@ -23,6 +23,19 @@ def test_a_heartbeat_goes_out_five_times_in_the_watchdogs_time(wire, peer, profi
     assert len(wire.of(0x77F)) == pytest.approx(WATCHED_S / every_s, abs=1.0)
 
 
+def test_to_be_kept_alive_costs_no_cycle(wire, peer, profile):
+    """One more sign of life, at once; the next is due when it was."""
+    drive = CanopenDrive(wire, profile, SteppedClock(), node=1)
+    drive.connect()
+    assert not drive.preflight(DriveLimits(10.0, 300.0, 2.0, 0.5)).refused
+    wire.put(0x701, b"\x05")
+    drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
+    wire.sent.clear()
+    for _ in range(3):
+        drive.keep_alive()
+    assert len(wire.of(0x77F)) == 3 and not wire.of(0x80)
+
+
 def test_a_period_that_the_profile_does_not_have_is_not_written(wire, peer, profile):
     """Even where the drive has an object of that number: nobody has said what it does there."""
     without = profile.model_copy(update={"cyclic": profile.cyclic.model_copy(update={"has_period": False})})

@@ -112,6 +112,10 @@ def test_both_routes_tell_the_inertia(kind, rate_hz, mode, routes):
     assert run.outcome.stop.confirmed
     assert run.drive.top_rad_s < RIG_LIMITS.speed_max_rad_s
     assert run.recording.excitation.kind == kind
+    (acquired,) = (stage for stage in run.recording.stages if stage.name == "acquire")
+    time_s = run.recording.time_s
+    during = run.recording.speed_rad_s[(time_s >= acquired.start_s) & (time_s <= acquired.end_s)]
+    assert kind != "coast-down" or during.min() > 3.0     # each coasting ends at the lower speed, 3.3 rad/s
     found = identify(run.recording, Options(tolerance=0.2))     # unknown lags may leave it wide on one side
     assert found.verdict is Verdict.VALID
     assert found.inertia.value == pytest.approx(TRUE_KG_M2, rel=0.03)

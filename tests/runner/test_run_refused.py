@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.drive import PowerState
+from drivers.drive import Mode, PowerState
 from drivers.errors import LimitHit, PreflightRefused
 from tdhil.errors import ExitCode, Interrupted, exit_code
 from tdhil.runner.settings import ExcitationRequest
-from tests.runner.fake_drive import LIMITS, FakeDrive, refused_check
+from tdhil.runner.stages.setup import TORQUE_SEEN_S
+from tests.runner.fake_drive import LIMITS, PERIOD_S, FakeDrive, refused_check
 from tests.runner.run_outcomes import assert_at_rest, outcomes
 
 
@@ -101,7 +102,10 @@ def test_a_locked_shaft_ends_the_probe(world):
     result = here.runner().run()
     assert isinstance(result.cause, PreflightRefused)
     assert "did not move up to the limit of 200 N·m" in str(result.cause)
-    assert max(command.torque_nm for command in here.drive.commands) == 200.0
+    torques = [command.torque_nm for command in here.drive.commands if command.mode is Mode.TORQUE]
+    assert max(torques) == 200.0
+    after = torques[len(torques) - torques[::-1].index(200.0):]
+    assert len(after) * PERIOD_S >= TORQUE_SEEN_S and set(after) == {0.0}      # no torque is left for the stop
     assert result.stop.confirmed
 
 

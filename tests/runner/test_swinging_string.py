@@ -11,6 +11,7 @@ import pytest
 
 from drivers.drive import Command, Mode, PowerState, Sample
 from drivers.errors import LimitHit, PreflightRefused
+from tdhil.estimation import RoughFriction
 from tdhil.recording import LagPrior
 from tdhil.recording.builder import RecordingBuilder
 from tdhil.runner.excitation import RigGuess
@@ -26,7 +27,7 @@ from tdhil.runner.stages.braking_probe import (
     slow_down,
     slow_speed,
 )
-from tdhil.runner.stages.speed import SpeedResult
+from tdhil.runner.stages.speed import SpeedResult, inertia_before_echo
 from tdhil.runner.stages.steady import Swing, calm_string, is_stick_slip, swing_of, widest
 from tdhil.runner.string_release import SwingDamper
 from tdhil.runner.task import Task
@@ -106,6 +107,17 @@ def ringing(**drive):
     here.bench.enable(Mode.SPEED, Command(Mode.SPEED, 0.0, 0.0))
     here.bench.hold(Command(Mode.SPEED, 3.0, 0.0), 8.0)
     return here
+
+
+def test_ramps_before_their_echo_tell_the_inertia_above_the_string(world):
+    """Up and down between two speeds, each ramp shorter than the echo; the pipe is nearly weightless here."""
+    limits = replace(LIMITS, load="string", torque_ramp_nm_s=40.0, echo_s=2.0, wave_impedance_nm_s_rad=1e-3)
+    here = World(limits=limits)
+    here.turn(4.0)
+    here.bench.guard.observer.doubt = None
+    found = inertia_before_echo(here.bench, limits, (3.0, 4.0), RoughFriction(8.0, 60.0, 1.0))
+    assert found is not None and found.inertia_kg_m2 == pytest.approx(here.drive.inertia, rel=0.1)
+    assert inertia_before_echo(here.bench, limits, (3.0, 4.0), None) is None
 
 
 def test_a_top_that_yields_damps_what_a_stiff_one_holds_on_to():

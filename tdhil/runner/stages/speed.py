@@ -160,7 +160,7 @@ def run_speed(
             friction = rough_friction(
                 moved.time_s, moved.speed_rad_s, moved.torque_nm - torque_offset_nm, low.level, high.level
             )
-            rough = _before_echo(loop, limits, (low_rad_s, high_rad_s), friction)
+            rough = inertia_before_echo(loop, limits, (low_rad_s, high_rad_s), friction)
             good_enough = RESTLESS_ERROR
             break
         rate *= 4.0
@@ -199,7 +199,7 @@ def run_speed(
     return result
 
 
-def _before_echo(
+def inertia_before_echo(
     loop: ControlLoop, limits: MachineLimits, speeds_rad_s: tuple[float, float], friction: RoughFriction | None
 ) -> RoughInertia | None:
     """Estimate the inertia above an oscillating string with a known pipe from quick ramps before the echo."""
