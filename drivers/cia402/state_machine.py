@@ -32,6 +32,7 @@ class State(Enum):
 
 
 # Statusword bits (6041h).
+FAULT_BIT = 1 << 3
 REMOTE = 1 << 9
 TARGET_REACHED = 1 << 10
 INTERNAL_LIMIT = 1 << 11

@@ -193,12 +193,13 @@ class EthercatBus(cia402.Cia402Bus):
             if self._clocks and data is not None:
                 periods = self._segment.master.dc_time / (self.period_s * 1e9)
                 self.ticks.follow(periods % 1.0 - SYNC0_SHARE)
-        self._look(now_s)
+        seen = self._inputs.unpack(data) if data and self._inputs and len(data) >= self._inputs.size else None
+        self._look(now_s, seen is not None and bool(seen[0] & cia402.FAULT_BIT))
         age_s = 0.0 if self.clock.stepped else self.clock.now_s() - now_s
-        if data is None or self._inputs is None or len(data) < self._inputs.size:
+        if seen is None:
             return cia402.CycleInputs(age_s)
         self._slave_watch.heard()
-        status, torque, speed, shown, demand, angle = self._inputs.unpack(data)
+        status, torque, speed, shown, demand, angle = seen
         self.reported.take_slow(now_s, shown, demand)
         return cia402.CycleInputs(age_s, True, False, status, torque, speed, angle)
 
@@ -228,13 +229,13 @@ class EthercatBus(cia402.Cia402Bus):
                 return self._station.read(start, length)
         return None
 
-    def _look(self, now_s: float) -> None:
-        """Check AL state, mailbox and watchdog registers. An unanswered datagram shows in the working counter too."""
+    def _look(self, now_s: float, fault: bool) -> None:
+        """Check AL state, mailbox (at once if a fault shows) and watchdog. A lost datagram shows in the counter too."""
         with suppress(CommunicationLost):
             found = self._station.al_status()
             self._al_state = found.state
             self._slave_watch.on_al_status(found)
-            if self._asked or now_s - self._looked_s >= MAILBOX_S:
+            if fault or self._asked or now_s - self._looked_s >= MAILBOX_S:
                 self._looked_s = now_s
                 self._asked = max(0, self._asked - 1)
                 self._mailbox.look()

@@ -82,7 +82,7 @@ class Mailbox:
         if (sdo := self.pump()) is not None:
             self.on_answer(sdo)
 
-    def call(self, sdo: bytes, answer_s: float, tries: int = 1) -> bytes:
+    def call(self, sdo: bytes, answer_s: float, tries: int, where: str) -> bytes:
         """Send a request and wait for its answer. Raises CommunicationLost without one."""
         for _ in range(tries):
             with suppress(CommunicationLost):          # sent again, or reported below
@@ -97,7 +97,7 @@ class Mailbox:
                         self.on_answer(found)
                     else:
                         time.sleep(0.0 if self._clock.stepped else _PAUSE_S)
-        raise not_answered("no answer to an SDO request (CoE)", self._station.place)
+        raise not_answered(f"no answer to an SDO request (CoE) for {where}", self._station.place)
 
 
 class CoeObjects(SdoClient):
@@ -109,4 +109,4 @@ class CoeObjects(SdoClient):
 
     def call(self, request: bytes, where: str, answer_s: float, tries: int) -> bytes:
         """Send a request and wait for its answer. Raises CommunicationLost without one."""
-        return self._mailbox.call(request, answer_s, tries)
+        return self._mailbox.call(request, answer_s, tries, where)

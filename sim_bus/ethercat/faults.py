@@ -51,17 +51,17 @@ KINDS: Kinds[Misbehaviour] = Kinds({
         lambda: changed(_slave, "inputs", lambda line: partial(bytes, line.slave.inputs())))),
     "watchdog-not-armed": FaultKind(50, "writes to registers 0400h to 0421h are answered and not kept", plain(
         lambda: changed(lambda line: line.slave.esc, "locked", lambda _: range(0x0400, 0x0422)))),
-    "mailbox-timeout": FaultKind(0, "no message in the mailbox is answered",
+    "mailbox-timeout": FaultKind(125, "no message in the mailbox is answered",
                                  plain(lambda: changed(_slave, "mailbox", lambda _: lambda message: None))),
-    "wrong-working-counter": FaultKind(0, "this share of the process data comes back with a working counter of 0",
+    "wrong-working-counter": FaultKind(124, "this share of the process data comes back with a working counter of 0",
                                        lambda v: _part("uncounted", share(v)), "1%", "SHARE"),
-    "al-error": FaultKind(0, "the slave leaves OPERATIONAL with this AL status code",
+    "al-error": FaultKind(122, "the slave leaves OPERATIONAL with this AL status code",
                           once(error_code, lambda line, code: line.slave.al_error(code)), "001Bh", "CODE"),
-    "sm-watchdog": FaultKind(0, "the watchdog of the process data expires, though they come",
+    "sm-watchdog": FaultKind(123, "the watchdog of the process data expires, though they come",
                              plain(lambda: Misbehaviour(lambda line: line.slave.esc.expire_watchdog()))),
-    "sii-garbage": FaultKind(0, "the identity in the EEPROM reads as ones, and its checksum is wrong",
+    "sii-garbage": FaultKind(126, "the identity in the EEPROM reads as ones, and its checksum is wrong",
                              plain(lambda: changed(lambda line: line.slave.esc, "eeprom", _garbage))),
-    "clock-jump": FaultKind(0, "the distributed clock jumps by so many seconds", once(number, _jump), "1", "SECONDS"),
+    "clock-jump": FaultKind(127, "the distributed clock jumps by so many seconds", once(number, _jump), "1", "SECONDS"),
     **of_drive(lambda fault: Misbehaviour(lambda line: fault.begin(line.slave), lambda line: fault.end(line.slave))),
 })
 parse_all, listed, listing = KINDS.parse_all, KINDS.listed, KINDS.listing

@@ -27,9 +27,10 @@ if TYPE_CHECKING:
     from tdhil.speed_loop import StepCase
 
 
-def list_faults() -> int:
-    """Print the known faults. Return the exit code."""
-    print("\n\n".join(f"--drive {bus.name}\n\n{bus.fault_listing()}" for bus in all_buses()))  # noqa: T201
+def list_faults(drive: str | None) -> int:
+    """Print the known faults of one bus, or of all of them. Return the exit code."""
+    shown = [bus for bus in all_buses() if drive in (None, bus.name)]
+    print("\n\n".join(f"--drive {bus.name}\n\n{bus.fault_listing()}" for bus in shown))  # noqa: T201
     return 0
 
 
@@ -99,7 +100,7 @@ def run_with(
     from tdhil.session import RunRequest, check_unverified, connection_of, plan_peer, suited, with_faults
 
     if "list" in (namespace.fault or ()):
-        return list_faults()
+        return list_faults(vars(namespace).get("drive"))
     rig = load_rig(namespace.rig) if namespace.rig else None
     options = resolve(vars(namespace), rig)
     if options.json is True:

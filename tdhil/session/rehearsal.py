@@ -100,6 +100,12 @@ REQUIRED: Final[Mapping[int, RequiredReaction]] = {
     121: RequiredReaction(
         "seen in two ways: torque off, 8; above a drill string only beyond the speed limit",
         ANY_STOP, or_covered=True),
+    122: RequiredReaction("abort, code decoded; QS as far as the drive follows", (6,)),
+    123: RequiredReaction("abort; the drive stops as its watchdog does", (5,)),
+    124: RequiredReaction("no sample; M; QS once feedback is missing for too long", (0, 5, 8, 9)),
+    125: RequiredReaction("R; in motion QS once watchdog and limits cannot be read back", (4, 5)),
+    126: RequiredReaction("R", (4,)),
+    127: RequiredReaction("unaffected: the cycle follows the clock", (0, 9)),
 }
 """Required reactions by row of docs/reference/faults.md."""
 

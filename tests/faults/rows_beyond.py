@@ -369,4 +369,20 @@ LYING: dict[int, Row] = {
               f"{DOUBT}test_above_a_string_it_is_removed_beyond_the_limit")),
 }
 
-BEYOND = LATE | SECOND_MASTER | MODBUS | UNITS | STAGES | COMMAND_LINE | LOG | SOFT_TORQUE | BETWEEN | LYING
+OVER_ETHERCAT = f"{HERE}test_ethercat_scripted.py::test_row"
+
+ETHERCAT: dict[int, Row] = {
+    122: Row("EtherCAT: the slave leaves OP with an AL status code", must(122), "6", (OVER_ETHERCAT,)),
+    123: Row("EtherCAT: the watchdog of the process data expires", must(123), "5",
+             (OVER_ETHERCAT, f"{HERE}test_ethercat_scripted.py::test_row_4_killed")),
+    124: Row("EtherCAT: process data come back with a wrong working counter", must(124), "0, 5",
+             (OVER_ETHERCAT, f"{HERE}test_ethercat_scripted.py::test_row_with_a_run_that_goes_on")),
+    125: Row("EtherCAT: the mailbox is not answered", must(125), "0, 4, 5", (OVER_ETHERCAT,)),
+    126: Row("EtherCAT: the EEPROM is damaged, or of another drive", must(126), "4", (OVER_ETHERCAT,)),
+    127: Row("EtherCAT: the distributed clock jumps", must(127), "0",
+             (f"{HERE}test_ethercat_scripted.py::test_row_with_a_run_that_goes_on",)),
+}
+
+BEYOND = (
+    LATE | SECOND_MASTER | MODBUS | UNITS | STAGES | COMMAND_LINE | LOG | SOFT_TORQUE | BETWEEN | LYING | ETHERCAT
+)

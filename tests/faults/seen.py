@@ -19,6 +19,7 @@ class Seen:
         if not path:
             return
         said = re.sub(r"Virtual bus channel tdhil-[0-9a-f]+", "virtual bus", said)
+        said = re.sub(r"\bec[0-9]+h[0-9]+\b", "eth1", said)       # a pair of interfaces of its own
         line = {"row": row, "test": self.test, "said": said, "standstill_s": standstill_s, "log": log, "code": code}
         with Path(path).open("a", encoding="utf-8") as file:
             file.write(json.dumps(line, ensure_ascii=False) + "\n")

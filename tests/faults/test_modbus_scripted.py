@@ -103,6 +103,12 @@ def test_the_list_names_those_of_both_buses():
     assert all(name in done.out for name in (*KINDS, "heartbeat-lost", "--drive canopen", "--drive modbus"))
 
 
+def test_the_list_of_one_bus_is_shorter():
+    done = tdhil("identify", "--drive", "modbus", "--fault", "list")
+    assert done.code == 0 and "bad-crc" in done.out
+    assert "heartbeat-lost" not in done.out and "--drive canopen" not in done.out
+
+
 @pytest.mark.heavy
 @pytest.mark.real_time
 def test_a_connection_that_is_reset_in_motion(tmp_path):

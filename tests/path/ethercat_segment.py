@@ -7,6 +7,8 @@ import socket
 import subprocess
 import sys
 
+import pytest
+
 from tests.path.path_runs import PLAIN, Peer, process
 
 _NUMBERS = itertools.count()
@@ -23,6 +25,15 @@ def why_not():
     with contextlib.suppress(OSError, RuntimeError), pair():
         return ""
     return "no veth pair or no raw sockets here: they need root and the kernel's veth"
+
+
+def segment():
+    """Skip where this system has none; fail where TDHIL_REQUIRE_VETH forbids to skip. A module's own fixture."""
+    reason = why_not()
+    if reason and os.environ.get("TDHIL_REQUIRE_VETH") == "1":
+        pytest.fail(f"no run over EtherCAT was tried ({reason}); TDHIL_REQUIRE_VETH=1 forbids to skip", pytrace=False)
+    if reason:
+        pytest.skip(f"no run over EtherCAT was tried: {reason}")
 
 
 @contextlib.contextmanager
