@@ -269,6 +269,13 @@ class RunOptions:
         help="periods per mean speed, settling included",
         more="periods at each mean speed; the first one is for settling",
     )
+    realisations: int = option(
+        "--realisations", "run.realisations", 1, group=Topic.MOTION, metavar="N", api=True, ge=1, le=8,
+        help="sets of phases of the multisine at each mean speed (1); 2 or more measure nonlinear distortion",
+        more="sets of phases of the multisine at each mean speed. With 2 or more, the frequency response measures the "
+             "[nonlinear distortion](../how-to/read-the-frequency-response.md) of the excited lines themselves; each "
+             "set settles anew",
+    )
     tolerance: float = option(
         "--tolerance", "run.tolerance", 0.05, group=Topic.RESULT, common=True, unit=SHARE, metavar="SHARE", api=True,
         gt=0, lt=1,

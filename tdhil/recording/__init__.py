@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from tdhil.recording.npz_cache import pack_recording as pack_recording, unpack_recording as unpack_recording
     from tdhil.recording.recording import (
         BoolArray as BoolArray, Excitation as Excitation, FloatArray as FloatArray, ImpedanceInput as ImpedanceInput,
+        IntArray as IntArray,
         LagPrior as LagPrior, Level as Level, Pipe as Pipe, Ramp as Ramp, Recording as Recording, Segment as Segment,
         Stage as Stage, SteppedSetpoint as SteppedSetpoint,
         TorqueAnswer as TorqueAnswer, ABORTED as ABORTED, aborted_stage as aborted_stage,
@@ -52,8 +53,8 @@ else:
         "log_writer": "RunWriter",
         "mcap_container": "MAGIC schema_of",
         "npz_cache": "pack_recording unpack_recording",
-        "recording": "BoolArray Excitation FloatArray ImpedanceInput LagPrior Level Pipe Ramp Recording Segment Stage "
-                     "SteppedSetpoint TorqueAnswer ABORTED aborted_stage before_abort",
+        "recording": "BoolArray Excitation FloatArray ImpedanceInput IntArray LagPrior Level Pipe Ramp Recording "
+                     "Segment Stage SteppedSetpoint TorqueAnswer ABORTED aborted_stage before_abort",
         "run_log": "RunEnd RunLog find_ended",
         "salvage": "Salvage examine write_copy",
         "trace_log": "write_trace_log",

@@ -102,6 +102,7 @@ def request_of(request: ExcitationRequest, mode: str) -> PlanRequest:
         amplitude_rad_s=request.amplitude_rad_s,
         offsets_rad_s=None if request.offset_rad_s is None else (request.offset_rad_s,),
         periods=request.periods,
+        realisations=request.realisations,
     )
 
 

@@ -46,6 +46,7 @@ class ExcitationRequest:
     amplitude_rad_s: float | None = None
     offset_rad_s: float | None = None
     periods: int | None = None
+    realisations: int = 1              # sets of phases at each mean speed
     confidence: float = 0.95
     tolerance: float | None = None     # acquire until J's relative half-width is this; None = for a fixed time
     max_time_s: float | None = None    # longest stage 5; None = the plan's own, or what the time limit leaves

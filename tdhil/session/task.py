@@ -117,6 +117,7 @@ def excitation_request(options: RunOptions, bench: Rig | None = None) -> Excitat
         amplitude_rad_s=options.amplitude_rad_s,
         offset_rad_s=options.offset_rad_s,
         periods=options.periods,
+        realisations=options.realisations,
         confidence=options.confidence,
         tolerance=options.tolerance if options.given("tolerance") else None,
         max_time_s=options.max_time_s,

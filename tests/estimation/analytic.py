@@ -24,8 +24,11 @@ def closed_form(
     lag_prior=None,
     seed=5,
     unrecorded_s=0.0,
+    phases_rad=None,
 ):
-    """``noise``: sd of white torque per sample, N·m, on the reported torque. ``unrecorded_s``: pause between segments.
+    """``phases_rad``: of the lines, one row for each segment; None: the same in all of them.
+
+    ``noise``: sd of white torque per sample, N·m, on the reported torque. ``unrecorded_s``: pause between segments.
 
     The closed form has no torque that would change the mean speed: without a pause its balance of momentum is false.
     """
@@ -33,12 +36,13 @@ def closed_form(
     omega = 2.0 * np.pi * np.array(lines)
     s = 1j * omega
     phases = np.array([0.3, 1.7, 4.0, 5.1, 2.4, 0.9, 5.6, 3.1, 1.2, 4.6])
-    speed_lines = np.array(amplitudes) * np.exp(1j * phases[: len(lines)])
     through = (inertia * s + viscous) * (1 + speed_lag * s) / (1 + torque_lag * s) * np.exp(-skew * s)
     times, speeds, torques, segments = [], [], [], []
     begin = 0.0
     period = 10.0
-    for offset in offsets:
+    for number, offset in enumerate(offsets):
+        own = phases[: len(lines)] if phases_rad is None else np.asarray(phases_rad[number])
+        speed_lines = np.array(amplitudes) * np.exp(1j * own)
         t = np.arange(round(periods * period * rate_hz)) / rate_hz
         turned = np.exp(1j * np.outer(t, omega))
         times.append(start + begin + t)

@@ -136,6 +136,42 @@ def test_detected_distortion_widens_the_intervals(linear):
         assert wide.distortion_rel > wide.noise_rel > 0.0
 
 
+CUBIC_NM_S3 = 6.0          # N·m per (rad/s)³: a tenth of the viscous torque of the strongest line, and more
+
+
+def bent_by_its_speed(seed, realisations, amplitudes=(1.5, 0.8, 0.25, 0.25)):
+    """A recording at two mean speeds whose friction grows with the third power of the deviation of speed."""
+    phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (2, realisations, 4))
+    phases = np.concatenate(phases if realisations > 1 else [phases[0], phases[0]])
+    offsets = (4.0,) * realisations + (7.0,) * realisations
+    plain = closed_form(noise=3.0, seed=seed, offsets=offsets, phases_rad=phases, periods=5,
+                        amplitudes=amplitudes)
+    speeds = [plain.speed_rad_s[(plain.time_s >= one.start_s) & (plain.time_s < one.end_s)] - one.offset_rad_s
+              for one in plain.excitation.segments]
+    return with_torque(plain, lambda _, number: CUBIC_NM_S3 * speeds[number] ** 3)
+
+
+def test_realisations_measure_the_distortion_of_the_lines_themselves():
+    """Their mean over all phases is 3/4 c a² + 3/2 c Σ b² for a line a beside others b; the intervals hold it."""
+    a = np.array([1.5, 0.8, 0.25, 0.25])
+    shift = CUBIC_NM_S3 * (0.75 * a**2 + 1.5 * (np.sum(a**2) - a**2))
+    linear_z = 1.0 / control.frequency_response(plant(), 2.0 * np.pi * np.array([0.1, 0.2, 0.3, 0.4])).frdata[0, 0]
+    exact = np.abs(1.0 / (linear_z + shift))
+    missed, widths = 0, {1: [], 4: []}
+    for realisations in widths:
+        for seed in range(12):
+            recording = bent_by_its_speed(seed, realisations)
+            case = measured(Case(recording, Options(), samples=usable_samples(recording)), recording.excitation)
+            found = measure_response(case, None, (), "none")
+            assert found.realisations == (2 * realisations if realisations > 1 else 1) and found.distortion.detected
+            widths[realisations] += [line.magnitude.high / line.magnitude.low - 1.0 for line in found.lines]
+            if realisations == 4:
+                missed += sum(not line.magnitude.low < g < line.magnitude.high
+                              for line, g in zip(found.lines, exact, strict=True))
+    assert missed <= 7                     # of 48 intervals of 95 %: more have a chance of 0.5 %
+    assert np.median(widths[4]) < 0.7 * np.median(widths[1])
+
+
 @pytest.mark.heavy
 def test_a_response_that_differs_between_mean_speeds_is_distortion():
     plain = closed_form(noise=3.0)

@@ -76,7 +76,7 @@ def test_the_examples_show_every_key_but_those_for_trying_things_out():
     text = "".join(path.read_text(encoding="utf-8") for path in (EXAMPLE, ETHERCAT, MODBUS))
     missing = {key for key in keys(rig_model()) if not re.search(rf"^[# ]*{key.split('.')[-1]}:", text, re.MULTILINE)}
     assert missing == {"bus.options", "run.mode", "run.frequency_hz", "run.amplitude_rad_s", "run.offset_rad_s",
-                       "run.periods", "run.seed", "run.simulate", "run.real_time", "run.stepped",
+                       "run.periods", "run.realisations", "run.seed", "run.simulate", "run.real_time", "run.stepped",
                        "run.json", "run.plant", "run.trace", "run.simulated_torque_scale",
                        "run.simulated_speed_scale", "run.simulated_added_inertia_kg_m2"}
 

@@ -80,6 +80,29 @@ def test_crest_of_the_multisine_is_low():
         assert 0.5 * np.ptp(deviation) / np.std(deviation) < crest
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_realisations_have_the_same_lines_and_other_phases_within_the_limits(mode):
+    plan = make_plan(LIMITS, GUESS, PlanRequest(mode=mode, realisations=3))
+    assert len(plan.segments) == 6 and len({one.reference.phases_rad for one in plan.segments}) == 6
+    assert len({(one.reference.lines_hz, one.reference.amplitudes_rad_s) for one in plan.segments}) == 1
+    speeds = [one.reference.offset_rad_s for one in plan.segments]
+    assert speeds == sorted(speeds) and len(set(speeds)) == 2
+    for segment in plan.segments:
+        _, values = sampled(segment)
+        assert LIMITS.speed_low_rad_s < values[:, 0].min() and values[:, 0].max() < LIMITS.speed_high_rad_s
+        assert np.abs(values[:, 1]).max() < 400.0
+    once = make_plan(LIMITS, GUESS, PlanRequest(mode=mode))
+    counted = sum(one.periods - one.settle_periods for one in once.segments)
+    assert sum(one.periods - one.settle_periods for one in plan.segments) == pytest.approx(counted, rel=0.25)
+    assert plan == make_plan(LIMITS, GUESS, PlanRequest(mode=mode, realisations=3))        # the phases are seeded
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "multisine"])
+def test_a_motion_whose_phases_are_its_form_has_one_realisation(kind):
+    with pytest.raises(PlanRefused, match="has one realisation"):
+        make_plan(LIMITS, GUESS, PlanRequest(kind=kind, realisations=2))
+
+
 def test_an_aborted_segment_ends_with_its_last_whole_period():
     segment = make_plan(LIMITS, GUESS).segments[0]
     assert segment.recorded(100.0, 147.0).end_s == pytest.approx(140.0)

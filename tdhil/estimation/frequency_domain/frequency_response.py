@@ -14,11 +14,13 @@ one recording):
 - At harmonics that are not excited, a linear shaft has T = Z W, whatever the torque is. A mean of D = T − Z W over the
   periods that exceeds its scatter is distortion. Dry friction that crosses zero, backlash and symmetric saturation make
   odd harmonics; a curved characteristic makes even ones.
-- Each mean speed is a realisation of its own. A linear shaft has the same Z at all of them.
+- Each mean speed and each set of phases is a realisation of its own. A linear shaft has the same Z in all of them.
 
 One realisation of phases shows that there is distortion, and its size beside the lines. It does not show its share at
 an excited line, which adds to the line with a fixed phase. That share is taken to be as large as at the nearest
-unexcited harmonics.
+unexcited harmonics. With several realisations (``--realisations``) the share at a line changes with the phases of the
+other lines. Then Z scatters by it over the M sets of phases, and their mean has 1/M of its variance, known with
+2 (M − 1) degrees of freedom.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ from tdhil.estimation.result import (
     UnexcitedHarmonic,
 )
 from tdhil.estimation.spectrum import ComplexArray, SpectralLine, torque_lines, unexcited_lines
-from tdhil.recording import FloatArray
+from tdhil.recording import FloatArray, IntArray
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Fitted model, drawn through the lines
@@ -108,6 +110,9 @@ class _StraightLine:
 DETECTED_P = 0.001
 """p-value of the test for distortion below which it is detected. 0.1 % of linear shafts are below it."""
 
+LEAST_SETS = 4
+"""Least number of sets of phases whose scatter is taken for that of the distortion: six degrees of freedom."""
+
 _MOST_HARMONICS = 12     # most unexcited harmonics tested
 _BEYOND = 3              # times the highest excited harmonic: end of third-order distortion
 _SAMPLES_A_CYCLE = 8     # fewest samples per cycle of an unexcited harmonic
@@ -156,19 +161,22 @@ def measure_response(
     distortion = DistortionTest(
         detected, p_value, by_harmonics, by_speed, power[1] / total if total > 0.0 else None, harmonics)
     confidence = case.options.confidence
+    used = [stretch.segment for stretch, fit in zip(case.stretches, case.fits, strict=True) if len(fit.speed)]
+    sets = list(dict.fromkeys(segment.phases_rad for segment in used))
+    set_of = np.array([sets.index(segment.phases_rad) for segment in used])
     lines = tuple(
-        _response_line(one, harmonics, detected, None if curve is None else complex(value), confidence)
+        _response_line(one, _LineDistortion.of(one, harmonics, detected, set_of),
+                       None if curve is None else complex(value), confidence)
         for one, value in zip(pooled, fitted, strict=True)
     )
-    used = [stretch.segment for stretch, fit in zip(case.stretches, case.fits, strict=True) if len(fit.speed)]
     return FrequencyResponse(
         confidence=confidence,
         model=model if curve is not None else "none",
         lines=lines,
         curve=() if curve is None else _drawn(curve, hertz),
         distortion=distortion,
-        mean_speeds_rad_s=tuple(segment.offset_rad_s for segment in used),
-        realisations=len({segment.phases_rad for segment in used}),
+        mean_speeds_rad_s=tuple(dict.fromkeys(segment.offset_rad_s for segment in used)),
+        realisations=len(sets),
     )
 
 
@@ -192,17 +200,50 @@ def _straight(lines: list[_PooledLine]) -> _StraightLine:
     return _StraightLine(float(np.sum(z.imag * omega) / np.sum(omega**2)), float(np.median(z.real)))
 
 
+@dataclass(frozen=True)
+class _LineDistortion:
+    """Distortion at one excited line, relative to it.
+
+    ``rel``: of one set of phases. ``of_mean_rel``: of the mean of all sets, 0 if none was detected, known with
+    ``freedom`` degrees of freedom.
+    """
+
+    rel: float
+    of_mean_rel: float
+    freedom: float
+
+    @classmethod
+    def of(
+        cls, one: _PooledLine, harmonics: tuple[UnexcitedHarmonic, ...], detected: bool, set_of: IntArray
+    ) -> _LineDistortion:
+        """Return the distortion: measured with `LEAST_SETS` of phases, otherwise as large as beside the line.
+
+        ``set_of``: (S,), the set of phases of each segment.
+        """
+        line = one.line
+        speed = math.sqrt(one.energy / float(np.sum(line.periods)))
+        sets = int(set_of.max()) + 1
+        if sets >= LEAST_SETS and len(line.speed) == len(set_of):
+            between = _excess_between(one, set_of)
+            rel = math.sqrt(max(between, 0.0) / 2.0) / (speed * abs(one.z))
+            return cls(rel, rel / math.sqrt(sets) if detected else 0.0, 2.0 * (sets - 1.0))
+        between = _excess_between(one, np.arange(len(line.speed)))
+        nearest = sorted(harmonics, key=lambda each: abs(each.hertz - line.hertz))[:_NEIGHBOURS]
+        beside = float(np.mean([each.torque_nm**2 - each.noise_nm**2 for each in nearest])) if nearest else 0.0
+        rel = math.sqrt(max(beside, between, 0.0) / 2.0) / (speed * abs(one.z))
+        return cls(rel, rel if detected else 0.0, math.inf)
+
+
 def _response_line(
-    one: _PooledLine, harmonics: tuple[UnexcitedHarmonic, ...], detected: bool, fitted: complex | None,
-    confidence: float,
+    one: _PooledLine, distortion: _LineDistortion, fitted: complex | None, confidence: float
 ) -> ResponseLine:
     line, omega = one.line, 2.0 * math.pi * one.line.hertz
-    speed = math.sqrt(one.energy / float(np.sum(line.periods)))
-    nearest = sorted(harmonics, key=lambda each: abs(each.hertz - line.hertz))[:_NEIGHBOURS]
-    beside = float(np.mean([each.torque_nm**2 - each.noise_nm**2 for each in nearest])) if nearest else 0.0
-    distortion = math.sqrt(max(beside, _excess_between_speeds(one), 0.0) / 2.0) / (speed * abs(one.z))
-    spread = math.hypot(one.noise_rel, distortion if detected else 0.0)
-    half = student_quantile(confidence, max(2.0 * line.nu, 1.0)) * spread
+    spread = math.hypot(one.noise_rel, distortion.of_mean_rel)
+    freedom = max(2.0 * line.nu, 1.0)
+    if math.isfinite(distortion.freedom) and distortion.of_mean_rel > 0.0:
+        # Welch and Satterthwaite (GUM, G.4.1)
+        freedom = spread**4 / (one.noise_rel**4 / freedom + distortion.of_mean_rel**4 / distortion.freedom)
+    half = student_quantile(confidence, freedom) * spread
     g = 1.0 / one.z
     turn = math.asin(half) if half < 1.0 else math.pi
     phase = math.atan2(g.imag, g.real)
@@ -214,7 +255,7 @@ def _response_line(
         phase_rad=Estimate(phase, phase - turn, phase + turn),
         apparent_inertia_kg_m2=Estimate(inertia, inertia - width, inertia + width),
         noise_rel=one.noise_rel,
-        distortion_rel=distortion,
+        distortion_rel=distortion.rel,
         coherence=_coherence(line),
         periods=round(float(np.sum(line.periods))),
         fitted_magnitude=None if fitted is None else 1.0 / abs(fitted),
@@ -339,11 +380,14 @@ def _between_speeds(lines: list[_PooledLine]) -> float | None:
     return _combined([float(chdtrc(freedom, statistic)), min(1.0, len(each) * min(each))]) if each else None
 
 
-def _excess_between_speeds(one: _PooledLine) -> float:
-    """Return E|·|² of the torque difference between the mean speeds, beyond noise, (N·m)²."""
-    more = len(one.line.speed) - 1
+def _excess_between(one: _PooledLine, group_of: IntArray) -> float:
+    """Return E|·|² of the torque difference between groups of segments, beyond noise, (N·m)². ``group_of``: (S,)."""
+    more = int(group_of.max())
     if more < 1:
         return 0.0
     left = one.line.torque - one.z * one.line.speed
-    between = float(np.sum(one.line.periods * np.abs(left) ** 2)) / more
-    return max(between - one.variance, 0.0) / float(np.mean(one.line.periods))
+    counts = np.bincount(group_of, one.line.periods)
+    means = (np.bincount(group_of, one.line.periods * left.real)
+             + 1j * np.bincount(group_of, one.line.periods * left.imag)) / counts
+    between = float(np.sum(counts * np.abs(means) ** 2)) / more
+    return max(between - one.variance, 0.0) / float(np.mean(counts))

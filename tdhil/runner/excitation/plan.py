@@ -20,7 +20,7 @@ from tdhil.runner.excitation.reference import (
     excitation_kind,
     make_transition,
 )
-from tdhil.runner.excitation.signals import PeriodicKind, Shape, begun_at_rest
+from tdhil.runner.excitation.signals import PeriodicKind, Shape, begun_at_rest, other_phases
 
 _OFFSET_SHARE = 0.38     # least distance of the two mean speeds, share of the usable window: lever for B
 LEAST_COUNTED = 6        # least number of evaluated periods at each mean speed: their scatter sets the weights
@@ -37,6 +37,8 @@ class PlanRequest:
     largest deviation of speed from its mean. ``offsets_rad_s``: mean speeds, one segment each. ``periods``: number per
     segment, with settling. ``shape``: lines that replace those of the multisine. ``offset_share``: least distance of
     two mean speeds that the plan chooses, as a share of the usable window (lever for the slope of friction).
+    ``realisations``: sets of phases at each mean speed, each in a segment of its own with the same amplitudes. No two
+    segments share a set, except with one realisation.
     ``settle_s``: least settling time of each segment.
     """
 
@@ -49,11 +51,15 @@ class PlanRequest:
     shape: Shape | None = None
     offset_share: float | None = None
     settle_s: float = SETTLE_S
+    realisations: int = 1
 
 
 @dataclass(frozen=True)
 class PlannedSegment:
-    """Segment at one mean speed: reference from its start, number of periods, predicted range of speed and torque."""
+    """Segment at one mean speed, with one set of phases.
+
+    It has its reference from its start, a number of periods, and a predicted range of speed and torque.
+    """
 
     reference: PeriodicReference
     periods: int
@@ -117,7 +123,7 @@ class Plan:
         }
 
     def parts(self) -> list[tuple[str, str]]:
-        """Return (place, text) for display: one for each mean speed."""
+        """Return (place, text) for display: one for each segment."""
         return [
             (f"at {one.reference.offset_rad_s:.3g} rad/s",
              f"{one.periods} periods of {one.reference.period_s:.3g} s, {one.settle_periods} to settle")
@@ -163,16 +169,16 @@ class Plan:
 
     @property
     def counted(self) -> int:
-        """Return the evaluated periods at each mean speed."""
+        """Return the evaluated periods of each segment."""
         return self.segments[0].periods - self.segments[0].settle_periods
 
     def with_counted(self, periods: int) -> "Plan":
-        """Return the same motion with this number of evaluated periods at each mean speed, besides settling."""
+        """Return the same motion with this number of evaluated periods in each segment, besides settling."""
         segments = tuple(replace(segment, periods=segment.settle_periods + periods) for segment in self.segments)
         return replace(self, segments=segments)
 
     def extension_s(self, periods: int) -> float:
-        """Return the time of further periods, s: at the last mean speed first, then at the others with settling."""
+        """Return the time of further periods, s: in the last segment first, then in the others with settling."""
         others = self.segments[:-1]
         again = sum(one.settle_periods * one.reference.period_s for one in others)
         ways = sum(
@@ -195,15 +201,27 @@ def make_plan(limits: MotionLimits, guess: RigGuess, wish: PlanRequest | None = 
     wish = wish or PlanRequest()
     shape, frequency = _shape_and_frequency(wish)
     period = 1.0 / frequency
-    shape = begun_at_rest(shape, period, guess.inertia_kg_m2, guess.viscous_nm_s_rad)
-    fit = _FittedShape.of(shape, period, limits, guess, wish.mode)
-    amplitude, offsets = _amplitude_and_offsets(fit, wish)
+    if wish.realisations > 1 and not periodic_kind(wish.kind).tuned:
+        raise PlanRefused(
+            f"the phases of {wish.kind} are part of its form, so it has one realisation", "Remove --realisations",
+        )
+    speeds = _number_of_offsets(wish)
+    fits = [
+        _FittedShape.of(
+            begun_at_rest(other_phases(shape, number), period, guess.inertia_kg_m2, guess.viscous_nm_s_rad),
+            period, limits, guess, wish.mode,
+        )
+        for number in range(wish.realisations * speeds if wish.realisations > 1 else 1)
+    ]
+    amplitude, offsets = _amplitude_and_offsets(fits, wish)
+    sets = [fits[number % len(fits)] for number in range(wish.realisations * speeds)]
+    each = [offset for offset in offsets for _ in range(wish.realisations)]
     settle = settling_periods(period, wish.settle_s)
     periods = _periods(wish, period, settle)
     return Plan(
         wish.kind,
         wish.mode,
-        tuple(fit.segment(offset, amplitude, periods, settle) for offset in offsets),
+        tuple(fit.segment(offset, amplitude, periods, settle) for offset, fit in zip(each, sets, strict=True)),
         limits,
         guess,
     )
@@ -223,6 +241,7 @@ class _FittedShape:
     torque_up: float     # torque above and below its mean, N·m per rad/s of amplitude
     torque_down: float
     foreseen: float      # as ``up``, for the speed that the guard predicts
+    steepest: float      # largest acceleration, rad/s² per rad/s of amplitude
 
     @classmethod
     def of(cls, shape: Shape, period_s: float, limits: MotionLimits, guess: RigGuess,
@@ -234,7 +253,13 @@ class _FittedShape:
         torque = moved.torque_deviation(period_s, guess.inertia_kg_m2, guess.viscous_nm_s_rad)
         both = np.concatenate([speed, moved.deviation()])
         peaks = (float(np.max(both)), float(-np.min(both)), float(np.max(torque)), float(-np.min(torque)))
-        return cls(shape, period_s, limits, guess, mode, *peaks, foreseen=max(peaks[0], float(np.max(ahead))))
+        steepest = float(np.max(np.abs(shape.steepness(period_s))))
+        return cls(shape, period_s, limits, guess, mode, *peaks, max(peaks[0], float(np.max(ahead))), steepest)
+
+    def around(self, others: "list[_FittedShape]") -> "_FittedShape":
+        """Return this shape with the largest peaks of all realisations."""
+        names = ("up", "down", "torque_up", "torque_down", "foreseen", "steepest")
+        return replace(self, **{name: max(getattr(one, name) for one in (self, *others)) for name in names})
 
     @property
     def swing(self) -> float:
@@ -245,7 +270,7 @@ class _FittedShape:
         """Return the largest amplitude that the drive's own speed ramp permits, rad/s."""
         if self.mode == "torque" or math.isinf(self.limits.acceleration_rad_s2):
             return math.inf
-        return RAMP_SHARE * self.limits.acceleration_rad_s2 / float(np.max(np.abs(self.shape.steepness(self.period_s))))
+        return RAMP_SHARE * self.limits.acceleration_rad_s2 / self.steepest
 
     def largest_at(self, offset_rad_s: float) -> tuple[float, str]:
         """Return the largest amplitude about a mean speed, rad/s, and the limit that determines it."""
@@ -344,17 +369,18 @@ def _periods(wish: PlanRequest, period_s: float, settle: int) -> int:
     if at_one_speed_s > 0.0:
         return settle + max(10, math.ceil(at_one_speed_s / period_s - 1e-9))
     # as long as the default multisine, but at least six evaluated periods: their scatter sets the weights
-    counted = (signals.DEFAULT_PERIODS - 1) / signals.MULTISINE_FREQUENCY_HZ
-    return settle + max(LEAST_COUNTED, math.ceil(counted / period_s - 1e-9))
+    # in all realisations together
+    counted = (signals.DEFAULT_PERIODS - 1) / signals.MULTISINE_FREQUENCY_HZ / wish.realisations
+    return settle + max(math.ceil(LEAST_COUNTED / wish.realisations), math.ceil(counted / period_s - 1e-9))
 
 
-def _amplitude_and_offsets(fit: _FittedShape, wish: PlanRequest) -> tuple[float, tuple[float, ...]]:
+def _amplitude_and_offsets(fits: list[_FittedShape], wish: PlanRequest) -> tuple[float, tuple[float, ...]]:
     if wish.amplitude_rad_s is not None and not (math.isfinite(wish.amplitude_rad_s) and wish.amplitude_rad_s > 0.0):
         raise PlanRefused(f"amplitude must be positive, not {wish.amplitude_rad_s:g} rad/s")
     if wish.offsets_rad_s is not None and not wish.offsets_rad_s:
         raise PlanRefused("at least one offset is needed")
-    offsets = wish.offsets_rad_s or _default_offsets(fit, wish)
-    largest, limit, where = min((*fit.largest_at(offset), offset) for offset in offsets)
+    offsets = wish.offsets_rad_s or _default_offsets(fits[0].around(fits[1:]), wish)
+    largest, limit, where = min((*fit.largest_at(offset), offset) for offset in offsets for fit in fits)
     if largest <= 0.0:
         raise PlanRefused(f"{limit} leaves no room for any excitation at {where:.3g} rad/s")
     amplitude = largest if wish.amplitude_rad_s is None else wish.amplitude_rad_s
@@ -364,6 +390,12 @@ def _amplitude_and_offsets(fit: _FittedShape, wish: PlanRequest) -> tuple[float,
             f"{largest:.3g} rad/s would fit"
         )
     return amplitude, tuple(offsets)
+
+
+def _number_of_offsets(wish: PlanRequest) -> int:
+    if wish.offsets_rad_s is not None:
+        return len(wish.offsets_rad_s)
+    return 1 if periodic_kind(wish.kind).at_one_speed_s > 0.0 else 2
 
 
 def _default_offsets(fit: _FittedShape, wish: PlanRequest) -> tuple[float, ...]:

@@ -102,6 +102,30 @@ def unit_peak(shape: Shape) -> Shape:
     return Shape(shape.harmonics, tuple(a / peak for a in shape.amplitudes), shape.phases_rad)
 
 
+_SETS = 256               # random sets of phases of which the best is taken
+
+
+@lru_cache(maxsize=8)
+def other_phases(shape: Shape, number: int) -> Shape:
+    """Return the same lines with the phases of realisation ``number``; 0: the shape itself.
+
+    Of `_SETS` random sets, seeded with the number, the one with the least sum of the crest factors of speed and torque.
+    The peak is not scaled to 1: each realisation must have the same amplitudes.
+    """
+    if number == 0:
+        return shape
+    draws = np.random.default_rng(number).uniform(0.0, 2.0 * np.pi, (_SETS, len(shape.harmonics)))
+    turns = np.outer(np.asarray(shape.harmonics), 2.0 * np.pi * np.arange(_GRID) / _GRID)
+    speed = np.asarray(shape.amplitudes)
+    torque = speed * np.asarray(shape.harmonics)
+    crests = [
+        sum(float(np.max(np.abs(size @ np.cos(turns + phases[:, None])))) / float(np.linalg.norm(size))
+            for size in (speed, torque))
+        for phases in draws
+    ]
+    return Shape(shape.harmonics, shape.amplitudes, tuple(float(phase) for phase in draws[int(np.argmin(crests))]))
+
+
 def begun_at_rest(shape: Shape, period_s: float, inertia_kg_m2: float, viscous_nm_s_rad: float) -> Shape:
     """Return the same motion with its start where the torque passes its mean.
 
