@@ -185,7 +185,7 @@ SUBJECTS = {
     "modbus/tcp": _driver("modbus/tcp", "test_modbus_links.py"),
     "modbus/preflight": _driver(
         "modbus/preflight", "test_modbus_preflight.py", "test_modbus_wrongs.py", "test_modbus_drive.py",
-        "test_modbus_announce.py", "test_modbus_temperature.py",
+        "test_modbus_announce.py", "test_modbus_temperature.py", "test_no_watchdog.py",
     ),
     "modbus/watchdog": _driver("modbus/watchdog", "test_modbus_preflight.py", "test_modbus_watchdog.py"),
     "modbus/parameters": _driver(
@@ -203,7 +203,7 @@ SUBJECTS = {
         "canopen/pdo", "test_pdo_mapping.py", "test_feedback.py", "test_trouble.py", "test_changed_feedback.py",
         "test_other_master.py", "test_quick_stop.py", "test_late_host.py",
     ),
-    "cia402/bus": _driver("cia402/bus", "test_cia402_without_bus.py"),
+    "cia402/bus": _driver("cia402/bus", "test_cia402_without_bus.py", "test_ethercat_drive.py"),
     "cia402/cycle_period": _driver("cia402/cycle_period", "test_preflight.py", "test_ethercat_drive.py"),
     "cia402/description": _driver("cia402/description", "test_ethercat_drive.py"),
     "cia402/mapping": _driver(

@@ -307,6 +307,44 @@ def test_nothing_listens():
     assert caught.value.next_step
 
 
+def test_an_address_that_does_not_answer(monkeypatch):
+    def silent(*_, **__):
+        raise TimeoutError("timed out")
+
+    monkeypatch.setattr("drivers.modbus.tcp.socket.create_connection", silent)
+    with pytest.raises(PreflightRefused, match="no answer to the connection") as caught:
+        TcpLink("192.0.2.1", 502, MonotonicClock())
+    assert "ping 192.0.2.1" in caught.value.next_step
+
+
+def test_on_other_systems_the_kernel_is_not_asked_for_what_was_not_acknowledged(monkeypatch):
+    with TcpPeer(lambda number, request: [good(request)]) as peer:
+        link = TcpLink("127.0.0.1", peer.port, MonotonicClock())
+        monkeypatch.setattr("fcntl.ioctl", lambda *_: pytest.fail("Linux alone knows this"))
+        monkeypatch.setattr("drivers.modbus.tcp.sys.platform", "win32")
+        try:
+            assert link.transact(1, ASK, LONG_S).pdu == GOOD
+        finally:
+            monkeypatch.undo()
+            link.close()
+
+
+def test_sending_has_the_time_of_its_reply_whatever_was_waited_before(monkeypatch):
+    waits, plain = [], socket.socket.sendall
+
+    def watched(self, data):
+        if self is link._socket:
+            waits.append(self.gettimeout())
+        return plain(self, data)
+
+    with TcpPeer(lambda number, request: [good(request)]) as peer:
+        link = TcpLink("127.0.0.1", peer.port, MonotonicClock(), connect_s=1.0)
+        monkeypatch.setattr(socket.socket, "sendall", watched, raising=False)
+        link.transact(1, ASK, LONG_S)
+        link.close()
+    assert waits == [LONG_S]
+
+
 def test_no_such_device(tmp_path):
     with pytest.raises(PreflightRefused, match="no such device") as caught:
         RtuLink(str(tmp_path / "ttyUSB7"), MonotonicClock())
@@ -449,6 +487,18 @@ def test_foreign_replies_cost_the_connection_a_few_times_only():
         link.close()
         assert peer.connections <= MOST_RENEWED + 1
         assert answered == 20 - MOST_RENEWED
+
+
+def test_the_connection_before_is_closed_when_another_is_opened():
+    """A drive may serve one connection only."""
+    with TcpPeer(lambda number, request: [tcp(0xF000 + number, 1, OTHER), good(request)]) as peer:
+        link = TcpLink("127.0.0.1", peer.port, MonotonicClock())
+        before = link._socket
+        for _ in range(2):
+            with contextlib.suppress(BadReply):
+                link.transact(1, ASK, LONG_S)
+        assert before.fileno() == -1
+        link.close()
 
 
 def test_opening_anew_never_takes_longer_than_a_reply_may(monkeypatch):

@@ -10,6 +10,7 @@ from drivers.drive import Command, DriveLimits, Mode, Outcome
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.link import EmbeddedLink
+from drivers.modbus.preflight import ECHO_POLL_S, ECHO_POLLS
 from profiles.library import load_modbus_profile
 from profiles.modbus import ModbusProfile
 from tests.drivers.modbus_bank import CONTROL, SPEED_SETPOINT, STATUS, TIME_OUT, Bank
@@ -429,8 +430,25 @@ def test_an_echo_may_be_late_but_not_stay_away(bank, generic, late):
     found = drive.preflight(LIMITS).refused
     assert [check.name for check in found] == ["speed setpoint as the drive understood it"] * (late == 1000)
     assert all("Does it take its reference from this bus" in check.next_step for check in found)
+    assert late == 3 or clock.now_s() > (ECHO_POLLS - 1.5) * ECHO_POLL_S   # the drive got its time
     assert clock.now_s() < 5.0
     assert bank.words[SPEED_SETPOINT] == bank.words[SPEED_SETPOINT + 1] == 0
+
+
+def test_a_setpoint_that_cannot_be_read_back_stays_untested_and_that_is_said(bank, generic):
+    answer = bank.answer
+    bank.answer = lambda pdu: (
+        bytes((0x83, 2)) if pdu[0] == 3 and int.from_bytes(pdu[1:3], "big") == SPEED_SETPOINT else answer(pdu))
+    drive = drive_on(bank, changed(generic, echoes=()))
+    drive.connect()
+    found = drive.preflight(LIMITS)
+    assert found.refused == ()
+    assert any(check.outcome is Outcome.NOTE and "can't be read: " in check.found for check in found.checks)
+
+
+def test_rig_and_drive_must_agree_on_every_parameter_that_the_rig_states(bank, generic):
+    rows = refused(bank, generic, given={"rated_speed": 1500.0})
+    assert next(iter(rows.values())).next_step.startswith("rig.yaml and the drive disagree")
 
 
 def test_a_ramp_up_is_as_steep_as_the_quick_stop_and_no_steeper(bank, generic):

@@ -93,6 +93,15 @@ def test_a_drive_that_shows_a_state_nobody_knows_is_asked_all_the_same():
     assert bank.machine.state == STOPPING
 
 
+@pytest.mark.parametrize(("counts", "near"), [(4000, False), (60, False), (47, True), (-47, True), (0, True)])
+def test_a_speed_in_known_units_is_near_zero_below_0_05_rad_s(counts, near):
+    """A count of the plain profile is 0.01 rpm."""
+    bank, clock = Bank(), SteppedClock()
+    bank.feedback = lambda: (counts, 0)
+    target = ModbusTarget(EmbeddedLink(bank.serve, clock), load_profile("generic/modbus"), unit=1)
+    assert target.poll().near_zero is near
+
+
 @pytest.mark.parametrize("refused", [SPEED_SETPOINT, MODE, MODE_SHOWN])
 def test_a_drive_that_refuses_speed_mode_gets_its_quick_stop_in_the_end(refused):
     bank, clock = Bank(), SteppedClock()

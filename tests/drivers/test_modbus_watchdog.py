@@ -2,13 +2,16 @@
 
 import struct
 from dataclasses import replace
-from itertools import pairwise
+from itertools import count, pairwise
 
 import pytest
 
 from drivers.clock import SteppedClock
 from drivers.drive import Outcome
-from drivers.modbus.watchdog import COUNT_S
+from drivers.errors import CommunicationLost
+from drivers.modbus.cycle import Round
+from drivers.modbus.watchdog import COUNT_S, measure_pace
+from drivers.preflight import PreflightTable
 from profiles.library import load_modbus_profile, load_profile, profile_names
 from profiles.modbus import ModbusProfile
 from tests.drivers.modbus_bank import TIME_OUT, Bank
@@ -122,6 +125,22 @@ def test_counting_keeps_the_armed_watchdog_fed():
     drive.preflight(LIMITS)
     assert bank.words[TIME_OUT] == 500
     assert max(b - a for a, b in pairwise(times)) < LIMITS.watchdog_s
+
+
+@pytest.mark.parametrize(("every", "refused"), [(1, True), (4, True), (5, False)])
+def test_a_line_that_loses_a_quarter_of_its_cycles_is_refused(every, refused):
+    asked, now_s = count(1), count(0.0, 0.01)
+
+    def go():
+        if next(asked) % every == 0:
+            raise CommunicationLost("no reply", where="line", next_step="Check it")
+        return Round({}, 0.0, 0.002, 0.002)
+
+    table = PreflightTable()
+    pace = measure_pace(table, "line", 10.0, 0.5, "5 requests", go, lambda: next(now_s))
+    assert (table.checks[-1].outcome is Outcome.REFUSED) is refused
+    assert pace.period_s == pytest.approx(0.1)
+    assert not refused or "cycles failed" in table.checks[-1].found
 
 
 def test_every_profile_that_ships_says_what_feeds_it():
