@@ -248,6 +248,7 @@ def test_what_rounding_leaves_in_the_mean_of_a_line(rate_hz, noise, shifted):
     assert again / 1.4 - 0.02 * once < np.mean(told) < 1.7 * again + 0.02 * once
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("rate_hz", "offsets"), [(10.0, (4.0, 7.0)), (10.05, (4.03, 7.02))])
 def test_a_coarse_register_that_rounds_alike_in_every_period_is_no_contradiction(rate_hz, offsets):
     """1 rpm at 10 Hz: the scatter between periods knows nothing of it, and spoke against the model at p = 1e-50.

@@ -213,7 +213,7 @@ class Lossy(FakeDrive):
         return sample._replace(fresh=False)
 
 
-@pytest.mark.heavy(but_first=4)
+@pytest.mark.heavy(but_first=1)
 @in_motion
 @pytest.mark.parametrize(("every", "outcome"), [(10, "degraded"), (1000, "ok")])
 def test_row_17_lost_frames(stage, every, outcome):

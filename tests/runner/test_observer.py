@@ -73,7 +73,7 @@ PHASES = (Phase.explicit, Phase.reuse, Phase.generate)      # a smaller rig is n
 any_run = given(rigs(), st.floats(-1.0, 1.0), st.floats(0.05, 0.3), st.floats(0.05, 1.0), st.integers(0, 1000))
 
 
-@settings(phases=PHASES, max_examples=6)
+@settings(phases=PHASES, max_examples=3)
 @any_run
 def test_a_healthy_run_raises_no_doubt(rig, wrong, rel_error, frequency_hz, seed):
     healthy(rig, wrong, rel_error, frequency_hz, seed)

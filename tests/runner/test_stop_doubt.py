@@ -282,6 +282,7 @@ def test_a_release_whose_speed_follows_is_not():
 # -- a shaft that runs out ----------------------------------------
 
 
+@pytest.mark.heavy
 def test_above_a_string_a_speed_that_is_lost_gets_no_speed_control(world):
     """It would push the shaft on; so would the watchdog. Zero torque until friction has stopped it, then off."""
     here = known(world, limits=STRING)
@@ -341,6 +342,7 @@ def test_an_inverted_sign_whose_shaft_does_not_coast_to_standstill_is_not_disabl
     assert all(abs(speed) < 0.05 for speed in here.drive.disabled_at)
 
 
+@pytest.mark.heavy
 def test_above_a_string_a_probe_that_saw_no_motion_gets_no_speed_control(world):
     here = world(Removing(sees=0.0, viscous=4.0), STRING)
     here.bench.enable(Mode.TORQUE, Command(Mode.TORQUE, 0.0, 0.0))

@@ -33,7 +33,7 @@ def torques(here):
     return seen
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize("twist_nm", [300.0, -300.0, pytest.param(100.0, marks=pytest.mark.heavy)])
 def test_trapped_torque_comes_down_on_the_ramp_before_anything_is_disabled(twist_nm):
     here = StringWorld(twist_nm=twist_nm)

@@ -467,6 +467,7 @@ def test_nobody_takes_away_the_watchdog_over_http(guarded):
 # -- a rig's file
 
 
+@pytest.mark.heavy
 def test_an_engineer_edits_a_rig_s_limits_and_nothing_that_leads_to_a_drive(guarded, rigs, nobody_s_port):
     engineer, path = guarded.sessions["engineer"], rigs / "real.yaml"
     before = path.read_text()
@@ -592,6 +593,7 @@ def test_an_admin_adds_and_removes_over_http(guarded):
     assert guarded.service.audit.verify() is None
 
 
+@pytest.mark.heavy
 def test_what_the_service_changes_itself_is_nobody_else_s_change(guarded, monkeypatch):
     """Its own thread looks in the middle of it: whose change it was is told once, and rightly."""
     written = accounts_module.write_json

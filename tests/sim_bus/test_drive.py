@@ -57,6 +57,7 @@ def test_cyclic_velocity_and_torque_with_a_switch_while_enabled(bench: Open) -> 
     assert abs(host.cycle(torque=torque, velocity=300, times=50)[1] - torque) <= 3
 
 
+@pytest.mark.heavy
 def test_profile_velocity_ramps_and_reaches(bench: Open) -> None:
     _, host = bench()
     host.set_up(mode=3)
@@ -98,7 +99,7 @@ def test_limits_show_in_bit_11(bench: Open) -> None:
     assert host.cycle(torque=140, times=30)[1] == 20
 
 
-@pytest.mark.heavy(but_first=5)
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("mode", [9, 10])
 @pytest.mark.parametrize(("option", "end"), [(0, "off"), (1, "off"), (2, "off"), (3, "off"), (5, "quick stop"),
                                              (6, "quick stop"), (7, "quick stop")])
@@ -195,6 +196,7 @@ def test_a_stop_of_the_watchdog_is_not_undone_by_the_old_word(bench: Open) -> No
     assert state(host.cycle(0x0F)[0]) == "enabled"
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("behaviour", "nmt"), [(0, 127), (1, 5), (2, 4)])
 def test_error_behaviour(bench: Open, behaviour: int, nmt: int) -> None:
     simulated, host = bench()
