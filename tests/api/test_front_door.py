@@ -36,8 +36,8 @@ def here(monkeypatch, tmp_path):
 @pytest.fixture(scope="module")
 def record(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    with contextlib.chdir(folder), tdhil.simulate(seed=7, rate_hz=50.0) as drive:
-        return tdhil.run(drive, SHORT, mode="speed", log=folder / "run.mcap", operator="A. Tester")
+    with contextlib.chdir(folder), tdhil.simulate(seed=7) as drive:
+        return tdhil.run(drive, SHORT, mode="speed", rate_hz=50.0, log=folder / "run.mcap", operator="A. Tester")
 
 
 def test_importing_it_loads_nothing():

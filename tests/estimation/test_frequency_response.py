@@ -59,6 +59,7 @@ def test_the_intervals_contain_the_exact_response_of_python_control(linear):
         assert line.magnitude.high / line.magnitude.low < 1.05
 
 
+@pytest.mark.heavy
 def test_the_intervals_cover_as_often_as_stated():
     exact = control.frequency_response(plant(), 2.0 * np.pi * np.array([0.1, 0.2, 0.3, 0.4])).frdata[0, 0]
     missed = lines = 0
@@ -175,6 +176,7 @@ def test_a_single_sine_has_a_response_though_it_tells_no_inertia():
     assert found.lines[0].fitted_magnitude is None and not found.distortion.detected
 
 
+@pytest.mark.heavy
 def test_a_recording_without_periodic_excitation_has_no_response():
     assert identify(replace(closed_form(), excitation=None)).frequency_response is None
 

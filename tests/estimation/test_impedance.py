@@ -214,6 +214,7 @@ def test_the_whole_identification_has_it_beside_the_inertia_and_again_from_what_
     assert identify(builder.recording()).impedance == whole.impedance
 
 
+@pytest.mark.heavy
 def test_the_command_is_what_was_sent_rounded_and_held():
     drive = machine("the paper's", torque_quantum=5.0)
     recording = record(drive, seed=1, counted=6)

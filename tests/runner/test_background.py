@@ -218,6 +218,7 @@ def test_a_real_time_priority_is_not_handed_down():
         found.close()
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("work", ["idle", "at work"])
 def test_it_ends_when_this_process_is_killed(tmp_path, work):
     said = tmp_path / "pid"

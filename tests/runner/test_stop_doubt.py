@@ -318,6 +318,7 @@ def test_a_torque_that_stays_in_spite_of_zero_gets_the_quick_stop(world):
     assert not report.confirmed and "quick_stop" in here.drive.calls
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("limits", [LIMITS, STRING])
 def test_an_inverted_sign_coasts_to_standstill_without_speed_control(world, limits):
     here = world(Removing(direction=-1.0, viscous=4.0), limits)
@@ -330,6 +331,7 @@ def test_an_inverted_sign_coasts_to_standstill_without_speed_control(world, limi
     assert abs(here.drive.disabled_at[0]) < 0.05
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("limits", [LIMITS, STRING])
 def test_an_inverted_sign_whose_shaft_does_not_coast_to_standstill_is_not_disabled_in_motion(world, limits):
     here = world(Removing(direction=-1.0, viscous=0.0, coulomb=0.0), limits)

@@ -509,6 +509,7 @@ def test_an_engineer_edits_a_rig_s_limits_and_nothing_that_leads_to_a_drive(guar
             assert (one.rig, one.details["keys"], one.details["before"]) == ("real", ["limits"], found["sha256"])
 
 
+@pytest.mark.heavy
 def test_a_rig_s_file_is_not_edited_without_a_login_nor_in_a_folder_that_is_read_only(guarded, service, monkeypatch):
     with TestClient(service.web.asgi, base_url="http://127.0.0.1:8420") as client:
         assert client.post(f"{API}/rigs/a/file", json={"text": "", "sha256": ""}).status_code == 403

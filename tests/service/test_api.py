@@ -121,6 +121,7 @@ def test_downloads_come_in_pieces(client, call, service):
     assert not [one for one in service.audit.entries() if one.what == "downloaded result.json"]
 
 
+@pytest.mark.heavy
 def test_a_log_that_grows_comes_in_pieces_too(client, call, service):
     run = call.start(what="hold")["id"]
     service.wait(run, "moving")

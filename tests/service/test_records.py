@@ -113,6 +113,7 @@ def test_the_index_is_made_again_with_annotations_and_a_broken_file_is_none(tmp_
 # -- archive
 
 
+@pytest.mark.heavy
 def test_an_archived_run_is_hidden_from_list_trend_compare_and_last_result_unless_asked_for(
         call, service, monkeypatch):
     first, second = ended(call, service), ended(call, service)

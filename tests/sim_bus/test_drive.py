@@ -99,7 +99,7 @@ def test_limits_show_in_bit_11(bench: Open) -> None:
     assert host.cycle(torque=140, times=30)[1] == 20
 
 
-@pytest.mark.heavy(but_first=2)
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("mode", [9, 10])
 @pytest.mark.parametrize(("option", "end"), [(0, "off"), (1, "off"), (2, "off"), (3, "off"), (5, "quick stop"),
                                              (6, "quick stop"), (7, "quick stop")])
@@ -123,6 +123,7 @@ def test_quick_stop_options(bench: Open, option: int, end: str, mode: int) -> No
     assert resumed == ("enabled" if option >= 5 else "off")
 
 
+@pytest.mark.heavy
 def test_halt_stays_enabled_and_goes_on(bench: Open) -> None:
     simulated, host = bench()
     host.set_up()
@@ -135,6 +136,7 @@ def test_halt_stays_enabled_and_goes_on(bench: Open) -> None:
     assert simulated.simulator.speed_rad_s == pytest.approx(200 * RPM_TENTH, abs=0.05)
 
 
+@pytest.mark.heavy
 def test_disable_operation_with_ramp_waits_for_rest_and_disable_voltage_does_not(bench: Open) -> None:
     simulated, host = bench()
     host.set_up()
@@ -164,7 +166,7 @@ def watched(host: Any, option: int, behaviour: int = 1) -> None:
     assert host.emcy() == []
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize(("option", "first", "last"), [
     (0, "enabled", "enabled"), (1, "reaction", "fault"), (2, "off", "off"), (3, "quick stop", "off"),
 ])
@@ -187,6 +189,7 @@ def test_watchdog_reactions(bench: Open, option: int, first: str, last: str) -> 
     assert host.emcy()[-1] == 0 and host.read(0x1001) == 0 and host.read(0x1003) == 1
 
 
+@pytest.mark.heavy
 def test_a_stop_of_the_watchdog_is_not_undone_by_the_old_word(bench: Open) -> None:
     _, host = bench()
     host.write(0x605A, 0, 6, 2)
@@ -239,6 +242,7 @@ def run_frames(bench: Open, seed: int) -> list[tuple[int, int, int]]:
     return [host.cycle(velocity=250) for _ in range(400)]
 
 
+@pytest.mark.heavy
 def test_same_seed_same_frames(bench: Open) -> None:
     first = run_frames(bench, 7)
     assert first == run_frames(bench, 7)

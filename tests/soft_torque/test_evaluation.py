@@ -153,6 +153,7 @@ def test_critical_speed_and_damping_are_read_off_the_rows():
     assert found.outcome is EvaluationOutcome.AS_PREDICTED
 
 
+@pytest.mark.heavy(but_first=3)
 @pytest.mark.parametrize(("log", "outcome", "said"), [
     (rows(66.0, (68.0, 65.2, 66.1), damping=0.22), EvaluationOutcome.DIFFERS,
      "critical speed 66.1 rpm, predicted 56 to 59"),
