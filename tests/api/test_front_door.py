@@ -82,6 +82,7 @@ def test_the_document_is_that_of_the_command_line(record, capsys):
     assert result.exit_code == code
 
 
+@pytest.mark.heavy
 def test_a_result_shows_itself_as_the_card(record, capsys):
     result = tdhil.identify(record)
     main(["replay", record.log])

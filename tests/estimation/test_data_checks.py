@@ -147,6 +147,7 @@ def test_an_undeclared_tone_is_told_with_its_frequency(hertz):
     assert f"at {hertz:.4g} Hz" in said[0] or abs(float(said[0].split(" at ")[1].split(" Hz")[0]) - hertz) < 0.02
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("periods", [3, 5, 10, 60])
 def test_a_drift_is_seldom_seen_where_there_is_none(periods):
     """The warning at 3.5 sd: once in two thousand runs, if the scatter is well known and if it isn't."""

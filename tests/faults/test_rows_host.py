@@ -33,7 +33,7 @@ def stopped_by_host(run, since_s, seen, row, code, *words):
     seen(row, run.message, standstill_s, run.assert_log_whole(), code)
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 143),
                                               (signal.SIGQUIT, 143)])
 def test_rows_1_3_a_signal(number, code, rehearse, monkeypatch, seen):

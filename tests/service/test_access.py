@@ -103,6 +103,7 @@ def guarded(tmp_path: Path, rigs: Path, people: None) -> Iterator[Guarded]:
 # -- every route
 
 
+@pytest.mark.heavy(each_share=True)
 def test_every_route_for_everybody(guarded, monkeypatch):
     """Generated from the served document: who may, gets past the door; who may not, 401 or 403, and nothing happens.
 

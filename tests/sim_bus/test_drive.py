@@ -40,6 +40,7 @@ def test_path_to_operation_and_back(bench: Open) -> None:
     assert status & 0x0210 == 0x0210                              # remote, voltage enabled
 
 
+@pytest.mark.heavy
 def test_cyclic_velocity_and_torque_with_a_switch_while_enabled(bench: Open) -> None:
     simulated, host = bench()
     host.set_up()
