@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 from tdhil.config import OPTION
@@ -195,6 +196,7 @@ def refuse_uninformative(
     raise PlanRefused(NOTHING_TO_EXPECT, f"Leave out {' and '.join(named)}: tdhil then chooses a motion that can")
 
 
+@lru_cache(maxsize=32)      # a prediction takes half a second, and a worker process refuses for the same rig again
 def _informs(
     request: ExcitationRequest, mode: str, limits: MotionLimits, guess: RigGuess, known: DesignKnowledge
 ) -> bool:

@@ -37,7 +37,7 @@ def here(monkeypatch, tmp_path):
 def record(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     with contextlib.chdir(folder), tdhil.simulate(seed=7) as drive:
-        return tdhil.run(drive, SHORT, mode="speed", log=folder / "run.mcap", operator="A. Tester")
+        return tdhil.run(drive, SHORT, mode="speed", rate_hz=50.0, log=folder / "run.mcap", operator="A. Tester")
 
 
 def test_importing_it_loads_nothing():
@@ -82,6 +82,7 @@ def test_the_document_is_that_of_the_command_line(record, capsys):
     assert result.exit_code == code
 
 
+@pytest.mark.heavy
 def test_a_result_shows_itself_as_the_card(record, capsys):
     result = tdhil.identify(record)
     main(["replay", record.log])
@@ -119,7 +120,7 @@ def test_what_ends_a_run_is_raised_once_the_shaft_rests(tmp_path):
     assert not tdhil.read("broken.mcap").whole
 
 
-def test_what_was_refused_before_motion_is_said_and_leaves_the_last_log(record):
+def test_what_was_refused_before_motion_is_said_and_leaves_the_last_log():
     with tdhil.simulate(seed=7) as drive, pytest.raises(PreflightRefused, match="plan of stage 5"):
         tdhil.run(drive, tdhil.Multisine(amplitude_rad_s=1000.0), log="none.mcap")
     assert not Path("none.mcap").exists()
@@ -148,6 +149,7 @@ def test_an_option_is_named_as_python_calls_it(tmp_path, wrong, said):
     assert said in str(caught.value) and f"--{said[:4]}" not in str(caught.value)
 
 
+@pytest.mark.heavy
 def test_values_that_can_t_be_are_named_as_python_calls_them(record, tmp_path, capsys):
     with pytest.raises(UsageError, match="confidence") as caught:
         tdhil.identify(record, confidence=7.0)
@@ -294,6 +296,7 @@ def test_true_moves(real_preflight):
     ask(CallbackOperator(stderr_console(), lambda text: True), real_preflight, Asked())
 
 
+@pytest.mark.heavy
 def test_frames_for_notebooks(record):
     pytest.importorskip("pandas")
     frame = record.to_pandas()
@@ -310,6 +313,7 @@ def test_datasets_for_notebooks(record):
     assert data.sizes == {"time_s": len(record)}
 
 
+@pytest.mark.heavy
 def test_a_library_that_is_missing_is_named(record, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(UsageError, match=r"pandas is not installed.*notebook"):

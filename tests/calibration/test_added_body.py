@@ -23,6 +23,7 @@ def case(values, bodies, noise=0.002, sds=None, **more):
     return CalibrationCase(runs, values, covariance, covariance, 50.0, None, **more)
 
 
+@pytest.mark.heavy
 def test_the_factor_and_the_inertia_of_two_runs(tmp_path):
     found = find_calibration(two(tmp_path), "motor").calibration
     assert found.verdict is Verdict.VALID

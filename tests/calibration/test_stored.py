@@ -45,6 +45,7 @@ def test_a_run_with_a_calibration_is_in_calibrated_torque(document):
     assert conclude(recording(0.0, 7), RUN, "run.mcap").document["torque_calibration"] is None
 
 
+@pytest.mark.heavy
 def test_the_file_is_read_again_and_never_written_over(document, tmp_path):
     path = tmp_path / "calibration.json"
     save_calibration(document, path)
@@ -91,6 +92,7 @@ def test_an_old_calibration_is_named(document):
     assert any("valid for 100" in warning for warning in warnings)
 
 
+@pytest.mark.heavy
 def test_a_replay_takes_the_calibration_of_its_drive_only(document):
     found = with_calibration(RUN, recording(0.0, 7), document, "calibration.json")
     assert found["torque_calibration"] == document

@@ -45,6 +45,7 @@ def test_the_table_fits_eighty_columns_and_says_what_it_shows(trace, capsys, mon
     assert "No nonlinear distortion was detected" in " ".join(said.split())
 
 
+@pytest.mark.heavy
 def test_json_csv_parquet_and_picture_have_the_same_lines(trace, tmp_path, capsys):
     duckdb = pytest.importorskip("duckdb", reason="duckdb is not installed (pip install '.[parquet]')")
     table, parquet, picture = (tmp_path / f"frf.{ending}" for ending in ("csv", "parquet", "png"))
@@ -65,6 +66,7 @@ def test_json_csv_parquet_and_picture_have_the_same_lines(trace, tmp_path, capsy
     assert head.startswith(b"\x89PNG") and struct.unpack(">II", head[16:24])[0] > 900
 
 
+@pytest.mark.heavy
 def test_the_name_of_a_log_is_no_formula_in_the_table(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     name, *motion = write_trace(tmp_path, "=cmd")
@@ -73,6 +75,7 @@ def test_the_name_of_a_log_is_no_formula_in_the_table(tmp_path, monkeypatch):
         assert {row["log"] for row in csv.DictReader(file)} == {"'=cmd.csv"}
 
 
+@pytest.mark.heavy
 def test_python_has_the_same_response(trace, capsys):
     import tdhil
 

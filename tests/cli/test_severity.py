@@ -47,6 +47,7 @@ def test_one_record(bench, capsys):
         5600.0 / 296.5 * np.sin(2.0 * np.pi / 8.16 * 0.944) * 30.0 / np.pi, rel=0.05)
 
 
+@pytest.mark.heavy
 def test_two_records_side_by_side_in_80_columns_and_as_a_page(bench, capsys):
     code, out, err = ran(bench, capsys, "--against", str(bench / "after.csv"), "--report", str(bench / "page.html"))
     assert code == 0

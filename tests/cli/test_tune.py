@@ -347,6 +347,7 @@ def test_a_schedule_needs_the_string(tuned):
     assert code == ExitCode.USAGE and "--string string.yaml" in json.dumps(document)
 
 
+@pytest.mark.heavy
 def test_the_picture_of_a_schedule_is_drawn(tmp_path):
     """With and without critical speeds, and with a depth that is refused."""
     figure = pytest.importorskip("matplotlib.figure")

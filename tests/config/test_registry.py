@@ -92,7 +92,7 @@ def test_a_toy_excitation_is_run_by_the_front_door_and_identified(tmp_path):
     assert inertia is not None and inertia.low < 104.0 < inertia.high
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.usefixtures("toys")
 @pytest.mark.parametrize(("kind", "motion"), [("two-tones", "segments"), ("stairs", "ways")])
 def test_a_toy_excitation_is_taken_by_the_command_line_and_rig_yaml(kind, motion, tmp_path, capsys):

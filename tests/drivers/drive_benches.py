@@ -197,10 +197,10 @@ class Run:
         self.drive.enable(mode)
         return self.until(lambda sample: sample.state is PowerState.ENABLED and sample.mode is mode, 1.0, mode)
 
-    def turning(self, speed=5.0):
+    def turning(self, speed=5.0, for_s=6.0):
         self.ready()
         self.enable()
-        return self.go(6.0, speed=speed)
+        return self.go(for_s, speed=speed)
 
     def rests(self, sample):
         """As the drive says: some switch themselves off once they are at rest."""

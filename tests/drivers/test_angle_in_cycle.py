@@ -111,6 +111,7 @@ def test_a_lost_frame_leaves_a_gap_and_no_wrong_angle(made):
         [pairs[0][0].position_rad - pairs[0][1]] * 25, abs=1.01 * COUNT_RAD)
 
 
+@pytest.mark.heavy
 def test_an_angle_without_its_feedback_is_dropped(made):
     run = made(CanopenBench)
     run.turning(5.0)
@@ -226,6 +227,7 @@ def test_turns_that_can_not_be_known_are_not_given(made, monkeypatch):
     assert seldom.drive.read_position() is not None
 
 
+@pytest.mark.heavy
 def test_a_look_brings_it_too(made):
     run = made(CanopenBench)
     run.turning(5.0)

@@ -55,6 +55,7 @@ def test_the_drives_heartbeat_is_lost(turning, bench):
     assert 100 <= k * PERIOD_S / 0.004 <= 155          # 0.5 s after the last one, which is up to 0.1 s old
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize(("frame", "kind", "text"), [
     ((0x701, b"\x00"), DriveFault, "restarted"),
     ((0x081, bytes.fromhex("1023030000000000")), DriveFault, "EMCY 2310h"),

@@ -166,6 +166,7 @@ def test_a_value_that_differs_once_is_asked_for_again(running, wire, peer):
     assert len(asked) >= 2
 
 
+@pytest.mark.heavy
 def test_a_drive_that_answers_no_sdo_from_the_beginning_runs_on_and_that_is_told(make, wire, peer):
     drive = make()
     ready(drive)
@@ -207,6 +208,7 @@ def echo(peer):
     peer.before_answer = before
 
 
+@pytest.mark.heavy
 def test_a_speed_in_the_drive_that_is_not_ours_ends_the_run(running, wire, peer):
     echo(peer)
     go(running, wire, 15.0, speed=1.0)

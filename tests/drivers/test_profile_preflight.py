@@ -137,6 +137,7 @@ def wide_profile(kind):
     return CanopenProfile.model_validate(data)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("kind", ["i32", "f32"])
 def test_torque_of_32_bits(make, monkeypatch, kind):
     from tests.drivers import drive_benches

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -65,9 +66,20 @@ def doubted(one: StopRound) -> bool:
     return one.seen is None or one.seen.follows or one.seen.blank
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(PIECES)
 def test_a_shaft_that_turns_or_is_doubted_is_never_released_nor_called_at_rest(pieces):
+    never_released(pieces)
+
+
+@pytest.mark.heavy
+@settings(max_examples=150, deadline=None)
+@given(PIECES)
+def test_in_more_courses_neither(pieces):
+    never_released(pieces)
+
+
+def never_released(pieces):
     course, action = StopCourse.begin(0.0), StopAction.REQUEST
     past: list[StopRound] = []
     for now in rounds(pieces):

@@ -108,6 +108,7 @@ def test_what_a_dead_host_left_is_gone_with_the_next_run_and_with_a_stop_from_ou
     assert bench.read(*OFFSET) == 0
 
 
+@pytest.mark.heavy
 def test_a_stop_by_sdo_takes_it_away_first(bench):
     run = turning(bench)
     push(run, 100.0, 50)

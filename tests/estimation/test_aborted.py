@@ -7,6 +7,7 @@ import pytest
 
 from tdhil.estimation import Verdict, identify
 from tdhil.recording.recording import MARGIN_S, Stage, before_abort
+from tests.estimation.analytic import closed_form
 
 pytestmark = pytest.mark.one_worker("default plan")      # its recording is one of 24 that are simulated at once
 
@@ -64,9 +65,10 @@ def test_before_the_excitation_there_is_no_number_and_the_abort_is_the_reason(on
     assert "still" not in found.reason
 
 
-def test_nothing_of_the_last_second_counts(one_recording):
-    at_s = float(one_recording.time_s[-1]) - 20.0
-    kept = before_abort(aborted(one_recording, at_s, 5.0))
+def test_nothing_of_the_last_second_counts():
+    recording = closed_form()
+    at_s = float(recording.time_s[-1]) - 20.0
+    kept = before_abort(aborted(recording, at_s, 5.0))
     assert kept.time_s[-1] < at_s - MARGIN_S
     for segment in kept.excitation.segments:
         assert segment.end_s <= at_s - MARGIN_S
@@ -74,5 +76,6 @@ def test_nothing_of_the_last_second_counts(one_recording):
         assert periods == pytest.approx(round(periods), abs=1e-6)
 
 
-def test_a_run_that_went_to_its_end_is_left_as_it_is(one_recording):
-    assert before_abort(one_recording) is one_recording
+def test_a_run_that_went_to_its_end_is_left_as_it_is():
+    recording = closed_form()
+    assert before_abort(recording) is recording

@@ -147,6 +147,7 @@ def test_an_undeclared_tone_is_told_with_its_frequency(hertz):
     assert f"at {hertz:.4g} Hz" in said[0] or abs(float(said[0].split(" at ")[1].split(" Hz")[0]) - hertz) < 0.02
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("periods", [3, 5, 10, 60])
 def test_a_drift_is_seldom_seen_where_there_is_none(periods):
     """The warning at 3.5 sd: once in two thousand runs, if the scatter is well known and if it isn't."""
@@ -248,6 +249,7 @@ def test_what_rounding_leaves_in_the_mean_of_a_line(rate_hz, noise, shifted):
     assert again / 1.4 - 0.02 * once < np.mean(told) < 1.7 * again + 0.02 * once
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("rate_hz", "offsets"), [(10.0, (4.0, 7.0)), (10.05, (4.03, 7.02))])
 def test_a_coarse_register_that_rounds_alike_in_every_period_is_no_contradiction(rate_hz, offsets):
     """1 rpm at 10 Hz: the scatter between periods knows nothing of it, and spoke against the model at p = 1e-50.

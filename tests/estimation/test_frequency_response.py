@@ -59,6 +59,7 @@ def test_the_intervals_contain_the_exact_response_of_python_control(linear):
         assert line.magnitude.high / line.magnitude.low < 1.05
 
 
+@pytest.mark.heavy
 def test_the_intervals_cover_as_often_as_stated():
     exact = control.frequency_response(plant(), 2.0 * np.pi * np.array([0.1, 0.2, 0.3, 0.4])).frdata[0, 0]
     missed = lines = 0
@@ -73,6 +74,7 @@ def test_the_intervals_cover_as_often_as_stated():
     assert lines == 160 and missed <= 17
 
 
+@pytest.mark.heavy
 def test_python_control_reads_the_arrays(linear):
     frd = control.FRD(*linear.to_frd())
     for line in linear.lines:
@@ -83,6 +85,7 @@ def test_python_control_reads_the_arrays(linear):
     assert np.allclose((1 / frd).frdata[0, 0], linear.impedance, rtol=1e-12, atol=0.0)
 
 
+@pytest.mark.heavy
 def test_xarray_has_the_lines_with_their_units(linear):
     found = linear.to_xarray()
     assert found.hertz.values.tolist() == linear.hertz.tolist()
@@ -119,6 +122,7 @@ def test_a_linear_shaft_has_no_distortion(linear):
     assert found.by_harmonics is not None and found.by_speed is not None
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("harmonic, odd", [(5, True), (6, False)])
 def test_torque_at_an_unexcited_harmonic_is_distortion(harmonic, odd):
     bent = with_torque(closed_form(noise=3.0), lambda t, _: 2.0 * np.cos(2.0 * np.pi * harmonic * t / 10.0 + 0.4))
@@ -129,6 +133,7 @@ def test_torque_at_an_unexcited_harmonic_is_distortion(harmonic, odd):
     assert seen.torque_nm == pytest.approx(2.0, rel=0.1) and seen.p_value < 1e-6
 
 
+@pytest.mark.heavy
 def test_detected_distortion_widens_the_intervals(linear):
     bent = respond(with_torque(closed_form(noise=3.0), lambda t, _: 2.0 * np.cos(2.0 * np.pi * 0.5 * t)))
     for wide, narrow in zip(bent.lines, linear.lines, strict=True):
@@ -181,6 +186,7 @@ def test_a_response_that_differs_between_mean_speeds_is_distortion():
     assert found.detected and found.by_speed < 0.0015
 
 
+@pytest.mark.heavy
 def test_a_constant_friction_and_another_torque_scale_are_no_distortion(linear):
     scaled = closed_form(noise=3.0, coulomb=200.0)
     scaled = replace(scaled, torque_nm=1.1 * scaled.torque_nm)
@@ -206,6 +212,7 @@ def test_a_single_sine_has_a_response_though_it_tells_no_inertia():
     assert found.lines[0].fitted_magnitude is None and not found.distortion.detected
 
 
+@pytest.mark.heavy
 def test_a_recording_without_periodic_excitation_has_no_response():
     assert identify(replace(closed_form(), excitation=None)).frequency_response is None
 
@@ -230,6 +237,7 @@ def test_the_clearer_signal_is_divided_by():
     assert abs(error.mean()) < 4.0 * np.std(error) / math.sqrt(len(seen))
 
 
+@pytest.mark.heavy
 def test_the_values_are_those_of_the_table_of_lines(linear):
     identified = identify(closed_form(noise=3.0), Options())
     for line, point in zip(identified.frequency_response.lines, identified.lines, strict=True):

@@ -57,7 +57,7 @@ def left_out(one, number):
     return pytest.mark.long if str(number)[0] == "1" else pytest.mark.heavy if number > 3 else ()
 
 
-@pytest.mark.heavy(but_first=8)
+@pytest.mark.heavy
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("one", "number"), [
     pytest.param(one, number, id=f"{one.name}-{number}", marks=left_out(one, number)) for one, number in CASES

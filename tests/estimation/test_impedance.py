@@ -31,6 +31,7 @@ def holds(part, truth, times=1.0):
     return abs(part.value - truth) <= times * 0.5 * (part.high - part.low)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.heavy(but_first=2)
 @NAMED
 @pytest.mark.parametrize("by", ["offset", "reference"])
@@ -76,6 +77,7 @@ def test_a_loop_in_closed_form_is_sampled_as_the_simulated_drive_is(integral):
     assert drive.inner_lag == pytest.approx(0.02905, abs=1e-5)
 
 
+@pytest.mark.heavy
 def test_a_sampled_integral_moves_the_gain_within_its_interval():
     """P = 1600 and I = 800, every 2 ms, with a fiftieth of the usual noise: the loop acts as P − I h/2 = 1599.2."""
     few = {name: 0.02 * value for name, value in vars(Machine()).items() if name.endswith(("_sd", "noise", "quantum"))}
@@ -212,6 +214,7 @@ def test_the_whole_identification_has_it_beside_the_inertia_and_again_from_what_
     assert identify(builder.recording()).impedance == whole.impedance
 
 
+@pytest.mark.heavy
 def test_the_command_is_what_was_sent_rounded_and_held():
     drive = machine("the paper's", torque_quantum=5.0)
     recording = record(drive, seed=1, counted=6)

@@ -94,6 +94,7 @@ class ThreePoles:
         return (104.0 * s + 8.0) * poles[0] / poles[1]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("seed", [
     0, pytest.param(1, marks=pytest.mark.heavy), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, 6)),
 ])

@@ -22,7 +22,7 @@ from tdhil.recording.recording import Recording
 from tdhil.runner.excitation import PlanRequest
 from tests.estimation.planned_motions import planned
 from tests.estimation.shaft_bench import Rig, simulate
-from tests.estimation.stages_bench import Stages, run_stages, usual_runs
+from tests.estimation.stages_bench import Stages, run_stages, ten_runs, usual_runs
 
 pytestmark = pytest.mark.one_worker("friction")     # both look at the same runs
 
@@ -111,7 +111,7 @@ def test_without_excited_segments_the_rows_tell_the_scatter(runs):
 
 
 def test_a_result_that_is_wrong_is_contradicted():
-    recording = usual_runs()[0]
+    recording = ten_runs()[0]
     wrong = result(1.15 * TRUE)
     opinions = opinions_of(recording, wrong)
     assert [opinion.agrees for opinion in opinions] == [False, False]
@@ -131,7 +131,7 @@ def test_torque_that_nobody_reports_is_found_by_the_coast_down():
 
 
 def test_a_compliant_shaft_is_compared_with_all_that_turns():
-    recording = usual_runs()[1]
+    recording = ten_runs()[1]
     motor_only = result(80.0)
     whole = Compliant(around(TRUE, 0.5), around(24.0, 1.0), None, None, None, None)
     assert {o.agrees for o in opinions_of(recording, motor_only)} == {False}
@@ -180,7 +180,7 @@ def test_a_balance_from_calm_to_calm_knows_of_the_reports_their_delay_only(speed
 
 
 def test_a_coarse_speed_widens_the_interval():
-    recording = usual_runs()[2]
+    recording = ten_runs()[2]
     coarse = replace(
         recording, speed_rad_s=np.round(recording.speed_rad_s / 0.3) * 0.3, speed_resolution_rad_s=0.3
     )
@@ -191,7 +191,7 @@ def test_a_coarse_speed_widens_the_interval():
 
 
 def test_the_same_record_gives_the_same_bits():
-    recording = usual_runs()[3]
+    recording = ten_runs()[3]
     assert opinions_of(recording) == opinions_of(recording)
 
 
@@ -223,7 +223,7 @@ def test_nothing_to_go_by_is_no_opinion_and_nothing_raises():
 def test_torque_read_in_step_with_a_speed_setpoint_is_an_unknown_of_its_own():
     """As at 15 cycles a second: in the rows that a speed setpoint moved, J reads a share too large."""
     plainly, openly = [], []
-    for recording in usual_runs()[:10]:
+    for recording in ten_runs():
         found = balances(recording, usable_samples(recording))
         rows = tuple(
             replace(row, stepped_rad_s=row.change_rad_s, impulse_nm_s=row.impulse_nm_s + 0.08 * TRUE * row.change_rad_s)

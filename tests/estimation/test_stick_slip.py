@@ -58,7 +58,7 @@ def test_none_of_108_records_in_stick_slip_is_answered_wrong(every):
     assert check(some) >= 0.7 * len(some)
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize("machine", [FIELD, SERVO, HEAVY], ids=lambda machine: machine.name)
 def test_sound_records_are_never_called_stick_slip(machine):
     """Among them starts from standstill, coasting to standstill, and speeds that go through zero."""

@@ -151,6 +151,7 @@ def test_the_wide_band_is_left_where_the_model_is_doubtful_in_it_or_untested(mon
     assert solved.bins == len((wide if said == 0.5 else narrow).problem.bins)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("gain", "followed"), [
     (0.0, (0.0, 0.1)), *(
         pytest.param(*case, marks=pytest.mark.heavy) for case in ((5.0, (0.0, 0.2)), (40.0, (0.95, 1.0)))),

@@ -62,7 +62,7 @@ def record(scale, seed, lag=(0.5,), rate_hz=100.0, offset=4.0, limit=None):
 
 
 @pytest.mark.long(but_first=4)
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize("rate_hz", [100.0, 12.5])
 @pytest.mark.parametrize("lag", list(LAGS.values()), ids=list(LAGS))
 def test_the_ratio_covers_whatever_lags_between(lag, rate_hz):

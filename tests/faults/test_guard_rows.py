@@ -96,7 +96,7 @@ in_motion = pytest.mark.parametrize("stage", STAGES[1:])
 in_torque = pytest.mark.parametrize("stage", ["torque", "hold", "acquire"])
 
 
-@pytest.mark.heavy(but_first=8)
+@pytest.mark.heavy(but_first=5)
 @each_stage
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 143)])
 @pytest.mark.parametrize("times", [1, 2])
@@ -122,6 +122,7 @@ def test_row_2_a_signal_during_the_stop_changes_nothing():
     run("acquire", begin).assert_stopped(Interrupted, ExitCode.INTERRUPTED)
 
 
+@pytest.mark.heavy(but_first=3)
 @each_stage
 def test_row_5_an_exception(stage):
     def begin(here):
@@ -133,6 +134,7 @@ def test_row_5_an_exception(stage):
     run(stage, begin).assert_stopped(ZeroDivisionError, ExitCode.INTERNAL)
 
 
+@pytest.mark.heavy(but_first=2)
 @in_motion
 def test_row_6_a_stop_that_is_not_confirmed(stage):
     def begin(here):
@@ -162,6 +164,7 @@ class Slow(FakeDrive):
         return Counters(self.cycles, self.missed, 0, self.overruns)
 
 
+@pytest.mark.heavy(but_first=2)
 @in_motion
 def test_row_8_a_loop_that_is_late_again_and_again(stage):
     def begin(here):
@@ -177,6 +180,7 @@ def test_row_8_a_loop_that_is_late_now_and_then():
     assert "began late" in ended.result.stages[-1].detail
 
 
+@pytest.mark.heavy(but_first=3)
 @each_stage
 def test_row_10_a_log_that_can_not_be_written(stage):
     def begin(here):
@@ -189,6 +193,7 @@ def test_row_10_a_log_that_can_not_be_written(stage):
     ended.assert_stopped(LogError, exit_code(LogError("x")))
 
 
+@pytest.mark.heavy(but_first=2)
 @in_motion
 def test_rows_12_13_15_the_bus_is_gone(stage):
     def begin(here):
@@ -213,7 +218,7 @@ class Lossy(FakeDrive):
         return sample._replace(fresh=False)
 
 
-@pytest.mark.heavy(but_first=4)
+@pytest.mark.heavy(but_first=1)
 @in_motion
 @pytest.mark.parametrize(("every", "outcome"), [(10, "degraded"), (1000, "ok")])
 def test_row_17_lost_frames(stage, every, outcome):
@@ -247,6 +252,7 @@ def test_row_18_duplicated_or_late_feedback_is_found():
     assert "late or twice" in ended.result.stages[-1].detail
 
 
+@pytest.mark.heavy(but_first=2)
 @in_motion
 def test_row_19_no_feedback_any_more(stage):
     ended = run(stage, from_now_on(lambda drive, sample: sample._replace(fresh=False)))
@@ -292,7 +298,7 @@ def test_rows_20_to_23_what_the_driver_raises(stage, error, code):
     assert told
 
 
-@pytest.mark.heavy(but_first=8)
+@pytest.mark.heavy(but_first=4)
 @in_motion
 @pytest.mark.parametrize("state", [PowerState.OFF, PowerState.READY, PowerState.QUICK_STOP, PowerState.FAULT])
 def test_rows_31_33_a_drive_that_leaves_its_state(stage, state):
@@ -345,7 +351,7 @@ def test_row_34_the_load_is_lost(stage):
     assert max(ended.speeds) <= 10.0 + 2.0 * PERIOD_S * 400.0 / 5.0
 
 
-@pytest.mark.heavy(but_first=8)
+@pytest.mark.heavy(but_first=4)
 @in_motion
 @pytest.mark.parametrize(
     ("change", "what"),
@@ -394,6 +400,7 @@ def test_row_37_a_setpoint_that_is_none_never_reaches_the_bus(mode, value):
     assert len(here.drive.commands) == sent
 
 
+@pytest.mark.heavy(but_first=2)
 @in_motion
 def test_row_37_a_setpoint_that_is_none_ends_the_run(stage):
     here = World()

@@ -107,6 +107,7 @@ def test_a_report_stays(name, signal):
     assert drive.told()[signal] == first != twin.told()[signal]
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize(("name", "signals"), [
     ("speed-delay", ("speed",)), ("torque-delay", ("torque",)), ("demand-delay", ("demand",)),
     ("position-delay", ("position",)), ("feedback-delay", ("speed", "torque", "demand", "position")),
@@ -147,6 +148,7 @@ def test_all_of_the_feedback(name, status, others):
     assert drive.inverter.speed_rad_s == twin.inverter.speed_rad_s
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize(("name", "value", "share"), [
     ("sensor-lost", "", 0.0), ("sensor-scale", "0.5", 0.5), ("sensor-sign", "", -1.0), ("sensor-slips", "40%", 0.6),
 ])

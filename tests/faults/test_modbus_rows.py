@@ -89,6 +89,7 @@ AT_ONCE = ("exception 1", "exception 2 for good", "silence", "every reply cut sh
 """In the README's command; the others are CI's. tests/drivers/test_modbus_wrongs.py has each of them, without a run."""
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(
     ("row", "name", "becomes", "requests", "code", "words", "stage"), [
         pytest.param(*case, id=f"{case[1]} in {case[-1]}",

@@ -31,6 +31,7 @@ def fed_by(folder, what):
     return path
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize(("what", "runs_on"), [
     ("any_request", True), ("requests_of_this_connection", False), ("writes", False), ("control_word", False),
     ("writes_of_this_connection", False),

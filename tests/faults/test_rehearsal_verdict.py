@@ -76,6 +76,7 @@ def test_a_log_may_say_anything():
     assert rehearsal_of({"rehearsal": 5}) is None and rehearsal_of({}) is None
 
 
+@pytest.mark.heavy
 def test_a_refusal_that_is_required_passes_in_document_and_on_the_terminal(rehearse):
     run = rehearse("--fault", "wrong-identity", "--profile", "maxon/epos4")
     assert run.done.code == ExitCode.REFUSED

@@ -33,7 +33,7 @@ def stopped_by_host(run, since_s, seen, row, code, *words):
     seen(row, run.message, standstill_s, run.assert_log_whole(), code)
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 143),
                                               (signal.SIGQUIT, 143)])
 def test_rows_1_3_a_signal(number, code, rehearse, monkeypatch, seen):
@@ -42,6 +42,7 @@ def test_rows_1_3_a_signal(number, code, rehearse, monkeypatch, seen):
     stopped_by_host(run, acted[0], seen, 1 if number == signal.SIGINT else 3, code, "interrupted by")
 
 
+@pytest.mark.heavy
 def test_row_2_a_second_signal_during_the_stop(rehearse, monkeypatch, seen):
     acted = at(monkeypatch, *SPEEDS, kill(signal.SIGINT))
     plain, again = LiveDisplay.cycle, []
@@ -150,7 +151,7 @@ def test_row_35_time_and_travel(which, rehearse, tmp_path, seen):
 NONE = (float("nan"), float("inf"), 1e9)
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize(("field", "value"), [*product(["torque_nm", "speed_rad_s"], NONE)])
 def test_row_37_a_setpoint_that_is_none(field, value, rehearse, monkeypatch, seen):
     due, plain = [], ControlLoop.cycle

@@ -66,7 +66,7 @@ def test_taken_by_name_the_host_still_stops_the_shaft(unarmed, bus, seen):
          run.assert_log_whole(), run.done.code)
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 def test_taken_by_name_and_the_line_is_gone(unarmed, bus, seen):
     """What was accepted: nothing stops the shaft. Then the message must not say so, and the hard-wired stop is left."""
     cause = "bus-dead@speed+15s" if bus == "canopen" else "no-reply@speed+15s"

@@ -57,6 +57,7 @@ def stopped_by_its_watchdog(drive):
     return round(shaft.at_rest_from() - silent_s, 2)
 
 
+@pytest.mark.heavy
 def test_row_4_killed(turning, seen):
     drive, running = turning
     running.signal(signal.SIGKILL)

@@ -91,8 +91,7 @@ CASES = (
 )
 
 
-AT_ONCE = ("load-lost@acquire+2s", "sto" + IN_MOTION, "speed-lost" + IN_MOTION, "feedback-zero" + IN_MOTION,
-           "encoder-inverted")
+AT_ONCE = ("sto" + IN_MOTION, "speed-lost" + IN_MOTION, "feedback-zero" + IN_MOTION, "encoder-inverted")
 """Faults in motion that the README's command tries; the others are CI's. `test_lying_drive` has their contradictions,
 without a bus."""
 

@@ -23,7 +23,7 @@ STOPPED = (
 )
 
 
-@pytest.mark.heavy(but_first=2)
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("row", "fault", "notice_s", "words"), STOPPED, ids=[row[1] for row in STOPPED])
 def test_noticed_and_stopped(row, fault, notice_s, words, rehearse, seen):
     run = rehearse("--fault", fault)

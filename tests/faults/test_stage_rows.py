@@ -28,6 +28,7 @@ def test_a_string_and_a_quick_stop_that_lets_go(drive, profile, rehearse, tmp_pa
     seen(79, f"`load: string` with {profile}: {run.message}", None, run.assert_log_whole(), run.done.code)
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("drive", "first", "never", "code"), [
     ("canopen", "emcy@speed+1s", "sto@acquire+7s", 6), ("modbus", "drive-fault@speed+1s", "sto@9999s", 6),
     ("canopen", "write-not-kept", "sto@speed", 4), ("modbus", "write-not-kept", "drive-fault@speed", 4),
@@ -43,7 +44,7 @@ def test_a_fault_that_never_comes_is_said(drive, first, never, code, rehearse, s
     seen(81, said, None, run.assert_log_whole(), run.done.code)
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("drive", "when"), [
         ("canopen", "hold+2s"), ("modbus", "acquire+5s"),

@@ -157,6 +157,8 @@ class House:
         self.files = [path.relative_to(ROOT).as_posix() for folder in FOLDERS for path in (ROOT / folder).rglob("*")
                       if "__pycache__" not in path.parts]
         self.files += [path.name for path in ROOT.iterdir()] + [".ci/run"]
+        # Each file's path and each end of it that begins a part, so that a name is found without a search.
+        self.ends = {file.split("/", n)[-1] for file in self.files for n in range(file.count("/") + 1)}
 
     def in_class(self, name: str, member: str, seen: frozenset[str] = frozenset()) -> bool:
         for members in self.classes.get(name, ()):
@@ -168,7 +170,7 @@ class House:
 
     def has_file(self, name: str, near: Path) -> bool:
         name = name.removeprefix("./").rstrip("/")
-        return any(file == name or file.endswith(f"/{name}") for file in self.files) or (near.parent / name).exists()
+        return name in self.ends or (near.parent / name).exists()
 
     def resolves(self, name: str) -> bool:
         """Is ``name`` a module, or what follows a module or a class a member of it?"""

@@ -14,9 +14,12 @@ def embedded(folder, *arguments):
 
 
 class TestFiveStages(FiveStages):
-    @pytest.fixture(params=["virtual", pytest.param("socketcand", marks=pytest.mark.heavy)])
+    @pytest.fixture(params=[
+        "virtual", *(pytest.param(more, marks=pytest.mark.heavy) for more in ("virtual-replayed", "socketcand"))
+    ])
     def bus(self, request):
-        return {"virtual": embedded, "socketcand": over_a_peer}[request.param]
+        self.replayed = request.param != "virtual"
+        return over_a_peer if request.param == "socketcand" else embedded
 
     @pytest.fixture
     def interrupted_bus(self):

@@ -24,7 +24,7 @@ TORQUE, SPEED = load_profile("generic/cia402"), load_profile("danfoss/fc302")
 
 
 @pytest.mark.long(but_first=6)
-@pytest.mark.heavy(but_first=2)
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("arguments", "option"), [
     (("--max-time", 60), "--max-time 1"),
     (("--max-time", "1min", "--tolerance", "1%"), "--max-time 1"),

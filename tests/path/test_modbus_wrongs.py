@@ -59,6 +59,7 @@ def ran(tmp_path, name):
     return done, Shaft.read(trace)
 
 
+@pytest.mark.heavy(but_first=4)
 @pytest.mark.parametrize(("name", "wrong"), some_always(CAUGHT))
 def test_refused_before_the_shaft_moves(name, wrong, monkeypatch, tmp_path):
     wired(monkeypatch, wrong)

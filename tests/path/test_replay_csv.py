@@ -164,7 +164,9 @@ def test_a_log_is_known_by_its_content(run, tmp_path):
     (("--torque-lag-sd", "0.1"), "--torque-lag"),
     (("--excitation", "none.yaml"), "none.yaml"),
 ])
-def test_a_wrong_option_ends_with_2_and_names_what_is_wrong(trace, arguments, said):
+def test_a_wrong_option_ends_with_2_and_names_what_is_wrong(tmp_path, arguments, said):
+    trace = tmp_path / "run.csv"          # its columns are right; that it shows no motion is never reached
+    trace.write_text("time_s,speed_rad_s,torque_nm\n" + "".join(f"{0.01 * k:.2f},2.0,76.0\n" for k in range(100)))
     done = tdhil("replay", trace, *arguments)
     assert done.code == 2, done.err
     assert said in done.err

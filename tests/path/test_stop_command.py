@@ -79,6 +79,7 @@ def test_a_turning_shaft_is_brought_to_rest_and_never_disabled(turning):
     assert shaft.state[-1] == "quick stop active"      # held, not let go
 
 
+@pytest.mark.heavy
 def test_a_drive_that_is_off_already_is_left_alone(turning):
     drive, _ = turning
     done = stop(drive)
@@ -158,6 +159,7 @@ def test_a_master_that_enables_again_and_again_loses_its_rpdo(turning):
     assert drive.shaft.state[-1] == "quick stop active"
 
 
+@pytest.mark.heavy
 def test_nobody_answers(tmp_path):
     with peer(tmp_path, *REAL_TIME) as drive:
         done = tdhil("stop", *drive.options, "--node", 5)

@@ -18,7 +18,7 @@ run: {{mode: speed}}
 """
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("plant", "speed", "torque", "probe", "ramp", "time"),
     [("plant_two_mass.yaml", 10.0, 4000.0, 2000.0, 2.0, 14.0), ("plant_string.yaml", 10.0, 4000.0, 2000.0, 2.0, 14.0),

@@ -72,9 +72,23 @@ def test_every_mistake_in_a_choice_is_named_at_its_quantity():
 NAMES = st.lists(st.text(st.characters(codec="utf-8", exclude_characters="\r\n"), max_size=12), max_size=6)
 
 
-@settings(max_examples=60, deadline=None)
-@given(names=NAMES, items=st.lists(st.text(max_size=20), max_size=5))
+any_choice = given(names=NAMES, items=st.lists(st.text(max_size=20), max_size=5))
+
+
+@settings(max_examples=10, deadline=None)
+@any_choice
 def test_no_choice_raises_and_a_right_one_has_no_mistake(names, items):
+    choose(names, items)
+
+
+@pytest.mark.heavy
+@settings(max_examples=60, deadline=None)
+@any_choice
+def test_more_choices_raise_nothing(names, items):
+    choose(names, items)
+
+
+def choose(names, items):
     for quantity, text in column_mistakes(items, names, rated=False):
         assert quantity in ("time", "speed", "torque", "rated", "") and text
     right = ["time=t:ms", "speed=Drehzahl [U/min]:rpm", "torque=m:Nm"]

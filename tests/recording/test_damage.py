@@ -249,6 +249,7 @@ def test_random_bytes_after_the_magic(tmp_path):
         read_damaged(tmp_path / "x.mcap", MAGIC + random.Random(seed).randbytes(5000))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("apart", [
     283, pytest.param(71, marks=pytest.mark.heavy), pytest.param(29, marks=pytest.mark.long),
 ])

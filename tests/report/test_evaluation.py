@@ -35,6 +35,7 @@ def test_the_page_has_both_columns_and_the_pictures(tmp_path):
     assert write_evaluation_report(document(log), log, tmp_path / "x.pdf").read_bytes().startswith(b"%PDF")
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("log", "colour", "words"), [
     (rows(66.0, (68.0, 65.2, 66.1), damping=0.22), "yellow", "critical speed 66.1 rpm, predicted 56 to 59"),
     (rows(57.0, (57.5, 56.6), damping=0.22, clamped=1.0), "red", "torque limit"),

@@ -167,7 +167,7 @@ def test_the_envelope_loses_no_peak():
     assert np.all(low <= high)
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["r.html", "r.pdf"])
 def test_no_descriptor_left_for_the_report_is_said_plainly(tmp_path, name):
     """Fonts and modules that are read late fail as the file does: not a mistake of ours."""

@@ -122,6 +122,7 @@ def recording(counted=6):
     return Recording(none, none, none, no, no, Excitation("multisine", "torque", segments))
 
 
+@pytest.mark.heavy(but_first=5)
 @pytest.mark.parametrize(
     ("interval", "now", "scale", "then", "looks", "seen", "left_s", "periods", "after"),
     [

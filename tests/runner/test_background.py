@@ -103,6 +103,7 @@ def test_it_gives_what_the_function_gives_and_raises_what_it_raises(live):
     assert texts(live) == []
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "wish", [
         ExcitationRequest(periods=2, mode="speed"),
@@ -125,13 +126,14 @@ def test_the_plan_is_the_one_that_a_thread_makes(world, worker_process, monkeypa
     assert pickle.dumps(there.plan.segments) == pickle.dumps(here.plan.segments)
 
 
+@pytest.mark.heavy
 def test_its_linear_algebra_keeps_to_one_core_so_that_the_control_loop_has_the_others(monkeypatch, request):
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
     worker_process = request.getfixturevalue("worker_process")      # begins now
     assert worker_process.ask(functools.partial(os.getenv, "OPENBLAS_NUM_THREADS")) == "1"
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
 def test_where_it_dies_in_the_midst_of_work_a_thread_does_it_and_the_log_says_so(live, tmp_path, end):
     begun = tmp_path / "begun"
@@ -151,7 +153,7 @@ while os.getpid() != {os.getpid()}:
     assert live.bench.compute(functools.partial(max, 1, 2), REST) == 2        # it stays dead, and that stops nothing
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("work", "kind"), [(lambda: 3, "int"), (functools.partial(compile, "3", "", "eval"), "code")]
 )
@@ -200,6 +202,7 @@ def test_it_is_nicer_than_the_loop_and_inherits_nothing_but_its_pipes(worker_pro
     assert {name for name in opened if "/pipe:" not in name} == {os.devnull}
 
 
+@pytest.mark.heavy
 @pytest.mark.skipif(not hasattr(os, "sched_setscheduler") or os.geteuid() != 0, reason="needs to be allowed SCHED_FIFO")
 def test_a_real_time_priority_is_not_handed_down():
     before = os.sched_getscheduler(0), os.sched_getparam(0)
@@ -215,6 +218,7 @@ def test_a_real_time_priority_is_not_handed_down():
         found.close()
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("work", ["idle", "at work"])
 def test_it_ends_when_this_process_is_killed(tmp_path, work):
     said = tmp_path / "pid"
@@ -269,6 +273,7 @@ def test_a_stop_request_ends_the_wait_for_it():
     assert begin(nothing, lambda: True, program="import time; time.sleep(600)") == (None, "a stop was requested")
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("ready", [True, False])
 def test_a_run_has_one_in_real_time_and_leaves_none_behind(world, monkeypatch, ready):
     """Made before the drive is armed; killed before the stop begins, whichever way the run ends."""

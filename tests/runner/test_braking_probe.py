@@ -60,7 +60,7 @@ def test_a_drive_that_reads_no_sign_is_found_at_low_speed(world, how):
     assert here.drive.state is PowerState.OFF
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize(("how", "rate_hz", "seed"), [
     ("unsigned", 10, 1), ("unsigned", 50, 2), ("magnitude", 10, 3), ("magnitude", 50, 4),
 ])

@@ -135,6 +135,7 @@ def test_stated_lags_tighten_what_is_expected_and_move_the_lines():
     assert chosen.half_width < 0.7 * choose(LIMITS, GUESS, PlanRequest(), KNOWN, 0.95).half_width
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize(
     "wish",
     [

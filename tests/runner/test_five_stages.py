@@ -65,6 +65,7 @@ def test_in_speed_mode_two_stages_are_skipped(world):
     assert_at_rest(here, result)
 
 
+@pytest.mark.heavy
 def test_a_drive_without_torque_mode_is_run_in_speed_mode(world):
     here = world(FakeDrive(modes=frozenset({Mode.SPEED})))
     assert outcomes(here.runner().run())[2:4] == [("torque", "skipped"), ("hold", "skipped")]
@@ -146,7 +147,7 @@ def test_a_load_that_lets_go_in_torque_mode_is_caught_inside_the_window(world):
     assert "began to turn" in result.stop.trouble[-1]
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize("inertia", [2.0, 100.0, 3000.0])
 def test_light_and_heavy_shafts_go_through_alike(world, inertia):
     here = world(FakeDrive(inertia=inertia))

@@ -260,6 +260,7 @@ def test_a_string_that_sticks_and_slips_does_not(period_s, depth):
     assert followed(lambda t: min(7.0, t), speed, 90.0, STRING) is None
 
 
+@pytest.mark.heavy
 @given(st.lists(st.tuples(st.floats(0.0, 9.0), st.floats(0.0, 9.0)), min_size=1, max_size=60))
 def test_whoever_is_near_the_latest_reference_is_within_all_of_them(rows):
     """The quick answer and the one by all blocks are the same."""

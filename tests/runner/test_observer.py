@@ -73,7 +73,7 @@ PHASES = (Phase.explicit, Phase.reuse, Phase.generate)      # a smaller rig is n
 any_run = given(rigs(), st.floats(-1.0, 1.0), st.floats(0.05, 0.3), st.floats(0.05, 1.0), st.integers(0, 1000))
 
 
-@settings(phases=PHASES, max_examples=6)
+@settings(phases=PHASES, max_examples=3)
 @any_run
 def test_a_healthy_run_raises_no_doubt(rig, wrong, rel_error, frequency_hz, seed):
     healthy(rig, wrong, rel_error, frequency_hz, seed)
@@ -145,7 +145,7 @@ JUMPS = {
 }
 
 
-@pytest.mark.heavy(but_first=6)
+@pytest.mark.heavy(but_first=3)
 @pytest.mark.parametrize("lag_s", LAGS)
 @pytest.mark.parametrize("name", JUMPS)
 @pytest.mark.parametrize("mode", ["speed", "torque"])
@@ -174,6 +174,7 @@ def test_a_lost_encoder_is_found_before_the_shaft_is_fast(lag_s):
     assert bench.fastest <= 6.0
 
 
+@pytest.mark.heavy(but_first=3)
 @pytest.mark.parametrize("lag_s", LAGS)
 @pytest.mark.parametrize("how", ["ramps", "torque mode"])
 def test_a_speed_that_freezes_is_found_once_the_shaft_turns_otherwise(lag_s, how):
@@ -284,6 +285,7 @@ def test_feedback_that_repeats_as_a_whole_is_found_once_the_setpoint_has_moved(r
 # -- before J is known ----------------------------------------
 
 
+@pytest.mark.heavy(but_first=3)
 @pytest.mark.parametrize("name", JUMPS)
 def test_after_the_first_level_a_jump_is_found_although_j_is_not_known(name):
     bench = Bench(PLAIN)
@@ -446,6 +448,7 @@ def test_a_lost_load_is_a_lighter_shaft_and_its_speed_lives(left):
 # -- what is no feedback ----------------------------------------
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("gap_s", [0.6, 3.0])
 @pytest.mark.parametrize("seen", ["nothing", "stale samples"])
 def test_a_gap_in_the_feedback_begins_anew(gap_s, seen):
@@ -467,6 +470,7 @@ def test_a_gap_in_the_feedback_begins_anew(gap_s, seen):
     assert bench.found_after(1.0, lambda: bench.hold(0.02, 8.0)) is not None
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("signal", ["speed_rad_s", "torque_nm"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_value_that_is_no_number_is_left_out(signal, value):
@@ -486,6 +490,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("rig", [PLAIN, WITH_POSITION])
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_shaft_that_accelerates_against_the_quick_stop_is_seen_in_two_ways(name, rig):
@@ -498,6 +503,7 @@ def test_a_shaft_that_accelerates_against_the_quick_stop_is_seen_in_two_ways(nam
     assert bench.fastest <= 1.2 * LIMITS.speed_max_rad_s
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("rig", [PLAIN, WITH_POSITION])
 @pytest.mark.parametrize("value", [0.0, 5.0])
 def test_a_sensor_that_is_dead_in_the_stop_is_seen_in_two_ways(value, rig):

@@ -70,6 +70,7 @@ def test_a_display_that_fails_as_a_stage_begins(world, stage):
         assert_at_rest(here, result)
 
 
+@pytest.mark.heavy(but_first=3)
 @EACH_STAGE
 def test_a_log_that_is_broken_for_good(world, stage):
     """Disk full: every later call fails as well, those of the stop and of the end of the stage included."""
@@ -111,6 +112,7 @@ def test_a_stop_request_in_each_stage(world, stage, signum):
     assert_at_rest(here, result)
 
 
+@pytest.mark.heavy(but_first=3)
 @EACH_STAGE
 def test_a_drive_fault_in_each_stage(world, stage):
     here = world()

@@ -282,6 +282,7 @@ def test_a_release_whose_speed_follows_is_not():
 # -- a shaft that runs out ----------------------------------------
 
 
+@pytest.mark.heavy
 def test_above_a_string_a_speed_that_is_lost_gets_no_speed_control(world):
     """It would push the shaft on; so would the watchdog. Zero torque until friction has stopped it, then off."""
     here = known(world, limits=STRING)
@@ -317,6 +318,7 @@ def test_a_torque_that_stays_in_spite_of_zero_gets_the_quick_stop(world):
     assert not report.confirmed and "quick_stop" in here.drive.calls
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("limits", [LIMITS, STRING])
 def test_an_inverted_sign_coasts_to_standstill_without_speed_control(world, limits):
     here = world(Removing(direction=-1.0, viscous=4.0), limits)
@@ -329,6 +331,7 @@ def test_an_inverted_sign_coasts_to_standstill_without_speed_control(world, limi
     assert abs(here.drive.disabled_at[0]) < 0.05
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("limits", [LIMITS, STRING])
 def test_an_inverted_sign_whose_shaft_does_not_coast_to_standstill_is_not_disabled_in_motion(world, limits):
     here = world(Removing(direction=-1.0, viscous=0.0, coulomb=0.0), limits)
@@ -341,6 +344,7 @@ def test_an_inverted_sign_whose_shaft_does_not_coast_to_standstill_is_not_disabl
     assert all(abs(speed) < 0.05 for speed in here.drive.disabled_at)
 
 
+@pytest.mark.heavy
 def test_above_a_string_a_probe_that_saw_no_motion_gets_no_speed_control(world):
     here = world(Removing(sees=0.0, viscous=4.0), STRING)
     here.bench.enable(Mode.TORQUE, Command(Mode.TORQUE, 0.0, 0.0))

@@ -33,7 +33,7 @@ def torques(here):
     return seen
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize("twist_nm", [300.0, -300.0, pytest.param(100.0, marks=pytest.mark.heavy)])
 def test_trapped_torque_comes_down_on_the_ramp_before_anything_is_disabled(twist_nm):
     here = StringWorld(twist_nm=twist_nm)
@@ -211,6 +211,7 @@ def test_it_begins_from_a_speed_of_zero_where_none_is_known(last):
     assert here.drive.commands[0].speed_rad_s == 0.0
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("told", [40.0, -40.0, 1e12, NAN])
 def test_one_wrong_report_is_not_followed(told):
     """What tripped the run is the last report; a ramp from there would drive the shaft up to it."""

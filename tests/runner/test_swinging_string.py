@@ -171,6 +171,7 @@ def test_a_swing_that_noise_keeps_going_is_none_of_a_bit_that_sticks():
     assert any(kind == "string" and "does not decay" in text for kind, text in here.log.events)
 
 
+@pytest.mark.heavy
 def test_a_restless_string_is_stick_slip_only_where_its_bit_stops():
     """3,000 m under a stiff loop, from a simulator of its own: 120 rpm sticks, 179 and 205 rpm turn under 0.8 kN·m of
     bit noise. Their torque swings by more than 0.6 ζω, which used to be called stick-slip."""

@@ -103,6 +103,7 @@ def guarded(tmp_path: Path, rigs: Path, people: None) -> Iterator[Guarded]:
 # -- every route
 
 
+@pytest.mark.heavy(each_share=True)
 def test_every_route_for_everybody(guarded, monkeypatch):
     """Generated from the served document: who may, gets past the door; who may not, 401 or 403, and nothing happens.
 
@@ -467,6 +468,7 @@ def test_nobody_takes_away_the_watchdog_over_http(guarded):
 # -- a rig's file
 
 
+@pytest.mark.heavy
 def test_an_engineer_edits_a_rig_s_limits_and_nothing_that_leads_to_a_drive(guarded, rigs, nobody_s_port):
     engineer, path = guarded.sessions["engineer"], rigs / "real.yaml"
     before = path.read_text()
@@ -508,6 +510,7 @@ def test_an_engineer_edits_a_rig_s_limits_and_nothing_that_leads_to_a_drive(guar
             assert (one.rig, one.details["keys"], one.details["before"]) == ("real", ["limits"], found["sha256"])
 
 
+@pytest.mark.heavy
 def test_a_rig_s_file_is_not_edited_without_a_login_nor_in_a_folder_that_is_read_only(guarded, service, monkeypatch):
     with TestClient(service.web.asgi, base_url="http://127.0.0.1:8420") as client:
         assert client.post(f"{API}/rigs/a/file", json={"text": "", "sha256": ""}).status_code == 403
@@ -592,6 +595,7 @@ def test_an_admin_adds_and_removes_over_http(guarded):
     assert guarded.service.audit.verify() is None
 
 
+@pytest.mark.heavy
 def test_what_the_service_changes_itself_is_nobody_else_s_change(guarded, monkeypatch):
     """Its own thread looks in the middle of it: whose change it was is told once, and rightly."""
     written = accounts_module.write_json

@@ -121,6 +121,7 @@ def test_downloads_come_in_pieces(client, call, service):
     assert not [one for one in service.audit.entries() if one.what == "downloaded result.json"]
 
 
+@pytest.mark.heavy
 def test_a_log_that_grows_comes_in_pieces_too(client, call, service):
     run = call.start(what="hold")["id"]
     service.wait(run, "moving")
@@ -316,6 +317,7 @@ def test_a_drive_that_a_terminal_has_is_refused_and_named(call, service):
     assert f"process {os.getpid()} (" in refused["holder"]
 
 
+@pytest.mark.heavy
 def test_twenty_posts_at_once_are_one_run(client, call, service):
     answers: list[int] = []
     send = [threading.Thread(target=lambda: answers.append(
@@ -572,6 +574,7 @@ def test_a_real_drive_that_no_stop_reaches_blocks_its_rig_until_somebody_signs(c
     call("POST", f"/runs/{again}/sign-off", 409, json={"note": "x"})
 
 
+@pytest.mark.heavy
 def test_a_new_web_finds_the_run_of_the_old_one(call, service, tmp_path, rigs):
     run = call.start(what="hold")["id"]
     service.wait(run, "moving")
@@ -586,6 +589,7 @@ def test_a_new_web_finds_the_run_of_the_old_one(call, service, tmp_path, rigs):
     assert len(after.store.ids()) == 1
 
 
+@pytest.mark.heavy
 def test_a_service_that_ends_begins_nothing_and_waits_for_rest(call, service):
     run, loose = call.start(what="hold")["id"], call.start("b", what="loose")["id"]
     for one in (run, loose):
@@ -620,6 +624,7 @@ def test_nothing_moves_by_a_restart(call, service, tmp_path, rigs):
     assert State.MOVING not in [one.state for one in after.store.status(run).history]
 
 
+@pytest.mark.heavy
 def test_a_locked_index_and_a_full_audit_hold_up_no_stop(call, service, monkeypatch):
     run = call.start(what="hold")["id"]
     service.wait(run, "moving")
@@ -647,6 +652,7 @@ def test_the_list_says_what_a_run_is_now(call, service):
     assert call("GET", "/runs?state=moving&rig=b", 200) == []
 
 
+@pytest.mark.heavy
 def test_what_a_killed_web_left_out_of_the_index_is_in_it_again(call, service, tmp_path, rigs):
     run = call.start()["id"]
     service.wait(run, "done")

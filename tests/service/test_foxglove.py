@@ -140,6 +140,7 @@ def test_a_client_of_its_own_gets_what_the_log_holds(service, protocol):
     assert {(one["encoding"], one["schemaEncoding"]) for one in viewer.channels.values()} == {("protobuf", "protobuf")}
 
 
+@pytest.mark.heavy
 def test_who_reads_slowly_has_little_on_its_way(service, monkeypatch):
     """So that what is asked of him, is he still there, doesn't wait behind what he hasn't read: he isn't cut off."""
     sent: list[int] = []

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from profiles import load_profile, profile_names
@@ -76,9 +76,23 @@ def test_every_mistake_is_shown_at_once():
 TEXTS = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=40).filter(lambda one: one.strip())
 
 
-@given(TEXTS | st.sampled_from(["a: b", "x # y", "'", '"', "{a: 1}", "[", "- a", "!!python/x", "on", "null", "1e3",
-                                "~"]))
+any_text = given(TEXTS | st.sampled_from(["a: b", "x # y", "'", '"', "{a: 1}", "[", "- a", "!!python/x", "on", "null",
+                                          "1e3", "~"]))
+
+
+@settings(max_examples=15)
+@any_text
 def test_a_text_stays_a_text(text):
+    stays(text)
+
+
+@pytest.mark.heavy
+@any_text
+def test_more_texts_stay_texts(text):
+    stays(text)
+
+
+def stays(text):
     found = draft_of(complete("maxon/epos4", name=text, address=ADDRESS["canopen"] | {"channel": text}))
     assert found.problems == []
     rig = parse_rig(found.text, "rig.yaml")

@@ -113,6 +113,7 @@ def test_the_index_is_made_again_with_annotations_and_a_broken_file_is_none(tmp_
 # -- archive
 
 
+@pytest.mark.heavy
 def test_an_archived_run_is_hidden_from_list_trend_compare_and_last_result_unless_asked_for(
         call, service, monkeypatch):
     first, second = ended(call, service), ended(call, service)
@@ -195,6 +196,7 @@ def test_a_person_signs_the_verdict_and_the_log_once_and_the_audit_has_it(call, 
     assert "the log is another one" in call("GET", f"/runs/{run}/acceptance", 200)["problem"]
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("verdict", ["fail", "cannot tell"])
 def test_what_is_no_pass_is_signed_with_a_remark_only(call, service, verdict):
     run, sent = accepted(call, service, verdict)
@@ -205,6 +207,7 @@ def test_what_is_no_pass_is_signed_with_a_remark_only(call, service, verdict):
     assert found["signature"]["remark"] == "bearing is replaced next week"
 
 
+@pytest.mark.heavy
 def test_another_verdict_or_log_than_the_person_saw_is_refused_in_words(call, service):
     run, sent = accepted(call, service, "fail")
     for other, words in (({"verdict": "pass"}, "the verdict is fail, not pass"),
@@ -219,6 +222,7 @@ def test_another_verdict_or_log_than_the_person_saw_is_refused_in_words(call, se
     assert "has not ended" in call("POST", f"/runs/{moving}/acceptance", 409, json=sent)["error"]["message"]
 
 
+@pytest.mark.heavy
 def test_a_report_older_than_the_signature_is_made_again(call, service, monkeypatch):
     run, sent = accepted(call, service)
     folder, made = service.store.place(run), []
@@ -285,6 +289,7 @@ def test_a_run_is_deleted_by_its_typed_id_with_its_files_alone_and_the_audit_kee
     assert not [one for one in service.said if run in one]              # no index entry is tried again for ever
 
 
+@pytest.mark.heavy
 def test_what_moves_or_is_referred_to_is_not_deleted(call, service, rigs):
     moving = call.start("a", "hold")["id"]
     service.wait(moving, "moving")
@@ -327,6 +332,7 @@ def test_a_run_is_kept_until_its_process_has_ended_and_can_be_signed_and_archive
     call("POST", f"/runs/{run}/archive", 200, json={"archived": True})
 
 
+@pytest.mark.heavy
 def test_a_run_that_is_replayed_is_kept_until_that_has_ended(call, service):
     run = ended(call, service)
     service.web.waiting_replays[run, "001"] = ReplayView("001", {}, now(), "local", "waiting")

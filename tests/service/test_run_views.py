@@ -145,6 +145,7 @@ def test_a_fleet_that_is_ended_or_whose_web_dies_keeps_what_is_done(call, servic
     wait_for("its end", lambda: fleets.get(fleet).state == "interrupted")
 
 
+@pytest.mark.heavy(but_first=6)
 @pytest.mark.parametrize("body", [
     {"folder": "/etc"}, {"folder": "logs", "below": ".."}, {"folder": "logs", "below": "../logs2"},
     {"folder": "logs", "below": "/etc"}, {"folder": "logs", "below": "nothing"}, {"folder": "logs", "below": "a\0b"},

@@ -314,6 +314,10 @@ def test_what_cannot_be_served_is_said_in_words(tmp_path, capsys, monkeypatch, a
     monkeypatch.setattr("tdhil.service.server._uvicorn", lambda *_: pytest.fail("it served"))
     (tmp_path / "file").touch()
     (tmp_path / "taken" / "service.lock").mkdir(parents=True)
+    locks = tmp_path / "lock"              # a folder of its own: another test may hold a drive of this computer
+    locks.mkdir()
+    locks.chmod(0o1777)
+    monkeypatch.setattr("tdhil.session.drive_lock.FOLDERS", (str(locks),))
     assert main(["serve", "--port", "0", *arguments]) == ExitCode.USAGE
     assert words in capsys.readouterr().err
     assert not (tmp_path / "d").exists()

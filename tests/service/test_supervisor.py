@@ -83,6 +83,7 @@ def test_close_ends_its_threads_and_no_run(service):
     assert service.store.status(run).state is State.MOVING
 
 
+@pytest.mark.heavy
 def test_a_service_that_brakes_begins_nothing_more(service):
     service.supervisor.start()
     loose, run = begun(service, "loose"), begun(service, "hold", "b")
@@ -230,6 +231,7 @@ def test_a_signature_is_for_a_stop_that_was_not_confirmed_alone(service):
     wait_for("the audit", lambda: ("anna", "signed off", bad, "a") in lines(service))
 
 
+@pytest.mark.heavy
 def test_an_edit_waits_for_nobody_who_has_the_rig(service, monkeypatch, rigs):
     service.supervisor.start()
     rig = service.supervisor.rigs.get("real")

@@ -40,6 +40,7 @@ def test_path_to_operation_and_back(bench: Open) -> None:
     assert status & 0x0210 == 0x0210                              # remote, voltage enabled
 
 
+@pytest.mark.heavy
 def test_cyclic_velocity_and_torque_with_a_switch_while_enabled(bench: Open) -> None:
     simulated, host = bench()
     host.set_up()
@@ -57,6 +58,7 @@ def test_cyclic_velocity_and_torque_with_a_switch_while_enabled(bench: Open) -> 
     assert abs(host.cycle(torque=torque, velocity=300, times=50)[1] - torque) <= 3
 
 
+@pytest.mark.heavy
 def test_profile_velocity_ramps_and_reaches(bench: Open) -> None:
     _, host = bench()
     host.set_up(mode=3)
@@ -98,7 +100,7 @@ def test_limits_show_in_bit_11(bench: Open) -> None:
     assert host.cycle(torque=140, times=30)[1] == 20
 
 
-@pytest.mark.heavy(but_first=5)
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("mode", [9, 10])
 @pytest.mark.parametrize(("option", "end"), [(0, "off"), (1, "off"), (2, "off"), (3, "off"), (5, "quick stop"),
                                              (6, "quick stop"), (7, "quick stop")])
@@ -122,6 +124,7 @@ def test_quick_stop_options(bench: Open, option: int, end: str, mode: int) -> No
     assert resumed == ("enabled" if option >= 5 else "off")
 
 
+@pytest.mark.heavy
 def test_halt_stays_enabled_and_goes_on(bench: Open) -> None:
     simulated, host = bench()
     host.set_up()
@@ -134,6 +137,7 @@ def test_halt_stays_enabled_and_goes_on(bench: Open) -> None:
     assert simulated.simulator.speed_rad_s == pytest.approx(200 * RPM_TENTH, abs=0.05)
 
 
+@pytest.mark.heavy
 def test_disable_operation_with_ramp_waits_for_rest_and_disable_voltage_does_not(bench: Open) -> None:
     simulated, host = bench()
     host.set_up()
@@ -163,7 +167,7 @@ def watched(host: Any, option: int, behaviour: int = 1) -> None:
     assert host.emcy() == []
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize(("option", "first", "last"), [
     (0, "enabled", "enabled"), (1, "reaction", "fault"), (2, "off", "off"), (3, "quick stop", "off"),
 ])
@@ -186,6 +190,7 @@ def test_watchdog_reactions(bench: Open, option: int, first: str, last: str) -> 
     assert host.emcy()[-1] == 0 and host.read(0x1001) == 0 and host.read(0x1003) == 1
 
 
+@pytest.mark.heavy
 def test_a_stop_of_the_watchdog_is_not_undone_by_the_old_word(bench: Open) -> None:
     _, host = bench()
     host.write(0x605A, 0, 6, 2)
@@ -195,6 +200,7 @@ def test_a_stop_of_the_watchdog_is_not_undone_by_the_old_word(bench: Open) -> No
     assert state(host.cycle(0x0F)[0]) == "enabled"
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("behaviour", "nmt"), [(0, 127), (1, 5), (2, 4)])
 def test_error_behaviour(bench: Open, behaviour: int, nmt: int) -> None:
     simulated, host = bench()
@@ -237,6 +243,7 @@ def run_frames(bench: Open, seed: int) -> list[tuple[int, int, int]]:
     return [host.cycle(velocity=250) for _ in range(400)]
 
 
+@pytest.mark.heavy
 def test_same_seed_same_frames(bench: Open) -> None:
     first = run_frames(bench, 7)
     assert first == run_frames(bench, 7)

@@ -88,6 +88,7 @@ def inline(frames: list[can.Message], **options: object) -> list[Said]:
     return answers
 
 
+@pytest.mark.heavy(but_first=3)
 @pytest.mark.parametrize(("faults", "worn"), [
     ((), None), ((), "kollmorgen/akd"), ((), "maxon/epos4"), (("frame-loss=20%", "duplicate-frames=20%"), None),
     (("replayed-feedback@1s=1/1s", "emcy@1500ms=7305h"), None), (("bus-dead@1s",), None),

@@ -105,6 +105,7 @@ def with_watchdog(**update: object) -> ModbusProfile:
     return GENERIC.model_copy(update={"watchdog": GENERIC.watchdog.model_copy(update=update)})
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize(("reaction", "state", "braking", "at_rest"), [
     ("quick_stop", 0x07, True, True), ("ramp_stop", 0x40, True, True), ("fault_reaction", 0x08, True, True),
     ("coast", 0x40, False, True), ("none", 0x27, False, False),

@@ -34,7 +34,7 @@ def ready(process: subprocess.Popen[str]) -> list[str]:
     return line.split()
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_over_tcp(tmp_path: Path, number: signal.Signals) -> None:
     trace = tmp_path / "shaft.csv"

@@ -140,7 +140,7 @@ def test_a_silent_host_stops_the_shaft(bench: Open, tmp_path: Path, reaction: in
     assert all(sooner <= later for sooner, later in pairwise(times))
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize(("guard_ms", "factor"), [(0, 4), (50, 0), (0, 0)])
 def test_guarding_that_is_not_set_watches_nobody(bench: Open, guard_ms: int, factor: int) -> None:
     simulated, host = bench(profile=load_canopen_profile(S120))

@@ -56,6 +56,7 @@ def test_nothing_worse_than_the_present_gains_is_recommended(beside_good_gains):
         assert not best.failed
 
 
+@pytest.mark.heavy
 def test_the_soft_row_is_far_below_the_stiff_one(beside_good_gains):
     """The soft row has less than 40 % of the stiff critical speed under noise. Its linear limit is lower still."""
     stiff, soft = (beside_good_gains.by_kind(kind) for kind in ("stiff", "soft"))

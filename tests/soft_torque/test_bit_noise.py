@@ -75,6 +75,7 @@ def test_the_interval_holds_the_noise_that_acted(rms_nm, correlation_s, seeds):
     assert np.median(density) == pytest.approx(rms_nm**2 * correlation_s, rel=0.2)
 
 
+@pytest.mark.heavy
 def test_string_and_inertia_widen_the_interval():
     whole = record(drilled(200.0, 0.2, 2), 0)
     narrow, wide = bit_noise_in(whole, EXACT, EXACT_J), bit_noise_in(whole, STRING, INERTIA)

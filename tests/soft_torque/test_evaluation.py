@@ -122,7 +122,7 @@ def rows(turns_from_rpm, trials, *, damping=0.2, hertz=0.13, **more):
 
 
 @pytest.mark.long(but_first=3)
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize("seed", range(8))
 def test_two_modes_that_are_alike_are_told_apart_in_noise(seed):
     # Modes of a = 0.25 in the reference case, with the noise that the loop's own disturbances leave in the speed.
@@ -153,6 +153,7 @@ def test_critical_speed_and_damping_are_read_off_the_rows():
     assert found.outcome is EvaluationOutcome.AS_PREDICTED
 
 
+@pytest.mark.heavy(but_first=3)
 @pytest.mark.parametrize(("log", "outcome", "said"), [
     (rows(66.0, (68.0, 65.2, 66.1), damping=0.22), EvaluationOutcome.DIFFERS,
      "critical speed 66.1 rpm, predicted 56 to 59"),

@@ -53,6 +53,7 @@ def late(record: SurfaceRecord, begin_s: float) -> SurfaceRecord:
                    torque_nm=record.torque_nm[kept])
 
 
+@pytest.mark.heavy
 def test_stick_slip_is_found_at_once_with_its_frequency_and_downhole_swing(drilled):
     record, bit = drilled["paper", 100]
     found = severity(record, EXACT, INERTIA)
@@ -70,6 +71,7 @@ def test_stick_slip_is_found_at_once_with_its_frequency_and_downhole_swing(drill
     assert severity(record, STRING, INERTIA).downhole_rad_s.high > 1.1 * found.downhole_rad_s.high
 
 
+@pytest.mark.heavy
 def test_a_string_that_turns_raises_no_alarm(drilled):
     for name in (("soft", 100), ("soft", 180), ("paper", 180)):
         record, bit = drilled[name]
@@ -97,6 +99,7 @@ def test_the_bits_speed_is_followed_through_sections_of_different_pipe():
     assert found[known] == pytest.approx(turn.real[known], abs=0.02)
 
 
+@pytest.mark.heavy
 def test_the_reflection_is_that_of_the_gains_in_place(drilled):
     for name, law in (("paper", PAPER), ("soft", SOFT_035)):
         record = late(drilled[name, 100][0], 2.0 * PERIOD_S)
@@ -109,6 +112,7 @@ def test_the_reflection_is_that_of_the_gains_in_place(drilled):
                     (DRIVE, SOFT_035)).reflection.verdict == "reflects more"
 
 
+@pytest.mark.heavy
 def test_what_says_nothing_is_refused(drilled):
     record, _ = drilled["soft", 180]
     with pytest.raises(SeverityRefused, match="does not turn"):

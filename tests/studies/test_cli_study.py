@@ -202,6 +202,7 @@ def test_set_changes_a_setting_by_name_or_symbol(studies):
         assert document["runs"] == [{"inertia_kg_m2": 200.0}]
 
 
+@pytest.mark.heavy
 def test_a_written_study_file_can_be_changed_and_run(studies, tmp_path):
     assert tdhil("table1", "--set", "Kp=600")[0] == 0
     mine = tmp_path / "my.yaml"

@@ -76,6 +76,7 @@ def test_noise_is_a_disturbance_of_the_shaft_seeded():
     assert 0.0 < np.abs(one - silent).max() < 0.05
 
 
+@pytest.mark.heavy
 def test_runs_of_a_batch_need_the_same_number_of_samples():
     with pytest.raises(ValueError, match="same number"):
         simulate([QUIET, changed(QUIET, duration_s=2.0)])
@@ -83,6 +84,7 @@ def test_runs_of_a_batch_need_the_same_number_of_samples():
     assert both.simulated_s == pytest.approx(12.0)
 
 
+@pytest.mark.heavy
 def test_progress_runs_from_zero_towards_one():
     shares = []
     simulate([QUIET], shares.append)

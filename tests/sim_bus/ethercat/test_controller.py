@@ -145,6 +145,7 @@ def test_stepped_time_moves_with_each_cycle_by_the_period():
     assert host.slave.time_us == before + 24_000
 
 
+@pytest.mark.heavy
 def test_the_watchdog_of_the_process_data_drops_the_slave_and_stops_the_shaft():
     host = enabled(running(stepped=False), 3)
     assert (host.read(0x0400), host.read(0x0420), host.read(0x0440)) == (2498, 1000, 1)
