@@ -203,7 +203,7 @@ MEANING = {
     12: (
         "a rehearsed fault (`--fault`) did not cause the reaction that the fault table requires, or an identified "
         "value contradicts its expected one (`acceptance:`, `--expect`); `tdhil tune verify`: the drive does not step "
-        "as tuned",
+        "as tuned; `tdhil evidence --check`: the archive does not pass",
         "Compare what was required with what was seen. Both are on the card, and in `rehearsal` and `acceptance` of "
         "the document.",
     ),
