@@ -62,7 +62,9 @@ class LogScrub:
         self._kept_name = str(bench.get("name") or "") if rig_name else ""
         self._serial(_part(run.get("identity")).get("serial"))
         found = {*words, *_names_in(run, rig_name=rig_name)}
-        found |= {form for number in self._serials for form in (str(number), f"{number:x}", f"{number:08x}")
+        found |= {form for number in self._serials for form in (
+            str(number), *(f"{sign}{number:{form}}{unit}" for form in ("x", "08x")
+                           for sign, unit in (("", ""), ("", "h"), ("0x", ""))))
                   if len(form) >= _SHORTEST_NUMBER}
         found = {word for word in found if len(word) >= _SHORTEST}
         self.words = tuple(sorted(found, key=lambda word: (-len(word), word)))
@@ -72,9 +74,8 @@ class LogScrub:
 
     def text(self, text: str) -> str:
         """Scrub one text."""
-        if self._names is not None:
-            text = self._names.sub(NAME, text)
-        return without_leaks(text)
+        text = without_leaks(text)             # whole paths first, or the names in them would cut them
+        return text if self._names is None else without_leaks(self._names.sub(NAME, text))
 
     def value(self, value: Any, key: str = "") -> Any:
         """Scrub plain data at all levels; numbers and keys that are plain names stay."""

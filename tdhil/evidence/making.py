@@ -94,6 +94,10 @@ def make_evidence(
     facts = LogFacts(run.configuration, _preflight(run.events), recording.simulated)
     _refuse(facts, statement, str(log))
     stages = [(one.name, one.outcome) for one in run.stages]
+    if foreign := _foreign(log):
+        raise UsageError(f"the log has records that tdhil did not write: {', '.join(foreign)}", where=str(log),
+                         next_step="Name the log as tdhil wrote it, without attachments or metadata of another program",
+                         entry=MessageCode.EVIDENCE_INCOMPLETE)
     if missing := missing_in(facts, stages, complete=found.whole):
         raise UsageError(f"the log lacks {'; '.join(missing)}", where=str(log),
                          next_step="Name the log of a run that reached its end",
@@ -182,6 +186,16 @@ def _refuse(facts: LogFacts, statement: Statement, where: str) -> None:
     if statement.simulated and not facts.simulated:
         raise UsageError("is a run of a real drive, and would be marked as simulated", where=where,
                          next_step="Leave --simulated out", entry=MessageCode.EVIDENCE_SIMULATED)
+
+
+def _foreign(log: Path) -> tuple[str, ...]:
+    """Return the records of another program in a log; () for a log that was cut off, which is refused as such."""
+    from tdhil.recording import audit_log
+
+    try:
+        return audit_log(log).foreign
+    except LogError:
+        return ()
 
 
 def _preflight(events: Iterable[Any]) -> tuple[str, ...]:

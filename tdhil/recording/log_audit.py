@@ -26,6 +26,7 @@ _MESSAGE: Final = 0x05
 _PLAIN: Final = frozenset({0x01, 0x02, 0x03, 0x04, 0x06, 0x07, 0x08, 0x0B, 0x0E, 0x0F})
 """Records of a finished log: header, footer, declarations, chunks, indexes, statistics. An attachment (09h), metadata
 (0Ch) or a message outside a chunk is none of them."""
+_FOREIGN: Final = {0x09: "an attachment", 0x0C: "metadata"}
 _WITH_TEXT: Final = frozenset({0x01, 0x03, 0x04})
 """Records with texts: header, schema, channel."""
 
@@ -54,7 +55,7 @@ def audit_log(path: Path) -> LogAudit:
                 raise LogBroken("its records do not fill the file", where=path.name)
             opcode, length = _RECORD.unpack(head)
             if opcode not in _PLAIN:
-                foreign[f"record {opcode:02X}h"] = None
+                foreign[_FOREIGN.get(opcode, f"record {opcode:02X}h")] = None
             elif opcode in _WITH_TEXT:
                 declarations[read_at(file, offset + _RECORD.size, length)] = None
             elif opcode == CHUNK:
