@@ -563,7 +563,7 @@ class EvidenceOptions(_Said):
     )
     reference_inertia_kg_m2: float | None = option(
         "--reference-inertia", group=Topic.EVIDENCE, unit=INERTIA, metavar="J", gt=0, lt=1e9, api=True,
-        form=Form("Reference inertia at the motor shaft, kg·m²", ("evidence",), hint="as the rig's file"),
+        form=Form("Reference inertia at the motor shaft, kg·m²", ("evidence",), hint="none"),
         help="reference inertia at the motor shaft, from another source than this run, kg·m²",
     )
     reference_sd_kg_m2: float | None = option(
@@ -572,7 +572,7 @@ class EvidenceOptions(_Said):
         help="standard uncertainty of the reference inertia, kg·m²",
     )
     reference_method: Literal["weighed", "drawing", "manufacturer", "other"] | None = option(
-        "--reference-method", group=Topic.EVIDENCE, api=True,
+        "--reference-method", group=Topic.EVIDENCE, api=True, unset="not stated",
         form=Form("How it is known", ("evidence",)),
         help="how the reference inertia is known",
     )

@@ -7,7 +7,8 @@ from profiles import lazy_names
 if TYPE_CHECKING:
     from tdhil.evidence.archive import MEMBERS as MEMBERS, archive_of as archive_of, members_in as members_in
     from tdhil.evidence.drives import (
-        Agreement as Agreement, agreement_of as agreement_of, entries_of as entries_of, shown_entries as shown_entries,
+        Agreement as Agreement, agreement_of as agreement_of, covered_entries as covered_entries,
+        entries_of as entries_of, shown_entries as shown_entries,
     )
     from tdhil.evidence.making import (
         Evidence as Evidence, EvidenceCheck as EvidenceCheck, check_evidence as check_evidence,
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "archive": "MEMBERS archive_of members_in",
-        "drives": "Agreement agreement_of entries_of shown_entries",
+        "drives": "Agreement agreement_of covered_entries entries_of shown_entries",
         "making": "Evidence EvidenceCheck check_evidence make_evidence",
         "scrub": "Scrub names_of_this_computer",
         "statement": "NEEDED SHORTEST_KEY Statement flag_of serial_hmac statement_in statement_of wrong_in",

@@ -95,3 +95,12 @@ def entries_of(profile: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
         for name, part in profile.items():
             if isinstance(part, Mapping) and {"source", "confidence"} <= set(part):
                 yield str(name), {key: value for key, value in part.items() if key not in _ABOUT}
+
+
+def covered_entries(profile: Any, shown: Mapping[str, str], today: Any) -> dict[str, str]:
+    """Return the shown entries that still have the values of the run, each with the observation.
+
+    ``profile``: that of the run; ``today``: the profile of the same name as tdhil contains it, or None.
+    """
+    present = dict(entries_of(today))
+    return {name: shown[name] for name, claim in entries_of(profile) if name in shown and present.get(name) == claim}
