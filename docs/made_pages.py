@@ -348,10 +348,10 @@ DRIVES_HEAD = """
 Each row is an archive of one run in the folder `evidence/` of the repository. A test checks each archive, and identifies J
 again from its log. [Publish evidence](../how-to/publish-evidence.md) describes how an archive is made and sent.
 
-* **En** compares J with the reference inertia: the difference over the expanded uncertainty of both (ISO 13528). At most 1
-  means that they agree.
-* **Shown** names the entries of the profile whose effect the run showed. Such an entry may have the confidence *verified*,
-  with the archive as its `source`. A test refuses an entry that names an archive which does not show it.
+* **En** compares J with the reference inertia: the difference over the expanded uncertainty of both (ISO 13528).
+  At most 1 means that they agree.
+* **Shown** names the entries of the profile whose effect the run showed. Such an entry may have the confidence
+  *verified*, with the archive as its `source`. A test refuses an entry that names an archive which does not show it.
 * The archive shows what its publisher recorded and stated. It does not show who made the run.
 """
 
@@ -378,7 +378,8 @@ def drives() -> str:
             f"{identity['name']}, revision {identity['revision']:X}h" + (
                 f", firmware {statement.firmware}" if statement.firmware else ""),
             f"`{name}`",
-            "none" if inertia is None else f"{inertia['value']:.4g} ({inertia['low_total']:.4g} to {inertia['high_total']:.4g})",
+            "none" if inertia is None else
+            f"{inertia['value']:.4g} ({inertia['low_total']:.4g} to {inertia['high_total']:.4g})",
             "none" if reference is None else
             f"{reference.inertia_kg_m2:.4g} ± {reference.sd_kg_m2:.2g} (1 sd), {reference.method}: {reference.note}",
             "–" if found is None else f"{found.score:.2f}",

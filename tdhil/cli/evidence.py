@@ -23,12 +23,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="default: beside the log; no file is overwritten")
     parser.add_argument(_OF_THE_CHECK, type=Path, metavar="evidence.zip", help="check this archive instead: digests, "
                         "completeness, private texts, and J again from its log")
-    parser.add_argument("--sha256", metavar="HEX", help="with --check: the archive's SHA-256, as the publisher states it")
+    parser.add_argument("--sha256", metavar="HEX", help="with --check: the archive's SHA-256, as the publisher "
+                        "states it")
     statement = parser.add_argument_group("statement of the publisher")
     for option in OF_EVIDENCE:
         add_option(statement, option)
-    statement.add_argument("--serial-key", type=Path, metavar="FILE", help="key of at least 32 bytes for a keyed hash of "
-                           "the serial number: it shows that two archives are of one drive")
+    statement.add_argument("--serial-key", type=Path, metavar="FILE", help="key of at least 32 bytes for a keyed "
+                           "hash of the serial number: it shows that two archives are of one drive")
     parser.set_defaults(run=run)
 
 

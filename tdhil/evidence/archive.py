@@ -42,7 +42,9 @@ SIMULATED: Final = "SIMULATED"
 _DATE: Final = (1980, 1, 1, 0, 0, 0)
 """Date of each member: the earliest one that ZIP can state."""
 _CHECK: Final = re.compile(
-    r"(?P<name>.*?): (?:required (?P<required>.*?), )?found (?P<found>.*) \((?P<outcome>ok|note|refused)\) ?(?P<where>.*)")
+    r"(?P<name>.*?): (?:required (?P<required>.*?), )?found (?P<found>.*) \((?P<outcome>ok|note|refused)\)"
+    r" ?(?P<where>.*)")
+"""Text of an event of preflight (`tdhil.runner`)."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ def missing_in(facts: LogFacts, stages: Sequence[tuple[str, str]], *, complete: 
 def members_of(facts: LogFacts, log: bytes, statement: Statement, result: Mapping[str, Any], version: str
                ) -> dict[str, bytes]:
     """Return the members by name, in their order. ``log``: bytes of the scrubbed log; ``version``: of tdhil."""
-    identity = {name: value for name, value in dict(facts.run.get("identity") or {}).items()}
+    identity = dict(facts.run.get("identity") or {})
     found = {
         README: "",
         STATEMENT: text_of(statement.plain()),

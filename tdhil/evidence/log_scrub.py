@@ -214,8 +214,8 @@ def _names_in(run: Mapping[str, Any], *, rig_name: bool) -> set[str]:
 
 _COMMON_FOLDERS: Final = frozenset({
     "", ".", "..", "~", "bench", "c:", "data", "desktop", "documents", "downloads", "drive", "etc", "examples",
-    "generic", "home", "log", "logs", "media", "mnt", "opt", "profile", "profiles", "rig", "rigs", "root", "run", "runs",
-    "srv", "tdhil", "tmp", "torque", "speed", "users", "usr", "var", "work",
+    "generic", "home", "log", "logs", "media", "mnt", "opt", "profile", "profiles", "rig", "rigs", "root", "run",
+    "runs", "srv", "tdhil", "tmp", "torque", "speed", "users", "usr", "var", "work",
 })
 """Names of folders and files that identify nothing, and that occur as words."""
 

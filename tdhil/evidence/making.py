@@ -113,7 +113,8 @@ def make_evidence(
             stored = conclude(log)
         result = _equal_results(stored, conclude(copy), str(log))
         members = _members(copy, statement, result, __version__)
-        leaks = [f"{name}: {' and '.join(kinds)}" for name, texts in _texts(members, copy) if (kinds := leaks_in(texts))]
+        leaks = [f"{name}: {' and '.join(kinds)}" for name, texts in _texts(members, copy)
+                 if (kinds := leaks_in(texts))]
     if leaks:
         raise UsageError(
             f"the archive would contain private texts ({'; '.join(leaks)})", where=str(log), next_step="Correct the texts of the statement, or remove a word with --remove",

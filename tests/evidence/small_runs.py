@@ -50,8 +50,8 @@ def write_run(path: Path, run: dict[str, Any] | None = None, *, simulated: bool 
         writer.configuration(configuration() if run is None else run, {"gear_ratio": 2.0, "simulated": simulated})
         writer.frame(RawFrame(0.0, False, 0x581, b"\x43\x18\x10\x04" + serial.to_bytes(4, "little")))
         writer.frame(RawFrame(0.0, True, 0x601, b"\x40\x18\x10\x04\0\0\0\0"))
-        for name, text in (("identity", "found vendor FBh (ok) 1018h"), ("watchdog", "required 500 ms, found 500 ms (ok)")):
-            writer.event(Event(0.0, "preflight", f"{name}: {text}"))
+        for text in ("identity: found vendor FBh (ok) 1018h", "watchdog: required 500 ms, found 500 ms (ok)"):
+            writer.event(Event(0.0, "preflight", text))
         writer.event(Event(0.5, "mode", "torque mode confirmed, seeded with 80 N·m"))
         for one in events:
             writer.event(one)

@@ -13,7 +13,15 @@ import pytest
 
 from tdhil.config import OF_EVIDENCE, EvidenceOptions, form_options
 from tdhil.errors import UsageError
-from tdhil.evidence import agreement_of, check_evidence, make_evidence, shown_entries, statement_in, statement_of, wrong_in
+from tdhil.evidence import (
+    agreement_of,
+    check_evidence,
+    make_evidence,
+    shown_entries,
+    statement_in,
+    statement_of,
+    wrong_in,
+)
 from tdhil.evidence.archive import MEMBERS, LogFacts, archive_of, members_in, members_of, problems_of_members
 from tdhil.evidence.statement import ReferenceInertia, Statement, parts_in, serial_hmac
 from tdhil.recording import MAGIC
@@ -194,7 +202,8 @@ def test_a_number_that_scrubbing_would_change_is_an_error(tmp_path):
 @pytest.mark.parametrize(("given", "names"), [
     ({}, ["publisher", "publish"]),
     ({"publisher": "A", "publish": "log,photo"}, ["publish"]),
-    ({"publisher": "A", "publish": "log", "reference_inertia_kg_m2": 104.0}, ["reference_sd_kg_m2", "reference_method"]),
+    ({"publisher": "A", "publish": "log", "reference_inertia_kg_m2": 104.0},
+     ["reference_sd_kg_m2", "reference_method"]),
     ({"publisher": "A", "publish": "log", "reference_inertia_kg_m2": 104.0, "reference_sd_kg_m2": 1.0,
       "reference_method": "weighed"}, ["reference_note"]),
     ({"publisher": "A", "publish": "log", "reference_note": "a drawing"}, ["reference_inertia_kg_m2"]),
