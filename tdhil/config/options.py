@@ -567,7 +567,7 @@ class EvidenceOptions(_Said):
         help="reference inertia at the motor shaft, from another source than this run, kg·m²",
     )
     reference_sd_kg_m2: float | None = option(
-        "--reference-sd", group=Topic.EVIDENCE, unit=INERTIA, metavar="U", ge=0, lt=1e9, api=True,
+        "--reference-uncertainty", group=Topic.EVIDENCE, unit=INERTIA, metavar="U", ge=0, lt=1e9, api=True,
         form=Form("Its standard uncertainty, kg·m²", ("evidence",)),
         help="standard uncertainty of the reference inertia, kg·m²",
     )
