@@ -345,8 +345,9 @@ def _schema(answer: dict[str, Any]) -> str:
 
 EVIDENCE = ROOT / "evidence"
 DRIVES_HEAD = """
-Each row is an archive of one run in the folder `evidence/` of the repository. A test checks each archive, and identifies J
-again from its log. [Publish evidence](../how-to/publish-evidence.md) describes how an archive is made and sent.
+Each row is an archive of one run in the folder `evidence/` of the repository. A test checks each archive, and
+identifies J again from its log. [Publish evidence](../how-to/publish-evidence.md) describes how an archive is made
+and sent.
 
 * **En** compares J with the reference inertia: the difference over the expanded uncertainty of both (ISO 13528).
   At most 1 means that they agree.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tdhil.cli.arguments import add_option
 from tdhil.config import OF_EVIDENCE, EvidenceOptions
@@ -52,9 +52,9 @@ def _make(namespace: argparse.Namespace) -> int:
     log: Path = namespace.log
     target: Path = namespace.output or log.with_name(f"{log.stem}.evidence.zip")
     require_file(log)
-    given = EvidenceOptions(**{
-        one.keyword: tuple(value) if isinstance(value, list) else value
-        for one in OF_EVIDENCE if (value := getattr(namespace, one.name)) is not None})
+    stated: dict[str, Any] = {one.keyword: value for one in OF_EVIDENCE
+                              if (value := getattr(namespace, one.name)) is not None}
+    given = EvidenceOptions(**stated | {"remove": tuple(stated.get("remove", ()))})
     if wrong := wrong_in(given):
         (name, why), *more = wrong
         also = f" ({', '.join(flag_of(one) for one, _ in more)} too)" if more else ""

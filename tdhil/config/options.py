@@ -2,9 +2,9 @@
 
 A row is a field of one of five dataclasses: `RunOptions` (also possible in rig.yaml), `Overrides` and `RunDetails`
 (for one run only), `TraceOptions` (for a trace of another tool), and `EvidenceOptions` (for an archive of evidence).
-The field's annotation is the option's type, its default the option's default; `option` has the rest. The command line, the schema
-of rig.yaml, the keywords of `tdhil.run`, the service's API and forms, and the rows of docs/reference/rig.md are made
-from this table. No large library is imported here, because ``--help`` reads it.
+The field's annotation is the option's type, its default the option's default; `option` has the rest. The command
+line, the schema of rig.yaml, the keywords of `tdhil.run`, the service's API and forms, and the rows of
+docs/reference/rig.md are made from this table. No large library is imported here, because ``--help`` reads it.
 """
 
 from collections.abc import Iterator, Mapping

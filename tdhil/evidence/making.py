@@ -108,16 +108,16 @@ def make_evidence(
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / LOG
         write_copy(log, copy, found, edit=scrub.message, level=LEVEL)
-        stored = run.result
-        if stored is None or stored.get("tdhil") != __version__:
-            stored = conclude(log)
-        result = _equal_results(stored, conclude(copy), str(log))
+        stored: Mapping[str, Any] = run.result or {}
+        before = stored if stored.get("tdhil") == __version__ else conclude(log)
+        result = _equal_results(before, conclude(copy), str(log))
         members = _members(copy, statement, result, __version__)
         leaks = [f"{name}: {' and '.join(kinds)}" for name, texts in _texts(members, copy)
                  if (kinds := leaks_in(texts))]
     if leaks:
         raise UsageError(
-            f"the archive would contain private texts ({'; '.join(leaks)})", where=str(log), next_step="Correct the texts of the statement, or remove a word with --remove",
+            f"the archive would contain private texts ({'; '.join(leaks)})", where=str(log),
+            next_step="Correct the texts of the statement, or remove a word with --remove",
             entry=MessageCode.EVIDENCE_LEAK)
     archive = archive_of(members)
     return Evidence(archive, hashlib.sha256(archive).hexdigest(), members)

@@ -1,4 +1,4 @@
-"""The archive of evidence of a run, over HTTP: who may, what the audit has, the download, every mistake at its field."""
+"""The archive of evidence of a run over HTTP: the audit, the download, every mistake at its field."""
 
 from __future__ import annotations
 

@@ -397,7 +397,7 @@ def test_an_acceptance_that_fails_is_signed_with_a_remark_and_then_shows_who_sig
 @pytest.mark.heavy
 @pytest.mark.parametrize("width", [390, 1280])
 def test_evidence_of_a_run_is_made_on_its_page(browser, served, monkeypatch, width):
-    """Every missing part is marked at its field; then the archive is there, with its digest. axe-core finds no fault."""
+    """Every missing part is marked at its field; then the archive is there, with its digest."""
     from functools import partial
 
     from tdhil.evidence import check_evidence, make_evidence
