@@ -11,19 +11,19 @@ if TYPE_CHECKING:
         entries_of as entries_of, shown_entries as shown_entries,
     )
     from tdhil.evidence.making import (
-        Evidence as Evidence, EvidenceCheck as EvidenceCheck, check_evidence as check_evidence,
+        EvidenceArchive as EvidenceArchive, EvidenceCheck as EvidenceCheck, check_evidence as check_evidence,
         make_evidence as make_evidence,
     )
     from tdhil.evidence.scrub import Scrub as Scrub, names_of_this_computer as names_of_this_computer
     from tdhil.evidence.statement import (
-        NEEDED as NEEDED, SHORTEST_KEY as SHORTEST_KEY, Statement as Statement, flag_of as flag_of,
+        NEEDED as NEEDED, SHORTEST_KEY as SHORTEST_KEY, PublisherStatement as PublisherStatement, flag_of as flag_of,
         serial_hmac as serial_hmac, statement_in as statement_in, statement_of as statement_of, wrong_in as wrong_in,
     )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "archive": "MEMBERS archive_of members_in",
         "drives": "Agreement agreement_of covered_entries entries_of shown_entries",
-        "making": "Evidence EvidenceCheck check_evidence make_evidence",
+        "making": "EvidenceArchive EvidenceCheck check_evidence make_evidence",
         "scrub": "Scrub names_of_this_computer",
-        "statement": "NEEDED SHORTEST_KEY Statement flag_of serial_hmac statement_in statement_of wrong_in",
+        "statement": "NEEDED SHORTEST_KEY PublisherStatement flag_of serial_hmac statement_in statement_of wrong_in",
     })

@@ -27,7 +27,7 @@ from io import BytesIO
 from typing import Any, Final
 
 from tdhil.evidence.drives import CONFIDENCE, agreement_of, shown_entries
-from tdhil.evidence.statement import PARTS, Statement
+from tdhil.evidence.statement import PARTS, PublisherStatement
 
 KIND: Final = "tdhil_evidence"
 FORMAT: Final = 1
@@ -49,7 +49,7 @@ _CHECK: Final = re.compile(
 
 @dataclass(frozen=True)
 class LogFacts:
-    """What the other members take from the scrubbed log. ``run``: its configuration; ``preflight``: texts of the
+    """Facts that the other members take from the scrubbed log. ``run``: its configuration; ``preflight``: texts of the
     events of preflight, in order; ``simulated``: as the recording states it; ``torque_mode``: the drive confirmed its
     torque mode.
     """
@@ -81,7 +81,7 @@ def missing_in(facts: LogFacts, stages: Sequence[tuple[str, str]], *, complete: 
     return tuple(missing)
 
 
-def members_of(facts: LogFacts, log: bytes, statement: Statement, result: Mapping[str, Any], version: str
+def members_of(facts: LogFacts, log: bytes, statement: PublisherStatement, result: Mapping[str, Any], version: str
                ) -> dict[str, bytes]:
     """Return the members by name, in their order. ``log``: bytes of the scrubbed log; ``version``: of tdhil."""
     identity = dict(facts.run.get("identity") or {})
@@ -174,7 +174,7 @@ def _parameter(text: str) -> dict[str, str]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def readme(facts: LogFacts, statement: Statement, result: Mapping[str, Any], version: str) -> str:
+def readme(facts: LogFacts, statement: PublisherStatement, result: Mapping[str, Any], version: str) -> str:
     """Return the text for a reader who has the archive and nothing else."""
     shown = shown_entries(facts.run, statement, result, torque_mode=facts.torque_mode)
     identity, profile = (dict(facts.run.get(name) or {}) for name in ("identity", "profile"))
@@ -222,7 +222,7 @@ def _inertia(result: Mapping[str, Any]) -> str:
             f" interval {found['low_total']:.6g} to {found['high_total']:.6g}")
 
 
-def _reference(statement: Statement) -> str:
+def _reference(statement: PublisherStatement) -> str:
     one = statement.reference
     if one is None:
         return "none stated"
@@ -230,6 +230,6 @@ def _reference(statement: Statement) -> str:
             f" {one.note}")
 
 
-def _agreement(statement: Statement, result: Mapping[str, Any]) -> str:
+def _agreement(statement: PublisherStatement, result: Mapping[str, Any]) -> str:
     found = agreement_of(statement, result)
     return "not known: no reference, or no J" if found is None else found.text

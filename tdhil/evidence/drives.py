@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any, Final
 
-from tdhil.evidence.statement import Statement
+from tdhil.evidence.statement import PublisherStatement
 
 LARGEST_SCORE: Final = 1.0
 """Largest En score of an agreement (ISO 13528:2022, 9.7)."""
@@ -43,7 +43,7 @@ class Agreement:
                 f" {100 * self.uncertainty_rel:.1f} %, En {self.score:.2f}")
 
 
-def agreement_of(statement: Statement, result: Mapping[str, Any]) -> Agreement | None:
+def agreement_of(statement: PublisherStatement, result: Mapping[str, Any]) -> Agreement | None:
     """Return the comparison; None without a reference, without J, or without any uncertainty."""
     found, reference = result.get("inertia_kg_m2"), statement.reference
     if not isinstance(found, Mapping) or reference is None:
@@ -58,7 +58,7 @@ def agreement_of(statement: Statement, result: Mapping[str, Any]) -> Agreement |
 
 
 def shown_entries(
-    run: Mapping[str, Any], statement: Statement, result: Mapping[str, Any], *, torque_mode: bool
+    run: Mapping[str, Any], statement: PublisherStatement, result: Mapping[str, Any], *, torque_mode: bool
 ) -> dict[str, str]:
     """Return the entries of the profile that this run of a real drive shows to be right, each with the observation.
 

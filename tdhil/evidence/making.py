@@ -27,7 +27,7 @@ from tdhil.evidence.archive import (
 )
 from tdhil.evidence.leaks import leaks_in, texts_in
 from tdhil.evidence.log_scrub import LogScrub
-from tdhil.evidence.statement import Statement, serial_hmac, statement_in
+from tdhil.evidence.statement import PublisherStatement, serial_hmac, statement_in
 from tdhil.version import __version__
 
 Conclude = Callable[[Path], Mapping[str, Any]]
@@ -44,7 +44,7 @@ OTHER_VERSION: Final = 0.01
 
 
 @dataclass(frozen=True)
-class Evidence:
+class EvidenceArchive:
     """A finished archive: its bytes, and what it says. ``sha256``: of the whole archive."""
 
     archive: bytes
@@ -77,9 +77,9 @@ def conclude_log(log: Path) -> Mapping[str, Any]:
 
 
 def make_evidence(
-    log: Path, statement: Statement, words: Iterable[str] = (), *, serial_key: bytes = b"",
+    log: Path, statement: PublisherStatement, words: Iterable[str] = (), *, serial_key: bytes = b"",
     conclude: Conclude = conclude_log,
-) -> Evidence:
+) -> EvidenceArchive:
     """Return the archive of a run. ``words``: further words to remove, such as the names of this computer.
 
     ``serial_key``: key for the hash of the drive's serial number, b'' for no hash.
@@ -120,7 +120,7 @@ def make_evidence(
             next_step="Correct the texts of the statement, or remove a word with --remove",
             entry=MessageCode.EVIDENCE_LEAK)
     archive = archive_of(members)
-    return Evidence(archive, hashlib.sha256(archive).hexdigest(), members)
+    return EvidenceArchive(archive, hashlib.sha256(archive).hexdigest(), members)
 
 
 def check_evidence(archive: bytes, sha256: str = "", *, conclude: Conclude | None = conclude_log) -> EvidenceCheck:
@@ -172,7 +172,7 @@ def check_evidence(archive: bytes, sha256: str = "", *, conclude: Conclude | Non
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _refuse(facts: LogFacts, statement: Statement, where: str) -> None:
+def _refuse(facts: LogFacts, statement: PublisherStatement, where: str) -> None:
     """Raise UsageError for a run that is no evidence as it is requested."""
     if facts.run.get("trace") is not None:
         raise UsageError("is a trace of another tool, and no log of a run: it has no identity and no preflight",
@@ -203,7 +203,7 @@ def _preflight(events: Iterable[Any]) -> tuple[str, ...]:
     return tuple(one.text for one in events if one.kind == "preflight")
 
 
-def _members(log: Path, statement: Statement, result: Mapping[str, Any], version: str) -> dict[str, bytes]:
+def _members(log: Path, statement: PublisherStatement, result: Mapping[str, Any], version: str) -> dict[str, bytes]:
     """Return the members that follow from a scrubbed log and a statement."""
     from tdhil.recording import read_run
 
@@ -253,7 +253,7 @@ def _problems_of_log(log: Path, *, rig_name: bool) -> Iterator[str]:
 
 
 def _problems_of_content(
-    members: Mapping[str, bytes], log: Path, statement: Statement, stated: Mapping[str, Any], version: str
+    members: Mapping[str, bytes], log: Path, statement: PublisherStatement, stated: Mapping[str, Any], version: str
 ) -> Iterator[str]:
     """Yield which members do not follow from log, statement and result. Another version may word the README anew."""
     derived = _members(log, statement, stated, version)

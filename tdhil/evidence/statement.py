@@ -36,8 +36,8 @@ class ReferenceInertia:
 
 
 @dataclass(frozen=True)
-class Statement:
-    """What the publisher states. ``publish``: the permitted parts; ``reference``: None if none is known.
+class PublisherStatement:
+    """Statement of the publisher. ``publish``: the permitted parts; ``reference``: None if none is known.
 
     ``serial_hmac_sha256``: keyed hash of the drive's serial number, '' without a key.
     """
@@ -54,9 +54,9 @@ class Statement:
         return asdict(self) | {"publish": list(self.publish)}
 
 
-def statement_in(plain: Any) -> Statement:
+def statement_in(plain: Any) -> PublisherStatement:
     """Return the statement in statement.json. Raises ValueError with the mistakes."""
-    if not isinstance(plain, Mapping) or set(plain) != set(Statement.__dataclass_fields__):
+    if not isinstance(plain, Mapping) or set(plain) != set(PublisherStatement.__dataclass_fields__):
         raise ValueError("statement.json has other entries than those of a statement")
     reference = plain["reference"]
     if reference is not None and (
@@ -115,13 +115,13 @@ def wrong_in(given: EvidenceOptions) -> list[tuple[str, str]]:
     return wrong
 
 
-def statement_of(given: EvidenceOptions, *, serial_hmac_sha256: str = "") -> Statement:
+def statement_of(given: EvidenceOptions, *, serial_hmac_sha256: str = "") -> PublisherStatement:
     """Return the statement of options without mistakes."""
     reference = None
     if given.reference_inertia_kg_m2 is not None:
         reference = ReferenceInertia(float(given.reference_inertia_kg_m2), float(given.reference_sd_kg_m2 or 0.0),
                                      str(given.reference_method), _line(given.reference_note))
-    return Statement(_line(given.publisher), parts_in(given.publish or ""), reference, _line(given.firmware),
+    return PublisherStatement(_line(given.publisher), parts_in(given.publish or ""), reference, _line(given.firmware),
                      given.simulated, serial_hmac_sha256)
 
 

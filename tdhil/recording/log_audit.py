@@ -33,7 +33,7 @@ _WITH_TEXT: Final = frozenset({0x01, 0x03, 0x04})
 
 @dataclass(frozen=True)
 class LogAudit:
-    """What a file has beside the messages of tdhil. ``foreign``: unknown records, one line each; ``declarations``:
+    """Content of a file beside the messages of tdhil. ``foreign``: unknown records, one line each; ``declarations``:
     bodies of the records that have texts.
     """
 

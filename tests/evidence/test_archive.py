@@ -23,13 +23,13 @@ from tdhil.evidence import (
     wrong_in,
 )
 from tdhil.evidence.archive import MEMBERS, LogFacts, archive_of, members_in, members_of, problems_of_members
-from tdhil.evidence.statement import ReferenceInertia, Statement, parts_in, serial_hmac
+from tdhil.evidence.statement import PublisherStatement, ReferenceInertia, parts_in, serial_hmac
 from tdhil.recording import MAGIC
 from tdhil.recording.log_format import Event
 from tests.evidence.small_runs import RESULT, configuration, found, write_run
 
 REFERENCE = ReferenceInertia(105.0, 1.0, "weighed", "disc of 480 kg, radius 0.66 m")
-STATEMENT = Statement("The Institute", ("log", "result", "identity"), REFERENCE, "0x0170", False)
+STATEMENT = PublisherStatement("The Institute", ("log", "result", "identity"), REFERENCE, "0x0170", False)
 FACTS = LogFacts(configuration(), ("watchdog: required 500 ms, found 500 ms (ok) 1016h",), False, torque_mode=True)
 
 

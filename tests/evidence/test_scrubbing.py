@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from tdhil.evidence import make_evidence
 from tdhil.evidence.leaks import LEAKS, leaks_in, without_leaks
 from tdhil.evidence.log_scrub import LogScrub
-from tdhil.evidence.statement import Statement
+from tdhil.evidence.statement import PublisherStatement
 from tdhil.recording import CHANNELS, CLASSES, COMMAND, messages_of, read_frames, read_run
 from tdhil.recording.log_format import Event
 from tdhil.recording.mcap_container import Container
 from tdhil.recording.mcap_recovery import Contents, walk
 from tests.evidence.small_runs import PROFILE, RESULT, SERIAL, configuration, found, write_run
 
-STATEMENT = Statement("The Institute", ("log", "result", "identity"), None, "", False)
+STATEMENT = PublisherStatement("The Institute", ("log", "result", "identity"), None, "", False)
 NAMES = ("first", "last", "rig", "host", "user", "folder", "file", "note", "secret", "key", "field", "mail",
          "calibrated")
 WORD = st.text(string.ascii_lowercase, min_size=6, max_size=12).map(lambda text: f"q{text}x")
@@ -136,7 +136,7 @@ def test_scrubbing_again_changes_nothing(scrubbed):
 def test_the_rig_s_name_stays_where_it_is_permitted(tmp_path):
     log = write_run(tmp_path / "run.mcap", configuration(bench={"name": "Rig 7 of Acme", "limits": {}},
                                                          unverified=["seen on Rig 7 of Acme"]))
-    permitted = Statement("The Institute", ("log", "rig"), None, "", False)
+    permitted = PublisherStatement("The Institute", ("log", "rig"), None, "", False)
     for statement, name in ((STATEMENT, None), (permitted, "Rig 7 of Acme")):
         made = make_evidence(log, statement, (), conclude=found)
         (tmp_path / "out.mcap").write_bytes(made.members["run.mcap"])

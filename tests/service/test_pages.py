@@ -427,7 +427,7 @@ def test_evidence_of_a_run_is_made_on_its_page(browser, served, monkeypatch, wid
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
     for label, text in (("Publisher: who permits this", HOSTILE), ("Parts that may be published", "all"),
                         ("Its standard uncertainty", "1"), ("How, in words", "a disc of 480 kg")):
-        page.get_by_label(label).fill(text)
+        page.get_by_role("textbox", name=label).fill(text)
     page.get_by_label("How it is known").select_option("weighed")
     page.get_by_role("button", name="Make the archive").click()
     link = page.get_by_role("link", name="evidence.zip")
