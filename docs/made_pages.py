@@ -4,6 +4,7 @@
 |---|---|
 | reference/command-line.md | the parsers of `tdhil.cli` |
 | reference/candidates.md | the table of `tdhil.estimation.candidates` |
+| reference/drives.md | the archives in `evidence/` |
 | reference/exit-codes.md | `tdhil.errors.ExitCode` and the tree of errors |
 | reference/http-api.md | the OpenAPI document of `tdhil serve` |
 """
@@ -203,7 +204,7 @@ MEANING = {
     12: (
         "a rehearsed fault (`--fault`) did not cause the reaction that the fault table requires, or an identified "
         "value contradicts its expected one (`acceptance:`, `--expect`); `tdhil tune verify`: the drive does not step "
-        "as tuned",
+        "as tuned; `tdhil evidence --check`: the archive does not pass",
         "Compare what was required with what was seen. Both are on the card, and in `rehearsal` and `acceptance` of "
         "the document.",
     ),
@@ -339,7 +340,65 @@ def _schema(answer: dict[str, Any]) -> str:
     return ""
 
 
-PAGES = {"candidates.md": candidates, "command-line.md": command_line, "exit-codes.md": exit_codes,
+# ---------------------------------------------------------------------------------------------------------------------
+# Drives with evidence
+
+EVIDENCE = ROOT / "evidence"
+DRIVES_HEAD = """
+Each row is an archive of one run in the folder `evidence/` of the repository. A test checks each archive, and
+identifies J again from its log. [Publish evidence](../how-to/publish-evidence.md) describes how an archive is made
+and sent.
+
+* **En** compares J with the reference inertia: the difference over the expanded uncertainty of both (ISO 13528).
+  At most 1 means that they agree.
+* **Shown** names the entries of the profile whose effect the run showed. Such an entry may have the confidence
+  *verified*, with the archive as its `source`. A test refuses an entry that names an archive which does not show it.
+* The archive shows what its publisher recorded and stated. It does not show who made the run.
+"""
+
+
+def drives() -> str:
+    """The page of the drives of which there is evidence, and of the example."""
+    import json
+
+    from profiles.library import load_profile, profile_names
+    from tdhil.evidence import agreement_of, covered_entries, members_in, statement_in
+
+    real, simulated = [], []
+    for path in sorted(EVIDENCE.glob("*.zip")):
+        members = members_in(path.read_bytes())
+        identity, profile, result, manifest = (
+            json.loads(members[name]) for name in ("identity.json", "profile.json", "result.json", "manifest.json"))
+        statement = statement_in(json.loads(members["statement.json"]))
+        name = profile["name"]
+        today = load_profile(name).model_dump(mode="json", by_alias=True) if name in profile_names() else None
+        covered = covered_entries(profile, manifest["shown"], today)
+        found, inertia, reference = agreement_of(statement, result), result["inertia_kg_m2"], statement.reference
+        row = (
+            f"`{path.name}`",
+            f"{identity['name']}, revision {identity['revision']:X}h" + (
+                f", firmware {statement.firmware}" if statement.firmware else ""),
+            f"`{name}`",
+            "none" if inertia is None else
+            f"{inertia['value']:.4g} ({inertia['low_total']:.4g} to {inertia['high_total']:.4g})",
+            "none" if reference is None else
+            f"{reference.inertia_kg_m2:.4g} ± {reference.sd_kg_m2:.2g} (1 sd), {reference.method}: {reference.note}",
+            "–" if found is None else f"{found.score:.2f}",
+            ", ".join(f"`{one}`: {why}" for one, why in covered.items()) or "none",
+            statement.publisher,
+        )
+        (simulated if manifest["simulated"] else real).append(" | ".join(_cell(one) for one in row))
+    head = ["| archive | drive | profile | J at the motor, kg·m² (95 %) | reference, kg·m² | En | shown | publisher |",
+            "|---|---|---|---|---|---|---|---|"]
+    out = [MADE + "# Drives with evidence", "", DRIVES_HEAD.strip(), "", "## Real drives", ""]
+    out += [*head, *(f"| {row} |" for row in real)] if real else ["No archive of a real drive has been received yet."]
+    out += ["", "## SIMULATED: the example", "",
+            "This archive is of the simulated drive. It shows the form of an archive, and nothing about a drive.", "",
+            *head, *(f"| {row} |" for row in simulated)]
+    return "\n".join(out).rstrip() + "\n"
+
+
+PAGES = {"candidates.md": candidates, "command-line.md": command_line, "drives.md": drives, "exit-codes.md": exit_codes,
          "http-api.md": http_api}
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ The hundreds of a code are the exit code of the process that ends with it::
     TDH-2xx   use, files, configuration                   2      TDH-9xx   not identifiable, model rejected   9
     TDH-3xx   partial result                              3      TDH-10xx  nothing readable in a file        10
     TDH-4xx   refused before motion                       4      TDH-11xx  tuning refused                    11
-    TDH-5xx   communication                               5      TDH-12xx  rehearsal, acceptance not passed 12
+    TDH-5xx   communication                               5      TDH-12xx  rehearsal, acceptance, evidence  12
     TDH-6xx   drive                                       6      TDH-13xx  interrupted              130 to 192
 
 The table stands here because every room raises errors, and `profiles` lies below every other room. An error class has
@@ -365,6 +365,22 @@ class MessageCode(Enum):
         238, "The trace file exists and is not a trace",
         "--trace names a file that tdhil did not write, so tdhil keeps it.",
         "Name another file.")
+    EVIDENCE_STATEMENT = (
+        239, "The publisher's statement is incomplete",
+        "An archive of evidence needs the publisher, the parts that may be published, and a whole reference inertia.",
+        "Add the options that the message names, such as --publisher and --publish.")
+    EVIDENCE_SIMULATED = (
+        240, "The run is no evidence about a drive",
+        "The run is of the simulated drive or a rehearsal of faults, or the mark --simulated does not fit the log.",
+        "Name the log of a run on a real drive, or mark an example with --simulated.")
+    EVIDENCE_INCOMPLETE = (
+        241, "The log is incomplete as evidence",
+        "The run did not reach its end, or the log lacks the identity, the profile or the preflight of the drive.",
+        "Name the log of a complete run.")
+    EVIDENCE_LEAK = (
+        242, "The archive would contain a private text",
+        "A path, an address, a password or a key is left in a member of the archive after scrubbing.",
+        "Correct the texts of the statement, or name the word with --remove.")
 
     # --- 3xx: partial result -----------------------------------------------------------------------------------------
     LOG_BROKEN = (
@@ -813,6 +829,10 @@ class MessageCode(Enum):
         1201, "An identified value contradicts the expected one",
         "The interval of the identified value and the tolerance of the expected one have no value in common.",
         "Find what is off on the card. Correct the machine, or the expected value in rig.yaml.")
+    EVIDENCE_FAILED = (
+        1202, "An archive of evidence did not pass its check",
+        "The archive was changed, is incomplete, contains a private text, or its result does not follow from its log.",
+        "Request the archive and its SHA-256 from the publisher again.")
 
     # --- 13xx: interrupted -------------------------------------------------------------------------------------------
     INTERRUPTED = (

@@ -26,7 +26,7 @@ GROUPS: Final = {
     9: ("Not identifiable", "9", "The data do not determine the inertia, or contradict the model."),
     10: ("Unreadable files", "10", "A file holds nothing that can be used."),
     11: ("Tuning refused", "11", "The requested gains are not recommended."),
-    12: ("Not passed", "12", "A rehearsal or an acceptance did not pass."),
+    12: ("Not passed", "12", "A rehearsal, an acceptance or an archive of evidence did not pass."),
     13: ("Interrupted", "130 and above", "Ctrl-C or another signal ended the program."),
 }
 """Title, exit code and one sentence of each group of codes."""

@@ -45,6 +45,7 @@ _GROUPS: Final = {
         "watch": "identify each new log in a folder",
         "export": "write a log's CAN frames or samples in another format",
         "recover": "show what a damaged log holds, and write a clean copy",
+        "evidence": "make or check an archive of a run on a real drive",
         "support": "put a log and its surroundings into one archive",
     },
     "prepare": {

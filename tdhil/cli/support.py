@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import getpass
 import json
 import os
 import platform
-import re
-import socket
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
@@ -20,6 +17,7 @@ from typing import Any
 
 from tdhil.buses import all_buses
 from tdhil.errors import ExitCode, LogError, MessageCode, UsageError
+from tdhil.evidence import Scrub
 from tdhil.version import __version__
 
 LIBRARIES = (
@@ -31,15 +29,6 @@ VARIABLES = (
     "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS",
 )
 """Environment variables that are included, beside those of the buses; all others are private."""
-
-_SECRET = re.compile(r"pass(word|wd|phrase)?|secret|token|api_?key|credential|authori[sz]ation|private", re.IGNORECASE)
-_PERSON = frozenset({"operator"})
-_HOMES = re.compile(r"((?:/home|/Users|[A-Za-z]:\\+Users)[/\\]+)[^/\\\s'\":;,]+")
-_LOGIN = re.compile(r"(\w+://)[^/@\s]+@")
-_ASSIGNED = re.compile(rf"((?:{_SECRET.pattern})\w*\s*[:=]\s*)[^\s,}}]+", re.IGNORECASE)
-_GONE = "<removed>"
-_SHORTEST_NAME = 4
-"""Shortest name that is removed, characters; a shorter one occurs within other words."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -136,67 +125,6 @@ def _add_log(archive: zipfile.ZipFile, log: Path, scrub: Scrub) -> bool:
             archive.writestr(f"{name}.json", _json(scrub.value(part)))
     archive.writestr("configuration.json", _json(scrub.value(configuration)))
     return found.whole
-
-
-class Scrub:
-    """Removes data of the sender: home folders, the names of user and computer, operators, logins, secrets."""
-
-    def __init__(self, *, home: str, names: Iterable[str]) -> None:
-        self._home = home if len(home) > 1 else ""
-        words = sorted({re.escape(name) for name in names if len(name) >= _SHORTEST_NAME}, key=len, reverse=True)
-        self._names = re.compile(rf"(?<![A-Za-z0-9])(?:{'|'.join(words)})(?![A-Za-z0-9])") if words else None
-
-    @classmethod
-    def of_this_computer(cls) -> Scrub:
-        """Return the scrubber for this computer. Names with another meaning in a log (root, user) are kept."""
-        names = []
-        with suppress(Exception):      # no entry for this user, and no variables
-            names.append(getpass.getuser())
-        with suppress(OSError):
-            names.append(socket.gethostname())
-        return cls(home=str(Path.home()), names=[name for name in names if name not in ("root", "user", "localhost")])
-
-    def text(self, text: str) -> str:
-        """Scrub one text."""
-        if self._home:
-            text = text.replace(self._home, "~")
-        text = _HOMES.sub(r"\1<user>", text)
-        text = _LOGIN.sub(rf"\1{_GONE}@", text)
-        text = _ASSIGNED.sub(lambda found: found[1] + _GONE, text)
-        return self._names.sub("<name>", text) if self._names is not None else text
-
-    def value(self, value: Any, key: str = "") -> Any:
-        """Scrub plain data at all levels."""
-        if value not in (None, "") and isinstance(key, str) and (_SECRET.search(key) or key in _PERSON):
-            return _GONE
-        if isinstance(value, str):
-            return self.text(value)
-        if isinstance(value, Mapping):
-            return {self.text(str(name)): self.value(one, str(name)) for name, one in value.items()}
-        if isinstance(value, list | tuple):
-            return [self.value(one) for one in value]
-        return value
-
-    def message(self, channel: int, payload: bytes) -> bytes:
-        """Scrub the texts of a log's message; its numbers stay."""
-        from google.protobuf.descriptor import FieldDescriptor
-
-        from tdhil.recording import CHANNELS, CLASSES, COMMAND, EXCITATION, RAW_FRAMES, SAMPLE, VIRTUAL_STRING
-
-        if channel in RAW_FRAMES | {SAMPLE, COMMAND, EXCITATION, VIRTUAL_STRING}:
-            return payload
-        message = CLASSES[CHANNELS[channel][1]].FromString(payload)
-        for field in message.DESCRIPTOR.fields:
-            if field.type != FieldDescriptor.TYPE_STRING:
-                continue
-            text = getattr(message, field.name)
-            try:
-                text = json.dumps(self.value(json.loads(text)), ensure_ascii=False) if field.name == "json" else None
-            except ValueError:
-                text = None
-            setattr(message, field.name, self.text(getattr(message, field.name)) if text is None else text)
-        scrubbed: bytes = message.SerializeToString()
-        return scrubbed
 
 
 def _json(value: Any) -> str:

@@ -1,10 +1,10 @@
 """Table of a run's options. Each option is declared here once; everything that takes options is made from it.
 
-A row is a field of one of four dataclasses: `RunOptions` (also possible in rig.yaml), `Overrides` and `RunDetails`
-(for one run only), and `TraceOptions` (for a trace of another tool). The field's annotation is the option's type, its
-default the option's default; `option` has the rest. The command line, the schema of rig.yaml, the keywords of
-`tdhil.run`, the service's API and forms, and the rows of docs/reference/rig.md are made from this table. No large
-library is imported here, because ``--help`` reads it.
+A row is a field of one of five dataclasses: `RunOptions` (also possible in rig.yaml), `Overrides` and `RunDetails`
+(for one run only), `TraceOptions` (for a trace of another tool), and `EvidenceOptions` (for an archive of evidence).
+The field's annotation is the option's type, its default the option's default; `option` has the rest. The command
+line, the schema of rig.yaml, the keywords of `tdhil.run`, the service's API and forms, and the rows of
+docs/reference/rig.md are made from this table. No large library is imported here, because ``--help`` reads it.
 """
 
 from collections.abc import Iterator, Mapping
@@ -71,6 +71,7 @@ class Topic(Enum):
     OUTPUT = "log and output"
     SIMULATED = "simulated rig"
     TRACE = "trace"
+    EVIDENCE = "statement"
 
 
 _LIMITS: Final = {"gt": ("greater than", gt), "ge": ("at least", ge), "lt": ("less than", lt), "le": ("at most", le)}
@@ -79,7 +80,7 @@ _LIMITS: Final = {"gt": ("greater than", gt), "ge": ("at least", ge), "lt": ("le
 @dataclass(frozen=True)
 class Form:
     """Field of the service's forms. ``parts``: its places among ``run``, ``simulated``, ``real``, ``rehearsal``,
-    ``replay``, ``upload`` and ``trace``.
+    ``replay``, ``upload``, ``trace`` and ``evidence``.
 
     ``unit``: unit of a number that is entered without one. ``hint``: shown in the empty field instead of the default.
     """
@@ -550,12 +551,68 @@ class TraceOptions(_Said):
     )
 
 
+@dataclass(frozen=True)
+class EvidenceOptions(_Said):
+    """Statement of the publisher for an archive of evidence (`tdhil evidence`). The recorded log contains the rest.
+
+    They are no options of a run, so `OPTIONS` does not have them.
+    """
+
+    publisher: str | None = option(
+        "--publisher", group=Topic.EVIDENCE, metavar="NAME", api=True, longest=200,
+        form=Form("Publisher: who permits this", ("evidence",), hint="a person or an organisation"),
+        help="person or organisation that permits publication; the archive shows this name",
+    )
+    publish: str | None = option(
+        "--publish", group=Topic.EVIDENCE, metavar="PARTS", api=True, longest=60,
+        form=Form("Parts that may be published", ("evidence",), hint="log,result,identity or all"),
+        help="parts that may be published: log, result, identity, rig (the rig's name), separated by commas, or all",
+    )
+    reference_inertia_kg_m2: float | None = option(
+        "--reference-inertia", group=Topic.EVIDENCE, unit=INERTIA, metavar="J", gt=0, lt=1e9, api=True,
+        form=Form("Reference inertia at the motor shaft, kg·m²", ("evidence",), hint="none"),
+        help="reference inertia at the motor shaft, from another source than this run, kg·m²",
+    )
+    reference_sd_kg_m2: float | None = option(
+        "--reference-uncertainty", group=Topic.EVIDENCE, unit=INERTIA, metavar="U", ge=0, lt=1e9, api=True,
+        form=Form("Its standard uncertainty, kg·m²", ("evidence",)),
+        help="standard uncertainty of the reference inertia, kg·m²",
+    )
+    reference_method: Literal["weighed", "drawing", "manufacturer", "other"] | None = option(
+        "--reference-method", group=Topic.EVIDENCE, api=True, unset="not stated",
+        form=Form("How it is known", ("evidence",)),
+        help="how the reference inertia is known",
+    )
+    reference_note: str | None = option(
+        "--reference-note", group=Topic.EVIDENCE, metavar="TEXT", api=True, longest=500,
+        form=Form("How, in words", ("evidence",), wide=True, hint="masses and radii, drawing number, test report"),
+        help="how the reference inertia is known, in words, such as masses and radii, or a drawing",
+    )
+    firmware: str | None = option(
+        "--firmware", group=Topic.EVIDENCE, metavar="TEXT", api=True, longest=100,
+        form=Form("Firmware version, as the drive's panel shows it", ("evidence",)),
+        help="firmware version of the drive, as its panel or tool shows it",
+    )
+    remove: tuple[str, ...] = option(
+        "--remove", group=Topic.EVIDENCE, default=(), metavar="WORD", api=True, longest=200,
+        form=Form("Further words to remove", ("evidence",), hint="names of a site or a customer"),
+        help="further word to remove from every text, such as the name of a site; may be repeated",
+    )
+    simulated: bool = option(
+        "--simulated", group=Topic.EVIDENCE, default=False, api=True,
+        form=Form("Mark it as a run of the simulated drive", ("evidence",)),
+        help="mark the archive as that of the simulated drive; without this option such a run is refused",
+    )
+
+
 RESOLVED: Final = tuple(_rows(RunOptions))
 """The options that `resolve` decides: those of `RunOptions`."""
 OPTIONS: Final = (*RESOLVED, *_rows(Overrides), *_rows(RunDetails))
 """All rows of the table that are options of a run."""
 OF_A_TRACE: Final = tuple(_rows(TraceOptions, by_field=True))
 """Options for reading a trace of another tool."""
+OF_EVIDENCE: Final = tuple(_rows(EvidenceOptions, by_field=True))
+"""Options of the statement in an archive of evidence."""
 OPTION: Final = MappingProxyType({one.name: one for one in OPTIONS})
 ASKED_AGAIN: Final = tuple(sorted((one for one in OPTIONS if one.asked_again), key=lambda one: one.name))
 """Options that a replay, a comparison or a fleet may set differently from the run."""
@@ -572,7 +629,7 @@ def is_name(flag: str, value: str) -> bool:
 
 def form_options(part: str) -> list[Option]:
     """Return the options of one part of a form."""
-    return [one for one in (*OPTIONS, *OF_A_TRACE) if one.form is not None and part in one.form.parts]
+    return [one for one in (*OPTIONS, *OF_A_TRACE, *OF_EVIDENCE) if one.form is not None and part in one.form.parts]
 
 
 def _shown(value: Any) -> str:

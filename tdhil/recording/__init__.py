@@ -14,6 +14,9 @@ if TYPE_CHECKING:
         read_recording as read_recording, read_reference as read_reference, survey_trace as survey_trace,
         units_of as units_of,
     )
+    from tdhil.recording.log_audit import (
+        LogAudit as LogAudit, audit_log as audit_log, messages_of as messages_of, texts_of_message as texts_of_message,
+    )
     from tdhil.recording.log_format import (
         CAN as CAN, CHANNELS as CHANNELS, CLASSES as CLASSES, COMMAND as COMMAND, EXCITATION as EXCITATION,
         FRAME_CHANNELS as FRAME_CHANNELS, LiveInertia as LiveInertia, RAW_FRAMES as RAW_FRAMES, SAMPLE as SAMPLE,
@@ -46,6 +49,7 @@ else:
             "Bench GAP_INTERVALS USUAL parse_columns read_recording REFERENCE_FLAG ReferenceTrace TIME_AND_TORQUE "
             "read_reference TraceSurvey column_mistakes survey_trace units_of"
         ),
+        "log_audit": "LogAudit audit_log messages_of texts_of_message",
         "log_format": "CAN CHANNELS CLASSES COMMAND EXCITATION FRAME_CHANNELS LiveInertia RAW_FRAMES SAMPLE "
                       "VIRTUAL_COLUMNS VIRTUAL_STRING schema_name",
         "log_reader": "read_cycles read_frames read_run",

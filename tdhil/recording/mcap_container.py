@@ -60,15 +60,16 @@ class Container:
     """One file during writing. Every method except `add` may raise OSError; the file then ends with its last chunk.
 
     Each write first checks that the file still exists: a write to a removed or truncated file gives no error.
+    ``level``: of the compression; 1 keeps pace with a run.
     """
 
-    def __init__(self, file: RawFile) -> None:
+    def __init__(self, file: RawFile, level: int = 1) -> None:
         self._file = file
         self._offset = 0
         self._tail = b""                                # last bytes written
         self._seam: tuple[int, bytes] = (0, b"")        # their position, and the bytes before them
         self._watched = _is_named(file)
-        self._compress = zstandard.ZstdCompressor(level=1).compress
+        self._compress = zstandard.ZstdCompressor(level=level).compress
         self._parts: list[bytes] = []
         self._size = 0
         self._index: dict[int, list[int]] = {}          # by channel: log time, offset, log time, offset,

@@ -80,10 +80,10 @@ Edit = Callable[[int, bytes], bytes]
 """Function (channel, payload) → the payload to be written instead."""
 
 
-def write_copy(source: Path, target: Path, found: Salvage, edit: Edit | None = None) -> int:
+def write_copy(source: Path, target: Path, found: Salvage, edit: Edit | None = None, level: int = 1) -> int:
     """Write all readable content of ``source`` as a finished log to ``target``. Return the number of its messages.
 
-    ``target`` appears only when it is complete. Raises `LogError`.
+    ``target`` appears only when it is complete. ``level``: of the compression. Raises `LogError`.
     """
     part = target.with_name(target.name + ".part")
     try:
@@ -93,7 +93,7 @@ def write_copy(source: Path, target: Path, found: Salvage, edit: Edit | None = N
                           next_step="Choose another file") from error
     try:
         with file:
-            count = _copy(source, Container(file), found, edit)
+            count = _copy(source, Container(file, level), found, edit)
             with suppress(OSError):            # not every file has a disk
                 os.fsync(file.fileno())
         part.replace(target)

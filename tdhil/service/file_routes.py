@@ -45,13 +45,13 @@ def routes(site: Site) -> list[Route]:
 
 async def log(site: Site, request: Request, body: None) -> Response:
     """Return the log, also during the run."""
-    return await _file(site, request, "run.mcap", "application/octet-stream")
+    return await file_of(site, request, "run.mcap", "application/octet-stream")
 
 
 async def report(site: Site, request: Request, body: None) -> Response:
     """Return the report, for display in the browser. It is made again after a signature."""
     await _renew_signed(site, request.path_params["run"], "report.html")
-    response = await _file(site, request, "report.html", "text/html", shown=True)
+    response = await file_of(site, request, "report.html", "text/html", shown=True)
     response.headers["content-security-policy"] = REPORT_POLICY
     return response
 
@@ -63,7 +63,7 @@ async def report_pdf(site: Site, request: Request, body: None) -> Response:
     folder = await off(lambda: site.store.place(run))
     if not (folder / "report.pdf").exists() and (folder / "result.json").exists():
         await site.work("report", run, {"name": "report.pdf"})
-    return await _file(site, request, "report.pdf", "application/pdf")
+    return await file_of(site, request, "report.pdf", "application/pdf")
 
 
 async def _renew_signed(site: Site, run: str, name: str) -> None:
@@ -80,7 +80,7 @@ async def _renew_signed(site: Site, run: str, name: str) -> None:
 
 async def result(site: Site, request: Request, body: None) -> Response:
     """Return the result."""
-    return await _file(site, request, "result.json", "application/json")
+    return await file_of(site, request, "result.json", "application/json")
 
 
 async def samples(site: Site, request: Request, body: None) -> Response:
@@ -92,12 +92,12 @@ async def samples(site: Site, request: Request, body: None) -> Response:
             raise UsageError("the run has no finished log", where=f"run {run}", next_step="Wait until it has ended",
                              entry=MessageCode.NOT_READY)
         await site.work("samples", run, {})
-    return await _file(site, request, "samples.csv", "text/csv")
+    return await file_of(site, request, "samples.csv", "text/csv")
 
 
 async def recording(site: Site, request: Request, body: None) -> Response:
     """Return the uploaded trace of a run, as it was received."""
-    return await _file(site, request, TRACE, "text/csv")
+    return await file_of(site, request, TRACE, "text/csv")
 
 
 async def pictures(site: Site, request: Request, body: None) -> list[PictureView]:
@@ -126,7 +126,7 @@ async def _shown(site: Site, run: str) -> tuple[ShownPicture, ...]:
     return await off(look)
 
 
-async def _file(site: Site, request: Request, name: str, media: str, *, shown: bool = False) -> Response:
+async def file_of(site: Site, request: Request, name: str, media: str, *, shown: bool = False) -> Response:
     """Return a file of the run as a download; with ``shown``, for display. Raises NotThere."""
     run, who = request.path_params["run"], principal(request).name
     path = (await off(lambda: site.store.place(run))) / name

@@ -166,6 +166,20 @@ class RunRecords:
                 raise LogError(f"the signature can't be written ({error.strerror or error})", where=where,
                                next_step="Nothing was signed. Check the folder of the service") from error
 
+    # -- evidence ----------------------------------------------------------------------------------------------------
+
+    def ask_evidence(self, run: str, who: str, *, publisher: str, publish: str) -> str:
+        """Record who requested an archive with which permission. Return the rig. Raises NotThere, LogError, and
+        Conflict for a run that has not ended, or has no log.
+        """
+        with self._lock:
+            request, where = self._store.request(run), f"run {run}"
+            self._require_settled(run)
+            if not (self._store.place(run) / LOG).is_file():
+                raise Conflict("this run has no log", where=where)
+            self._audit(who, "evidence requested", run, request.rig, publisher=publisher, publish=publish)
+        return request.rig
+
     def _log_sha256(self, run: str) -> str:
         """Return the SHA-256 of the log; from memory while the file keeps its size and times."""
         path = self._store.place(run) / LOG

@@ -17,6 +17,7 @@ from tdhil.service.acceptance_signature import AcceptanceSignature
 from tdhil.service.accounts import Role
 from tdhil.service.annotations import AnnotationEdit
 from tdhil.service.audit import Broken, Entry
+from tdhil.service.evidence_request import STATED, EvidenceView
 from tdhil.service.fleets import FleetView
 from tdhil.service.foxglove import PROTOCOLS
 from tdhil.service.run_state import Check, Confirmation, Entered, State, Stop, Told, Watch
@@ -147,7 +148,7 @@ class RunView:
 
     ``operator``, ``note``: as edited later, else as in ``options``. ``edits``: each later edit, with old and new value.
     ``signature``: under its acceptance. ``uploaded``: source of an uploaded recording (file, sha256, by, at, rig as
-    stated, kind, size_bytes); None for a run of this service.
+    stated, kind, size_bytes); None for a run of this service. ``evidence``: its archive, if one was made.
     """
 
     id: str
@@ -186,6 +187,7 @@ class RunView:
     edits: list[AnnotationEdit] = field(default_factory=list)
     signature: AcceptanceSignature | None = None
     uploaded: dict[str, Any] | None = None
+    evidence: EvidenceView | None = None
 
 
 @dataclass(frozen=True)
@@ -589,7 +591,9 @@ OPTIONS: Final = "Options"
 """Body of a request for a run: an object with the command line's options."""
 RECORDING: Final = "Recording"
 """Body of a request about an upload: an object with the options of `tdhil replay`, and the rig."""
-OBJECTS: Final = frozenset({OPTIONS, RECORDING})
+EVIDENCE: Final = "Evidence"
+"""Body of a request for an archive: an object with the statement of the publisher."""
+OBJECTS: Final = frozenset({OPTIONS, RECORDING, EVIDENCE})
 """Bodies that are objects with options. Their handlers check them."""
 FILE: Final = "File"
 """Body of an upload: the bytes of a file. Its handler receives and limits them."""
@@ -686,6 +690,10 @@ ROUTES: Final = (
           _file("application/json"), errors=(404,), headers=_RANGE),
     Route("GET", "/runs/{run}/samples.csv", "samples", "Every sample with its command; made at the first request",
           "viewer", _file("text/csv"), errors=(404, 422), headers=_RANGE),
+    Route("POST", "/runs/{run}/evidence", "make_evidence", "Make the archive of a run, scrubbed, for others to check",
+          "engineer", {201: EvidenceView}, EVIDENCE, (403, 404, 409, 422, 503)),
+    Route("GET", "/runs/{run}/evidence.zip", "evidence", "The archive of evidence", "viewer",
+          _file("application/zip"), errors=(404,), headers=_RANGE),
     Route("GET", "/runs/{run}/pictures", "pictures", "The report's pictures", "viewer", {200: list[PictureView]},
           errors=(404,)),
     Route("GET", "/runs/{run}/pictures/{number}", "picture", "One of the pictures", "viewer", {200: "image/svg+xml"},
@@ -796,6 +804,10 @@ def document() -> dict[str, Any]:
                     "properties": {
                         "rig": {"type": "string", "description": "rig of the recording as you state it, '' for none"},
                         **{name: option_schema(one) for name, one in ACCEPTED.items()}}}
+        if kind == EVIDENCE:
+            return {"type": "object", "description": "the options of `tdhil evidence`, such as "
+                    '{"publisher": "The Institute", "publish": "log,result,identity"}',
+                    "properties": {name: option_schema(one) for name, one in STATED.items()}}
         found = adapter(kind).json_schema(mode=mode, ref_template="#/components/schemas/{model}")
         schemas.update(found.pop("$defs", {}))
         if isinstance(kind, type) and found.get("type") == "object":

@@ -22,6 +22,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge
 from tdhil.errors import TdhilError
 from tdhil.service.access import Access
 from tdhil.service.answers import KeptAnswers
+from tdhil.service.evidence_request import ABOUT, ARCHIVE, evidence_in
 from tdhil.service.fleets import Fleets
 from tdhil.service.limits import UPLOAD_LIMIT
 from tdhil.service.live_feed import Feeds
@@ -113,7 +114,7 @@ class Site:
         if (kept := self._answers.get(key)) is not None:
             return kept
         work, limiter = partial(self.supervisor.work, what, run, asked), self._works
-        if what in ("replay", "calibrate", "upload"):
+        if what in ("replay", "calibrate", "upload", "evidence"):
             limiter = self._replays
         if what == "preview":
             limiter = self._previews
@@ -205,7 +206,8 @@ class Site:
         with suppress(TdhilError):
             rig_name = self.supervisor.rigs.get(request.rig).name
         annotations = self.store.annotations(run)
-        found = [name for name in ("run.mcap", TRACE, "recovered.mcap", "report.html", "result.json", "report.pdf")
+        found = [name for name in ("run.mcap", TRACE, "recovered.mcap", "report.html", "result.json", "report.pdf",
+                              ARCHIVE)
                  if (folder / name).is_file()]
         return RunView(
             request.id, request.rig, rig_name, status.state, status.stage, status.at,
@@ -218,6 +220,7 @@ class Site:
             annotations.text("operator", request.options), annotations.text("note", request.options),
             list(annotations.tags), annotations.archived, list(annotations.edits),
             self.records.signature(run), None if request.uploaded is None else dict(request.uploaded),
+            evidence_in(read_json(folder / ABOUT)),
         )
 
     def broker_messages(self) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
 from tdhil.service import (
     auth_routes,
+    evidence_routes,
     file_routes,
     fleet_routes,
     new_rig_routes,
@@ -53,7 +54,8 @@ from tdhil.service.supervisor import Supervisor
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 SUBJECTS: Final = (
-    new_rig_routes, rig_routes, run_routes, file_routes, upload_routes, fleet_routes, auth_routes, service_routes)
+    new_rig_routes, rig_routes, run_routes, file_routes, evidence_routes, upload_routes,
+    fleet_routes, auth_routes, service_routes)
 _GONE: Final = suppress(WebSocketDisconnect, RuntimeError)
 """Context for messages to a socket, whose other end may disconnect at any time."""
 

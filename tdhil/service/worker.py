@@ -160,10 +160,31 @@ def upload(asked: dict[str, Any]) -> dict[str, Any]:
     return {"document": identify_upload(asked["kind"], asked["options"], asked["source"])}
 
 
+def evidence(asked: dict[str, Any]) -> dict[str, Any]:
+    """Make the archive of evidence of a run's log, as `tdhil evidence` does."""
+    from tdhil.config import EvidenceOptions
+    from tdhil.evidence import make_evidence, names_of_this_computer, statement_of
+    from tdhil.service.evidence_request import ARCHIVE
+
+    os.chdir(asked["folder"])
+    given = EvidenceOptions(**{**asked["stated"], "remove": tuple(asked["stated"]["remove"])})
+    statement = statement_of(given)
+    made = make_evidence(Path("run.mcap"), statement, (*given.remove, *names_of_this_computer()),
+                         serial_key=Path(asked["key_file"]).read_bytes())
+    beside = Path(f".{os.getpid()}-{ARCHIVE}")
+    try:
+        beside.write_bytes(made.archive)
+        beside.replace(ARCHIVE)
+    finally:
+        beside.unlink(missing_ok=True)
+    return {"document": {"sha256": made.sha256, "size_bytes": len(made.archive), "publisher": statement.publisher,
+                         "publish": list(statement.publish), "simulated": statement.simulated}}
+
+
 WORK: Final = {
     "plan": plan, "scan": scan, "pace": pace, "replay": replay, "report": report, "samples": samples,
     "recover": recover, "trend": trend, "compare": compare, "calibrate": calibrate, "preview": preview,
-    "upload": upload,
+    "upload": upload, "evidence": evidence,
 }
 
 

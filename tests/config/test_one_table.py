@@ -20,7 +20,7 @@ import pytest
 
 import tdhil
 from tdhil.cli.main import main
-from tdhil.config.options import ASKED_AGAIN, OPTION, OPTIONS, RunOptions, form_options
+from tdhil.config.options import ASKED_AGAIN, OF_EVIDENCE, OPTION, OPTIONS, RunOptions, form_options
 from tdhil.config.reference import page_of
 from tdhil.config.registry import BUSES, EXCITATIONS, MODELS
 
@@ -273,6 +273,14 @@ def test_no_name_of_an_option_stands_in_a_second_file(file):
     found = {name for name in stated(PACKAGE / file) if name in NAMES | CHOICES}
     assert found - allowed == set(), "an option is declared in tdhil/config/options.py alone: take it from OPTION"
     assert allowed - found == set(), "an exception that nothing needs"
+
+
+def test_no_flag_of_the_statement_stands_in_a_second_file():
+    flags = {one.flag for one in OF_EVIDENCE} - {one.flag for one in OPTIONS}
+    assert len(flags) == len(OF_EVIDENCE)
+    there = {file for file in FILES for flag in flags
+             if file.endswith(".py") and f'"{flag}"' in (PACKAGE / file).read_text("utf-8")}
+    assert there == {"config/options.py"}
 
 
 def test_every_exception_is_of_a_file_and_has_a_reason():

@@ -395,6 +395,53 @@ def test_an_acceptance_that_fails_is_signed_with_a_remark_and_then_shows_who_sig
 
 
 @pytest.mark.heavy
+@pytest.mark.parametrize("width", [390, 1280])
+def test_evidence_of_a_run_is_made_on_its_page(browser, served, monkeypatch, width):
+    """Every missing part is marked at its field; then the archive is there, with its digest."""
+    from functools import partial
+
+    from tdhil.evidence import check_evidence, make_evidence
+    from tests.evidence.small_runs import found, write_run
+
+    play_uploads(served.service, monkeypatch)
+    monkeypatch.setattr("tdhil.evidence.making.make_evidence", partial(make_evidence, conclude=found))
+    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    wait_for("its end", lambda: not served.service.supervisor.live())
+    log = served.service.store.place(run) / "run.mcap"
+    log.unlink(missing_ok=True)
+    write_run(log)
+    context = browser.new_context(base_url=served.url, viewport={"width": width, "height": 800}, bypass_csp=True)
+    page = context.new_page()
+    page.goto(f"/runs/{run}")
+    page.get_by_text("Make evidence of this run").click()
+    page.get_by_label("Reference inertia at the motor shaft").fill("104")
+    page.get_by_role("button", name="Make the archive").click()
+    page.locator("#wrong-publisher").wait_for()
+    assert {"publisher", "publish", "reference_sd_kg_m2", "reference_method"} == {
+        one.get_attribute("name") for one in page.locator("#evidence-form [aria-invalid=true]").all()}
+    if axe := os.environ.get("TDHIL_AXE"):
+        page.add_script_tag(path=axe)
+        assert [one["id"] for one in page.evaluate("axe.run()")["violations"]
+                if one["impact"] in ("serious", "critical")] == []
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    for label, text in (("Publisher: who permits this", HOSTILE), ("Parts that may be published", "all"),
+                        ("Its standard uncertainty", "1"), ("How, in words", "a disc of 480 kg")):
+        page.get_by_role("textbox", name=label).fill(text)
+    page.get_by_label("How it is known").select_option("weighed")
+    page.get_by_role("button", name="Make the archive").click()
+    link = page.get_by_role("link", name="evidence.zip")
+    link.wait_for()
+    digest = page.locator(".files code").inner_text()
+    with page.expect_download() as download:
+        link.click()
+    archive = Path(download.value.path()).read_bytes()
+    assert check_evidence(archive, digest, conclude=found).problems == ()
+    assert page.evaluate("window.pwned") is None
+    context.close()
+
+
+@pytest.mark.heavy
 def test_a_run_is_tagged_archived_and_deleted_from_its_page(page, served):
     runs = []
     for note in ("done", "done"):

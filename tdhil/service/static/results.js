@@ -160,6 +160,7 @@
     });
     annotations(id);
     signature(id);
+    evidence(id);
     const sign = byId("sign");
     if (sign) sign.addEventListener("submit", async (event) => {
       event.preventDefault();
@@ -197,6 +198,26 @@
     } catch (error) {
       fail(error instanceof Refused ? error.message : "No answer from tdhil serve.");
     }
+  }
+
+  /** The archive of evidence: its form marks every wrong field; the page comes again with the link. */
+  function evidence(id) {
+    const form = byId("evidence-form"), wait = byId("evidence-wait");
+    if (!form) return;
+    form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      submits(form, byId("evidence-said"), async () => {
+        const over = waiting(wait, "The archive is made", "evidence");
+        try {
+          await call("POST", `/runs/${id}/evidence`, asked(form), {}, 600000);
+          over(true);
+          location.reload();
+        } finally {
+          over(false);
+          show(wait);
+        }
+      });
+    });
   }
 
   /** Forms that change the records of a run: annotations, archive, deletion. Each is there for its role only. */

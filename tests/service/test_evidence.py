@@ -1,0 +1,74 @@
+"""The archive of evidence of a run over HTTP: the audit, the download, every mistake at its field."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+
+import pytest
+
+from tdhil.evidence import check_evidence, make_evidence
+from tests.evidence.small_runs import found, write_run
+from tests.service.conftest import play_uploads
+from tests.service.test_records import ended, noted
+
+STATED = {"publisher": "The Institute", "publish": "log,result,identity", "remove": ["North Yard"]}
+
+
+@pytest.fixture
+def run(call, service, monkeypatch):
+    """A run with the log of a real drive; its identification is played."""
+    play_uploads(service, monkeypatch)
+    monkeypatch.setattr("tdhil.evidence.making.make_evidence", partial(make_evidence, conclude=found))
+    which = ended(call, service)
+    (service.store.place(which) / "run.mcap").unlink(missing_ok=True)
+    write_run(service.store.place(which) / "run.mcap")
+    return which
+
+
+def test_an_archive_is_made_downloaded_and_audited(call, service, client, run):
+    assert call("GET", f"/runs/{run}", 200)["evidence"] is None
+    call("GET", f"/runs/{run}/evidence.zip", 404)
+    made = call("POST", f"/runs/{run}/evidence", 201, json=STATED)
+    assert (made["publisher"], made["publish"]) == ("The Institute", ["log", "result", "identity"])
+    archive = client.get(f"/api/v1/runs/{run}/evidence.zip")
+    assert archive.headers["content-type"] == "application/zip" and "evidence.zip" in archive.headers[
+        "content-disposition"]
+    assert check_evidence(archive.content, made["sha256"], conclude=found).problems == ()
+    view = call("GET", f"/runs/{run}", 200)
+    assert view["evidence"] == made and "evidence.zip" in view["files"]
+    (asked,), (done,) = noted(service, "evidence requested"), noted(service, "evidence made")
+    assert asked.details == {"publisher": "The Institute", "publish": "log,result,identity"}
+    assert done.details["sha256"] == made["sha256"] and noted(service, "downloaded evidence.zip")
+    assert call("POST", f"/runs/{run}/evidence", 201, json=STATED)["sha256"] == made["sha256"]
+    key = service.store.folder / "evidence.key"
+    assert len(key.read_bytes()) == 32 and key.stat().st_mode & 0o77 == 0
+
+
+def test_every_mistake_of_the_statement_is_said_at_its_field(call, service, run):
+    sent = {"publish": "photo", "reference_inertia_kg_m2": "-1", "reference_method": "guessed"}
+    refused = call("POST", f"/runs/{run}/evidence", 422, json=sent)
+    assert {one["option"] for one in refused["fields"]} == {
+        "publisher", "publish", "reference_inertia_kg_m2", "reference_sd_kg_m2", "reference_method"}
+    call("POST", f"/runs/{run}/evidence", 422, json={**STATED, "photo": 1})
+    assert not noted(service, "evidence requested")
+
+
+def test_a_private_text_is_refused_and_leaves_no_archive(call, service, run):
+    told = call("POST", f"/runs/{run}/evidence", 422, json={**STATED, "firmware": "from 10.1.2.3"})
+    assert "private text" in told["error"]["message"] and "10.1.2.3" not in json.dumps(told)
+    assert not (service.store.place(run) / "evidence.zip").exists()
+
+
+def test_without_an_audit_entry_no_archive_is_made(call, service, run, monkeypatch):
+    def full(*said, **more):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(service.audit, "note", full)
+    call("POST", f"/runs/{run}/evidence", 503, json=STATED)
+    assert not (service.store.place(run) / "evidence.zip").exists()
+
+
+def test_the_run_s_page_has_the_form_for_an_engineer_only(client, run):
+    text = client.get(f"/runs/{run}").text
+    assert 'id="evidence-form"' in text and 'name="publisher"' in text and 'name="reference_method"' in text
