@@ -372,6 +372,12 @@ class RunOptions:
         more="body of known inertia, at the motor, on the embedded rig's shaft, over `plant.added_inertia_kg_m2` "
              "of the plant",
     )
+    letterhead: str | None = option(
+        "--letterhead", "letterhead", group=Topic.OUTPUT, metavar="letterhead.yaml", beside_rig=True, is_file=True,
+        min_length=1, python=False, help="company, address and logo for the report",
+        more="a file with `company`, `address` (lines) and `logo` (a PNG beside it) for the head of the report; "
+             "`tdhil serve` has its own, which an admin sets",
+    )
     trace: str | None = option(
         "--trace", "run.trace", group=Topic.SIMULATED, metavar="shaft.csv", is_file=True, min_length=1,
         help="CSV of the true motion of the embedded rig", more="CSV of the true motion of the embedded rig",
@@ -463,6 +469,21 @@ class RunDetails(_Said):
         form=Form("Note", ("run", "upload"), wide=True),
         help="remark on this run, for log and report",
     )
+    customer: str | None = option(
+        "--customer", group=Topic.OUTPUT, metavar="NAME", api=True, longest=200,
+        form=Form("Customer", ("run", "upload")),
+        help="customer, for log and report",
+    )
+    order_number: str | None = option(
+        "--order-number", group=Topic.OUTPUT, metavar="TEXT", api=True, longest=100,
+        form=Form("Order number", ("run", "upload")),
+        help="number of the customer's order, for log and report",
+    )
+    place: str | None = option(
+        "--place", group=Topic.OUTPUT, metavar="TEXT", api=True, longest=200,
+        form=Form("Place", ("run", "upload")),
+        help="place of the run, for log and report",
+    )
     faults: tuple[str, ...] = option(
         "--fault", group=Topic.SIMULATED, default=(), metavar="FAULT", api=True,
         form=Form("Rehearse a fault", ("simulated",), hint="sto@hold+2s"),
@@ -477,6 +498,10 @@ class RunDetails(_Said):
         "--real-time-priority", group=Topic.CYCLE, api=True,
         help="real-time priority for the control loop, and locked memory, if the system allows it",
     )
+
+    def texts(self) -> dict[str, str | None]:
+        """Return what a person stated of the run, by the names of `STATED`."""
+        return {name: getattr(self, name) for name in STATED}
 
 
 @dataclass(frozen=True)
@@ -550,6 +575,8 @@ OPTIONS: Final = (*RESOLVED, *_rows(Overrides), *_rows(RunDetails))
 OF_A_TRACE: Final = tuple(_rows(TraceOptions, by_field=True))
 """Options for reading a trace of another tool."""
 OPTION: Final = MappingProxyType({one.name: one for one in OPTIONS})
+STATED: Final = tuple(one.name for one in _rows(RunDetails) if one.kind is str)
+"""Names of the texts that a person states of a run, for log and report. They may be edited later."""
 ASKED_AGAIN: Final = tuple(sorted((one for one in OPTIONS if one.asked_again), key=lambda one: one.name))
 """Options that a replay, a comparison or a fleet may set differently from the run."""
 

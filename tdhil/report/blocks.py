@@ -24,6 +24,7 @@ from tdhil.report.labels import (
     TORQUE_OVER_ANGLE,
     UNCERTAINTY_BUDGET,
 )
+from tdhil.report.letterhead import NO_LETTERHEAD, Letterhead
 
 if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
@@ -108,7 +109,9 @@ class ReportSection:
 
 @dataclass(frozen=True)
 class Report:
-    """Complete report. ``simulated`` is the banner of `marks`, '' without a mark."""
+    """Complete report. ``simulated`` is the banner of `marks`, '' without a mark. ``reference``: customer, order
+    number and place, as names with texts; every sheet repeats them.
+    """
 
     title: str
     subtitle: str
@@ -117,6 +120,8 @@ class Report:
     warnings: tuple[str, ...]
     sections: tuple[ReportSection, ...]
     footer: str
+    reference: tuple[tuple[str, str], ...] = ()
+    letterhead: Letterhead = NO_LETTERHEAD
 
 
 def _simulated(document: Part) -> str:
@@ -142,7 +147,17 @@ def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
         warnings=coded_warnings(document),
         sections=tuple(section for section in _sections(document, recording, sha256) if section.blocks),
         footer=f"tdhil {document['tdhil']}" + (f" · log SHA-256 {sha256[:16]}…" if sha256 else ""),
+        reference=reference_of(document),
     )
+
+
+_REFERENCE = (("customer", "Customer"), ("order_number", "Order number"), ("place", "Place"))
+"""Keys of the document with their names in a report. A document from before 0.2 lacks them."""
+
+
+def reference_of(document: Part) -> tuple[tuple[str, str], ...]:
+    """Return customer, order number and place of a run, those that are stated."""
+    return tuple((name, str(document[key])) for key, name in _REFERENCE if document.get(key))
 
 
 def shown_date(text: str | None) -> str:
@@ -244,6 +259,9 @@ def _run_rows(document: Part, recording: Recording) -> Iterator[tuple[str, str]]
     yield "operator", document["operator"] or "not named (--operator)"
     if document["note"]:
         yield "note", document["note"]
+    for one in document.get("edits") or ():
+        yield "edited after the run", (f"{one['field'].replace('_', ' ')}, by {one['who']}, {shown_date(one['at'])}; "
+                                       f"before: {one['old'] or 'not stated'}")
     if drive:
         yield "drive", drive["name"] or "reports no name"
         yield "identity", ", ".join(f"{name} {drive[name]:X}h" for name in ("vendor", "product", "revision"))
