@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from tdhil.buses import all_buses
+from tdhil.config import STATED
 from tdhil.errors import ExitCode, LogError, MessageCode, UsageError
 from tdhil.version import __version__
 
@@ -33,7 +34,7 @@ VARIABLES = (
 """Environment variables that are included, beside those of the buses; all others are private."""
 
 _SECRET = re.compile(r"pass(word|wd|phrase)?|secret|token|api_?key|credential|authori[sz]ation|private", re.IGNORECASE)
-_PERSON = frozenset({"operator"})
+_PERSON = frozenset(STATED) - {"note"}
 _HOMES = re.compile(r"((?:/home|/Users|[A-Za-z]:\\+Users)[/\\]+)[^/\\\s'\":;,]+")
 _LOGIN = re.compile(r"(\w+://)[^/@\s]+@")
 _ASSIGNED = re.compile(rf"((?:{_SECRET.pattern})\w*\s*[:=]\s*)[^\s,}}]+", re.IGNORECASE)

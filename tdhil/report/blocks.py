@@ -13,6 +13,7 @@ from datetime import datetime
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from tdhil.config import OPTION, STATED
 from tdhil.recording import Recording
 from tdhil.report.acceptance import acceptance_rows, signature_rows
 from tdhil.report.card import COMPLIANT, estimate_text, in_degrees, inertia_text, minutes, plus_minus, rounded, sentence
@@ -151,13 +152,14 @@ def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
     )
 
 
-_REFERENCE = (("customer", "Customer"), ("order_number", "Order number"), ("place", "Place"))
-"""Keys of the document with their names in a report. A document from before 0.2 lacks them."""
+_REFERENCE = tuple(OPTION[name] for name in STATED if name not in ("operator", "note"))
+"""Texts that identify a report for its customer. The document of an earlier version lacks them."""
 
 
 def reference_of(document: Part) -> tuple[tuple[str, str], ...]:
     """Return customer, order number and place of a run, those that are stated."""
-    return tuple((name, str(document[key])) for key, name in _REFERENCE if document.get(key))
+    return tuple((one.form.label, str(document[one.name])) for one in _REFERENCE
+                 if one.form is not None and document.get(one.name))
 
 
 def shown_date(text: str | None) -> str:

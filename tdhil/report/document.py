@@ -9,7 +9,7 @@ from typing import Any
 
 from profiles import MessageCode, entry_of, with_code
 from tdhil.calibration import CalibrationUnusable, StoredCalibration
-from tdhil.config import expectations_in
+from tdhil.config import STATED, expectations_in
 from tdhil.estimation import Identification, InertiaEstimate
 from tdhil.recording import Recording
 from tdhil.report.acceptance import acceptance_of
@@ -209,9 +209,7 @@ def provenance(run: Mapping[str, Any]) -> dict[str, Any]:
     }
     return {
         "date": text_of(run.get("started")),
-        "operator": text_of(run.get("operator")),
-        "note": text_of(run.get("note")),
-        **{name: text_of(run.get(name)) for name in ("customer", "order_number", "place")},
+        **{name: text_of(run.get(name)) for name in STATED},
         "rig": rig if bench else None,
         "drive": identity if drive else None,
         "profile": {name: text_of(profile.get(name)) or "" for name in ("name", "title")} if profile else None,

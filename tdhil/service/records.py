@@ -44,15 +44,14 @@ class RunRecords:
         self._hashes: dict[str, tuple[tuple[int, int, int], str]] = {}
 
     def annotate(
-        self, run: str, who: str, *, tags: Sequence[str] | None = None, operator: str | None = None,
-        note: str | None = None,
+        self, run: str, who: str, *, tags: Sequence[str] | None = None, **texts: str | None
     ) -> None:
-        """Edit tags, operator and note of a run; None leaves a value. Raises NotThere, LogError, and ValuesWrong with
-        all wrong values.
+        """Edit tags and texts (of `STATED`) of a run; None leaves a value. Raises NotThere, LogError, and ValuesWrong
+        with all wrong values.
         """
         wrong: list[tuple[str, str]] = []
         wanted: dict[str, Any] = {}
-        for name, text in (("operator", operator), ("note", note)):
+        for name, text in texts.items():
             if text is not None:
                 wanted[name] = one_line(text)
                 if len(wanted[name]) > LONGEST_TEXT[name]:

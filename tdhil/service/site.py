@@ -19,10 +19,13 @@ from urllib.parse import quote
 import anyio
 from prometheus_client import CollectorRegistry, Counter, Gauge
 
+from tdhil.config import STATED
 from tdhil.errors import TdhilError
+from tdhil.service.acceptance_signature import FILE as SIGNATURE_FILE
 from tdhil.service.access import Access
 from tdhil.service.answers import KeptAnswers
 from tdhil.service.fleets import Fleets
+from tdhil.service.letterhead import outdated_reports
 from tdhil.service.limits import UPLOAD_LIMIT
 from tdhil.service.live_feed import Feeds
 from tdhil.service.records import RunRecords
@@ -215,9 +218,11 @@ class Site:
             status.error, status.exit_code, status.verdict,
             self.store.result(run), found, self.replays(run), read_json(folder / "signed_off.json"),
             lives(folder), request.rehearsal, None if status.rehearsal is None else dict(status.rehearsal),
-            annotations.text("operator", request.options), annotations.text("note", request.options),
-            list(annotations.tags), annotations.archived, list(annotations.edits),
-            self.records.signature(run), None if request.uploaded is None else dict(request.uploaded),
+            tags=list(annotations.tags), archived=annotations.archived, edits=list(annotations.edits),
+            signature=self.records.signature(run),
+            uploaded=None if request.uploaded is None else dict(request.uploaded),
+            outdated=outdated_reports(folder, SIGNATURE_FILE, annotations),
+            **{name: annotations.text(name, request.options) for name in STATED},
         )
 
     def broker_messages(self) -> dict[str, Any]:

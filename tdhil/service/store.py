@@ -24,6 +24,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
+from tdhil.config import STATED
 from tdhil.errors import LogUnopened
 from tdhil.service.annotations import Annotations
 from tdhil.service.run_state import NotThere, State, Status, now
@@ -36,7 +37,8 @@ RESERVE: Final = 2**16
 CONNECTION_FILE: Final = "connection.json"
 """File in a run's folder with the address of its drive, for a later stop (`tdhil.session.kept`)."""
 _RESERVE, _USED = ".reserve", ".state.json"
-_ANNOTATIONS: Final = "annotations.json"
+ANNOTATIONS_FILE: Final = "annotations.json"
+"""File in a run's folder with its later edits."""
 _DELETED: Final = ".deleted-"
 """Start of the name of a run's folder during its deletion."""
 
@@ -137,6 +139,9 @@ class Summary:
     note: str | None = None
     tags: tuple[str, ...] = ()
     archived: bool = False
+    customer: str | None = None
+    order_number: str | None = None
+    place: str | None = None
 
     def contains(self, text: str) -> bool:
         """Return whether every word of ``text`` occurs in a text of this row, in upper or lower case."""
@@ -150,7 +155,7 @@ class Summary:
         return " ".join(str(kept[name] or "") for name in SEARCHED).casefold()
 
 
-SEARCHED: Final = ("id", "rig", "state", "asked", "asked_by", "verdict", "operator", "note", "tags")
+SEARCHED: Final = ("id", "rig", "state", "asked", "asked_by", "verdict", *STATED, "tags")
 """Columns of `Summary` in which a search finds text."""
 
 
@@ -166,8 +171,8 @@ def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any]
         (result or {}).get("verdict"), inertia.get("value"), inertia.get("low_total"), inertia.get("high_total"),
         inertia.get("repeatability_rel"), status.exit_code, request.rehearsal,
         request.uploaded is not None,
-        annotations.text("operator", request.options) or None, annotations.text("note", request.options) or None,
-        annotations.tags, annotations.archived,
+        tags=annotations.tags, archived=annotations.archived,
+        **{name: annotations.text(name, request.options) or None for name in STATED},
     )
 
 
@@ -250,14 +255,14 @@ class Store:
 
     def annotations(self, run: str) -> Annotations:
         """Return the present annotations of the run; none if the file can't be read."""
-        plain = read_json(self.place(run) / _ANNOTATIONS)
+        plain = read_json(self.place(run) / ANNOTATIONS_FILE)
         with suppress(TypeError):
             return Annotations.of_plain(plain or {})
         return Annotations()
 
     def annotate(self, run: str, annotations: Annotations) -> None:
         """Write the annotations of the run. Raises NotThere and OSError."""
-        write_json(self.place(run) / _ANNOTATIONS, annotations.plain())
+        write_json(self.place(run) / ANNOTATIONS_FILE, annotations.plain())
 
     def delete(self, run: str) -> None:
         """Delete the folder of the run with all its files. Raises NotThere and OSError.
@@ -346,7 +351,7 @@ class Store:
 _COLUMNS: Final = tuple(Summary.__dataclass_fields__)
 _SEARCHED: Final = "searched"
 """Column with the text of a row in lower case, so that a search calls no function for each row."""
-_VERSION: Final = 5
+_VERSION: Final = 6
 
 
 class Index:
