@@ -96,6 +96,7 @@ class RunRecords:
             self._audit(who, "run deleted", run, request.rig, files=files, log_sha256=log_sha256,
                         asked=request.asked, asked_by=request.asked_by)
             try:
+                self._store.keep_key(request)
                 self._store.delete(run)
             except OSError as error:
                 self._supervisor.note(who, "deletion failed", run, request.rig, why=str(error))

@@ -676,7 +676,8 @@ ROUTES: Final = (
           "operator", {200: PaceView}, errors=(403, 404, 409, 422)),
     Route("POST", "/rigs/{rig}/runs", "start", "Request a run", "operator", {201: RunView, 200: RunView}, OPTIONS,
           (403, 404, 409, 422, 429, 503, 507),
-          headers={"Idempotency-Key": "the same key returns the same run and never starts a second one"}),
+          headers={"Idempotency-Key": "the same key returns the same run and never starts a second one, also after"
+                   " the run was deleted (409)"}),
     Route("POST", "/rigs/{rig}/stop", "stop_rig", "Stop the rig's run; without a run, tdhil stop on its drive, which"
           " needs an operator if no tdhil moves it", "viewer", {200: StoppedView}, Nothing, (403, 404, 503, 504)),
     Route("GET", "/runs", "runs", "The runs, the newest first", "viewer", {200: list[Summary]}, errors=(422,),

@@ -46,6 +46,8 @@ LEASES: Final = 8
 
 NO_RIG: Final = "Uploaded recording"
 """Title of a run without a rig."""
+WHOLE_INDEX_S: Final = 30.0
+"""Longest wait of a trend for an index that is being made, s: 10,000 runs take about 10 s. A list does not wait."""
 TREND_RUNS: Final = 1000
 """Number of latest runs in a trend."""
 
@@ -180,6 +182,7 @@ class Site:
         An uploaded recording has no row, since its identity is only stated by a person. Archived runs are included only
         with ``archived``.
         """
+        self.supervisor.index.wait_until_made(WHOLE_INDEX_S)
         runs = self.list_runs(rig, "done", TREND_RUNS, archived=archived)
         return [{**row, "date": _local(one.asked)} for one in runs
                 if (row := read_json(self.store.place(one.id) / "row.json")) is not None]

@@ -14,6 +14,7 @@ from tdhil.report.acceptance import signature_rows
 from tdhil.service.acceptance_signature import AcceptanceSignature, hash_of
 from tdhil.service.annotations import Annotations, tags_of
 from tdhil.service.letterhead import stored_letterhead
+from tdhil.service.run_channel import lives
 from tdhil.service.run_state import State, now, way_to
 from tdhil.service.schemas import ReplayView
 from tdhil.service.store import Index, Store, StoredRequest, write_json
@@ -240,6 +241,22 @@ def test_a_report_older_than_the_signature_is_made_again(call, service, monkeypa
     for name in ("report.html", "report.pdf", "report.html"):
         assert call("GET", f"/runs/{run}/{name}", 200).text == "signed"
     assert made == [("report", "report.html"), ("report", "report.pdf")]
+
+
+def test_the_key_of_a_deleted_run_starts_no_second_run(call, service):
+    key = {"headers": {"Idempotency-Key": "k" * 20}}
+    run = call("POST", "/rigs/a/runs", 201, json={"note": "done"}, **key)["id"]
+    service.wait(run, "done")
+    wait_for("its end", lambda: run not in service.supervisor.live())
+    assert call("POST", "/rigs/a/runs", 200, json={"note": "done"}, **key)["id"] == run
+    wait_for("its process", lambda: not lives(service.store.place(run)))
+    call("POST", f"/runs/{run}/delete", 200, json={"confirm": run})
+    for asked in ({"note": "done"}, {"note": "another"}):
+        refused = call("POST", "/rigs/a/runs", 409, json=asked, **key)["error"]["message"]
+        assert f"the run of this key, {run}, was deleted" in refused and "Nothing was started" in refused
+    assert service.store.ids() == []
+    again = call("POST", "/rigs/b/runs", 201, json={"note": "done"}, **key)["id"]   # another rig: another request
+    service.wait(again, "done")
 
 
 def test_customer_order_and_place_are_edited_later_and_make_the_report_outdated(call, service):
