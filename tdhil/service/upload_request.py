@@ -67,6 +67,10 @@ def upload_options(body: Mapping[str, Any], kind: str) -> tuple[dict[str, Any], 
         elif text := limits_in_words(option, found[name]):
             wrong.append((name, text))
     wrong += [(sd, f"needs the value: {label_of(lag)}") for lag, sd in _LAGS if sd in found and lag not in found]
+    from tdhil.recording import motion_of
+
+    refused = {name for name, _ in wrong}
+    wrong += [(name, text) for name, text in motion_of(found)[1] if name not in refused]
     return found, wrong
 
 

@@ -57,6 +57,29 @@ def american(t, w, m):
 
 
 @pytest.mark.heavy
+def test_the_options_of_one_motion_replace_its_file(run, tmp_path):
+    """The first mean speed alone: by its options the same result, digit by digit, as by a file with this segment."""
+    _, recording, excitation, _ = run
+    fresh = recording.fresh
+    columns = (recording.time_s[fresh], recording.speed_rad_s[fresh],
+               recording.torque_nm[fresh] - recording.torque_offset_nm)
+    trace, one = tmp_path / "trace.csv", tmp_path / "one.yaml"
+    trace.write_text("time_s,speed_rad_s,torque_nm\n"
+                     + "\n".join(",".join(map(repr, values)) for values in zip(*(one.tolist() for one in columns), strict=True)))
+    whole = yaml.safe_load(excitation.read_text())
+    first = whole["segments"][0]
+    one.write_text(yaml.safe_dump({**whole, "segments": [first]}))
+    options = ("--motion-start", first["start_s"], "--motion-period", first["period_s"], "--motion-periods",
+               first["periods"], "--motion-settle-periods", first["settle_periods"], "--motion-offset",
+               first["offset_rad_s"], "--motion-lines", ",".join(map(str, first["lines_hz"])), "--motion-mode",
+               whole["mode"])
+    by_file, by_options = (tdhil("replay", trace, "--json", *more) for more in (("--excitation", one), options))
+    assert by_options.document == by_file.document and by_file.document["lines"]
+    refused = tdhil("replay", trace, *options[2:])
+    assert refused.code == 2 and "--motion-start: is needed for a periodic motion" in refused.err
+
+
+@pytest.mark.heavy
 @pytest.mark.parametrize("dialect", [plain, percent, german, american])
 def test_a_run_in_other_words_has_the_same_inertia(run, tmp_path, dialect):
     document, recording, excitation, _ = run
