@@ -65,7 +65,7 @@ def test_the_options_of_one_motion_replace_its_file(run, tmp_path):
                recording.torque_nm[fresh] - recording.torque_offset_nm)
     trace, one = tmp_path / "trace.csv", tmp_path / "one.yaml"
     trace.write_text("time_s,speed_rad_s,torque_nm\n"
-                     + "\n".join(",".join(map(repr, values)) for values in zip(*(one.tolist() for one in columns), strict=True)))
+                     + "\n".join(",".join(map(repr, row)) for row in zip(*(c.tolist() for c in columns), strict=True)))
     whole = yaml.safe_load(excitation.read_text())
     first = whole["segments"][0]
     one.write_text(yaml.safe_dump({**whole, "segments": [first]}))
