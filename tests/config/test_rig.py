@@ -64,6 +64,7 @@ run:
   simulated_added_inertia_kg_m2: 55
 accept_unverified: [watchdog, likely]
 modbus: {host: 192.0.2.10, port: 5020, unit: 7}
+letterhead: letterhead.yaml
 """
 
 

@@ -147,7 +147,7 @@ def motion_of(given: Mapping[str, Any]) -> tuple[dict[str, Any] | None, list[tup
     content: dict[str, Any] = {"segments": (segment,)}
     for name, value in stated.items():
         *section, key = _KEYS[name]
-        (segment if section else content)[key] = _hertz(value) if name == "motion_lines_hz" else value
+        (segment if section else content)[str(key)] = _hertz(value) if name == "motion_lines_hz" else value
     try:
         ExcitationFile.model_validate(content)
     except ValidationError as error:
