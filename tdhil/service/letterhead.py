@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Final
 
 from tdhil.errors import LogError, UsageError
+from tdhil.fleet import ANNOTATIONS_FILE
 from tdhil.report.letterhead import LONGEST_LINE, MOST_LINES, NO_LETTERHEAD, Letterhead, clean_logo
 from tdhil.service.annotations import Annotations, one_line
 from tdhil.service.audit import Audit
 from tdhil.service.start_request import ValuesWrong
-from tdhil.service.store import ANNOTATIONS_FILE, Store, read_json, write_json
+from tdhil.service.store import Store, read_json, write_json
 
 FILE: Final = "letterhead.json"
 """File in the folder of the service."""
