@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         write_report as write_report,
     )
     from tdhil.report.letterhead import (
+        LONGEST_LINE as LONGEST_LINE, MOST_LINES as MOST_LINES,
         NO_LETTERHEAD as NO_LETTERHEAD, Letterhead as Letterhead, clean_logo as clean_logo,
         load_letterhead as load_letterhead,
     )
@@ -81,7 +82,7 @@ else:
         "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",
         "frequency_response": "draw_bode draw_faults draw_responses print_responses response_sentences save_responses",
         "html": "ShownPicture check_report_path pictures_in write_report",
-        "letterhead": "NO_LETTERHEAD Letterhead clean_logo load_letterhead",
+        "letterhead": "LONGEST_LINE MOST_LINES NO_LETTERHEAD Letterhead clean_logo load_letterhead",
         "live": "LiveDisplay",
         "page": "STYLE has_extra inline_svg install_command repeatable_figures require_extra",
         "plots": "draw_run",

@@ -11,7 +11,7 @@ from typing import Final
 
 from tdhil.errors import LogError, UsageError
 from tdhil.fleet import ANNOTATIONS_FILE
-from tdhil.report.letterhead import LONGEST_LINE, MOST_LINES, NO_LETTERHEAD, Letterhead, clean_logo
+from tdhil.report import LONGEST_LINE, MOST_LINES, NO_LETTERHEAD, Letterhead, clean_logo
 from tdhil.service.annotations import Annotations, one_line
 from tdhil.service.audit import Audit
 from tdhil.service.start_request import ValuesWrong
