@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
+from tdhil.cli import replay as replay_command
+from tdhil.cli.main import build_parser
 from tdhil.recording.csv.excitation import load_excitation
 from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import tdhil
@@ -56,6 +58,10 @@ def american(t, w, m):
         "utf-16", options
 
 
+def parse(*words):
+    return build_parser("replay").parse_args(["replay", *map(str, words)])
+
+
 @pytest.mark.heavy
 def test_the_options_of_one_motion_replace_its_file(run, tmp_path):
     """The first mean speed alone: by its options the same result, digit by digit, as by a file with this segment."""
@@ -74,7 +80,10 @@ def test_the_options_of_one_motion_replace_its_file(run, tmp_path):
                first["offset_rad_s"], "--motion-lines", ",".join(map(str, first["lines_hz"])), "--motion-mode",
                whole["mode"])
     by_file, by_options = (tdhil("replay", trace, "--json", *more) for more in (("--excitation", one), options))
-    assert by_options.document == by_file.document and by_file.document["lines"]
+    assert by_options.document == by_file.document
+    known = [replay_command.read_recorded(parse(trace, *more), trace).recording.excitation
+             for more in (("--excitation", one), options)]
+    assert known[0] == known[1] and known[0].segments[0].lines_hz == tuple(first["lines_hz"])
     refused = tdhil("replay", trace, *options[2:])
     assert refused.code == 2 and "--motion-start: is needed for a periodic motion" in refused.err
 
