@@ -5,7 +5,8 @@
     python benchmarks/many_runs.py [--runs 10000]
 
 The runs are files of requests, states and annotations without logs. Printed are the medians of five tries, s: the
-index made from the files, one entry renewed, the list, and searches that find one run, many, and none.
+index made from the files, the longest list during that, one entry renewed, the list, and searches that find one run,
+many, and none.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ import json
 import statistics
 import sys
 import tempfile
+import threading
 import time
+import timeit
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -38,6 +41,17 @@ def seconds(work: Callable[[], Any]) -> float:
         work()
         times.append(time.monotonic() - began_s)
     return statistics.median(times)
+
+
+def waits_during(index: Index) -> list[float]:
+    """Return the times of lists that are requested while the index is made again, s."""
+    work = threading.Thread(target=index.rebuild)
+    work.start()
+    times = []
+    while work.is_alive():
+        times.append(timeit.timeit(index.find, number=1))
+        time.sleep(0.02)
+    return times
 
 
 def make(store: Store, runs: int) -> None:
@@ -68,7 +82,10 @@ def main() -> None:
         index = Index(store)
         began_s = time.monotonic()
         index.rebuild()
-        print(f"{runs} runs; index made from the files: {time.monotonic() - began_s:.2f} s")
+        made_s = time.monotonic() - began_s
+        waits = waits_during(index)
+        print(f"{runs} runs; index made from the files: {made_s:.2f} s; lists during that: {len(waits)}, the longest "
+              f"took {max(waits):.4f} s, 1/{made_s / max(waits):.0f} of it")
         first = store.ids()[0]
         for what, work in (
             ("entry renewed", lambda: index.put(store.summary(first))),

@@ -150,12 +150,16 @@ class Result:
         """Return the JSON document of ``tdhil identify --json``, without any change."""
         return dict(self.document)
 
-    def save_report(self, path: str | Path) -> Path:
-        """Write the report, HTML or PDF by its name, and return its path. Raises UsageError (extra `report`)."""
-        from tdhil.report import check_report_path, write_report
+    def save_report(self, path: str | Path, letterhead: str | Path | None = None) -> Path:
+        """Write the report, HTML or PDF by its name, and return its path. Raises UsageError (extra `report`).
+
+        ``letterhead``: a letterhead.yaml with company, address and logo, as for ``--letterhead``.
+        """
+        from tdhil.report import check_report_path, load_letterhead, write_report
 
         check_report_path(Path(path), Path(self.record.log), "save_report")
-        return write_report(self.document, self.record.recording, Path(path))
+        return write_report(self.document, self.record.recording, Path(path),
+                            load_letterhead(None if letterhead is None else Path(letterhead)))
 
     def __repr__(self) -> str:
         from tdhil.report import inertia_text
@@ -273,7 +277,7 @@ def run(
     details = RunDetails.of(asked)
     chosen, connection, peer = _peer(drive, {name: one for name, one in asked.items() if one is not None})
     request = RunRequest.of(chosen, connection, peer, drive.rig, overrides=Overrides.of(asked),
-                            operator=details.operator, note=details.note,
+                            stated=details.texts(),
                             real_time_priority=bool(details.real_time_priority), expect=details.expect)
     session = RunSession(request, _operator_interface(request, confirm, on_inertia))
     try:

@@ -87,6 +87,12 @@ def hide_rare(*actions: argparse.Action) -> None:
     _RARE.update(actions)
 
 
+def add_archived(parser: argparse._ActionsContainer) -> None:
+    """Add the option that includes runs which `tdhil serve` has archived."""
+    parser.add_argument("--archived", action="store_true",
+                        help="include runs that tdhil serve has archived (default: they are left out)")
+
+
 def add_settings(parser: argparse.ArgumentParser, whose: str) -> None:
     """Add the options of identifying a log again; ``whose`` settings are the default, such as ``the run's``."""
     for option in ASKED_AGAIN:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import TIME
-from tdhil.cli.arguments import add_option, add_settings, amount, settings_in
+from tdhil.cli.arguments import add_archived, add_option, add_settings, amount, settings_in
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.errors import ExitCode, MessageCode, UsageError
@@ -57,6 +57,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--memory-limit", type=int, default=1500, metavar="MB",
                         help="memory limit for one log (default 1500 MB)")
     parser.add_argument("--no-cache", action="store_true", help="keep no recordings beside the table")
+    add_archived(parser)
     add_option(parser, OPTION["json"], help="the summary as one JSON document on stdout")
 
 
@@ -106,7 +107,7 @@ class FolderWatch:
         """Return the rows of logs that are new since the last check, and add them to the table."""
         from tdhil.fleet import find_logs, run_fleet
 
-        now = {log: _stamp(log) for log in find_logs(self._request.roots).logs}
+        now = {log: _stamp(log) for log in find_logs(self._request.roots, archived=self._request.archived).logs}
         resting = {log: stamp for log, stamp in now.items() if at_once or self._before.get(log) == stamp}
         self._before = now
         if all(self._done.get(log) == stamp for log, stamp in resting.items()):
@@ -157,7 +158,7 @@ def _request(namespace: argparse.Namespace, roots: tuple[str, ...], out: Path) -
         scheduler=getattr(namespace, "scheduler", None),
         limits=TaskLimits(namespace.time_limit, namespace.memory_limit * 1_000_000),
         cache=not namespace.no_cache, again=getattr(namespace, "again", False),
-        retry_failed=getattr(namespace, "retry_failed", False),
+        retry_failed=getattr(namespace, "retry_failed", False), archived=namespace.archived,
     )
 
 
@@ -231,6 +232,8 @@ def _print(summary: FleetSummary, as_json: bool) -> None:
     _list(console, "slowest", [f"{one['log']}: {one['cpu_s']:.2f} s of CPU" for one in found["slowest"]])
     if summary.live:
         console.print(f"skipped: {summary.live} being written")
+    if summary.archived:
+        console.print(f"left out: {counted(summary.archived, 'archived run')}; --archived includes them")
     if summary.bare_traces:
         console.print(f"skipped: {counted(summary.bare_traces, 'CSV file')} without a .yaml of the same name")
 

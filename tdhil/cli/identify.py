@@ -21,6 +21,7 @@ from tdhil.errors import ExitCode, LogError, TdhilError, code_of, error_document
 if TYPE_CHECKING:
     from tdhil.buses import Connection
     from tdhil.config import Rig, RunOptions
+    from tdhil.report import Letterhead
     from tdhil.runner import RunOutcome
     from tdhil.session import Ending, Rehearsal, RunRequest, RunSession
     from tdhil.soft_torque import EvaluationCase
@@ -108,10 +109,12 @@ def run_with(
     options, connection = connection_of(vars(namespace), rig, options)
     check_unverified(connection.profile, options)
     console = stderr_console()
+    letterhead = None
     if namespace.report is not None:
-        from tdhil.report import check_report_path
+        from tdhil.report import check_report_path, load_letterhead
 
         check_report_path(namespace.report, Path(options.log))
+        letterhead = load_letterhead(None if options.letterhead is None else Path(options.letterhead))
     _check_files(namespace, options)
     simulated = options.simulate or not connection.configured
     if namespace.dry_run:
@@ -123,15 +126,15 @@ def run_with(
     show_settings(console, options, connection, peer, rig)
     details = RunDetails.of(vars(namespace))
     request = RunRequest.of(
-        options, connection, peer, rig, overrides=Overrides.of(vars(namespace)), operator=details.operator,
-        note=details.note, real_time_priority=bool(details.real_time_priority), case=case, expect=details.expect,
+        options, connection, peer, rig, overrides=Overrides.of(vars(namespace)), stated=details.texts(),
+        real_time_priority=bool(details.real_time_priority), case=case, expect=details.expect,
     )
     if case is None:
         with console.status("planning …") if console.is_terminal else nullcontext():
             said = say_before(options, rig, connection.profile, simulated)
         if said is not None:
             console.print(said, style="yellow", markup=False)
-    return _run(request, console, namespace.report, logs)
+    return _run(request, console, namespace.report, logs, letterhead)
 
 
 def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
@@ -146,7 +149,10 @@ def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
         check_trace_path(Path(options.trace), options.source("trace"))
 
 
-def _run(request: RunRequest, console: Console, report: Path | None, logs: list[Path] | None) -> int:
+def _run(
+    request: RunRequest, console: Console, report: Path | None, logs: list[Path] | None,
+    letterhead: Letterhead | None,
+) -> int:
     import tdhil.cli.main as entry
     from tdhil.session import Ending, RunSession, TerminalOperator
 
@@ -157,14 +163,15 @@ def _run(request: RunRequest, console: Console, report: Path | None, logs: list[
     # After a run of a calibration the process continues, so signals must work again, at the prompt and later.
     with Ending(own_process=entry.process.own and logs is None) as ending:
         session = RunSession(request, operator_interface, report=report is not None)
-        code = ending.code(_finish(session, ending, options, console, report))
+        code = ending.code(_finish(session, ending, options, console, report, letterhead))
         if logs is not None:
             logs.append(session.path)
         return code
 
 
 def _finish(
-    session: RunSession, ending: Ending, options: RunOptions, console: Console, report: Path | None
+    session: RunSession, ending: Ending, options: RunOptions, console: Console, report: Path | None,
+    letterhead: Letterhead | None,
 ) -> int:
     from tdhil.cli.results import print_result, save_report
 
@@ -195,7 +202,8 @@ def _finish(
             code = code or int(exit_code(error))
         if document is not None:
             # the report contains the log's SHA-256
-            save_report(document, session.log.recording(complete=True), report, session.log.virtual_string)
+            save_report(document, session.log.recording(complete=True), report, session.log.virtual_string,
+                        letterhead=letterhead)
     return code
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tdhil.cli.arguments import add_option, add_settings, settings_in
 from tdhil.cli.results import print_result, save_report
-from tdhil.config import OF_A_TRACE, OPTION, expectations_in, expectations_of
+from tdhil.config import OF_A_TRACE, OPTION, STATED, expectations_in, expectations_of
 from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.file_hash import sha256_of
 from tdhil.session import (
@@ -27,6 +27,7 @@ from tdhil.session import (
 )
 
 if TYPE_CHECKING:
+    from tdhil.report import Letterhead
     from tdhil.session import EvaluationConclusion, RunRecord, VerificationConclusion
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,8 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_option(parser, OPTION["json"])
     parser.add_argument("--report", type=Path, metavar="FILE",
                         help="the result with pictures in one file: report.html, or report.pdf on A4")
-    add_option(parser, OPTION["operator"], help="name of the operator, for the report (default: from the log)")
-    add_option(parser, OPTION["note"], help="remark for the report (default: from the log)")
+    for name in STATED:
+        add_option(parser, OPTION[name], help=f"{OPTION[name].help.replace('log and report', 'the report')} (default: "
+                   "from the log)")
+    add_option(parser, OPTION["letterhead"])
     add_option(parser, OPTION["expect"])
     add_settings(parser, "the run's")
     parser.add_argument("--torque-calibration", type=Path, metavar="calibration.json",
@@ -64,14 +67,16 @@ def run(namespace: argparse.Namespace) -> int:
     settings_in(namespace)
     check_trace(namespace)
     require_file(path)
+    letterhead = None
     if namespace.report is not None:
-        from tdhil.report import check_report_path
+        from tdhil.report import check_report_path, load_letterhead
 
         check_report_path(namespace.report, path)
+        letterhead = load_letterhead(None if namespace.letterhead is None else Path(namespace.letterhead))
     recorded = _expecting(namespace, read_recorded(namespace, path).with_said(_said(namespace)))
     if is_evaluation(recorded.configuration) or is_verification(recorded.configuration):
-        return _evaluation(namespace, recorded)
-    return _identify(namespace, recorded)
+        return _evaluation(namespace, recorded, letterhead)
+    return _identify(namespace, recorded, letterhead)
 
 
 def read_recorded(namespace: argparse.Namespace, path: Path) -> RunRecord:
@@ -90,7 +95,7 @@ def read_recorded(namespace: argparse.Namespace, path: Path) -> RunRecord:
     return read(path, **trace)
 
 
-def _evaluation(namespace: argparse.Namespace, recorded: RunRecord) -> int:
+def _evaluation(namespace: argparse.Namespace, recorded: RunRecord, letterhead: Letterhead | None) -> int:
     """Evaluate the virtual string or the steps of this log, and print the result."""
     from tdhil.report import stderr_console
 
@@ -112,11 +117,12 @@ def _evaluation(namespace: argparse.Namespace, recorded: RunRecord) -> int:
     try:
         print_result(found.document, namespace.json)
     finally:
-        save_report(found.document, recorded.recording, namespace.report, recorded.virtual_string)
+        save_report(found.document, recorded.recording, namespace.report, recorded.virtual_string,
+                    letterhead=letterhead)
     return int(ExitCode.PARTIAL if not recorded.whole and found.exit_code is ExitCode.OK else found.exit_code)
 
 
-def _identify(namespace: argparse.Namespace, recorded: RunRecord) -> int:
+def _identify(namespace: argparse.Namespace, recorded: RunRecord, letterhead: Letterhead | None) -> int:
     """Identify and print. Return the exit code of the result, or the one for a result from a part of the run."""
     from tdhil.api import identify
     from tdhil.report import stderr_console
@@ -133,7 +139,7 @@ def _identify(namespace: argparse.Namespace, recorded: RunRecord) -> int:
     try:
         print_result(result.document, namespace.json)
     finally:
-        save_report(result.document, recorded.recording, namespace.report)
+        save_report(result.document, recorded.recording, namespace.report, letterhead=letterhead)
     part = recorded.assumed is None and not recorded.whole
     return int(ExitCode.PARTIAL if part and result.exit_code is ExitCode.OK else result.exit_code)
 
@@ -159,7 +165,7 @@ def _expecting(namespace: argparse.Namespace, recorded: RunRecord) -> RunRecord:
 
 
 def _said(namespace: argparse.Namespace) -> dict[str, str]:
-    return {name: getattr(namespace, name) for name in ("operator", "note") if getattr(namespace, name) is not None}
+    return {name: getattr(namespace, name) for name in STATED if getattr(namespace, name) is not None}
 
 
 def check_trace(namespace: argparse.Namespace) -> None:

@@ -12,24 +12,28 @@ from tdhil.cli.standard_streams import OutputLost
 
 if TYPE_CHECKING:
     from tdhil.recording import FloatArray, Recording
+    from tdhil.report import Letterhead
 
 
 def save_report(
-    document: Mapping[str, Any], recording: Recording, path: Path | None, virtual_string: FloatArray | None = None
+    document: Mapping[str, Any], recording: Recording, path: Path | None, virtual_string: FloatArray | None = None,
+    *, letterhead: Letterhead | None = None,
 ) -> None:
     """Write the report if requested. Raises UsageError if it can't be written.
 
     ``virtual_string``: its cycles, if the run has one.
     """
     if path is not None:
-        from tdhil.report import write_evaluation_report, write_report, write_verification_report
+        from tdhil.report import NO_LETTERHEAD, write_evaluation_report, write_report, write_verification_report
+
+        head = letterhead or NO_LETTERHEAD
 
         if _is_verification(document):
-            written = write_verification_report(document, path)
+            written = write_verification_report(document, path, head)
         elif _is_evaluation(document) and virtual_string is not None:
-            written = write_evaluation_report(document, virtual_string, path)
+            written = write_evaluation_report(document, virtual_string, path, head)
         else:
-            written = write_report(document, recording, path)
+            written = write_report(document, recording, path, head)
         if written != path:
             print(f"tdhil: {path} was created by another program meanwhile; the report is {written}", file=sys.stderr)  # noqa: T201
 

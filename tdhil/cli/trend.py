@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tdhil.cli.arguments import add_option, add_settings, settings_in
+from tdhil.cli.arguments import add_archived, add_option, add_settings, settings_in
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.errors import MessageCode, UsageError
@@ -39,6 +39,7 @@ def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_output(parser: argparse.ArgumentParser) -> None:
+    add_archived(parser)
     add_option(parser, OPTION["json"])
     parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with a picture, in one "
                                                                          "file (extra `report`)")
@@ -46,10 +47,18 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """Read the table, and report changes."""
-    from tdhil.fleet import read_table, trend_document
+    from tdhil.fleet import counted, is_archived, read_table, trend_document
 
     _check_report(namespace.report, (namespace.table,))
-    document = trend_document(read_table(namespace.table), namespace.rig)
+    rows = read_table(namespace.table)
+    kept = rows if namespace.archived else [row for row in rows if not is_archived(row.log)]
+    if rows and not kept:
+        raise UsageError("every run of this table is archived", where=str(namespace.table),
+                         next_step="Add --archived", entry=MessageCode.LOG_NEEDED)
+    document = trend_document(kept, namespace.rig)
+    if left := len(rows) - len(kept):
+        text = f"{counted(left, 'archived run')} left out; --archived includes them"
+        document = {**document, "notes": [*document["notes"], text]}
     if namespace.json:
         print_json(document)
     else:
@@ -65,7 +74,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 def run_compare(namespace: argparse.Namespace) -> int:
     """Identify each log, and compare it with the first."""
-    from tdhil.fleet import FleetSettings, compare_document, identified
+    from tdhil.fleet import FleetSettings, compare_document, identified, is_archived
 
     if len(namespace.logs) < 2:
         raise UsageError(f"{len(namespace.logs)} log is named, and compare needs two or more",
@@ -75,6 +84,9 @@ def run_compare(namespace: argparse.Namespace) -> int:
         if not log.is_file():
             raise UsageError("this log does not exist", where=str(log), next_step="Name a run.mcap of tdhil",
                              entry=MessageCode.FILE_NOT_FOUND)
+        if not namespace.archived and is_archived(log):
+            raise UsageError("tdhil serve has archived this run", where=str(log),
+                             next_step="Add --archived, or leave it out", entry=MessageCode.VALUE_NOT_ALLOWED)
     settings = FleetSettings(**settings_in(namespace))
     _check_report(namespace.report, namespace.logs)
     document = compare_document([identified(log, settings) for log in namespace.logs])

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
         OPTIONS as OPTIONS,
         Topic as Topic, Option as Option,
         Origin as Origin, Overrides as Overrides, RunDetails as RunDetails, RunOptions as RunOptions,
-        Setting as Setting, form_options as form_options,
+        STATED as STATED, Setting as Setting, form_options as form_options,
     )
     from tdhil.config.registry import (
         BUSES as BUSES, DEFAULT_BUS as DEFAULT_BUS, DEFAULT_EXCITATION as DEFAULT_EXCITATION,
@@ -40,7 +40,7 @@ else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "keywords": "OF_THE_RESULT OF_THE_RUN OF_THE_SIMULATOR values_of with_keywords",
         "options": "ASKED_AGAIN CLOCKS EvidenceOptions OF_A_TRACE OF_EVIDENCE OPTION OPTIONS Topic Option Origin "
-                   "Overrides RunDetails RunOptions Setting form_options",
+                   "Overrides RunDetails RunOptions STATED Setting form_options",
         "registry": "BUSES DEFAULT_BUS DEFAULT_EXCITATION EXCITATIONS MODELS SPEED_UNIT_TOLERANCE has_plateaus "
                     "imported load identified_before_echo",
         "acceptance": "ACCEPTED_QUANTITIES Expectation expectations_in expectations_of",

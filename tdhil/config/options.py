@@ -17,7 +17,7 @@ from typing import Any, Final, Literal, Protocol, Self, Union, get_args, get_ori
 
 from drivers import own_limits
 from profiles.quantities import FREQUENCY, FRICTION, INERTIA, MINUTE, PERCENT, SHARE, SPEED, TIME, TORQUE, Unit
-from tdhil.config.registry import BUSES, DEFAULT_BUS, DEFAULT_EXCITATION, EXCITATIONS, MODELS, RegistryEntry
+from tdhil.config.registry import BUSES, DEFAULT_BUS, DEFAULT_EXCITATION, EXCITATIONS, MODELS, RegistryEntry, names
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Value of an option, and its source.
@@ -80,7 +80,7 @@ _LIMITS: Final = {"gt": ("greater than", gt), "ge": ("at least", ge), "lt": ("le
 @dataclass(frozen=True)
 class Form:
     """Field of the service's forms. ``parts``: its places among ``run``, ``simulated``, ``real``, ``rehearsal``,
-    ``replay``, ``upload``, ``trace`` and ``evidence``.
+    ``replay``, ``upload``, ``trace``, ``motion``, ``motion-file`` and ``evidence``.
 
     ``unit``: unit of a number that is entered without one. ``hint``: shown in the empty field instead of the default.
     """
@@ -380,6 +380,12 @@ class RunOptions:
         more="body of known inertia, at the motor, on the embedded rig's shaft, over `plant.added_inertia_kg_m2` "
              "of the plant",
     )
+    letterhead: str | None = option(
+        "--letterhead", "letterhead", group=Topic.OUTPUT, metavar="letterhead.yaml", beside_rig=True, is_file=True,
+        min_length=1, python=False, help="company, address and logo for the report",
+        more="a file with `company`, `address` (lines) and `logo` (a PNG beside it) for the head of the report; "
+             "`tdhil serve` has its own, which an admin sets",
+    )
     trace: str | None = option(
         "--trace", "run.trace", group=Topic.SIMULATED, metavar="shaft.csv", is_file=True, min_length=1,
         help="CSV of the true motion of the embedded rig", more="CSV of the true motion of the embedded rig",
@@ -471,6 +477,21 @@ class RunDetails(_Said):
         form=Form("Note", ("run", "upload"), wide=True),
         help="remark on this run, for log and report",
     )
+    customer: str | None = option(
+        "--customer", group=Topic.OUTPUT, metavar="NAME", api=True, longest=200,
+        form=Form("Customer", ("run", "upload")),
+        help="customer, for log and report",
+    )
+    order_number: str | None = option(
+        "--order-number", group=Topic.OUTPUT, metavar="TEXT", api=True, longest=100,
+        form=Form("Order number", ("run", "upload")),
+        help="number of the customer's order, for log and report",
+    )
+    place: str | None = option(
+        "--place", group=Topic.OUTPUT, metavar="TEXT", api=True, longest=200,
+        form=Form("Place", ("run", "upload")),
+        help="place of the run, for log and report",
+    )
     faults: tuple[str, ...] = option(
         "--fault", group=Topic.SIMULATED, default=(), metavar="FAULT", api=True,
         form=Form("Rehearse a fault", ("simulated",), hint="sto@hold+2s"),
@@ -485,6 +506,10 @@ class RunDetails(_Said):
         "--real-time-priority", group=Topic.CYCLE, api=True,
         help="real-time priority for the control loop, and locked memory, if the system allows it",
     )
+
+    def texts(self) -> dict[str, str | None]:
+        """Return what a person stated of the run, by the names of `STATED`."""
+        return {name: getattr(self, name) for name in STATED}
 
 
 @dataclass(frozen=True)
@@ -501,8 +526,47 @@ class TraceOptions(_Said):
     )
     excitation: str | None = option(
         "--excitation", group=Topic.TRACE, metavar="excitation.yaml", is_file=True, api=True, longest=20_000,
-        form=Form("Periodic motion: the content of an excitation.yaml", ("trace",), hint="unknown", wide=True),
+        form=Form("Several mean speeds: the content of an excitation.yaml, in place of the fields of the motion",
+                  ("motion-file",), hint="one mean speed", wide=True),
         help="the periodic motion that was run: period, lines, mean speeds, start times",
+    )
+    motion_kind: str | None = option(
+        "--motion-kind", group=Topic.TRACE, choices=tuple(names(EXCITATIONS, periodic=True)), api=True,
+        unset=DEFAULT_EXCITATION, form=Form("Periodic motion", ("motion",), hint="unknown, or none"),
+        help="periodic motion about one mean speed (default: {default}, if another of its options is given)",
+    )
+    motion_mode: Literal["torque", "speed"] | None = option(
+        "--motion-mode", group=Topic.TRACE, api=True, unset="torque", form=Form("Controlled quantity", ("motion",)),
+        help="quantity that the drive controlled during the motion (default {default})",
+    )
+    motion_start_s: float | None = option(
+        "--motion-start", group=Topic.TRACE, unit=TIME, metavar="S", gt=-1e9, lt=1e9, api=True,
+        form=Form("Start of the first period, s in the trace", ("motion",), hint="needed"),
+        help="start of the first period, in the trace's time",
+    )
+    motion_period_s: float | None = option(
+        "--motion-period", group=Topic.TRACE, unit=TIME, metavar="S", gt=0, le=86400, api=True,
+        form=Form("Length of a period, s", ("motion",), hint="needed"), help="length of a period",
+    )
+    motion_periods: int | None = option(
+        "--motion-periods", group=Topic.TRACE, metavar="N", ge=1, le=100_000, api=True,
+        form=Form("Number of periods", ("motion",), hint="needed"), help="number of periods",
+    )
+    motion_settle_periods: int | None = option(
+        "--motion-settle-periods", group=Topic.TRACE, metavar="N", ge=0, le=100_000, api=True, unset="1",
+        form=Form("Periods at the start to leave out", ("motion",), hint="1"),
+        help="periods at the start to leave out (default {default})",
+    )
+    motion_offset_rad_s: float | None = option(
+        "--motion-offset", group=Topic.TRACE, unit=SPEED, metavar="RAD_S", gt=-1e5, lt=1e5, api=True,
+        form=Form("Mean speed of the motor shaft, rad/s", ("motion",), hint="needed"),
+        help="mean speed of the motor shaft during the motion",
+    )
+    motion_lines_hz: str | None = option(
+        "--motion-lines", group=Topic.TRACE, metavar="HZ,HZ,…", api=True, longest=900,
+        form=Form("Excited frequencies, Hz, separated by commas", ("motion",), hint="needed, such as 0.1, 0.2, 0.4",
+                  wide=True),
+        help="excited frequencies, separated by commas, such as 0.1,0.2,0.4",
     )
     rated_torque_nm: float | None = option(
         "--rated-torque", group=Topic.TRACE, unit=TORQUE, metavar="NM", gt=0, lt=1e9, api=True,
@@ -614,6 +678,8 @@ OF_A_TRACE: Final = tuple(_rows(TraceOptions, by_field=True))
 OF_EVIDENCE: Final = tuple(_rows(EvidenceOptions, by_field=True))
 """Options of the statement in an archive of evidence."""
 OPTION: Final = MappingProxyType({one.name: one for one in OPTIONS})
+STATED: Final = tuple(one.name for one in _rows(RunDetails) if one.kind is str)
+"""Names of the texts that a person states of a run, for log and report. They may be edited later."""
 ASKED_AGAIN: Final = tuple(sorted((one for one in OPTIONS if one.asked_again), key=lambda one: one.name))
 """Options that a replay, a comparison or a fleet may set differently from the run."""
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any, Final
 
-from tdhil.config import BUSES
+from tdhil.config import BUSES, STATED
 from tdhil.evidence.leaks import without_leaks
 
 NAME: Final = "<name>"
@@ -32,7 +32,7 @@ _OF_THE_BENCH: Final = frozenset({
     "make_up_torque_nm", "node", "profile", "rate_hz", "reference_inertia_kg_m2", "torque_ramp_nm_s",
 })
 """Entries of rig.yaml that stay. Address, name and folders are not among them."""
-_PRIVATE: Final = frozenset({"operator", "note", "uploaded", "connection"})
+_PRIVATE: Final = frozenset({*STATED, "uploaded", "connection"})
 """Keys of the result document whose values are left out."""
 _CATEGORICAL: Final = frozenset({"interface", "parity"})
 """Settings of the bus that stay although they are texts."""
@@ -188,7 +188,7 @@ def _names_in(run: Mapping[str, Any], *, rig_name: bool) -> set[str]:
     """Return the names that the private entries of a configuration state: of persons, rigs, hosts, folders."""
     bench = _part(run.get("bench"))
     found: set[str] = set()
-    texts = [run.get("operator")] + ([] if rig_name else [bench.get("name")])
+    texts = [run.get(name) for name in STATED if name != "note"] + ([] if rig_name else [bench.get("name")])
     for text in texts:
         if isinstance(text, str):
             found |= {text.strip(), *_WORD.findall(text)}

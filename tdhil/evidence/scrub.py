@@ -11,12 +11,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
+from tdhil.config import STATED
+
 SECRET: Final = re.compile(
     r"pass(word|wd|phrase)?|secret|token|api_?key|credential|authori[sz]ation|private", re.IGNORECASE)
 """Names of settings whose values are secrets."""
 GONE: Final = "<removed>"
 
-_PERSON = frozenset({"operator"})
+_PERSON = frozenset(STATED) - {"note"}
 _HOMES = re.compile(r"((?:/home|/Users|[A-Za-z]:\\+Users)[/\\]+)[^/\\\s'\":;,]+")
 _LOGIN = re.compile(r"(\w+://)[^/@\s]+@")
 _ASSIGNED = re.compile(rf"((?:{SECRET.pattern})\w*\s*[:=]\s*)[^\s,}}]+", re.IGNORECASE)

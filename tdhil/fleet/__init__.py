@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from profiles import lazy_names
 
 if TYPE_CHECKING:
+    from tdhil.fleet.archive_mark import ANNOTATIONS_FILE as ANNOTATIONS_FILE, is_archived as is_archived
     from tdhil.fleet.change_detection import (
         Difference as Difference, History as History, Measured as Measured, difference as difference,
         history as history,
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "change_detection": "Difference History Measured difference history",
+        "archive_mark": "ANNOTATIONS_FILE is_archived",
         "fleet": "FleetRequest FleetSummary Progress find_logs run_fleet",
         "rows": "FleetRow FleetSettings counted row_of",
         "table": "load_duckdb read_table",

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
+from tdhil.fleet.archive_mark import is_archived
 from tdhil.fleet.rows import FleetRow, FleetSettings, failure_row, row_key
 from tdhil.fleet.table import Journal, check_table_path, write_table
 from tdhil.fleet.task import Done, LogTask, content_hash, identify_log, named_errors, remote, sidecar_of
@@ -28,7 +29,8 @@ class FleetRequest:
     processes on this machine.
 
     ``scheduler``: address of a Dask cluster to use instead. ``cache``: keep recordings that were read beside the table;
-    ``again``: identify all logs anew; ``retry_failed``: identify the failed ones anew.
+    ``again``: identify all logs anew; ``retry_failed``: identify the failed ones anew. ``archived``: include runs that
+    `tdhil serve` has archived.
     """
 
     roots: tuple[str, ...]
@@ -40,6 +42,7 @@ class FleetRequest:
     cache: bool = True
     again: bool = False
     retry_failed: bool = False
+    archived: bool = True
 
     @property
     def folder(self) -> Path:
@@ -51,7 +54,7 @@ class FleetRequest:
 class FleetSummary:
     """Result of a fleet, rows by log. ``done_before``: number of rows that existed before; ``live``: of logs that are
     being written; ``bare_traces``: of CSV files without a sidecar; ``slowest``: log and CPU time in s; ``left``: number
-    of logs still to do.
+    of logs still to do; ``archived``: of archived runs that were left out.
     """
 
     rows: tuple[FleetRow, ...]
@@ -63,6 +66,7 @@ class FleetSummary:
     cpu_s: float = 0.0
     wall_s: float = 0.0
     left: int = 0
+    archived: int = 0
     interrupted: bool = False
 
     def document(self) -> dict[str, Any]:
@@ -88,6 +92,7 @@ class FleetSummary:
             ],
             "slowest": [{"log": log, "cpu_s": cpu_s} for log, cpu_s in self.slowest],
             "done_before": self.done_before, "live": self.live, "bare_traces": self.bare_traces, "left": self.left,
+            "archived": self.archived,
             "cpu_s": self.cpu_s, "wall_s": self.wall_s,
         }
 
@@ -135,7 +140,7 @@ def run_fleet(
     """
     check_table_path(request.out, request.folder)
     began = time.monotonic()
-    found = find_logs(request.roots)
+    found = find_logs(request.roots, archived=request.archived)
     if not found.logs and not found.live:
         raise UsageError("no log is there", where=", ".join(request.roots),
                          next_step="Logs end in .mcap; a trace in .csv needs a .yaml of the same name beside it",
@@ -167,6 +172,7 @@ def run_fleet(
     taken.sort(reverse=True)
     return FleetSummary(
         rows=ordered, out=request.out, done_before=before, live=len(found.live), bare_traces=len(found.bare_traces),
+        archived=len(found.archived),
         slowest=tuple((log, cpu_s) for cpu_s, log in taken[:_SLOWEST]), cpu_s=sum(cpu_s for cpu_s, _ in taken),
         wall_s=time.monotonic() - began, left=len(found.logs) - len(rows),
         interrupted=interrupted,
@@ -270,16 +276,17 @@ def _stamp(log: str) -> Stamp:
 
 @dataclass(frozen=True)
 class FoundLogs:
-    """Logs in their order; logs that are being written; traces without a sidecar."""
+    """Logs in their order; logs that are being written; traces without a sidecar; logs of archived runs."""
 
     logs: tuple[str, ...]
     live: tuple[str, ...]
     bare_traces: tuple[str, ...]
+    archived: tuple[str, ...] = ()
 
 
-def find_logs(roots: Sequence[str]) -> FoundLogs:
+def find_logs(roots: Sequence[str], *, archived: bool = True) -> FoundLogs:
     """Return every .mcap, and every .csv with a sidecar, below the folders. A file that is named itself may have any
-    ending.
+    ending. Without ``archived``, runs that `tdhil serve` has archived are left out.
 
     Raises UsageError for a root that does not exist. A folder that can't be listed is left out. A file that can't be
     read stays in the list and gets a row with its error later.
@@ -303,7 +310,8 @@ def find_logs(roots: Sequence[str]) -> FoundLogs:
         else:
             raise UsageError("there is no such file or folder", where=root, next_step=_meant(path),
                              entry=MessageCode.FILE_NOT_FOUND)
-    return FoundLogs(tuple(sorted(logs)), tuple(sorted(live)), tuple(sorted(bare)))
+    hidden = set() if archived else {one for one in logs if is_archived(one)}
+    return FoundLogs(tuple(sorted(logs - hidden)), tuple(sorted(live)), tuple(sorted(bare)), tuple(sorted(hidden)))
 
 
 def _meant(path: Path) -> str:

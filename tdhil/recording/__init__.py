@@ -11,6 +11,7 @@ if TYPE_CHECKING:
         ReferenceTrace as ReferenceTrace,
         TIME_AND_TORQUE as TIME_AND_TORQUE, USUAL as USUAL, parse_columns as parse_columns,
         TraceSurvey as TraceSurvey, column_mistakes as column_mistakes,
+        motion_of as motion_of,
         read_recording as read_recording, read_reference as read_reference, survey_trace as survey_trace,
         units_of as units_of,
     )
@@ -47,7 +48,7 @@ else:
         "builder": "RecordingBuilder RecordingPart",
         "csv": (
             "Bench GAP_INTERVALS USUAL parse_columns read_recording REFERENCE_FLAG ReferenceTrace TIME_AND_TORQUE "
-            "read_reference TraceSurvey column_mistakes survey_trace units_of"
+            "read_reference TraceSurvey motion_of column_mistakes survey_trace units_of"
         ),
         "log_audit": "LogAudit audit_log messages_of texts_of_message",
         "log_format": "CAN CHANNELS CLASSES COMMAND EXCITATION FRAME_CHANNELS LiveInertia RAW_FRAMES SAMPLE "

@@ -32,6 +32,11 @@ if TYPE_CHECKING:
         ShownPicture as ShownPicture, check_report_path as check_report_path, pictures_in as pictures_in,
         write_report as write_report,
     )
+    from tdhil.report.letterhead import (
+        LONGEST_LINE as LONGEST_LINE, MOST_LINES as MOST_LINES,
+        NO_LETTERHEAD as NO_LETTERHEAD, Letterhead as Letterhead, clean_logo as clean_logo,
+        load_letterhead as load_letterhead,
+    )
     from tdhil.report.live import LiveDisplay as LiveDisplay
     from tdhil.report.page import (
         STYLE as STYLE, has_extra as has_extra, inline_svg as inline_svg,
@@ -77,6 +82,7 @@ else:
         "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",
         "frequency_response": "draw_bode draw_faults draw_responses print_responses response_sentences save_responses",
         "html": "ShownPicture check_report_path pictures_in write_report",
+        "letterhead": "LONGEST_LINE MOST_LINES NO_LETTERHEAD Letterhead clean_logo load_letterhead",
         "live": "LiveDisplay",
         "page": "STYLE has_extra inline_svg install_command repeatable_figures require_extra",
         "plots": "draw_run",

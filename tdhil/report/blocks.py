@@ -13,6 +13,7 @@ from datetime import datetime
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from tdhil.config import OPTION, STATED
 from tdhil.recording import Recording
 from tdhil.report.acceptance import acceptance_rows, signature_rows
 from tdhil.report.card import COMPLIANT, estimate_text, in_degrees, inertia_text, minutes, plus_minus, rounded, sentence
@@ -24,6 +25,7 @@ from tdhil.report.labels import (
     TORQUE_OVER_ANGLE,
     UNCERTAINTY_BUDGET,
 )
+from tdhil.report.letterhead import NO_LETTERHEAD, Letterhead
 
 if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
@@ -108,7 +110,9 @@ class ReportSection:
 
 @dataclass(frozen=True)
 class Report:
-    """Complete report. ``simulated`` is the banner of `marks`, '' without a mark."""
+    """Complete report. ``simulated`` is the banner of `marks`, '' without a mark. ``reference``: customer, order
+    number and place, as names with texts; every sheet repeats them.
+    """
 
     title: str
     subtitle: str
@@ -117,6 +121,8 @@ class Report:
     warnings: tuple[str, ...]
     sections: tuple[ReportSection, ...]
     footer: str
+    reference: tuple[tuple[str, str], ...] = ()
+    letterhead: Letterhead = NO_LETTERHEAD
 
 
 def _simulated(document: Part) -> str:
@@ -142,7 +148,18 @@ def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
         warnings=coded_warnings(document),
         sections=tuple(section for section in _sections(document, recording, sha256) if section.blocks),
         footer=f"tdhil {document['tdhil']}" + (f" · log SHA-256 {sha256[:16]}…" if sha256 else ""),
+        reference=reference_of(document),
     )
+
+
+_REFERENCE = tuple(OPTION[name] for name in STATED if name not in ("operator", "note"))
+"""Texts that identify a report for its customer. The document of an earlier version lacks them."""
+
+
+def reference_of(document: Part) -> tuple[tuple[str, str], ...]:
+    """Return customer, order number and place of a run, those that are stated."""
+    return tuple((one.form.label, str(document[one.name])) for one in _REFERENCE
+                 if one.form is not None and document.get(one.name))
 
 
 def shown_date(text: str | None) -> str:
@@ -244,6 +261,9 @@ def _run_rows(document: Part, recording: Recording) -> Iterator[tuple[str, str]]
     yield "operator", document["operator"] or "not named (--operator)"
     if document["note"]:
         yield "note", document["note"]
+    for one in document.get("edits") or ():
+        yield "edited after the run", (f"{one['field'].replace('_', ' ')}, by {one['who']}, {shown_date(one['at'])}; "
+                                       f"before: {one['old'] or 'not stated'}")
     if drive:
         yield "drive", drive["name"] or "reports no name"
         yield "identity", ", ".join(f"{name} {drive[name]:X}h" for name in ("vendor", "product", "revision"))

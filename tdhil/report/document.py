@@ -9,7 +9,7 @@ from typing import Any
 
 from profiles import MessageCode, entry_of, with_code
 from tdhil.calibration import CalibrationUnusable, StoredCalibration
-from tdhil.config import expectations_in
+from tdhil.config import STATED, expectations_in
 from tdhil.estimation import Identification, InertiaEstimate
 from tdhil.recording import Recording
 from tdhil.report.acceptance import acceptance_of
@@ -194,7 +194,9 @@ def coded_warnings(document: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def provenance(run: Mapping[str, Any]) -> dict[str, Any]:
-    """Return date, place, operator and drive of the run; None for data that the log lacks. A log is not trusted."""
+    """Return date, place, customer, operator and drive of the run; None for data that the log lacks. A log is not
+    trusted.
+    """
     bench, drive, profile = (_mapping(run.get(name)) or {} for name in ("bench", "identity", "profile"))
     limits = _mapping(bench.get("limits")) or {}
     numbers = ("vendor", "product", "revision", "serial")
@@ -207,8 +209,7 @@ def provenance(run: Mapping[str, Any]) -> dict[str, Any]:
     }
     return {
         "date": text_of(run.get("started")),
-        "operator": text_of(run.get("operator")),
-        "note": text_of(run.get("note")),
+        **{name: text_of(run.get(name)) for name in STATED},
         "rig": rig if bench else None,
         "drive": identity if drive else None,
         "profile": {name: text_of(profile.get(name)) or "" for name in ("name", "title")} if profile else None,

@@ -12,10 +12,21 @@ import numpy as np
 from rich.text import Text as Words
 
 from tdhil.recording import FloatArray, Recording
-from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, shown_date
+from tdhil.report.blocks import (
+    AnswerBox,
+    Column,
+    Pairs,
+    Picture,
+    Report,
+    ReportSection,
+    Table,
+    reference_of,
+    shown_date,
+)
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED, rehearsal_rows, run_facts
 from tdhil.report.html import log_hash, write_blocks
+from tdhil.report.letterhead import NO_LETTERHEAD, Letterhead
 from tdhil.report.plots import DARK, OURS, QUIET, envelope
 from tdhil.soft_torque import COLUMNS, RPM, Phase
 
@@ -128,12 +139,14 @@ _CLOSE = (
 """Phases shown in detail, for `_CLOSE_S`, from so many seconds before."""
 
 
-def write_evaluation_report(document: Part, rows: FloatArray, path: Path) -> Path:
+def write_evaluation_report(
+    document: Part, rows: FloatArray, path: Path, letterhead: Letterhead = NO_LETTERHEAD
+) -> Path:
     """Write the page, HTML or PDF by its name, and return its path. ``rows``: of `COLUMNS`, one per cycle of the log.
 
     Raises UsageError if it cannot be written.
     """
-    return write_blocks(evaluation_report(document, rows, log_hash(document)), path)
+    return write_blocks(evaluation_report(document, rows, log_hash(document)), path, letterhead)
 
 
 def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Report:
@@ -172,6 +185,7 @@ def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Rep
         warnings=() if document["complete"] else ("The run was cut short: this is what there is of it.",),
         sections=tuple(sections),
         footer=f"tdhil {document['tdhil']}" + (f" · log SHA-256 {sha256[:16]}…" if sha256 else ""),
+        reference=reference_of(document),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import unescape
 from importlib.resources import files
 from pathlib import Path
@@ -14,6 +14,7 @@ from tdhil.errors import MessageCode, UsageError
 from tdhil.file_hash import sha256_of
 from tdhil.recording import Recording
 from tdhil.report.blocks import WIDTH_IN, Picture, Report, report_of
+from tdhil.report.letterhead import NO_LETTERHEAD, Letterhead
 from tdhil.report.page import inline_svg, require_extra
 
 PDF = ".pdf"
@@ -56,13 +57,15 @@ def fresh(path: Path) -> Path:
     return found
 
 
-def write_report(document: Mapping[str, Any], recording: Recording, path: Path) -> Path:
+def write_report(
+    document: Mapping[str, Any], recording: Recording, path: Path, letterhead: Letterhead = NO_LETTERHEAD
+) -> Path:
     """Write a report of a finished log, HTML or PDF by its name, and return its path.
 
     The path differs if such a file was created meanwhile. Raises UsageError if the report cannot be written.
     """
     try:
-        return _put(report_of(document, recording, log_hash(document)), path)
+        return _put(replace(report_of(document, recording, log_hash(document)), letterhead=letterhead), path)
     except OSError as error:      # of the file, or of a module or a font that cannot be read without a file descriptor
         raise UsageError(
             f"can't be written ({error.strerror or error})",
@@ -72,10 +75,10 @@ def write_report(document: Mapping[str, Any], recording: Recording, path: Path) 
         ) from error
 
 
-def write_blocks(report: Report, path: Path) -> Path:
+def write_blocks(report: Report, path: Path, letterhead: Letterhead = NO_LETTERHEAD) -> Path:
     """Write any report, HTML or PDF by its name, and return its path. Raises UsageError if it cannot be written."""
     try:
-        return _put(report, path)
+        return _put(replace(report, letterhead=letterhead), path)
     except OSError as error:
         raise UsageError(f"can't be written ({error.strerror or error})", where=f"--report {path}",
                          entry=MessageCode.FILE_NOT_WRITABLE) from error

@@ -14,6 +14,7 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 from tdhil.report.blocks import WIDTH_IN, AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
+from tdhil.report.letterhead import Letterhead
 from tdhil.report.page import lay_out, repeatable_figures
 
 if TYPE_CHECKING:
@@ -43,13 +44,26 @@ def pdf_bytes(report: Report) -> bytes:
 
 
 def sheets_of(report: Report) -> list[Figure]:
-    """Return the sheets as figures of A4, with their feet."""
+    """Return the sheets as figures of A4, with their feet.
+
+    The pictures get the height that needs the fewest sheets, without a last sheet that is mostly empty.
+    """
     with _fonts():
-        sheets = _Sheets(report.simulated)
-        _write(sheets, report)
-        for number, figure in enumerate(sheets.figures, start=1):
-            sheets.foot(figure, report.footer, f"page {number} of {len(sheets.figures)}")
-    return sheets.figures
+        laid_out = [_laid_out(report, scale) for scale in _PICTURE_SCALES]
+        return min(laid_out, key=lambda one: one.emptiness).drawn(report.footer)
+
+
+def _laid_out(report: Report, scale: float) -> _Sheets:
+    sheets = _Sheets(report.simulated, scale, _running_head(report))
+    _write(sheets, report)
+    return sheets
+
+
+def _running_head(report: Report) -> str:
+    """Return the line at the top of every sheet but the first."""
+    parts = (report.subtitle or report.title, *(f"{name} {text}" for name, text in report.reference))
+    lines = wrapped(" · ".join(filter(None, parts)), 6.8, INNER)
+    return lines[0] + (" …" if len(lines) > 1 else "")
 
 
 @contextmanager
@@ -66,62 +80,92 @@ def _metadata(report: Report) -> dict[str, Any]:
     return {"Title": title, "Subject": report.subtitle, "Creator": report.footer, "CreationDate": None}
 
 
-class _Sheets:
-    """Sheets so far; ``at`` is the position up to which the last one is filled."""
+_PICTURE_SCALES = (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 1.05, 1.1, 1.15, 1.2)
+"""Heights of the pictures that are tried, relative to their own. A flatter picture is hard to read."""
+_LEAST_FILLED = 0.25
+"""Share of the last sheet that is filled at least, if any height of the pictures allows it."""
 
-    def __init__(self, banner: str) -> None:
-        self.figures: list[Figure] = []
+
+class _Sheets:
+    """Sheets so far: the pieces of each with their positions. They are drawn when all is laid out.
+
+    ``at``: the position up to which the last sheet is filled. ``scale``: relative height of the pictures. ``figure``:
+    the sheet that is drawn.
+    """
+
+    figure: Figure
+
+    def __init__(self, banner: str, scale: float, running_head: str) -> None:
+        self._pieces: list[list[tuple[float, Draw]]] = []
         self.at = BOTTOM
-        self._banner = banner
+        self.scale = scale
+        self._banner, self._running_head = banner, running_head
         self._top = TOP
 
     def place(self, height: float, draw: Draw, space: float = 0.0) -> None:
-        """Draw a piece of this height that stays together, below a space (none at the top of a sheet)."""
-        if not self.figures or (self.at + space + height > BOTTOM and not self.fresh):
+        """Add a piece of this height that stays together, below a space (none at the top of a sheet)."""
+        if not self._pieces or (self.at + space + height > BOTTOM and not self.fresh):
             self.new()
         if self.fresh:
             space = 0.0
         self.at += space
-        draw(self, self.at)
+        self._pieces[-1].append((self.at, draw))
         self.at += height
 
     def room(self, space: float = 0.0) -> float:
         """Return the height left on this sheet below a space."""
-        return BOTTOM - self.at - space if self.figures else BOTTOM - TOP
+        return BOTTOM - self.at - space if self._pieces else BOTTOM - TOP
 
     def new(self) -> None:
         """Begin another sheet."""
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(WIDE / 72.0, HIGH / 72.0))
-        FigureCanvasAgg(figure)
-        self.figures.append(figure)
-        self.at = TOP
-        if self._banner:
-            self.box(TOP - 18.0, 15.0, LEFT, INNER, "#a21caf")
-            self.line(LEFT + 6.0, TOP - 18.0 + 10.8, self._banner, SMALL, color="white", weight="bold")
-            self.at = TOP + 6.0
-        self._top = self.at
+        first = not self._pieces
+        self._pieces.append([])
+        self._top = self.at = TOP + (6.0 if self._banner else 0.0) + (0.0 if first else 8.0)
 
     @property
     def fresh(self) -> bool:
         """Return whether the last sheet is still empty."""
-        return bool(self.figures) and self.at == self._top
+        return bool(self._pieces) and self.at == self._top
 
-    def foot(self, figure: Figure, left: str, right: str) -> None:
-        """Draw the foot of a sheet."""
-        at = HIGH - 26.0
-        for text, x, side in ((left, LEFT, "left"), (right, WIDE - LEFT, "right")):
-            figure.text(x / WIDE, 1.0 - at / HIGH, text, fontsize=6.8, color=_QUIET, ha=side, va="baseline",
-                        parse_math=False)
+    @property
+    def emptiness(self) -> tuple[int, bool, float]:
+        """Return a rank: number of sheets, whether the last one is mostly empty, and the change of the pictures."""
+        filled = (self.at - TOP) / (BOTTOM - TOP)
+        return len(self._pieces), len(self._pieces) > 1 and filled < _LEAST_FILLED, abs(self.scale - 1.0)
 
-    # -- on the last sheet -----------------------------------------------------------------------------------
+    def drawn(self, footer: str) -> list[Figure]:
+        """Draw all sheets, with a foot each."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        found = []
+        for number, pieces in enumerate(self._pieces, start=1):
+            self.figure = Figure(figsize=(WIDE / 72.0, HIGH / 72.0))
+            FigureCanvasAgg(self.figure)
+            self._head(number)
+            for at, draw in pieces:
+                draw(self, at)
+            self._foot(footer, f"page {number} of {len(self._pieces)}")
+            found.append(self.figure)
+        return found
+
+    def _head(self, number: int) -> None:
+        if self._banner:
+            self.box(TOP - 18.0, 15.0, LEFT, INNER, "#a21caf")
+            self.line(LEFT + 6.0, TOP - 18.0 + 10.8, self._banner, SMALL, color="white", weight="bold")
+        if number > 1:
+            self.line(LEFT, TOP + (6.5 if self._banner else -4.0), self._running_head, 6.8, color=_QUIET)
+
+    def _foot(self, left: str, right: str) -> None:
+        self.line(LEFT, HIGH - 26.0, left, 6.8, color=_QUIET)
+        self.line(WIDE - LEFT, HIGH - 26.0, right, 6.8, color=_QUIET, side="right")
+
+    # -- on the sheet that is drawn -----------------------------------------------------------------------------------
 
     def line(self, x: float, y: float, text: str, size: float, *, color: str = _DARK, weight: str = "normal",
              style: str = "normal", side: str = "left") -> None:
         """Draw one line of text with its baseline at ``y``."""
-        self.figures[-1].text(x / WIDE, 1.0 - y / HIGH, text, fontsize=size, color=color, fontweight=weight,
+        self.figure.text(x / WIDE, 1.0 - y / HIGH, text, fontsize=size, color=color, fontweight=weight,
                               fontstyle=style, ha=side, va="baseline", parse_math=False)
 
     def lines(self, x: float, y: float, texts: Sequence[str], size: float, **how: Any) -> None:
@@ -133,20 +177,30 @@ class _Sheets:
         """Draw a line across the page."""
         from matplotlib.lines import Line2D
 
-        figure = self.figures[-1]
+        figure = self.figure
         figure.add_artist(Line2D((LEFT / WIDE, (LEFT + INNER) / WIDE), (1.0 - y / HIGH,) * 2, lw=width, color=color))
 
     def box(self, y: float, height: float, x: float, width: float, color: str) -> None:
         """Draw a filled rectangle, from its top."""
         from matplotlib.patches import Rectangle
 
-        figure = self.figures[-1]
+        figure = self.figure
         figure.add_artist(Rectangle((x / WIDE, 1.0 - (y + height) / HIGH), width / WIDE, height / HIGH, lw=0.0,
                                     facecolor=color, transform=figure.transFigure))
 
+    def image(self, y: float, x: float, size: tuple[float, float], png: bytes) -> None:
+        """Draw a PNG of this width and height, with its own pixels."""
+        from matplotlib.image import imread
+
+        width, height = size
+        axes = self.figure.add_axes((x / WIDE, 1.0 - (y + height) / HIGH, width / WIDE, height / HIGH))
+        axes.imshow(imread(BytesIO(png), format="png"), interpolation="none", aspect="auto", cmap="gray", vmin=0.0,
+                    vmax=1.0)
+        axes.set_axis_off()
+
     def picture(self, y: float, picture: Picture, height: float) -> None:
         """Draw a figure within the figure of the sheet."""
-        figure = self.figures[-1]
+        figure = self.figure
         grid = figure.add_gridspec(3, 3, width_ratios=(LEFT, INNER, WIDE - LEFT - INNER),
                                    height_ratios=(y, height, HIGH - y - height))
         inside = figure.add_subfigure(grid[1, 1])
@@ -162,12 +216,55 @@ def _write(sheets: _Sheets, report: Report) -> None:
         on.line(LEFT, y + 17.0, report.title, 17.0, weight="bold")
         on.line(LEFT, y + 31.0, report.subtitle, 9.0, color=_QUIET)
 
-    sheets.place(38.0, head)
+    if report.letterhead:
+        _letterhead(sheets, report.letterhead)
+    sheets.place(38.0, head, 8.0)
+    if report.reference:
+        _reference(sheets, report.reference)
     _answer(sheets, report.answer)
     for warning in report.warnings:
         _warning(sheets, warning)
     for section in report.sections:
         _section(sheets, section)
+
+
+_LOGO = (180.0, 52.0)
+"""Largest width and height of the logo, points."""
+
+
+def _letterhead(sheets: _Sheets, letterhead: Letterhead) -> None:
+    """Draw the logo on the left, company and address on the right, and a line below."""
+    columns, rows = letterhead.logo_size
+    scale = min(_LOGO[0] / columns, _LOGO[1] / rows) if letterhead.logo else 0.0
+    width = INNER - (_LOGO[0] + 20.0 if letterhead.logo else 0.0)
+    company = wrapped(letterhead.company, 11.0, width, "bold") if letterhead.company else []
+    address = [part for line in letterhead.address for part in wrapped(line, SMALL, width)]
+    texts = len(company) * 11.0 * _LEADING + len(address) * SMALL * _LEADING
+    height = max(texts, rows * scale) + 8.0
+
+    def draw(on: _Sheets, y: float) -> None:
+        if letterhead.logo:
+            on.image(y, LEFT, (columns * scale, rows * scale), letterhead.logo)
+        on.lines(WIDE - LEFT, y, company, 11.0, weight="bold", side="right")
+        on.lines(WIDE - LEFT, y + len(company) * 11.0 * _LEADING, address, SMALL, color=_QUIET, side="right")
+        on.rule(y + height, "#888888", 1.0)
+
+    sheets.place(height, draw)
+
+
+def _reference(sheets: _Sheets, reference: Sequence[tuple[str, str]]) -> None:
+    """Draw customer, order number and place beside each other."""
+    share = INNER / len(reference)
+    cells = [(name, wrapped(text, 9.0, share - 12.0, "bold")) for name, text in reference]
+    most = max(len(texts) for _, texts in cells)
+
+    def draw(on: _Sheets, y: float) -> None:
+        for number, (name, texts) in enumerate(cells):
+            x = LEFT + number * share
+            on.lines(x, y, [name], SMALL, color=_QUIET)
+            on.lines(x, y + SMALL * _LEADING, texts, 9.0, weight="bold")
+
+    sheets.place((SMALL + most * 9.0) * _LEADING, draw, 2.0)
 
 
 def _answer(sheets: _Sheets, answer: AnswerBox) -> None:
@@ -241,7 +338,7 @@ def _text(sheets: _Sheets, heading: str | None, block: Text) -> None:
 
 
 def _picture(sheets: _Sheets, heading: str | None, block: Picture) -> None:
-    height = 72.0 * block.height_in * INNER / (72.0 * WIDTH_IN)
+    height = sheets.scale * block.height_in * INNER / WIDTH_IN
     caption = wrapped(block.caption, SMALL, INNER)
 
     def draw(on: _Sheets, y: float) -> None:
@@ -325,6 +422,11 @@ def _draw_rows(on: _Sheets, y: float, head: _TableRow | None, rows: Sequence[_Ta
 
 def wrapped(text: str, size: float, width: float, weight: str = "normal", style: str = "normal") -> list[str]:
     """Return lines no wider than ``width``; a word without spaces is cut if necessary."""
+    return list(_wrapped(text, size, width, weight, style))
+
+
+@lru_cache(maxsize=4096)       # the same texts are laid out again for each height of the pictures
+def _wrapped(text: str, size: float, width: float, weight: str, style: str) -> tuple[str, ...]:
     lines: list[str] = []
     for paragraph in text.splitlines() or [""]:
         line = ""
@@ -343,7 +445,7 @@ def wrapped(text: str, size: float, width: float, weight: str = "normal", style:
                 word = word[cut:]
             line = word
         lines.append(line)
-    return lines
+    return tuple(lines)
 
 
 @lru_cache(maxsize=4096)

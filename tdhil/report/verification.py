@@ -13,10 +13,21 @@ from rich.table import Table as Grid
 from rich.text import Text as Words
 
 from tdhil.recording import Recording
-from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, shown_date
+from tdhil.report.blocks import (
+    AnswerBox,
+    Column,
+    Pairs,
+    Picture,
+    Report,
+    ReportSection,
+    Table,
+    reference_of,
+    shown_date,
+)
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED, only_finite, rehearsal_rows, run_facts
 from tdhil.report.html import log_hash, write_blocks
+from tdhil.report.letterhead import NO_LETTERHEAD, Letterhead
 from tdhil.report.plots import DARK, OURS, QUIET
 
 if TYPE_CHECKING:
@@ -125,9 +136,9 @@ def _ends(part: Part, times: float) -> str:
 # As a page.
 
 
-def write_verification_report(document: Part, path: Path) -> Path:
+def write_verification_report(document: Part, path: Path, letterhead: Letterhead = NO_LETTERHEAD) -> Path:
     """Write the page, HTML or PDF by its name; return where it went. Raises UsageError if it can't be written."""
-    return write_blocks(verification_report(document, log_hash(document)), path)
+    return write_blocks(verification_report(document, log_hash(document)), path, letterhead)
 
 
 def verification_report(document: Part, sha256: str = "") -> Report:
@@ -157,6 +168,7 @@ def verification_report(document: Part, sha256: str = "") -> Report:
         warnings=() if document["complete"] else ("The run was cut short: this is what there is of it.",),
         sections=tuple(sections),
         footer=f"tdhil {document['tdhil']}" + (f" · log SHA-256 {sha256[:16]}…" if sha256 else ""),
+        reference=reference_of(document),
     )
 
 

@@ -1,4 +1,4 @@
-"""Annotations of a run, edited after it: tags, operator, note, archived. Pure data, file annotations.json.
+"""Annotations of a run, edited after it: tags, archived, and the texts of `STATED`. Pure data, annotations.json.
 
 The log and the request stay as they were recorded. An edit stands beside them, with user, time, old and new value.
 """
@@ -10,14 +10,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
-from tdhil.config import OPTION
+from tdhil.config import OPTION, STATED
 
 MOST_TAGS: Final = 20
 """Largest number of tags of a run."""
 LONGEST_TAG: Final = 40
 """Longest tag, characters."""
-LONGEST_TEXT: Final[Mapping[str, int]] = {name: OPTION[name].longest or 0 for name in ("operator", "note")}
-"""Longest operator and note, characters: as in the request of a run."""
+LONGEST_TEXT: Final[Mapping[str, int]] = {name: OPTION[name].longest or 0 for name in STATED}
+"""Longest text of each kind, characters: as in the request of a run."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,14 @@ class AnnotationEdit:
 
 @dataclass(frozen=True)
 class Annotations:
-    """Present annotations of a run. ``operator``, ``note``: None for the recorded text."""
+    """Present annotations of a run. None for a text: as recorded."""
 
     tags: tuple[str, ...] = ()
     operator: str | None = None
     note: str | None = None
+    customer: str | None = None
+    order_number: str | None = None
+    place: str | None = None
     archived: bool = False
     edits: tuple[AnnotationEdit, ...] = ()
 
@@ -53,21 +56,30 @@ class Annotations:
         return asdict(self)
 
     def text(self, field: str, recorded: Mapping[str, Any]) -> str:
-        """Return the present operator or note: the edited text, else the one in the request's options."""
+        """Return a present text, such as the operator: the edited one, else the one in the request's options."""
         edited: str | None = getattr(self, field)
         return str(recorded.get(field) or "") if edited is None else edited
 
+    @property
+    def text_edits(self) -> list[AnnotationEdit]:
+        """Return the edits of texts, which a report shows."""
+        return [one for one in self.edits if one.field in LONGEST_TEXT]
+
+    def shown_on(self, document: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a result with the present texts and their edits, for its report."""
+        present = {name: one for name in LONGEST_TEXT if (one := getattr(self, name)) is not None}
+        return {**document, **present, "edits": [asdict(one) for one in self.text_edits]}
+
     def edited(
         self, recorded: Mapping[str, Any], who: str, at: str, *, tags: Iterable[str] | None = None,
-        operator: str | None = None, note: str | None = None, archived: bool | None = None,
+        archived: bool | None = None, **texts: str | None,
     ) -> Annotations:
         """Return the annotations after an edit; None leaves a value. An equal value is no edit."""
         found = self
         new_tags = None if tags is None else tuple(tags)
         for field, old, new, value in (
             ("tags", ", ".join(self.tags), None if new_tags is None else ", ".join(new_tags), new_tags),
-            ("operator", self.text("operator", recorded), operator, operator),
-            ("note", self.text("note", recorded), note, note),
+            *((name, self.text(name, recorded), new, new) for name, new in texts.items()),
             ("archived", _yes(self.archived), None if archived is None else _yes(archived), archived),
         ):
             if new is not None and new != old:

@@ -7,6 +7,7 @@ import ssl
 import time
 import urllib.error
 import urllib.request
+from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Final
@@ -144,10 +145,13 @@ class Client:
         return self._object("POST", f"/rigs/{quote(rig, safe='')}/stop", {})
 
     def annotate(
-        self, run: str, *, tags: Sequence[str] | None = None, operator: str | None = None, note: str | None = None
+        self, run: str, *, tags: Sequence[str] | None = None, **texts: str | None
     ) -> dict[str, Any]:
-        """Edit tags, operator and note of an ended run; None leaves a value. The log stays as it is."""
-        body = {"tags": None if tags is None else list(tags), "operator": operator, "note": note}
+        """Edit tags and texts (``operator``, ``note``, ``customer``, ``order_number``, ``place``) of an ended run.
+
+        None leaves a value. The log stays as it is.
+        """
+        body = {"tags": None if tags is None else list(tags), **texts}
         return self._object("POST", f"/runs/{quote(run, safe='')}/annotations", body)
 
     def archive(self, run: str, archived: bool = True) -> dict[str, Any]:
@@ -176,6 +180,15 @@ class Client:
             time.sleep(0.2)
             found = self._object("GET", f"/runs/{quote(run, safe='')}/replays/{found['name']}")
         return found
+
+    def letterhead(self) -> dict[str, Any]:
+        """Return ``company``, ``address`` and ``logo`` (a PNG in base64) of the reports."""
+        return self._object("GET", "/letterhead")
+
+    def change_letterhead(self, company: str, address: Sequence[str], logo: bytes | None = None) -> dict[str, Any]:
+        """Change the head of the reports. ``logo``: a PNG, b'' for none, None for the present one."""
+        text = None if logo is None else b64encode(logo).decode()
+        return self._object("POST", "/letterhead", {"company": company, "address": list(address), "logo": text})
 
     def uploads(self) -> dict[str, Any]:
         """Return the uploads that wait to be identified, and ``limit_bytes``, the largest file."""

@@ -11,6 +11,7 @@ from starlette.responses import FileResponse, Response, StreamingResponse
 from tdhil.errors import MessageCode, UsageError
 from tdhil.service.acceptance_signature import FILE
 from tdhil.service.access import principal
+from tdhil.service.letterhead import outdated_reports
 from tdhil.service.middleware import off
 from tdhil.service.routing import api
 from tdhil.service.run_state import NotThere
@@ -49,32 +50,27 @@ async def log(site: Site, request: Request, body: None) -> Response:
 
 
 async def report(site: Site, request: Request, body: None) -> Response:
-    """Return the report, for display in the browser. It is made again after a signature."""
-    await _renew_signed(site, request.path_params["run"], "report.html")
+    """Return the report, for display in the browser. It is made again if signature, edits or letterhead are newer."""
+    await _renew(site, request.path_params["run"], "report.html")
     response = await file_of(site, request, "report.html", "text/html", shown=True)
     response.headers["content-security-policy"] = REPORT_POLICY
     return response
 
 
 async def report_pdf(site: Site, request: Request, body: None) -> Response:
-    """Return the report as PDF on A4 pages. It is made at the first request, and again after a signature."""
+    """Return the report as PDF on A4 pages. It is made at the first request, and again as `report`."""
     run = request.path_params["run"]
-    await _renew_signed(site, run, "report.pdf")
+    await _renew(site, run, "report.pdf")
     folder = await off(lambda: site.store.place(run))
     if not (folder / "report.pdf").exists() and (folder / "result.json").exists():
         await site.work("report", run, {"name": "report.pdf"})
     return await file_of(site, request, "report.pdf", "application/pdf")
 
 
-async def _renew_signed(site: Site, run: str, name: str) -> None:
-    """Make a report again that is older than the signature under the acceptance. Raises NotThere and Refused."""
+async def _renew(site: Site, run: str, name: str) -> None:
+    """Make a report again that is older than what it shows beside the result. Raises NotThere and Refused."""
     folder = await off(lambda: site.store.place(run))
-
-    def outdated() -> bool:
-        signed, made = folder / FILE, folder / name
-        return signed.is_file() and made.is_file() and made.stat().st_mtime_ns <= signed.stat().st_mtime_ns
-
-    if await off(outdated):
+    if name in await off(lambda: outdated_reports(folder, FILE, site.store.annotations(run))):
         await site.work("report", run, {"name": name})
 
 

@@ -40,7 +40,6 @@ from tdhil.service.start_request import ValuesWrong
 from tdhil.service.upload_request import label_of
 
 T = TypeVar("T")
-BODY_LIMIT: Final = 64 * 1024
 POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
     "form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
@@ -164,8 +163,8 @@ async def body_of(request: Request, route: Route) -> Any:
     data = b""
     async for piece in request.stream():
         data += piece
-        if len(data) > BODY_LIMIT:
-            raise UsageError(f"the body is longer than the limit of {BODY_LIMIT} bytes", where="body",
+        if len(data) > route.longest:
+            raise UsageError(f"the body is longer than the limit of {route.longest} bytes", where="body",
                              entry=MessageCode.REQUEST_WRONG)
     media = request.headers.get("content-type", "application/json").split(";")[0].strip().lower()
     if media != "application/json":

@@ -12,7 +12,7 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from tdhil.config import form_options
+from tdhil.config import OPTION, STATED, form_options
 from tdhil.service.access import principal, require
 from tdhil.service.accounts import Role
 from tdhil.service.api_page import api_page
@@ -40,6 +40,7 @@ class Pages:
         )
         self._templates.globals["version"] = __version__
         self._templates.globals["form_options"] = form_options
+        self._templates.globals["stated_options"] = [OPTION[name] for name in STATED]
 
     def render(self, request: Request, template: str, here: str, status: int = 200, **known: Any) -> Response:
         """Return a page. ``here``: the page's entry in the menu."""
@@ -64,6 +65,7 @@ class Pages:
             self._page("/compare", "compare.html", "runs"),
             self._page("/fleets", "fleets.html", "fleets"),
             self._page("/fleets/{fleet}", "fleet.html", "fleets"),
+            self._page("/letterhead", "letterhead.html", "letterhead", "admin"),
             self._page("/audit", "audit.html", "audit", "admin"),
             self._page("/accounts", "accounts.html", "accounts"),
             self._page("/docs", "docs.html", "docs"),

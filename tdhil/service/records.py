@@ -44,15 +44,14 @@ class RunRecords:
         self._hashes: dict[str, tuple[tuple[int, int, int], str]] = {}
 
     def annotate(
-        self, run: str, who: str, *, tags: Sequence[str] | None = None, operator: str | None = None,
-        note: str | None = None,
+        self, run: str, who: str, *, tags: Sequence[str] | None = None, **texts: str | None
     ) -> None:
-        """Edit tags, operator and note of a run; None leaves a value. Raises NotThere, LogError, and ValuesWrong with
-        all wrong values.
+        """Edit tags and texts (of `STATED`) of a run; None leaves a value. Raises NotThere, LogError, and ValuesWrong
+        with all wrong values.
         """
         wrong: list[tuple[str, str]] = []
         wanted: dict[str, Any] = {}
-        for name, text in (("operator", operator), ("note", note)):
+        for name, text in texts.items():
             if text is not None:
                 wanted[name] = one_line(text)
                 if len(wanted[name]) > LONGEST_TEXT[name]:
@@ -97,6 +96,7 @@ class RunRecords:
             self._audit(who, "run deleted", run, request.rig, files=files, log_sha256=log_sha256,
                         asked=request.asked, asked_by=request.asked_by)
             try:
+                self._store.keep_key(request)
                 self._store.delete(run)
             except OSError as error:
                 self._supervisor.note(who, "deletion failed", run, request.rig, why=str(error))

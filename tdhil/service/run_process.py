@@ -30,6 +30,7 @@ from tdhil.service.attendance import (
     Watcher,
     print_line,
 )
+from tdhil.service.letterhead import stored_letterhead
 from tdhil.service.run_channel import STOP_FILE, ChannelListener
 from tdhil.service.run_state import State, Status, Told, Watch, end_of, now, way_to
 from tdhil.service.start_request import binding_of, plan_of, read_rig, refuse_changed, run_request
@@ -198,7 +199,7 @@ class RunProcess:
         from tdhil.report import write_report
 
         try:
-            write_report(document, recording, Path("report.html"))
+            write_report(document, recording, Path("report.html"), stored_letterhead(self.folder.parent.parent))
         except (UsageError, OSError) as error:
             print_line(f"the report can't be written: {error}")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import anyio
 
-from tdhil.config import ASKED_AGAIN, resolve
+from tdhil.config import ASKED_AGAIN, STATED, resolve
 from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.access import principal
 from tdhil.service.accounts import ROLES
@@ -171,9 +171,10 @@ async def sign_off(site: Site, request: Request, body: SignOffBody) -> RunView:
 
 
 async def annotate(site: Site, request: Request, body: AnnotationsBody) -> RunView:
-    """Edit tags, operator and note of a run."""
+    """Edit tags, operator, note, customer, order number and place of a run."""
     which, who = request.path_params["run"], principal(request).name
-    await off(lambda: site.records.annotate(which, who, tags=body.tags, operator=body.operator, note=body.note))
+    await off(lambda: site.records.annotate(which, who, tags=body.tags,
+                                            **{name: getattr(body, name) for name in STATED}))
     return await off(lambda: site.run_view(which))
 
 

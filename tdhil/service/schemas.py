@@ -146,7 +146,8 @@ class ReplayView:
 class RunView:
     """A run without its samples. ``result``: document of `tdhil identify --json`; ``files``: names for downloads.
 
-    ``operator``, ``note``: as edited later, else as in ``options``. ``edits``: each later edit, with old and new value.
+    ``operator``, ``note``, ``customer``, ``order_number``, ``place``: as edited later, else as in ``options``.
+    ``edits``: each later edit, with old and new value. ``outdated``: reports that are made again at the next request.
     ``signature``: under its acceptance. ``uploaded``: source of an uploaded recording (file, sha256, by, at, rig as
     stated, kind, size_bytes); None for a run of this service. ``evidence``: its archive, if one was made.
     """
@@ -188,6 +189,19 @@ class RunView:
     signature: AcceptanceSignature | None = None
     uploaded: dict[str, Any] | None = None
     evidence: EvidenceView | None = None
+    customer: str = ""
+    order_number: str = ""
+    place: str = ""
+    outdated: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class LetterheadView:
+    """Head of the reports of this service. ``logo``: a PNG in base64, '' without one."""
+
+    company: str
+    address: list[str]
+    logo: str
 
 
 @dataclass(frozen=True)
@@ -395,6 +409,9 @@ class ErrorView:
 # -- request bodies -------------------------------------------------------------------------------------------------
 
 
+KIBIBYTE: Final = 1024
+
+
 class Body:
     """A request body. An unknown key is refused, not ignored."""
 
@@ -436,6 +453,18 @@ class AnnotationsBody(Body):
     tags: list[str] | None = None
     operator: str | None = None
     note: str | None = None
+    customer: str | None = None
+    order_number: str | None = None
+    place: str | None = None
+
+
+@dataclass(frozen=True)
+class LetterheadBody(Body):
+    """The whole new letterhead. ``logo``: a PNG in base64, '' for none, null for the present one."""
+
+    company: str
+    address: list[str]
+    logo: str | None = None
 
 
 @dataclass(frozen=True)
@@ -616,6 +645,8 @@ class Route:
     errors: tuple[int, ...] = ()
     query: Mapping[str, str] = field(default_factory=dict)
     headers: Mapping[str, str] = field(default_factory=dict)
+    longest: int = 64 * KIBIBYTE
+    """Largest body, bytes."""
 
 
 _ARCHIVED: Final = {"archived": "true: archived runs too"}
@@ -649,12 +680,14 @@ ROUTES: Final = (
           "operator", {200: PaceView}, errors=(403, 404, 409, 422)),
     Route("POST", "/rigs/{rig}/runs", "start", "Request a run", "operator", {201: RunView, 200: RunView}, OPTIONS,
           (403, 404, 409, 422, 429, 503, 507),
-          headers={"Idempotency-Key": "the same key returns the same run and never starts a second one"}),
+          headers={"Idempotency-Key": "the same key returns the same run and never starts a second one, also after"
+                   " the run was deleted (409)"}),
     Route("POST", "/rigs/{rig}/stop", "stop_rig", "Stop the rig's run; without a run, tdhil stop on its drive, which"
           " needs an operator if no tdhil moves it", "viewer", {200: StoppedView}, Nothing, (403, 404, 503, 504)),
     Route("GET", "/runs", "runs", "The runs, the newest first", "viewer", {200: list[Summary]}, errors=(422,),
           query={"rig": "runs of this rig only", "state": "runs in this state only",
-                 "text": "runs with these words in id, rig, state, time, user, verdict, operator, note or tags",
+                 "text": "runs with these words in id, rig, state, time, user, verdict, operator, note,"
+                 " customer, order number, place or tags",
                  "limit": "most runs to return (100)", **_ARCHIVED}),
     Route("GET", "/runs/compare", "compare", "Compare runs", "viewer", {200: CompareView}, errors=(404, 422),
           query={"runs": "two to eight runs, separated by commas", **_ARCHIVED}),
@@ -667,8 +700,9 @@ ROUTES: Final = (
           Nothing, (403, 404, 503, 504)),
     Route("POST", "/runs/{run}/sign-off", "sign_off", "Sign off a stop that was not confirmed", "engineer",
           {200: RunView}, SignOffBody, (403, 404, 409, 422)),
-    Route("POST", "/runs/{run}/annotations", "annotate", "Edit tags, operator and note of a run; its log stays as"
-          " recorded", "operator", {200: RunView}, AnnotationsBody, (403, 404, 422, 503)),
+    Route("POST", "/runs/{run}/annotations", "annotate", "Edit tags, operator, note, customer, order"
+          " number and place of a run; its log stays as recorded", "operator", {200: RunView}, AnnotationsBody,
+          (403, 404, 422, 503)),
     Route("POST", "/runs/{run}/archive", "archive", "Hide a run from lists and histories, or show it again",
           "engineer", {200: RunView}, ArchiveBody, (403, 404, 409, 422, 503)),
     Route("POST", "/runs/{run}/delete", "delete_run", "Delete a run with all its files; the audit keeps the entry",
@@ -728,6 +762,10 @@ ROUTES: Final = (
           query={"from": "first row (0)", "limit": "most rows to return (200)"}),
     Route("GET", "/fleets/{fleet}/fleet.csv", "fleet_table", "The table of a fleet request", "viewer",
           _file("text/csv"), errors=(404,), headers=_RANGE),
+    Route("GET", "/letterhead", "letterhead", "Company, address and logo of the reports", "viewer",
+          {200: LetterheadView}),
+    Route("POST", "/letterhead", "change_letterhead", "Change company, address and logo of the reports", "admin",
+          {200: LetterheadView}, LetterheadBody, (403, 422, 503), longest=512 * KIBIBYTE),
     Route("GET", "/audit", "audit", "The audit: requests, confirmations, stops, downloads", "admin", {200: AuditView},
           query={"limit": "most lines to return (200)", "head": "an exported NUMBER:HASH to check the chain against"}),
     Route("POST", "/login", "login", "Name and password for a session, in two cookies", None, {200: MeView}, LoginBody,

@@ -10,11 +10,13 @@ from prometheus_client import generate_latest
 from starlette.responses import Response
 
 from tdhil.errors import MessageCode, UsageError
+from tdhil.service import letterhead as letterheads
 from tdhil.service.access import principal
 from tdhil.service.audit import ChainHead
+from tdhil.service.letterhead import stored_letterhead
 from tdhil.service.middleware import off
 from tdhil.service.routing import api
-from tdhil.service.schemas import AuditView, HealthView, document
+from tdhil.service.schemas import AuditView, HealthView, LetterheadBody, LetterheadView, document
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
@@ -28,6 +30,8 @@ def routes(site: Site) -> list[Route]:
     """Return the routes. Health and metrics are also at the root, where monitoring systems expect them."""
     return [
         api(site, audit),
+        api(site, letterhead),
+        api(site, change_letterhead),
         api(site, health),
         api(site, health, base=""),
         api(site, metrics),
@@ -51,6 +55,19 @@ async def audit(site: Site, request: Request, body: None) -> AuditView:
         return AuditView(entries[-int(limit):][::-1], broken, None if head is None else str(head), book.made())
 
     return await off(look)
+
+
+async def letterhead(site: Site, request: Request, body: None) -> LetterheadView:
+    """Return company, address and logo of the reports."""
+    return LetterheadView(**(await off(lambda: stored_letterhead(site.store.folder))).plain())
+
+
+async def change_letterhead(site: Site, request: Request, body: LetterheadBody) -> LetterheadView:
+    """Change company, address and logo of the reports."""
+    who = principal(request).name
+    found = await off(lambda: letterheads.change_letterhead(
+        site.store, site.supervisor.audit, who, company=body.company, address=body.address, logo=body.logo))
+    return LetterheadView(**found.plain())
 
 
 async def health(site: Site, request: Request, body: None) -> HealthView:

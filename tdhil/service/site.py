@@ -19,11 +19,14 @@ from urllib.parse import quote
 import anyio
 from prometheus_client import CollectorRegistry, Counter, Gauge
 
+from tdhil.config import STATED
 from tdhil.errors import TdhilError
+from tdhil.service.acceptance_signature import FILE as SIGNATURE_FILE
 from tdhil.service.access import Access
 from tdhil.service.answers import KeptAnswers
 from tdhil.service.evidence_request import ABOUT, ARCHIVE, evidence_in
 from tdhil.service.fleets import Fleets
+from tdhil.service.letterhead import outdated_reports
 from tdhil.service.limits import UPLOAD_LIMIT
 from tdhil.service.live_feed import Feeds
 from tdhil.service.records import RunRecords
@@ -44,6 +47,8 @@ LEASES: Final = 8
 
 NO_RIG: Final = "Uploaded recording"
 """Title of a run without a rig."""
+WHOLE_INDEX_S: Final = 30.0
+"""Longest wait of a trend for an index that is being made, s: 10,000 runs take about 10 s. A list does not wait."""
 TREND_RUNS: Final = 1000
 """Number of latest runs in a trend."""
 
@@ -178,6 +183,7 @@ class Site:
         An uploaded recording has no row, since its identity is only stated by a person. Archived runs are included only
         with ``archived``.
         """
+        self.supervisor.index.wait_until_made(WHOLE_INDEX_S)
         runs = self.list_runs(rig, "done", TREND_RUNS, archived=archived)
         return [{**row, "date": _local(one.asked)} for one in runs
                 if (row := read_json(self.store.place(one.id) / "row.json")) is not None]
@@ -217,10 +223,12 @@ class Site:
             status.error, status.exit_code, status.verdict,
             self.store.result(run), found, self.replays(run), read_json(folder / "signed_off.json"),
             lives(folder), request.rehearsal, None if status.rehearsal is None else dict(status.rehearsal),
-            annotations.text("operator", request.options), annotations.text("note", request.options),
-            list(annotations.tags), annotations.archived, list(annotations.edits),
-            self.records.signature(run), None if request.uploaded is None else dict(request.uploaded),
-            evidence_in(read_json(folder / ABOUT)),
+            tags=list(annotations.tags), archived=annotations.archived, edits=list(annotations.edits),
+            signature=self.records.signature(run),
+            uploaded=None if request.uploaded is None else dict(request.uploaded),
+            evidence=evidence_in(read_json(folder / ABOUT)),
+            outdated=outdated_reports(folder, SIGNATURE_FILE, annotations),
+            **{name: annotations.text(name, request.options) for name in STATED},
         )
 
     def broker_messages(self) -> dict[str, Any]:

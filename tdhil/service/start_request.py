@@ -343,7 +343,7 @@ def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None 
                 raise UsageError("is for a simulated rig", where=one.name, entry=MessageCode.REQUEST_WRONG)
     return RunRequest.of(
         options, connection, replace(peer, left_in=left_in), rig.rig, overrides=Overrides.of(asked),
-        operator=details.operator, note=details.note, expect=details.expect,
+        stated=details.texts(), expect=details.expect,
         real_time_priority=not peer.embedded if details.real_time_priority is None else details.real_time_priority,
     )
 

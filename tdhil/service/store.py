@@ -24,7 +24,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
+from tdhil.config import STATED
 from tdhil.errors import LogUnopened
+from tdhil.fleet import ANNOTATIONS_FILE
 from tdhil.service.annotations import Annotations
 from tdhil.service.run_state import NotThere, State, Status, now
 
@@ -36,7 +38,10 @@ RESERVE: Final = 2**16
 CONNECTION_FILE: Final = "connection.json"
 """File in a run's folder with the address of its drive, for a later stop (`tdhil.session.kept`)."""
 _RESERVE, _USED = ".reserve", ".state.json"
-_ANNOTATIONS: Final = "annotations.json"
+_DELETED_KEYS: Final = "deleted_keys.json"
+"""File with the requests of deleted runs that had an Idempotency-Key."""
+KEYS: Final = 500
+"""Number of newest runs, and of deleted runs, that are searched for an Idempotency-Key."""
 _DELETED: Final = ".deleted-"
 """Start of the name of a run's folder during its deletion."""
 
@@ -137,6 +142,9 @@ class Summary:
     note: str | None = None
     tags: tuple[str, ...] = ()
     archived: bool = False
+    customer: str | None = None
+    order_number: str | None = None
+    place: str | None = None
 
     def contains(self, text: str) -> bool:
         """Return whether every word of ``text`` occurs in a text of this row, in upper or lower case."""
@@ -150,7 +158,7 @@ class Summary:
         return " ".join(str(kept[name] or "") for name in SEARCHED).casefold()
 
 
-SEARCHED: Final = ("id", "rig", "state", "asked", "asked_by", "verdict", "operator", "note", "tags")
+SEARCHED: Final = ("id", "rig", "state", "asked", "asked_by", "verdict", *STATED, "tags")
 """Columns of `Summary` in which a search finds text."""
 
 
@@ -166,8 +174,8 @@ def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any]
         (result or {}).get("verdict"), inertia.get("value"), inertia.get("low_total"), inertia.get("high_total"),
         inertia.get("repeatability_rel"), status.exit_code, request.rehearsal,
         request.uploaded is not None,
-        annotations.text("operator", request.options) or None, annotations.text("note", request.options) or None,
-        annotations.tags, annotations.archived,
+        tags=annotations.tags, archived=annotations.archived,
+        **{name: annotations.text(name, request.options) or None for name in STATED},
     )
 
 
@@ -250,14 +258,14 @@ class Store:
 
     def annotations(self, run: str) -> Annotations:
         """Return the present annotations of the run; none if the file can't be read."""
-        plain = read_json(self.place(run) / _ANNOTATIONS)
+        plain = read_json(self.place(run) / ANNOTATIONS_FILE)
         with suppress(TypeError):
             return Annotations.of_plain(plain or {})
         return Annotations()
 
     def annotate(self, run: str, annotations: Annotations) -> None:
         """Write the annotations of the run. Raises NotThere and OSError."""
-        write_json(self.place(run) / _ANNOTATIONS, annotations.plain())
+        write_json(self.place(run) / ANNOTATIONS_FILE, annotations.plain())
 
     def delete(self, run: str) -> None:
         """Delete the folder of the run with all its files. Raises NotThere and OSError.
@@ -268,6 +276,20 @@ class Store:
         gone = folder.rename(folder.with_name(f"{_DELETED}{run}"))
         _sync_folder(self.runs)
         shutil.rmtree(gone, ignore_errors=True)
+
+    def keep_key(self, request: StoredRequest) -> None:
+        """Remember the Idempotency-Key of a run that is about to be deleted. Raises OSError."""
+        if request.idempotency_key is not None:
+            kept = [*self._deleted_keys(), [request.id, request.rig, request.idempotency_key, request.asked_by]]
+            write_json(self.folder / _DELETED_KEYS, {"runs": kept[-KEYS:]})
+
+    def deleted_with_key(self, rig: str, key: str, who: str) -> str | None:
+        """Return the deleted run that this user requested of this rig with this key; None if there is none."""
+        return next((str(run) for run, *of in reversed(self._deleted_keys()) if of == [rig, key, who]), None)
+
+    def _deleted_keys(self) -> list[list[str]]:
+        found = (read_json(self.folder / _DELETED_KEYS) or {}).get("runs")
+        return [one for one in found if isinstance(one, list) and one] if isinstance(found, list) else []
 
     def finish_deletions(self) -> None:
         """Delete the folders whose deletion was interrupted."""
@@ -346,7 +368,9 @@ class Store:
 _COLUMNS: Final = tuple(Summary.__dataclass_fields__)
 _SEARCHED: Final = "searched"
 """Column with the text of a row in lower case, so that a search calls no function for each row."""
-_VERSION: Final = 5
+_VERSION: Final = 6
+BATCH: Final = 100
+"""Runs that are written to the index under its lock at a time: 5 to 20 ms, after their files were read without it."""
 
 
 class Index:
@@ -356,15 +380,23 @@ class Index:
         self._store = store
         self._path = store.folder / "index.sqlite"
         self._lock = threading.Lock()
+        self._making = threading.Lock()
+        self._changed: set[str] = set()        # runs with a newer row than a rebuild in progress may have read
+        self._made_anew = False                # whether the last `_open` made empty tables
+        self._checked: tuple[int, int] | None = None           # device and inode of the file that has this version
 
     def put(self, summary: Summary) -> None:
         """Add or replace a row. Raises sqlite3.Error if it is locked or the disk is full; the files stay correct."""
+        self._ensure()
         with self._lock, closing(self._open()) as base, base:
+            self._note_change(summary.id)
             self._put(base, summary)
 
     def remove(self, run: str) -> None:
         """Remove a row, if it exists. Raises sqlite3.Error."""
+        self._ensure()
         with self._lock, closing(self._open()) as base, base:
+            self._note_change(run)
             base.execute("delete from runs where id = ?", (run,))
 
     def find(
@@ -373,8 +405,10 @@ class Index:
     ) -> list[Summary]:
         """Return matching rows, the newest first; archived runs only with ``archived``. Raises sqlite3.Error.
 
-        ``text``: words for `Summary.contains`.
+        ``text``: words for `Summary.contains`. During `rebuild`, the rows are those of the former index, or without
+        one the newest so far.
         """
+        self._ensure()
         where = [] if archived else ["not archived"]
         where += [f"{name} = ?" for name, value in (("rig", rig), ("state", state)) if value is not None]
         values = [value for value in (rig, state) if value is not None]
@@ -388,38 +422,91 @@ class Index:
             ).fetchall()
         return [_summary_of_row(dict(zip(_COLUMNS, row, strict=True))) for row in rows]
 
-    def rebuild(self) -> int:
-        """Make the index again from the files. Return the number of runs."""
-        with self._lock:
-            self._path.unlink(missing_ok=True)
-            with closing(self._open(filled=False)) as base, base:
-                return self._fill(base)
+    def wait_until_made(self, within_s: float) -> bool:
+        """Wait for a rebuild in progress. Return whether the index has every run."""
+        made = self._making.acquire(timeout=within_s)
+        if made:
+            self._making.release()
+        return made
 
-    def _open(self, *, filled: bool = True) -> sqlite3.Connection:
-        new = not self._path.exists()
+    def rebuild(self) -> int:
+        """Make the index again from the files. Return the number of runs.
+
+        The files are read without the lock. It is held for `BATCH` rows at a time, so that a list waits for one batch.
+        """
+        with self._making:
+            return self._rebuild()
+
+    def _rebuild(self) -> int:
+        with self._lock:
+            self._changed.clear()
+            try:
+                with closing(self._open()) as base:
+                    sound = base.execute("pragma quick_check(1)").fetchone() == ("ok",)
+            except sqlite3.OperationalError:           # locked, or the disk is full: no reason to delete it
+                raise
+            except sqlite3.DatabaseError:
+                sound = False
+            if not sound:
+                self._path.unlink(missing_ok=True)
+        ids = self._store.ids()
+        count = 0
+        for start in range(0, len(ids), BATCH):
+            found = []
+            for run in ids[start : start + BATCH]:
+                with suppress(NotThere):
+                    found.append(self._store.summary(run))
+            count += len(found)
+            with self._lock, closing(self._open()) as base, base:
+                for summary in found:
+                    if summary.id not in self._changed:
+                        self._put(base, summary)
+        with self._lock, closing(self._open()) as base, base:
+            gone = {run for (run,) in base.execute("select id from runs")} - set(ids) - self._changed
+            base.executemany("delete from runs where id = ?", ((run,) for run in gone))
+        return count
+
+    def _note_change(self, run: str) -> None:
+        if self._making.locked():
+            self._changed.add(run)
+
+    def _ensure(self) -> None:
+        """Make an index that is missing or of another version, unless another thread does so now."""
+        with suppress(OSError):
+            found = self._path.stat()
+            if found.st_size and (found.st_dev, found.st_ino) == self._checked:
+                return
+        if not self._making.acquire(blocking=False):
+            return
+        try:
+            with self._lock, closing(self._open()) as base:
+                made = self._made_anew
+                base.execute("select 1 from runs limit 1")
+            if made:
+                self._rebuild()
+        finally:
+            self._making.release()
+
+    def _open(self) -> sqlite3.Connection:
+        """Return the open index; empty tables if it is missing or of another version. The lock is held."""
         base = sqlite3.connect(self._path, timeout=0.5)
         try:
             base.execute("pragma journal_mode = delete")
             base.execute("pragma synchronous = full")
             (version,) = base.execute("pragma user_version").fetchone()
-            if new or version != _VERSION:
+            self._made_anew = version != _VERSION
+            if self._made_anew:
                 with base:
                     base.execute("drop table if exists runs")
                     base.execute(f"create table runs (id text primary key, {', '.join((*_COLUMNS[1:], _SEARCHED))})")
                     base.execute("create index by_rig on runs (rig, id)")
                     base.execute(f"pragma user_version = {_VERSION}")
-                    if filled:
-                        self._fill(base)
+            found = self._path.stat()
+            self._checked = found.st_dev, found.st_ino
         except BaseException:
             base.close()
             raise
         return base
-
-    def _fill(self, base: sqlite3.Connection) -> int:
-        found = list(self._store.summaries())
-        for summary in found:
-            self._put(base, summary)
-        return len(found)
 
     @staticmethod
     def _put(base: sqlite3.Connection, summary: Summary) -> None:

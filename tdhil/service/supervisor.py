@@ -54,7 +54,7 @@ from tdhil.service.start_request import (
     require_motion,
     require_new_rig,
 )
-from tdhil.service.store import CONNECTION_FILE, Index, Store, StoredRequest, read_json, write_json, write_whole
+from tdhil.service.store import CONNECTION_FILE, KEYS, Index, Store, StoredRequest, read_json, write_json, write_whole
 from tdhil.session import Holder, holder_of, holders
 
 LOOK_S: Final = 0.2
@@ -63,8 +63,6 @@ INDEX_LOOKS: Final = 10
 """Number of checks between two tries to write a failed index entry."""
 STOP_S: Final = 60.0
 """Longest duration of `tdhil stop` for a shaft that keeps turning, s."""
-KEYS: Final = 500
-"""Number of newest runs that are searched for an Idempotency-Key."""
 SIMULATED_STOP: Final = "no real shaft turns: the simulated drive ended with its run"
 Say = Callable[[str], None]
 
@@ -221,6 +219,9 @@ class Supervisor:
                     raise Conflict("this key was used for another request", where="Idempotency-Key",
                                    next_step="Use a new key")
                 return Asked(before, new=False)
+            if key is not None and (gone := self.store.deleted_with_key(rig_id, key, who)) is not None:
+                raise Conflict(f"the run of this key, {gone}, was deleted", where="Idempotency-Key",
+                               next_step="Nothing was started. Use a new key for a new run")
             if self._braking:
                 raise Conflict("the service is ending", next_step="Start tdhil serve again")
             self.refuse_busy(rig)

@@ -1,4 +1,4 @@
-"""Request to read or identify an uploaded recording: options for a trace, settings, operator, note and the rig."""
+"""Request to read or identify an uploaded recording: options for a trace, settings, texts and the rig."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final
 
-from tdhil.config import ASKED_AGAIN, OF_A_TRACE, OPTION, Option
+from tdhil.config import ASKED_AGAIN, OF_A_TRACE, OPTION, STATED, Option
 from tdhil.errors import MessageCode, UsageError
 from tdhil.service.start_request import ValuesWrong, limits_in_words, value_of
 
 RIG: Final = "rig"
 """Key of the rig as the person states it, '' for none."""
-_ALSO: Final = (*ASKED_AGAIN, OPTION["operator"], OPTION["note"])
+_ALSO: Final = (*ASKED_AGAIN, *(OPTION[name] for name in STATED))
 ACCEPTED: Final = MappingProxyType({one.name: one for one in (*OF_A_TRACE, *_ALSO)})
 """Options of a request about an upload, by name."""
 _OF_A_TRACE: Final = frozenset(one.name for one in OF_A_TRACE)
@@ -67,6 +67,10 @@ def upload_options(body: Mapping[str, Any], kind: str) -> tuple[dict[str, Any], 
         elif text := limits_in_words(option, found[name]):
             wrong.append((name, text))
     wrong += [(sd, f"needs the value: {label_of(lag)}") for lag, sd in _LAGS if sd in found and lag not in found]
+    from tdhil.recording import motion_of
+
+    refused = {name for name, _ in wrong}
+    wrong += [(name, text) for name, text in motion_of(found)[1] if name not in refused]
     return found, wrong
 
 

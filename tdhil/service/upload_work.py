@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from tdhil.config import ASKED_AGAIN, OF_A_TRACE
+from tdhil.config import ASKED_AGAIN, OF_A_TRACE, STATED
 from tdhil.errors import ExitCode, LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.run_state import Told
 from tdhil.service.store import read_json, write_json
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 PLOTTED: Final = 800
 """Number of stretches in the plot of a preview; each has the smallest and the largest value."""
-SAID: Final = ("operator", "note")
 
 
 def read_marked() -> RunRecord:
@@ -176,7 +175,7 @@ def identify_upload(kind: str, options: Mapping[str, Any], source: Mapping[str, 
     for name in ("result.json", "report.html", *((LOG,) if kind == "trace" else ())):
         Path(name).unlink(missing_ok=True)
     record = read_upload(kind, options)
-    said = {name: options[name] for name in SAID if options.get(name)}
+    said = {name: options[name] for name in STATED if options.get(name)}
     settings = {one.name: options[one.name] for one in ASKED_AGAIN if options.get(one.name) is not None}
     configuration = {**record.asked(settings), **said, "uploaded": dict(source)}
     record = replace(record, configuration=configuration, log=LOG)
@@ -198,13 +197,14 @@ def identify_upload(kind: str, options: Mapping[str, Any], source: Mapping[str, 
     return {
         "verdict": document["verdict"], "exit_code": int(code), "simulated": record.recording.simulated,
         "rehearsal": document["rehearsal"], "identity": (document["drive"] or {}).get("name") or "",
-        "said": {**{name: document[name] for name in SAID if document[name]},
+        "said": {**{name: document[name] for name in STATED if document[name]},
                  **({"fault": document["rehearsed_faults"]} if document["rehearsed_faults"] else {})},
     }
 
 
 def _write_report(document: Mapping[str, Any], recording: Recording) -> None:
     from tdhil.report import write_report
+    from tdhil.service.letterhead import stored_letterhead
 
     with suppress(UsageError, LogError, OSError):      # the result is valid without its report
-        write_report(document, recording, Path("report.html"))
+        write_report(document, recording, Path("report.html"), stored_letterhead(Path("../..")))

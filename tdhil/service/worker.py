@@ -9,6 +9,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -54,15 +55,22 @@ def replay(asked: dict[str, Any]) -> dict[str, Any]:
 def report(asked: dict[str, Any]) -> dict[str, Any]:
     """Write the report of a run with a result to the named file."""
     from tdhil.report import require_extra, write_report
+    from tdhil.service.letterhead import stored_letterhead
+    from tdhil.service.store import Store
     from tdhil.session import read
 
     require_extra("report")
     os.chdir(asked["folder"])
     wanted = Path(str(asked["name"])).name
     beside = Path(f".{os.getpid()}-{wanted}")
-    document = _signed(json.loads(Path("result.json").read_bytes()))
+    began_ns = time.time_ns()
+    noted = Store(Path("../..")).annotations(Path.cwd().name)
+    document = noted.shown_on(_signed(json.loads(Path("result.json").read_bytes())))
+    letterhead = stored_letterhead(Path("../.."))
     try:
-        write_report(document, read("run.mcap").recording, beside).replace(wanted)
+        written = write_report(document, read("run.mcap").recording, beside, letterhead)
+        os.utime(written, ns=(began_ns, began_ns))     # a change while the report was made makes it outdated
+        written.replace(wanted)
     finally:
         beside.unlink(missing_ok=True)
     return {"document": {"file": wanted}}

@@ -142,7 +142,7 @@ def read(
     path: str | Path,
     *,
     columns: Sequence[str] | None = None,
-    excitation: str | Path | None = None,
+    excitation: str | Path | Mapping[str, Any] | None = None,
     rated_torque_nm: float | None = None,
     torque_limit_nm: float | None = None,
     gear_ratio: float | None = None,
@@ -152,7 +152,8 @@ def read(
 ) -> RunRecord:
     """Read a run.mcap, whole or cut short, or a trace in CSV; the options are those of ``tdhil replay`` for a trace.
 
-    ``columns``: such as ``["time=t_s", "speed=n_rpm:rpm", "torque=m_pct:%"]``; ``excitation``: an excitation.yaml;
+    ``columns``: such as ``["time=t_s", "speed=n_rpm:rpm", "torque=m_pct:%"]``; ``excitation``: an
+    excitation.yaml, or its content;
     ``skew_sd_s``: time offset between speed and torque, s (1 sd). A tdhil log contains all of this.
     Raises LogError (no tdhil data in the file), DataFileError (with the line) and UsageError.
     """
@@ -176,13 +177,21 @@ def read(
 
 def trace_arguments(given: Mapping[str, Any], source: str) -> dict[str, Any]:
     """Return the keywords of `read` for a trace. ``given``: values of `tdhil.config.OF_A_TRACE` by name, None without
-    one; ``source``: of the stated lags, as text.
+    one; ``source``: of the stated lags, as text. Raises UsageError for a motion that is not complete.
     """
     from tdhil.config import OF_A_TRACE
+    from tdhil.recording import motion_of
     from tdhil.session.task import stated_lags
 
     lags = ("speed_lag_s", "speed_lag_sd_s", "torque_lag_s", "torque_lag_sd_s")
-    found = {one.name: given.get(one.name) for one in OF_A_TRACE if one.name not in lags}
+    motion, wrong = motion_of(given)
+    if wrong:
+        flags = {one.name: one.flag for one in OF_A_TRACE}
+        raise UsageError("; ".join(f"{flags[name]}: {text}" for name, text in wrong), where="the motion of the trace",
+                         entry=MessageCode.VALUE_NOT_ALLOWED)
+    found = {one.name: given.get(one.name) for one in OF_A_TRACE
+             if one.name not in lags and not one.name.startswith("motion_")}
+    found["excitation"] = motion or found["excitation"]
     speed_s, speed_sd_s, torque_s, torque_sd_s = (given.get(name) for name in lags)
     return {**found, "lags": stated_lags(speed_s, speed_sd_s, torque_s, torque_sd_s, source)}
 
@@ -256,9 +265,9 @@ def write_as_log(record: RunRecord, path: Path, run: Mapping[str, Any]) -> None:
 
 
 def _read_trace(
-    path: Path, columns: Sequence[str] | None, excitation: str | Path | None, rated_torque_nm: float | None,
-    torque_limit_nm: float | None, gear_ratio: float | None, scale: float | None, lags: LagPrior | None,
-    skew_sd_s: float | None,
+    path: Path, columns: Sequence[str] | None, excitation: str | Path | Mapping[str, Any] | None,
+    rated_torque_nm: float | None, torque_limit_nm: float | None, gear_ratio: float | None, scale: float | None,
+    lags: LagPrior | None, skew_sd_s: float | None,
 ) -> RunRecord:
     from tdhil.config import ASKED_AGAIN
     from tdhil.recording import USUAL, Bench, LagPrior, parse_columns, read_recording
@@ -273,7 +282,8 @@ def _read_trace(
         skew_sd_s=skew_sd_s,
     )
     choices = USUAL if columns is None else parse_columns(list(columns))
-    recording, assumed = read_recording(path, choices, None if excitation is None else Path(excitation), bench)
+    motion = Path(excitation) if isinstance(excitation, str) else excitation
+    recording, assumed = read_recording(path, choices, motion, bench)
     if scale is None:
         assumed = (*assumed, f"standard uncertainty of the torque scale, assumed: {ASSUMED_TORQUE_SCALE_REL_SD:.0%}")
     return RunRecord(recording, {"identify": {one.name: one.default for one in ASKED_AGAIN}}, str(path), assumed)

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol
 
 from tdhil.buses import Connection, PeerPlan
@@ -59,8 +60,8 @@ class RunRequest:
     peer: PeerPlan
     rig: Rig | None
     overrides: Overrides = field(default_factory=Overrides)
-    operator: str | None = None
-    note: str | None = None
+    stated: Mapping[str, str | None] = field(default_factory=dict)
+    """Texts that a person states of the run, by the names of `tdhil.config.STATED`."""
     real_time_priority: bool = False
     case: EvaluationCase | StepCase | None = None
     """Virtual string or small steps of the set speed in stage 5, in place of an excitation."""
@@ -70,14 +71,14 @@ class RunRequest:
     @classmethod
     def of(
         cls, options: RunOptions, connection: Connection, peer: PeerPlan, rig: Rig | None, *, overrides: Overrides,
-        operator: str | None = None, note: str | None = None, real_time_priority: bool = False,
+        stated: Mapping[str, str | None] = MappingProxyType({}), real_time_priority: bool = False,
         case: EvaluationCase | StepCase | None = None, expect: Sequence[str] = (),
     ) -> RunRequest:
         """Return the request, with limits that suit the plant. Raises PreflightRefused for motion beyond the limits."""
         bench = suited(rig, peer.plant)
         if case is None:
             refuse_hopeless(options, bench, connection.profile)
-        return cls(options, connection, peer, bench, overrides, operator, note, real_time_priority, case,
+        return cls(options, connection, peer, bench, overrides, stated, real_time_priority, case,
                    expectations_of({} if bench is None else bench.acceptance, expect))
 
 
@@ -123,8 +124,7 @@ class RunSession:
         self._outcome: RunOutcome | None = None
         self.rehearsal: Rehearsal | None = None
         """Verdict on the rehearsed faults, once the run has ended; None without faults."""
-        said = {"operator": request.operator, "note": request.note}
-        self.log = RunLog(writer, configuration(request) | said)
+        self.log = RunLog(writer, configuration(request) | dict(request.stated))
 
     @property
     def path(self) -> Path:

@@ -232,14 +232,14 @@ EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
     "service/static/app.js": ("a role, signals of the plots, the key of a sign-off, the clock that a page measures", {
         "note", "operator", "step", "speed", "torque", "real_time"}),
     "service/static/results.js": (
-        "a rehearsal's request; keys of answers; a column of the friction table; the records of a run, edited later", {
-            "fault", "faults", "log", "model", "note", "operator", "real_time", "speed", "yes"}),
+        "a rehearsal's request; keys of answers; a column of the friction table", {
+            "fault", "faults", "log", "model", "note", "real_time", "speed", "yes"}),
+    "service/static/letterhead.js": ("the page and the route of the service's own letterhead", {"letterhead"}),
     "service/static/upload.js": (
         "quantities of a trace, a kind of file, a role, keys of a preview", {
             "drive", "log", "note", "operator", "profile", "rate", "speed", "torque", "trace"}),
     "service/templates/accounts.html": ("a role", {"operator"}),
-    "service/templates/run.html": ("what was seen, for a sign-off; the records of a run, edited later", {
-        "note", "operator"}),
+    "service/templates/run.html": ("what was seen, for a sign-off", {"note"}),
 }
 """File → (reason, names that may stand in it)."""
 

@@ -65,6 +65,7 @@ run:
   realisations: 2
 accept_unverified: [watchdog, likely]
 modbus: {host: 192.0.2.10, port: 5020, unit: 7}
+letterhead: letterhead.yaml
 """
 
 

@@ -23,7 +23,7 @@ from tests.evidence.small_runs import PROFILE, RESULT, SERIAL, configuration, fo
 
 STATEMENT = PublisherStatement("The Institute", ("log", "result", "identity"), None, "", False)
 NAMES = ("first", "last", "rig", "host", "user", "folder", "file", "note", "secret", "key", "field", "mail",
-         "calibrated")
+         "calibrated", "customer", "order", "place")
 WORD = st.text(string.ascii_lowercase, min_size=6, max_size=12).map(lambda text: f"q{text}x")
 FOLDER = "/ho" "me"      # written so that no path of a home stands in the tree
 
@@ -32,7 +32,8 @@ def seeded(path: Path, words: dict[str, str], serial: int) -> Path:
     """A log that states each word wherever a log may state one."""
     w, home = words, f"{FOLDER}/{words['user']}/{words['folder']}"
     run = configuration(
-        operator=f"{w['first']} {w['last']}", note=f"at {w['note']}", rig_file=f"{home}/{w['file']}.yaml",
+        operator=f"{w['first']} {w['last']}", note=f"at {w['note']}", customer=f"{w['customer']} AS",
+        order_number=f"{w['order']} 7", place=w["place"], rig_file=f"{home}/{w['file']}.yaml",
         options={"log": {"value": f"{home}/run.mcap", "source": f"{w['file']}.yaml:3"},
                  "rate_hz": {"value": "250", "source": f"{w['file']}.yaml:3"}},
         bus={"host": {"value": f"{w['host']}.example.org", "source": "--host"}, "port": {"value": "502", "source": "-"},
@@ -47,12 +48,14 @@ def seeded(path: Path, words: dict[str, str], serial: int) -> Path:
                "modbus": {"host": w["host"], "serial": f"/dev/{w['key']}"}},
     )
     run["identity"] = {**run["identity"], "serial": serial}
-    result = {**RESULT, "operator": w["first"], "note": w["note"], "log": f"{home}/run.mcap", "date": run["started"],
+    result = {**RESULT, "operator": w["first"], "note": w["note"], "customer": w["customer"],
+              "order_number": w["order"], "place": w["place"], "log": f"{home}/run.mcap", "date": run["started"],
               "rig": {"name": w["rig"], "file": f"{home}/{w['file']}.yaml"}, "drive": {"serial": serial},
               "connection": f"host {w['host']}", "uploaded": {"by": w["last"]}}
     events = (
         Event(0.6, "warning", f"the drive of {w['rig']} has serial {serial}, {serial:X}h; token={w['secret']}",
               f'File "{home}/a.py", line 3, in {w["field"]}'),
+        Event(0.65, "note", f"for {w['customer']}, order {w['order']}, at {w['place']}"),
         Event(0.7, "note", f"see {home}/x, {w['host']}:502 and ssh://{w['user']}@{w['host']}"),
     )
     write_run(path, run, events=events, result=result, serial=serial)
@@ -119,7 +122,8 @@ def test_what_identification_needs_stays(scrubbed):
     assert after.configuration["converted"] == [["limits.torque_nm", "400 Nm", "rig.yaml"]]
     assert after.configuration["profile"]["torque"] == PROFILE["torque"]
     assert after.configuration["profile"]["speed"]["source"] == "read by <name>, <path>"
-    assert [one.text for one in after.events if one.kind == "note"] == ["see <path>, <name>:502 and <address>"]
+    assert [one.text for one in after.events if one.kind == "note"] == [
+        "for <name>, order <name>, at <name>", "see <path>, <name>:502 and <address>"]
 
 
 def test_equal_drives_stay_equal_and_different_ones_different(scrubbed):

@@ -37,7 +37,7 @@ EXCEPTIONS = {
     "tdhil/service/server.py: serve": 11,
     "tdhil/session/run_record.py: _read_trace": 9,
     "tdhil/session/run_record.py: read": 9,
-    "tdhil/session/run_session.py: of": 10,
+    "tdhil/session/run_session.py: of": 9,
     "tdhil/soft_torque/evaluation.py: _verdict": 9,
     "tdhil/soft_torque/simulation.py: simulate": 10,
     "tdhil/soft_torque/uncertainty.py: draw_truths": 10,

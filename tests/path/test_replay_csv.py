@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
+from tdhil.cli import replay as replay_command
+from tdhil.cli.main import build_parser
 from tdhil.recording.csv.excitation import load_excitation
 from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import tdhil
@@ -54,6 +56,36 @@ def american(t, w, m):
     options = ("--columns", "torque=Tq:lbf.ft", "speed=Spd")
     return "Time [us]\tTq\tSpd (deg/s)\n", "%.1f\t%.8f\t%.8f", (t * 1e6, m / 1.3558179483314004, np.degrees(w)), \
         "utf-16", options
+
+
+def parse(*words):
+    return build_parser("replay").parse_args(["replay", *map(str, words)])
+
+
+@pytest.mark.heavy
+def test_the_options_of_one_motion_replace_its_file(run, tmp_path):
+    """The first mean speed alone: by its options the same result, digit by digit, as by a file with this segment."""
+    _, recording, excitation, _ = run
+    fresh = recording.fresh
+    columns = (recording.time_s[fresh], recording.speed_rad_s[fresh],
+               recording.torque_nm[fresh] - recording.torque_offset_nm)
+    trace, one = tmp_path / "trace.csv", tmp_path / "one.yaml"
+    trace.write_text("time_s,speed_rad_s,torque_nm\n"
+                     + "\n".join(",".join(map(repr, row)) for row in zip(*(c.tolist() for c in columns), strict=True)))
+    whole = yaml.safe_load(excitation.read_text())
+    first = whole["segments"][0]
+    one.write_text(yaml.safe_dump({**whole, "segments": [first]}))
+    options = ("--motion-start", first["start_s"], "--motion-period", first["period_s"], "--motion-periods",
+               first["periods"], "--motion-settle-periods", first["settle_periods"], "--motion-offset",
+               first["offset_rad_s"], "--motion-lines", ",".join(map(str, first["lines_hz"])), "--motion-mode",
+               whole["mode"])
+    by_file, by_options = (tdhil("replay", trace, "--json", *more) for more in (("--excitation", one), options))
+    assert by_options.document == by_file.document
+    known = [replay_command.read_recorded(parse(trace, *more), trace).recording.excitation
+             for more in (("--excitation", one), options)]
+    assert known[0] == known[1] and known[0].segments[0].lines_hz == tuple(first["lines_hz"])
+    refused = tdhil("replay", trace, *options[2:])
+    assert refused.code == 2 and "--motion-start: is needed for a periodic motion" in refused.err
 
 
 @pytest.mark.heavy

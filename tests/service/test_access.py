@@ -157,8 +157,8 @@ def test_who_may_what_is_as_it_was_agreed(guarded):
                      "annotate", "uploads", "upload", "one_upload", "preview", "identify_upload", "delete_upload"},
         "engineer": {"edit_rig", "sign_off", "archive", "sign_acceptance", "make_evidence", "add_rig", "draft_rig",
                      "scan_bus"},
-        "admin": {"audit", "delete_run", "accounts", "add_user", "set_password", "remove_user", "add_token",
-                  "remove_token"},
+        "admin": {"audit", "delete_run", "change_letterhead", "accounts", "add_user", "set_password", "remove_user",
+                  "add_token", "remove_token"},
         "anybody": {"login", "logout", "me", "health", "openapi"},
     }
     changes_nothing = {"plan", "password", *STOPS}         # of somebody else's

@@ -39,7 +39,7 @@ pytestmark = [
 ]
 HOSTILE = "<script>window.pwned=1</script><b id=x>bold</b>"
 PAGES = ("/", "/new-rig", "/start/a", "/calibrate/a", "/rehearse/a", "/rigs/a", "/runs", "/upload", "/fleets", "/audit",
-         "/docs")
+         "/docs", "/letterhead")
 PLAN = {
     "excitation": "multisine", "mode": "torque", "duration_s": 100.0, "expected_half_width": 0.021, "stopping": None,
     "speed_rad_s": {"min": 1.0, "max": 5.0}, "torque_nm": {"min": -10.0, "max": 50.0},
@@ -297,6 +297,68 @@ def test_a_wait_shows_how_long_it_lasts_and_how_long_it_usually_does(page, serve
     page.get_by_text(re.compile(r"^Planning: \d+ s of about \d+ s$")).wait_for()
     goes_on.set()
     page.get_by_role("row", name="expected interval of J").wait_for()
+
+
+@pytest.mark.heavy
+def test_a_letterhead_is_set_and_an_svg_refused_at_its_field(page, served):
+    from tests.report.test_letterhead import png
+
+    page.goto("/")
+    page.get_by_role("link", name="Letterhead of reports").click()
+    page.get_by_label("Company").fill(HOSTILE)
+    page.get_by_label("Address").fill("Hafen 1\nAurich")
+    logo = page.get_by_label("Logo, a PNG")
+    logo.set_input_files({"name": "logo.png", "mimeType": "image/png", "buffer": b"<svg onload='window.pwned=1'/>"})
+    page.get_by_role("button", name="Save").click()
+    page.get_by_text("It may contain scripts").wait_for()
+    assert logo.get_attribute("aria-invalid") == "true" and not page.locator("#logo").is_visible()
+    logo.set_input_files({"name": "logo.png", "mimeType": "image/png", "buffer": png(300, 100)})
+    page.get_by_role("button", name="Save").click()
+    page.get_by_text("Saved.").wait_for()
+    wait_for("the picture", lambda: page.evaluate("document.querySelector('#logo img').naturalWidth") == 300)
+    page.reload()
+    wait_for("the text", lambda: page.get_by_label("Company").input_value() == HOSTILE)
+    page.get_by_label("Remove the logo").check()
+    page.get_by_role("button", name="Save").click()
+    page.locator("#logo").wait_for(state="hidden")
+    assert page.get_by_label("Address").input_value() == "Hafen 1\nAurich"
+    assert page.evaluate("window.pwned") is None
+
+
+@pytest.mark.heavy
+def test_a_report_that_is_made_again_shows_its_progress(page, served, monkeypatch):
+    """After an edit, as after a signature: the page says so, shows the time, and then gives the new report."""
+    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    wait_for("its end", lambda: not served.service.supervisor.live())
+    folder = served.service.store.place(run)
+    for name in ("report.html", "report.pdf"):
+        (folder / name).write_text("<h1>old</h1>")
+    goes_on, made = threading.Event(), []
+
+    def slow(what, of, asked):
+        made.append(asked["name"])
+        goes_on.wait(30.0)
+        (folder / asked["name"]).write_text("<h1>with its order</h1>")
+        return {"document": {"file": asked["name"]}}
+
+    monkeypatch.setattr(served.service.supervisor, "work", slow)
+    page.goto(f"/runs/{run}")
+    page.get_by_label("Order number").fill("4711")
+    page.get_by_role("button", name="Save").click()
+    page.get_by_text("made again when it is opened").wait_for()
+    page.get_by_text("made again at the next download").wait_for()
+    page.get_by_role("link", name="report.html").click()
+    page.get_by_text(re.compile(r"^The page is made again: \d+ s$")).wait_for()
+    assert page.locator(".making").get_by_role("progressbar").count() == 1
+    goes_on.set()
+    with page.context.expect_page() as opened:
+        page.get_by_role("link", name="open it").click()
+    opened.value.get_by_text("with its order").wait_for()
+    assert made == ["report.html"]
+    with page.expect_download() as got:
+        page.get_by_role("link", name="report.pdf").click()
+    assert Path(got.value.path()).read_text() == "<h1>with its order</h1>" and made == ["report.html", "report.pdf"]
 
 
 REHEARSAL = {

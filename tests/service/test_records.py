@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 from dataclasses import asdict, replace
 
 import pytest
 
+from tdhil.report import Letterhead, clean_logo
 from tdhil.report.acceptance import signature_rows
 from tdhil.service.acceptance_signature import AcceptanceSignature, hash_of
 from tdhil.service.annotations import Annotations, tags_of
+from tdhil.service.letterhead import stored_letterhead
+from tdhil.service.run_channel import lives
 from tdhil.service.run_state import State, now, way_to
 from tdhil.service.schemas import ReplayView
 from tdhil.service.store import Index, Store, StoredRequest, write_json
+from tests.report.test_letterhead import png
 from tests.service.conftest import wait_for
 
 
@@ -240,6 +245,76 @@ def test_a_report_older_than_the_signature_is_made_again(call, service, monkeypa
     for name in ("report.html", "report.pdf", "report.html"):
         assert call("GET", f"/runs/{run}/{name}", 200).text == "signed"
     assert made == [("report", "report.html"), ("report", "report.pdf")]
+
+
+def test_the_key_of_a_deleted_run_starts_no_second_run(call, service):
+    key = {"headers": {"Idempotency-Key": "k" * 20}}
+    run = call("POST", "/rigs/a/runs", 201, json={"note": "done"}, **key)["id"]
+    service.wait(run, "done")
+    wait_for("its end", lambda: run not in service.supervisor.live())
+    assert call("POST", "/rigs/a/runs", 200, json={"note": "done"}, **key)["id"] == run
+    wait_for("its process", lambda: not lives(service.store.place(run)))
+    call("POST", f"/runs/{run}/delete", 200, json={"confirm": run})
+    for asked in ({"note": "done"}, {"note": "another"}):
+        refused = call("POST", "/rigs/a/runs", 409, json=asked, **key)["error"]["message"]
+        assert f"the run of this key, {run}, was deleted" in refused and "Nothing was started" in refused
+    assert service.store.ids() == []
+    again = call("POST", "/rigs/b/runs", 201, json={"note": "done"}, **key)["id"]   # another rig: another request
+    service.wait(again, "done")
+
+
+def test_customer_order_and_place_are_edited_later_and_make_the_report_outdated(call, service):
+    run = ended(call, service)
+    folder = service.store.place(run)
+    (folder / "report.html").write_text("old")
+    assert call("GET", f"/runs/{run}", 200)["outdated"] == []
+    call("POST", f"/runs/{run}/annotations", 200, json={"tags": ["x"]})
+    assert call("GET", f"/runs/{run}", 200)["outdated"] == []                  # no report shows a tag
+    sent = {"customer": "Østfold", "order_number": "4711", "place": "Hall 3"}
+    found = call("POST", f"/runs/{run}/annotations", 200, json=sent)
+    assert {name: found[name] for name in sent} == sent and found["outdated"] == ["report.html"]
+    assert [one["id"] for one in call("GET", "/runs?text=4711%20hall", 200)] == [run]
+    long = call("POST", f"/runs/{run}/annotations", 422, json={"order_number": "x" * 101})
+    assert [one["option"] for one in long["fields"]] == ["order_number"]
+
+
+def test_an_edited_text_stands_in_the_report_with_what_was_recorded():
+    noted = Annotations().edited({"operator": "Anna"}, "local", "2026-05-01T12:30:00.000Z", operator="Bert", tags=["x"])
+    shown = noted.shown_on({"operator": "Anna", "note": None})
+    assert (shown["operator"], shown["note"]) == ("Bert", None)
+    assert [(one["field"], one["old"]) for one in shown["edits"]] == [("operator", "Anna")]
+
+
+def test_an_admin_changes_the_letterhead_with_an_audit_line_and_old_reports_are_outdated(call, service):
+    run = ended(call, service)
+    (service.store.place(run) / "report.pdf").write_text("old")
+    assert call("GET", "/letterhead", 200) == {"company": "", "address": [], "logo": ""}
+    logo = base64.b64encode(png()).decode()
+    found = call("POST", "/letterhead", 200, json={"company": " Nord\nwerk ", "address": ["Hafen 1", ""], "logo": logo})
+    assert (found["company"], found["address"]) == ("Nord werk", ["Hafen 1"])
+    kept = clean_logo(png())
+    assert base64.b64decode(found["logo"]) == kept and call("GET", "/letterhead", 200) == found
+    assert stored_letterhead(service.store.folder) == Letterhead("Nord werk", ("Hafen 1",), kept)
+    (entry,) = noted(service, "letterhead changed")
+    assert dict(entry.details) == {"company": "Nord werk", "address": ["Hafen 1"],
+                                   "logo_sha256": hashlib.sha256(kept).hexdigest()}
+    assert call("GET", f"/runs/{run}", 200)["outdated"] == ["report.pdf"]
+    assert call("POST", "/letterhead", 200, json={"company": "N", "address": []})["logo"] == found["logo"]
+    assert call("POST", "/letterhead", 200, json={"company": "N", "address": [], "logo": ""})["logo"] == ""
+    assert service.audit.verify() is None
+
+
+def test_a_letterhead_that_is_not_accepted_names_each_field_and_changes_nothing(call, service):
+    svg = base64.b64encode(b"<svg xmlns='http://www.w3.org/2000/svg' onload='alert(1)'/>").decode()
+    sent = {"company": "x" * 121, "address": ["y"] * 7, "logo": svg}
+    found = call("POST", "/letterhead", 422, json=sent)
+    assert [one["option"] for one in found["fields"]] == ["company", "address", "logo"]
+    assert "It may contain scripts" in found["fields"][2]["message"]
+    call("POST", "/letterhead", 422, json={"company": "", "address": [], "logo": "no base64!"})
+    call("POST", "/letterhead", 422, json={"company": "", "address": [], "logo": "A" * 600_000})
+    assert not noted(service, "letterhead changed") and not (service.store.folder / "letterhead.json").exists()
+    (service.store.folder / "letterhead.json").write_text('{"logo": "PHN2Zy8+"}')          # edited on the disk: an SVG
+    assert stored_letterhead(service.store.folder) == Letterhead()
 
 
 def test_the_worker_puts_the_signature_into_the_document_of_the_report(tmp_path, monkeypatch):

@@ -18,6 +18,7 @@ import pytest
 
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
+from tdhil.service import store as store_module
 from tdhil.service.audit import KEY_FILE, Audit, ChainHead
 from tdhil.service.run_channel import lives, take_life
 from tdhil.service.run_state import NotThere, State, Status, now, way_to
@@ -162,6 +163,57 @@ def test_a_rehearsal_is_marked_in_the_list_of_runs(store):
     index = Index(store)
     index.put(summary_of(request, store.status(request.id), None))
     assert [one.rehearsal for one in index.find()] == [True]
+
+
+def test_a_rebuild_holds_its_lock_for_one_batch_only(store, monkeypatch):
+    """The files are read without the lock: a list asked for meanwhile waits for no more than one batch."""
+    monkeypatch.setattr(store_module, "BATCH", 2)
+    for _ in range(5):
+        a_run(store)
+    index, read, seen = Index(store), store.summary, []
+    assert index.rebuild() == 5
+
+    def reading(run):
+        seen.append(len(index.find(limit=1000)))           # would never return if the lock were held
+        assert not index.wait_until_made(0.0)
+        return read(run)
+
+    monkeypatch.setattr(store, "summary", reading)
+    assert index.rebuild() == 5 and seen == [5] * 5        # the former index
+    seen.clear()
+    (store.folder / "index.sqlite").unlink()
+    assert index.rebuild() == 5 and seen == [0, 0, 2, 2, 4]
+    assert index.wait_until_made(0.0)
+
+
+def test_what_changes_during_a_rebuild_is_not_overwritten(store, monkeypatch):
+    runs = [a_run(store) for _ in range(3)]
+    index, read = Index(store), store.summary
+    index.rebuild()
+    for name in ("request.json", "state.json"):
+        (store.place(runs[2]) / name).unlink()
+
+    def reading(run):
+        found = read(run)
+        if run == runs[0]:
+            index.put(replace(found, note="newer"))
+        if run == runs[1]:
+            index.remove(run)
+        return found
+
+    monkeypatch.setattr(store, "summary", reading)
+    index.rebuild()
+    assert {one.id: one.note for one in index.find(limit=9) if one.id != runs[2]} == {runs[0]: "newer"}
+    store.delete(runs[2])
+    monkeypatch.setattr(store, "summary", read)
+    assert index.rebuild() == 2 and {one.id for one in index.find()} == set(runs[:2])
+
+
+def test_a_file_that_is_no_index_is_replaced_by_a_rebuild(store):
+    run = a_run(store)
+    (store.folder / "index.sqlite").write_bytes(b"no database" * 1000)
+    index = Index(store)
+    assert index.rebuild() == 1 and [one.id for one in index.find()] == [run]
 
 
 def test_it_has_a_rollback_journal(store):

@@ -118,6 +118,29 @@ def test_every_wrong_value_is_named_at_its_field_and_no_run_is_made(call, servic
     assert work == []
 
 
+MOTION = {"motion_start_s": "0.5 s", "motion_period_s": 0.5, "motion_periods": 4, "motion_offset_rad_s": "30 rpm",
+          "motion_lines_hz": "2, 4, 10"}
+
+
+@pytest.mark.parametrize(("more", "wrong"), [
+    ({}, []),
+    ({"motion_kind": "prbs", "motion_mode": "speed", "motion_settle_periods": 0}, []),
+    ({"motion_periods": None, "motion_lines_hz": ""}, ["motion_periods", "motion_lines_hz"]),
+    ({"motion_lines_hz": "2, 3.3"}, ["motion_lines_hz"]),
+    ({"motion_lines_hz": "2, two"}, ["motion_lines_hz"]),
+    ({"motion_lines_hz": "2 2"}, ["motion_lines_hz"]),
+    ({"motion_periods": 1}, ["motion_periods"]),
+    ({"motion_period_s": -1, "motion_kind": "pulses"}, ["motion_period_s", "motion_kind"]),
+    ({"excitation": "kind: sine"}, ["excitation"]),
+])
+def test_the_fields_of_a_motion_are_checked_and_each_mistake_is_at_its_field(call, work, more, wrong):
+    upload = send(call)["id"]
+    found = call("POST", f"/uploads/{upload}/preview", 200, json={**MAPPING, **MOTION, **more})
+    assert [one["option"] for one in found["wrong"]] == wrong
+    reading = found["preview"]["reading"]
+    assert wrong or reading["excitation"] == more.get("motion_kind", "multisine")
+
+
 def test_what_failed_is_told_and_can_be_identified_again(call, work):
     upload = send(call)["id"]
     found = identify(call, upload, note="fails")

@@ -1,5 +1,6 @@
 """Reading of a CSV trace from a drive's own tool: find its layout, read it with line numbers, return a Recording."""
 
+from tdhil.recording.csv.excitation import motion_of as motion_of
 from tdhil.recording.csv.layout import (
     REFERENCE_FLAG as REFERENCE_FLAG, TIME_AND_TORQUE as TIME_AND_TORQUE, USUAL as USUAL,
     parse_columns as parse_columns,

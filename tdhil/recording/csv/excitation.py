@@ -11,14 +11,16 @@
 Times are those of the trace, in seconds. If it has clock times, they count from its first row.
 """
 
+import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from drivers import DataFileError, Problem
-from profiles import DataModel, load_with_lines, refuse_if
+from profiles import DataModel, load_with_lines, messages_of, parse_with_lines, refuse_if
 from tdhil.config import DEFAULT_EXCITATION, EXCITATIONS, Registered
 from tdhil.recording.recording import Excitation, FloatArray, Level, Segment
 
@@ -119,11 +121,69 @@ class ExcitationFile(DataModel):
         return self
 
 
-def load_excitation(path: Path, time_s: FloatArray) -> tuple[Excitation, tuple[Level, ...]]:
-    """Return the excitation in ``path`` for a trace with these times. Raises DataFileError with every problem and
-    its line.
+_KEYS: Mapping[str, tuple[str | int, ...]] = {
+    "motion_kind": ("kind",), "motion_mode": ("mode",), "motion_start_s": ("segments", 0, "start_s"),
+    "motion_period_s": ("segments", 0, "period_s"), "motion_periods": ("segments", 0, "periods"),
+    "motion_settle_periods": ("segments", 0, "settle_periods"), "motion_offset_rad_s": ("segments", 0, "offset_rad_s"),
+    "motion_lines_hz": ("segments", 0, "lines_hz"),
+}
+"""Options of a motion about one mean speed, by name, with their places in an excitation.yaml."""
+_NEEDED = ("motion_start_s", "motion_period_s", "motion_periods", "motion_offset_rad_s", "motion_lines_hz")
+
+
+def motion_of(given: Mapping[str, Any]) -> tuple[dict[str, Any] | None, list[tuple[str, str]]]:
+    """Return the content of an excitation.yaml from the options of a motion, and their mistakes as (option, reason).
+
+    ``given``: values of `tdhil.config.OF_A_TRACE` by name. None if no option of a motion is given.
     """
-    loaded = load_with_lines(path, ExcitationFile)
+    stated = {name: given[name] for name in _KEYS if given.get(name) is not None}
+    if not stated:
+        return None, []
+    if given.get("excitation"):
+        return None, [("excitation", "contains the whole motion: leave its other fields empty")]
+    if missing := [name for name in _NEEDED if name not in stated]:
+        return None, [(name, "is needed for a periodic motion") for name in missing]
+    segment: dict[str, Any] = {}
+    content: dict[str, Any] = {"segments": (segment,)}
+    for name, value in stated.items():
+        *section, key = _KEYS[name]
+        (segment if section else content)[str(key)] = _hertz(value) if name == "motion_lines_hz" else value
+    try:
+        ExcitationFile.model_validate(content)
+    except ValidationError as error:
+        wrong: dict[str, str] = {}
+        for path, message in messages_of(error, json.loads(json.dumps(content)), ExcitationFile):
+            wrong.setdefault(_option_at(path), message)
+        return None, list(wrong.items())
+    return content, []
+
+
+def _hertz(text: str) -> tuple[float | str, ...]:
+    """Return the frequencies in a text; a part that is no number stays a text, which the model refuses."""
+    found: list[float | str] = []
+    for part in text.replace(";", " ").replace(",", " ").split():
+        try:
+            found.append(float(part))
+        except ValueError:
+            found.append(part)
+    return tuple(found)
+
+
+def _option_at(path: tuple[str | int, ...]) -> str:
+    """Return the option whose place is the beginning of this path."""
+    return next((name for name, key in _KEYS.items() if path[: len(key)] == key), "motion_start_s")
+
+
+def load_excitation(
+    source: Path | Mapping[str, Any], time_s: FloatArray
+) -> tuple[Excitation, tuple[Level, ...]]:
+    """Return the excitation in a file, or the content of one, for a trace with these times. Raises DataFileError with
+    every problem and its line.
+    """
+    if isinstance(source, Path):
+        loaded = load_with_lines(source, ExcitationFile)
+    else:
+        loaded = parse_with_lines(json.dumps(source), "motion", ExcitationFile)
     parts = loaded.value.segments
     first, last = float(time_s[0]), float(time_s[-1])
     outside = [

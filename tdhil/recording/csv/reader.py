@@ -1,11 +1,12 @@
 """Reading of a trace, with further data of the bench, as a Recording."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -391,7 +392,7 @@ class Bench:
 
 
 def read_recording(
-    path: Path, choices: Choices = USUAL, excitation: Path | None = None, bench: Bench | None = None
+    path: Path, choices: Choices = USUAL, excitation: Path | Mapping[str, Any] | None = None, bench: Bench | None = None
 ) -> tuple[Recording, tuple[str, ...]]:
     """Return the Recording, and a warning for each assumption and for rows left out.
 

@@ -96,9 +96,10 @@
   function runPage() {
     const id = document.body.dataset.run;
     const kept = (run) => run.state + run.files.filter((one) => one !== "report.pdf").join();    // content on which the page depends
-    let shown = "", files = null;
+    let shown = "", files = null, outdated = (document.body.dataset.outdated || "").split(" ");
     every(1500, async () => {
       const run = await call("GET", `/runs/${id}`);
+      outdated = run.outdated;
       if (files !== null && files !== kept(run)) location.reload();
       if (files === null && run.files.includes("report.html")) await pictures(id, run.result);
       files = kept(run);
@@ -125,25 +126,36 @@
       }
       return clocks.get(one.name);
     }
-    const pdf = document.querySelector(".files a[href$='report.pdf']");
-    if (pdf) pdf.addEventListener("click", async (event) => {
-      if (pdf.dataset.ready !== undefined) return;
-      event.preventDefault();            // it is made first, and this page says so
-      const note = el("div");
-      pdf.closest("li").append(note);
-      const over = waiting(note, "The PDF is made", "pdf");
-      try {
-        const answer = await fetch(pdf.href);
-        if (!answer.ok) throw new Refused((await answer.json()).error.message);
-        over(true);
-        pdf.dataset.ready = "";
-        show(note);
-        pdf.click();
-      } catch (error) {
-        over(false);
-        show(note, el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
-      }
-    });
+    for (const link of document.querySelectorAll(".files a[href$='report.pdf'], .files a[href$='report.html']")) report(link);
+    /** A report that is made first, or made again after a signature, an edit or a new letterhead: the page shows this. */
+    function report(link) {
+      const name = link.href.slice(link.href.lastIndexOf("/") + 1), inPage = name === "report.html";
+      const note = el("div", { class: "making" });
+      let busy = false;
+      link.addEventListener("click", async (event) => {
+        const again = outdated.includes(name);
+        if (!again && (inPage || link.dataset.ready !== undefined)) return;
+        event.preventDefault();
+        if (busy) return;
+        busy = true;
+        link.closest("li").append(note);
+        const over = waiting(note, `${inPage ? "The page" : "The PDF"} is made${again ? " again" : ""}`, inPage ? "page" : "pdf");
+        try {
+          const answer = await fetch(link.href);
+          if (!answer.ok) throw new Refused((await answer.json()).error.message);
+          over(true);
+          link.dataset.ready = "";
+          outdated = outdated.filter((one) => one !== name);
+          if (inPage) show(note, el("p", { role: "status" }, "The page was made again: ", el("a", { href: link.href, target: "_blank", rel: "noopener" }, "open it")));
+          else { show(note); link.click(); }
+        } catch (error) {
+          over(false);
+          show(note, el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+        } finally {
+          busy = false;
+        }
+      });
+    }
     const replay = byId("replay");
     replay.addEventListener("submit", async (event) => {
       event.preventDefault();
@@ -226,8 +238,8 @@
     if (form) form.addEventListener("submit", (event) => {
       event.preventDefault();
       submits(form, byId("annotate-said"), async () => {
-        const text = (name) => form.elements[name].value;
-        await call("POST", `/runs/${id}/annotations`, { tags: text("tags").split(","), operator: text("operator"), note: text("note") });
+        const texts = Object.fromEntries([...form.elements].filter((one) => one.name).map((one) => [one.name, one.value]));
+        await call("POST", `/runs/${id}/annotations`, { ...texts, tags: texts.tags.split(",") });
         location.reload();
       });
     });
