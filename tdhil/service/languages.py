@@ -18,6 +18,8 @@ from typing import Any, Final
 from markupsafe import Markup, escape
 from starlette.requests import HTTPConnection
 
+from tdhil.errors import MessageCode
+
 FOLDER: Final = Path(__file__).with_name("catalogues")
 COOKIE: Final = "tdhil-language"
 """Name of the cookie in which a page's switch keeps the chosen language."""
@@ -56,8 +58,9 @@ class Language:
         return f"{value:g}".replace(".", self.decimal)
 
     def script(self) -> str:
-        """Return the texts as a script for the pages. It contains only ASCII."""
-        return f"window.tdhilTexts = {json.dumps(dict(self.texts))};\n"
+        """Return the texts, and the titles of the message codes, as a script for the pages. It contains only ASCII."""
+        titles = {one.code: self.word(one.title, one.code) for one in MessageCode}
+        return f"window.tdhilTexts = {json.dumps(dict(self.texts))};\nwindow.tdhilTitles = {json.dumps(titles)};\n"
 
 
 def entries(text: str) -> list[dict[str, str]]:
