@@ -67,7 +67,7 @@ def of_errors() -> Iterator[Text]:
             if not _ERRORS.search(ast.unparse(call.func)):
                 continue
             for node in (*call.args[:1], *(one.value for one in call.keywords if one.arg == "next_step")):
-                for part in ast.walk(node) if isinstance(node, ast.IfExp) else (node,):
+                for part in (node.body, node.orelse) if isinstance(node, ast.IfExp) else (node,):
                     text = _pattern(part)
                     if text and re.search(r"[a-z]{2,} \S", re.sub(r"\{\d\}", "", text)):
                         yield Text(str(path.relative_to(ROOT)), "message", text)

@@ -12,6 +12,9 @@
   /** Translate a word that the service sends, as a state or a label. An unknown one stays English. */
   const word = (text, context = "") => texts.get(context ? `${context}${BETWEEN}${text}` : text) ?? text;
 
+  /** A value in a message may be a word of the vocabulary. */
+  const value = (text) => ["role", "state", "verdict"].map((context) => texts.get(context + BETWEEN + text)).find(Boolean) ?? text;
+
   let patterns = null;
   /** Translate a message of the service, with the values in it; null if it is not known. */
   function phrase(text) {
@@ -23,7 +26,7 @@
     }).filter((one) => one.fixed >= LEAST).sort((a, b) => b.fixed - a.fixed);
     for (const { fits, made } of patterns) {
       const found = fits.exec(text);
-      if (found) return fill(made, { ...found.slice(1) });
+      if (found) return fill(made, { ...found.slice(1).map(value) });
     }
     return null;
   }
