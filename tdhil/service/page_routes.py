@@ -18,7 +18,7 @@ from tdhil.config import Option, form_options
 from tdhil.service.access import principal, require
 from tdhil.service.accounts import Role
 from tdhil.service.api_page import api_page
-from tdhil.service.languages import FOLDER, Language, language_of, languages
+from tdhil.service.languages import Language, language_of, languages
 from tdhil.service.middleware import off
 from tdhil.version import __version__
 
@@ -45,11 +45,11 @@ def _hint(language: Language, option: Option) -> str:
 
 
 class Pages:
-    """Templates and routes of the pages. ``folder``: that of the catalogues."""
+    """Templates and routes of the pages, in each language."""
 
-    def __init__(self, site: Site, folder: Path = FOLDER) -> None:
+    def __init__(self, site: Site) -> None:
         self._site = site
-        self._languages = languages(folder)
+        self._languages = languages()
         self._templates = {tag: self._environment(one) for tag, one in self._languages.items()}
 
     def _environment(self, language: Language) -> Environment:
