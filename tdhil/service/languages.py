@@ -114,7 +114,7 @@ def language_of(request: HTTPConnection, known: Iterable[str]) -> str:
     tags = set(known)
     if (chosen := request.cookies.get(COOKIE)) in tags:
         return str(chosen)
-    wanted = []
+    wanted: list[tuple[float, int, str]] = []
     for one in request.headers.get("accept-language", "")[:300].split(","):
         tag, _, quality = one.strip().lower().partition(";q=")
         try:

@@ -31,7 +31,8 @@ from tests.service.javascript import literals
 CATALOGUES = sorted(FOLDER.glob("*.po"))
 HOLE = re.compile(r"\{\w*\}")
 BARE = {
-    "tdhil": "name of the program", "rad/s": "unit", "rad/s²": "unit", "rad": "unit", "N·m": "unit", "kg·m²": "unit", "rpm": "unit",
+    "tdhil": "name of the program", "rad/s": "unit", "rad/s²": "unit", "rad": "unit", "N·m": "unit",
+    "kg·m²": "unit", "rpm": "unit",
     "PNG": "format", "CSV": "format", "SHA-256": "name of the hash", "rig.yaml": "name of a file",
     "run.mcap": "name of a file", "trace.csv": "name of a file", "report.html": "name of a file",
     "report.pdf": "name of a file", "result.json": "name of a file", "samples.csv": "name of a file",
@@ -45,7 +46,8 @@ SHOWN = ("placeholder", "aria-label", "title", "alt")
 NO_TEXT = re.compile(
     r"""use strict|UTC.*|HTTP \$\{\}|GET|POST|X-CSRF-Token|Content-Type|Content Security|Idempotency-Key|TDH-\d+"""
     r"""|\(prefers-color-scheme: dark\)|tdhil \$\{\}|time_s,speed_rad_s,torque_nm|rehearsal: \$\{\}"""
-    r"""|[^ ]*[/=&#\[\]_@{}][^ ]*|.*sans-serif|rotate\(.*\)|(?:[\w.]*\$\{\})+[\w.-]*|tdhil[\w-]*(\$\{\})?|by hand|now alarm|verdict good""")
+    r"""|[^ ]*[/=&#\[\]_@{}][^ ]*|.*sans-serif|rotate\(.*\)|(?:[\w.]*\$\{\})+[\w.-]*|tdhil[\w-]*(\$\{\})?"""
+    r"""|by hand|now alarm|verdict good""")
 """Literals of a script that no reader sees, or that are data: addresses, headers, classes, formats of dates."""
 UNITS = re.compile(r"\$\{\}|[^\w]|N·m(·s/rad)?|kg·m²|rad|Hz|KiB|MiB|min|s\b|SHA-256|\d")
 NOT_SHOWN = re.compile(
@@ -83,7 +85,8 @@ def bare(template: str) -> list[str]:
     parser = Shown()
     template = re.sub(r"\{% block data %\}.*?\{% endblock %\}", "", template)
     parser.feed(re.sub(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}", "·", template, flags=re.DOTALL))
-    pieces = (piece.strip(" :,;()±.…") for text in parser.found for piece in re.split("[·\n]", text.replace("·m", "_m")))
+    pieces = (piece.strip(" :,;()±.…") for text in parser.found
+              for piece in re.split("[·\n]", text.replace("·m", "_m")))
     found = [one.replace("_m", "·m") for one in pieces if re.search(r"[^\W\d_]{2,}", one)]
     of_macros = [const.value for output in Environment().parse(template).find_all(nodes.Output)
                  for one in output.nodes if isinstance(one, nodes.CondExpr | nodes.Const)
@@ -141,7 +144,8 @@ def test_a_translation_has_the_values_of_its_text_and_its_edges(path):
 def test_a_catalogue_is_read_as_gettext_writes_it():
     text = ('# by a translator\nmsgid ""\nmsgstr ""\n"Language: xx\\n"\n"X-Language-Name: Xx\\n"\n"X-Decimal: ,\\n"\n\n'
             '#: a.html\nmsgid "a \\"b\\"\\n"\n"c"\nmsgstr "é"\n\n#, fuzzy\nmsgid "old"\nmsgstr "alt"\n\n'
-            'msgctxt "stage"\nmsgid "hold"\nmsgstr "halten"\n\n#~ msgid "gone"\n#~ msgstr "weg"\n\nmsgid "x"\nmsgstr ""\n')
+            'msgctxt "stage"\nmsgid "hold"\nmsgstr "halten"\n\n#~ msgid "gone"\n#~ msgstr "weg"\n\n'
+            'msgid "x"\nmsgstr ""\n')
     assert language(text) == Language("xx", "Xx", ",", {'a "b"\nc': "é", f"stage{BETWEEN}hold": "halten"})
     for wrong in (text.replace('msgid "old"', "msgid old"), text.replace("X-Decimal", "X-Point")):
         with pytest.raises(CatalogueWrong):
