@@ -50,7 +50,7 @@
     const meaning = ({ description: said }, description = word(said)) => (description.includes("; ") ? capital(`${description.split("; ").slice(1).join("; ")}, ${description.split("; ")[0]}`) : capital(description));
     const place = (one) => capital(`${word(one.name.replaceAll("_", " "), "key")}: ${word(one.description)}`);
     const buses = [...new Set(profiles.map((one) => one.bus_title))];
-    show(field("profile"), ...buses.map((bus) => el("optgroup", { label: bus }, ...profiles.filter((one) => one.bus_title === bus)
+    show(field("profile"), ...buses.map((bus) => el("optgroup", { label: bus, lang: "en" }, ...profiles.filter((one) => one.bus_title === bus)
       .map((one) => el("option", { value: one.name }, `${one.title} (${one.name})`)))));
     show(byId("machine"), ...machine.map((one) => input(one.name, meaning(one))));
 

@@ -111,7 +111,7 @@
       byId("replays").hidden = !ENDED.includes(run.state) || !run.files.includes("run.mcap");
       const first = run.result ? [{ asked: {}, result: run.result, state: "done", first: true }] : [];
       show(byId("replay-rows"), ...[...first, ...run.replays].map((one) => el("tr", {},
-        el("th", { scope: "row" }, one.first ? tr("the run itself") : Object.entries(one.asked).map(([name, value]) => `${name} ${value}`).join(", ") || tr("as the run")),
+        el("th", { scope: "row" }, one.first ? tr("the run itself") : english(Object.entries(one.asked).map(([name, value]) => `${name} ${value}`).join(", ")) || tr("as the run")),
         el("td", {}, one.state === "waiting" ? waits(one) : one.error ? errorText(one.error) : word(one.result.verdict, "verdict")),
         el("td", {}, ofResult(one.result) || "–"),
         el("td", {}, one.result && one.result.inertia_kg_m2 ? percent(one.result.inertia_kg_m2.half_width_total_rel) : ""))));
@@ -412,7 +412,7 @@
         ...curve(tr("Friction, N·m"), tr("speed, rad/s"), "friction", "speed_rad_s"),
         el("h2", {}, tr("Settings")), el("p", { class: "dim" }, tr("≠ marks different settings.")),
         region(tr("Settings"), el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...ids.map((id, k) => el("th", { scope: "col" }, dot(k), ` ${k + 1}`)))),
-          el("tbody", {}, ...comparison.settings.map((one) => line(`${one.differs ? "≠ " : ""}${one.name}`, one.name === "date" ? one.values.map(when) : one.values.map((value) => ({ True: tr("yes"), False: tr("no") }[value] ?? value)), one.differs))))));
+          el("tbody", {}, ...comparison.settings.map((one) => line(el("span", {}, one.differs ? "≠ " : "", english(one.name)), one.name === "date" ? one.values.map(when) : one.values.map((value) => ({ True: tr("yes"), False: tr("no") }[value] ?? english(value))), one.differs))))));
     }, tr("Each run is identified again"), "compare");
   }
   const percentOf = (share) => `${share > 0 ? "+" : ""}${precise(100 * share, 2)} %`;
@@ -528,7 +528,7 @@
   // -- many logs
 
   const FLEET = { running: tr("identifying"), done: tr("done"), interrupted: tr("ended early"), failed: tr("failed") };
-  const asWhat = (settings) => Object.entries(settings).map(([name, value]) => `${name} ${value}`).join(", ") || tr("as in each run");
+  const asWhat = (settings) => english(Object.entries(settings).map(([name, value]) => `${name} ${value}`).join(", ")) || tr("as in each run");
   const stateOf = (one) => (one.held ? tr("waiting: a shaft turns, or a drive is in use") : FLEET[one.state]) + (one.total ? `: ${tr("{done} of {total} logs", { done: one.done, total: one.total })}` : "") + (one.failed ? `, ${tr("{count} failed", { count: one.failed })}` : "");
 
   function fleetsPage() {
