@@ -1,7 +1,7 @@
 // The pages of tdhil serve. Data from elsewhere are inserted as text, never as markup.
 "use strict";
 (() => {
-  const { english, errorText, fixed, local, point, precise, said, tick, tr, word } = window.tdhilLanguage;
+  const { english, errorText, fixed, local, point, precise, tick, tr, word, worded } = window.tdhilLanguage;
   const API = "/api/v1";
   const SILENT_MS = 2000;      // without an answer in this time, a stop counts as not delivered and values as old
   const UNDELIVERED = tr("NOT DELIVERED: use the hard-wired stop");
@@ -267,7 +267,7 @@
   function markWrong(form, fields, go = true) {
     const known = fields.filter((one) => form.elements[one.option]);
     known.forEach((one) => {
-      const field = form.elements[one.option], note = el("span", { class: "alarm wrong", id: `wrong-${one.option}` }, said(one.message));
+      const field = form.elements[one.option], note = el("span", { class: "alarm wrong", id: `wrong-${one.option}` }, worded(one.message));
       field.setAttribute("aria-invalid", "true");
       field.setAttribute("aria-describedby", note.id);
       field.closest("label").append(note);
@@ -361,7 +361,7 @@
       byId("plan").hidden = true;            // the plan of other values
       if (fields.length) {
         show(byId("said"), el("div", { class: "alarm", role: "alert" }, el("p", {}, fields.length === 1 ? tr("One value can't be used. Nothing was started.") : tr("{count} values can't be used. Nothing was started.", { count: fields.length })),
-          el("ul", {}, ...fields.map((one) => el("li", {}, el("strong", {}, word(one.label)), ": ", said(one.message))))));
+          el("ul", {}, ...fields.map((one) => el("li", {}, el("strong", {}, word(one.label)), ": ", worded(one.message))))));
         markWrong(form, fields);
         return;
       }

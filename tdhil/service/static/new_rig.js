@@ -1,7 +1,7 @@
 // A new rig in six steps: profile, address with a scan, settings by hand, machine limits with their picture, check, save.
 "use strict";
 (() => {
-  const { english, local, point, said, tr, word } = window.tdhilLanguage;
+  const { english, local, point, tr, word, worded } = window.tdhilLanguage;
   const { Refused, byId, call, el, markWrong, pages, show, unmark, waiting } = window.tdhil;
   const SCAN_MS = 130000;            // the service ends a scan after 120 s
 
@@ -98,7 +98,7 @@
       for (const one of named.filter((each) => !form.elements[each.option])) {
         const place = form.querySelector(`[data-field="${CSS.escape(one.option)}"]`);
         if (!place) { rest.push(one.message); continue; }
-        place.append(el("span", { class: "alarm wrong" }, said(one.message)));
+        place.append(el("span", { class: "alarm wrong" }, worded(one.message)));
         if (!marked) place.scrollIntoView({ block: "center" });
       }
       return rest;

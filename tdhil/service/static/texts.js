@@ -46,7 +46,7 @@
     return found;
   }
   /** A message of the service as an element or a text: translated if it is known, else in English. */
-  const said = (text) => phrase(text) ?? english(text);
+  const worded = (text) => phrase(text) ?? english(text);
   /** A text of a result with its code: on a page of another language, the title of the code stands before it. */
   const coded = (code, text) => (texts.size && titles.has(code) ? [`${titles.get(code)}. `, english(text)] : [english(text)]);
 
@@ -66,5 +66,5 @@
       location.reload();
     });
   });
-  window.tdhilLanguage = { coded, english, errorText, fixed, local, point, precise, said, tick, tr, word };
+  window.tdhilLanguage = { coded, english, errorText, fixed, local, point, precise, tick, tr, word, worded };
 })();
