@@ -8,14 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from starlette.exceptions import HTTPException
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from tdhil.config import OPTION, STATED, form_options
+from tdhil.config import OPTION, STATED, Option, form_options
 from tdhil.service.access import principal, require
 from tdhil.service.accounts import Role
 from tdhil.service.api_page import api_page
+from tdhil.service.languages import Language, language_of, languages
 from tdhil.service.middleware import off
 from tdhil.version import __version__
 
@@ -29,24 +32,47 @@ _OF_HERE: Final = re.compile(r"/(?![/\\])[\x21-\x5b\x5d-\x7e]*")
 """Pattern of addresses to which a login may redirect: paths of this service only."""
 
 
+AS_RIG: Final = "as rig.yaml, else "
+"""First part of the text of an empty field whose value the rig's file may state (`Option.form_hint`)."""
+
+
+def _hint(language: Language, option: Option) -> str:
+    """Return the text of an empty field in a language."""
+    hint = option.form_hint
+    if hint.startswith(AS_RIG):
+        return str(language.text("as rig.yaml, else {value}", value=language.word(hint.removeprefix(AS_RIG))))
+    return language.word(hint)
+
+
 class Pages:
-    """Templates and routes of the pages."""
+    """Templates and routes of the pages, in each language."""
 
     def __init__(self, site: Site) -> None:
         self._site = site
-        self._templates = Environment(
+        self._languages = languages()
+        self._templates = {tag: self._environment(one) for tag, one in self._languages.items()}
+
+    def _environment(self, language: Language) -> Environment:
+        """Return the templates in a language. In them ``_("text")`` is a text, and ``word(text)`` one that varies."""
+        found = Environment(
             loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
             lstrip_blocks=True,
         )
-        self._templates.globals["version"] = __version__
-        self._templates.globals["form_options"] = form_options
-        self._templates.globals["stated_options"] = [OPTION[name] for name in STATED]
+        found.globals.update(
+            version=__version__, form_options=form_options, stated_options=[OPTION[name] for name in STATED],
+            language=language, languages=self._languages.values(),
+            _=language.text, word=language.word, hint=lambda option: _hint(language, option),
+            code=Markup("<code>{}</code>").format, strong=Markup("<strong>{}</strong>").format,
+            speed_unit=Markup("<span data-speed-unit>rad/s</span>"))
+        found.filters["number"] = language.number
+        return found
 
     def render(self, request: Request, template: str, here: str, status: int = 200, **known: Any) -> Response:
-        """Return a page. ``here``: the page's entry in the menu."""
-        text = self._templates.get_template(template).render(
+        """Return a page in the language of the request. ``here``: the page's entry in the menu."""
+        templates = self._templates[language_of(request, self._languages)]
+        text = templates.get_template(template).render(
             here=here, who=principal(request), login=self._site.access.login, **known)
-        return HTMLResponse(text, status)
+        return HTMLResponse(text, status, {"vary": "Accept-Language, Cookie"})
 
     def routes(self) -> list[BaseRoute]:
         """Return the routes: every page with its template, its entry in the menu and its least role."""
@@ -70,6 +96,7 @@ class Pages:
             self._page("/accounts", "accounts.html", "accounts"),
             self._page("/docs", "docs.html", "docs"),
             Route("/login", self._login),
+            Route("/texts/{language}.js", self._texts),
             Route("/favicon.ico", lambda request: RedirectResponse("/static/icon.svg")),
             Mount("/static", StaticFiles(directory=HERE / "static")),
         ]
@@ -94,6 +121,11 @@ class Pages:
             return self.render(request, template, here, **known)
 
         return Route(path, serve)
+
+    async def _texts(self, request: Request) -> Response:
+        if (found := self._languages.get(request.path_params["language"])) is None:
+            raise HTTPException(404)
+        return Response(found.script(), media_type="text/javascript")
 
     async def _login(self, request: Request) -> Response:
         there = request.query_params.get("next", "/")

@@ -10,6 +10,7 @@ import json
 import sys
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -122,7 +123,8 @@ class Web(Site):
             there = f"{request.url.path}?{request.url.query}" if request.url.query else request.url.path
             return RedirectResponse(f"/login?{urlencode({'next': there})}", 303)
         reported = error_view(error).error
-        return self._pages.render(request, "error.html", "", status_of(error), reported=reported)
+        return self._pages.render(request, "error.html", "", status_of(error), reported=reported,
+                                  reported_json=json.dumps(asdict(reported)))
 
     def _methods(self, request: Request) -> set[str]:
         """Return the methods of an address, from all of its routes."""

@@ -57,7 +57,7 @@ def test_four_packages_and_nothing_else_at_the_top(names):
 @pytest.mark.parametrize("package", PACKAGES)
 def test_every_module_and_every_data_file_is_there(package, names):
     wanted = {str(path.relative_to(ROOT)) for path in (ROOT / package).rglob("*")
-              if path.suffix in {".py", ".yaml", ".eds", ".typed"} and "__pycache__" not in path.parts}
+              if path.suffix in {".py", ".yaml", ".eds", ".typed", ".po"} and "__pycache__" not in path.parts}
     assert f"{package}/__init__.py" in wanted
     assert f"{package}/py.typed" in wanted
     assert wanted - names == set()

@@ -1,16 +1,18 @@
 // The pages of tdhil serve. Data from elsewhere are inserted as text, never as markup.
 "use strict";
 (() => {
+  const { english, errorText, fixed, local, point, precise, tick, tr, word, worded } = window.tdhilLanguage;
   const API = "/api/v1";
   const SILENT_MS = 2000;      // without an answer in this time, a stop counts as not delivered and values as old
-  const UNDELIVERED = "NOT DELIVERED: use the hard-wired stop";
+  const UNDELIVERED = tr("NOT DELIVERED: use the hard-wired stop");
   const ENDED = ["done", "refused", "stopped", "failed", "stop_not_confirmed", "interrupted"];
   const STATES = {
-    requested: "requested", preflight: "preflight", awaiting_confirmation: "waiting for the code",
-    moving: "moving", stopping: "stopping", identifying: "identifying", done: "done", refused: "refused",
-    stopped: "stopped, at standstill", failed: "failed, at standstill", stop_not_confirmed: "STOP NOT CONFIRMED",
-    interrupted: "interrupted",
+    requested: tr("requested"), preflight: tr("preflight"), awaiting_confirmation: tr("waiting for the code"),
+    moving: tr("moving"), stopping: tr("stopping"), identifying: tr("identifying"), done: tr("done"), refused: tr("refused"),
+    stopped: tr("stopped, at standstill"), failed: tr("failed, at standstill"), stop_not_confirmed: tr("STOP NOT CONFIRMED"),
+    interrupted: tr("interrupted"),
   };
+  const OLD = tr("No answer from tdhil serve: the values are old. A moving run continues under its guard, and a watched run stops. The hard-wired stop works.");
   const byId = (id) => document.getElementById(id);
 
   /** Make an element with attributes, texts and child elements. */
@@ -29,7 +31,7 @@
   /** Value of a CSS variable: colours follow light and dark. */
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   /** Axis of a uPlot chart in the page's colours. */
-  const axis = (more) => ({ stroke: colour("--dim"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") }, ...more });
+  const axis = (more) => ({ stroke: colour("--dim"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") }, values: (self, all) => all.map(tick), ...more });
 
   class Refused extends Error {}
 
@@ -60,7 +62,7 @@
       });
       const found = await answer.json();
       if (answer.status === 401 && document.body.dataset.page !== "login") loggedOut();
-      if (!answer.ok) throw Object.assign(new Refused(found.error ? found.error.message : `HTTP ${answer.status}`), { fields: found.fields || [] });
+      if (!answer.ok) throw Object.assign(new Refused(found.error ? errorText(found.error) : `HTTP ${answer.status}`), { fields: found.fields || [] });
       return found;
     } finally {
       clearTimeout(timer);
@@ -82,7 +84,7 @@
     away("");
     outside = true;
     byId("away").hidden = false;
-    show(byId("away"), "Your login has ended: the values are old. Stop may still work, and this page reports the result. If not, use the hard-wired stop. ", el("a", { href: `/login?next=${there}` }, "Log in"));
+    show(byId("away"), `${tr("Your login has ended: the values are old. Stop may still work, and this page reports the result. If not, use the hard-wired stop.")} `, el("a", { href: `/login?next=${there}` }, tr("Log in")));
     document.body.classList.add("stale");
   }
 
@@ -102,18 +104,18 @@
     setInterval(() => {
       const silent = Date.now() - last > ms + SILENT_MS;
       document.body.classList.toggle("stale", silent);
-      if (silent && !byId("away").textContent.includes(UNDELIVERED)) away("No answer from tdhil serve: the values are old. A moving run continues under its guard, and a watched run stops. The hard-wired stop works.");
-      else if (byId("away").textContent.startsWith("No answer")) away("");
+      if (silent && !byId("away").textContent.includes(UNDELIVERED)) away(OLD);
+      else if (byId("away").textContent === OLD) away("");
     }, 500);
   }
 
-  const number = (value, digits = 4) => (value === null || value === undefined ? "–" : Number(value).toPrecision(digits).replace(/\.?0+$/, (m) => (m.includes(".") ? "" : m)));
+  const number = (value, digits = 4) => (value === null || value === undefined ? "–" : local(Number(value).toPrecision(digits).replace(/\.?0+$/, (m) => (m.includes(".") ? "" : m))));
   /** Format a value with its interval: two digits of the half-width, as on the terminal's card. */
   function interval(value, low, high) {
     if (value === null || value === undefined) return null;
     if (low === null || low === undefined || high === null || high === undefined) return number(value);
     const half = (high - low) / 2, places = half > 0 ? Math.min(12, Math.max(0, 1 - Math.floor(Math.log10(half)))) : 4;
-    return `${value.toFixed(places)} (${low.toFixed(places)} to ${high.toFixed(places)})`;
+    return tr("{value} ({low} to {high})", { value: fixed(value, places), low: fixed(low, places), high: fixed(high, places) });
   }
   const withUnit = (text) => (text === null ? null : `${text} kg·m²`);
   const inertia = (one) => (one ? withUnit(interval(one.inertia_kg_m2, one.low_kg_m2, one.high_kg_m2)) : null);
@@ -125,7 +127,7 @@
   const RPM = 60 / (2 * Math.PI), UNIT_KEY = "tdhil-speed-unit", redo = [];
   let inRpm = false;
   try { inRpm = localStorage.getItem(UNIT_KEY) === "rpm"; } catch (error) { /* then rad/s */ }
-  const speedUnit = () => (inRpm ? "rpm" : "rad/s");
+  const speedUnit = () => (inRpm ? tr("rpm") : "rad/s");
   const inSpeedUnit = (value) => (inRpm ? RPM * value : value);
   const onSpeedUnit = (draw) => { redo.push(draw); };
   /** Make an element whose text contains speeds; the text follows the chosen unit. */
@@ -138,19 +140,19 @@
     const button = byId("speed-unit");
     const label = () => {
       button.textContent = speedUnit();
-      button.setAttribute("aria-label", `Speeds in ${speedUnit()}. Change to ${inRpm ? "rad/s" : "rpm"}`);
+      button.setAttribute("aria-label", tr("Speeds in {unit}. Change to {other}", { unit: speedUnit(), other: inRpm ? "rad/s" : tr("rpm") }));
       for (const one of document.querySelectorAll("[data-speed-unit]")) one.textContent = speedUnit();
       for (const one of document.querySelectorAll("[data-speed]")) one.textContent = number(inSpeedUnit(Number(one.dataset.speed)), 3);
     };
     label();
     button.addEventListener("click", () => {
       inRpm = !inRpm;
-      try { localStorage.setItem(UNIT_KEY, speedUnit()); } catch (error) { /* then for this page only */ }
+      try { localStorage.setItem(UNIT_KEY, inRpm ? "rpm" : "rad/s"); } catch (error) { /* then for this page only */ }
       label();
       redo.forEach((draw) => draw());
     });
   }
-  const percent = (share) => (share === null || share === undefined ? "" : `±${(100 * share).toPrecision(2)} %`);
+  const percent = (share) => (share === null || share === undefined ? "" : `±${precise(100 * share, 2)} %`);
   /** Format local time with an unambiguous month. */
   const two = (one, digits = 2) => String(one).padStart(digits, "0");
   const time = (at) => `${two(at.getHours())}:${two(at.getMinutes())}:${two(at.getSeconds())}`;
@@ -167,8 +169,8 @@
   }
   /** Return a quantity as typed, with this unit if it has none. The service checks it. */
   function quantity(text, unit) {
-    const typed = text.trim().replace(",", ".");
-    return /[\d.]$/.test(typed) ? typed + unit : typed;
+    const typed = point(text);
+    return /[\d.]$/.test(typed) && unit !== "1" ? typed + unit : typed;
   }
   function span(seconds) {
     const whole = Math.max(0, Math.round(seconds));
@@ -183,7 +185,7 @@
     const tick = () => {
       const ms = Date.now() - sinceMs;
       if (usual && ms < usual) bar.value = ms; else bar.removeAttribute("value");       // longer than usual: it goes on
-      line.textContent = `${text}: ${span(ms / 1000)}${usual ? ` of about ${span(usual / 1000)}` : ""}`;
+      line.textContent = `${text}: ${span(ms / 1000)}${usual ? ` ${tr("of about {time}", { time: span(usual / 1000) })}` : ""}`;
     };
     tick();
     const timer = setInterval(tick, 500);
@@ -193,42 +195,42 @@
       if (done) try { localStorage.setItem(key, String(Date.now() - sinceMs)); } catch (error) { /* as above */ }
     };
   }
-  const rehearsal = (yes) => (yes ? el("span", { class: "badge" }, "REHEARSAL") : null);
-  const uploaded = (yes) => (yes ? el("span", { class: "badge" }, "UPLOADED") : null);
-  const badge = (simulated) => (simulated ? el("span", { class: "badge" }, "SIMULATED") : null);
+  const rehearsal = (yes) => (yes ? el("span", { class: "badge" }, tr("REHEARSAL")) : null);
+  const uploaded = (yes) => (yes ? el("span", { class: "badge" }, tr("UPLOADED")) : null);
+  const badge = (simulated) => (simulated ? el("span", { class: "badge" }, tr("SIMULATED")) : null);
 
   // -- rigs
 
   function rigCard(rig) {
     const said = {
-      free: rig.simulated || rig.motion !== "never" ? "free" : `free; can't be moved from here (service.motion: ${rig.motion})`,
-      busy: "in use by a run", held: `held by ${rig.holder}`, blocked: "blocked: a stop was not confirmed", unusable: rig.problem,
+      free: rig.simulated || rig.motion !== "never" ? tr("free") : tr("free; can't be moved from here (service.motion: {rule})", { rule: rig.motion }),
+      busy: tr("in use by a run"), held: tr("held by {holder}", { holder: rig.holder }), blocked: tr("blocked: a stop was not confirmed"), unusable: english(rig.problem),
     }[rig.state];
     const mayStart = may("operator") && rig.state === "free" && (rig.simulated || rig.motion !== "never");
     return el("article", { class: "card", "aria-labelledby": `rig-${rig.id}` },
       el("h2", { id: `rig-${rig.id}` }, rig.name, " ", badge(rig.simulated) || ""),
       el("p", { class: rig.state === "blocked" || rig.state === "unusable" ? "alarm" : "dim" }, said),
-      rig.last ? el("p", {}, el("span", { class: "figure" }, `J = ${inertia(rig.last)}`), el("br"), el("a", { href: `/runs/${rig.last.id}` }, when(rig.last.asked))) : el("p", { class: "dim" }, "no result yet"),
+      rig.last ? el("p", {}, el("span", { class: "figure" }, `J = ${inertia(rig.last)}`), el("br"), el("a", { href: `/runs/${rig.last.id}` }, when(rig.last.asked))) : el("p", { class: "dim" }, tr("no result yet")),
       el("p", { class: "row" },
-        mayStart ? el("a", { class: "button", href: `/start/${encodeURIComponent(rig.id)}` }, "Start") : null,
-        rig.run ? el("a", { class: "button", href: `/runs/${rig.run}/live` }, "Live") : null,
-        rig.run || rig.state === "held" || rig.state === "blocked" ? el("button", { type: "button", class: "danger", onclick: () => stopRig(rig) }, "Stop") : null,
-        may("operator") ? el("a", { class: "button quiet", href: `/calibrate/${encodeURIComponent(rig.id)}` }, "Calibrate") : null,
-        may("operator") && rig.simulated && rig.state === "free" ? el("a", { class: "button quiet", href: `/rehearse/${encodeURIComponent(rig.id)}` }, "Rehearse") : null,
-        rig.state !== "unusable" ? el("a", { class: "button quiet", href: `/rigs/${encodeURIComponent(rig.id)}` }, "History") : null,
-        may("engineer") ? el("a", { class: "button quiet", href: `/rigs/${encodeURIComponent(rig.id)}/file` }, "File") : null,
-        rig.blocked_by ? el("a", { class: "button", href: `/runs/${rig.blocked_by}` }, "Sign off") : null));
+        mayStart ? el("a", { class: "button", href: `/start/${encodeURIComponent(rig.id)}` }, tr("Start")) : null,
+        rig.run ? el("a", { class: "button", href: `/runs/${rig.run}/live` }, tr("Live")) : null,
+        rig.run || rig.state === "held" || rig.state === "blocked" ? el("button", { type: "button", class: "danger", onclick: () => stopRig(rig) }, tr("Stop")) : null,
+        may("operator") ? el("a", { class: "button quiet", href: `/calibrate/${encodeURIComponent(rig.id)}` }, tr("Calibrate")) : null,
+        may("operator") && rig.simulated && rig.state === "free" ? el("a", { class: "button quiet", href: `/rehearse/${encodeURIComponent(rig.id)}` }, tr("Rehearse")) : null,
+        rig.state !== "unusable" ? el("a", { class: "button quiet", href: `/rigs/${encodeURIComponent(rig.id)}` }, tr("History")) : null,
+        may("engineer") ? el("a", { class: "button quiet", href: `/rigs/${encodeURIComponent(rig.id)}/file` }, tr("File")) : null,
+        rig.blocked_by ? el("a", { class: "button", href: `/runs/${rig.blocked_by}` }, tr("Sign off")) : null));
   }
 
   async function stopRig(rig) {
-    const late = setTimeout(() => away(`Stop of ${rig.name} ${UNDELIVERED}`), SILENT_MS);
+    const late = setTimeout(() => away(tr("Stop of {rig} {problem}", { rig: rig.name, problem: UNDELIVERED })), SILENT_MS);
     try {
       const found = await call("POST", `/rigs/${encodeURIComponent(rig.id)}/stop`, {}, {}, rig.run ? 10000 : 90000);      // without a run the answer comes after standstill
       if (byId("away").textContent.includes(UNDELIVERED)) away("");
       if (found.runs.length) location.assign(`/runs/${found.runs[0]}/live`);
-      else away(`${rig.name}: ${found.said}${found.exit_code === 0 ? "" : ". Use the hard-wired stop"}`);
+      else away(`${rig.name}: ${found.said}${found.exit_code === 0 ? "" : `. ${tr("Use the hard-wired stop")}`}`);
     } catch (error) {
-      away(`Stop of ${rig.name} ${UNDELIVERED}${error instanceof Refused ? `. ${error.message}` : ""}`);
+      away(`${tr("Stop of {rig} {problem}", { rig: rig.name, problem: UNDELIVERED })}${error instanceof Refused ? `. ${error.message}` : ""}`);
     } finally {
       clearTimeout(late);
     }
@@ -255,7 +257,7 @@
         if (field.checked) found[field.name] = true;
       } else if (text) {
         found[field.name] = unit ? quantity(text, unit) : kind === "tuple" ? text.split(/[\s,]+/)
-          : kind === "int" && /^-?\d+$/.test(text) ? Number(text) : text;
+          : kind === "int" && /^-?\d+$/.test(text) ? Number(text) : kind === "float" ? point(text) : text;
       }
     }
     return found;
@@ -265,7 +267,7 @@
   function markWrong(form, fields, go = true) {
     const known = fields.filter((one) => form.elements[one.option]);
     known.forEach((one) => {
-      const field = form.elements[one.option], note = el("span", { class: "alarm wrong", id: `wrong-${one.option}` }, one.message);
+      const field = form.elements[one.option], note = el("span", { class: "alarm wrong", id: `wrong-${one.option}` }, worded(one.message));
       field.setAttribute("aria-invalid", "true");
       field.setAttribute("aria-describedby", note.id);
       field.closest("label").append(note);
@@ -287,7 +289,7 @@
       await send();
     } catch (error) {
       if (error.fields && markWrong(form, error.fields)) return;
-      said.textContent = error instanceof Refused ? error.message : "No answer from tdhil serve.";
+      said.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve.");
       said.hidden = false;
     }
   }
@@ -295,17 +297,17 @@
   function planTable(plan) {
     const half = plan.expected_half_width, speed = (value) => number(inSpeedUnit(value), 3);
     const rows = [
-      ["expected interval of J (repeatability)", half === null ? "not predicted" : percent(half)],
-      ["time", `${span(plan.duration_s + 90)}, of which ${span(plan.duration_s)} are stage 5`],
-      ["motion", `${plan.excitation} in ${plan.mode} mode`],
-      ["speed", ofSpeed(() => `${speed(plan.speed_rad_s.min)} to ${speed(plan.speed_rad_s.max)} ${speedUnit()} (limits ${speed(plan.limits.speed_min_rad_s)} to ${speed(plan.limits.speed_max_rad_s)})`)],
-      ["torque, N·m", `${number(plan.torque_nm.min, 3)} to ${number(plan.torque_nm.max, 3)} (limit ±${number(plan.limits.torque_nm, 3)})`],
+      [tr("expected interval of J (repeatability)"), half === null ? tr("not predicted") : percent(half)],
+      [tr("time"), tr("{time}, of which {part} are stage 5", { time: span(plan.duration_s + 90), part: span(plan.duration_s) })],
+      [tr("motion"), tr("{excitation} in {mode} mode", { excitation: plan.excitation, mode: word(plan.mode, "mode") })],
+      [tr("speed"), ofSpeed(() => tr("{low} to {high} {unit} (limits {least} to {most})", { low: speed(plan.speed_rad_s.min), high: speed(plan.speed_rad_s.max), unit: speedUnit(), least: speed(plan.limits.speed_min_rad_s), most: speed(plan.limits.speed_max_rad_s) }))],
+      [tr("torque, N·m"), tr("{low} to {high} (limit ±{most})", { low: number(plan.torque_nm.min, 3), high: number(plan.torque_nm.max, 3), most: number(plan.limits.torque_nm, 3) })],
     ];
-    const advice = plan.stopping && !plan.stopping.reachable ? el("p", { class: "alarm" }, `±${number(100 * plan.stopping.tolerance, 3)} % can't be reached: ${plan.stopping.advice}`) : null;
+    const advice = plan.stopping && !plan.stopping.reachable ? el("p", { class: "alarm" }, `${tr("±{share} % can't be reached:", { share: number(100 * plan.stopping.tolerance, 3) })} `, english(plan.stopping.advice)) : null;
     return [
       el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text))))),
       advice || "",
-      el("p", { class: "dim" }, "These values are assumed. A run first measures friction, inertia and noise, and then plans again."),
+      el("p", { class: "dim" }, tr("These values are assumed. A run first measures friction, inertia and noise, and then plans again.")),
     ];
   }
 
@@ -317,17 +319,17 @@
     let measuring = null, warned = false;
     const measure = async () => {
       where.className = "dim";
-      where.textContent = "Measuring whether this computer sustains the cycle rate …";
+      where.textContent = tr("Measuring whether this computer sustains the cycle rate …");
       try {
         const { pace: found } = await call("GET", `/rigs/${encodeURIComponent(rig)}/pace`, undefined, {}, 60000);
         if (box.checked) {
           where.className = found.holds ? "" : "alarm";
-          where.textContent = found.text;
+          show(where, english(found.text));
         }
         return found.holds;
       } catch (error) {
         where.className = "alarm";
-        where.textContent = error instanceof Refused ? error.message : "The cycle rate could not be measured.";
+        where.textContent = error instanceof Refused ? error.message : tr("The cycle rate could not be measured.");
         return false;
       }
     };
@@ -339,7 +341,7 @@
     return async () => {             // a second request starts all the same
       if (!box.checked || warned || await (measuring ||= measure())) return true;
       warned = true;
-      where.textContent += " Start again to run all the same.";
+      where.append(` ${tr("Start again to run all the same.")}`);
       const closed = where.closest("details");
       if (closed) closed.open = true;
       where.scrollIntoView({ block: "center" });
@@ -358,8 +360,8 @@
     function refuse(message, fields = []) {
       byId("plan").hidden = true;            // the plan of other values
       if (fields.length) {
-        show(byId("said"), el("div", { class: "alarm", role: "alert" }, el("p", {}, `${fields.length === 1 ? "One value" : `${fields.length} values`} can't be used. Nothing was started.`),
-          el("ul", {}, ...fields.map((one) => el("li", {}, el("strong", {}, one.label), `: ${one.message}`)))));
+        show(byId("said"), el("div", { class: "alarm", role: "alert" }, el("p", {}, fields.length === 1 ? tr("One value can't be used. Nothing was started.") : tr("{count} values can't be used. Nothing was started.", { count: fields.length })),
+          el("ul", {}, ...fields.map((one) => el("li", {}, el("strong", {}, word(one.label)), ": ", worded(one.message))))));
         markWrong(form, fields);
         return;
       }
@@ -371,7 +373,7 @@
     }
     every(3000, async () => {
       const found = await call("GET", `/rigs/${encodeURIComponent(rig)}`);
-      const why = { busy: "A run uses this rig.", held: `Held by ${found.holder}.`, blocked: "Blocked until a stop that was not confirmed is signed off." }[found.state];
+      const why = { busy: tr("A run uses this rig."), held: tr("Held by {holder}.", { holder: found.holder }), blocked: tr("Blocked until a stop that was not confirmed is signed off.") }[found.state];
       byId("rig-state").textContent = why || "";
     });
     form.addEventListener("submit", async (event) => {
@@ -381,8 +383,8 @@
       const options = asked(form);
       buttons.forEach((one) => { one.disabled = true; });
       unmark(form);
-      const over = wanted === "plan" ? waiting(byId("said"), "Planning", "plan") : () => {};
-      if (wanted === "plan") byId("plan").hidden = true; else show(byId("said"), el("p", { class: "dim" }, "Asking …"));
+      const over = wanted === "plan" ? waiting(byId("said"), tr("Planning"), "plan") : () => {};
+      if (wanted === "plan") byId("plan").hidden = true; else show(byId("said"), el("p", { class: "dim" }, tr("Asking …")));
       let planned = false;
       try {
         if (wanted === "plan") {
@@ -400,7 +402,7 @@
           follow(run.id);
         }
       } catch (error) {
-        refuse(error instanceof Refused ? error.message : "No answer from tdhil serve.", error.fields);
+        refuse(error instanceof Refused ? error.message : tr("No answer from tdhil serve."), error.fields);
       } finally {
         over(planned);
         buttons.forEach((one) => { one.disabled = false; });
@@ -420,7 +422,7 @@
       plot = new uPlot({
         width: where.clientWidth || 320, height: 190, legend: { show: false }, cursor: { show: false },
         scales: { x: { time: false, range: (self, low, high) => (high > low ? [low, high] : [(low || 0) - 5, (low || 0) + 5]) } },
-        axes: [axis({ size: 34, values: (self, ticks) => ticks.map((one) => `${one} s`) }), axis({ size: 52 })],
+        axes: [axis({ size: 34, values: (self, all) => all.map((one) => `${tick(one)} s`) }), axis({ size: 52 })],
         series: [{}, edge(0), edge(0), edge(1), edge(1), { stroke: shade, width: 2, points: { show: true, size: 7, fill: shade } }],
         bands: [{ series: [1, 2], fill: `${shade}22` }, { series: [3, 4], fill: `${shade}44` }],
         hooks: { draw: [(self) => {
@@ -462,10 +464,10 @@
       const last = inertias[inertias.length - 1], known = inertias.filter((one) => one.inertia_kg_m2 !== null).pop();
       byId("inertia").hidden = !known;
       byId("inertia-now").textContent = known ? withUnit(interval(known.inertia_kg_m2, known.low_kg_m2, known.high_kg_m2)) : "–";
-      const words = [`${last.periods} periods`];
+      const words = [tr("{count} periods", { count: last.periods })];
       if (known) words.push(percent((known.high_kg_m2 - known.low_kg_m2) / 2 / known.inertia_kg_m2));
       if (last.p_value !== null) words.push(`p = ${number(last.p_value, 2)}`);
-      if (last.tolerance !== null && last.least_left_s !== null) words.push(`at least ${span(last.least_left_s)} to ±${Number((100 * last.tolerance).toPrecision(3))} %`);
+      if (last.tolerance !== null && last.least_left_s !== null) words.push(tr("at least {time} to ±{share} %", { time: span(last.least_left_s), share: local(String(Number((100 * last.tolerance).toPrecision(3)))) }));
       if (last.inertia_kg_m2 === null) words.push(last.reason);
       byId("inertia-said").textContent = words.join(", ");
       byId("inertia-row").hidden = false;
@@ -495,7 +497,7 @@
     function event(one) {
       const list = byId("events");
       if (one.kind === "preflight") return;
-      list.prepend(el("li", {}, `${one.time_s === null ? "" : one.time_s.toFixed(1) + " s "}${one.text.startsWith(`${one.kind}:`) ? "" : `${one.kind}: `}${one.text}`));
+      list.prepend(el("li", {}, one.time_s === null ? "" : `${fixed(one.time_s, 1)} s `, english(`${one.text.startsWith(`${one.kind}:`) ? "" : `${one.kind}: `}${one.text}`)));
       while (list.children.length > 200) list.lastElementChild.remove();
     }
 
@@ -505,7 +507,7 @@
       show(byId("stages"), ...names.map((name) => {
         const one = done[name];
         const current = status.state === "moving" && status.stage === name;
-        const text = one ? `${{ ok: "✓", skipped: "–", aborted: "✗" }[one.outcome] || "~"} ${name}, ${span(one.end_s - one.start_s)}${one.outcome === "ok" ? "" : `, ${one.outcome}`}` : `${current ? "▸" : "·"} ${name}, about ${span(status.expected_s[name])}`;
+        const text = one ? `${{ ok: "✓", skipped: "–", aborted: "✗" }[one.outcome] || "~"} ${word(name, "stage")}, ${span(one.end_s - one.start_s)}${one.outcome === "ok" ? "" : `, ${word(one.outcome, "outcome")}`}` : `${current ? "▸" : "·"} ${tr("{stage}, about {time}", { stage: word(name, "stage"), time: span(status.expected_s[name]) })}`;
         return el("li", current ? { "aria-current": "step" } : {}, text);
       }));
     }
@@ -522,8 +524,8 @@
     }
 
     function state() {
-      const error = status.error ? `: ${status.error.message}` : "";
-      byId("state").textContent = `${STATES[status.state] || status.state}${status.stage ? `: ${status.stage}` : ""}${error}`;
+      const error = status.error ? `: ${errorText(status.error)}` : "";
+      byId("state").textContent = `${STATES[status.state] || status.state}${status.stage ? `: ${word(status.stage, "stage")}` : ""}${error}`;
       byId("state").className = status.state === "stop_not_confirmed" ? "alarm" : "";
       const over = ENDED.includes(status.state);
       if (!over) wentOn = true;
@@ -538,8 +540,8 @@
       byId("confirm").hidden = !confirm;
       if (confirm) {
         checklist(status.confirmation.text);
-        const marks = { ok: "✓", note: "i" }, half = status.expected_half_width;
-        byId("confirm-expected").textContent = `Expected: ${half ? `J to ${percent(half)}, ` : ""}about ${span(Object.values(status.expected_s).reduce((sum, one) => sum + one, 0))}. ${status.identity}; if the host fails: ${status.safe_action}.`;
+        const marks = { ok: "✓", note: "i" }, half = status.expected_half_width, whole = Object.values(status.expected_s).reduce((sum, one) => sum + one, 0);
+        byId("confirm-expected").textContent = `${half ? tr("Expected: J to {share}, about {time}.", { share: percent(half), time: span(whole) }) : tr("Expected: about {time}.", { time: span(whole) })} ${tr("{drive}; if the host fails: {action}", { drive: status.identity, action: status.safe_action })}.`;
         show(byId("confirm-checks"), ...status.preflight.map((one) => el("tr", { class: one.outcome }, el("td", {}, marks[one.outcome] || "✗"), el("th", { scope: "row" }, one.name), el("td", {}, one.wanted), el("td", {}, one.found), el("td", {}, one.where))));
       }
       stopTimes();
@@ -568,11 +570,11 @@
     function stopTimes() {
       const stop = (status && status.stop) || {};
       const steps = [];
-      if (asking && !stop.asked) steps.push(el("li", {}, "asking …"));
-      if (stop.asked) steps.push(el("li", {}, `asked ${clock(stop.asked)}`));
-      if (stop.asked && stop.seen) steps.push(el("li", {}, `→ drive reacted ${clock(stop.seen)}`));
-      if (stop.at_rest) steps.push(el("li", {}, `${stop.asked ? "→ " : ""}standstill ${clock(stop.at_rest)}`));
-      if (stop.confirmed === false) steps.push(el("li", { class: "alarm" }, "Standstill NOT confirmed: use the hard-wired stop"));
+      if (asking && !stop.asked) steps.push(el("li", {}, tr("asking …")));
+      if (stop.asked) steps.push(el("li", {}, tr("asked {time}", { time: clock(stop.asked) })));
+      if (stop.asked && stop.seen) steps.push(el("li", {}, tr("→ drive reacted {time}", { time: clock(stop.seen) })));
+      if (stop.at_rest) steps.push(el("li", {}, `${stop.asked ? "→ " : ""}${tr("standstill {time}", { time: clock(stop.at_rest) })}`));
+      if (stop.confirmed === false) steps.push(el("li", { class: "alarm" }, tr("Standstill NOT confirmed: use the hard-wired stop")));
       show(byId("stop-times"), ...steps);
     }
 
@@ -582,7 +584,7 @@
       if (stop.asked || over) undelivered = false;
       const waits = stop.asked && !stop.seen && !stop.at_rest && !over && status.history.some((one) => one.state === "moving");
       unseen = waits ? unseen || Date.now() : null;
-      const text = undelivered ? UNDELIVERED : unseen && Date.now() - unseen > SILENT_MS ? "THE DRIVE DOES NOT REACT: use the hard-wired stop" : "";
+      const text = undelivered ? UNDELIVERED : unseen && Date.now() - unseen > SILENT_MS ? tr("THE DRIVE DOES NOT REACT: use the hard-wired stop") : "";
       byId("undelivered").hidden = !text;
       if (text && byId("undelivered").textContent !== text) byId("undelivered").textContent = text;
     }
@@ -650,10 +652,11 @@
       if (over) return;
       const unheard = mine && Date.now() - heard > SILENT_MS;
       where.className = watch.lost || watch.gone || unheard ? "alarm" : "";
-      const text = watch.lost ? `This run was not watched: it was stopped at ${clock(watch.lost)}.`
-        : unheard ? "The run receives nothing from this page: it stops 5 s after the last message."
-        : mine ? "You watch this run. If this page is hidden or closed for 5 s, the shaft stops."
-        : `${watch.by} watches this run on another page${watch.gone ? `, which is ${watch.how} since ${clock(watch.gone)}` : ""}: the shaft stops 5 s after that page is hidden or closed.`;
+      const text = watch.lost ? tr("This run was not watched: it was stopped at {time}.", { time: clock(watch.lost) })
+        : unheard ? tr("The run receives nothing from this page: it stops 5 s after the last message.")
+        : mine ? tr("You watch this run. If this page is hidden or closed for 5 s, the shaft stops.")
+        : watch.gone ? tr("{name} watches this run on another page, which is {how} since {time}: the shaft stops 5 s after that page is hidden or closed.", { name: watch.by, how: word(watch.how, "page"), time: clock(watch.gone) })
+        : tr("{name} watches this run on another page: the shaft stops 5 s after that page is hidden or closed.", { name: watch.by });
       if (where.textContent !== text) where.textContent = text;
     }
 
@@ -669,7 +672,7 @@
         if (watched && !key) hold(crypto.randomUUID());
         await call("POST", `/runs/${run}/confirm`, { code: field.value.replace(/\s/g, ""), binding: status.confirmation.binding, lease: watched ? key : null });
       } catch (error) {
-        said.textContent = error instanceof Refused ? error.message : "No answer from tdhil serve.";
+        said.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve.");
         said.hidden = false;
       }
       field.value = "";
@@ -691,22 +694,22 @@
       const real = age === null ? null : age + (now - message) / 1000;
       const old = silent || (running && ["moving", "stopping"].includes(status.state) && real !== null && real > SILENT_MS / 1000);
       document.body.classList.toggle("stale", Boolean(old && (running || silent)));
-      if (silent && message) away(`No connection to tdhil serve: the values are old. ${watched ? "The run stops, because it is not watched" : "The run continues under its guard"}. The hard-wired stop works.`);
+      if (silent && message) away(watched ? tr("No connection to tdhil serve: the values are old. The run stops, because it is not watched. The hard-wired stop works.") : tr("No connection to tdhil serve: the values are old. The run continues under its guard. The hard-wired stop works."));
       else if (!silent) away("");
-      byId("age").textContent = real === null ? "–" : running || silent ? (real < 10 ? `${real.toFixed(1)} s` : span(real)) : "ended";
+      byId("age").textContent = real === null ? "–" : running || silent ? (real < 10 ? `${fixed(real, 1)} s` : span(real)) : tr("ended");
       stopAlarm();
       watching();
       const left = leftS();
-      byId("left").textContent = left === null ? "" : `· about ${span(left)} left`;
+      byId("left").textContent = left === null ? "" : `· ${tr("about {time} left", { time: span(left) })}`;
       if (status && status.confirmation && !byId("confirm").hidden) {
         const leftMs = new Date(status.confirmation.expires) - now;
-        byId("confirm-left").textContent = leftMs > 0 ? `${Math.ceil(leftMs / 1000)} s left` : "the code is void";
+        byId("confirm-left").textContent = leftMs > 0 ? tr("{count} s left", { count: Math.ceil(leftMs / 1000) }) : tr("the code is void");
       }
       if (dirty) {
         dirty = false;
         charts.set(samples);
         const last = samples[0].length - 1;
-        byId("speed").textContent = last < 0 || samples[1][last] === null ? "–" : inSpeedUnit(samples[1][last]).toFixed(2);
+        byId("speed").textContent = last < 0 || samples[1][last] === null ? "–" : fixed(inSpeedUnit(samples[1][last]), 2);
         byId("torque").textContent = last < 0 || samples[2][last] === null ? "–" : samples[2][last].toFixed(0);
       }
     }, 150);
@@ -719,7 +722,7 @@
       if (now === shown) return;
       shown = now;
       byId("chain").className = found.broken ? "alarm" : "dim";
-      byId("chain").textContent = found.broken ? `The chain is BROKEN at ${found.broken.file}:${found.broken.line}: ${found.broken.why}` : `The chain of all lines is intact. Keep its head on another computer: ${found.head || "no line yet"}`;
+      byId("chain").textContent = found.broken ? tr("The chain is BROKEN at {place}: {why}", { place: `${found.broken.file}:${found.broken.line}`, why: found.broken.why }) : tr("The chain of all lines is intact. Keep its head on another computer: {head}", { head: found.head || tr("no line yet") });
       show(byId("entries"), ...found.entries.map((one) => el("tr", {}, el("th", { scope: "row" }, when(one.at)), el("td", {}, one.who), el("td", {}, one.what), el("td", {}, one.rig || ""),
         el("td", {}, one.run ? el("a", { href: `/runs/${one.run}` }, one.run) : ""), el("td", {}, Object.keys(one.details).length ? JSON.stringify(one.details) : ""))));
     });
@@ -732,7 +735,7 @@
     try {
       await work();
     } catch (error) {
-      where.textContent = error instanceof Refused ? error.message : "No answer from tdhil serve.";
+      where.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve.");
       where.hidden = false;
     }
   }
@@ -757,7 +760,7 @@
     form.addEventListener("submit", (event) => {
       event.preventDefault();
       byId("rig-file-done").textContent = "";
-      saying(said, async () => { fill(await call("POST", path, { text: form.elements.text.value, sha256 })); byId("rig-file-done").textContent = "Saved."; });
+      saying(said, async () => { fill(await call("POST", path, { text: form.elements.text.value, sha256 })); byId("rig-file-done").textContent = tr("Saved."); });
     });
     saying(said, async () => fill(await call("GET", path)));
   }
@@ -770,22 +773,27 @@
       const form = event.target;
       saying(said, async () => { after(await call("POST", path, given(form))); form.reset(); });
     });
-    const rows = (where, path, found) => show(byId(where), ...found.map((one) => el("tr", {}, el("th", { scope: "row" }, one.name), el("td", {}, one.role), el("td", {}, when(one.since)),
-      el("td", {}, el("button", { type: "button", class: "quiet", "aria-label": `Remove ${one.name}`, onclick: () => confirm(`Remove ${one.name}?`) && saying(said, async () => fill(await call("POST", `/${path}/${encodeURIComponent(one.name)}/remove`, {}))) }, "Remove")))));
+    const rows = (where, path, found) => show(byId(where), ...found.map((one) => el("tr", {}, el("th", { scope: "row" }, one.name), el("td", {}, word(one.role, "role")), el("td", {}, when(one.since)),
+      el("td", {}, el("button", { type: "button", class: "quiet", "aria-label": tr("Remove {name}", { name: one.name }), onclick: () => confirm(tr("Remove {name}?", { name: one.name })) && saying(said, async () => fill(await call("POST", `/${path}/${encodeURIComponent(one.name)}/remove`, {}))) }, tr("Remove"))))));
     const fill = (found) => { rows("users", "users", found.users); rows("tokens", "tokens", found.tokens); };
     const look = async () => fill(await call("GET", "/accounts"));
     sends("password", "/password", () => location.assign("/login"));
     sends("add-user", "/users", look);
-    sends("add-token", "/tokens", (made) => { show(byId("token"), `The token of ${made.name}, shown only once: `, el("code", {}, made.token)); look(); });
+    sends("add-token", "/tokens", (made) => { show(byId("token"), `${tr("The token of {name}, shown only once:", { name: made.name })} `, el("code", {}, made.token)); look(); });
     if (byId("users")) saying(said, look);
+  }
+
+  /** The text of an error that the service sent with its page, in the language of the page. */
+  function errorPage() {
+    byId("reported").textContent = errorText(JSON.parse(byId("reported").dataset.error));
   }
 
   const logout = byId("logout");
   if (logout) logout.addEventListener("click", async () => {
-    try { await call("POST", "/logout", {}); location.assign("/login"); } catch (error) { away("No answer from tdhil serve: you may still be logged in."); }
+    try { await call("POST", "/logout", {}); location.assign("/login"); } catch (error) { away(tr("No answer from tdhil serve: you may still be logged in.")); }
   });
 
-  const pages = { login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
+  const pages = { error: errorPage, login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
   window.tdhil = { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, csrf, el, every, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();

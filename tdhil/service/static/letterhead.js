@@ -1,13 +1,14 @@
 // The head of the reports: company, address, logo.
 "use strict";
 (() => {
+  const { tr } = window.tdhilLanguage;
   const { Refused, byId, call, el, pages, show, submits } = window.tdhil;
 
   /** The file in base64, without the beginning of a data URL. */
   const inBase64 = (file) => new Promise((done, fail) => {
     const reader = new FileReader();
     reader.addEventListener("load", () => done(reader.result.slice(reader.result.indexOf(",") + 1)));
-    reader.addEventListener("error", () => fail(new Refused("The file can't be read.")));
+    reader.addEventListener("error", () => fail(new Refused(tr("The file can't be read."))));
     reader.readAsDataURL(file);
   });
 
@@ -29,7 +30,7 @@
         const chosen = fields.logo.files[0];
         const picture = chosen ? await inBase64(chosen) : fields.remove.checked ? "" : null;
         fill(await call("POST", "/letterhead", { company: fields.company.value, address: fields.address.value.split("\n"), logo: picture }));
-        show(done, el("span", { class: "dim" }, "Saved. Each report is made again when it is next opened."));
+        show(done, el("span", { class: "dim" }, tr("Saved. Each report is made again when it is next opened.")));
       });
     });
     submits(form, said, async () => fill(await call("GET", "/letterhead")));

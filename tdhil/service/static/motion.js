@@ -1,12 +1,13 @@
 // Speed and torque of a run over one time axis: zoom, pan, values under the cursor, export of the view.
 "use strict";
 (() => {
+  const { fixed, tick, tr, word } = window.tdhilLanguage;
   const { axis, byId, colour, el, inSpeedUnit, onSpeedUnit, speedUnit } = window.tdhil;
   const HEIGHT = 190;
   const LEAST_S = 0.2;           // shortest view: five displayed samples
   const DRAG_PX = 6;             // a shorter drag is a click
   const STEP = 0.25, ZOOM = 2;   // a press of a button moves by a quarter of the view, or halves it
-  const HINT = "Drag across a chart to zoom. Double-click shows the whole run.";
+  const HINT = tr("Drag across a chart to zoom. Double-click shows the whole run.");
 
   /** Nearest index of `time` to `at`; `time` rises. */
   function nearest(time, at) {
@@ -60,8 +61,8 @@
     function read(at) {
       const text = at === null || !samples[0].length ? HINT : (() => {
         const k = nearest(samples[0], at), speed = samples[1][k], torque = samples[2][k];
-        const value = (one, digits) => (one === null ? "no value" : one.toFixed(digits));
-        return `${samples[0][k].toFixed(2)} s: ${value(speed === null ? null : inSpeedUnit(speed), 3)} ${speedUnit()}, ${value(torque, 1)} N·m`;
+        const value = (one, digits) => (one === null ? tr("no value") : fixed(one, digits));
+        return `${fixed(samples[0][k], 2)} s: ${value(speed === null ? null : inSpeedUnit(speed), 3)} ${speedUnit()}, ${value(torque, 1)} N·m`;
       })();
       if (readout.textContent !== text) readout.textContent = text;
     }
@@ -80,7 +81,7 @@
       for (const stage of stages) {
         const x = self.valToPos(stage.end_s, "x", true), before = Math.max(self.valToPos(from, "x", true), left);
         c.beginPath(); c.moveTo(x, top); c.lineTo(x, top + height); c.stroke();
-        if (chart.column === 1 && x - before > c.measureText(stage.name).width + 8 * px) c.fillText(stage.name, before + 4 * px, top + height - 3 * px);
+        if (chart.column === 1 && x - before > c.measureText(word(stage.name, "stage")).width + 8 * px) c.fillText(word(stage.name, "stage"), before + 4 * px, top + height - 3 * px);
         from = stage.end_s;
       }
       c.strokeStyle = colour("--limit");
@@ -94,7 +95,7 @@
     }
 
     /** Columns of a chart. Only speeds in rpm need a copy: this runs as long as samples come. */
-    const data = (chart) => [samples[0], chart.column === 1 && speedUnit() === "rpm" ? samples[1].map((one) => (one === null ? null : inSpeedUnit(one))) : samples[chart.column]];
+    const data = (chart) => [samples[0], chart.column === 1 && inSpeedUnit(1) !== 1 ? samples[1].map((one) => (one === null ? null : inSpeedUnit(one))) : samples[chart.column]];
     function draw() {
       for (const chart of charts) {
         if (chart.plot) chart.plot.destroy();
@@ -109,7 +110,7 @@
               return [from - pad, to + pad];
             } },
           },
-          axes: [axis({ size: 34, values: (self, ticks) => ticks.map((one) => `${one} s`) }), axis({ size: 52 })],
+          axes: [axis({ size: 34, values: (self, all) => all.map((one) => `${tick(one)} s`) }), axis({ size: 52 })],
           series: [{}, { stroke: colour(chart.colour), width: 1.5, points: { show: false } }],
           hooks: {
             draw: [(self) => marks(chart, self)],

@@ -1,6 +1,7 @@
 // A new rig in six steps: profile, address with a scan, settings by hand, machine limits with their picture, check, save.
 "use strict";
 (() => {
+  const { english, local, point, tr, word, worded } = window.tdhilLanguage;
   const { Refused, byId, call, el, markWrong, pages, show, unmark, waiting } = window.tdhil;
   const SCAN_MS = 130000;            // the service ends a scan after 120 s
 
@@ -17,8 +18,8 @@
       if (text !== undefined) one.textContent = text;
       return one;
     };
-    const round = (value) => Number(value.toPrecision(3)).toString();
-    const svg = draw("svg", { viewBox: `0 0 ${W} ${H}`, class: "window", role: "img", "aria-label": `Window of motion: ${round(low)} to ${round(high)} rad/s, at most ${round(torque)} N·m either way` });
+    const round = (value) => local(Number(value.toPrecision(3)).toString());
+    const svg = draw("svg", { viewBox: `0 0 ${W} ${H}`, class: "window", role: "img", "aria-label": tr("Window of motion: {low} to {high} rad/s, at most {torque} N·m either way", { low: round(low), high: round(high), torque: round(torque) }) });
     svg.append(
       draw("rect", { x: x(low), y: y(torque), width: x(high) - x(low), height: y(-torque) - y(torque), class: "inside" }),
       draw("line", { x1: left, x2: W - right, y1: y(0), y2: y(0), class: "axis" }),
@@ -26,10 +27,10 @@
       draw("line", { x1: x(0), x2: x(0), y1: y(Math.min(probe, torque)), y2: y(0), class: "probe" }));
     for (const nm of [torque, 0, -torque]) svg.append(draw("text", { x: left - 6, y: y(nm) + 4, "text-anchor": "end" }, round(nm)));
     for (const speed of [low, high]) svg.append(draw("text", { x: x(speed), y: H - bottom + 16, "text-anchor": "middle" }, round(speed)));
-    svg.append(draw("text", { x: (left + W - right) / 2, y: H - 8, "text-anchor": "middle" }, "speed, rad/s"),
-      draw("text", { x: 14, y: (top + H - bottom) / 2, "text-anchor": "middle", transform: `rotate(-90 14 ${(top + H - bottom) / 2})` }, "torque, N·m"));
+    svg.append(draw("text", { x: (left + W - right) / 2, y: H - 8, "text-anchor": "middle" }, tr("speed, rad/s")),
+      draw("text", { x: 14, y: (top + H - bottom) / 2, "text-anchor": "middle", transform: `rotate(-90 14 ${(top + H - bottom) / 2})` }, tr("torque, N·m")));
     return el("figure", {}, svg, el("figcaption", { class: "dim" },
-      `Shaded: the window of a run. Thick: the sign probe, the first motion, with at most ${round(probe)} N·m. A stop from the highest speed takes ${round(high / brake)} s.`));
+      tr("Shaded: the window of a run. Thick: the sign probe, the first motion, with at most {torque} N·m. A stop from the highest speed takes {time} s.", { torque: round(probe), time: round(high / brake) })));
   }
 
   async function newRigPage() {
@@ -46,10 +47,10 @@
 
     const capital = (text) => `${text.charAt(0).toUpperCase()}${text.slice(1)}`;
     /** Label of a key of the machine: "N·m; highest torque" is "Highest torque, N·m". */
-    const meaning = ({ description }) => (description.includes("; ") ? capital(`${description.split("; ").slice(1).join("; ")}, ${description.split("; ")[0]}`) : capital(description));
-    const place = (one) => capital(`${one.name.replaceAll("_", " ")}: ${one.description}`);
+    const meaning = ({ description: said }, description = word(said)) => (description.includes("; ") ? capital(`${description.split("; ").slice(1).join("; ")}, ${description.split("; ")[0]}`) : capital(description));
+    const place = (one) => capital(`${word(one.name.replaceAll("_", " "), "key")}: ${word(one.description)}`);
     const buses = [...new Set(profiles.map((one) => one.bus_title))];
-    show(field("profile"), ...buses.map((bus) => el("optgroup", { label: bus }, ...profiles.filter((one) => one.bus_title === bus)
+    show(field("profile"), ...buses.map((bus) => el("optgroup", { label: bus, lang: "en" }, ...profiles.filter((one) => one.bus_title === bus)
       .map((one) => el("option", { value: one.name }, `${one.title} (${one.name})`)))));
     show(byId("machine"), ...machine.map((one) => input(one.name, meaning(one))));
 
@@ -57,15 +58,15 @@
     function profileChanged() {
       const one = chosen();
       show(byId("address"), ...one.address.map((key) => input(`address.${key.name}`, place(key))));
-      show(byId("parameters"), ...one.parameters.map((key) => input(key.name, `${key.description}, which the drive does not report`)));
-      byId("profile-hint").textContent = one.experimental ? "This profile was made from documents. No run with it was reported yet." : "";
+      show(byId("parameters"), ...one.parameters.map((key) => input(key.name, tr("{quantity}, which the drive does not report", { quantity: word(key.description) }))));
+      byId("profile-hint").textContent = one.experimental ? tr("This profile was made from documents. No run with it was reported yet.") : "";
       byId("rated").hidden = !one.rated_torque_by_hand;
       const doubts = Object.entries(one.unverified);
       show(byId("by-hand"),
-        one.by_hand.length ? el("p", {}, "Make these settings at the drive. A run is refused until it reads them:") : el("p", {}, "This profile asks for no settings by hand."),
-        one.by_hand.length ? el("ul", {}, ...one.by_hand.map((text) => el("li", {}, text))) : null,
-        doubts.length ? el("p", { "data-field": "accept_unverified" }, "These entries of the profile are not verified on a drive. Compare each with the drive's manual, and accept it:") : null,
-        ...doubts.map(([name, source]) => el("label", { class: "check" }, el("input", { type: "checkbox", name: "accept", value: name }), `${name}: ${source}`)));
+        one.by_hand.length ? el("p", {}, tr("Make these settings at the drive. A run is refused until it reads them:")) : el("p", {}, tr("This profile asks for no settings by hand.")),
+        one.by_hand.length ? el("ul", {}, ...one.by_hand.map((text) => el("li", {}, english(text)))) : null,
+        doubts.length ? el("p", { "data-field": "accept_unverified" }, tr("These entries of the profile are not verified on a drive. Compare each with the drive's manual, and accept it:")) : null,
+        ...doubts.map(([name, source]) => el("label", { class: "check" }, el("input", { type: "checkbox", name: "accept", value: name }), english(`${name}: ${source}`))));
     }
     function loadChanged() {
       const string = field("load").value === "string";
@@ -79,13 +80,13 @@
 
     function draft() {
       const found = { address: {}, limits: {}, string: {}, accept_unverified: [...form.querySelectorAll("[name=accept]:checked")].map((one) => one.value), alone: field("alone").checked };
-      for (const name of ["profile", "name", "load", "gear_ratio", "motion"]) found[name] = field(name).value.trim();
-      found.rated_torque_nm = byId("rated").hidden ? "" : field("rated_torque_nm").value.trim();
-      found.parameters = Object.fromEntries([...form.querySelectorAll("#parameters input")].map((one) => [one.name.replace("parameters.", ""), one.value.trim()]));
+      for (const name of ["profile", "name", "load", "gear_ratio", "motion"]) found[name] = point(field(name).value);
+      found.rated_torque_nm = byId("rated").hidden ? "" : point(field("rated_torque_nm").value);
+      found.parameters = Object.fromEntries([...form.querySelectorAll("#parameters input")].map((one) => [one.name.replace("parameters.", ""), point(one.value)]));
       for (const one of form.querySelectorAll("#address input")) found.address[one.name.replace("address.", "")] = one.value.trim();
       for (const one of byId("machine").querySelectorAll("input")) {
-        if (one.name.startsWith("limits.")) found.limits[one.name.replace("limits.", "")] = one.value.trim();
-        else found.string[one.name] = one.value.trim();
+        if (one.name.startsWith("limits.")) found.limits[one.name.replace("limits.", "")] = point(one.value);
+        else found.string[one.name] = point(one.value);
       }
       return found;
     }
@@ -97,7 +98,7 @@
       for (const one of named.filter((each) => !form.elements[each.option])) {
         const place = form.querySelector(`[data-field="${CSS.escape(one.option)}"]`);
         if (!place) { rest.push(one.message); continue; }
-        place.append(el("span", { class: "alarm wrong" }, one.message));
+        place.append(el("span", { class: "alarm wrong" }, worded(one.message)));
         if (!marked) place.scrollIntoView({ block: "center" });
       }
       return rest;
@@ -109,13 +110,13 @@
       const found = await call("POST", "/new-rig/draft", draft());
       picture(found.limits);
       show(byId("draft"),
-        el("p", { class: found.problems.length ? "alarm" : "verdict good" }, found.problems.length ? `${found.problems.length} ${found.problems.length === 1 ? "entry needs" : "entries need"} a correction. Each is marked at its field.` : "The file is complete."),
+        el("p", { class: found.problems.length ? "alarm" : "verdict good" }, found.problems.length ? found.problems.length === 1 ? tr("1 entry needs a correction. Each is marked at its field.") : tr("{count} entries need a correction. Each is marked at its field.", { count: found.problems.length }) : tr("The file is complete.")),
         el("label", {}, "rig.yaml", el("textarea", { name: "text", rows: "24", readonly: "", spellcheck: "false" }, found.text)));
       const rest = mark(found.problems);
       if (rest.length) { said.textContent = rest.join(" "); said.hidden = false; }
       return found;
     }
-    const refused = (error) => { said.textContent = error instanceof Refused ? error.message : "No answer from tdhil serve."; said.hidden = false; };
+    const refused = (error) => { said.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve."); said.hidden = false; };
     form.addEventListener("submit", async (event) => {
       event.preventDefault();
       const save = event.submitter && event.submitter.value === "save";
@@ -134,14 +135,14 @@
     byId("scan").addEventListener("click", async () => {
       unmark(form);
       said.hidden = true;
-      const over = waiting(byId("scan-said"), "Scanning");
+      const over = waiting(byId("scan-said"), tr("Scanning"));
       byId("scan").disabled = true;
       try {
         const { found, remarks } = await call("POST", "/new-rig/scan", draft(), {}, SCAN_MS);
         over();
         show(byId("scan-said"), ...found.map((one) => el("article", { class: "card" },
-          el("p", {}, el("strong", {}, one.title || "a drive without a name"), ` · ${one.identity}${one.simulated ? " · SIMULATED" : ""}`),
-          el("p", { class: "dim" }, `profile ${one.profile || "none"} (${one.why})`),
+          el("p", {}, el("strong", {}, one.title || tr("a drive without a name")), ` · ${one.identity}${one.simulated ? ` · ${tr("SIMULATED")}` : ""}`),
+          el("p", { class: "dim" }, tr("profile {profile} ({why})", { profile: one.profile || tr("none"), why: one.why })),
           el("button", { type: "button", class: "quiet", onclick: () => {
             if (one.profile && byName.has(one.profile) && one.profile !== field("profile").value) {
               const typed = draft().address;
@@ -150,11 +151,11 @@
               for (const [name, text] of Object.entries(typed)) if (field(`address.${name}`)) field(`address.${name}`).value = text;
             }
             for (const [name, text] of Object.entries(one.fields)) if (field(`address.${name}`)) field(`address.${name}`).value = text;
-          } }, "Use this drive"))),
-          found.length ? null : el("p", {}, "No drive replied."), ...remarks.map((text) => el("p", { class: "dim" }, text)));
+          } }, tr("Use this drive")))),
+          found.length ? null : el("p", {}, tr("No drive replied.")), ...remarks.map((text) => el("p", { class: "dim" }, english(text))));
       } catch (error) {
         over();
-        show(byId("scan-said"), el("p", { class: "alarm" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+        show(byId("scan-said"), el("p", { class: "alarm" }, error instanceof Refused ? error.message : tr("No answer from tdhil serve.")));
       } finally {
         byId("scan").disabled = false;
       }

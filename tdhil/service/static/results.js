@@ -1,6 +1,7 @@
 // Results: one run, a comparison, a rig over time, many logs. As in app.js, data from elsewhere are inserted as text.
 "use strict";
 (() => {
+  const { coded, english, errorText, fixed, point, precise, tr, word } = window.tdhilLanguage;
   const { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, may, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, uploaded, waiting, when, zone } = window.tdhil;
 
   // -- one run
@@ -8,32 +9,32 @@
   function resultOf(run) {
     const result = run.result;
     const parts = [el("p", { class: "now" }, el("strong", { class: run.state === "stop_not_confirmed" ? "alarm" : "" }, STATES[run.state] || run.state))];
-    if (run.error) parts.push(el("p", { class: run.state === "stopped" && run.stop.asked ? "dim" : "alarm" }, run.error.message));
-    if (!ENDED.includes(run.state)) parts.push(el("p", {}, el("a", { class: "button", href: `/runs/${run.id}/live` }, "Live")));
+    if (run.error) parts.push(el("p", { class: run.state === "stopped" && run.stop.asked ? "dim" : "alarm" }, errorText(run.error)));
+    if (!ENDED.includes(run.state)) parts.push(el("p", {}, el("a", { class: "button", href: `/runs/${run.id}/live` }, tr("Live"))));
     parts.push(...rehearsed(run));
     parts.push(...accepted(result));
     if (!result) return parts;
-    const rows = [["verdict", result.verdict]];
+    const rows = [[tr("verdict"), word(result.verdict, "verdict")]];
     const J = result.inertia_kg_m2;
     const estimate = (one, unit) => (one ? `${of(one)} ${unit}` : null);
-    if (J) rows.push([`J, ${number(100 * (J.confidence ?? 0.95))} % interval to quote`, `${ofResult(result)}  ${percent(J.half_width_total_rel)}`], ["repeatability, this drive", `${of(J)} kg·m²  ${percent(J.repeatability_rel)}`]);
-    for (const [name, key, unit] of [["viscous friction B", "viscous_nm_s_rad", "N·m·s/rad"], ["Coulomb friction T_c, constant load included", "coulomb_nm", "N·m"], ["lag of the reported speed", "speed_lag_s", "s"], ["lag of the reported torque", "torque_lag_s", "s"], ["time offset between speed and torque", "skew_s", "s"]]) {
+    if (J) rows.push([tr("J, {share} % interval to quote", { share: number(100 * (J.confidence ?? 0.95)) }), `${ofResult(result)}  ${percent(J.half_width_total_rel)}`], [tr("repeatability, this drive"), `${of(J)} kg·m²  ${percent(J.repeatability_rel)}`]);
+    for (const [name, key, unit] of [[tr("viscous friction B"), "viscous_nm_s_rad", "N·m·s/rad"], [tr("Coulomb friction T_c, constant load included"), "coulomb_nm", "N·m"], [tr("lag of the reported speed"), "speed_lag_s", "s"], [tr("lag of the reported torque"), "torque_lag_s", "s"], [tr("time offset between speed and torque"), "skew_s", "s"]]) {
       const text = estimate(result[key], unit);
       if (text) rows.push([name, text]);
     }
-    if (result.model) rows.push(["model", result.model]);
+    if (result.model) rows.push([tr("model"), result.model]);
     for (const one of result.second_opinions || []) {
-      const agrees = one.agrees === null ? "" : one.agrees ? ", agrees" : ", DISAGREES";
-      rows.push([`momentum cross-check, ${one.route}`, `${estimate(one.inertia_kg_m2, "kg·m²")}${agrees}`]);
+      const agrees = one.agrees === null ? "" : one.agrees ? `, ${tr("agrees")}` : `, ${tr("DISAGREES")}`;
+      rows.push([tr("momentum cross-check, {route}", { route: one.route }), `${estimate(one.inertia_kg_m2, "kg·m²")}${agrees}`]);
     }
     const card = el("div", { class: "card" },
       J ? el("p", { class: "figure large" }, `J = ${ofResult(result)}`) : null,
-      el("p", { class: `verdict ${VERDICTS[result.verdict] || ""}` }, result.verdict),
-      region("Numbers", el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))),
-      el("p", {}, sentence(result.reason || "")), result.advice ? el("p", {}, sentence(result.advice)) : null);
+      el("p", { class: `verdict ${VERDICTS[result.verdict] || ""}` }, word(result.verdict, "verdict")),
+      region(tr("Numbers"), el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))),
+      el("p", {}, ...coded(result.code, sentence(result.reason || ""))), result.advice ? el("p", {}, english(sentence(result.advice))) : null);
     parts.push(card);
     const codes = result.warning_codes || [], wanted = run.state === "stopped" && run.stop.asked;
-    (result.warnings || []).forEach((one, k) => parts.push(el("p", { class: wanted && codes[k] === ENDED_EARLY ? "dim" : "alarm" }, sentence(one))));
+    (result.warnings || []).forEach((one, k) => parts.push(el("p", { class: wanted && codes[k] === ENDED_EARLY ? "dim" : "alarm" }, ...coded(codes[k], sentence(one)))));
     return parts;
   }
   /** Expected against identified, each by its interval, and what is off. */
@@ -41,25 +42,25 @@
     const found = result && result.acceptance;
     if (!found) return [];
     const colour = { pass: "good", fail: "bad" };
-    return [el("section", { class: "card" }, el("h2", {}, "Acceptance"),
-      el("p", { class: `verdict ${colour[found.verdict] || "fair"}` }, found.verdict),
-      ...found.off.map((one) => el("p", { class: "alarm" }, `${one} [${found.code}]`)),
-      region("Acceptance", el("table", { class: "whole" }, el("thead", {}, el("tr", {}, ...["quantity", "expected", "identified", "verdict"].map((one) => el("th", { scope: "col" }, one)))),
-        el("tbody", {}, ...found.quantities.map((one) => el("tr", {}, el("th", { scope: "row" }, one.label),
+    return [el("section", { class: "card" }, el("h2", {}, tr("Acceptance")),
+      el("p", { class: `verdict ${colour[found.verdict] || "fair"}` }, word(found.verdict, "verdict")),
+      ...found.off.map((one) => el("p", { class: "alarm" }, ...coded(found.code, `${one} [${found.code}]`))),
+      region(tr("Acceptance"), el("table", { class: "whole" }, el("thead", {}, el("tr", {}, ...[tr("quantity"), tr("expected"), tr("identified"), tr("verdict")].map((one) => el("th", { scope: "col" }, one)))),
+        el("tbody", {}, ...found.quantities.map((one) => el("tr", {}, el("th", { scope: "row" }, word(one.label)),
           el("td", {}, `${number(one.expected)} ± ${number(one.tolerance, 2)} ${one.unit}`),
-          el("td", {}, one.value === null ? "not identified" : `${of(one)} ${one.unit}`),
-          el("td", { class: `verdict ${colour[one.verdict] || "fair"}` }, one.verdict))))))) ];
+          el("td", {}, one.value === null ? tr("not identified") : `${of(one)} ${one.unit}`),
+          el("td", { class: `verdict ${colour[one.verdict] || "fair"}` }, word(one.verdict, "verdict")))))))) ];
   }
   /** The verdict on rehearsed faults: required and seen. */
   function rehearsed(run) {
     const found = run.rehearsal_verdict;
     if (!found) return [];
     const rows = [...found.faults.flatMap((one) => [
-      [one.fault, `${one.verdict}; exit ${one.codes.join(" or ")} is required`],
-      [`required by ${one.row ? `row ${one.row}` : "any fault"}`, one.required]]), ["seen", found.seen]];
-    return [el("section", { class: "card" }, el("h2", {}, "Rehearsal"),
-      el("p", { class: `verdict ${{ pass: "good", fail: "bad" }[found.verdict] || "fair"}` }, found.verdict),
-      region("Rehearsal", el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))))];
+      [one.fault, tr("{verdict}; exit {codes} is required", { verdict: word(one.verdict, "verdict"), codes: one.codes.join(` ${tr("or")} `) })],
+      [one.row ? tr("required by row {row}", { row: one.row }) : tr("required by any fault"), english(one.required)]]), [tr("seen"), english(found.seen)]];
+    return [el("section", { class: "card" }, el("h2", {}, tr("Rehearsal")),
+      el("p", { class: `verdict ${{ pass: "good", fail: "bad" }[found.verdict] || "fair"}` }, word(found.verdict, "verdict")),
+      region(tr("Rehearsal"), el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))))];
   }
   const ENDED_EARLY = "TDH-030";
   const VERDICTS = { valid: "good", valid_wide: "fair", not_identifiable: "bad", model_rejected: "bad" };
@@ -69,21 +70,21 @@
     const lines = [...((result && result.budget) || [])].sort((a, b) => (b.half_width_kg_m2 ?? Infinity) - (a.half_width_kg_m2 ?? Infinity));
     if (!lines.length) return [];
     const most = Math.max(...lines.map((one) => one.half_width_kg_m2 ?? 0));
-    return [el("details", {}, el("summary", {}, "Uncertainty budget, in numbers"), region("Uncertainty budget", el("table", {},
-      el("tbody", {}, ...lines.map((one) => el("tr", {}, el("th", { scope: "row" }, one.source),
+    return [el("details", {}, el("summary", {}, tr("Uncertainty budget, in numbers")), region(tr("Uncertainty budget"), el("table", {},
+      el("tbody", {}, ...lines.map((one) => el("tr", {}, el("th", { scope: "row" }, word(one.source, "budget")),
         el("td", {}, `± ${number(one.half_width_kg_m2, 2)} kg·m²`),
-        el("td", {}, el("meter", { min: 0, max: most || 1, value: one.half_width_kg_m2 ?? 0, "aria-label": `share of the largest: ${one.source}` })),
-        el("td", { class: "dim" }, one.note)))))))];
+        el("td", {}, el("meter", { min: 0, max: most || 1, value: one.half_width_kg_m2 ?? 0, "aria-label": tr("share of the largest: {source}", { source: word(one.source, "budget") }) })),
+        el("td", { class: "dim" }, english(one.note))))))))];
   }
 
   /** The report's pictures, and the friction curve in numbers below its own. */
   async function pictures(id, result) {
     const found = await call("GET", `/runs/${id}/pictures`);
     show(byId("pictures"), ...found.flatMap((one) => [
-      el("h2", {}, one.heading),
-      el("figure", {}, el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: one.caption, loading: "lazy" }), el("figcaption", {}, one.caption))]));
+      el("h2", {}, word(one.heading)),
+      el("figure", {}, el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: one.caption, loading: "lazy" }), el("figcaption", {}, english(one.caption)))]));
     const curve = (result && result.friction_curve) || [];
-    if (curve.length) byId("pictures").append(numbers("Friction over speed, in numbers", ["speed", "torque, N·m"],
+    if (curve.length) byId("pictures").append(numbers(tr("Friction over speed, in numbers"), [tr("speed"), tr("torque, N·m")],
       curve.map((one) => [ofSpeed(() => `${number(inSpeedUnit(one.speed_rad_s))} ${speedUnit()}`), of(one.torque_nm)])));
   }
   const of = (one) => interval(one.value, one.low, one.high) ?? "–";
@@ -111,8 +112,8 @@
       byId("replays").hidden = !ENDED.includes(run.state) || !run.files.includes("run.mcap");
       const first = run.result ? [{ asked: {}, result: run.result, state: "done", first: true }] : [];
       show(byId("replay-rows"), ...[...first, ...run.replays].map((one) => el("tr", {},
-        el("th", { scope: "row" }, one.first ? "the run itself" : Object.entries(one.asked).map(([name, value]) => `${name} ${value}`).join(", ") || "as the run"),
-        el("td", {}, one.state === "waiting" ? waits(one) : one.error ? one.error.message : one.result.verdict),
+        el("th", { scope: "row" }, one.first ? tr("the run itself") : english(Object.entries(one.asked).map(([name, value]) => `${name} ${value}`).join(", ")) || tr("as the run")),
+        el("td", {}, one.state === "waiting" ? waits(one) : one.error ? errorText(one.error) : word(one.result.verdict, "verdict")),
         el("td", {}, ofResult(one.result) || "–"),
         el("td", {}, one.result && one.result.inertia_kg_m2 ? percent(one.result.inertia_kg_m2.half_width_total_rel) : ""))));
     });
@@ -121,7 +122,7 @@
     function waits(one) {
       if (!clocks.has(one.name)) {
         const cell = el("div");
-        waiting(cell, "Identifying again", "replay", Date.parse(one.at));
+        waiting(cell, tr("Identifying again"), "replay", Date.parse(one.at));
         clocks.set(one.name, cell);
       }
       return clocks.get(one.name);
@@ -139,18 +140,18 @@
         if (busy) return;
         busy = true;
         link.closest("li").append(note);
-        const over = waiting(note, `${inPage ? "The page" : "The PDF"} is made${again ? " again" : ""}`, inPage ? "page" : "pdf");
+        const over = waiting(note, inPage ? tr("The page is made again") : again ? tr("The PDF is made again") : tr("The PDF is made"), inPage ? "page" : "pdf");
         try {
           const answer = await fetch(link.href);
-          if (!answer.ok) throw new Refused((await answer.json()).error.message);
+          if (!answer.ok) throw new Refused(errorText((await answer.json()).error));
           over(true);
           link.dataset.ready = "";
           outdated = outdated.filter((one) => one !== name);
-          if (inPage) show(note, el("p", { role: "status" }, "The page was made again: ", el("a", { href: link.href, target: "_blank", rel: "noopener" }, "open it")));
+          if (inPage) show(note, el("p", { role: "status" }, tr("The page was made again:"), " ", el("a", { href: link.href, target: "_blank", rel: "noopener" }, tr("open it"))));
           else { show(note); link.click(); }
         } catch (error) {
           over(false);
-          show(note, el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+          show(note, el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : tr("No answer from tdhil serve.")));
         } finally {
           busy = false;
         }
@@ -163,7 +164,7 @@
       said.hidden = true;
       try {
         const found = await call("POST", `/runs/${id}/replays`, asked(replay));
-        if (found.state === "done") { said.textContent = `Replay ${Number(found.name)} below has these settings.`; said.className = "dim"; said.hidden = false; }
+        if (found.state === "done") { said.textContent = tr("Replay {number} below has these settings.", { number: Number(found.name) }); said.className = "dim"; said.hidden = false; }
       } catch (error) {
         said.textContent = error.message;
         said.className = "alarm";
@@ -203,12 +204,12 @@
     });
     try {
       found = await call("GET", `/runs/${id}/acceptance`, undefined, {}, 120000);
-      if (found.problem) fail(`The signature does not hold: ${found.problem}.`);
+      if (found.problem) fail(`${tr("The signature does not hold:")} ${found.problem}.`);
       if (!form) return;
       byId("log-sha256").textContent = found.log_sha256;
       form.querySelector("button").disabled = false;
     } catch (error) {
-      fail(error instanceof Refused ? error.message : "No answer from tdhil serve.");
+      fail(error instanceof Refused ? error.message : tr("No answer from tdhil serve."));
     }
   }
 
@@ -219,7 +220,7 @@
     form.addEventListener("submit", (event) => {
       event.preventDefault();
       submits(form, byId("evidence-said"), async () => {
-        const over = waiting(wait, "The archive is made", "evidence");
+        const over = waiting(wait, tr("The archive is made"), "evidence");
         try {
           await call("POST", `/runs/${id}/evidence`, asked(form), {}, 600000);
           over(true);
@@ -266,7 +267,7 @@
 
   // -- lists
 
-  const NO_RIG = "Uploaded recording";         // as the title of its page
+  const NO_RIG = tr("Uploaded recording");         // as the title of its page
   function runsPage() {
     const chosen = new Set(), link = byId("compare");
     link.addEventListener("click", () => location.assign(`/compare?runs=${[...chosen].sort().join()}${form.elements.archived.checked ? "&archived=true" : ""}`));
@@ -275,7 +276,7 @@
       if (yes) chosen.add(id); else chosen.delete(id);
       const enough = chosen.size >= 2 && chosen.size <= 8;
       link.disabled = !enough;
-      byId("chosen").textContent = chosen.size ? `${chosen.size} chosen${chosen.size > 8 ? ", eight at most" : ""}` : "Choose two to eight runs.";
+      byId("chosen").textContent = chosen.size ? chosen.size > 8 ? tr("{count} chosen, eight at most", { count: chosen.size }) : tr("{count} chosen", { count: chosen.size }) : tr("Choose two to eight runs.");
     }
     const form = byId("search"), heads = [...document.querySelectorAll("[data-key]")];
     let found = [], key = "id", down = true, asking = 0;
@@ -285,13 +286,13 @@
       const order = (a, b) => (a === null) - (b === null) || (typeof a === "number" ? a - b : String(a).localeCompare(String(b)));
       const runs = [...found].sort((a, b) => (value(a) === null || value(b) === null ? order(value(a), value(b)) : (down ? -1 : 1) * order(value(a), value(b))) || (a.id < b.id ? 1 : -1));
       show(byId("runs"), ...(runs.length ? runs.map((one) => {
-        const box = el("input", { type: "checkbox", "aria-label": `compare ${one.rig || NO_RIG}, ${when(one.asked)}`, checked: chosen.has(one.id), disabled: one.verdict === null });
+        const box = el("input", { type: "checkbox", "aria-label": tr("compare {run}", { run: `${one.rig || NO_RIG}, ${when(one.asked)}` }), checked: chosen.has(one.id), disabled: one.verdict === null });
         box.addEventListener("change", () => choose(one.id, box.checked));
         return el("tr", {}, el("td", { class: "pick" }, box),
           el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}`, "aria-label": `${one.rig || NO_RIG}, ${when(one.asked)}` }, one.rig || NO_RIG), " ", badge(one.simulated) || "", " ", rehearsal(one.rehearsal) || "", " ", uploaded(one.uploaded) || ""),
-          el("td", {}, when(one.asked)), el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict || ""),
-          el("td", {}, said(one) || "", ...(one.tags.length ? [" ", ...tags(one.tags)] : []), ...(one.archived ? [" ", el("span", { class: "badge" }, "ARCHIVED")] : [])));
-      }) : [el("tr", {}, el("td", { colspan: 7, class: "dim" }, form.elements.text.value || form.elements.state.value ? "no run matches" : "no run yet"))]));
+          el("td", {}, when(one.asked)), el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict ? word(one.verdict, "verdict") : ""),
+          el("td", {}, said(one) || "", ...(one.tags.length ? [" ", ...tags(one.tags)] : []), ...(one.archived ? [" ", el("span", { class: "badge" }, tr("ARCHIVED"))] : [])));
+      }) : [el("tr", {}, el("td", { colspan: 7, class: "dim" }, form.elements.text.value || form.elements.state.value ? tr("no run matches") : tr("no run yet")))]));
     }
     async function look() {
       const query = new URLSearchParams(), mine = ++asking;
@@ -341,7 +342,7 @@
       plot = new uPlot({
         width: where.clientWidth || 320, height: 240, legend: { show: false }, cursor: { show: false },
         scales: { x: { time, range: () => [xs[0] - side, xs[xs.length - 1] + side] }, y: { range: () => [low - pad, high + pad] } },
-        axes: [axis({ size: 48, label: time ? `local time, ${zone(new Date(1000 * xs[xs.length - 1]))}` : label, labelSize: 22, ...(time ? { values: TIMES } : {}) }), axis({ size: 62 })],
+        axes: [axis({ size: 48, label: time ? tr("local time, {zone}", { zone: zone(new Date(1000 * xs[xs.length - 1])) }) : label, labelSize: 22, ...(time ? { values: TIMES } : {}) }), axis({ size: 62 })],
         series: [{}, ...series.map(() => ({ stroke: "transparent", paths: () => null, points: { show: false } }))],
         hooks: { draw: [(self) => {
           const c = self.ctx, px = devicePixelRatio;
@@ -374,14 +375,14 @@
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   }
 
-  async function once(where, look, text = "Loading", kind = "faults") {
+  async function once(where, look, text = tr("Loading"), kind = "faults") {
     const over = waiting(where, text, kind);
     try {
       await look();
       over(true);
     } catch (error) {
       over(false);
-      show(where, el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+      show(where, el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : tr("No answer from tdhil serve.")));
     }
     alive();
   }
@@ -393,21 +394,21 @@
 
   function historyPage() {
     const rig = document.body.dataset.rig, where = byId("history"), link = byId("archived"), at = (date) => new Date(date).getTime() / 1000;
-    if (archivedToo()) { link.href = location.pathname; link.textContent = "Without archived runs"; }
+    if (archivedToo()) { link.href = location.pathname; link.textContent = tr("Without archived runs"); }
     once(where, async () => {
       const { trend } = await call("GET", `/rigs/${encodeURIComponent(rig)}/trend${archivedToo()}`, undefined, {}, 120000);
-      show(where, ...trend.notes.map((one) => el("p", { class: "dim" }, one)));
+      show(where, ...trend.notes.map((one) => el("p", { class: "dim" }, english(one))));
       for (const quantity of trend.quantities.filter((one) => one.points.length)) {
-        const plot = el("div", { class: "plot", role: "img", "aria-label": `${quantity.name} over time` });
-        where.append(el("section", {}, el("h2", {}, `${quantity.name}, ${quantity.unit}`),
-          el("p", { class: quantity.changes.length || quantity.drift ? "alarm" : "" }, quantity.text),
-          ...quantity.changes.map((one) => el("p", {}, el("a", { href: `/compare?runs=${encodeURIComponent(one.before)},${encodeURIComponent(one.after)}${archivedToo("&")}` }, `Compare the runs before and after, ${when(one.before_date)} and ${when(one.after_date)}`))),
-          el("figure", {}, el("figcaption", {}, "each point with its repeatability on this drive; dashed: a change"), plot),
-          numbers(`${quantity.name} in numbers`, ["run", `${quantity.unit}, interval`], quantity.points.map((one) => [el("a", { href: `/runs/${encodeURIComponent(one.log)}` }, when(one.date)), of(one)]))));
+        const plot = el("div", { class: "plot", role: "img", "aria-label": tr("{quantity} over time", { quantity: word(quantity.name) }) });
+        where.append(el("section", {}, el("h2", {}, `${word(quantity.name)}, ${quantity.unit}`),
+          el("p", { class: quantity.changes.length || quantity.drift ? "alarm" : "" }, english(quantity.text)),
+          ...quantity.changes.map((one) => el("p", {}, el("a", { href: `/compare?runs=${encodeURIComponent(one.before)},${encodeURIComponent(one.after)}${archivedToo("&")}` }, tr("Compare the runs before and after, {first} and {second}", { first: when(one.before_date), second: when(one.after_date) })))),
+          el("figure", {}, el("figcaption", {}, tr("each point with its repeatability on this drive; dashed: a change")), plot),
+          numbers(tr("{quantity} in numbers", { quantity: word(quantity.name) }), [tr("run"), tr("{unit}, interval", { unit: quantity.unit })], quantity.points.map((one) => [el("a", { href: `/runs/${encodeURIComponent(one.log)}` }, when(one.date)), of(one)]))));
         points(plot, [{ colour: "--c0", points: quantity.points.map((one) => ({ ...one, x: at(one.date) })) }],
           { time: true, marks: quantity.changes.map((one) => (at(one.before_date) + at(one.after_date)) / 2) });
       }
-    }, "The results are compared", "history");
+    }, tr("The results are compared"), "history");
   }
 
   // -- comparison
@@ -421,33 +422,33 @@
       const heads = ids.map((id, k) => el("th", { scope: "col" }, dot(k), " ", el("a", { href: `/runs/${id}` }, names[k]), " ", badge(comparison.results[k].simulated) || "", " ", rehearsal(comparison.results[k].rehearsed_faults) || "", " ", uploaded(comparison.results[k].uploaded) || ""));
       const said = comparison.differences.map((one, k) => {
         const moment = one.quantities.find((other) => other.column === "inertia_kg_m2");
-        return el("p", { class: moment && moment.differs ? "now alarm" : "now" }, dot(0), " ", names[0], " and ", dot(k + 1), ` ${names[k + 1]}: ${one.text}.`);
+        return el("p", { class: moment && moment.differs ? "now alarm" : "now" }, dot(0), " ", names[0], ` ${tr("and")} `, dot(k + 1), ` ${names[k + 1]}: `, english(`${one.text}.`));
       });
       const others = comparison.differences.flatMap((one, k) => one.quantities.filter((other) => other.column !== "inertia_kg_m2").map((other) => [
-        `${other.name}, ${k + 2} against 1`, other.differs ? "differs" : "no significant difference",
-        other.relative ? `${percentOf(other.change)} (${percentOf(other.low)} to ${percentOf(other.high)})` : `${number(other.change, 3)} (${number(other.low, 3)} to ${number(other.high, 3)}) ${other.unit}`]));
+        tr("{quantity}, {run} against 1", { quantity: word(other.name), run: k + 2 }), other.differs ? tr("differs") : tr("no significant difference"),
+        other.relative ? tr("{value} ({low} to {high})", { value: percentOf(other.change), low: percentOf(other.low), high: percentOf(other.high) }) : `${tr("{value} ({low} to {high})", { value: number(other.change, 3), low: number(other.low, 3), high: number(other.high, 3) })} ${other.unit}`]));
       const curve = (title, label, key, x) => {
         const series = comparison[key].map((found, k) => ({ colour: `--c${k}`, points: found.filter((one) => one.value !== null).map((one) => ({ ...one, x: one[x] })) }));
         if (!series.some((one) => one.points.length)) return [];
         const plot = el("div", { class: "plot", role: "img", "aria-label": title });
         setTimeout(() => points(plot, series, { label }), 0);             // after it has a width
         return [el("h2", {}, title), el("p", { class: "row legend" }, ...names.map((name, k) => el("span", {}, dot(k), ` ${k + 1}: ${name}`))), el("figure", {}, plot),
-          numbers(`${title}, in numbers`, [label, ...names], tabled(series))];
+          numbers(tr("{title}, in numbers", { title }), [label, ...names], tabled(series))];
       };
       show(where, ...said,
-        region("Results", el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...heads)), el("tbody", {},
-          line("J, interval to quote, kg·m²", comparison.results.map((one) => interval(one.inertia_kg_m2, one.inertia_low_total_kg_m2, one.inertia_high_total_kg_m2) ?? "–")),
-          line("J, repeatability, kg·m²", comparison.results.map((one) => interval(one.inertia_kg_m2, one.inertia_low_kg_m2, one.inertia_high_kg_m2) ?? "–")),
-          line("verdict", comparison.results.map((one) => one.verdict))))),
-        others.length ? numbers("Friction and lags", ["quantity", "", "difference"], others) : null,
-        ...curve("Apparent inertia by frequency, kg·m²", "frequency, Hz", "apparent_inertia", "hertz"),
-        ...curve("Friction, N·m", "speed, rad/s", "friction", "speed_rad_s"),
-        el("h2", {}, "Settings"), el("p", { class: "dim" }, "≠ marks different settings."),
-        region("Settings", el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...ids.map((id, k) => el("th", { scope: "col" }, dot(k), ` ${k + 1}`)))),
-          el("tbody", {}, ...comparison.settings.map((one) => line(`${one.differs ? "≠ " : ""}${one.name}`, one.name === "date" ? one.values.map(when) : one.values.map((value) => ({ True: "yes", False: "no" }[value] ?? value)), one.differs))))));
-    }, "Each run is identified again", "compare");
+        region(tr("Results"), el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...heads)), el("tbody", {},
+          line(tr("J, interval to quote, kg·m²"), comparison.results.map((one) => interval(one.inertia_kg_m2, one.inertia_low_total_kg_m2, one.inertia_high_total_kg_m2) ?? "–")),
+          line(tr("J, repeatability, kg·m²"), comparison.results.map((one) => interval(one.inertia_kg_m2, one.inertia_low_kg_m2, one.inertia_high_kg_m2) ?? "–")),
+          line(tr("verdict"), comparison.results.map((one) => word(one.verdict, "verdict")))))),
+        others.length ? numbers(tr("Friction and lags"), [tr("quantity"), "", tr("difference")], others) : null,
+        ...curve(tr("Apparent inertia by frequency, kg·m²"), tr("frequency, Hz"), "apparent_inertia", "hertz"),
+        ...curve(tr("Friction, N·m"), tr("speed, rad/s"), "friction", "speed_rad_s"),
+        el("h2", {}, tr("Settings")), el("p", { class: "dim" }, tr("≠ marks different settings.")),
+        region(tr("Settings"), el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...ids.map((id, k) => el("th", { scope: "col" }, dot(k), ` ${k + 1}`)))),
+          el("tbody", {}, ...comparison.settings.map((one) => line(el("span", {}, one.differs ? "≠ " : "", english(one.name)), one.name === "date" ? one.values.map(when) : one.values.map((value) => ({ True: tr("yes"), False: tr("no") }[value] ?? english(value))), one.differs))))));
+    }, tr("Each run is identified again"), "compare");
   }
-  const percentOf = (share) => `${share > 0 ? "+" : ""}${(100 * share).toPrecision(2)} %`;
+  const percentOf = (share) => `${share > 0 ? "+" : ""}${precise(100 * share, 2)} %`;
   const line = (name, values, marked = false) => el("tr", marked ? { class: "differs" } : {}, el("th", { scope: "row" }, name), ...values.map((one) => el("td", {}, one)));
   /** A row for each place, a cell for each series; the mean of several points at one place. */
   function tabled(series) {
@@ -465,7 +466,7 @@
     if (!form) return;
     form.addEventListener("submit", (event) => event.preventDefault());
     const paced = pacing(rig, form);
-    const seconds = (name) => form.elements[name].value.trim().replace(",", ".").replace(/\s*s$/, "");
+    const seconds = (name) => point(form.elements[name].value).replace(/\s*s$/, "");
     async function begin(fault, value, button) {
       const moment = fault.from_start ? "" : `@${form.elements.stage.value}${seconds("after") ? `+${seconds("after")}s` : ""}`;
       const text = `${fault.name}${moment}${value ? `=${value}` : ""}${!fault.from_start && seconds("duration") ? `/${seconds("duration")}s` : ""}`;
@@ -475,7 +476,7 @@
         const run = await call("POST", `/rigs/${encodeURIComponent(rig)}/runs`, { fault: [text], note: `rehearsal: ${text}`, real_time: form.elements.real_time.checked }, { "Idempotency-Key": crypto.randomUUID() });
         follow(run.id);
       } catch (error) {
-        show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+        show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : tr("No answer from tdhil serve.")));
         byId("said").scrollIntoView({ block: "center" });
         button.disabled = false;
       }
@@ -484,11 +485,11 @@
       const faults = await call("GET", `/rigs/${encodeURIComponent(rig)}/faults`);
       show(byId("said"));
       show(byId("faults"), ...faults.map((one) => {
-        const value = one.takes ? el("input", { value: one.value, "aria-label": `${one.name}: ${one.takes.toLowerCase()}`, autocomplete: "off" }) : null;
-        const button = el("button", { type: "button", class: "quiet", "aria-label": `Rehearse ${one.name}` }, "Rehearse");
+        const value = one.takes ? el("input", { value: one.value, "aria-label": `${one.name}: ${one.takes.toLowerCase()}`, lang: "en", autocomplete: "off" }) : null;
+        const button = el("button", { type: "button", class: "quiet", "aria-label": tr("Rehearse {fault}", { fault: one.name }) }, tr("Rehearse"));
         button.addEventListener("click", () => begin(one, value && value.value.trim() !== one.value ? value.value.trim() : "", button));
         return el("li", {}, el("strong", {}, one.name, one.row ? el("span", { class: "dim" }, ` ${one.row}`) : ""),
-          el("span", {}, one.summary, one.from_start ? el("span", { class: "dim" }, "; from the start") : "", el("br"), el("span", { class: "dim" }, `Required: ${one.required}`)), value || el("span"), button);
+          el("span", {}, english(one.summary), one.from_start ? el("span", { class: "dim" }, `; ${tr("from the start")}`) : "", el("br"), el("span", { class: "dim" }, `${tr("Required:")} `, english(one.required))), value || el("span"), button);
       }));
     });
   }
@@ -499,7 +500,7 @@
     const rig = document.body.dataset.rig, form = byId("calibrate"), runs = new Map();
     if (!form) return;
     const choices = [form.elements.without, form.elements.with_body];
-    const named = (run) => `${when(run.asked)}, ${run.verdict}: J as reported ${inertia(run)}`;
+    const named = (run) => `${when(run.asked)}, ${word(run.verdict, "verdict")}: ${tr("J as reported {inertia}", { inertia: inertia(run) })}`;
     let shown = "";
     every(2000, async () => {
       const found = (await call("GET", `/runs?rig=${encodeURIComponent(rig)}&state=done`)).filter((run) => run.inertia_kg_m2 !== null), now = JSON.stringify(found);
@@ -508,28 +509,28 @@
       for (const run of found) runs.set(run.id, run);
       for (const choice of choices) {
         const kept = choice.value;
-        show(choice, el("option", { value: "" }, found.length ? "choose a run" : "no run with a result yet"), ...found.map((run) => el("option", { value: run.id }, named(run))));
+        show(choice, el("option", { value: "" }, found.length ? tr("choose a run") : tr("no run with a result yet")), ...found.map((run) => el("option", { value: run.id }, named(run))));
         choice.value = runs.has(kept) ? kept : "";
       }
     });
     const decimal = (name) => {
-      const text = form.elements[name].value.trim().replace(",", ".");
+      const text = point(form.elements[name].value);
       return text === "" ? null : Number(text);
     };
     form.addEventListener("submit", async (event) => {
       event.preventDefault();
       const added = decimal("added"), sd = decimal("added_sd"), button = form.querySelector("button");
-      const wrong = choices.some((one) => !one.value) ? "Choose both runs." : choices[0].value === choices[1].value ? "Choose two different runs."
-        : !(added > 0) ? "Give the inertia of the body as a positive number of kg·m²." : sd !== null && !(sd >= 0) ? "Give the standard uncertainty as a number of kg·m²." : "";
+      const wrong = choices.some((one) => !one.value) ? tr("Choose both runs.") : choices[0].value === choices[1].value ? tr("Choose two different runs.")
+        : !(added > 0) ? tr("Give the inertia of the body as a positive number of kg·m².") : sd !== null && !(sd >= 0) ? tr("Give the standard uncertainty as a number of kg·m².") : "";
       if (wrong) return show(byId("said"), el("p", { class: "alarm", role: "alert" }, wrong));
       button.disabled = true;
-      show(byId("said"), el("p", { class: "dim" }, "Both logs are identified …"));
+      show(byId("said"), el("p", { class: "dim" }, tr("Both logs are identified …")));
       try {
         const body = { without: choices[0].value, with_body: choices[1].value, added_kg_m2: added, added_sd_kg_m2: sd, at: form.elements.at.value };
         const { calibration } = await call("POST", `/rigs/${encodeURIComponent(rig)}/calibration`, body, {}, 300000);
         show(byId("said"), ...calibrated(calibration));
       } catch (error) {
-        show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+        show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : tr("No answer from tdhil serve.")));
       }
       button.disabled = false;
       byId("said").scrollIntoView({ block: "nearest" });
@@ -540,40 +541,40 @@
 
   function calibrated(found) {
     const factor = found.calibration_factor, J = found.inertia_kg_m2, share = (one) => percent(0.5 * (one.high - one.low) / one.value);
-    const rows = [["verdict", found.verdict]];
-    if (factor) rows.push(["calibration factor", `${of(factor)}  ${share(factor)}`], ["J without the body", `${of(J)} kg·m²  ${share(J)}`]);
-    for (const one of found.runs) if (one.reported_kg_m2 !== undefined) rows.push([`${number(one.added_kg_m2)} kg·m² added`, `${number(one.reported_kg_m2)} kg·m² as reported`]);
-    const parts = [el("div", { class: "card" }, el("p", { class: "figure" }, factor ? `κ = ${of(factor)}` : found.verdict),
-      region("Numbers", el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => line(name, [text]))))),
-      el("p", {}, sentence(found.reason)), found.advice ? el("p", {}, sentence(found.advice)) : null)];
-    for (const one of found.warnings) parts.push(el("p", { class: "caution" }, sentence(one)));
+    const rows = [[tr("verdict"), word(found.verdict, "verdict")]];
+    if (factor) rows.push([tr("calibration factor"), `${of(factor)}  ${share(factor)}`], [tr("J without the body"), `${of(J)} kg·m²  ${share(J)}`]);
+    for (const one of found.runs) if (one.reported_kg_m2 !== undefined) rows.push([tr("{inertia} kg·m² added", { inertia: number(one.added_kg_m2) }), tr("{inertia} kg·m² as reported", { inertia: number(one.reported_kg_m2) })]);
+    const parts = [el("div", { class: "card" }, el("p", { class: "figure" }, factor ? `κ = ${of(factor)}` : word(found.verdict, "verdict")),
+      region(tr("Numbers"), el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => line(name, [text]))))),
+      el("p", {}, english(sentence(found.reason))), found.advice ? el("p", {}, english(sentence(found.advice))) : null)];
+    for (const one of found.warnings) parts.push(el("p", { class: "caution" }, english(sentence(one))));
     if (!factor) return parts;
-    parts.push(el("h3", {}, "Uncertainty budget"), region("Uncertainty budget", el("table", {},
-      el("thead", {}, el("tr", {}, ...["", "± % of κ", "± % of J"].map((one) => el("th", { scope: "col" }, one)))),
-      el("tbody", {}, ...found.budget.map((one) => line(one.source, [(100 * factor.coverage_factor * one.of_factor).toFixed(2), (100 * J.coverage_factor * one.of_inertia).toFixed(2)]))))));
+    parts.push(el("h3", {}, tr("Uncertainty budget")), region(tr("Uncertainty budget"), el("table", {},
+      el("thead", {}, el("tr", {}, ...["", tr("± % of κ"), tr("± % of J")].map((one) => el("th", { scope: "col" }, one)))),
+      el("tbody", {}, ...found.budget.map((one) => line(word(one.source, "budget"), [fixed(100 * factor.coverage_factor * one.of_factor, 2), fixed(100 * J.coverage_factor * one.of_inertia, 2)]))))));
     const file = URL.createObjectURL(new Blob([`${JSON.stringify(found, null, 2)}\n`], { type: "application/json" }));
     parts.push(el("p", {}, el("a", { class: "button", href: file, download: "calibration.json" }, "calibration.json")),
-      el("p", {}, "Put the file beside the rig's file, and name it there: drive_data: {torque_calibration: calibration.json}. Each later run is then in calibrated N·m."));
+      el("p", {}, tr("Put the file beside the rig's file, and name it there: drive_data: {torque_calibration: calibration.json}. Each later run is then in calibrated N·m.")));
     return parts;
   }
 
   // -- many logs
 
-  const FLEET = { running: "identifying", done: "done", interrupted: "ended early", failed: "failed" };
-  const asWhat = (settings) => Object.entries(settings).map(([name, value]) => `${name} ${value}`).join(", ") || "as in each run";
-  const stateOf = (one) => (one.held ? "waiting: a shaft turns, or a drive is in use" : FLEET[one.state]) + (one.total ? `: ${one.done} of ${one.total} logs` : "") + (one.failed ? `, ${one.failed} failed` : "");
+  const FLEET = { running: tr("identifying"), done: tr("done"), interrupted: tr("ended early"), failed: tr("failed") };
+  const asWhat = (settings) => english(Object.entries(settings).map(([name, value]) => `${name} ${value}`).join(", ")) || tr("as in each run");
+  const stateOf = (one) => (one.held ? tr("waiting: a shaft turns, or a drive is in use") : FLEET[one.state]) + (one.total ? `: ${tr("{done} of {total} logs", { done: one.done, total: one.total })}` : "") + (one.failed ? `, ${tr("{count} failed", { count: one.failed })}` : "");
 
   function fleetsPage() {
     const form = byId("ask");
     let shown = "";
-    call("GET", "/fleets/folders").then((folders) => show(form.elements.folder, ...folders.map((one) => el("option", { value: one }, one || "the runs of this service"))), () => {});
+    call("GET", "/fleets/folders").then((folders) => show(form.elements.folder, ...folders.map((one) => el("option", { value: one }, one || tr("the runs of this service")))), () => {});
     form.addEventListener("submit", async (event) => {
       event.preventDefault();
       try {
         const found = await call("POST", "/fleets", asked(form));
         location.assign(`/fleets/${found.id}`);
       } catch (error) {
-        show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+        show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : tr("No answer from tdhil serve.")));
       }
     });
     every(2000, async () => {
@@ -581,32 +582,32 @@
       if (now === shown) return;
       shown = now;
       show(byId("fleets"), ...(found.length ? found.map((one) => el("tr", {}, el("th", { scope: "row" }, el("a", { href: `/fleets/${one.id}` }, when(one.asked))),
-        el("td", {}, one.folder || "the runs of this service", one.below ? `, ${one.below}` : "", one.archived ? ", archived too" : ""), el("td", {}, asWhat(one.settings)), el("td", {}, stateOf(one))))
-        : [el("tr", {}, el("td", { colspan: 4, class: "dim" }, "none yet"))]));
+        el("td", {}, one.folder || tr("the runs of this service"), one.below ? `, ${one.below}` : "", one.archived ? `, ${tr("archived too")}` : ""), el("td", {}, asWhat(one.settings)), el("td", {}, stateOf(one))))
+        : [el("tr", {}, el("td", { colspan: 4, class: "dim" }, tr("none yet")))]));
     });
   }
 
   function fleetRow(row) {
     const own = /^runs\/([0-9]{8}-[0-9]{6}-[0-9a-f]{6})\/run\.mcap$/.exec(row.log);
     const J = interval(row.inertia_kg_m2, row.inertia_low_total_kg_m2, row.inertia_high_total_kg_m2) ?? "–";
-    const was = row.changed ? `other: ${row.stored_verdict} ${number(row.stored_inertia_kg_m2)}` : row.changed === false ? "the same" : "";
+    const was = row.changed ? tr("other: {verdict} {inertia}", { verdict: word(row.stored_verdict, "verdict"), inertia: number(row.stored_inertia_kg_m2) }) : row.changed === false ? tr("the same") : "";
     return el("tr", row.error_kind ? { class: "refused" } : {}, el("th", { scope: "row" }, own ? el("a", { href: `/runs/${own[1]}` }, own[1]) : row.log),
-      el("td", {}, row.rig || "", " ", badge(row.simulated) || "", " ", rehearsal(row.rehearsed_faults) || ""), el("td", {}, when(row.date)), el("td", {}, row.error_kind ? `${row.error_kind}: ${row.error_text}` : `${row.verdict}${inPart(row)}`), el("td", {}, J), el("td", {}, was));
+      el("td", {}, row.rig || "", " ", badge(row.simulated) || "", " ", rehearsal(row.rehearsed_faults) || ""), el("td", {}, when(row.date)), el("td", {}, row.error_kind ? english(`${row.error_kind}: ${row.error_text}`) : `${word(row.verdict, "verdict")}${inPart(row)}`), el("td", {}, J), el("td", {}, was));
   }
 
   // as FleetRow.part_text; older rows have no such field
   function inPart(row) {
-    if (row.aborted_stage || row.aborted_by) return `, aborted${row.aborted_stage ? ` in stage ${row.aborted_stage}` : ""}${row.aborted_by ? ` (${row.aborted_by})` : ""}`;
-    return row.complete === false ? ", log cut short" : "";
+    if (row.aborted_stage || row.aborted_by) return `, ${row.aborted_stage ? tr("aborted in stage {stage}", { stage: word(row.aborted_stage, "stage") }) : tr("aborted")}${row.aborted_by ? ` (${row.aborted_by})` : ""}`;
+    return row.complete === false ? `, ${tr("log cut short")}` : "";
   }
 
   function fleetSummary(found) {
-    const counts = [...Object.entries(found.verdicts), ...Object.entries(found.failed).map(([kind, count]) => [`failed: ${kind}`, count])];
-    const more = [["from a part of the run", (found.in_part || []).length], ["finished before", found.done_before], ["different from the result in the log", found.changed.length], ["skipped: being written", found.live], ["skipped: CSV without a .yaml", found.bare_traces], ["remaining", found.left]].filter(([, count]) => count);
-    return [el("h2", {}, "Summary"), el("div", { class: "two" },
-      region("Number of logs", el("table", {}, el("tbody", {}, ...[...counts, ...more].map(([name, count]) => line(name, [String(count)]))))),
-      el("div", {}, el("p", {}, `${found.logs} logs in ${span(found.wall_s)}, ${span(found.cpu_s)} of processor time.`),
-        found.slowest.length ? numbers("The slowest", ["log", "processor time, s"], found.slowest.map((one) => [one.log, one.cpu_s.toFixed(2)])) : null))];
+    const counts = [...Object.entries(found.verdicts).map(([verdict, count]) => [word(verdict, "verdict"), count]), ...Object.entries(found.failed).map(([kind, count]) => [tr("failed: {kind}", { kind }), count])];
+    const more = [[tr("from a part of the run"), (found.in_part || []).length], [tr("finished before"), found.done_before], [tr("different from the result in the log"), found.changed.length], [tr("skipped: being written"), found.live], [tr("skipped: CSV without a .yaml"), found.bare_traces], [tr("remaining"), found.left]].filter(([, count]) => count);
+    return [el("h2", {}, tr("Summary")), el("div", { class: "two" },
+      region(tr("Number of logs"), el("table", {}, el("tbody", {}, ...[...counts, ...more].map(([name, count]) => line(name, [String(count)]))))),
+      el("div", {}, el("p", {}, tr("{count} logs in {time}, {cpu} of processor time.", { count: found.logs, time: span(found.wall_s), cpu: span(found.cpu_s) })),
+        found.slowest.length ? numbers(tr("The slowest"), [tr("log"), tr("processor time, s")], found.slowest.map((one) => [one.log, fixed(one.cpu_s, 2)])) : null))];
   }
 
   function fleetPage() {
@@ -624,19 +625,19 @@
       if (state !== null && view.state !== state) { count = 0; byId("rows").replaceChildren(); }      // the table also has the earlier rows
       state = view.state;
       const going = state === "running";
-      byId("state").textContent = stateOf(view) + (going && view.left_s !== null ? `, about ${span(view.left_s)} left` : "");
+      byId("state").textContent = stateOf(view) + (going && view.left_s !== null ? `, ${tr("about {time} left", { time: span(view.left_s) })}` : "");
       byId("progress").max = view.total || 1;
       byId("progress").value = view.done;
       byId("end").hidden = !going;
       byId("again").hidden = going;
       byId("table").hidden = going || !view.summary;
       said.hidden = !view.error;
-      said.textContent = view.error ? view.error.message : "";
+      said.textContent = view.error ? errorText(view.error) : "";
       if (going || !view.summary) show(byId("summary")); else if (!byId("summary").firstChild) show(byId("summary"), ...fleetSummary(view.summary));
       await rows();
     });
     const press = async (work) => {
-      try { await work(); } catch (error) { away(error instanceof Refused ? error.message : "No answer from tdhil serve."); }
+      try { await work(); } catch (error) { away(error instanceof Refused ? error.message : tr("No answer from tdhil serve.")); }
     };
     byId("end").addEventListener("click", () => press(() => call("POST", `/fleets/${id}/stop`, {})));
     byId("again").addEventListener("click", () => press(() => call("POST", "/fleets", { folder: view.folder, below: view.below, archived: view.archived, ...view.settings })));

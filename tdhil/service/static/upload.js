@@ -1,11 +1,12 @@
 // Upload of a recording: the file, a preview with a mapping of its columns, and the run that is made from it.
 "use strict";
 (() => {
+  const { english, errorText, local, tr, word } = window.tdhilLanguage;
   const { API, Refused, asked, axis, badge, byId, call, colour, csrf, el, inSpeedUnit, markWrong, number, onSpeedUnit, pages, rehearsal, show, span, speedUnit, submits, unmark, waiting, when } = window.tdhil;
   const QUANTITIES = ["time", "speed", "torque"];
   const BUSY = ["delayed", "identifying"];
   const HEIGHTS = [150, 180];  // of the charts, px; the lower one has the time axis with its label
-  const LOST = "No answer from tdhil serve.";
+  const LOST = tr("No answer from tdhil serve.");
   const LONG_MS = 600000;      // the preview of a large file, or a second one behind it
   const mebi = (bytes) => (bytes < 1e5 ? `${number(bytes / 1024, 2)} KiB` : `${number(bytes / 2 ** 20, 3)} MiB`);
 
@@ -16,13 +17,13 @@
       sender.open("POST", `${API}/uploads?name=${encodeURIComponent(file.name)}`);
       for (const [name, value] of Object.entries({ "Content-Type": "application/octet-stream", ...csrf() })) sender.setRequestHeader(name, value);
       sender.upload.addEventListener("progress", (event) => progress(event.loaded, event.total));
-      sender.addEventListener("abort", () => reject(new Refused("The upload was cancelled. Nothing was kept.")));
-      sender.addEventListener("error", () => reject(new Refused("The upload was cut off. Nothing was kept.")));
+      sender.addEventListener("abort", () => reject(new Refused(tr("The upload was cancelled. Nothing was kept."))));
+      sender.addEventListener("error", () => reject(new Refused(tr("The upload was cut off. Nothing was kept."))));
       sender.addEventListener("load", () => {
         let body = {};
         try { body = JSON.parse(sender.responseText); } catch (error) { /* as of no answer */ }
         if (sender.status === 201) resolve(body);
-        else reject(new Refused(body.error ? body.error.message : `HTTP ${sender.status}`));
+        else reject(new Refused(body.error ? errorText(body.error) : `HTTP ${sender.status}`));
       });
       sender.send(file);
     });
@@ -35,10 +36,10 @@
     let charts = [];
     const draw = () => {
       charts.forEach((one) => one.destroy());
-      charts = [[speed.map((one) => (one === null ? null : inSpeedUnit(one))), speedUnit(), "--speed", "speed"], [torque, "N·m", "--torque", "torque"]].map(([values, unit, name, label], k) => new uPlot({
+      charts = [[speed.map((one) => (one === null ? null : inSpeedUnit(one))), speedUnit(), "--speed", tr("speed")], [torque, "N·m", "--torque", tr("torque")]].map(([values, unit, name, label], k) => new uPlot({
         width: where.clientWidth || 320, height: HEIGHTS[k], legend: { show: false }, cursor: { sync: { key: "preview" }, drag: { x: false, y: false } },
         scales: { x: { time: false } },
-        axes: [axis({ size: k ? 40 : 24, ...(k ? { label: "time, s", labelSize: 18 } : {}) }), axis({ size: 62, label: `${label}, ${unit}`, labelSize: 20 })],
+        axes: [axis({ size: k ? 40 : 24, ...(k ? { label: tr("time, s"), labelSize: 18 } : {}) }), axis({ size: 62, label: `${label}, ${unit}`, labelSize: 20 })],
         series: [{}, { stroke: colour(name), width: 1, points: { show: false } }],
       }, [time, values], places[k]));
     };
@@ -50,13 +51,13 @@
 
   /** Length, rate, gaps, ranges and warnings of a reading. */
   function figures(reading) {
-    const short = (value) => String(Number(value.toPrecision(3)));
-    const range = (one, of = (value) => value) => (one ? `${short(of(one.min))} to ${short(of(one.max))}` : "–");
+    const short = (value) => local(String(Number(value.toPrecision(3))));
+    const range = (one, of = (value) => value) => (one ? tr("{low} to {high}", { low: short(of(one.min)), high: short(of(one.max)) }) : "–");
     const rows = [
-      ["length", span(reading.duration_s)], ["samples", String(reading.samples)],
-      ["rate", reading.rate_hz === null ? "–" : `${number(reading.rate_hz, 3)} Hz`],
-      ["gaps in the time", reading.gaps ? `${reading.gaps}, the widest of ${number(reading.widest_gap_s, 3)} s at ${number(reading.widest_gap_at_s, 5)} s` : "none"],
-      [`speed, ${speedUnit()}`, range(reading.speed_rad_s, inSpeedUnit)], ["torque, N·m", range(reading.torque_nm)],
+      [tr("length"), span(reading.duration_s)], [tr("samples"), String(reading.samples)],
+      [tr("rate"), reading.rate_hz === null ? "–" : `${number(reading.rate_hz, 3)} Hz`],
+      [tr("gaps in the time"), reading.gaps ? tr("{count}, the widest of {width} s at {time} s", { count: reading.gaps, width: number(reading.widest_gap_s, 3), time: number(reading.widest_gap_at_s, 5) }) : tr("none")],
+      [`${tr("speed")}, ${speedUnit()}`, range(reading.speed_rad_s, inSpeedUnit)], [tr("torque, N·m"), range(reading.torque_nm)],
     ];
     return el("dl", { class: "figures" }, ...rows.map(([name, text]) => el("div", {}, el("dt", {}, name), el("dd", {}, text))));
   }
@@ -66,16 +67,16 @@
     const of = (name) => QUANTITIES.find((quantity) => chosen[quantity] === name);
     const mark = (name) => (of(name) ? "mapped" : null);
     return el("table", {},
-      el("caption", {}, `Header in line ${found.header_line}; ${found.encoding}, ${found.separator} between cells, decimal ${found.decimal}`),
-      el("thead", {}, el("tr", {}, ...found.names.map((name, k) => el("th", { scope: "col", class: mark(name) }, of(name) ? el("small", {}, of(name)) : null, name || "–", found.units[k] ? el("span", { class: "dim" }, ` ${found.units[k]}`) : null)))),
+      el("caption", {}, tr("Header in line {line}; {encoding}, {separator} between cells, decimal {decimal}", { line: found.header_line, encoding: found.encoding, separator: word(found.separator, "sign"), decimal: word(found.decimal, "sign") })),
+      el("thead", {}, el("tr", {}, ...found.names.map((name, k) => el("th", { scope: "col", class: mark(name) }, of(name) ? el("small", {}, word(of(name), "quantity")) : null, name || "–", found.units[k] ? el("span", { class: "dim" }, ` ${found.units[k]}`) : null)))),
       el("tbody", {}, ...found.rows.map((row) => el("tr", {}, ...row.map((cell, k) => el("td", { class: mark(found.names[k]) }, cell))))));
   }
 
   /** What a log of tdhil states of its run. */
   function ofLog(run) {
     const drive = run.drive || {}, rig = run.rig || {};
-    const rows = [["rig in the log", rig.name || rig.file], ["date", run.date ? when(run.date) : null], ["operator", run.operator], ["note", run.note], ["drive", drive.name], ["serial number", drive.serial || null],
-      ["profile", run.profile && run.profile.name], ["recorded by", run.recorded_by && `tdhil ${run.recorded_by}`], ["stages", run.stages.map((one) => `${one.name} ${one.outcome}`).join(", ")], ["log", run.complete ? "whole" : "cut short"]];
+    const rows = [[tr("rig in the log"), rig.name || rig.file], [tr("date"), run.date ? when(run.date) : null], [tr("operator"), run.operator], [tr("note"), run.note], [tr("drive"), drive.name], [tr("serial number"), drive.serial || null],
+      [tr("profile"), run.profile && run.profile.name], [tr("recorded by"), run.recorded_by && `tdhil ${run.recorded_by}`], [tr("stages"), run.stages.map((one) => `${word(one.name, "stage")} ${word(one.outcome, "outcome")}`).join(", ")], [tr("log"), run.complete ? tr("whole") : tr("cut short")]];
     return el("div", {}, el("p", {}, badge(run.simulated), " ", rehearsal(run.rehearsed_faults.length)),
       el("table", {}, el("tbody", {}, ...rows.filter(([, text]) => text).map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, String(text)))))));
   }
@@ -105,8 +106,8 @@
     function offer(found) {
       for (const guess of found.guess) {
         const names = [...new Set(found.names.filter(Boolean))];
-        show(field(`columns.${guess.quantity}`), el("option", { value: "" }, "choose …"), ...names.map((one) => el("option", { value: one, selected: one === guess.column }, one)));
-        show(field(`unit.${guess.quantity}`), el("option", { value: "" }, guess.quantity === "time" ? "s, or clock time" : "as the file states, else SI"), ...found.known_units[guess.quantity].map((one) => el("option", { value: one, selected: one === guess.unit }, one)));
+        show(field(`columns.${guess.quantity}`), el("option", { value: "" }, tr("choose …")), ...names.map((one) => el("option", { value: one, selected: one === guess.column }, one)));
+        show(field(`unit.${guess.quantity}`), el("option", { value: "" }, guess.quantity === "time" ? tr("s, or clock time") : tr("as the file states, else SI")), ...found.known_units[guess.quantity].map((one) => el("option", { value: one, selected: one === guess.unit }, one)));
       }
     }
 
@@ -114,17 +115,17 @@
       const { preview } = found;
       read = found;
       byId("problem").hidden = !preview.problem;
-      byId("problem").textContent = preview.problem ? preview.problem.message : "";
+      byId("problem").textContent = preview.problem ? errorText(preview.problem) : "";
       if (preview.table) show(byId("table"), table(preview.table, chosen()));
       const reading = preview.reading, place = el("div");
       show(byId("reading"), preview.run ? ofLog(preview.run) : null, reading ? figures(reading) : null, reading ? place : null,
-        reading && reading.warnings.length ? el("details", { open: reading.warnings.length < 6 }, el("summary", {}, `Remarks of the reader: ${reading.warnings.length}`), el("ul", {}, ...reading.warnings.map((one) => el("li", {}, one)))) : null);
+        reading && reading.warnings.length ? el("details", { open: reading.warnings.length < 6 }, el("summary", {}, tr("Remarks of the reader: {count}", { count: reading.warnings.length })), el("ul", {}, ...reading.warnings.map((one) => el("li", {}, english(one))))) : null);
       redraw = reading && reading.samples ? plots(place, reading.plot) : () => {};
     }
 
     /** Read the upload with the present mapping. Each wrong value is marked at its field. */
     async function preview(first = false) {
-      const mine = ++asking, over = first ? waiting(byId("reading"), "Reading the file", "preview") : () => {};
+      const mine = ++asking, over = first ? waiting(byId("reading"), tr("Reading the file"), "preview") : () => {};
       byId("mapping-said").hidden = true;
       try {
         const found = await call("POST", `/uploads/${open.id}/preview`, first ? {} : mapping(), {}, LONG_MS);
@@ -135,7 +136,7 @@
         draw(found);
         markWrong(form, found.wrong, false);
         const elsewhere = found.wrong.filter((one) => !field(one.option));
-        if (elsewhere.length) report(new Refused(elsewhere.map((one) => `${one.label}: ${one.message}`).join("; ")), byId("mapping-said"));
+        if (elsewhere.length) report(new Refused(elsewhere.map((one) => `${word(one.label)}: ${one.message}`).join("; ")), byId("mapping-said"));
       } catch (error) {
         over(false);
         if (mine !== asking) return;
@@ -149,7 +150,7 @@
       history.replaceState(null, "", `/upload?upload=${upload.id}`);
       byId("preview").hidden = false;
       byId("upload-name").textContent = upload.name;
-      show(byId("upload-about"), `${upload.kind === "log" ? "Log of tdhil" : "Trace in CSV"}, ${mebi(upload.size_bytes)}, uploaded by ${upload.by}, ${when(upload.at)}. SHA-256 `, el("code", {}, upload.sha256));
+      show(byId("upload-about"), `${upload.kind === "log" ? tr("Log of tdhil") : tr("Trace in CSV")}, ${mebi(upload.size_bytes)}, ${tr("uploaded by {name}", { name: upload.by })}, ${when(upload.at)}. SHA-256 `, el("code", {}, upload.sha256));
       others();
       byId("of-trace").hidden = upload.kind !== "trace";
       form.hidden = false;
@@ -163,7 +164,7 @@
 
     /** Wait for the run of the upload, and go to its page. */
     async function follow() {
-      const over = waiting(byId("identifying"), "Identifying", "upload");
+      const over = waiting(byId("identifying"), tr("Identifying"), "upload");
       form.inert = true;
       try {
         for (;;) {
@@ -174,7 +175,7 @@
             return;
           }
           byId("delayed").hidden = found.state !== "delayed";
-          if (found.state === "failed") throw new Refused(found.error.message);
+          if (found.state === "failed") throw new Refused(errorText(found.error));
           await new Promise((done) => { setTimeout(done, 400); });
         }
       } catch (error) {
@@ -190,7 +191,7 @@
     async function list() {
       const found = await call("GET", "/uploads");
       limit = found.limit_bytes;
-      byId("limit").textContent = `at most ${mebi(limit)}`;
+      byId("limit").textContent = tr("at most {size}", { size: mebi(limit) });
       waits = found.uploads;
       others();
       return waits;
@@ -199,18 +200,18 @@
     function others() {
       const found = waits.filter((one) => !open || one.id !== open.id);
       byId("waiting").hidden = !found.length;
-      show(byId("uploads"), ...found.map((one) => el("li", {}, el("button", { type: "button", class: "quiet", onclick: () => present(one) }, one.name), ` ${mebi(one.size_bytes)}, ${one.by}, ${when(one.at)}`, one.state === "waiting" ? "" : `, ${one.state}`)));
+      show(byId("uploads"), ...found.map((one) => el("li", {}, el("button", { type: "button", class: "quiet", onclick: () => present(one) }, one.name), ` ${mebi(one.size_bytes)}, ${one.by}, ${when(one.at)}`, one.state === "waiting" ? "" : `, ${word(one.state, "state")}`)));
     }
 
     async function take(chosenFile) {
       said.hidden = true;
-      if (!chosenFile.size) return report(new Refused("This file is empty. Choose another file."));
-      if (chosenFile.size > limit) return report(new Refused(`This file has ${mebi(chosenFile.size)}. The limit is ${mebi(limit)}. Export the part with the motion.`));
+      if (!chosenFile.size) return report(new Refused(tr("This file is empty. Choose another file.")));
+      if (chosenFile.size > limit) return report(new Refused(tr("This file has {size}. The limit is {limit}. Export the part with the motion.", { size: mebi(chosenFile.size), limit: mebi(limit) })));
       const bar = byId("sending").querySelector("progress");
       const sending = send(chosenFile, (loaded, total) => {
         bar.max = total;
         bar.value = loaded;
-        byId("sent").textContent = `${mebi(loaded)} of ${mebi(total)}`;
+        byId("sent").textContent = tr("{part} of {whole}", { part: mebi(loaded), whole: mebi(total) });
       });
       byId("sending").hidden = false;
       file.disabled = true;
@@ -247,7 +248,7 @@
       });
     });
     byId("discard").addEventListener("click", () => {
-      if (!confirm(`Delete ${open.name}?`)) return;
+      if (!confirm(tr("Delete {name}?", { name: open.name }))) return;
       submits(form, byId("mapping-said"), async () => {
         await call("POST", `/uploads/${open.id}/delete`, {});
         location.assign("/upload");
