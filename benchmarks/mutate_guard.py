@@ -130,6 +130,7 @@ SUBJECTS = {
         "canopen/drive", "test_preflight.py", "test_trouble.py", "test_late_host.py", "test_drive_faults.py",
         "test_feedback.py", "test_sdo_feedback.py", "test_other_master.py", "test_supervision.py", "test_position.py",
         "test_guarding.py", "test_no_watchdog.py", "test_profile_preflight.py", "test_drive_contract.py",
+        "test_watchdog_feed.py",
     ),
     "cia402/drive": _driver(
         "cia402/drive", "test_preflight.py", "test_trouble.py", "test_late_host.py", "test_drive_faults.py",
@@ -220,7 +221,9 @@ SUBJECTS = {
         "cia402/process_data", "test_objects.py", "test_feedback.py", "test_cia402_without_bus.py",
         "test_profile_preflight.py",
     ),
-    **{f"ethercat/{name}": _driver(f"ethercat/{name}", "test_ethercat_drive.py", "test_drive_contract.py")
+    **{f"ethercat/{name}": Subject(
+        f"drivers/ethercat/{name}.py",
+        ("drivers/test_ethercat_drive.py", "drivers/test_drive_contract.py", "path/test_ethercat_path.py"))
        for name in ("drive", "mailbox", "pdo", "quick_stop", "raw", "scan", "segment", "station", "supervision")},
     "modbus/access": _driver("modbus/access", "test_modbus_preflight.py", "test_modbus_wrongs.py"),
     "modbus/codec": _driver("modbus/codec", "test_modbus_codec.py", "test_modbus_drive.py"),

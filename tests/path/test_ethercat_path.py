@@ -3,8 +3,8 @@
 import pytest
 
 from tdhil.recording.log_reader import read_frames, read_run, read_samples
-from tests.path.ethercat_segment import segment
-from tests.path.path_runs import INERTIA, QUICK, STAGES, Shaft, identify, tdhil
+from tests.path.ethercat_segment import segment, simulated_drive
+from tests.path.path_runs import INERTIA, QUICK, STAGES, Shaft, host, identify, tdhil
 
 SETPOINTS = 2                      # sync manager of the outputs
 
@@ -50,3 +50,17 @@ def test_the_simulated_drive_has_the_units_of_each_profile(tmp_path, name):
     inertia = done.document["inertia_kg_m2"]
     assert inertia["low_total"] < INERTIA < inertia["high_total"]
     shaft.assert_at_rest()
+
+
+@pytest.mark.heavy
+def test_stop_brings_a_drive_to_standstill_that_another_host_left_turning(tmp_path):
+    with simulated_drive(tmp_path, "--seed", 1, "--stepped") as drive:
+        with host(tmp_path, *drive.options, *QUICK, "--stepped") as running:
+            assert running.wait_for_line("stage torque …"), running.err
+            running.signal(9)
+            running.child.wait()
+        done = tdhil("stop", "--drive", "ethercat", *drive.options)
+        assert done.code == 0, done.err
+        assert "at rest" in done.out + done.err
+        drive.shaft.assert_never_let_go()
+        assert abs(drive.shaft.speed_rad_s[-1]) < 0.05

@@ -22,6 +22,7 @@ class Observed:
     unseen_s: float = 0.0
     by_position: float | None = None
     rest_share: float = 1.0
+    doubt: object = None
 
     def speed_rad_s(self, sample):
         return sample.speed_rad_s if self.by_position is None else self.by_position
@@ -99,6 +100,27 @@ def at_seconds(seconds, *reports):
 
 def test_one_sample_that_turns_begins_anew():
     assert at_seconds(4.0, (50, sample(1.0, speed=0.2))) == pytest.approx(1.0 + SETTLE_S, abs=3.0 * PERIOD_S)
+
+
+def rests_with(every, factor, observed=None):
+    """Whether standstill is seen within 10 s, when each sample of this number shows this multiple of its speed."""
+    rest = Standstill(observed or Observed(), AT_REST, SETTLE_S, GAP_S)
+    return any(rest.see(sample(cycle * PERIOD_S, speed=factor * AT_REST * (cycle % every == 0)))
+               for cycle in range(1, 500))
+
+
+@pytest.mark.parametrize(("every", "factor", "rests"), [
+    (20, 1.05, True), (20, -1.9, True), (11, 1.05, True),
+    (20, 2.1, False),                  # too fast for a count of noise
+    (9, 1.05, False), (2, 1.05, False), (1, 1.05, False),      # too often
+])
+def test_single_counts_of_noise_do_not_hide_standstill(every, factor, rests):
+    assert rests_with(every, factor) is rests
+
+
+@pytest.mark.parametrize("observed", [Observed(doubt="speed"), Observed(position_quiet=False)])
+def test_after_a_contradiction_or_with_a_position_that_moves_no_count_is_noise(observed):
+    assert not rests_with(20, 1.05, observed)
 
 
 def test_a_single_lost_frame_does_not():

@@ -4,8 +4,8 @@ import pytest
 
 from drivers.drive import PositionReading, PowerState
 from drivers.errors import CommunicationLost
-from tdhil.runner.stop import LONGEST_GAP_CYCLES, LONGEST_GAP_S, POSITION_EVERY_S
-from tests.runner.fake_drive import PERIOD_S, FakeDrive, lost
+from tdhil.runner.stop import AT_REST_SHARE, LONGEST_GAP_CYCLES, LONGEST_GAP_S, POSITION_EVERY_S
+from tests.runner.fake_drive import LIMITS, PERIOD_S, FakeDrive, lost
 from tests.runner.stop_calls import LAG_S, SILENT, asked
 
 
@@ -26,6 +26,23 @@ def test_exchanges_that_fail_for_a_while_are_survived(world, first, error):
     assert report.confirmed
     assert str(error) in report.trouble
     assert here.drive.disabled_at == [0.0]
+
+
+@pytest.mark.parametrize(("every", "factor", "confirmed"), [(20, 1.05, True), (20, -1.9, True), (20, 2.5, False),
+                                                            (3, 1.05, False)])
+def test_single_counts_of_a_coarse_and_noisy_report_are_no_motion(world, every, factor, confirmed):
+    """Neither before the drive is disabled nor after."""
+    here = world()
+    here.turn(5.0)
+    at_rest_rad_s = AT_REST_SHARE * LIMITS.speed_max_rad_s
+
+    def coarse(drive, sample):
+        return sample._replace(speed_rad_s=sample.speed_rad_s + factor * at_rest_rad_s * (drive.cycles % every == 0))
+
+    here.drive.misbehave = coarse
+    report = here.stop_sequence().run()
+    assert report.confirmed is confirmed
+    assert not confirmed or "began to turn" not in str(report.trouble)
 
 
 @pytest.mark.parametrize("misbehave", [lost, lambda drive, sample: sample._replace(fresh=False)], ids=["dead", "stale"])
