@@ -112,7 +112,8 @@ def vocabulary() -> Iterator[Text]:
     from tdhil.service.run_state import State
 
     options = "tdhil/config/options.py"
-    for part in ("run", "simulated", "real", "rehearsal", "replay", "trace", "upload"):
+    forms = ("run", "simulated", "real", "rehearsal", "replay", "trace", "upload", "motion", "motion-file", "evidence")
+    for part in forms:
         for one in form_options(part):
             assert one.form is not None
             yield Text(options, "", one.form.label)

@@ -488,7 +488,7 @@
         const value = one.takes ? el("input", { value: one.value, "aria-label": `${one.name}: ${one.takes.toLowerCase()}`, lang: "en", autocomplete: "off" }) : null;
         const button = el("button", { type: "button", class: "quiet", "aria-label": tr("Rehearse {fault}", { fault: one.name }) }, tr("Rehearse"));
         button.addEventListener("click", () => begin(one, value && value.value.trim() !== one.value ? value.value.trim() : "", button));
-        return el("li", {}, el("strong", {}, one.name, one.row ? el("span", { class: "dim" }, ` ${one.row}`) : ""),
+        return el("li", {}, el("strong", { lang: "en" }, one.name, one.row ? el("span", { class: "dim" }, ` ${one.row}`) : ""),
           el("span", {}, english(one.summary), one.from_start ? el("span", { class: "dim" }, `; ${tr("from the start")}`) : "", el("br"), el("span", { class: "dim" }, `${tr("Required:")} `, english(one.required))), value || el("span"), button);
       }));
     });
