@@ -14,8 +14,7 @@ from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.file_hash import sha256_of
 from tdhil.session import (
     check_lags,
-    conclude_evaluation,
-    conclude_verification,
+    conclude_run,
     is_evaluation,
     is_log,
     is_verification,
@@ -28,7 +27,7 @@ from tdhil.session import (
 
 if TYPE_CHECKING:
     from tdhil.report import Letterhead
-    from tdhil.session import EvaluationConclusion, RunRecord, VerificationConclusion
+    from tdhil.session import RunRecord
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of replay. A default of None means: not given."""
@@ -99,19 +98,11 @@ def _evaluation(namespace: argparse.Namespace, recorded: RunRecord, letterhead: 
     """Evaluate the virtual string or the steps of this log, and print the result."""
     from tdhil.report import stderr_console
 
-    steps = is_verification(recorded.configuration)
+    what = "steps of tdhil tune verify" if is_verification(recorded.configuration) else "a virtual string"
     for name in settings_in(namespace):
-        what = "steps of tdhil tune verify" if steps else "a virtual string"
         raise UsageError(f"is for a run that identifies; this log contains {what}", where=OPTION[name].flag)
     recorded.require_motion()
-    if steps:
-        found: VerificationConclusion | EvaluationConclusion = conclude_verification(
-            recorded.recording, recorded.configuration, recorded.log)
-    else:
-        assert recorded.virtual_string is not None
-        found = conclude_evaluation(
-            recorded.virtual_string, recorded.recording, recorded.configuration, recorded.log
-        )
+    found = conclude_run(recorded.recording, recorded.configuration, recorded.log, recorded.virtual_string)
     for problem in recorded.problems:
         stderr_console().print(f"tdhil: {recorded.log}: {problem}", style="yellow", markup=False)
     try:

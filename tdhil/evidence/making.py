@@ -63,17 +63,11 @@ class EvidenceCheck:
 
 def conclude_log(log: Path) -> Mapping[str, Any]:
     """Return the result document of a log, as `tdhil replay` finds it."""
-    from tdhil.session import conclude, conclude_evaluation, conclude_verification, is_evaluation, is_verification, read
+    from tdhil.session import conclude_run, read
 
     record = read(log)
     record.require_motion()
-    run = record.configuration
-    if is_evaluation(run):
-        assert record.virtual_string is not None
-        return conclude_evaluation(record.virtual_string, record.recording, run, LOG).document
-    if is_verification(run):
-        return conclude_verification(record.recording, run, LOG).document
-    return conclude(record.recording, run, LOG, record.assumed).document
+    return conclude_run(record.recording, record.configuration, LOG, record.virtual_string, record.assumed).document
 
 
 def make_evidence(

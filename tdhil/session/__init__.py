@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from profiles import lazy_names
 
 if TYPE_CHECKING:
-    from tdhil.session.conclusion import conclude as conclude
+    from tdhil.session.conclusion import conclude as conclude, conclude_run as conclude_run
     from tdhil.session.confirm import (
         confirm_mounted as confirm_mounted, require_terminal as require_terminal,
         CallbackOperator as CallbackOperator, TerminalOperator as TerminalOperator, motion_summary as motion_summary,
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
         plan_document as plan_document, plan_dry as plan_dry,
     )
     from tdhil.session.evaluation import (
-        EvaluationConclusion as EvaluationConclusion, conclude_evaluation as conclude_evaluation,
         evaluation_case as evaluation_case, is_evaluation as is_evaluation,
         load_tuning as load_tuning,
     )
@@ -62,7 +61,6 @@ if TYPE_CHECKING:
         RunSession as RunSession,
     )
     from tdhil.session.verification import (
-        VerificationConclusion as VerificationConclusion, conclude_verification as conclude_verification,
         is_verification as is_verification,
         load_step_case as load_step_case,
     )
@@ -87,13 +85,13 @@ if TYPE_CHECKING:
     )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
-        "conclusion": "conclude",
+        "conclusion": "conclude conclude_run",
         "confirm": "confirm_mounted require_terminal CallbackOperator TerminalOperator motion_summary",
         "connection": "connection_of simulated_connection",
         "drive_lock": "DriveHeld Holder address_of hold holder_of holders",
         "dry_run": "BEFORE_ACQUIRE_S Figure plan_course plan_document plan_dry plan_dry_steps",
-        "evaluation": "EvaluationConclusion conclude_evaluation evaluation_case is_evaluation load_tuning",
-        "verification": "VerificationConclusion conclude_verification is_verification load_step_case",
+        "evaluation": "evaluation_case is_evaluation load_tuning",
+        "verification": "is_verification load_step_case",
         "kept": "connection_of_kept kept_connection",
         "log_files": "check_different_files check_log_path is_live make_room",
         "open_drive": "opened_drive plan_peer with_faults",

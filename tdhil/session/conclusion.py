@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from profiles import CodedText
 from tdhil.config import ASKED_AGAIN
 from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.estimation import Identification, Options, Verdict
-from tdhil.recording import Recording
+from tdhil.recording import FloatArray, Recording
 from tdhil.session.rehearsal import code_with
 from tdhil.session.stored_calibration import apply_calibration
+
+if TYPE_CHECKING:
+    from tdhil.session.evaluation import EvaluationConclusion
+    from tdhil.session.verification import VerificationConclusion
 
 TORQUE_SCALE = "torque scale"
 """Source in the uncertainty budget that a torque calibration reduces."""
@@ -77,6 +81,25 @@ def identified_so_far(run: Mapping[str, Any], recording: Recording, confidence: 
 
     recording = apply_calibration(recording, run).recording
     return identify(recording, replace(_options(run, "the run"), confidence=confidence))
+
+
+def conclude_run(
+    recording: Recording, run: Mapping[str, Any], log: str, virtual_string: FloatArray | None = None,
+    warnings: Sequence[str] | None = None,
+) -> Conclusion | EvaluationConclusion | VerificationConclusion:
+    """Identify, evaluate the virtual string or compare the steps, whichever the run did.
+
+    ``virtual_string``: rows of its channel; the others as for `conclude`.
+    """
+    from tdhil.session.evaluation import conclude_evaluation, is_evaluation
+    from tdhil.session.verification import conclude_verification, is_verification
+
+    if is_evaluation(run):
+        assert virtual_string is not None
+        return conclude_evaluation(virtual_string, recording, run, log)
+    if is_verification(run):
+        return conclude_verification(recording, run, log)
+    return conclude(recording, run, log, warnings)
 
 
 def conclude(

@@ -192,18 +192,11 @@ class RunSession:
 
     def conclude(self) -> Conclusion | EvaluationConclusion | VerificationConclusion:
         """Identify, evaluate the virtual string or compare the steps, from the recording, and log the result."""
-        from tdhil.session.conclusion import conclude
-        from tdhil.session.evaluation import conclude_evaluation, is_evaluation
-        from tdhil.session.verification import conclude_verification, is_verification
+        from tdhil.session.conclusion import Conclusion, conclude_run
 
-        recording, run, path = self.log.recording(complete=True), self.log.run, str(self.path)
-        found: Conclusion | EvaluationConclusion | VerificationConclusion
-        if is_evaluation(run):
-            found = conclude_evaluation(self.log.virtual_string, recording, run, path)
-        elif is_verification(run):
-            found = conclude_verification(recording, run, path)
-        else:
-            found = conclude(recording, run, path)
+        recording = self.log.recording(complete=True)
+        found = conclude_run(recording, self.log.run, str(self.path), self.log.virtual_string)
+        if isinstance(found, Conclusion):
             self._tell_last(found, recording)
         self._judge(found.document, int(found.exit_code))
         if self.rehearsal is not None:
