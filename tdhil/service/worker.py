@@ -10,7 +10,8 @@ import os
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -52,6 +53,18 @@ def replay(asked: dict[str, Any]) -> dict[str, Any]:
     return {"document": identify(read_marked(), **given).to_dict()}
 
 
+@contextmanager
+def _put(name: str) -> Iterator[Path]:
+    """Yield a file that takes the place of ``name`` at the end. A file that is not complete is removed."""
+    beside = Path(f".{os.getpid()}-{name}")
+    beside.unlink(missing_ok=True)
+    try:
+        yield beside
+        beside.replace(name)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
 def report(asked: dict[str, Any]) -> dict[str, Any]:
     """Write the report of a run with a result to the named file."""
     from tdhil.report import require_extra, write_report
@@ -62,17 +75,13 @@ def report(asked: dict[str, Any]) -> dict[str, Any]:
     require_extra("report")
     os.chdir(asked["folder"])
     wanted = Path(str(asked["name"])).name
-    beside = Path(f".{os.getpid()}-{wanted}")
     began_ns = time.time_ns()
     noted = Store(Path("../..")).annotations(Path.cwd().name)
     document = noted.shown_on(_signed(json.loads(Path("result.json").read_bytes())))
     letterhead = stored_letterhead(Path("../.."))
-    try:
-        written = write_report(document, read("run.mcap").recording, beside, letterhead)
-        os.utime(written, ns=(began_ns, began_ns))     # a change while the report was made makes it outdated
-        written.replace(wanted)
-    finally:
-        beside.unlink(missing_ok=True)
+    with _put(wanted) as beside:
+        write_report(document, read("run.mcap").recording, beside, letterhead)
+        os.utime(beside, ns=(began_ns, began_ns))      # a change while the report was made makes it outdated
     return {"document": {"file": wanted}}
 
 
@@ -92,15 +101,11 @@ def _signed(document: dict[str, Any]) -> dict[str, Any]:
 def samples(asked: dict[str, Any]) -> dict[str, Any]:
     """Write the run's samples as samples.csv, as `tdhil export` does."""
     os.chdir(asked["folder"])
-    beside = Path(f".{os.getpid()}-samples.csv")
-    command = [sys.executable, "-m", "tdhil", "export", "run.mcap", "--to", "csv", "-o", str(beside)]
-    try:
+    with _put("samples.csv") as beside:
+        command = [sys.executable, "-m", "tdhil", "export", "run.mcap", "--to", "csv", "-o", str(beside)]
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
         if not beside.exists():
             raise UsageError(" ".join(done.stderr.split())[:500] or "can't be exported", where="run.mcap")
-        beside.replace("samples.csv")
-    finally:
-        beside.unlink(missing_ok=True)
     return {"document": {"file": "samples.csv"}}
 
 
@@ -179,12 +184,8 @@ def evidence(asked: dict[str, Any]) -> dict[str, Any]:
     statement = statement_of(given)
     made = make_evidence(Path("run.mcap"), statement, (*given.remove, *names_of_this_computer()),
                          serial_key=Path(asked["key_file"]).read_bytes())
-    beside = Path(f".{os.getpid()}-{ARCHIVE}")
-    try:
+    with _put(ARCHIVE) as beside:
         beside.write_bytes(made.archive)
-        beside.replace(ARCHIVE)
-    finally:
-        beside.unlink(missing_ok=True)
     return {"document": {"sha256": made.sha256, "size_bytes": len(made.archive), "publisher": statement.publisher,
                          "publish": list(statement.publish), "simulated": statement.simulated}}
 
