@@ -16,7 +16,7 @@ from tdhil.service.start_request import ValuesWrong, value_of
 
 ARCHIVE: Final = "evidence.zip"
 ABOUT: Final = "evidence.json"
-STATED: Final = MappingProxyType({one.name: one for one in OF_EVIDENCE})
+STATEMENT: Final = MappingProxyType({one.name: one for one in OF_EVIDENCE})
 """Options of the statement, by name."""
 
 
@@ -53,10 +53,10 @@ def stated_in(body: Mapping[str, Any]) -> EvidenceOptions:
     given: dict[str, Any] = {}
     wrong: list[tuple[str, str]] = []
     for name, value in body.items():
-        option = STATED.get(str(name))
+        option = STATEMENT.get(str(name))
         if option is None:
             raise UsageError("is not a part of the statement", where=str(name)[:60],
-                             next_step=f"Parts: {', '.join(STATED)}", entry=MessageCode.REQUEST_WRONG)
+                             next_step=f"Parts: {', '.join(STATEMENT)}", entry=MessageCode.REQUEST_WRONG)
         if value in (None, "", []):
             continue
         try:

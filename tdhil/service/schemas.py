@@ -17,7 +17,7 @@ from tdhil.service.acceptance_signature import AcceptanceSignature
 from tdhil.service.accounts import Role
 from tdhil.service.annotations import AnnotationEdit
 from tdhil.service.audit import Broken, Entry
-from tdhil.service.evidence_request import STATED, EvidenceView
+from tdhil.service.evidence_request import STATEMENT, EvidenceView
 from tdhil.service.fleets import FleetView
 from tdhil.service.foxglove import PROTOCOLS
 from tdhil.service.run_state import Check, Confirmation, Entered, State, Stop, Told, Watch
@@ -845,7 +845,7 @@ def document() -> dict[str, Any]:
         if kind == EVIDENCE:
             return {"type": "object", "description": "the options of `tdhil evidence`, such as "
                     '{"publisher": "The Institute", "publish": "log,result,identity"}',
-                    "properties": {name: option_schema(one) for name, one in STATED.items()}}
+                    "properties": {name: option_schema(one) for name, one in STATEMENT.items()}}
         found = adapter(kind).json_schema(mode=mode, ref_template="#/components/schemas/{model}")
         schemas.update(found.pop("$defs", {}))
         if isinstance(kind, type) and found.get("type") == "object":
