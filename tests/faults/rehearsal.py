@@ -16,6 +16,35 @@ HELD = {"operation enabled", "quick stop active", "fault reaction active"}
 TURNING_RAD_S = 0.02
 
 
+IN_MOTION = "@speed+15s"       # at 4 rad/s
+NOTICED_AT_ONCE_S = 0.1        # five cycles
+FEEDBACK_S = 0.4               # a quarter of a second without feedback
+WATCHDOG_S = 0.6               # the drive's own, and a cycle
+CONTRADICT = ("contradict each other", "The shaft was stopped")
+
+
+@dataclass(frozen=True)
+class Case:
+    """``ends``: refused (nothing moves), held (the drive holds the shaft until it rests), coasts (the drive let go).
+
+    ``backwards_rad_s``: so fast a wrong sensor or power stage may turn the shaft backwards before that is noticed.
+    """
+
+    row: int
+    fault: str
+    code: int
+    words: tuple[str, ...]
+    ends: str = "held"
+    notice_s: float = NOTICED_AT_ONCE_S
+    more: tuple[object, ...] = ()
+    confirmed: bool = True
+    backwards_rad_s: float = 0.3
+
+    @property
+    def id(self):
+        return f"{self.row}-{self.fault}"
+
+
 @dataclass
 class Rehearsed:
     """One run, over."""
@@ -64,6 +93,16 @@ class Rehearsed:
         assert shaft.time_s[-1] - shaft.at_rest_from() >= 1.0
         assert shaft.speed_rad_s.min() > -backwards_rad_s
         return round(self.standstill_s(since_s), 2)
+
+    def assert_as(self, case):
+        """Ended with the words of a case, and the shaft did as it says; return the time to standstill, if it moved."""
+        self.assert_ended(case.code, *case.words)
+        if case.ends == "refused":
+            self.assert_nothing_moved()
+            return None
+        return self.assert_stopped(
+            self.fault_s, case.notice_s, held=case.ends == "held", backwards_rad_s=case.backwards_rad_s
+        )
 
     def assert_log_whole(self):
         """Finalised: recovery has nothing to do, and the stages in it are those that were reported."""

@@ -1,38 +1,15 @@
 """`tdhil identify --drive ethercat --simulate --fault …`: rehearsed end to end, over a pair of veth interfaces."""
 
-from dataclasses import dataclass
-
 import pytest
 
 from sim_bus.ethercat.faults import KINDS
+from tests.faults.rehearsal import CONTRADICT, FEEDBACK_S, IN_MOTION, WATCHDOG_S, Case
 from tests.path.ethercat_segment import segment, simulated_drive
 from tests.path.path_runs import INERTIA, QUICK, host, wait_for
 
 _segment = pytest.fixture(scope="module", autouse=True)(segment)
 
-IN_MOTION = "@speed+15s"       # at 4 rad/s
-NOTICED_AT_ONCE_S = 0.1        # five cycles
-FEEDBACK_S = 0.4               # a quarter of a second without feedback
-WATCHDOG_S = 0.6               # the drive's own, and a cycle
 READ_BACK_S = 6.0              # ten questions without an answer
-CONTRADICT = ("contradict each other", "The shaft was stopped")
-
-
-@dataclass(frozen=True)
-class Case:
-    """``ends``: refused (nothing moves), held (the drive holds the shaft until it rests), coasts (the drive let go).
-
-    ``backwards_rad_s``: so fast a wrong power stage may turn the shaft backwards before that is noticed.
-    """
-
-    row: int
-    fault: str
-    code: int
-    words: tuple[str, ...]
-    ends: str = "held"
-    notice_s: float = NOTICED_AT_ONCE_S
-    backwards_rad_s: float = 0.3
-
 
 CASES = (
     Case(12, "bus-dead" + IN_MOTION, 8, ("no feedback", "drive's own watchdog"), notice_s=WATCHDOG_S),
@@ -77,19 +54,12 @@ WITH_EACH_COMMIT = {"bus-dead" + IN_MOTION, "al-error" + IN_MOTION + "=001Ah", "
 
 
 @pytest.mark.parametrize("case", [
-    pytest.param(case, id=f"{case.row}-{case.fault}",
+    pytest.param(case, id=case.id,
                  marks=pytest.mark.heavy if case.fault in WITH_EACH_COMMIT else pytest.mark.long) for case in CASES
 ])
 def test_row(case, rehearse, seen):
     run = rehearse("--drive", "ethercat", "--fault", case.fault)
-    run.assert_ended(case.code, *case.words)
-    standstill_s = None
-    if case.ends == "refused":
-        run.assert_nothing_moved()
-    else:
-        standstill_s = run.assert_stopped(
-            run.fault_s, case.notice_s, held=case.ends == "held", backwards_rad_s=case.backwards_rad_s
-        )
+    standstill_s = run.assert_as(case)
     if case.code == 8:
         assert "NOT confirmed" in run.done.document["stop"] and "hard-wired emergency stop" in run.done.err
     if case.row > 121:

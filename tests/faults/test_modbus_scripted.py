@@ -9,14 +9,15 @@ import json
 import re
 import subprocess
 import sys
-from dataclasses import dataclass
+from functools import partial
 
 import pytest
 
 from sim_bus.modbus.faults import KINDS, ONLY_ON
+from tests.faults import rehearsal
+from tests.faults.rehearsal import IN_MOTION
 from tests.path.path_runs import HANGS_S, Shaft, ShaftTrace, process, tdhil, wait_for
 
-IN_MOTION = "@speed+15s"       # at 4 rad/s
 PATIENT = (                    # against the wall clock a busy machine's pauses must not be taken for a fault
     "limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,"
     " watchdog_s: 5.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
@@ -24,18 +25,7 @@ PATIENT = (                    # against the wall clock a busy machine's pauses 
 NOTICED_S = 0.6                # half the watchdog's time, or all of it, and five cycles
 
 
-@dataclass(frozen=True)
-class Case:
-    """``ends``: refused (nothing moves), held (the drive holds the shaft until it rests), coasts (the drive let go)."""
-
-    row: int
-    fault: str
-    code: int
-    words: tuple[str, ...]
-    ends: str = "held"
-    notice_s: float = NOTICED_S
-
-
+Case = partial(rehearsal.Case, notice_s=NOTICED_S)
 CASES = (
     Case(19, "frozen-feedback@acquire+2s", 8, ("frozen", "gateway"), notice_s=2.0),
     Case(23, "drive-fault@torque+3s", 6, ("fault", "--reset-fault")),
@@ -65,17 +55,13 @@ CASES = (
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.row}-{case.fault}")
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.id)
 def test_row(case, rehearse, tmp_path):
     rig = tmp_path / "warm.yaml"
     rig.write_text(PATIENT.replace("watchdog_s: 5.0", "watchdog_s: 0.5, temperature_c: 110.0"))
     run = rehearse("--drive", "modbus", "--fault", case.fault, "--rig", rig)
-    run.assert_ended(case.code, *case.words)
+    run.assert_as(case)
     assert f"scripted fault {case.fault}" in " ".join(run.done.err.split())
-    if case.ends == "refused":
-        run.assert_nothing_moved()
-    else:
-        run.assert_stopped(run.fault_s, case.notice_s, held=case.ends == "held")
     run.assert_log_whole()
 
 

@@ -1,41 +1,13 @@
 """Rows of the fault table that a drive or a bus causes: scripted in the simulated drive, seen on the whole path."""
 
-from dataclasses import dataclass
 from itertools import product
 
 import pytest
 
 from tdhil.recording.log_reader import read_run
+from tests.faults.rehearsal import CONTRADICT, FEEDBACK_S, IN_MOTION, WATCHDOG_S, Case
 
-IN_MOTION = "@speed+15s"       # at 4 rad/s
-NOTICED_AT_ONCE_S = 0.1        # five cycles
 HEARTBEAT_S = 0.7              # 0.5 s without one, which may have been due 0.1 s before
-FEEDBACK_S = 0.4               # a quarter of a second without feedback
-WATCHDOG_S = 0.6               # the drive's own, and a cycle
-CONTRADICT = ("contradict each other", "The shaft was stopped")
-
-
-@dataclass(frozen=True)
-class Case:
-    """``ends``: refused (nothing moves), held (the drive holds the shaft until it rests), coasts (the drive let go).
-
-    ``backwards_rad_s``: so fast a wrong sensor or power stage may turn the shaft backwards before that is noticed.
-    """
-
-    row: int
-    fault: str
-    code: int
-    words: tuple[str, ...]
-    ends: str = "held"
-    notice_s: float = NOTICED_AT_ONCE_S
-    more: tuple[object, ...] = ()
-    confirmed: bool = True
-    backwards_rad_s: float = 0.3
-
-    @property
-    def id(self):
-        return f"{self.row}-{self.fault}"
-
 
 CASES = (
     Case(12, "bus-dead" + IN_MOTION, 8, ("no feedback", "drive's own watchdog"), notice_s=WATCHDOG_S, confirmed=False),
@@ -105,14 +77,8 @@ def at_once(case):
 ])
 def test_row(case, rehearse, seen):
     run = rehearse("--fault", case.fault, *case.more)
-    run.assert_ended(case.code, *case.words)
-    standstill_s = None
-    if case.ends == "refused":
-        run.assert_nothing_moved()
-    else:
-        standstill_s = run.assert_stopped(
-            run.fault_s, case.notice_s, held=case.ends == "held", backwards_rad_s=case.backwards_rad_s
-        )
+    standstill_s = run.assert_as(case)
+    if case.ends != "refused":
         run.shaft.assert_enabled(True)
     assert ("NOT confirmed" in run.done.document["stop"]) is not case.confirmed
     if not case.confirmed:
