@@ -28,9 +28,13 @@ it. A drive may report coarser than its profile states, and noise then shows a c
 
 
 class CountsOfNoise:
-    """Tells single counts of a noisy and coarse speed report from motion, over one time at standstill."""
+    """Tells single counts of a noisy and coarse speed report from motion, over one time at standstill.
 
-    def __init__(self, at_rest_rad_s: float) -> None:
+    After a contradiction no count is noise.
+    """
+
+    def __init__(self, observer: Observer, at_rest_rad_s: float) -> None:
+        self._observer = observer
         self._most_rad_s = COUNT_FACTOR * at_rest_rad_s
         self.restart()
 
@@ -42,9 +46,8 @@ class CountsOfNoise:
         """Add one sample. Return whether it is quiet, or beyond the standstill speed by noise alone."""
         self._samples += 1
         self._counts += not quiet
-        return quiet or (
-            abs(speed_rad_s) <= self._most_rad_s and self._counts <= max(1.0, COUNT_SHARE * self._samples)
-        )
+        few = self._counts <= max(1.0, COUNT_SHARE * self._samples)
+        return quiet or (few and abs(speed_rad_s) <= self._most_rad_s and self._observer.doubt is None)
 
 
 class Standstill:
@@ -57,7 +60,7 @@ class Standstill:
         self._longest_gap_s = longest_gap_s
         self._since_s: float | None = None
         self._heard_s = 0.0
-        self._noise = CountsOfNoise(at_rest_rad_s)
+        self._noise = CountsOfNoise(observer, at_rest_rad_s)
 
     @property
     def settle_s(self) -> float:
@@ -84,8 +87,7 @@ class Standstill:
         gap, quiet, observer = gap_s > max(self._longest_gap_s, polled_gap_s), self.quiet(sample), self._observer
         noise = self._noise.explains(observer.speed_rad_s(sample), quiet=quiet)
         if not quiet:
-            trusted = observer.doubt is None and observer.reports_trusted
-            if gap or not (noise and trusted and observer.angle_quiet(self._at_rest_rad_s)):
+            if gap or not (noise and observer.reports_trusted and observer.angle_quiet(self._at_rest_rad_s)):
                 self._since_s = None
             return False
         if self._since_s is None or gap:

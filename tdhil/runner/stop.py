@@ -643,9 +643,9 @@ class StopSequence:
 
     def _stays_at_rest(self) -> bool:
         """Return whether the shaft stays at standstill without torque. Without feedback it counts as staying there."""
-        quiet_s, turned, heard_s = 0.0, False, self._loop.now_s
-        noise = CountsOfNoise(self._at_rest_rad_s)
-        enough_s = max(self._settle_s, min(0.8 * REST_AFTER_S, self._loop.guard.observer.shows_s(
+        quiet_s, turned, heard_s, observer = 0.0, False, self._loop.now_s, self._loop.guard.observer
+        noise = CountsOfNoise(observer, self._at_rest_rad_s)
+        enough_s = max(self._settle_s, min(0.8 * REST_AFTER_S, observer.shows_s(
             self._at_rest_rad_s, self._held_at_rest_nm)))
         for _ in range(self._loop.cycles(REST_AFTER_S)):
             sample = self._exchange(_REST, or_poll=True)
@@ -658,10 +658,8 @@ class StopSequence:
             apart_s = sample.time_s - heard_s if self._polls.standing else 0.0
             quiet_s += max(self._loop.period_s, min(self._longest_gap_s, apart_s))
             heard_s = sample.time_s
-            observer = self._loop.guard.observer
             speed_rad_s = observer.speed_rad_s(sample)
-            quiet = abs(speed_rad_s) <= self._at_rest_rad_s
-            if not noise.explains(speed_rad_s, quiet=quiet) or not (quiet or observer.doubt is None):
+            if not noise.explains(speed_rad_s, quiet=abs(speed_rad_s) <= self._at_rest_rad_s):
                 quiet_s = 0.0
                 noise.restart()
                 if not turned:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -205,23 +206,22 @@ def make_plan(limits: MotionLimits, guess: RigGuess, wish: PlanRequest | None = 
         raise PlanRefused(
             f"the phases of {wish.kind} are part of its form, so it has one realisation", "Remove --realisations",
         )
-    speeds = _number_of_offsets(wish)
+    speeds = 2 if wish.offsets_rad_s is None else len(wish.offsets_rad_s)     # of a tuned motion
     fits = [
         _FittedShape.of(
             begun_at_rest(other_phases(shape, number), period, guess.inertia_kg_m2, guess.viscous_nm_s_rad),
             period, limits, guess, wish.mode,
         )
-        for number in range(wish.realisations * speeds if wish.realisations > 1 else 1)
+        for number in range(1 if wish.realisations == 1 else wish.realisations * speeds)
     ]
     amplitude, offsets = _amplitude_and_offsets(fits, wish)
-    sets = [fits[number % len(fits)] for number in range(wish.realisations * speeds)]
     each = [offset for offset in offsets for _ in range(wish.realisations)]
     settle = settling_periods(period, wish.settle_s)
     periods = _periods(wish, period, settle)
     return Plan(
         wish.kind,
         wish.mode,
-        tuple(fit.segment(offset, amplitude, periods, settle) for offset, fit in zip(each, sets, strict=True)),
+        tuple(fit.segment(offset, amplitude, periods, settle) for offset, fit in zip(each, cycle(fits))),
         limits,
         guess,
     )
@@ -390,12 +390,6 @@ def _amplitude_and_offsets(fits: list[_FittedShape], wish: PlanRequest) -> tuple
             f"{largest:.3g} rad/s would fit"
         )
     return amplitude, tuple(offsets)
-
-
-def _number_of_offsets(wish: PlanRequest) -> int:
-    if wish.offsets_rad_s is not None:
-        return len(wish.offsets_rad_s)
-    return 1 if periodic_kind(wish.kind).at_one_speed_s > 0.0 else 2
 
 
 def _default_offsets(fit: _FittedShape, wish: PlanRequest) -> tuple[float, ...]:
