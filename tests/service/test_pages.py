@@ -310,7 +310,7 @@ def test_a_letterhead_is_set_and_an_svg_refused_at_its_field(page, served):
     logo = page.get_by_label("Logo, a PNG")
     logo.set_input_files({"name": "logo.png", "mimeType": "image/png", "buffer": b"<svg onload='window.pwned=1'/>"})
     page.get_by_role("button", name="Save").click()
-    page.get_by_text("It may contain scripts").wait_for()
+    page.locator("#wrong-logo").get_by_text("It may contain scripts").wait_for()
     assert logo.get_attribute("aria-invalid") == "true" and not page.locator("#logo").is_visible()
     logo.set_input_files({"name": "logo.png", "mimeType": "image/png", "buffer": png(300, 100)})
     page.get_by_role("button", name="Save").click()
