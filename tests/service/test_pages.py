@@ -326,6 +326,22 @@ def test_a_letterhead_is_set_and_an_svg_refused_at_its_field(page, served):
 
 
 @pytest.mark.heavy
+@pytest.mark.parametrize(("path", "label", "stored"), [
+    ("/letterhead", "Company", ""), ("/rigs/a/file", "rig.yaml", "simulate: true"),
+])
+def test_a_form_takes_no_text_before_what_is_stored_is_in_it(page, path, label, stored):
+    held = []
+    page.route(f"**/api/v1{path}", lambda route: held.append(route))
+    page.goto(path)
+    wait_for("the question", lambda: page.wait_for_timeout(20) or held)
+    field = page.get_by_label(label)
+    assert not field.is_enabled()
+    held[0].continue_()
+    wait_for("the answer", field.is_enabled)
+    assert stored in field.input_value()
+
+
+@pytest.mark.heavy
 def test_a_report_that_is_made_again_shows_its_progress(page, served, monkeypatch):
     """After an edit, as after a signature: the page says so, shows the time, and then gives the new report."""
     run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id

@@ -294,6 +294,14 @@
     }
   }
 
+  /** Fill a form with what is stored. It takes no text before, since the answer would replace it. */
+  async function fillsFirst(form, fill) {
+    const open = [...form.elements].filter((one) => !one.disabled);
+    open.forEach((one) => { one.disabled = true; });
+    await fill();
+    open.forEach((one) => { one.disabled = false; });
+  }
+
   function planTable(plan) {
     const half = plan.expected_half_width, speed = (value) => number(inSpeedUnit(value), 3);
     const rows = [
@@ -762,7 +770,7 @@
       byId("rig-file-done").textContent = "";
       saying(said, async () => { fill(await call("POST", path, { text: form.elements.text.value, sha256 })); byId("rig-file-done").textContent = tr("Saved."); });
     });
-    saying(said, async () => fill(await call("GET", path)));
+    saying(said, () => fillsFirst(form, async () => fill(await call("GET", path))));
   }
 
   function accountsPage() {
@@ -794,7 +802,7 @@
   });
 
   const pages = { error: errorPage, login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, csrf, el, every, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, zone };
+  window.tdhil = { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, csrf, el, every, fillsFirst, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);

@@ -2,7 +2,7 @@
 "use strict";
 (() => {
   const { tr } = window.tdhilLanguage;
-  const { Refused, byId, call, el, pages, show, submits } = window.tdhil;
+  const { Refused, byId, call, el, fillsFirst, pages, show, submits } = window.tdhil;
 
   /** The file in base64, without the beginning of a data URL. */
   const inBase64 = (file) => new Promise((done, fail) => {
@@ -33,7 +33,7 @@
         show(done, el("span", { class: "dim" }, tr("Saved. Each report is made again when it is next opened.")));
       });
     });
-    submits(form, said, async () => fill(await call("GET", "/letterhead")));
+    submits(form, said, () => fillsFirst(form, async () => fill(await call("GET", "/letterhead"))));
   }
 
   pages.letterhead = letterheadPage;
