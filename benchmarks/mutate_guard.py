@@ -130,7 +130,7 @@ SUBJECTS = {
         "canopen/drive", "test_preflight.py", "test_trouble.py", "test_late_host.py", "test_drive_faults.py",
         "test_feedback.py", "test_sdo_feedback.py", "test_other_master.py", "test_supervision.py", "test_position.py",
         "test_guarding.py", "test_no_watchdog.py", "test_profile_preflight.py", "test_drive_contract.py",
-        "test_watchdog_feed.py",
+        "test_watchdog_feed.py", "test_changed_feedback.py",
     ),
     "cia402/drive": _driver(
         "cia402/drive", "test_preflight.py", "test_trouble.py", "test_late_host.py", "test_drive_faults.py",
