@@ -177,6 +177,10 @@ class MessageCode(Enum):
         59, "The present gains have thin margins",
         "In the worst case, the gains in the drive keep less margin than requested.",
         "Lower the present gains, or type in the tuned ones.")
+    LOAD_MAY_STAY_BEHIND = (
+        60, "The load may stay behind the motor",
+        "The excited frequencies do not show whether the load turns with the motor.",
+        "Excite lower frequencies, below the oscillation of the load, or separate the load from the motor.")
 
     # --- 1xx: internal error -----------------------------------------------------------------------------------------
     INTERNAL_ERROR = (

@@ -354,13 +354,26 @@ def of_reports(prior: LagPrior) -> list[str]:
     return found
 
 
+_TURNS_AS_ONE = CodedText(
+    "the rig's load is a string, but at these lines all turns as one: J is that of motor, string and what hangs below"
+    " it together, not the motor's alone",
+    MessageCode.STRING_MOVES_WITH_MOTOR)
+_MAY_STAY_BEHIND = CodedText(
+    "the rig's load is a string, and these lines do not show whether it turns with the motor: J is that of all that"
+    " turns there, which may be the motor alone",
+    MessageCode.LOAD_MAY_STAY_BEHIND)
+
+
+def whose_load_may_stay_behind(finding: Finding) -> Finding:
+    """Return a rigid shaft's finding with the caveat that the load may stay behind instead of turning as one."""
+    return replace(
+        finding, warnings=tuple(_MAY_STAY_BEHIND if one is _TURNS_AS_ONE else one for one in finding.warnings))
+
+
 def _caveats(result: RigidResult, as_paper: bool, has_drill_string: bool) -> tuple[str, ...]:
     found = []
     if has_drill_string:
-        found.append(CodedText(
-            "the rig's load is a string, but at these lines all turns as one: J is that of motor, string and "
-            "what hangs below it together, not the motor's alone",
-            MessageCode.STRING_MOVES_WITH_MOTOR))
+        found.append(_TURNS_AS_ONE)
     if result.fitted.problem.constraint is None:
         found.append(CodedText(
             "only one mean speed: viscous friction rests on the lines, not on levels",
