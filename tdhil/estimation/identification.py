@@ -24,7 +24,7 @@ from tdhil.estimation.frequency_domain import measure_response
 from tdhil.estimation.impedance import measure_impedance, refusal
 from tdhil.estimation.paper_method import paper_estimate
 from tdhil.estimation.periodic import clear_lines, identify_lines, measured
-from tdhil.estimation.result import Identification, Options, Refused
+from tdhil.estimation.result import DriveImpedance, Identification, Options, Refused
 from tdhil.estimation.samples import Samples, excited_window, usable_samples
 from tdhil.estimation.setpoint_sampling import stretched
 from tdhil.estimation.time_domain import identify_record, recorded
@@ -56,16 +56,21 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
     finding = jump_checked(level_checked(angle_checked(finding, case), case), case)
     found = conclude(case, stretched(finding, case.recording))
     if isinstance(case, PeriodicCase):
-        response = measure_response(case, seen.curve, seen.settled, seen.model)
-        found = replace(found, frequency_response=response)
+        found = replace(
+            found, frequency_response=measure_response(case, seen.curve, seen.settled, seen.model))
+    return replace(found, impedance=_impedance(case, finding, found))
+
+
+def _impedance(case: Case, finding: Finding, found: Identification) -> DriveImpedance | None:
+    """Measure the drive's impedance if this is asked for; else None. A contradicted or unidentified run is refused."""
     asked = case.recording.impedance
     if asked is None:
-        return found
+        return None
     if finding.contradiction.reason:
-        return replace(found, impedance=refusal(asked, found.reason, found.advice))
+        return refusal(asked, found.reason, found.advice)
     if isinstance(case, PeriodicCase):
-        return replace(found, impedance=measure_impedance(case))
-    return replace(found, impedance=refusal(asked, finding.refusal.reason, finding.refusal.advice))
+        return measure_impedance(case)
+    return refusal(asked, finding.refusal.reason, finding.refusal.advice)
 
 
 def _again(case: Case, excitation: Excitation, samples: Samples) -> tuple[PeriodicCase, Finding]:
