@@ -5,9 +5,10 @@
 Each seed draws a profile that ships (both buses), a shaft (rigid, two masses, drill string; J from 0.02 to 3000 kg·m²;
 each law of friction), what disturbs it, how late and how coarsely the drive reports, and a cycle rate; the limits fit
 the shaft. Every report is honest. A row of the table is a cause that ended runs; an alarm is a cause whose class name
-says that reports contradict each other. A rig that is refused before its drive was enabled does not count. An interval
-is held against the inertia that the result names: the motor's, that of motor and load together, or either where it
-states that the data do not tell. `--against` compares every interval of J with that of another commit.
+says that reports contradict each other, or a stop that was not confirmed. A rig that is refused before its drive was
+enabled does not count. An interval is held against the inertia that the result names: the motor's, that of motor and
+load together, or either where it states that the data do not tell. `--against` compares every interval of J with that
+of another commit.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from profiles import MessageCode  # noqa: E402
 from profiles.library import load_profile, profile_names  # noqa: E402
 from sim_bus.plant.drill_string import StringParams  # noqa: E402
 from sim_bus.shaft_judge import read_shaft  # noqa: E402
+from tdhil.errors import ExitCode  # noqa: E402
 
 ALARM = "Contradict"
 """Part of the class name of the observer's errors."""
@@ -258,9 +260,14 @@ def line(row: dict[str, Any]) -> str:
             f"{'' if row['moved'] else '  (never enabled)'}")
 
 
+def alarm(row: dict[str, Any]) -> bool:
+    """Return whether its reports were not believed, or its standstill not."""
+    return ALARM in row["cause"] or row["exit_code"] == int(ExitCode.STOP_NOT_CONFIRMED)
+
+
 def alarms(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Those that were stopped since their reports were not believed."""
-    return [row for row in rows if ALARM in row["cause"]]
+    """Those that were stopped or left since their reports were not believed."""
+    return [row for row in rows if alarm(row)]
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> str:
@@ -269,12 +276,12 @@ def summary(rows: Sequence[dict[str, Any]]) -> str:
     lines = ["", f"{len(rows)} rigs, {len(rows) - len(counted)} refused before motion, {len(counted)} runs, "
              f"{sum(row['took_s'] for row in rows):.0f} s of processor time"]
     for cause, count in Counter(row["cause"] or "none: went to its end" for row in counted).most_common():
-        lines.append(f"  {count:>5}  {cause}{'  FALSE ALARM' if ALARM in cause else ''}")
+        lines.append(f"  {count:>5}  {cause}")
     told = [row for row in counted if row["low"] is not None and row["verdict"] in ("valid", "valid_wide")]
     missed = [row for row in told if not covers(row)]
     lines.append(f"valid or valid_wide: {len(told)}, of which {len(missed)} miss J: "
                  + ", ".join(str(row["seed"]) for row in missed))
-    lines.append(f"false alarms: {len(alarms(rows))}")
+    lines.append(f"false alarms: {len(alarms(rows))}: " + ", ".join(str(row["seed"]) for row in alarms(rows)))
     return "\n".join(lines)
 
 

@@ -14,6 +14,7 @@ from tdhil.runner.settings import ExcitationRequest
 from tdhil.runner.stop import BLOCK_S, LONGEST_S, MODE_S, StopTimeout
 from tdhil.runner.string_release import (
     FASTEST_SWING_S,
+    HARD_SHARE,
     QUIET_S,
     STIFFEST,
     TRAVEL_RAD,
@@ -310,6 +311,18 @@ def test_an_oscillation_faster_than_any_string_makes_it_stiffer():
 
     assert yields_after(2.5 * FASTEST_SWING_S) == pytest.approx(40.0 / 80.0)
     assert yields_after(1.5) == pytest.approx(40.0 / 80.0 / STIFFEST, rel=1e-6)
+
+
+def test_an_oscillation_within_a_few_cycles_makes_it_stiffer_though_the_mean_hides_it():
+    """A report every 65 ms, and a torque that changes its sign every second cycle."""
+    def yields_after(torque_nm):
+        going = letting_go(period_s=0.065)
+        for step in range(80):
+            going.step(torque_nm if step % 4 < 2 else -torque_nm, 0.0)
+        return going.step(-40.0, 0.0)
+
+    assert yields_after(0.9 * HARD_SHARE * LIMITS.torque_nm) == pytest.approx(40.0 / 80.0)
+    assert yields_after(1.1 * HARD_SHARE * LIMITS.torque_nm) == pytest.approx(40.0 / 80.0 / STIFFEST, rel=1e-6)
 
 
 def test_its_bounds_in_time_and_travel():
