@@ -139,7 +139,7 @@ def schedule_section(document: Part) -> ReportSection:
     blocks: list[Table | Text | Picture] = [
         Table(tuple(Column(name, 1.0 / len(headings), number=True) for name in headings), rows),
         Text(document["sentence"]),
-        Picture(partial(draw_schedule, document=document), 3.6,
+        Picture("schedule", partial(draw_schedule, document=document), 3.6,
                 "Gains and critical speed over depth. Crosses: interpolated gains, checked halfway between two rows."),
     ]
     if parameters:
