@@ -57,8 +57,8 @@ GRAPHS = {
         "the points bend (stay above the bend, with a larger --offset), or two points at one speed differ (warm up)"),
     "impedance": Graph(
         "The drive's own impedance",
-        "the points lie on the curve",
-        "the points miss the curve (disconnect string and brake; switch ramps and feed-forward off)"),
+        "the points lie on the curve, and the band of |r| is narrow",
+        "the points scatter about the curve, or the band is wide (disconnect string and brake, or add --periods)"),
     "open_loop": Graph(
         "Speed loop: open loop and sensitivity",
         "|L| falls through 1 once, its phase stays above the dashed line there, and |S| stays below 2",
@@ -108,8 +108,8 @@ GRAPHS = {
         "the bit stops in each period (raise the set speed, lower the weight on bit, or tune soft torque)"),
     "severity": Graph(
         "Severity: index over the record",
-        "the index stays below the yellow line",
-        "it lies above the red line (raise the set speed, lower the weight on bit, or tune soft torque)"),
+        "the index stays below the lower line",
+        "the index lies above the upper, red line (raise the set speed, lower the weight on bit, or tune soft torque)"),
     "bodies": Graph(
         "Calibration: bodies",
         "the line passes through all runs within their bars",
@@ -122,7 +122,7 @@ GRAPHS = {
     "sensor": Graph(
         "Calibration: record of a reference sensor",
         "the curves lie on each other but for the scale, and the residuals look like noise",
-        "the residuals look like the motion (check the clock, the column and the place of the sensor)"),
+        "the residuals drift or look like the motion (check the clock, the column and the place of the sensor)"),
     "linearity": Graph(
         "Calibration: linearity",
         "the residuals lie in a level band about 0",

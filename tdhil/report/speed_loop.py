@@ -24,6 +24,7 @@ from tdhil.report.document import SIMULATED, only_finite
 from tdhil.report.graphs import GRAPHS
 from tdhil.report.html import write_blocks
 from tdhil.report.page import repeatable_figures, require_extra
+from tdhil.report.plots import plain_ticks
 from tdhil.report.schedule import gain_words
 from tdhil.soft_torque import DriveSetting
 from tdhil.speed_loop import (
@@ -39,7 +40,6 @@ from tdhil.speed_loop import (
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
 Part = Mapping[str, Any]
@@ -399,18 +399,10 @@ def draw_loop(figure: FigureBase, document: Part) -> None:
     axes[2].set_xscale("log")
     for place in axes:
         place.grid(alpha=0.3, which="both")
-    _plain_ticks(axes[2])
+    plain_ticks(axes[2].xaxis)
     axes[0].legend(fontsize="small", loc="lower left")
     axes[1].legend(handles=[line for line in axes[1].lines if "margin" in str(line.get_label())], fontsize="small",
                    loc="lower left")
-
-
-def _plain_ticks(axes: Axes) -> None:
-    def text(value: float, _: object = None) -> str:
-        return f"{value:g}" if f"{value:.0e}"[0] in "125" else ""
-
-    for which in ("major", "minor"):
-        getattr(axes.xaxis, f"set_{which}_formatter")(text)
 
 
 def draw_step(figure: FigureBase, document: Part) -> None:
