@@ -33,7 +33,7 @@ MACHINES = CASES | {
     "limit": Machine(reported_limit=160.0),
     "bend": Machine(speeds=(1.4, 2.2, 3.4, 5.5), stribeck=60.0, lines=(0.1, 0.3, 0.5), amplitudes=(0.4, 0.1, 0.06)),
     "warming": Machine(speeds=(4.0, 7.0, 4.1), warming=(40.0, 60.0)),
-    "loose": Machine(lost=(15.0, 110.0)),
+    "loose": Machine(lost=(4.0, 125.0)),
     "slower_filter": Machine(lags_s=(0.40, 0.25)),
     "heavier": Machine(motor=116.0),
 }
@@ -100,6 +100,43 @@ def _impedance(load_nm: float) -> Draw:
     return partial(draw_impedance, found=asdict(bench.found(bench.record(machine, counted=6))))
 
 
+PAGE = ROOT / "docs" / "reference" / "graphs.md"
+LIVE_S = (60.0, 80.0, 118.0, 138.0, 148.0)
+"""Times at which the run with a lost mass is analysed, s."""
+
+
+def _until(whole: Any, end_s: float) -> Any:
+    """Return the recording up to the last whole period before a time."""
+    kept = whole.time_s <= end_s
+    cut = {key: getattr(whole, key)[kept] for key in ("time_s", "speed_rad_s", "torque_nm", "fresh", "limited")}
+    parts = []
+    for one in whole.excitation.segments:
+        periods = int((min(end_s, one.end_s) - one.start_s) // one.period_s)
+        if periods > one.settle_periods + 1:
+            parts.append(replace(one, end_s=one.start_s + periods * one.period_s))
+    return replace(whole, excitation=replace(whole.excitation, segments=tuple(parts)), **cut)
+
+
+def live_text() -> str:
+    """Return J during a run in which a mass comes off the shaft, as a terminal of 80 columns shows it."""
+    from rich.console import Console, Group
+
+    from tdhil.estimation import identify
+    from tdhil.report.live import inertia_rows
+    from tdhil.runner.interim import live_inertia
+
+    parts = [_until(recording("loose"), end_s) for end_s in LIVE_S]
+    console = Console(file=io.StringIO(), width=80)
+    console.print(Group(*inertia_rows([live_inertia(identify(part), part, 0.95) for part in parts])))
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    return "\n".join(line.rstrip() for line in text.splitlines() if not line.startswith(("Good:", "Bad:")))
+
+
+def with_live(page: str, text: str) -> str:
+    """Return the page with the text in the block below its mark."""
+    return re.sub(r"(?<=<!-- live -->\n```text\n).*?(?=\n```\n)", lambda _: text, page, flags=re.DOTALL)
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Speed loop
 
@@ -157,7 +194,8 @@ def _verified(share: float) -> Mapping[str, Any]:
 def _verification(share: float) -> Draw:
     from tdhil.report.verification import draw_verification
 
-    return partial(draw_verification, document=_verified(share))
+    found = _verified(share)
+    return partial(draw_verification, document={**found, "response": _thinned(_thinned(found["response"]))})
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -397,8 +435,11 @@ def picture(name: str) -> str:
 
 
 def main(names: Sequence[str]) -> int:
-    """Draw the named pictures, or all."""
-    for name in names or PICTURES:
+    """Draw the named pictures, or all; ``live`` writes J during a run into the page."""
+    if not names or "live" in names:
+        PAGE.write_text(with_live(PAGE.read_text(encoding="utf-8"), live_text()), encoding="utf-8")
+        print("docs/reference/graphs.md: live", flush=True)
+    for name in [name for name in names if name != "live"] or ([] if names else PICTURES):
         path = IMAGES / f"graph_{name}.svg"
         path.write_text(picture(name), encoding="utf-8")
         print(f"docs/images/{path.name}: {path.stat().st_size} bytes", flush=True)
