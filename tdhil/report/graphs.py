@@ -27,7 +27,7 @@ GRAPHS = {
     "run": Graph(
         "Speed and torque",
         "all periods look alike, and the torque stays below its limit",
-        "the torque is cut off (lower --amplitude), the speed comes near zero (raise --offset), or the periods drift "
+        "the torque is cut off (lower the amplitude), the speed comes near zero (raise the offset), or the periods drift "
         "(warm up)"),
     "live": Graph(
         "J during the run",
@@ -54,15 +54,15 @@ GRAPHS = {
     "friction": Graph(
         "Friction over speed",
         "the points lie on a straight line",
-        "the points bend (stay above the bend, with a larger --offset), or two points at one speed differ (warm up)"),
+        "the points bend (stay above the bend, with a larger offset), or two points at one speed differ (warm up)"),
     "impedance": Graph(
         "The drive's own impedance",
         "the points lie on the curve, and the band of |r| is narrow",
-        "the points scatter about the curve, or the band is wide (disconnect string and brake, or add --periods)"),
+        "the points scatter about the curve, or the band is wide (disconnect string and brake, or measure more periods)"),
     "open_loop": Graph(
         "Speed loop: open loop and sensitivity",
         "|L| falls through 1 once, its phase stays above the dashed line there, and |S| stays below 2",
-        "|L| rises to 1 again (use the notch, or a lower --bandwidth), or measured points lie off the curve (check "
+        "|L| rises to 1 again (use the notch, or a lower bandwidth), or measured points lie off the curve (check "
         "the frequency response)"),
     "step": Graph(
         "Speed loop: step of the set speed",
