@@ -82,7 +82,7 @@
     const found = await call("GET", `/runs/${id}/pictures`);
     show(byId("pictures"), ...found.flatMap((one) => [
       el("h2", {}, word(one.heading)),
-      el("figure", {}, el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: one.caption, loading: "lazy" }), el("figcaption", {}, english(one.caption)))]));
+      el("figure", {}, region(tr("{title}, picture", { title: word(one.heading) }), el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: one.caption, loading: "lazy" })), el("figcaption", {}, english(one.caption)))]));
     const curve = (result && result.friction_curve) || [];
     if (curve.length) byId("pictures").append(numbers(tr("Friction over speed, in numbers"), [tr("speed"), tr("torque, N·m")],
       curve.map((one) => [ofSpeed(() => `${number(inSpeedUnit(one.speed_rad_s))} ${speedUnit()}`), of(one.torque_nm)])));
