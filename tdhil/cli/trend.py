@@ -214,7 +214,8 @@ def _write(
     said = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
     page = (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        f"<style>{STYLE}</style><h1>{html.escape(title)}</h1><ul>{said}</ul>{inline_svg(draw, size_in)}"
+        f"<style>{STYLE}</style><h1>{html.escape(title)}</h1><ul>{said}</ul><div class=\"wide\">"
+        f"{inline_svg(draw, size_in)}</div>"
         f"<p>{html.escape(GRAPHS[graph].reading)}</p>{table}</html>\n"
     )
     try:

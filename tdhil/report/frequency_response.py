@@ -131,6 +131,7 @@ def draw_responses(figure: FigureBase, parts: Sequence[tuple[str, Part]]) -> Non
                      ms=4)
     axes[3].axhline(1.0, color=DARK, lw=0.8, ls=":")
     axes[3].set_ylabel("residual,\nst. dev.")
+    axes[3].margins(y=0.25)             # whole markers in a low panel
     axes[3].set_ylim(bottom=0.0)
     _finish(axes)
     axes[0].legend(fontsize="small", loc="best", ncols=2)

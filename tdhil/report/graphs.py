@@ -27,8 +27,8 @@ GRAPHS = {
     "run": Graph(
         "Speed and torque",
         "all periods look alike, and the torque stays below its limit",
-        "the torque is cut off (lower the amplitude), the speed comes near zero (raise the offset), or the periods drift "
-        "(warm up)"),
+        "the torque is cut off (lower the amplitude), the speed comes near zero (raise the offset), or the periods "
+        "drift (warm up)"),
     "live": Graph(
         "J during the run",
         "the interval becomes narrower, and each one overlaps the earlier ones",
@@ -58,7 +58,8 @@ GRAPHS = {
     "impedance": Graph(
         "The drive's own impedance",
         "the points lie on the curve, and the band of |r| is narrow",
-        "the points scatter about the curve, or the band is wide (disconnect string and brake, or measure more periods)"),
+        "the points scatter about the curve, or the band is wide (disconnect string and brake, or measure more "
+        "periods)"),
     "open_loop": Graph(
         "Speed loop: open loop and sensitivity",
         "|L| falls through 1 once, its phase stays above the dashed line there, and |S| stays below 2",

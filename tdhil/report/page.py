@@ -28,6 +28,7 @@ nav a { margin-right: .8rem; white-space: nowrap }
 img, svg { max-width: 100%; height: auto }
 img { border: 1px solid #ddd }
 .wide { overflow-x: auto }
+@media (max-width: 40rem) { .wide svg { max-width: none } }
 table { border-collapse: collapse; margin: .6rem 0; font-size: 13px }
 caption { text-align: left; font-style: italic; padding-bottom: .2rem }
 th, td { border: 1px solid #ddd; padding: .2rem .5rem; text-align: right }

@@ -357,7 +357,7 @@ def save_loop_picture(document: Part, path: Path) -> None:
 
     with repeatable_figures(), rc_context({"font.size": 9.0}):
         figure = Figure(figsize=_SIZE_IN, layout="constrained")
-        grid = figure.add_gridspec(2, 1, height_ratios=(3, 1))
+        grid = figure.add_gridspec(2, 1, height_ratios=(5, 2))
         draw_loop(figure.add_subfigure(grid[0]), document)
         draw_step(figure.add_subfigure(grid[1]), document)
         figure.supxlabel(fill(GRAPHS["open_loop"].reading, _CAPTION_SIGNS), fontsize="small")
