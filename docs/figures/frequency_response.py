@@ -26,7 +26,6 @@ from tdhil.report import draw_faults, inline_svg, response_sentences, result_doc
 
 IMAGES = ROOT / "docs" / "images"
 STEP_S, SAMPLE_EVERY, PERIOD_S, PERIODS, SETTLE = 0.002, 5, 10.0, 8, 1
-LAGS_S = (0.40, 0.15)  # of the reported speed and torque
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,12 @@ class Machine:
     stribeck: float = 0.0
     stribeck_width: float = 2.5
     true_limit: float = math.inf  # torque that the motor has; the drive reports its demand
+    reported_limit: float = math.inf  # torque that the motor has; the drive reports it and its limit
+    warming: tuple[float, float] = (0.0, 30.0)  # N·m more friction at the start, and its time constant in s
+    lost: tuple[float, float] = (0.0, math.inf)  # kg·m² that come off the shaft, and when in s
+    speed_noise: float = 0.01
     speed_step: float = 0.01
+    lags_s: tuple[float, float] = (0.40, 0.15)  # of the reported speed and torque
     lag_prior: LagPrior = field(default_factory=LagPrior)
     settle: int = SETTLE
 
@@ -95,7 +99,7 @@ def simulated(machine: Machine, seed: int = 7) -> Recording:
         forward.append(feed + m.viscous * mean)
     wanted, torque_ff = np.concatenate(target), np.concatenate(forward) + m.coulomb + m.load_friction
     steps = len(wanted)
-    noise, sensed = 8.0 * rng.standard_normal(steps), 0.01 * rng.standard_normal(steps)
+    noise, sensed = 8.0 * rng.standard_normal(steps), m.speed_noise * rng.standard_normal(steps)
     speed_of_motor = speed_of_load = float(wanted[0])
     twist = (0.5 * m.gap + m.load_friction / m.spring) if m.load else 0.0
     integral = seen = seen_target = 0.0
@@ -106,10 +110,12 @@ def simulated(machine: Machine, seed: int = 7) -> Recording:
         error = seen_target - seen
         integral += 2.5 * STEP_S * error
         demand = torque_ff[n] + 25.0 * error + integral
+        demand = max(-m.reported_limit, min(m.reported_limit, demand))
         speeds[n], torques[n] = speed_of_motor + sensed[n], demand
         torque = max(-m.true_limit, min(m.true_limit, demand)) + noise[n]
         friction = m.viscous * speed_of_motor + math.copysign(
-            m.coulomb + m.stribeck * math.exp(-((speed_of_motor / m.stribeck_width) ** 2)), speed_of_motor
+            m.coulomb + m.warming[0] * math.exp(-n * STEP_S / m.warming[1])
+            + m.stribeck * math.exp(-((speed_of_motor / m.stribeck_width) ** 2)), speed_of_motor
         )
         through = 0.0
         if m.load:
@@ -117,15 +123,16 @@ def simulated(machine: Machine, seed: int = 7) -> Recording:
             through = m.spring * beyond + (m.damping * (speed_of_motor - speed_of_load) if beyond else 0.0)
             twist += STEP_S * (speed_of_motor - speed_of_load)
             speed_of_load += STEP_S / m.load * (through - math.copysign(m.load_friction, speed_of_load))
-        speed_of_motor += STEP_S / m.motor * (torque - friction - through)
-    reports = [_lagged(signal, lag)[::SAMPLE_EVERY] for signal, lag in zip((speeds, torques), LAGS_S, strict=True)]
+        motor = m.motor - (m.lost[0] if n * STEP_S > m.lost[1] else 0.0)
+        speed_of_motor += STEP_S / motor * (torque - friction - through)
+    reports = [_lagged(signal, lag)[::SAMPLE_EVERY] for signal, lag in zip((speeds, torques), m.lags_s, strict=True)]
     count = len(reports[0])
     return Recording(
         time_s=np.arange(count) * STEP_S * SAMPLE_EVERY,
         speed_rad_s=np.round(reports[0] / m.speed_step) * m.speed_step,
         torque_nm=np.round(reports[1] + 2.0 * rng.standard_normal(count)),
         fresh=np.ones(count, dtype=bool),
-        limited=np.zeros(count, dtype=bool),
+        limited=np.abs(torques[::SAMPLE_EVERY]) >= m.reported_limit,
         excitation=Excitation("multisine", "torque", tuple(
             Segment(start, start + length, PERIOD_S, m.settle, mean, m.lines, m.amplitudes, tuple(phases.tolist()))
             for start, mean in zip(starts, m.speeds, strict=True)
@@ -133,7 +140,7 @@ def simulated(machine: Machine, seed: int = 7) -> Recording:
         lag_prior=m.lag_prior,
         speed_resolution_rad_s=m.speed_step,
         torque_resolution_nm=1.0,
-        torque_limit_nm=2000.0,
+        torque_limit_nm=min(2000.0, m.reported_limit),
         simulated=True,
     )
 

@@ -68,7 +68,7 @@ def run(namespace: argparse.Namespace) -> int:
         lines = [_followed_text(one) for one in document["quantities"]] + list(document["notes"])
         if any(point["in_part"] is not None for one in document["quantities"] for point in one["points"]):
             lines.append("hollow: a result from a part of the run")
-        _write(namespace.report, title, lines, "", lambda figure: _draw_trend(figure, document), (7.2, 7.5))
+        _write(namespace.report, "trend", title, lines, "", lambda figure: _draw_trend(figure, document), (7.2, 7.5))
     return 0
 
 
@@ -96,7 +96,7 @@ def run_compare(namespace: argparse.Namespace) -> int:
         _print_compared(document)
     if namespace.report is not None:
         lines = [f"{one['to']}: {one['text']}" for one in document["differences"]]
-        _write(namespace.report, f"Runs compared{_simulated(document)}", lines, _settings_html(document),
+        _write(namespace.report, "compare", f"Runs compared{_simulated(document)}", lines, _settings_html(document),
                lambda figure: _draw_curves(figure, document), (7.2, 3.4))
     return 0
 
@@ -207,14 +207,16 @@ def _check_report(path: Path | None, inputs: Sequence[Path]) -> None:
 
 
 def _write(
-    path: Path, title: str, lines: Sequence[str], table: str, draw: Any, size_in: tuple[float, float]
+    path: Path, graph: str, title: str, lines: Sequence[str], table: str, draw: Any, size_in: tuple[float, float]
 ) -> None:
-    from tdhil.report import STYLE, inline_svg
+    from tdhil.report import GRAPHS, STYLE, inline_svg
 
     said = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
     page = (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        f"<style>{STYLE}</style><h1>{html.escape(title)}</h1><ul>{said}</ul>{inline_svg(draw, size_in)}{table}</html>\n"
+        f"<style>{STYLE}</style><h1>{html.escape(title)}</h1><ul>{said}</ul><div class=\"wide\">"
+        f"{inline_svg(draw, size_in)}</div>"
+        f"<p>{html.escape(GRAPHS[graph].reading)}</p>{table}</html>\n"
     )
     try:
         with path.open("x", encoding="utf-8") as file:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         draw_bode as draw_bode, draw_faults as draw_faults, draw_responses as draw_responses,
         print_responses as print_responses, response_sentences as response_sentences, save_responses as save_responses,
     )
+    from tdhil.report.graphs import GRAPHS as GRAPHS
     from tdhil.report.html import (
         ShownPicture as ShownPicture, check_report_path as check_report_path, pictures_in as pictures_in,
         write_report as write_report,
@@ -81,6 +82,7 @@ else:
         "verification": "print_verification verification_document verification_report write_verification_report",
         "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",
         "frequency_response": "draw_bode draw_faults draw_responses print_responses response_sentences save_responses",
+        "graphs": "GRAPHS",
         "html": "ShownPicture check_report_path pictures_in write_report",
         "letterhead": "LONGEST_LINE MOST_LINES NO_LETTERHEAD Letterhead clean_logo load_letterhead",
         "live": "LiveDisplay",

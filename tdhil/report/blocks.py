@@ -18,6 +18,7 @@ from tdhil.recording import Recording
 from tdhil.report.acceptance import acceptance_rows, signature_rows
 from tdhil.report.card import COMPLIANT, estimate_text, in_degrees, inertia_text, minutes, plus_minus, rounded, sentence
 from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows, uploaded_rows
+from tdhil.report.graphs import GRAPHS
 from tdhil.report.labels import (
     ACCELERATION_REGRESSION,
     ESTIMATES,
@@ -87,14 +88,20 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """Figure. ``draw`` fills a figure of 7 by ``height_in`` inches; ``names_left``: long words stand beside its
-    axis.
+    """Figure. ``graph`` is its row in `GRAPHS`; ``draw`` fills a figure of 7 by ``height_in`` inches; ``about``
+    states what it shows; ``names_left``: long words stand beside its axis.
     """
 
+    graph: str
     draw: Callable[[FigureBase], None]
     height_in: float
-    caption: str
+    about: str
     names_left: bool = False
+
+    @property
+    def caption(self) -> str:
+        """Text below the figure: what it shows, and how to read it."""
+        return f"{self.about} {GRAPHS[self.graph].reading}"
 
 
 Block = Text | Pairs | Table | Picture
@@ -206,7 +213,7 @@ def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Rep
         yield ReportSection("Acceptance", (Pairs((*accepted, *signature_rows(document["acceptance"]))),))
     yield ReportSection("The run", (Pairs(tuple(_run_rows(document, recording))),))
     if len(recording.time_s):
-        picture = Picture(partial(draw_run, recording=recording), 2.9, "Reported values, not smoothed. Green: "
+        picture = Picture("run", partial(draw_run, recording=recording), 2.9, "Reported values, not smoothed. Green: "
                           "operating points. Blue: excitation, its settling lighter.")
         yield ReportSection("Speed and torque", (picture,))
     if (impedance := document.get("impedance")) is not None:
@@ -214,7 +221,7 @@ def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Rep
     if document["inertia_kg_m2"] is not None or document["second_opinions"]:
         rows = len(document["second_opinions"]) + 4
         picture = Picture(
-            partial(draw_opinions, document=document), 0.55 + 0.2 * rows,
+            "estimates", partial(draw_opinions, document=document), 0.55 + 0.2 * rows,
             "The result beside other estimates from the same data. A momentum cross-check shares friction and torque "
             "scale with the result, and little else. If the two differ by more than their intervals, one of the "
             "assumptions is wrong.", names_left=True,
@@ -222,23 +229,23 @@ def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Rep
         yield ReportSection("Estimates of the inertia", (picture, *_opinions(document)))
     if document["lines"]:
         picture = Picture(
-            partial(draw_lines, document=document), 3.0,
+            "lines", partial(draw_lines, document=document), 3.0,
             "Ratio of torque to acceleration at each excited frequency. It changes with frequency, because the drive "
             "reports speed and torque late. The model explains all frequencies with one J (the band). Below: the "
-            "residuals of the model in standard deviations; values near 1 are noise.",
+            "residuals of the model in standard deviations.",
         )
         yield ReportSection("Torque over acceleration at each excited frequency", (picture,))
     if (response := document.get("frequency_response")) is not None:
         yield ReportSection("Frequency response", tuple(_response(response)))
     if document["budget"]:
         picture = Picture(
-            partial(draw_budget, document=document), 0.5 + 0.18 * len(document["budget"]),
+            "budget", partial(draw_budget, document=document), 0.5 + 0.18 * len(document["budget"]),
             "Half-width that each source alone contributes. The contributions add up approximately in squares. The "
             "95 % coverage interval includes the torque scale; the repeatability does not.", names_left=True,
         )
         yield ReportSection(UNCERTAINTY_BUDGET.capitalize(), (picture, _budget(document)))
     if document["friction_curve"]:
-        picture = Picture(partial(draw_friction, document=document), 1.8,
+        picture = Picture("friction", partial(draw_friction, document=document), 1.8,
                           "Torque at steady speed, load included. Lags do not affect it.")
         yield ReportSection("Friction over speed", (picture, _friction(document)))
     if harmonics := document.get("harmonics"):
@@ -345,7 +352,7 @@ def _response(found: Part) -> Iterator[Block]:
     from tdhil.report.frequency_response import draw_bode, response_sentences
 
     yield Picture(
-        partial(draw_bode, found=found), 3.4,
+        "response", partial(draw_bode, found=found), 3.4,
         "Speed over torque as the drive reports them, lags included, with intervals and the fitted model. Triangles: "
         "standard uncertainty by noise, and by nonlinear distortion. " + " ".join(response_sentences(found)))
 
@@ -361,7 +368,7 @@ def _impedance(found: Part) -> Iterator[Block]:
         if zeta:
             caption += (" Below: reflection |r| at a string of "
                         f"{zeta:.4g} N·m·s/rad (at the motor), with its interval. 1 reflects a wave completely.")
-        yield Picture(partial(draw_impedance, found=found), 3.4 if zeta else 2.2, caption)
+        yield Picture("impedance", partial(draw_impedance, found=found), 3.4 if zeta else 2.2, caption)
     rows = [
         (title, *rounded(part["value"], part["low"], part["high"]), unit)
         for title, key, unit in _LOOP if (part := found[key]) is not None

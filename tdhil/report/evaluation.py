@@ -158,12 +158,12 @@ def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Rep
     ))]
     if len(rows):
         shown = (
-            Picture(partial(draw_close, rows=rows, phase=Phase(phase), before_s=before_s), 1.9, caption)
+            Picture("string_close", partial(draw_close, rows=rows, phase=Phase(phase), before_s=before_s), 1.9, caption)
             for phase, before_s, caption in _CLOSE if np.any(rows[:, COLUMNS.index("phase")] == phase)
         )
         sections.append(ReportSection("Bit and top drive", (
             *shown,
-            Picture(partial(draw_course, rows=rows), 3.4,
+            Picture("string_course", partial(draw_course, rows=rows), 3.4,
                     "The whole course: the ramp of the set speed, and trials at steady set speeds, each from a bit "
                     "about to break away. Below: torque of drive and string at the main shaft."),
         )))

@@ -336,7 +336,7 @@ def _pairs_data(document: Part) -> Iterator[ReportSection]:
     columns = (Column("direction", 0.15), *(Column(name, 0.17, True) for name in (
         "R, N·m", "u(R), N·m", "T, N·m", "u(T), N·m", "residual, N·m")))
     facts = (("source", document["source"]), ("scatter", _scatter(document)), ("hysteresis", _hysteresis(document)))
-    picture = Picture(partial(draw_pairs, document=document), 4.2,
+    picture = Picture("pairs", partial(draw_pairs, document=document), 4.2,
                       "Reference torque over reported torque, with the line and its 95 % band; below, the residuals of"
                       " rising and falling torque.")
     yield ReportSection("Reference over reported torque", (picture, Pairs(facts), Table(columns, rows)))
@@ -348,10 +348,10 @@ def _reference_data(document: Part) -> Iterator[ReportSection]:
              ("standard uncertainty of its scale", f"{100.0 * reference['rel_sd']:.3g} %")]
     blocks: list[Block] = [Pairs((*facts, *_alignment(document)))]
     if document["series"] is not None:
-        blocks.append(Picture(partial(draw_reference, document=document), 4.2,
+        blocks.append(Picture("sensor", partial(draw_reference, document=document), 4.2,
                               "Both torques over the time of the log, after the same average, and the residuals."))
-        blocks.append(Picture(partial(draw_linearity, document=document), 1.8,
-                              "The residuals over torque. A curve would be an error of linearity."))
+        blocks.append(Picture("linearity", partial(draw_linearity, document=document), 1.8,
+                              "The residuals over torque."))
     yield ReportSection("Reference and reported torque", tuple(blocks))
 
 

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.text import Text as Words
 
 from tdhil.report.document import SIMULATED
+from tdhil.report.graphs import GRAPHS
 from tdhil.report.page import repeatable_figures
 from tdhil.report.plots import DARK, OURS, PAPER, QUIET
 
@@ -116,8 +117,8 @@ def draw_faults(figure: FigureBase, found: Part) -> None:
 
 
 def draw_responses(figure: FigureBase, parts: Sequence[tuple[str, Part]]) -> None:
-    """Draw |ω/T|, phase, apparent inertia and residuals of each named response; a single response also gets its
-    sentences.
+    """Draw |ω/T|, phase, apparent inertia and residuals of each named response, and a line on how to read them; a
+    single response also gets its sentences.
     """
     axes = figure.subplots(4, 1, sharex=True, height_ratios=(3, 2, 3, 1))
     for number, (name, found) in enumerate(parts):
@@ -130,11 +131,14 @@ def draw_responses(figure: FigureBase, parts: Sequence[tuple[str, Part]]) -> Non
                      ms=4)
     axes[3].axhline(1.0, color=DARK, lw=0.8, ls=":")
     axes[3].set_ylabel("residual,\nst. dev.")
+    axes[3].margins(y=0.25)             # whole markers in a low panel
     axes[3].set_ylim(bottom=0.0)
     _finish(axes)
     axes[0].legend(fontsize="small", loc="best", ncols=2)
-    if len(parts) == 1:
-        figure.supxlabel(fill(" ".join(response_sentences(parts[0][1])), _CAPTION_SIGNS), fontsize="small")
+    said = response_sentences(parts[0][1]) if len(parts) == 1 else ()
+    reading = GRAPHS["response" if len(parts) == 1 else "compare"].reading
+    figure.supxlabel("\n".join(fill(text, _CAPTION_SIGNS) for text in (" ".join(said), reading) if text),
+                     fontsize="small")
 
 
 def _finish(every: Sequence[Axes]) -> None:

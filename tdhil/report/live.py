@@ -24,6 +24,7 @@ from profiles import visible
 from tdhil.recording import LiveInertia, Stage
 from tdhil.report.card import minutes
 from tdhil.report.document import SIMULATED
+from tdhil.report.graphs import GRAPHS
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Output in its own thread, so that a blocked terminal (Ctrl-S, a pty without reader) blocks no other thread.
@@ -398,7 +399,8 @@ def inertia_rows(inertias: Sequence[LiveInertia]) -> list[RenderableType]:
             Text(minutes(one.time_s), "dim"), Text(_bar(one, low, high), style),
             Text(f"{one.inertia_kg_m2:.4g}", style), Text(f"±{100.0 * one.relative_half_width:.2g} %", style),
         )
-    return [title, grid, Text(_said(last), "dim", no_wrap=True, overflow="ellipsis")]
+    return [title, grid, Text(GRAPHS["live"].reading, "dim"),
+            Text(_said(last), "dim", no_wrap=True, overflow="ellipsis")]
 
 
 def _bar(one: LiveInertia, low: float, high: float) -> str:

@@ -43,7 +43,7 @@ def map_section(document: Part, bit: str) -> ReportSection:
                                       for kind in kinds))
         for k in range(len(said)))
     return ReportSection("The operator's map", (
-        Picture(partial(draw_map, document=document), 2.9, HOW_TO_READ),
+        Picture("map", partial(draw_map, document=document), 2.9, HOW_TO_READ),
         Table((Column(title, 0.2), *(Column(kind, width) for kind in kinds)), rows),
         Text(f"Simulated every {document['speeds_rpm'][1] - document['speeds_rpm'][0]:.0f} rpm under bit noise, string "
              f"and J as stated. The bit is that of string.yaml ({bit}), with its torque scaled. The bit torque is that "

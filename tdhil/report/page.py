@@ -28,6 +28,7 @@ nav a { margin-right: .8rem; white-space: nowrap }
 img, svg { max-width: 100%; height: auto }
 img { border: 1px solid #ddd }
 .wide { overflow-x: auto }
+@media (max-width: 40rem) { .wide svg { max-width: none } }
 table { border-collapse: collapse; margin: .6rem 0; font-size: 13px }
 caption { text-align: left; font-style: italic; padding-bottom: .2rem }
 th, td { border: 1px solid #ddd; padding: .2rem .5rem; text-align: right }
@@ -83,7 +84,7 @@ def repeatable_figures() -> Iterator[None]:
 
 def lay_out(figure: FigureBase, wide_in: float, high_in: float, *, names_left: bool = False) -> None:
     """Set margins in inches, equal for every figure of a page, so that their axes are aligned."""
-    left = 1.75 if names_left else 0.72
+    left = 1.75 if names_left else 0.86      # room for the label beside ticks such as 112.5 and −0.25
     every: Any = figure.axes
     above = not names_left and any(axes.texts for axes in every)
     top = 0.3 if above else 0.08

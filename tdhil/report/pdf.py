@@ -84,6 +84,8 @@ _PICTURE_SCALES = (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 1.05, 1.1, 1.15, 1.2)
 """Heights of the pictures that are tried, relative to their own. A flatter picture is hard to read."""
 _LEAST_FILLED = 0.25
 """Share of the last sheet that is filled at least, if any height of the pictures allows it."""
+_MOST_LEFT = 0.25
+"""Share of any other sheet that is left empty at most, if any height of the pictures allows it."""
 
 
 class _Sheets:
@@ -97,6 +99,7 @@ class _Sheets:
 
     def __init__(self, banner: str, scale: float, running_head: str) -> None:
         self._pieces: list[list[tuple[float, Draw]]] = []
+        self._left: list[float] = []        # points left empty on each sheet but the last
         self.at = BOTTOM
         self.scale = scale
         self._banner, self._running_head = banner, running_head
@@ -119,6 +122,8 @@ class _Sheets:
     def new(self) -> None:
         """Begin another sheet."""
         first = not self._pieces
+        if not first:
+            self._left.append(BOTTOM - self.at)
         self._pieces.append([])
         self._top = self.at = TOP + (6.0 if self._banner else 0.0) + (0.0 if first else 8.0)
 
@@ -128,10 +133,13 @@ class _Sheets:
         return bool(self._pieces) and self.at == self._top
 
     @property
-    def emptiness(self) -> tuple[int, bool, float]:
-        """Return a rank: number of sheets, whether the last one is mostly empty, and the change of the pictures."""
+    def emptiness(self) -> tuple[int, bool, bool, float]:
+        """Return a rank: number of sheets, whether the last one is mostly empty, whether another one has a large empty
+        part, and the change of the pictures.
+        """
         filled = (self.at - TOP) / (BOTTOM - TOP)
-        return len(self._pieces), len(self._pieces) > 1 and filled < _LEAST_FILLED, abs(self.scale - 1.0)
+        return (len(self._pieces), len(self._pieces) > 1 and filled < _LEAST_FILLED,
+                max(self._left, default=0.0) > _MOST_LEFT * (BOTTOM - TOP), abs(self.scale - 1.0))
 
     def drawn(self, footer: str) -> list[Figure]:
         """Draw all sheets, with a foot each."""

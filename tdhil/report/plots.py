@@ -12,6 +12,7 @@ from tdhil.recording import FloatArray, Recording
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import FigureBase
 
 
@@ -87,6 +88,15 @@ OURS, PAPER, DARK, QUIET = "#1f5fa8", "#c2410c", "0.15", "0.55"
 Part = Mapping[str, Any]
 
 
+def plain_ticks(axis: Axis) -> None:
+    """Label a logarithmic axis with 0.1, 0.2, 0.5 instead of powers of ten."""
+    def text(value: float, _: object = None) -> str:
+        return f"{value:g}" if f"{value:.0e}"[0] in "125" else ""
+
+    axis.set_major_formatter(text)
+    axis.set_minor_formatter(text)
+
+
 def draw_lines(figure: FigureBase, document: Part) -> None:
     """Draw, above, apparent inertia of every line, the model and J; below, the residuals."""
     points = document["lines"]
@@ -133,6 +143,7 @@ def draw_impedance(figure: FigureBase, found: Part) -> None:
     top.set_ylabel("|Z|, N·m·s/rad")
     top.legend(fontsize="small")
     axes[-1].set_xlabel("frequency, Hz")
+    plain_ticks(axes[-1].xaxis)
     for one in axes:
         one.grid(alpha=0.3, which="both")
 

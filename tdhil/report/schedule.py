@@ -14,6 +14,7 @@ from rich.text import Text as Words
 
 from tdhil.report.blocks import Column, Picture, ReportSection, Table, Text
 from tdhil.report.console import PlainConsole
+from tdhil.report.plots import plain_ticks
 from tdhil.soft_torque import (
     HIGHEST_NOISY_RPM,
     NOISY_RESOLUTION,
@@ -139,7 +140,7 @@ def schedule_section(document: Part) -> ReportSection:
     blocks: list[Table | Text | Picture] = [
         Table(tuple(Column(name, 1.0 / len(headings), number=True) for name in headings), rows),
         Text(document["sentence"]),
-        Picture(partial(draw_schedule, document=document), 3.6,
+        Picture("schedule", partial(draw_schedule, document=document), 3.6,
                 "Gains and critical speed over depth. Crosses: interpolated gains, checked halfway between two rows."),
     ]
     if parameters:
@@ -200,6 +201,7 @@ def draw_schedule(figure: FigureBase, document: Part) -> None:
         axes.plot(halfway, [one["at_motor"][key] for one in between], "x", ms=4, color=colour)
     axes.set_yscale("log")
     axes.set_ylabel("at the motor")
+    plain_ticks(axes.yaxis)
     if noisy:
         _draw_speeds(every[1], document)
     for one in every:

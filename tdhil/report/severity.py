@@ -206,10 +206,11 @@ def severity_report(document: Part, found: Sequence[Severity]) -> Report:
     for name, one in zip(names, found, strict=True):
         lead = f"{name}: " if len(records) > 1 else ""
         pictures += [
-            Picture(partial(draw_detail, one=one), 2.6, f"{lead}speed at the bit (estimated) and at the top, around "
-                    "the highest severity of the record."),
-            Picture(partial(draw_index, one=one), 2.0, f"{lead}severity index over the whole record. Above the red "
-                    "line the bit sticks and slips, above the yellow one it is at risk."),
+            Picture("bit_speed", partial(draw_detail, one=one), 2.6,
+                    f"{lead}speed at the bit (estimated) and at the top, around the highest severity of the record."),
+            Picture("severity", partial(draw_index, one=one), 2.0,
+                    f"{lead}severity index over the whole record. Above the upper line the bit sticks and slips, "
+                    "above the lower one it is at risk."),
         ]
     rows = tuple((name, *cells) for name, cells in _rows(records))
     check = last["reflection"]

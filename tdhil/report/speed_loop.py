@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,8 +21,10 @@ from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, Repor
 from tdhil.report.card import with_interval
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED, only_finite
+from tdhil.report.graphs import GRAPHS
 from tdhil.report.html import write_blocks
 from tdhil.report.page import repeatable_figures, require_extra
+from tdhil.report.plots import plain_ticks
 from tdhil.report.schedule import gain_words
 from tdhil.soft_torque import DriveSetting
 from tdhil.speed_loop import (
@@ -37,13 +40,13 @@ from tdhil.speed_loop import (
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
 Part = Mapping[str, Any]
 
 _COLOURS = {"present": "0.35", "tuned": "#1f5fa8"}
 _PNG_DPI = 150
+_CAPTION_SIGNS = 105        # characters in a line below the figure
 """Dots per inch of a PNG."""
 _SIZE_IN = (7.0, 8.4)
 """Size of a figure with all panels, inches."""
@@ -354,9 +357,10 @@ def save_loop_picture(document: Part, path: Path) -> None:
 
     with repeatable_figures(), rc_context({"font.size": 9.0}):
         figure = Figure(figsize=_SIZE_IN, layout="constrained")
-        grid = figure.add_gridspec(2, 1, height_ratios=(3, 1))
+        grid = figure.add_gridspec(2, 1, height_ratios=(5, 2))
         draw_loop(figure.add_subfigure(grid[0]), document)
         draw_step(figure.add_subfigure(grid[1]), document)
+        figure.supxlabel(fill(GRAPHS["open_loop"].reading, _CAPTION_SIGNS), fontsize="small")
         metadata = {"Date": None, "Creator": None} if path.suffix.lower() == ".svg" else None
         try:
             figure.savefig(path, dpi=_PNG_DPI, metadata=metadata)
@@ -395,18 +399,10 @@ def draw_loop(figure: FigureBase, document: Part) -> None:
     axes[2].set_xscale("log")
     for place in axes:
         place.grid(alpha=0.3, which="both")
-    _plain_ticks(axes[2])
+    plain_ticks(axes[2].xaxis)
     axes[0].legend(fontsize="small", loc="lower left")
     axes[1].legend(handles=[line for line in axes[1].lines if "margin" in str(line.get_label())], fontsize="small",
                    loc="lower left")
-
-
-def _plain_ticks(axes: Axes) -> None:
-    def text(value: float, _: object = None) -> str:
-        return f"{value:g}" if f"{value:.0e}"[0] in "125" else ""
-
-    for which in ("major", "minor"):
-        getattr(axes.xaxis, f"set_{which}_formatter")(text)
 
 
 def draw_step(figure: FigureBase, document: Part) -> None:
@@ -444,13 +440,12 @@ def loop_report(document: Part) -> Report:
     sections = [
         ReportSection("Gains and margins", (table, Pairs(tuple(_EXPLAINED.items())))),
         ReportSection("Open loop and sensitivity", (
-            Picture(partial(draw_loop, document=document), 5.2,
+            Picture("open_loop", partial(draw_loop, document=document), 5.2,
                     "Lines: as believed. Bands: all corners of the intervals. Points: the measured shaft without the "
-                    "lags of the reports. Good: |L| falls through 1 once, its phase stays above the dashed line there, "
-                    "and |S| stays below 2."),
+                    "lags of the reports."),
         )),
         ReportSection("Step of the set speed", (
-            Picture(partial(draw_step, document=document), 2.4,
+            Picture("step", partial(draw_step, document=document), 2.4,
                     "Speed of the motor after a small step, without torque limit, ramp or setpoint filter."),
         )),
     ]

@@ -496,18 +496,18 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
             *(Text(f"{one['kind']} refused: {one['refused']}") for one in document["controllers"] if one["refused"]),
         )),
         ReportSection("What the top drive sends back up the string", (
-            Picture(partial(draw_reflection, document=document), 2.6,
+            Picture("reflection", partial(draw_reflection, document=document), 2.6,
                     "|r(f)| at the top of the string: 1 is a wall, 0 swallows every wave. Dotted: the string's modes "
                     "with the top held."),
         )),
         ReportSection("Modes and their damping", (
-            Picture(partial(draw_modes, document=document), 2.3,
+            Picture("modes", partial(draw_modes, document=document), 2.3,
                     "Damping ratio of each mode of string and top drive together; the lowest pair decides."),
         )),
     ]
     if showcase is not None:
         sections.append(ReportSection("Stick-slip, with and without", (
-            Picture(partial(draw_showcase, showcase=showcase), 1.7 * len(showcase.kinds) + 0.5,
+            Picture("stick_slip", partial(draw_showcase, showcase=showcase), 1.7 * len(showcase.kinds) + 0.5,
                     f"Simulated: a stuck bit at a set speed of {showcase.set_rpm:.0f} rpm; the bit in colour, the top "
                     "drive in grey."),
         )))

@@ -151,9 +151,8 @@ def verification_report(document: Part, sha256: str = "") -> Report:
                    Column("predicted or typed", 0.28, number=True), Column("", 0.16)), tuple(_table(document))),)))
     sections += [
         ReportSection("Step of the set speed, as reported", (
-            Picture(partial(draw_verification, document=document), 2.8,
-                    "Mean of all steps. Good: the points lie on the dashed line. Bad: the points follow the solid line "
-                    "away from it (other gains), or neither line (a ramp, a filter or another resonance)."),)),
+            Picture("verified_step", partial(draw_verification, document=document), 2.8,
+                    "Mean of all steps."),)),
         ReportSection("Run", (Pairs((*_rows(document), ("stages", ", ".join(
             f"{one['name']} {one['outcome']} ({one['duration_s']:.0f} s)" for one in document["stages"])),
             *((("SHA-256", sha256),) if sha256 else ()))),)),

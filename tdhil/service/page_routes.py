@@ -15,6 +15,7 @@ from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from tdhil.config import OPTION, STATED, Option, form_options
+from tdhil.report import GRAPHS
 from tdhil.service.access import principal, require
 from tdhil.service.accounts import Role
 from tdhil.service.api_page import api_page
@@ -61,7 +62,7 @@ class Pages:
         found.globals.update(
             version=__version__, form_options=form_options, stated_options=[OPTION[name] for name in STATED],
             language=language, languages=self._languages.values(),
-            _=language.text, word=language.word, hint=lambda option: _hint(language, option),
+            graphs=GRAPHS, _=language.text, word=language.word, hint=lambda option: _hint(language, option),
             code=Markup("<code>{}</code>").format, strong=Markup("<strong>{}</strong>").format,
             speed_unit=Markup("<span data-speed-unit>rad/s</span>"))
         found.filters["number"] = language.number

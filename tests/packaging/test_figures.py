@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tdhil.report import GRAPHS
+
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "figures"
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
@@ -21,6 +23,19 @@ def figures():
     try:
         spec = importlib.util.spec_from_file_location("figures_of_the_pages", FOLDER / "draw.py")
         module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(FOLDER))
+    return module
+
+
+def script(name: str):
+    """The module of a script in docs/figures."""
+    sys.path.insert(0, str(FOLDER))
+    try:
+        spec = importlib.util.spec_from_file_location(f"{name}_of_the_pages", FOLDER / f"{name}.py")
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[spec.name] = module
         spec.loader.exec_module(module)
     finally:
         sys.path.remove(str(FOLDER))
@@ -76,16 +91,76 @@ def test_graphs_of_the_report_have_the_words_of_the_pictures(figures, whose):
 ])
 def test_pictures_of_the_frequency_response_have_the_words_of_the_pictures(name):
     pytest.importorskip("matplotlib", reason="matplotlib is not installed (pip install '.[report]')")
-    spec = importlib.util.spec_from_file_location("pictures_of_the_response", FOLDER / "frequency_response.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
+    module = script("frequency_response")
     document = module.document(name)
     assert document["frequency_response"]["distortion"]["detected"] is (name == "frf_stribeck")
     assert document["verdict"] == ("model_rejected" if name == "frf_lag" else "valid")
     words = re.compile(r"<text[^>]*>([^<]*)</text>")
     kept_picture = (module.IMAGES / f"{name}.svg").read_text(encoding="utf-8")
     assert words.findall(module.picture(document)) == words.findall(kept_picture), f"stale: draw {name}"
+
+
+@pytest.fixture(scope="module")
+def graphs():
+    """The script of the good and bad graphs."""
+    return script("graphs")
+
+
+CHEAP = {"pairs_bad", "trend_bad", "impedance_bad"}
+PICTURED = [
+    "run_good", "run_limit", "run_zero", "run_quantised", "run_warming", "estimates_bad", "lines_lag",
+    "budget_noise", "friction_bend", "friction_warming", "impedance_good", "impedance_bad", "open_loop_good",
+    "open_loop_bad", "step_good", "step_bad", "verified_step_good", "verified_step_bad", "reflection", "modes",
+    "stick_slip", "map", "schedule_good", "schedule_bad", "string_close_good", "string_close_bad", "bit_speed_good",
+    "bit_speed_bad", "severity_good", "severity_bad", "bodies_good", "bodies_bad", "pairs_good", "pairs_bad",
+    "sensor_good", "sensor_bad", "linearity_good", "linearity_bad", "trend_good", "trend_bad", "compare_good",
+    "compare_filter", "compare_inertia",
+]
+PAGE = ROOT / "docs" / "reference" / "graphs.md"
+MOST_BYTES = 90_000
+
+
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=pytest.mark.heavy if name in CHEAP else pytest.mark.long) for name in PICTURED])
+def test_a_good_or_bad_graph_has_the_words_of_its_picture(graphs, name):
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed (pip install '.[report]')")
+    words = re.compile(r"<text[^>]*>([^<]*)</text>")
+    drawn, shown = words.findall(graphs.picture(name)), words.findall(kept(graphs, f"graph_{name}"))
+    assert drawn == shown, f"stale: graphs.py {name}"
+
+
+@pytest.mark.long
+def test_j_of_a_run_that_loses_a_mass_is_that_of_the_page(graphs):
+    page = PAGE.read_text(encoding="utf-8")
+    drawn, shown = (NUMBER.sub("#", one) for one in (graphs.with_live(page, graphs.live_text()), page))
+    assert drawn == shown, "stale: graphs.py live"
+
+
+def test_each_good_and_bad_graph_is_small_and_on_the_page(graphs):
+    page = PAGE.read_text(encoding="utf-8")
+    assert list(graphs.PICTURES) == PICTURED
+    assert {one.graph for one in graphs.PICTURES.values()} <= set(GRAPHS)
+    for name in PICTURED:
+        assert f"](../images/graph_{name}.svg)" in page, name
+        assert (graphs.IMAGES / f"graph_{name}.svg").stat().st_size <= MOST_BYTES, name
+
+
+def test_each_graph_has_a_section_with_an_example_and_what_to_do():
+    sections = dict(part.split("\n", 1) for part in PAGE.read_text(encoding="utf-8").split("\n## ")[1:])
+    for name, graph in GRAPHS.items():
+        assert "](../images/" in sections[graph.section] or "```text" in sections[graph.section], name
+        assert ("| good | " in sections[graph.section] and "| bad" in sections[graph.section]) or name == "budget", name
+
+
+def test_each_row_of_the_table_of_graphs_is_shown_somewhere():
+    """`Picture` refuses an unknown name when its caption is read; a name that no code has would be a dead row."""
+    patterns = ("report/*.py", "cli/trend.py", "service/templates/*.html")
+    places = [path.read_text(encoding="utf-8") for pattern in patterns for path in (ROOT / "tdhil").glob(pattern)
+              if path.name != "graphs.py"]
+    for name in GRAPHS:
+        assert any(f'"{name}"' in text or f"graphs.{name}." in text for text in places), name
+    for text in places:
+        assert set(re.findall(r'\bPicture\(\s*"(\w+)"', text)) <= set(GRAPHS)
 
 
 @pytest.mark.heavy

@@ -248,7 +248,8 @@ def drawn(inertias):
 
 
 def test_the_intervals_of_j_are_drawn_to_one_scale_in_80_columns():
-    title, scale, *bars, said = drawn(answers())
+    title, scale, *bars, good, bad, said = drawn(answers())
+    assert good.startswith("Good: ") and bad.startswith("Bad: ")
     assert "95 % interval (repeatability)" in title
     assert scale.split() == ["100", "107"]
     assert len(bars) == 6                      # the first, and the latest five

@@ -104,6 +104,7 @@ def vocabulary() -> Iterator[Text]:
     from tdhil.config.acceptance import ACCEPTED_QUANTITIES
     from tdhil.estimation import Verdict
     from tdhil.fleet.trend import QUANTITIES
+    from tdhil.report import GRAPHS
     from tdhil.report.blocks import TORQUE_OVER_ANGLE, UNCERTAINTY_BUDGET
     from tdhil.runner import STAGES
     from tdhil.service.accounts import Role
@@ -160,6 +161,8 @@ def vocabulary() -> Iterator[Text]:
     for heading in (*re.findall(r'ReportSection\("([^"]+)"', blocks), UNCERTAINTY_BUDGET.capitalize(),
                     TORQUE_OVER_ANGLE.capitalize()):
         yield Text("tdhil/report/blocks.py", "", heading)
+    for name in sorted(set(re.findall(r"graphs\.(\w+)\.reading", "".join(map(Path.read_text, TEMPLATES))))):
+        yield Text("tdhil/report/graphs.py", "graph", GRAPHS[name].reading)
     for entry in MessageCode:
         yield Text("profiles/messages.py", entry.code, entry.title)
 

@@ -429,17 +429,26 @@
       const shade = colour("--c2"), edge = (width) => ({ stroke: shade, width, points: { show: false } });
       plot = new uPlot({
         width: where.clientWidth || 320, height: 190, legend: { show: false }, cursor: { show: false },
-        scales: { x: { time: false, range: (self, low, high) => (high > low ? [low, high] : [(low || 0) - 5, (low || 0) + 5]) } },
+        scales: { x: { time: false, range: () => {      // uPlot would begin at 0 for a single answer
+          const low = known[0]?.time_s ?? 0, high = known[known.length - 1]?.time_s ?? 0, pad = 0.04 * (high - low) || 5;
+          return [low - pad, high + pad];
+        } } },
         axes: [axis({ size: 34, values: (self, all) => all.map((one) => `${tick(one)} s`) }), axis({ size: 52 })],
         series: [{}, edge(0), edge(0), edge(1), edge(1), { stroke: shade, width: 2, points: { show: true, size: 7, fill: shade } }],
         bands: [{ series: [1, 2], fill: `${shade}22` }, { series: [3, 4], fill: `${shade}44` }],
         hooks: { draw: [(self) => {
           const last = known[known.length - 1];
-          if (!last || !last.tolerance) return;
+          if (!last) return;
           const c = self.ctx;
           c.save();
-          c.strokeStyle = colour("--limit");
+          c.strokeStyle = shade;
           c.lineWidth = 1.5 * devicePixelRatio;
+          for (const one of known.filter((each) => each.low_kg_m2 !== null && each.high_kg_m2 !== null)) {   // a band alone shows nothing of the first answer
+            const x = self.valToPos(one.time_s, "x", true);
+            c.beginPath(); c.moveTo(x, self.valToPos(one.low_kg_m2, "y", true)); c.lineTo(x, self.valToPos(one.high_kg_m2, "y", true)); c.stroke();
+          }
+          if (!last.tolerance) { c.restore(); return; }
+          c.strokeStyle = colour("--limit");
           c.setLineDash([6 * devicePixelRatio, 4 * devicePixelRatio]);
           for (const sign of [-1, 1]) {
             const y = self.valToPos(last.inertia_kg_m2 * (1 + sign * last.tolerance), "y", true);

@@ -82,7 +82,7 @@
     const found = await call("GET", `/runs/${id}/pictures`);
     show(byId("pictures"), ...found.flatMap((one) => [
       el("h2", {}, word(one.heading)),
-      el("figure", {}, el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: one.caption, loading: "lazy" }), el("figcaption", {}, english(one.caption)))]));
+      el("figure", {}, region(tr("{title}, picture", { title: word(one.heading) }), el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: one.caption, loading: "lazy" })), el("figcaption", {}, english(one.caption)))]));
     const curve = (result && result.friction_curve) || [];
     if (curve.length) byId("pictures").append(numbers(tr("Friction over speed, in numbers"), [tr("speed"), tr("torque, N·m")],
       curve.map((one) => [ofSpeed(() => `${number(inSpeedUnit(one.speed_rad_s))} ${speedUnit()}`), of(one.torque_nm)])));
@@ -403,7 +403,7 @@
         where.append(el("section", {}, el("h2", {}, `${word(quantity.name)}, ${quantity.unit}`),
           el("p", { class: quantity.changes.length || quantity.drift ? "alarm" : "" }, english(quantity.text)),
           ...quantity.changes.map((one) => el("p", {}, el("a", { href: `/compare?runs=${encodeURIComponent(one.before)},${encodeURIComponent(one.after)}${archivedToo("&")}` }, tr("Compare the runs before and after, {first} and {second}", { first: when(one.before_date), second: when(one.after_date) })))),
-          el("figure", {}, el("figcaption", {}, tr("each point with its repeatability on this drive; dashed: a change")), plot),
+          el("figure", {}, el("figcaption", {}, tr("each point with its repeatability on this drive; dashed: a change")), plot, el("p", { class: "dim said" }, where.dataset.said)),
           numbers(tr("{quantity} in numbers", { quantity: word(quantity.name) }), [tr("run"), tr("{unit}, interval", { unit: quantity.unit })], quantity.points.map((one) => [el("a", { href: `/runs/${encodeURIComponent(one.log)}` }, when(one.date)), of(one)]))));
         points(plot, [{ colour: "--c0", points: quantity.points.map((one) => ({ ...one, x: at(one.date) })) }],
           { time: true, marks: quantity.changes.map((one) => (at(one.before_date) + at(one.after_date)) / 2) });
@@ -427,12 +427,12 @@
       const others = comparison.differences.flatMap((one, k) => one.quantities.filter((other) => other.column !== "inertia_kg_m2").map((other) => [
         tr("{quantity}, {run} against 1", { quantity: word(other.name), run: k + 2 }), other.differs ? tr("differs") : tr("no significant difference"),
         other.relative ? tr("{value} ({low} to {high})", { value: percentOf(other.change), low: percentOf(other.low), high: percentOf(other.high) }) : `${tr("{value} ({low} to {high})", { value: number(other.change, 3), low: number(other.low, 3), high: number(other.high, 3) })} ${other.unit}`]));
-      const curve = (title, label, key, x) => {
+      const curve = (title, label, key, x, said) => {
         const series = comparison[key].map((found, k) => ({ colour: `--c${k}`, points: found.filter((one) => one.value !== null).map((one) => ({ ...one, x: one[x] })) }));
         if (!series.some((one) => one.points.length)) return [];
         const plot = el("div", { class: "plot", role: "img", "aria-label": title });
         setTimeout(() => points(plot, series, { label }), 0);             // after it has a width
-        return [el("h2", {}, title), el("p", { class: "row legend" }, ...names.map((name, k) => el("span", {}, dot(k), ` ${k + 1}: ${name}`))), el("figure", {}, plot),
+        return [el("h2", {}, title), el("p", { class: "row legend" }, ...names.map((name, k) => el("span", {}, dot(k), ` ${k + 1}: ${name}`))), el("figure", {}, plot, el("p", { class: "dim said" }, said)),
           numbers(tr("{title}, in numbers", { title }), [label, ...names], tabled(series))];
       };
       show(where, ...said,
@@ -441,8 +441,8 @@
           line(tr("J, repeatability, kg·m²"), comparison.results.map((one) => interval(one.inertia_kg_m2, one.inertia_low_kg_m2, one.inertia_high_kg_m2) ?? "–")),
           line(tr("verdict"), comparison.results.map((one) => word(one.verdict, "verdict")))))),
         others.length ? numbers(tr("Friction and lags"), [tr("quantity"), "", tr("difference")], others) : null,
-        ...curve(tr("Apparent inertia by frequency, kg·m²"), tr("frequency, Hz"), "apparent_inertia", "hertz"),
-        ...curve(tr("Friction, N·m"), tr("speed, rad/s"), "friction", "speed_rad_s"),
+        ...curve(tr("Apparent inertia by frequency, kg·m²"), tr("frequency, Hz"), "apparent_inertia", "hertz", where.dataset.said),
+        ...curve(tr("Friction, N·m"), tr("speed, rad/s"), "friction", "speed_rad_s", where.dataset.frictionSaid),
         el("h2", {}, tr("Settings")), el("p", { class: "dim" }, tr("≠ marks different settings.")),
         region(tr("Settings"), el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...ids.map((id, k) => el("th", { scope: "col" }, dot(k), ` ${k + 1}`)))),
           el("tbody", {}, ...comparison.settings.map((one) => line(el("span", {}, one.differs ? "≠ " : "", english(one.name)), one.name === "date" ? one.values.map(when) : one.values.map((value) => ({ True: tr("yes"), False: tr("no") }[value] ?? english(value))), one.differs))))));
