@@ -660,7 +660,7 @@ class EvidenceOptions(_Said):
     firmware: str | None = option(
         "--firmware", group=Topic.EVIDENCE, metavar="TEXT", api=True, longest=100,
         form=Form("Firmware version, as the drive's panel shows it", ("evidence",)),
-        help="firmware version of the drive, as its panel or tool shows it",
+        help="firmware version of the drive, as its panel or tool shows it (default: as the drive reports it)",
     )
     remove: tuple[str, ...] = option(
         "--remove", group=Topic.EVIDENCE, default=(), metavar="WORD", api=True, longest=200,

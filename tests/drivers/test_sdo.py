@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from drivers.canopen.bus import CanLink
 from drivers.canopen.sdo import SdoObjects
 from drivers.cia402.objects import name
+from drivers.cia402.preflight import read_identity
 from drivers.cia402.sdo_client import LONGEST_UPLOAD_S
 from drivers.cia402.sdo_message import abort_text, is_answer
 from drivers.clock import SteppedClock
@@ -214,3 +215,11 @@ def test_restore_to_a_silent_drive_ends(objects, peer, fake_time):
 
 def test_names():
     assert (name(0x6040), name(0x1016, 1), name(0x1A00, 0)) == ("6040h", "1016h:1", "1A00h")
+
+
+def test_the_software_version_is_read_where_the_drive_has_it(objects, peer):
+    assert read_identity(objects).firmware == ""
+    peer.objects[0x100A, 0] = b"V2.1 build 7 \0"
+    assert read_identity(objects).firmware == "V2.1 build 7"
+    peer.objects.pop((0x1008, 0))
+    assert read_identity(objects).name == "CiA 402 drive"
