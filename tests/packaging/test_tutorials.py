@@ -80,7 +80,7 @@ def beside(step: Step, folder: Path, environment: dict[str, str], enter: tuple[s
         yield
     finally:
         child.terminate()
-        child.wait(60.0)
+        child.wait(PATIENCE_S)
 
 
 def taken_ports(page: str) -> list[int]:
