@@ -103,7 +103,10 @@ FrameTap = Callable[[RawFrame], None]
 
 @dataclass(frozen=True)
 class Identity:
-    """Identity of the peer. Only the simulator's marker decides ``simulated``."""
+    """Identity of the peer. Only the simulator's marker decides ``simulated``.
+
+    ``firmware``: software version that the drive reports; '' if it reports none.
+    """
 
     vendor: int
     product: int
@@ -111,6 +114,7 @@ class Identity:
     serial: int
     name: str
     simulated: bool
+    firmware: str = ""
 
 
 @dataclass(frozen=True)

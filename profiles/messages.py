@@ -623,6 +623,10 @@ class MessageCode(Enum):
         512, "The run's process does not react",
         "The process was suspended, and does not read requests.",
         "Use the hard-wired stop. The drive's watchdog stops the shaft.")
+    UPLOAD_WITHOUT_END = (
+        513, "The drive sends an object without an end",
+        "A reply to an SDO request is longer than any object that tdhil reads, or its segments do not end in time.",
+        "Compare the object with the drive's manual. Update the firmware of the drive or of the gateway.")
 
     # --- 6xx: drive --------------------------------------------------------------------------------------------------
     DRIVE_FAULT = (

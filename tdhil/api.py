@@ -157,7 +157,7 @@ class Result:
         """
         from tdhil.report import check_report_path, load_letterhead, write_report
 
-        check_report_path(Path(path), Path(self.record.log), "save_report")
+        check_report_path(Path(path), Path(self.record.log), where="save_report")
         return write_report(self.document, self.record.recording, Path(path),
                             load_letterhead(None if letterhead is None else Path(letterhead)))
 

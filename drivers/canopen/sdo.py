@@ -22,7 +22,7 @@ class SdoObjects(SdoClient):
     """
 
     def __init__(self, link: CanLink, node: int) -> None:
-        super().__init__(ANSWER_S, (TRIES, TRIES), normal=False)
+        super().__init__(ANSWER_S, (TRIES, TRIES), normal=False, drive=f"node {node}")
         self._link = link
         self._node = node
         self._asked = bytes(8)
@@ -49,6 +49,10 @@ class SdoObjects(SdoClient):
             next_step="Check that the drive is powered, its node-ID and bit rate, the cable and its termination",
             entry=MessageCode.NODE_SILENT,
         )
+
+    def tell(self, message: bytes) -> None:
+        """Send a message that has no answer."""
+        self._send(message)
 
     def _send(self, request: bytes) -> None:
         self._link.drain()  # frames in the buffer answer an older request

@@ -25,13 +25,14 @@ def describe(objects: Objects) -> Description:
     title, simulated = "", False
     with suppress(CommunicationLost):
         identity += [objects.read_if_there(0x1018, sub) for sub in (1, 2, 3, 4)]
-        title = _text(objects, 0x1008)
-        simulated = _text(objects, MARKER_INDEX, 1) == MARKER_TEXT
+        title = text_if_there(objects, 0x1008) or ""
+        simulated = text_if_there(objects, MARKER_INDEX, 1) == MARKER_TEXT
     return Description(identity=tuple(identity) or (None,) * 4, title=title, simulated=simulated)
 
 
-def _text(objects: Objects, index: int, sub: int = 0) -> str:
+def text_if_there(objects: Objects, index: int, sub: int = 0) -> str | None:
+    """Return a text (VISIBLE_STRING) as one line for display, or None if the drive does not have the object."""
     try:
         return visible(objects.read_bytes(index, sub).decode("ascii", "replace").rstrip("\0 "))
     except ObjectRefused:
-        return ""
+        return None

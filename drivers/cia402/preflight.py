@@ -10,6 +10,7 @@ import struct
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+from drivers.cia402.description import text_if_there
 from drivers.cia402.limits import DriveSettings
 from drivers.cia402.objects import Objects, name, place
 from drivers.cia402.polling import reported_torque
@@ -29,7 +30,7 @@ from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.own_limits import SPEED, TORQUE
 from drivers.preflight import PreflightTable, agreed_rated_torque, check_nothing_held
 from drivers.undo_journal import UndoJournal
-from profiles import MARKER_INDEX, MARKER_TEXT, MessageCode, visible
+from profiles import MARKER_INDEX, MARKER_TEXT, MessageCode
 from profiles.cia402 import Cia402Profile, ReportingFilter
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -386,7 +387,7 @@ def report(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Identity of the drive (CiA 301: 1000h, 1018h, 1008h).
+# Identity of the drive (CiA 301: 1000h, 1018h, 1008h, 100Ah).
 
 
 def find_free_node(objects: Objects) -> None:
@@ -400,13 +401,14 @@ def find_free_node(objects: Objects) -> None:
 
 
 def read_identity(objects: Objects) -> Identity:
-    """Return vendor, product, revision and serial number (0 if absent), name, and whether it is simulated."""
+    """Return vendor, product, revision and serial number (0 if absent), name, firmware, and whether it is simulated.
+
+    The name and the manufacturer's software version (100Ah) are optional texts of CiA 301.
+    """
     vendor, product, revision, serial = (objects.read_if_there(0x1018, sub) or 0 for sub in (1, 2, 3, 4))
-    try:
-        title = visible(objects.read_bytes(0x1008).decode("ascii", "replace").rstrip("\0 "))
-    except ObjectRefused:
-        title = "CiA 402 drive"
-    return Identity(vendor, product, revision, serial, title, _is_simulated(objects))
+    title = text_if_there(objects, 0x1008)
+    return Identity(vendor, product, revision, serial, "CiA 402 drive" if title is None else title,
+                    _is_simulated(objects), text_if_there(objects, 0x100A) or "")
 
 
 def refuse_stepped(identity: Identity) -> None:
@@ -421,7 +423,4 @@ def refuse_stepped(identity: Identity) -> None:
 
 
 def _is_simulated(objects: Objects) -> bool:
-    try:
-        return objects.read_bytes(MARKER_INDEX, 1).decode("ascii", "replace").rstrip("\0") == MARKER_TEXT
-    except ObjectRefused:
-        return False
+    return text_if_there(objects, MARKER_INDEX, 1) == MARKER_TEXT

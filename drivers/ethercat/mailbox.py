@@ -45,6 +45,11 @@ class Mailbox:
         self.on_message: Callable[[bool, int, bytes], None] = lambda outgoing, manager, message: None
         """Called with each message and the number of its sync manager."""
 
+    @property
+    def place(self) -> str:
+        """Name of the slave in messages."""
+        return self._station.place
+
     def find(self) -> None:
         """Read addresses and lengths of the two mailboxes. Raises CommunicationLost if the slave has none."""
         (self._out, self._out_size, _), (self._in, self._in_size, _) = map(self._station.sync_manager, (0, 1))
@@ -104,9 +109,13 @@ class CoeObjects(SdoClient):
     """The object dictionary of one slave, by CoE."""
 
     def __init__(self, mailbox: Mailbox) -> None:
-        super().__init__(ANSWER_S, (TRIES, 1), normal=True)
+        super().__init__(ANSWER_S, (TRIES, 1), normal=True, drive=mailbox.place)
         self._mailbox = mailbox
 
     def call(self, request: bytes, where: str, answer_s: float, tries: int) -> bytes:
         """Send a request and wait for its answer. Raises CommunicationLost without one."""
         return self._mailbox.call(request, answer_s, tries, where)
+
+    def tell(self, message: bytes) -> None:
+        """Send a message that has no answer."""
+        self._mailbox.post(message)

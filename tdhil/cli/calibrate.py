@@ -12,6 +12,7 @@ from tdhil.cli.arguments import add_option, amount, share
 from tdhil.cli.calibrate_reference import WITHOUT_BODY, require_new, run_without_body
 from tdhil.cli.calibrate_speed import add_speed_arguments
 from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
+from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.errors import ExitCode, UsageError
@@ -72,7 +73,8 @@ def _add_torque(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--save", type=Path, metavar="calibration.json",
                         help="where the calibration goes, for torque_calibration in rig.yaml; never over a file")
     add_option(parser, OPTION["json"])
-    parser.add_argument("--report", type=Path, metavar="FILE", help="with pictures: report.html, or report.pdf on A4")
+    add_report_option(parser, "report")
+    add_head_options(parser)
     add_trace_arguments(parser)
     parser.set_defaults(run=run_torque)
 
@@ -96,13 +98,9 @@ def run_torque(namespace: argparse.Namespace) -> int:
             raise UsageError("needs --reference, the record of a sensor", where=f"--{name.replace('_', '-')}")
     wanted = _wanted(namespace)
     require_new(namespace.save)
-    if namespace.report is not None:
-        from tdhil.report import check_report_path
-
-        for path, _, _ in wanted:
-            check_report_path(namespace.report, path)
+    report = ReportFile.of_files(namespace, *(path for path, _, _ in wanted))
     runs = _read(namespace, wanted)
-    from tdhil.report import PlainConsole, print_calibration, stderr_console, write_calibration_report
+    from tdhil.report import PlainConsole, calibration_report, print_calibration, stderr_console
     from tdhil.session import document_of_calibration, find_calibration, save_calibration
 
     found = find_calibration(runs, namespace.at, confidence)
@@ -118,9 +116,8 @@ def run_torque(namespace: argparse.Namespace) -> int:
         else:
             save_calibration(document, namespace.save)
             stderr_console().print(f"calibration: {namespace.save}", markup=False, soft_wrap=True)
-    if namespace.report is not None:
-        written = write_calibration_report(document, namespace.report)
-        stderr_console().print(f"report: {written}", markup=False, soft_wrap=True)
+    if report is not None:
+        report.write(calibration_report(document), [run.record.configuration for run in runs])
     return int(ExitCode.OK if found.calibration.factor is not None else ExitCode.NOT_IDENTIFIABLE)
 
 

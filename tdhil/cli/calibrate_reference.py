@@ -11,11 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from tdhil.cli.replay import read_recorded
+from tdhil.cli.report_file import ReportFile
 from tdhil.cli.results import print_json
 from tdhil.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from tdhil.session import RunRecord
+
+    _Found = tuple[dict[str, Any], RunRecord | None]
+    """Document of the calibration, and the record that names the drive."""
 
 WITHOUT_BODY: Final = ("pairs", "reference", "known_pipe")
 """Options that replace the bodies; one at a time."""
@@ -37,15 +41,14 @@ def run_without_body(namespace: argparse.Namespace, confidence: float) -> int:
         raise UsageError(f"does not go with --{kind.replace('_', '-')}", where=f"--{name.replace('_', '-')}",
                          next_step=f"Such as: {_EXAMPLES[kind]}")
     require_new(namespace.save)
-    source = getattr(namespace, kind)
-    if namespace.report is not None:
-        from tdhil.report import check_report_path
+    report = ReportFile.of_files(namespace, getattr(namespace, kind), *namespace.logs)
+    document, record = _KINDS[kind](namespace, confidence)
+    code = _print_result(namespace, document)
+    if report is not None:
+        from tdhil.report import factor_report
 
-        check_report_path(namespace.report, source)
-        for log in namespace.logs:
-            check_report_path(namespace.report, log)
-    document = _KINDS[kind](namespace, confidence)
-    return _print_result(namespace, document)
+        report.write(factor_report(document), () if record is None else (record.configuration,))
+    return code
 
 
 def require_new(path: Path | None) -> None:
@@ -56,7 +59,7 @@ def require_new(path: Path | None) -> None:
 
 
 def _print_result(namespace: argparse.Namespace, document: Mapping[str, Any]) -> int:
-    from tdhil.report import PlainConsole, print_factor, stderr_console, write_factor_report
+    from tdhil.report import PlainConsole, print_factor, stderr_console
     from tdhil.session import save_calibration
 
     console = stderr_console()
@@ -71,9 +74,6 @@ def _print_result(namespace: argparse.Namespace, document: Mapping[str, Any]) ->
     elif namespace.save is not None:
         console.print(f"tdhil: nothing was written to {namespace.save}: there is no calibration factor",
                       style="yellow", markup=False, soft_wrap=True)
-    if namespace.report is not None:
-        written = write_factor_report(document, namespace.report)
-        console.print(f"report: {written}", markup=False, soft_wrap=True)
     return int(ExitCode.OK if found else ExitCode.NOT_IDENTIFIABLE)
 
 
@@ -87,7 +87,7 @@ def _one_log(namespace: argparse.Namespace, kind: str) -> RunRecord:
     return read_recorded(namespace, namespace.logs[0])
 
 
-def _pairs(namespace: argparse.Namespace, confidence: float) -> dict[str, Any]:
+def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
     from tdhil.calibration import calibrate_pairs
     from tdhil.report import pairs_document
     from tdhil.session import drive_identity, drive_settings, log_of_calibration, read_pairs
@@ -103,14 +103,15 @@ def _pairs(namespace: argparse.Namespace, confidence: float) -> dict[str, Any]:
         raise UsageError(str(error), where=str(namespace.pairs)) from None
     drive = {} if record is None else drive_identity(record.configuration)
     settings = {} if record is None else drive_settings(record.configuration, record.recording)
-    return pairs_document(
+    document = pairs_document(
         found, pairs, str(namespace.pairs), drive, settings, confidence=confidence,
         date=datetime.now().astimezone().isoformat(timespec="seconds"),
         simulated=record is not None and record.recording.simulated,
         runs=() if record is None else (log_of_calibration(record),))
+    return document, record
 
 
-def _reference(namespace: argparse.Namespace, confidence: float) -> dict[str, Any]:
+def _reference(namespace: argparse.Namespace, confidence: float) -> _Found:
     from tdhil.session import find_by_reference, require_file
 
     if namespace.reference_sd is not None and not 0.0 <= namespace.reference_sd < 1.0:
@@ -118,15 +119,15 @@ def _reference(namespace: argparse.Namespace, confidence: float) -> dict[str, An
     record = _one_log(namespace, "reference")
     require_file(namespace.reference)
     return find_by_reference(record, namespace.reference, namespace.column, namespace.at, namespace.reference_sd,
-                             confidence)
+                             confidence), record
 
 
-def _known_pipe(namespace: argparse.Namespace, confidence: float) -> dict[str, Any]:
+def _known_pipe(namespace: argparse.Namespace, confidence: float) -> _Found:
     from tdhil.session import find_by_known_pipe, require_file
 
     record = _one_log(namespace, "known_pipe")
     require_file(namespace.known_pipe)
-    return find_by_known_pipe(record, namespace.known_pipe, confidence)
+    return find_by_known_pipe(record, namespace.known_pipe, confidence), record
 
 
 _KINDS = {"pairs": _pairs, "reference": _reference, "known_pipe": _known_pipe}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from profiles.quantities import SPEED, TIME
 from tdhil.cli.arguments import add_option, amount, share
 from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
+from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.errors import ExitCode, UsageError
@@ -50,13 +51,15 @@ def add_speed_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--save", type=Path, metavar="calibration.json",
                         help="where the result goes: a new file, or one that holds a torque calibration of this drive")
     add_option(parser, OPTION["json"])
+    add_report_option(parser, "report")
+    add_head_options(parser)
     add_trace_arguments(parser)
     parser.set_defaults(run=run_speed)
 
 
 def run_speed(namespace: argparse.Namespace) -> int:
     """Read, compute, print, and save the result."""
-    from tdhil.report import PlainConsole, print_speed_calibration, speed_document, stderr_console
+    from tdhil.report import PlainConsole, print_speed_calibration, speed_document, speed_report, stderr_console
     from tdhil.session import (
         add_speed_calibration,
         check_speed_place,
@@ -68,6 +71,7 @@ def run_speed(namespace: argparse.Namespace) -> int:
     _check(namespace)
     if namespace.save is not None:
         check_speed_place(namespace.save)
+    report = ReportFile.of_files(namespace, *(() if namespace.log is None else (namespace.log,)))
     record = None
     if namespace.log is not None:
         require_file(namespace.log)
@@ -94,6 +98,8 @@ def run_speed(namespace: argparse.Namespace) -> int:
                 console.print("tdhil: no log names the drive: whether both calibrations are of the same drive was not"
                               " checked", style="yellow", markup=False, soft_wrap=True)
             console.print(f"calibration: {namespace.save}", markup=False, soft_wrap=True)
+    if report is not None:
+        report.write(speed_report(document), () if record is None else (record.configuration,))
     return int(ExitCode.OK if found.factor is not None else ExitCode.NOT_IDENTIFIABLE)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from tdhil.cli.report_file import add_report_option
+
 CONTROLLERS = ("soft", "stiff", "compensated", "broadband")
 
 
@@ -26,8 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                       help="result of tdhil identify on the present rig, if it is not the machine that was tuned for")
     what.add_argument("--dry-run", action="store_true",
                       help="plan the speed program within the rig's limits, or report what prevents it; nothing moves")
-    what.add_argument("--report", type=Path, metavar="FILE",
-                      help="the result with pictures in one file: evaluation.html, or evaluation.pdf on A4")
+    add_report_option(what, "evaluation")
     add_peer_arguments(parser)
     parser.set_defaults(run=run)
 

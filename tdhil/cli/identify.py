@@ -15,13 +15,13 @@ from profiles import with_code
 from tdhil.buses import PeerPlan, all_buses
 from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, add_options
 from tdhil.cli.calibrate_run import add_calibrate_arguments, check_calibrate, run_calibration
+from tdhil.cli.report_file import ReportFile, add_report_option
 from tdhil.config import OPTION, Overrides, RunDetails, Topic, load_rig, resolve
 from tdhil.errors import ExitCode, LogError, TdhilError, code_of, error_document, exit_code
 
 if TYPE_CHECKING:
     from tdhil.buses import Connection
     from tdhil.config import Rig, RunOptions
-    from tdhil.report import Letterhead
     from tdhil.runner import RunOutcome
     from tdhil.session import Ending, Rehearsal, RunRequest, RunSession
     from tdhil.soft_torque import EvaluationCase
@@ -65,8 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     sections = add_options(parser, Topic.MOTION, Topic.RESULT)
     sections[Topic.MOTION].add_argument("--dry-run", action="store_true",
                                         help="show the plan and the expected result; nothing moves")
-    sections[Topic.RESULT].add_argument("--report", type=Path, metavar="FILE", help="the result with pictures in one "
-                                        "file: report.html, or report.pdf on A4")
+    add_report_option(sections[Topic.RESULT], "report")
     add_calibrate_arguments(sections[Topic.RESULT])
     add_peer_arguments(parser)
     parser.set_defaults(run=run)
@@ -109,12 +108,7 @@ def run_with(
     options, connection = connection_of(vars(namespace), rig, options)
     check_unverified(connection.profile, options)
     console = stderr_console()
-    letterhead = None
-    if namespace.report is not None:
-        from tdhil.report import check_report_path, load_letterhead
-
-        check_report_path(namespace.report, Path(options.log))
-        letterhead = load_letterhead(None if options.letterhead is None else Path(options.letterhead))
+    report = ReportFile.requested(namespace, Path(options.log), letterhead=options.letterhead)
     _check_files(namespace, options)
     simulated = options.simulate or not connection.configured
     if namespace.dry_run:
@@ -134,7 +128,7 @@ def run_with(
             said = say_before(options, rig, connection.profile, simulated)
         if said is not None:
             console.print(said, style="yellow", markup=False)
-    return _run(request, console, namespace.report, logs, letterhead)
+    return _run(request, console, report, logs)
 
 
 def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
@@ -149,10 +143,7 @@ def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
         check_trace_path(Path(options.trace), options.source("trace"))
 
 
-def _run(
-    request: RunRequest, console: Console, report: Path | None, logs: list[Path] | None,
-    letterhead: Letterhead | None,
-) -> int:
+def _run(request: RunRequest, console: Console, report: ReportFile | None, logs: list[Path] | None) -> int:
     import tdhil.cli.main as entry
     from tdhil.session import Ending, RunSession, TerminalOperator
 
@@ -163,15 +154,14 @@ def _run(
     # After a run of a calibration the process continues, so signals must work again, at the prompt and later.
     with Ending(own_process=entry.process.own and logs is None) as ending:
         session = RunSession(request, operator_interface, report=report is not None)
-        code = ending.code(_finish(session, ending, options, console, report, letterhead))
+        code = ending.code(_finish(session, ending, options, console, report))
         if logs is not None:
             logs.append(session.path)
         return code
 
 
 def _finish(
-    session: RunSession, ending: Ending, options: RunOptions, console: Console, report: Path | None,
-    letterhead: Letterhead | None,
+    session: RunSession, ending: Ending, options: RunOptions, console: Console, report: ReportFile | None,
 ) -> int:
     from tdhil.cli.results import print_result, save_report
 
@@ -202,8 +192,7 @@ def _finish(
             code = code or int(exit_code(error))
         if document is not None:
             # the report contains the log's SHA-256
-            save_report(document, session.log.recording(complete=True), report, session.log.virtual_string,
-                        letterhead=letterhead)
+            save_report(document, session.log.recording(complete=True), report, session.log.virtual_string)
     return code
 
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tdhil.cli.arguments import add_option, add_settings, settings_in
+from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_result, save_report
-from tdhil.config import OF_A_TRACE, OPTION, STATED, expectations_in, expectations_of
+from tdhil.config import OF_A_TRACE, OF_THE_HEAD, OPTION, STATED, expectations_in, expectations_of
 from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.file_hash import sha256_of
 from tdhil.session import (
@@ -26,7 +27,6 @@ from tdhil.session import (
 )
 
 if TYPE_CHECKING:
-    from tdhil.report import Letterhead
     from tdhil.session import RunRecord
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,12 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, nargs="?", metavar="run.mcap|trace.csv",
                         help="the log of a run, whole or cut short, or a trace in CSV; recognised by their content")
     add_option(parser, OPTION["json"])
-    parser.add_argument("--report", type=Path, metavar="FILE",
-                        help="the result with pictures in one file: report.html, or report.pdf on A4")
+    add_report_option(parser, "report")
     for name in STATED:
-        add_option(parser, OPTION[name], help=f"{OPTION[name].help.replace('log and report', 'the report')} (default: "
-                   "from the log)")
-    add_option(parser, OPTION["letterhead"])
+        if OPTION[name] not in OF_THE_HEAD:
+            add_option(parser, OPTION[name], help=f"{OPTION[name].help.replace('log and report', 'the report')} "
+                       "(default: from the log)")
+    add_head_options(parser)
     add_option(parser, OPTION["expect"])
     add_settings(parser, "the run's")
     parser.add_argument("--torque-calibration", type=Path, metavar="calibration.json",
@@ -66,16 +66,11 @@ def run(namespace: argparse.Namespace) -> int:
     settings_in(namespace)
     check_trace(namespace)
     require_file(path)
-    letterhead = None
-    if namespace.report is not None:
-        from tdhil.report import check_report_path, load_letterhead
-
-        check_report_path(namespace.report, path)
-        letterhead = load_letterhead(None if namespace.letterhead is None else Path(namespace.letterhead))
+    report = ReportFile.requested(namespace, path, letterhead=namespace.letterhead)
     recorded = _expecting(namespace, read_recorded(namespace, path).with_said(_said(namespace)))
     if is_evaluation(recorded.configuration) or is_verification(recorded.configuration):
-        return _evaluation(namespace, recorded, letterhead)
-    return _identify(namespace, recorded, letterhead)
+        return _evaluation(namespace, recorded, report)
+    return _identify(namespace, recorded, report)
 
 
 def read_recorded(namespace: argparse.Namespace, path: Path) -> RunRecord:
@@ -94,7 +89,7 @@ def read_recorded(namespace: argparse.Namespace, path: Path) -> RunRecord:
     return read(path, **trace)
 
 
-def _evaluation(namespace: argparse.Namespace, recorded: RunRecord, letterhead: Letterhead | None) -> int:
+def _evaluation(namespace: argparse.Namespace, recorded: RunRecord, report: ReportFile | None) -> int:
     """Evaluate the virtual string or the steps of this log, and print the result."""
     from tdhil.report import stderr_console
 
@@ -108,12 +103,11 @@ def _evaluation(namespace: argparse.Namespace, recorded: RunRecord, letterhead: 
     try:
         print_result(found.document, namespace.json)
     finally:
-        save_report(found.document, recorded.recording, namespace.report, recorded.virtual_string,
-                    letterhead=letterhead)
+        save_report(found.document, recorded.recording, report, recorded.virtual_string)
     return int(ExitCode.PARTIAL if not recorded.whole and found.exit_code is ExitCode.OK else found.exit_code)
 
 
-def _identify(namespace: argparse.Namespace, recorded: RunRecord, letterhead: Letterhead | None) -> int:
+def _identify(namespace: argparse.Namespace, recorded: RunRecord, report: ReportFile | None) -> int:
     """Identify and print. Return the exit code of the result, or the one for a result from a part of the run."""
     from tdhil.api import identify
     from tdhil.report import stderr_console
@@ -130,7 +124,7 @@ def _identify(namespace: argparse.Namespace, recorded: RunRecord, letterhead: Le
     try:
         print_result(result.document, namespace.json)
     finally:
-        save_report(result.document, recorded.recording, namespace.report, letterhead=letterhead)
+        save_report(result.document, recorded.recording, report)
     part = recorded.assumed is None and not recorded.whole
     return int(ExitCode.PARTIAL if part and result.exit_code is ExitCode.OK else result.exit_code)
 

@@ -5,29 +5,27 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tdhil.cli.standard_streams import OutputLost
 
 if TYPE_CHECKING:
+    from tdhil.cli.report_file import ReportFile
     from tdhil.recording import FloatArray, Recording
-    from tdhil.report import Letterhead
 
 
 def save_report(
-    document: Mapping[str, Any], recording: Recording, path: Path | None, virtual_string: FloatArray | None = None,
-    *, letterhead: Letterhead | None = None,
+    document: Mapping[str, Any], recording: Recording, report: ReportFile | None,
+    virtual_string: FloatArray | None = None,
 ) -> None:
     """Write the report if requested. Raises UsageError if it can't be written.
 
     ``virtual_string``: its cycles, if the run has one.
     """
-    if path is not None:
-        from tdhil.report import NO_LETTERHEAD, write_evaluation_report, write_report, write_verification_report
+    if report is not None:
+        from tdhil.report import write_evaluation_report, write_report, write_verification_report
 
-        head = letterhead or NO_LETTERHEAD
-
+        path, head = report.path, report.letterhead
         if _is_verification(document):
             written = write_verification_report(document, path, head)
         elif _is_evaluation(document) and virtual_string is not None:

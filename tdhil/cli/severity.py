@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 from tdhil.cli.arguments import add_option
 from tdhil.cli.evaluate import CONTROLLERS
 from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
+from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.errors import ExitCode, MessageCode, UsageError
 
 if TYPE_CHECKING:
     from tdhil.recording import Recording
+    from tdhil.session import RunRecord
     from tdhil.soft_torque import (
         BitNoiseEstimate,
         DrillString,
@@ -42,8 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                              "gains")
     parser.add_argument("--use", choices=CONTROLLERS, default="soft", help="controller in that file (default soft)")
     add_option(parser, OPTION["json"])
-    parser.add_argument("--report", type=Path, metavar="FILE",
-                        help="the result with pictures in one file: severity.html, or severity.pdf on A4")
+    add_report_option(parser, "severity")
+    add_head_options(parser)
     add_trace_arguments(parser)
     parser.set_defaults(run=run)
 
@@ -54,29 +56,28 @@ def run(namespace: argparse.Namespace) -> int:
     from tdhil.cli.tune_soft_torque import string_for
     from tdhil.report import (
         PlainConsole,
-        check_report_path,
         print_severity,
         severity_document,
-        stderr_console,
-        write_severity_report,
+        severity_report,
     )
 
     check_trace(namespace)
-    if namespace.report is not None:
-        check_report_path(namespace.report, namespace.log)
+    paths = [namespace.log] if namespace.against is None else [namespace.log, namespace.against]
+    report = ReportFile.of_files(namespace, *paths)
     result = read_result(namespace.result)
     ratio, inertia = _inertia(result, namespace)
     string, _, _ = string_for(result, namespace, ratio)
     expected = None if namespace.controller is None else _expected(namespace)
-    console = stderr_console()
-    paths = [namespace.log] if namespace.against is None else [namespace.log, namespace.against]
     found: list[tuple[Severity, str]] = []
     noises: list[BitNoiseEstimate | str] = []
     warnings: list[str] = []
     simulated = False
+    configurations = []
     for path in paths:
-        severity, noise, simulated = _assess(path, namespace, result, string, inertia,
-                                             expected if path == paths[-1] else None, warnings)
+        severity, noise, record = _assess(path, namespace, result, string, inertia,
+                                          expected if path == paths[-1] else None, warnings)
+        simulated = record.recording.simulated
+        configurations.append(record.configuration)
         found.append((severity, str(path)))
         noises.append(noise)
     document = severity_document(found, noises, string, inertia, simulated=simulated,
@@ -85,17 +86,16 @@ def run(namespace: argparse.Namespace) -> int:
         print_json(document)
     else:
         print_severity(document, PlainConsole())
-    if namespace.report is not None:
-        written = write_severity_report(document, [one for one, _ in found], namespace.report)
-        console.print(f"report: {written}", markup=False, soft_wrap=True)
+    if report is not None:
+        report.write(severity_report(document, [one for one, _ in found]), configurations)
     return int(ExitCode.OK)
 
 
 def _assess(
     path: Path, namespace: argparse.Namespace, result: Mapping[str, Any], string: DrillString, inertia: Interval,
     expected: tuple[TopDrive, SpeedController] | None, warnings: list[str],
-) -> tuple[Severity, BitNoiseEstimate | str, bool]:
-    """Return severity and bit noise of one recording, and whether it is simulated; add warnings.
+) -> tuple[Severity, BitNoiseEstimate | str, RunRecord]:
+    """Return severity and bit noise of one recording, and its record; add warnings.
 
     A text in place of the bit noise is the reason why the record does not determine it.
     """
@@ -112,7 +112,7 @@ def _assess(
         noise: BitNoiseEstimate | str = bit_noise_in(record, string, inertia)
     except SeverityRefused as refused:
         noise = str(refused)
-    return found, noise, recorded.recording.simulated
+    return found, noise, recorded
 
 
 def _inertia(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[float, Interval]:

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import html
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tdhil.cli.arguments import add_archived, add_option, add_settings, settings_in
+from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.errors import MessageCode, UsageError
 
 if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
+
+    from tdhil.report import Report, ReportSection
 
 _COLOURS = ("#0b5cad", "#c2410c", "#15803d", "#7e22ce", "#525252", "#b45309", "#0e7490", "#be123c")
 
@@ -25,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of trend."""
     parser.add_argument("table", type=Path, metavar="FILE", help="a table that `tdhil fleet` wrote")
     parser.add_argument("--rig", metavar="NAME", help="name of the rig in rig.yaml (default: the only one)")
-    _add_output(parser)
+    _add_output(parser, "none")
     parser.set_defaults(run=run)
 
 
@@ -34,22 +37,22 @@ def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("logs", nargs="+", type=Path, metavar="run.mcap",
                         help="two or more; each is compared with the first")
     add_settings(parser, "each run's")
-    _add_output(parser)
+    _add_output(parser, "from the logs")
     parser.set_defaults(run=run_compare)
 
 
-def _add_output(parser: argparse.ArgumentParser) -> None:
+def _add_output(parser: argparse.ArgumentParser, stated: str) -> None:
     add_archived(parser)
     add_option(parser, OPTION["json"])
-    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with a picture, in one "
-                                                                         "file (extra `report`)")
+    add_report_option(parser, "report")
+    add_head_options(parser, stated)
 
 
 def run(namespace: argparse.Namespace) -> int:
     """Read the table, and report changes."""
     from tdhil.fleet import counted, is_archived, read_table, trend_document
 
-    _check_report(namespace.report, (namespace.table,))
+    report = ReportFile.of_files(namespace, namespace.table)
     rows = read_table(namespace.table)
     kept = rows if namespace.archived else [row for row in rows if not is_archived(row.log)]
     if rows and not kept:
@@ -63,12 +66,8 @@ def run(namespace: argparse.Namespace) -> int:
         print_json(document)
     else:
         _print_trend(document)
-    if namespace.report is not None:
-        title = f"{document['rig']} over time{_simulated(document)}"
-        lines = [_followed_text(one) for one in document["quantities"]] + list(document["notes"])
-        if any(point["in_part"] is not None for one in document["quantities"] for point in one["points"]):
-            lines.append("hollow: a result from a part of the run")
-        _write(namespace.report, "trend", title, lines, "", lambda figure: _draw_trend(figure, document), (7.2, 7.5))
+    if report is not None:
+        report.write(_trend_report(document), ())
     return 0
 
 
@@ -88,16 +87,15 @@ def run_compare(namespace: argparse.Namespace) -> int:
             raise UsageError("tdhil serve has archived this run", where=str(log),
                              next_step="Add --archived, or leave it out", entry=MessageCode.VALUE_NOT_ALLOWED)
     settings = FleetSettings(**settings_in(namespace))
-    _check_report(namespace.report, namespace.logs)
-    document = compare_document([identified(log, settings) for log in namespace.logs])
+    report = ReportFile.of_files(namespace, *namespace.logs)
+    runs = [identified(log, settings) for log in namespace.logs]
+    document = compare_document(runs)
     if namespace.json:
         print_json(document)
     else:
         _print_compared(document)
-    if namespace.report is not None:
-        lines = [f"{one['to']}: {one['text']}" for one in document["differences"]]
-        _write(namespace.report, "compare", f"Runs compared{_simulated(document)}", lines, _settings_html(document),
-               lambda figure: _draw_curves(figure, document), (7.2, 3.4))
+    if report is not None:
+        report.write(_compare_report(document), [run.document for run in runs])
     return 0
 
 
@@ -190,40 +188,42 @@ def _by_line(document: Mapping[str, Any]) -> dict[float, list[float | None]]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Output in one file, with a figure
+# Output as a report, with a figure
 
 
-def _check_report(path: Path | None, inputs: Sequence[Path]) -> None:
-    if path is None:
-        return
-    from tdhil.report import require_extra
+def _trend_report(document: Mapping[str, Any]) -> Report:
+    from tdhil.report import Picture, ReportSection, Text
 
-    if path.suffix != ".html":
-        raise UsageError("must end in .html", where=f"--report {path}", entry=MessageCode.VALUE_NOT_ALLOWED)
-    if path.exists() or any(path.resolve() == one.resolve() for one in inputs):
-        raise UsageError("already exists and was left unchanged", where=f"--report {path}",
-                         next_step="Name another file", entry=MessageCode.FILE_EXISTS)
-    require_extra("--report")
+    caption = "Each result with its 95 % coverage interval; a vertical line marks a change."
+    if any(point["in_part"] is not None for one in document["quantities"] for point in one["points"]):
+        caption += " Hollow: a result from a part of the run."
+    lines = (*(_followed_text(one) for one in document["quantities"]), *document["notes"])
+    picture = Picture("trend", partial(_draw_trend, document=document), 7.5, caption)
+    return _report(f"{document['rig']} over time", document, (
+        ReportSection("Changes", tuple(map(Text, lines))), ReportSection("Over time", (picture,))))
 
 
-def _write(
-    path: Path, graph: str, title: str, lines: Sequence[str], table: str, draw: Any, size_in: tuple[float, float]
-) -> None:
-    from tdhil.report import GRAPHS, STYLE, inline_svg
+def _compare_report(document: Mapping[str, Any]) -> Report:
+    from tdhil.report import Column, Picture, ReportSection, Table, Text
 
-    said = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
-    page = (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        f"<style>{STYLE}</style><h1>{html.escape(title)}</h1><ul>{said}</ul><div class=\"wide\">"
-        f"{inline_svg(draw, size_in)}</div>"
-        f"<p>{html.escape(GRAPHS[graph].reading)}</p>{table}</html>\n"
-    )
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(page)
-    except OSError as error:
-        raise UsageError(f"can't be written: {error.strerror or error}", where=f"--report {path}",
-                         entry=MessageCode.FILE_NOT_WRITABLE) from error
+    headings = _headings(document["logs"])
+    settings = Table(
+        (Column("", 0.04), Column("setting", 0.26), *(Column(one, 0.7 / len(headings)) for one in headings)),
+        tuple(("≠" if one["differs"] else "", one["name"], *map(str, one["values"])) for one in document["settings"]))
+    picture = Picture(
+        "compare", partial(_draw_curves, document=document), 3.4, "Apparent inertia at the excited frequencies.")
+    return _report("Runs compared", document, (
+        ReportSection("Differences", tuple(Text(f"{one['to']}: {one['text']}") for one in document["differences"])),
+        ReportSection("Apparent inertia", (picture,)), ReportSection("Settings", (settings,))))
+
+
+def _report(title: str, document: Mapping[str, Any], sections: tuple[ReportSection, ...]) -> Report:
+    from tdhil.report import SIMULATED, Report
+    from tdhil.version import __version__
+
+    said = f"{SIMULATED}: at least one drive and rig is simulated" if document["simulated"] else ""
+    return Report(title=title, subtitle="", simulated=said, answer=None, warnings=(),
+                  sections=tuple(one for one in sections if one.blocks), footer=f"tdhil {__version__}")
 
 
 def _draw_trend(figure: FigureBase, document: Mapping[str, Any]) -> None:
@@ -241,7 +241,8 @@ def _draw_trend(figure: FigureBase, document: Mapping[str, Any]) -> None:
         for change in one["changes"]:
             before, after = _moment(change["before_date"]), _moment(change["after_date"])
             axis.axvline(before + (after - before) / 2, color=_COLOURS[1], lw=1)
-        axis.set_ylabel(f"{one['name']}\n{one['unit']}")
+        axis.set_ylabel(f"{one['name']}\n{one['unit']}", fontsize="small")
+        axis.tick_params(axis="y", labelsize="small")
         axis.grid(alpha=0.3)
     locator = dates.AutoDateLocator(minticks=3, maxticks=8)
     axes[-1].xaxis.set_major_locator(locator)
@@ -270,13 +271,3 @@ def _draw_curves(figure: FigureBase, document: Mapping[str, Any]) -> None:
     axis.set_ylabel("apparent inertia, kg·m²")
     axis.grid(alpha=0.3)
     axis.legend(frameon=False)
-
-
-def _settings_html(document: Mapping[str, Any]) -> str:
-    head = "".join(f"<th>{html.escape(heading)}</th>" for heading in _headings(document["logs"]))
-    rows = "".join(
-        f"<tr><td>{'≠' if one['differs'] else ''}</td><td>{html.escape(one['name'])}</td>"
-        + "".join(f"<td>{html.escape(value)}</td>" for value in one["values"]) + "</tr>"
-        for one in document["settings"]
-    )
-    return f'<table class="claims"><tr><th></th><th>setting</th>{head}</tr>{rows}</table>'

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import RPM, TIME, TORQUE
 from tdhil.cli.arguments import add_option, amount, share
+from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
 from tdhil.cli.tune_inputs import (
     bounded_estimate,
@@ -103,8 +104,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-simulation", action="store_true",
                         help="omit the critical speeds (tdhil evaluate needs them)")
     add_option(parser, OPTION["json"])
-    parser.add_argument("--report", type=Path, metavar="FILE", help="write a report with pictures: tune.html, or "
-                                                                    "tune.pdf")
+    add_report_option(parser, "tune")
+    add_head_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -112,20 +113,18 @@ def run(namespace: argparse.Namespace) -> int:
     """Read, tune, print."""
     from tdhil.report import (
         PlainConsole,
-        check_report_path,
         map_document,
         print_tuning,
         showcase_of,
         stderr_console,
         tuning_document,
-        write_tuning_report,
+        tuning_report,
     )
     from tdhil.soft_torque import Search, operator_map, tune
 
     _check(namespace)
     _check_files(namespace)
-    if namespace.report is not None:
-        check_report_path(namespace.report, namespace.result)
+    report = ReportFile.of_files(namespace, namespace.result)
     stderr = stderr_console()
     with _progress(stderr, "reading the result"):          # a log is identified again, which takes seconds
         result = read_result(namespace.result)
@@ -137,7 +136,7 @@ def run(namespace: argparse.Namespace) -> int:
         document = tuning_document(tuning, tuned_for)
         if namespace.depths is not None:
             document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, profile, progress)
-        if namespace.report is not None:
+        if report is not None:
             progress("the operator's map: set speed and bit torque")
             found = operator_map(tuning)
             document["map"] = None if found is None else map_document(found)
@@ -148,9 +147,8 @@ def run(namespace: argparse.Namespace) -> int:
                        style="yellow", markup=False, soft_wrap=True)
     else:
         print_tuning(document, PlainConsole())
-    if namespace.report is not None:
-        written = write_tuning_report(document, showcase_of(tuning), namespace.report)
-        stderr.print(f"report: {written}", markup=False, soft_wrap=True)
+    if report is not None:
+        report.write(tuning_report(document, showcase_of(tuning)), (result,))
     return int(ExitCode.OK)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import FREQUENCY, RPM, TIME, TORQUE
 from tdhil.cli.arguments import add_option, amount
+from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
 from tdhil.cli.tune_inputs import (
     bounded_estimate,
@@ -73,8 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_option(parser, OPTION["json"])
     parser.add_argument("--plot", type=Path, metavar="FILE",
                         help="loop, sensitivity and step response as tune.png, tune.svg or tune.pdf")
-    parser.add_argument("--report", type=Path, metavar="FILE", help="write a report with pictures: tune.html, or "
-                                                                    "tune.pdf")
+    add_report_option(parser, "tune")
+    add_head_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -83,18 +84,16 @@ def run(namespace: argparse.Namespace) -> int:
     from tdhil.report import (
         PlainConsole,
         check_picture_path,
-        check_report_path,
         loop_document,
+        loop_report,
         print_loop_tuning,
         save_loop_picture,
         stderr_console,
-        write_loop_report,
     )
     from tdhil.speed_loop import design_speed_loop
 
     _check(namespace)
-    if namespace.report is not None:
-        check_report_path(namespace.report, namespace.result)
+    report = ReportFile.of_files(namespace, namespace.result)
     if namespace.plot is not None:
         check_picture_path(namespace.plot, namespace.result)
     result = read_result(namespace.result)       # a log is identified again, which takes seconds
@@ -108,12 +107,11 @@ def run(namespace: argparse.Namespace) -> int:
         print_json(document)
     else:
         print_loop_tuning(document, PlainConsole())
-    stderr = stderr_console()
     if namespace.plot is not None:
         save_loop_picture(document, namespace.plot)
-        stderr.print(f"plot: {namespace.plot}", markup=False, soft_wrap=True)
-    if namespace.report is not None:
-        stderr.print(f"report: {write_loop_report(document, namespace.report)}", markup=False, soft_wrap=True)
+        stderr_console().print(f"plot: {namespace.plot}", markup=False, soft_wrap=True)
+    if report is not None:
+        report.write(loop_report(document), (result,))
     return int(ExitCode.OK)
 
 

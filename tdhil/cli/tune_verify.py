@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from tdhil.cli.report_file import add_report_option
+
 GAINS = ("tuned", "present")
 
 
@@ -18,8 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                       help="gains in that file that the drive has now (default tuned)")
     what.add_argument("--dry-run", action="store_true",
                       help="plan the steps within the rig's limits, or report what prevents them; nothing moves")
-    what.add_argument("--report", type=Path, metavar="FILE",
-                      help="the result with pictures in one file: verify.html, or verify.pdf on A4")
+    add_report_option(what, "verify")
     add_peer_arguments(parser)
     parser.set_defaults(run=run)
 

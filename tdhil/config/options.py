@@ -148,6 +148,11 @@ class Option:
         return str(self.default).lower() if self.kind is bool else str(self.default)
 
     @property
+    def label(self) -> str:
+        """Return the name on a form or a report; '' for an option without a form."""
+        return "" if self.form is None else self.form.label
+
+    @property
     def help_text(self) -> str:
         """Sentence of ``--help``."""
         return self.help.replace("{default}", self.default_text)
@@ -655,7 +660,7 @@ class EvidenceOptions(_Said):
     firmware: str | None = option(
         "--firmware", group=Topic.EVIDENCE, metavar="TEXT", api=True, longest=100,
         form=Form("Firmware version, as the drive's panel shows it", ("evidence",)),
-        help="firmware version of the drive, as its panel or tool shows it",
+        help="firmware version of the drive, as its panel or tool shows it (default: as the drive reports it)",
     )
     remove: tuple[str, ...] = option(
         "--remove", group=Topic.EVIDENCE, default=(), metavar="WORD", api=True, longest=200,
@@ -680,6 +685,8 @@ OF_EVIDENCE: Final = tuple(_rows(EvidenceOptions, by_field=True))
 OPTION: Final = MappingProxyType({one.name: one for one in OPTIONS})
 STATED: Final = tuple(one.name for one in _rows(RunDetails) if one.kind is str)
 """Names of the texts that a person states of a run, for log and report. They may be edited later."""
+OF_THE_HEAD: Final = tuple(OPTION[name] for name in STATED if name not in ("operator", "note"))
+"""Texts in the head of every report: they identify it for its customer."""
 ASKED_AGAIN: Final = tuple(sorted((one for one in OPTIONS if one.asked_again), key=lambda one: one.name))
 """Options that a replay, a comparison or a fleet may set differently from the run."""
 

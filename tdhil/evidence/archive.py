@@ -85,10 +85,12 @@ def members_of(facts: LogFacts, log: bytes, statement: PublisherStatement, resul
                ) -> dict[str, bytes]:
     """Return the members by name, in their order. ``log``: bytes of the scrubbed log; ``version``: of tdhil."""
     identity = dict(facts.run.get("identity") or {})
+    if reported := _reported_firmware(facts):
+        identity["firmware_reported"] = reported
     found = {
         README: "",
         STATEMENT: text_of(statement.plain()),
-        IDENTITY: text_of(identity | {"firmware": statement.firmware}),
+        IDENTITY: text_of(identity | {"firmware": statement.firmware or reported}),
         PARAMETERS: text_of([_parameter(one) for one in facts.preflight]),
         PROFILE: text_of(facts.run.get("profile")),
         RESULT: text_of(result),
@@ -103,6 +105,18 @@ def members_of(facts: LogFacts, log: bytes, statement: PublisherStatement, resul
                     for name, data in members.items()},
     }
     return members | {MANIFEST: text_of(manifest).encode()}
+
+
+def _reported_firmware(facts: LogFacts) -> str:
+    """Return the software version that the drive reported (100Ah); '' for none, and for a log of an earlier version."""
+    found = dict(facts.run.get("identity") or {}).get("firmware")
+    return found if isinstance(found, str) else ""
+
+
+def _firmware(facts: LogFacts, statement: PublisherStatement) -> str:
+    reported = _reported_firmware(facts)
+    stated = statement.firmware or ("" if reported else "not stated")
+    return "; ".join(filter(None, (stated, f"the drive reports {reported} (100Ah)" if reported else "")))
 
 
 def archive_of(members: Mapping[str, bytes]) -> bytes:
@@ -186,7 +200,7 @@ def readme(facts: LogFacts, statement: PublisherStatement, result: Mapping[str, 
         "An archive of tdhil: one run that identified a moment of inertia, with all that is needed to check it.\n",
         f"drive            {identity.get('name', '')}, vendor {identity.get('vendor')}, product"
         f" {identity.get('product')}, revision {identity.get('revision')}",
-        f"firmware         {statement.firmware or 'not stated'}",
+        f"firmware         {_firmware(facts, statement)}",
         f"profile          {profile.get('name', '')}: {profile.get('title', '')}",
         f"date             {facts.run.get('started') or 'not stated'}",
         f"J                {_inertia(result)}",

@@ -46,6 +46,12 @@ _SHORTEST_NUMBER: Final = 4
 """Shortest serial number that is removed from a text, digits. A shorter one occurs as another number."""
 _SERIAL_OBJECT: Final = b"\x18\x10\x04"
 """Index 1018h, sub-index 4 (serial number) as SDO transfers have it (CiA 301, 7.2.4)."""
+_LSS: Final = (0x7E4, 0x7E5)
+"""Identifiers of the layer setting services: of the slave and of the master (CiA 305)."""
+_LSS_SERIAL: Final = frozenset({0x43, 0x4A, 0x4B, 0x5D})
+"""Commands of LSS with a serial number behind them: switch selective, lowest and highest of a search, inquiry."""
+_LSS_FASTSCAN, _SCANNED_SERIAL = 0x51, 3
+"""Fastscan searches a number of 1018h bit by bit; that of the serial number."""
 
 
 class LogScrub:
@@ -57,6 +63,7 @@ class LogScrub:
 
     def __init__(self, run: Mapping[str, Any], words: Iterable[str] = (), *, rig_name: bool = False) -> None:
         self._rig_name = rig_name
+        self._canopen = run.get("drive") == "canopen"
         self._serials: dict[int, int] = {}
         bench = _part(run.get("bench"))
         self._kept_name = str(bench.get("name") or "") if rig_name else ""
@@ -123,9 +130,8 @@ class LogScrub:
         message = CLASSES[name].FromString(payload)
         message.DiscardUnknownFields()
         if channel in RAW_FRAMES:
-            if _SERIAL_OBJECT in payload:
-                for frame in message.frames:
-                    frame.data = self.frame(frame.data)
+            for frame in message.frames:
+                frame.data = self.frame(frame.data, frame.identifier)
         elif name == "Text":
             message.json = self._json(CHANNELS[channel][0], message.json)
         else:
@@ -135,10 +141,14 @@ class LogScrub:
         scrubbed: bytes = message.SerializeToString(deterministic=True)
         return scrubbed
 
-    def frame(self, data: bytes) -> bytes:
-        """Replace the serial number in a frame that carries object 1018h:4."""
+    def frame(self, data: bytes, identifier: int) -> bytes:
+        """Replace the serial number in a frame that carries object 1018h:4, or names it by LSS (CiA 305)."""
         at = data.find(_SERIAL_OBJECT)
         start = at + len(_SERIAL_OBJECT)
+        if self._canopen and identifier in _LSS and len(data) >= 5:
+            if data[0] == _LSS_FASTSCAN and (len(data) < 7 or data[6] == _SCANNED_SERIAL):
+                return data[:1] + bytes(4) + data[5:]        # a part of the number, which is no number of a drive
+            at, start = (0, 1) if data[0] in _LSS_SERIAL else (-1, 0)
         if at < 0 or len(data) < start + 4:
             return data
         number = self._serial(int.from_bytes(data[start:start + 4], "little"))

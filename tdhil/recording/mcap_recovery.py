@@ -4,9 +4,10 @@
 
     magic  { 06 length:8  Chunk   { 07 length:8  MessageIndex } … } …  0F DataEnd  summary  02 Footer  magic
 
-Only the content of chunks is used, because only chunks have a CRC; indexes and summary are skipped. After invalid
-records, the next chunk is searched by the name of its compression and its consistent lengths. At most the limit of a
-chunk (`contents`) is decompressed, and `TOTAL_LIMIT` in all.
+Only the content of chunks is used, because only chunks have a CRC; indexes and summary are skipped. Other tools add
+attachments and metadata between the records. Both are skipped without being read, if their lengths are consistent.
+After invalid records, the next chunk is searched by the name of its compression and its consistent lengths. At most the
+limit of a chunk (`contents`) is decompressed, and `TOTAL_LIMIT` in all.
 """
 
 import re
@@ -122,7 +123,7 @@ def read_at(file: BinaryIO, offset: int, length: int) -> bytes:
 # ---------------------------------------------------------------------------------------------------------------------
 
 TOTAL_LIMIT: Final = 4 * 2**30
-HEADER, MESSAGE_INDEX, DATA_END = 0x01, 0x07, 0x0F
+HEADER, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 0x01, 0x07, 0x09, 0x0C, 0x0F
 _KNOWN: Final = frozenset(range(0x01, 0x10))
 _RECORD: Final = Struct("<BQ")
 _INDEX_HEAD: Final = _RECORD.size + 6                     # channel:2  length of the rest:4
@@ -175,6 +176,9 @@ def walk(file: BinaryIO, size: int) -> Iterator[Found]:
             yield found
         elif opcode == HEADER and end <= size and length < 4096:
             yield Library(_library(read_at(file, offset + _RECORD.size, length)))
+        elif end <= size and _is_added(file, opcode, offset + _RECORD.size, end):
+            offset = end
+            continue
         else:
             found_at = _next_chunk(file, offset + 1, size)
             cut = found_at is None and (len(head) < _RECORD.size or (opcode in _KNOWN and end > size))
@@ -189,6 +193,22 @@ def walk(file: BinaryIO, size: int) -> Iterator[Found]:
 def _is_index(head: bytes, length: int) -> bool:
     """Return whether this is the head of a message index whose two lengths agree."""
     return len(head) == _INDEX_HEAD and int.from_bytes(head[-4:], "little") + 6 == length
+
+
+def _is_added(file: BinaryIO, opcode: int, start: int, end: int) -> bool:
+    """Return whether an attachment or metadata of another tool fills ``start`` to ``end``, by the lengths in it.
+
+    ::
+
+        09  log time:8  creation time:8  n:4 name  n:4 media type  n:8 data  CRC:4
+        0C  n:4 name  n:4 pairs of (n:4 key  n:4 value)
+    """
+    fields = {ATTACHMENT: ((16, 0), (0, 4), (0, 4), (0, 8), (4, 0)), METADATA: ((0, 4), (0, 4))}.get(opcode, ())
+    for fixed, size in fields:
+        start += fixed + size + int.from_bytes(read_at(file, start + fixed, size), "little")
+        if start > end:
+            return False
+    return bool(fields) and start == end
 
 
 def _next_chunk(file: BinaryIO, offset: int, size: int) -> int | None:

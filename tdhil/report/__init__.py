@@ -6,7 +6,10 @@ from profiles import lazy_names
 
 if TYPE_CHECKING:
     from tdhil.report.acceptance import AcceptanceVerdict as AcceptanceVerdict, acceptance_of as acceptance_of
-    from tdhil.report.blocks import shown_date as shown_date
+    from tdhil.report.blocks import (
+        Column as Column, Picture as Picture, Report as Report, ReportSection as ReportSection, Table as Table,
+        Text as Text, reference_of as reference_of, shown_date as shown_date,
+    )
     from tdhil.report.card import (
         card_html as card_html, card_text as card_text, inertia_text as inertia_text, minutes as minutes,
         print_card as print_card, rounded as rounded, with_interval as with_interval,
@@ -31,7 +34,7 @@ if TYPE_CHECKING:
     from tdhil.report.graphs import GRAPHS as GRAPHS
     from tdhil.report.html import (
         ShownPicture as ShownPicture, check_report_path as check_report_path, pictures_in as pictures_in,
-        write_report as write_report,
+        write_blocks as write_blocks, write_report as write_report,
     )
     from tdhil.report.letterhead import (
         LONGEST_LINE as LONGEST_LINE, MOST_LINES as MOST_LINES,
@@ -46,36 +49,35 @@ if TYPE_CHECKING:
     )
     from tdhil.report.plots import draw_run as draw_run
     from tdhil.report.factor_calibration import (
-        known_pipe_document as known_pipe_document, pairs_document as pairs_document, print_factor as print_factor,
-        reference_document as reference_document, write_factor_report as write_factor_report,
+        factor_report as factor_report, known_pipe_document as known_pipe_document,
+        pairs_document as pairs_document, print_factor as print_factor, reference_document as reference_document,
     )
     from tdhil.report.speed_calibration import (
         print_speed_calibration as print_speed_calibration, speed_document as speed_document,
+        speed_report as speed_report,
     )
     from tdhil.report.torque_calibration import (
         calibration_document as calibration_document, calibration_report as calibration_report,
         draw_calibration as draw_calibration, print_calibration as print_calibration,
-        write_calibration_report as write_calibration_report,
     )
     from tdhil.report.severity import (
         print_severity as print_severity, severity_document as severity_document,
-        write_severity_report as write_severity_report,
+        severity_report as severity_report,
     )
     from tdhil.report.operator_map import map_document as map_document
     from tdhil.report.speed_loop import (
         LoopTunedFor as LoopTunedFor, check_picture_path as check_picture_path, loop_document as loop_document,
-        print_loop_tuning as print_loop_tuning, save_loop_picture as save_loop_picture,
-        write_loop_report as write_loop_report,
+        loop_report as loop_report, print_loop_tuning as print_loop_tuning, save_loop_picture as save_loop_picture,
     )
     from tdhil.report.schedule import schedule_document as schedule_document
     from tdhil.report.tuning import (
         TunedFor as TunedFor, print_tuning as print_tuning, showcase_of as showcase_of,
-        tuning_document as tuning_document, write_tuning_report as write_tuning_report,
+        tuning_document as tuning_document, tuning_report as tuning_report,
     )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "acceptance": "AcceptanceVerdict acceptance_of",
-        "blocks": "shown_date",
+        "blocks": "Column Picture Report ReportSection Table Text reference_of shown_date",
         "card": "card_html card_text inertia_text minutes print_card rounded with_interval",
         "console": "PlainConsole stderr_console",
         "document": "SIMULATED rehearsal_of result_document run_facts text_of",
@@ -83,19 +85,18 @@ else:
         "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",
         "frequency_response": "draw_bode draw_faults draw_responses print_responses response_sentences save_responses",
         "graphs": "GRAPHS",
-        "html": "ShownPicture check_report_path pictures_in write_report",
+        "html": "ShownPicture check_report_path pictures_in write_blocks write_report",
         "letterhead": "LONGEST_LINE MOST_LINES NO_LETTERHEAD Letterhead clean_logo load_letterhead",
         "live": "LiveDisplay",
         "page": "STYLE has_extra inline_svg install_command repeatable_figures require_extra",
         "plots": "draw_run",
-        "speed_calibration": "print_speed_calibration speed_document",
-        "torque_calibration": "calibration_document calibration_report draw_calibration print_calibration "
-                              "write_calibration_report",
+        "speed_calibration": "print_speed_calibration speed_document speed_report",
+        "torque_calibration": "calibration_document calibration_report draw_calibration print_calibration",
         "operator_map": "map_document",
-        "severity": "print_severity severity_document write_severity_report",
+        "severity": "print_severity severity_document severity_report",
         "schedule": "schedule_document",
-        "speed_loop": "LoopTunedFor check_picture_path loop_document print_loop_tuning save_loop_picture "
-                      "write_loop_report",
-        "tuning": "TunedFor print_tuning showcase_of tuning_document write_tuning_report",
-        "factor_calibration": "known_pipe_document pairs_document print_factor reference_document write_factor_report",
+        "speed_loop": "LoopTunedFor check_picture_path loop_document loop_report print_loop_tuning "
+                      "save_loop_picture",
+        "tuning": "TunedFor print_tuning showcase_of tuning_document tuning_report",
+        "factor_calibration": "factor_report known_pipe_document pairs_document print_factor reference_document",
     })

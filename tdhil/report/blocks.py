@@ -13,11 +13,11 @@ from datetime import datetime
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from tdhil.config import OPTION, STATED
+from tdhil.config import OF_THE_HEAD
 from tdhil.recording import Recording
 from tdhil.report.acceptance import acceptance_rows, signature_rows
 from tdhil.report.card import COMPLIANT, estimate_text, in_degrees, inertia_text, minutes, plus_minus, rounded, sentence
-from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows, uploaded_rows
+from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows, text_of, uploaded_rows
 from tdhil.report.graphs import GRAPHS
 from tdhil.report.labels import (
     ACCELERATION_REGRESSION,
@@ -118,13 +118,13 @@ class ReportSection:
 @dataclass(frozen=True)
 class Report:
     """Complete report. ``simulated`` is the banner of `marks`, '' without a mark. ``reference``: customer, order
-    number and place, as names with texts; every sheet repeats them.
+    number and place, as names with texts; every sheet repeats them. ``answer``: None without a verdict.
     """
 
     title: str
     subtitle: str
     simulated: str
-    answer: AnswerBox
+    answer: AnswerBox | None
     warnings: tuple[str, ...]
     sections: tuple[ReportSection, ...]
     footer: str
@@ -159,14 +159,12 @@ def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
     )
 
 
-_REFERENCE = tuple(OPTION[name] for name in STATED if name not in ("operator", "note"))
-"""Texts that identify a report for its customer. The document of an earlier version lacks them."""
-
-
 def reference_of(document: Part) -> tuple[tuple[str, str], ...]:
-    """Return customer, order number and place of a run, those that are stated."""
-    return tuple((one.form.label, str(document[one.name])) for one in _REFERENCE
-                 if one.form is not None and document.get(one.name))
+    """Return customer, order number and place of a result or of a log's configuration, those that are stated.
+
+    The document of an earlier version lacks them. A log is not trusted: what is no text is not stated.
+    """
+    return tuple((one.label, text) for one in OF_THE_HEAD if (text := text_of(document.get(one.name))))
 
 
 def shown_date(text: str | None) -> str:

@@ -1,4 +1,4 @@
-"""Common parts of all torque calibrations, on the card and on the laboratory's page."""
+"""Common parts of all calibrations, on the card and on the laboratory's page."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def with_share(part: Part, unit: str) -> str:
     return f"{with_interval(part['value'], part['low'], part['high'], unit).rstrip()}  ±{share:#.2g} %"
 
 
-def scale_error(factor: Part) -> str:
-    """Return the error of the drive's own torque: ``4.8 % too much torque``."""
+def scale_error(factor: Part, quantity: str = "torque") -> str:
+    """Return the error of the drive's own quantity: ``4.8 % too much torque``."""
     error = 100.0 * (1.0 / factor["value"] - 1.0)
-    return f"{abs(error):.2g} % too {'much' if error > 0.0 else 'little'} torque"
+    return f"{abs(error):.2g} % too {'much' if error > 0.0 else 'little'} {quantity}"
 
 
 def shown_degrees(dof: float) -> str:
@@ -91,11 +91,13 @@ def result_rows(quantities: Iterable[tuple[str, Part, str]]) -> Table:
     return Table(columns, rows)
 
 
-def laboratory_page(document: Part, lines: Iterable[str], sections: Iterable[ReportSection]) -> Report:
-    """Return the page of a torque calibration in the layout of a laboratory; ``lines``: below κ in the answer."""
+def laboratory_page(
+    document: Part, lines: Iterable[str], sections: Iterable[ReportSection], quantity: str = "torque"
+) -> Report:
+    """Return the page of a calibration in the layout of a laboratory; ``lines``: below κ in the answer."""
     factor = document["calibration_factor"]
     return Report(
-        title="Calibration of a drive's torque",
+        title=f"Calibration of a drive's {quantity}",
         subtitle=shown_date(document["date"]),
         simulated=f"{SIMULATED}: drive and rig are simulated, nothing real turned" if document["simulated"] else "",
         answer=AnswerBox(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -146,7 +146,7 @@ def write_evaluation_report(
 
     Raises UsageError if it cannot be written.
     """
-    return write_blocks(evaluation_report(document, rows, log_hash(document)), path, letterhead)
+    return write_blocks(replace(evaluation_report(document, rows, log_hash(document)), letterhead=letterhead), path)
 
 
 def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Report:

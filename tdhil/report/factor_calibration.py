@@ -9,7 +9,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +33,6 @@ from tdhil.report.calibration_page import (
 from tdhil.report.card import sentence, with_interval
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED
-from tdhil.report.html import write_blocks
 from tdhil.report.plots import DARK, OURS, QUIET
 from tdhil.version import __version__
 
@@ -257,11 +255,6 @@ _CARD_ROWS = {PAIRS: _pairs_rows, REFERENCE: _reference_rows, KNOWN_PIPE: _known
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Page of a calibration without a body
-
-
-def write_factor_report(document: Part, path: Path) -> Path:
-    """Write the page, HTML or PDF by its name, and return its path. Raises UsageError if it cannot be written."""
-    return write_blocks(factor_report(document), path)
 
 
 def factor_report(document: Part) -> Report:

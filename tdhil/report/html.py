@@ -26,10 +26,13 @@ _TEMPLATE, _STYLE = (files("tdhil.report").joinpath(name).read_text("utf-8")
 """Template and style, read at import: at the end of a run there may be no file descriptor left."""
 
 
-def check_report_path(path: Path, log: Path, where: str = "--report") -> None:
-    """Check before motion that a report can be written, and replaces no older file. Raises UsageError."""
+def check_report_path(path: Path, *inputs: Path, where: str = "--report") -> None:
+    """Check before motion that a report can be written, and replaces no older file. Raises UsageError.
+
+    ``inputs``: the log, or other files that the report must not replace.
+    """
     require_extra(where)
-    if path.resolve() == log.resolve():
+    if any(path.resolve() == one.resolve() for one in inputs):
         raise UsageError("is the log itself", where=f"{where} {path}", next_step="Such as report.html or report.pdf",
                          entry=MessageCode.SAME_FILE_TWICE)
     if path.is_dir():
@@ -75,10 +78,10 @@ def write_report(
         ) from error
 
 
-def write_blocks(report: Report, path: Path, letterhead: Letterhead = NO_LETTERHEAD) -> Path:
+def write_blocks(report: Report, path: Path) -> Path:
     """Write any report, HTML or PDF by its name, and return its path. Raises UsageError if it cannot be written."""
     try:
-        return _put(replace(report, letterhead=letterhead), path)
+        return _put(report, path)
     except OSError as error:
         raise UsageError(f"can't be written ({error.strerror or error})", where=f"--report {path}",
                          entry=MessageCode.FILE_NOT_WRITABLE) from error

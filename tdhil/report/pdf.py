@@ -229,7 +229,8 @@ def _write(sheets: _Sheets, report: Report) -> None:
     sheets.place(38.0, head, 8.0)
     if report.reference:
         _reference(sheets, report.reference)
-    _answer(sheets, report.answer)
+    if report.answer is not None:
+        _answer(sheets, report.answer)
     for warning in report.warnings:
         _warning(sheets, warning)
     for section in report.sections:

@@ -17,7 +17,6 @@ from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, Repor
 from tdhil.report.card import minutes
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED
-from tdhil.report.html import write_blocks
 from tdhil.report.plots import DARK, OURS, QUIET, envelope
 from tdhil.soft_torque import AT_RISK_INDEX, RPM, STICK_SLIP_INDEX, BitNoiseEstimate, DrillString, Interval, Severity
 from tdhil.version import __version__
@@ -189,11 +188,6 @@ def _reflection(one: Part) -> str:
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Page of the severity.
-
-
-def write_severity_report(document: Part, found: Sequence[Severity], path: Path) -> Path:
-    """Write the page, HTML or PDF by its name, and return its path. Raises UsageError if it cannot be written."""
-    return write_blocks(severity_report(document, found), path)
 
 
 def severity_report(document: Part, found: Sequence[Severity]) -> Report:

@@ -1,18 +1,30 @@
-"""Speed calibration as a JSON document, and on a terminal."""
+"""Speed calibration as a JSON document, on a terminal, and in the layout of a calibration laboratory."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Group
 from rich.panel import Panel
-from rich.table import Table
-from rich.text import Text
+from rich.table import Table as Grid
+from rich.text import Text as Words
 
-from tdhil.report.card import sentence, with_interval
+from tdhil.report.blocks import Column, Pairs, Report, ReportSection, Table, Text
+from tdhil.report.calibration_page import (
+    VERDICT_STYLE,
+    calibrated_item,
+    date_and_signature,
+    laboratory_page,
+    recordings,
+    result_rows,
+    scale_error,
+    shown_degrees,
+    with_share,
+)
+from tdhil.report.card import sentence
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED
 from tdhil.version import __version__
@@ -53,43 +65,101 @@ def speed_document(
 def print_speed_calibration(document: Part, console: PlainConsole) -> None:
     """Print the card of a speed calibration on a console."""
     factor, verdict = document["calibration_factor"], document["verdict"]
-    rows = names_and_texts([("verdict", Text(verdict, style="bold green" if verdict == "valid" else "bold red"))])
+    rows = names_and_texts([("verdict", Words(verdict, style=VERDICT_STYLE.get(verdict, "bold")))])
     if factor is not None:
-        half = 50.0 * (factor["high"] - factor["low"]) / factor["value"]
-        error = 100.0 * (1.0 / factor["value"] - 1.0)
-        rows.add_row("calibration factor", Text(
-            f"{with_interval(factor['value'], factor['low'], factor['high'], '').rstrip()}  ±{half:#.2g} %",
-            style="bold"))
-        rows.add_row("", "true speed = κ · reported speed: the drive reports"
-                         f" {abs(error):.2g} % too {'much' if error > 0.0 else 'little'} speed")
+        rows.add_row("calibration factor", Words(with_share(factor, ""), style="bold"))
+        rows.add_row("", f"true speed = κ · reported speed: the drive reports {scale_error(factor, 'speed')}")
     inputs = document["inputs"]
     if inputs:
-        rows.add_row("counted", f"{inputs['counted_turns']:g} turns of the {inputs['at']} shaft in"
-                                f" {inputs['seconds']:.5g} s, {abs(inputs['speed_rad_s']):.5g} rad/s reported")
+        rows.add_row("counted", _counted(inputs))
     if document["log"] is not None:
         rows.add_row("log", Path(document["log"]["log"]).name)
     body: list[Any] = [rows]
     if document["budget"]:
         body.append(_budget(document["budget"], None if factor is None else factor["coverage_factor"]))
-    body.append(Text(sentence(document["reason"])))
+    body.append(Words(sentence(document["reason"])))
     if document["advice"]:
-        body.append(Text(sentence(document["advice"]), style="italic"))
+        body.append(Words(sentence(document["advice"]), style="italic"))
     if factor is not None:
-        body.append(Text(sentence(_NOT_APPLIED), style="dim"))
-    body += [Text(f"! {warning}", style="yellow") for warning in document["warnings"]]
+        body.append(Words(sentence(_NOT_APPLIED), style="dim"))
+    body += [Words(f"! {warning}", style="yellow") for warning in document["warnings"]]
     title = "speed calibration" + (f" · {SIMULATED}" if document["simulated"] else "")
     console.print(Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue"))
 
 
-def _budget(lines: list[Part], k: float | None) -> Table:
-    table = Table.grid(padding=(0, 2))
+def _budget(lines: list[Part], k: float | None) -> Grid:
+    table = Grid.grid(padding=(0, 2))
     table.add_column(style="dim")
     for _ in range(2):
         table.add_column(justify="right", no_wrap=True)
     shown = "1 sd, % of κ" if k is None else "± % of κ"
-    table.add_row(Text("uncertainty budget", style="italic"), Text("1 sd", style="dim"), Text(shown, style="dim"))
+    table.add_row(Words("uncertainty budget", style="italic"), Words("1 sd", style="dim"), Words(shown, style="dim"))
     for line in sorted(lines, key=lambda one: -one["of_factor"]):
         unit = "" if line["unit"] == "1" else f" {line['unit']}"
         table.add_row(line["source"], f"{line['standard_uncertainty']:.3g}{unit}",
                       f"{100.0 * (k or 1.0) * line['of_factor']:.3f}")
     return table
+
+
+def _counted(inputs: Part) -> str:
+    return (f"{inputs['counted_turns']:g} turns of the {inputs['at']} shaft in {inputs['seconds']:.5g} s,"
+            f" {abs(inputs['speed_rad_s']):.5g} rad/s reported")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Page of a speed calibration
+
+
+def speed_report(document: Part) -> Report:
+    """Return the report in the layout of a calibration laboratory, as that of a torque calibration."""
+    factor = document["calibration_factor"]
+    lines = () if factor is None else (f"The drive reports {scale_error(factor, 'speed')}",)
+    return laboratory_page(document, lines, _sections(document), "speed")
+
+
+def _sections(document: Part) -> Iterator[ReportSection]:
+    factor, inputs = document["calibration_factor"], document["inputs"]
+    yield calibrated_item(document)
+    yield ReportSection("Method", (Text(_METHODS[document["method"]]),))
+    if inputs:
+        yield ReportSection("Counted turns", (Pairs((("counted", _counted(inputs)),)),))
+    if factor is not None:
+        yield ReportSection("Result", (
+            result_rows((("calibration factor κ", factor, "1"),)), Text(
+                "The expanded uncertainty U is the standard uncertainty multiplied by the coverage factor k for a"
+                f" coverage probability of {100.0 * factor['confidence']:g} %. {sentence(_NOT_APPLIED)}")))
+    if document["budget"]:
+        yield ReportSection("Uncertainty budget", (_page_budget(document), Text(_BUDGET_NOTE)))
+    yield recordings({"runs": [] if document["log"] is None else [document["log"]]})
+    yield date_and_signature(document)
+
+
+_METHODS = {
+    "turns": (
+        "Turns N of the shaft were counted in a time t, and the mean reported speed Ω was noted. With true speed"
+        " ω = κ Ω, the measurement equation is κ = 2π N/(Ω t). Evaluation of uncertainty: JCGM 100 (GUM), first order,"
+        " effective degrees of freedom after Welch and Satterthwaite."
+    ),
+    "position": (
+        "The angle that the drive's position counter shows was divided by the integral of the reported speed, in"
+        " stretches of one run. The counts per turn are taken as exact. The mean has the weights of the stretches."
+        " Evaluation of uncertainty: JCGM 100 (GUM), first order, effective degrees of freedom after Welch and"
+        " Satterthwaite."
+    ),
+}
+_BUDGET_NOTE = (
+    "u: standard uncertainty of the input quantity; ν: its degrees of freedom; c·u: contribution to the relative"
+    " standard uncertainty of κ, %."
+)
+
+
+def _page_budget(document: Part) -> Table:
+    rows = [(line["source"], f"{line['standard_uncertainty']:.3g}", "" if line["unit"] == "1" else line["unit"],
+             line["distribution"], shown_degrees(line["degrees_of_freedom"]), f"{100.0 * line['of_factor']:.3f}")
+            for line in document["budget"]]
+    if (factor := document["calibration_factor"]) is not None:
+        rows.append(("combined", "", "", "", shown_degrees(factor["degrees_of_freedom"]),
+                     f"{100.0 * factor['standard_uncertainty'] / factor['value']:.3f}"))
+    columns = (Column("input quantity X", 0.38), Column("u", 0.12, True), Column("unit", 0.1),
+               Column("distribution", 0.16), Column("ν", 0.08, True), Column("c·u of κ, %", 0.16, True))
+    return Table(columns, tuple(rows))

@@ -22,7 +22,6 @@ from tdhil.report.card import with_interval
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED, only_finite
 from tdhil.report.graphs import GRAPHS
-from tdhil.report.html import write_blocks
 from tdhil.report.page import repeatable_figures, require_extra
 from tdhil.report.plots import plain_ticks
 from tdhil.report.schedule import gain_words
@@ -423,11 +422,6 @@ def draw_step(figure: FigureBase, document: Part) -> None:
     axes.set_ylim(bottom=0.0)
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small", loc="lower right")
-
-
-def write_loop_report(document: Part, path: Path) -> Path:
-    """Write the page, HTML or PDF by its name, and return its path. Raises UsageError if it cannot be written."""
-    return write_blocks(loop_report(document), path)
 
 
 def loop_report(document: Part) -> Report:

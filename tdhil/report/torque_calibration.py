@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,7 +31,6 @@ from tdhil.report.calibration_page import (
 from tdhil.report.card import plus_minus, sentence
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED
-from tdhil.report.html import write_blocks
 from tdhil.report.plots import DARK, OURS, QUIET
 from tdhil.version import __version__
 
@@ -133,11 +131,6 @@ def _budget(document: Part) -> Grid:
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Page of a torque calibration
-
-
-def write_calibration_report(document: Part, path: Path) -> Path:
-    """Write the page, HTML or PDF by its name, and return its path. Raises UsageError if it cannot be written."""
-    return write_blocks(calibration_report(document), path)
 
 
 def calibration_report(document: Part) -> Report:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich import box
@@ -17,7 +16,6 @@ from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, Repor
 from tdhil.report.card import with_interval
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED
-from tdhil.report.html import write_blocks
 from tdhil.report.operator_map import map_section
 from tdhil.report.schedule import finite, gain_words, noisy_speed, print_schedule, schedule_section, spread_document
 from tdhil.soft_torque import (
@@ -477,11 +475,6 @@ def showcase_of(tuning: Tuning, seconds: float = 60.0) -> Showcase | None:
     return Showcase(rpm, (stiff.kind, best.kind), trace)
 
 
-def write_tuning_report(document: Part, showcase: Showcase | None, path: Path) -> Path:
-    """Write the page, HTML or PDF by its name, and return its path. Raises UsageError if it cannot be written."""
-    return write_blocks(tuning_report(document, showcase), path)
-
-
 def tuning_report(document: Part, showcase: Showcase | None) -> Report:
     """Return the blocks of the page."""
     taken = [one for one in document["controllers"] if not one["refused"]]
@@ -604,5 +597,4 @@ def draw_showcase(figure: FigureBase, showcase: Showcase) -> None:
 
 __all__ = [
     "Interval", "Showcase", "TunedFor", "print_tuning", "showcase_of", "tuning_document", "tuning_report",
-    "write_tuning_report",
 ]

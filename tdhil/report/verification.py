@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -138,7 +138,7 @@ def _ends(part: Part, times: float) -> str:
 
 def write_verification_report(document: Part, path: Path, letterhead: Letterhead = NO_LETTERHEAD) -> Path:
     """Write the page, HTML or PDF by its name; return where it went. Raises UsageError if it can't be written."""
-    return write_blocks(verification_report(document, log_hash(document)), path, letterhead)
+    return write_blocks(replace(verification_report(document, log_hash(document)), letterhead=letterhead), path)
 
 
 def verification_report(document: Part, sha256: str = "") -> Report:

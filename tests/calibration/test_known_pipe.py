@@ -9,7 +9,7 @@ from tdhil.calibration import KnownPipe, PipeInput, calibrate_known_pipe
 from tdhil.estimation import MeasuredString
 from tdhil.estimation.frequency_domain import string_view
 from tdhil.estimation.result import Estimate
-from tdhil.report import PlainConsole, print_factor, write_factor_report
+from tdhil.report import PlainConsole, factor_report, print_factor, write_blocks
 from tdhil.session import find_by_known_pipe, known_pipe_of
 from tests.calibration.bodies import recording
 from tests.calibration.bodies import run as body_run
@@ -121,7 +121,7 @@ def test_a_recording_gives_the_factor_and_the_usual_tolerances_do_not(tmp_path):
     assert "wider than" in usual["reason"]
     for document in (found, usual):
         print_factor(document, PlainConsole())
-        write_factor_report(document, tmp_path / f"{document['verdict']}.html")
+        write_blocks(factor_report(document), tmp_path / f"{document['verdict']}.html")
 
 
 def test_a_rigid_shaft_holds_no_string(tmp_path):

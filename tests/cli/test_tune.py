@@ -12,7 +12,7 @@ import pytest
 
 from tdhil.cli.main import main
 from tdhil.errors import ExitCode
-from tdhil.report import showcase_of, tuning_document, write_tuning_report
+from tdhil.report import showcase_of, tuning_document, write_blocks
 from tdhil.report.tuning import TunedFor, tuning_report
 from tdhil.soft_torque import DrawnValues, Interval, Search, TuneCase, tune
 from tests.soft_torque.cases import DRIVE, STRING
@@ -187,11 +187,11 @@ def test_the_page_has_the_pictures_and_the_speeds(tmp_path):
     assert stuck[0] > 10.0 > stuck[1]
     page = tuning_report(document, showcase)
     assert [section.heading for section in page.sections][3] == "Stick-slip, with and without"
-    written = write_tuning_report(document, showcase, tmp_path / "tune.html")
+    written = write_blocks(tuning_report(document, showcase), tmp_path / "tune.html")
     text = written.read_text(encoding="utf-8")
     assert text.count("<svg") == 3
     assert "SIMULATED" in text
-    assert write_tuning_report(document, None, tmp_path / "tune.pdf").read_bytes().startswith(b"%PDF")
+    assert write_blocks(tuning_report(document, None), tmp_path / "tune.pdf").read_bytes().startswith(b"%PDF")
 
 
 def impedance(**said):

@@ -5,7 +5,7 @@ import pytest
 from drivers.cia402.mapping import CyclicLayout
 from drivers.cia402.sdo_client import SdoClient
 from drivers.cia402.sdo_message import is_answer, uploaded
-from drivers.errors import ObjectRefused
+from drivers.errors import CommunicationLost, ObjectRefused
 
 WORD, STATUS, TORQUE, SPEED, MODE = (0x6040, 0, 16), (0x6041, 0, 16), (0x6077, 0, 16), (0x60FF, 0, 32), (0x6060, 0, 8)
 GAP, OTHER, BIT = (0, 0, 8), (0x6064, 0, 32), (0x2000, 1, 1)
@@ -41,8 +41,11 @@ class Client(SdoClient):
     """A client whose drive gives these answers."""
 
     def __init__(self, *answers, normal):
-        super().__init__(0.5, (3, 1), normal=normal)
-        self.answers, self.asked = list(answers), []
+        super().__init__(0.5, (3, 1), normal=normal, drive="node 5")
+        self.answers, self.asked, self.told = list(answers), [], []
+
+    def tell(self, message):
+        self.told.append(message.hex())
 
     def call(self, request, where, answer_s, tries):
         self.asked.append((request.hex(), tries))
@@ -62,6 +65,41 @@ def test_a_normal_transfer_has_its_data_behind_the_first_eight_bytes():
     client.write_bytes(0x1008, 0, b"ABCDEFGHIJ")
     assert client.asked == [("210810000a000000" "4142434445464748494a", 3)]
     assert Client("4108100006000000" "414243444546", normal=True).read_bytes(0x1008) == b"ABCDEF"
+
+
+@pytest.mark.parametrize("normal", [False, True])
+def test_an_announced_length_above_the_limit_is_aborted_at_once(normal):
+    client = Client("41081000ffffffff", normal=normal)
+    with pytest.raises(CommunicationLost, match="1008h: node 5 announces 4294967295 bytes, and the limit is 1024"):
+        client.read_bytes(0x1008)
+    assert client.told == ["8008100005000405"] and len(client.asked) == 1
+    number = Client("4141600009000000", normal=normal)
+    with pytest.raises(CommunicationLost, match="6041h: node 5 announces 9 bytes, and the limit is 8"):
+        number.read(0x6041)
+
+
+@pytest.mark.parametrize(("normal", "parts", "what"), [
+    (False, ["0041424344454647", "1041424344454647"] * 100, "sends more than 1024 bytes"),
+    (False, ["0e00000000000000"], "without data"),
+    (True, ["00" + "41" * 600, "10" + "41" * 600], "sends more than 1024 bytes"),
+    (True, ["0e00000000000000"], "without data"),
+])
+def test_segments_without_an_end_are_aborted(normal, parts, what):
+    client = Client("40081000ff030000", *parts, normal=normal)
+    with pytest.raises(CommunicationLost, match=what) as caught:
+        client.read_bytes(0x1008)
+    assert caught.value.entry.code == "TDH-513" and client.told == ["8008100005000405"]
+
+
+def test_in_motion_an_object_comes_in_one_message():
+    client = Client("4108100009000000", normal=False)
+    with client.answered_within(0.05), pytest.raises(CommunicationLost, match="while the shaft may turn"):
+        client.read_bytes(0x1008)
+    assert client.asked == [("4008100000000000", 1)] and client.told == ["8008100005000405"]
+    normal = Client("4110600004000000" "01020304", normal=True)
+    with normal.answered_within(0.05):
+        assert normal.read(0x6010) == 0x04030201
+    assert Client("4108100009000000", "0041424344454647", "1b48490000000000", normal=False).read_bytes(0x1008)
 
 
 @pytest.mark.parametrize("normal", [False, True])

@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 from drivers.canopen.bus import CanLink
 from drivers.canopen.sdo import SdoObjects
 from drivers.cia402.objects import name
+from drivers.cia402.preflight import read_identity
+from drivers.cia402.sdo_client import LONGEST_UPLOAD_S
 from drivers.cia402.sdo_message import abort_text, is_answer
 from drivers.clock import SteppedClock
 from drivers.errors import CommunicationLost, ObjectRefused
@@ -38,6 +40,35 @@ def test_widths_and_signs(objects, peer, bits, value, raw):
 def test_segmented_upload(objects, peer, length):
     peer.objects[0x1008, 0] = bytes(range(length))
     assert objects.read_bytes(0x1008) == bytes(range(length))
+
+
+@pytest.mark.parametrize("announced", [True, False])
+def test_an_endless_upload_is_aborted_in_little_time(objects, peer, wire, fake_time, announced):
+    """The scripted drive sends segments for ever, each just before the time-out of its request."""
+    head = bytes.fromhex("41081000ffff0000" if announced else "4008100000000000")
+
+    def answer(request):
+        if request[0] == 0x80:
+            return
+        wire.put(0x581, head if request[0] == 0x40 else bytes((request[0] & 0x10,)) + b"endless", 0.45)
+
+    wire.on_send = lambda identifier, data: answer(data) if identifier == 0x601 else None
+    begin_s = fake_time.now_s
+    with pytest.raises(CommunicationLost, match="node 1 announces" if announced else "node 1 sent") as caught:
+        objects.read_bytes(0x1008)
+    assert caught.value.where == "1008h" and "ended the transfer" in caught.value.what
+    assert fake_time.now_s - begin_s < (1.0 if announced else LONGEST_UPLOAD_S + 1.0)
+    assert wire.of(0x601)[-1].hex() == ("8008100005000405" if announced else "8008100000000405")
+    wire.on_send = peer.on_frame
+    assert objects.read(0x1000) == 0x00020192             # the client and the drive go on
+
+
+def test_the_time_for_an_upload_is_bounded_in_motion_too(objects, peer, wire, fake_time):
+    begin_s, sent = fake_time.now_s, len(wire.sent)
+    peer.objects[0x2000, 0] = bytes(2000)
+    with objects.answered_within(0.05), pytest.raises(CommunicationLost, match="2000 bytes"):
+        objects.read(0x2000)
+    assert fake_time.now_s - begin_s < 0.05 and len(wire.sent) - sent == 2        # request and abort
 
 
 def test_the_text_of_an_abort_is_that_of_the_standard():
@@ -184,3 +215,11 @@ def test_restore_to_a_silent_drive_ends(objects, peer, fake_time):
 
 def test_names():
     assert (name(0x6040), name(0x1016, 1), name(0x1A00, 0)) == ("6040h", "1016h:1", "1A00h")
+
+
+def test_the_software_version_is_read_where_the_drive_has_it(objects, peer):
+    assert read_identity(objects).firmware == ""
+    peer.objects[0x100A, 0] = b"V2.1 build 7 \0"
+    assert read_identity(objects).firmware == "V2.1 build 7"
+    peer.objects.pop((0x1008, 0))
+    assert read_identity(objects).name == "CiA 402 drive"

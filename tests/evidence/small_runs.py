@@ -22,6 +22,8 @@ PROFILE = {
     **{name: {"source": "the manual", "confidence": "likely", "value": number}
        for number, name in enumerate(("identity", "modes", "quick_stop", "speed", "torque", "watchdog"))},
 }
+LSS = ((0x7E4, 0x5D, bytes(3)), (0x7E5, 0x43, bytes(3)), (0x7E5, 0x4A, bytes(3)), (0x7E5, 0x51, b"\x08\x03\x00"))
+"""Frames of LSS with a serial number: identifier, command, and what follows the number (CiA 305)."""
 STAGES = ("setup", "speed", "torque", "hold", "acquire")
 
 
@@ -50,6 +52,8 @@ def write_run(path: Path, run: dict[str, Any] | None = None, *, simulated: bool 
         writer.configuration(configuration() if run is None else run, {"gear_ratio": 2.0, "simulated": simulated})
         writer.frame(RawFrame(0.0, False, 0x581, b"\x43\x18\x10\x04" + serial.to_bytes(4, "little")))
         writer.frame(RawFrame(0.0, True, 0x601, b"\x40\x18\x10\x04\0\0\0\0"))
+        for identifier, command, rest in LSS:
+            writer.frame(RawFrame(0.0, False, identifier, bytes((command,)) + serial.to_bytes(4, "little") + rest))
         for text in ("identity: found vendor FBh (ok) 1018h", "watchdog: required 500 ms, found 500 ms (ok)"):
             writer.event(Event(0.0, "preflight", text))
         writer.event(Event(0.5, "mode", "torque mode confirmed, seeded with 80 N·m"))

@@ -69,6 +69,7 @@ def test_the_members_follow_from_log_and_statement():
     assert json.loads(members["parameters.json"]) == [
         {"name": "watchdog", "required": "500 ms", "found": "500 ms", "outcome": "ok", "where": "1016h"}]
     assert json.loads(members["identity.json"])["firmware"] == "0x0170"
+    assert "firmware         0x0170\n" in members["README.txt"].decode()
     text = members["README.txt"].decode()
     for part in ("This run is of a real drive", "The Institute", "log, result, identity", "may not be       rig",
                  "agrees: J is -1.0 % from the reference", "disc of 480 kg", "--check"):
@@ -275,3 +276,14 @@ def test_an_event_of_a_mode_is_what_shows_it(tmp_path):
     log = write_run(tmp_path / "run.mcap", events=(Event(0.6, "note", "torque mode confirmed"),))
     made = make_evidence(log, STATEMENT, (), conclude=found)
     assert set(json.loads(made.members["manifest.json"])["shown"]) == {"modes", "quick_stop", "speed", "torque"}
+
+
+@pytest.mark.parametrize(("stated", "firmware", "line"), [
+    ("", "V2.1", "the drive reports V2.1 (100Ah)"), ("0x0170", "0x0170", "0x0170; the drive reports V2.1 (100Ah)"),
+])
+def test_the_firmware_is_that_of_the_statement_or_of_the_drive(stated, firmware, line):
+    run = {**FACTS.run, "identity": {**FACTS.run["identity"], "firmware": "V2.1"}}
+    members = members_of(replace(FACTS, run=run), b"log", replace(STATEMENT, firmware=stated), RESULT, "1.2.3")
+    identity = json.loads(members["identity.json"])
+    assert (identity["firmware"], identity["firmware_reported"]) == (firmware, "V2.1")
+    assert f"firmware         {line}\n" in members["README.txt"].decode()

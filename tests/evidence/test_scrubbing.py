@@ -19,7 +19,7 @@ from tdhil.recording import CHANNELS, CLASSES, COMMAND, messages_of, read_frames
 from tdhil.recording.log_format import Event
 from tdhil.recording.mcap_container import Container
 from tdhil.recording.mcap_recovery import Contents, walk
-from tests.evidence.small_runs import PROFILE, RESULT, SERIAL, configuration, found, write_run
+from tests.evidence.small_runs import LSS, PROFILE, RESULT, SERIAL, configuration, found, write_run
 
 STATEMENT = PublisherStatement("The Institute", ("log", "result", "identity"), None, "", False)
 NAMES = ("first", "last", "rig", "host", "user", "folder", "file", "note", "secret", "key", "field", "mail",
@@ -129,7 +129,26 @@ def test_what_identification_needs_stays(scrubbed):
 def test_equal_drives_stay_equal_and_different_ones_different(scrubbed):
     run = read_run(scrubbed[1]).configuration
     assert run["identity"]["serial"] == 1 and run["torque_calibration"]["drive"]["serial"] == 2
-    assert [one.data[4:] for one in read_frames(scrubbed[1])] == [b"\1\0\0\0", b"\0\0\0\0"]
+    frames = [one.data for one in read_frames(scrubbed[1])]
+    assert [one[4:] for one in frames[:2]] == [b"\1\0\0\0", b"\0\0\0\0"]
+    assert [one[0] for one in frames[2:]] == [one[1] for one in LSS]
+    assert [one[1:5] for one in frames[2:]] == [b"\1\0\0\0"] * 3 + [bytes(4)]
+    assert [one[5:] for one in frames[2:]] == [one[2] for one in LSS]
+
+
+@pytest.mark.parametrize(("identifier", "data"), [
+    (0x7E5, "5d00000000000000"),                # the request has no number
+    (0x7E4, "5c07000000000000"), (0x7E5, "5107000000080200"),           # a revision
+    (0x181, "43d2029649000000"), (0x7E4, "5dd2"), (0x7E4, ""),
+])
+def test_other_frames_stay(identifier, data):
+    assert LogScrub(configuration()).frame(bytes.fromhex(data), identifier).hex() == data
+
+
+def test_lss_is_of_canopen_only():
+    data = bytes.fromhex("43d2029649000000")
+    assert LogScrub(configuration()).frame(data, 0x7E5).hex() == "4301000000000000"
+    assert LogScrub(configuration(drive="ethercat")).frame(data, 0x7E5) == data
 
 
 def test_scrubbing_again_changes_nothing(scrubbed):

@@ -159,6 +159,12 @@ def test_the_command_trend(table, tmp_path, capsys):
     text = report.read_text(encoding="utf-8")
     assert "<svg" in text
     assert "changed by +" in text
+    (tmp_path / "letterhead.yaml").write_text("company: Nordwerk\n")
+    head = ["--letterhead", str(tmp_path / "letterhead.yaml"), "--customer", "Østfold"]
+    assert main(["trend", str(table), "--rig", "R7", "--report", str(tmp_path / "head.html"), *head]) == 0
+    assert all(one in (tmp_path / "head.html").read_text(encoding="utf-8") for one in ("Nordwerk", "Østfold"))
+    assert "Nordwerk" not in text
+    capsys.readouterr()
     assert main(["trend", str(table), "--rig", "R7", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["results"] == 24
     for wrong in ([], ["--rig", "R9"], ["--rig", "R7", "--report", str(report)], ["--rig", "R7", "--report", "x.txt"]):

@@ -1,6 +1,7 @@
 """The tutorials can be followed to the letter: their commands are taken out of the pages and run, in order.
 
 A run of theirs has 50 cycles a second here, a fifth of the drive's usual rate, and of what there is to compute.
+The pages name fixed ports. Each page therefore has a network of its own, so that another service takes none of them.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import socket
 import subprocess
 import sys
 import time
@@ -17,12 +19,14 @@ from pathlib import Path
 
 import pytest
 
+from tests.own_network import own_network
 from tests.path.path_runs import clean_environment
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "tutorials"
 PAGES = sorted(path.name for path in FOLDER.glob("*.md") if path.name != "README.md")
 BLOCK = re.compile(r"^(?:<!-- (run[^\n]*) -->\n)?```sh\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+PORT = re.compile(r"127\.0\.0\.1:(\d+)|\bport=(\d+)")
 PATIENCE_S = 300.0
 IN_OTHERS = "read-a-result.md"
 """Its two commands, a simulated run and a replay as JSON, are those of the pages on a first run."""
@@ -62,12 +66,12 @@ exec '{Path(sys.executable).parent / "tdhil"}' "$@"
 
 
 @contextlib.contextmanager
-def beside(step: Step, folder: Path, environment: dict[str, str]) -> Iterator[None]:
-    """A program of the second terminal."""
+def beside(step: Step, folder: Path, environment: dict[str, str], enter: tuple[str, ...]) -> Iterator[None]:
+    """A program of the second terminal. ``enter``: words before a command, which run it in the page's network."""
     said = folder / "second-terminal.txt"
     with said.open("w") as file:
-        child = subprocess.Popen(["bash", "-euo", "pipefail", "-c", f"exec {step.text}"], cwd=folder, env=environment,
-                                 stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT)
+        child = subprocess.Popen([*enter, "bash", "-euo", "pipefail", "-c", f"exec {step.text}"], cwd=folder,
+                                 env=environment, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT)
     try:
         until = time.monotonic() + PATIENCE_S
         while step.ready not in said.read_text() and child.poll() is None and time.monotonic() < until:
@@ -76,7 +80,42 @@ def beside(step: Step, folder: Path, environment: dict[str, str]) -> Iterator[No
         yield
     finally:
         child.terminate()
-        child.wait(60.0)
+        child.wait(PATIENCE_S)
+
+
+def taken_ports(page: str) -> list[int]:
+    """Return the ports of a page that another program of this computer has."""
+    found = {int(one or other) for one, other in PORT.findall((FOLDER / page).read_text(encoding="utf-8"))}
+    taken = []
+    for port in sorted(found):
+        with socket.socket() as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                trial.bind(("127.0.0.1", port))
+            except OSError:
+                taken.append(port)
+    return taken
+
+
+def test_a_network_of_its_own_has_every_port_free():
+    """A server of this computer holds the port of the service; a program in the other network takes it all the same."""
+    with socket.socket() as server, own_network() as enter:
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        port = server.getsockname()[1]
+        if not enter:
+            pytest.skip("this system allows no network namespace")
+        trial = (f"import socket; s = socket.create_server(('127.0.0.1', {port})); "
+                 f"c = socket.create_connection(('127.0.0.1', {port}), 10); s.accept()[0].send(b'x'); print(c.recv(1))")
+        done = subprocess.run([*enter, sys.executable, "-c", trial], capture_output=True, text=True, timeout=60.0)
+        assert (done.returncode, done.stdout) == (0, "b'x'\n"), done.stderr
+
+
+def test_the_ports_of_the_pages_are_found():
+    found = {page: sorted({int(one or other) for one, other in PORT.findall((FOLDER / page).read_text("utf-8"))})
+             for page in PAGES}
+    assert {page: ports for page, ports in found.items() if ports} == {
+        "first-run-on-a-drive.md": [29536], "service-in-ten-minutes.md": [8420]}
 
 
 def test_there_are_tutorials_with_commands():
@@ -85,7 +124,6 @@ def test_there_are_tutorials_with_commands():
 
 
 @pytest.mark.heavy
-@pytest.mark.one_worker("tutorials")             # two of them use the same port
 @pytest.mark.parametrize("page", [
     pytest.param(page, marks=pytest.mark.long if page == IN_OTHERS else ()) for page in PAGES
 ])
@@ -96,10 +134,13 @@ def test_a_tutorial_can_be_followed_to_the_letter(page, tmp_path):
     programs = (slower(tmp_path), Path(sys.executable).parent, environment.get("PATH", os.defpath))
     environment["PATH"] = os.pathsep.join(map(str, programs))
     with contextlib.ExitStack() as second_terminal:
+        enter = second_terminal.enter_context(own_network())
+        taken = [] if enter else taken_ports(page)
+        assert not taken, f"another program has port {taken}, and this system allows no network namespace"
         for step in steps(page):
             if step.ready is not None:
-                second_terminal.enter_context(beside(step, tmp_path, environment))
+                second_terminal.enter_context(beside(step, tmp_path, environment, enter))
                 continue
-            done = subprocess.run(["bash", "-euo", "pipefail", "-c", step.text], cwd=tmp_path, env=environment,
+            done = subprocess.run([*enter, "bash", "-euo", "pipefail", "-c", step.text], cwd=tmp_path, env=environment,
                                   stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=PATIENCE_S)
             assert done.returncode == step.code, f"{step.text}\n{done.stdout}\n{done.stderr}"

@@ -2,8 +2,10 @@
 
 import random
 import resource
+import struct
 import subprocess
 import sys
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,12 +15,13 @@ import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.data_stream import RecordBuilder
-from mcap.records import Chunk, DataEnd, Footer, Header
+from mcap.records import Attachment, Chunk, DataEnd, Footer, Header, Metadata
 from mcap.writer import Writer
 
 from tdhil.errors import LogError
 from tdhil.recording.log_reader import read_frames, read_run, read_samples
 from tdhil.recording.mcap_container import LIBRARY, MAGIC
+from tdhil.recording.mcap_recovery import Contents, walk
 from tests.recording.log_runs import make_run, same_run
 
 QUIET = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -175,6 +178,44 @@ def test_somebody_elses_mcap(tmp_path):
         writer.finish()
     with pytest.raises(LogError, match="not a run of this tool"):
         read_run(tmp_path / "x.mcap")
+
+
+def _with_records(data, *records):
+    """A log with records of another tool before its first chunk, between two chunks, and before the end of its data."""
+    found = [one.offset for one in walk(BytesIO(data), len(data)) if isinstance(one, Contents)]
+    end = data.rindex(struct.pack("<BQ", 0x0F, 4))
+    for at in (end, found[len(found) // 2], found[0]):
+        data = data[:at] + b"".join(records) + data[at:]
+    return data
+
+
+def _record(one):
+    builder = RecordBuilder()
+    one.write(builder)
+    return builder.end()
+
+
+ATTACHMENT = _record(Attachment(create_time=1, log_time=2, name="photo.jpg", media_type="image/jpeg", data=b"x" * 5000))
+METADATA = _record(Metadata(name="site", metadata={"rig": "R7", "well": "W1"}))
+
+
+def test_attachments_and_metadata_of_other_tools_are_no_damage(good, tmp_path):
+    data, run, samples, frames = good
+    nested = _record(Attachment(create_time=1, log_time=2, name="a.mcap", media_type="", data=data))
+    read, some, few = read_damaged(tmp_path / "added.mcap", _with_records(data, ATTACHMENT, METADATA, nested))
+    assert read.problems == run.problems == () and read.complete
+    assert same_run(read, run) and some == samples and few == frames
+
+
+@pytest.mark.parametrize("record", [ATTACHMENT, METADATA], ids=["attachment", "metadata"])
+def test_an_attachment_with_lengths_that_disagree_is_damage(good, tmp_path, record):
+    data, _, samples, _ = good
+    for at in (9 + 16, 9 + 16 + 4 + 9) if record is ATTACHMENT else (9, 9 + 4 + 4):
+        wrong = record[:at] + b"\xff" + record[at + 1:]
+        read, some, _ = read_damaged(tmp_path / "wrong.mcap", _with_records(data, wrong))
+        assert any("not a record" in str(one) for one in read.problems) and some == samples
+    cut = data[:data.rindex(struct.pack("<BQ", 0x0F, 4))] + record[:-3]
+    assert any("not closed" in str(one) for one in read_damaged(tmp_path / "cut.mcap", cut)[0].problems)
 
 
 def bomb(compression, size, declared, chunks=1):
