@@ -124,10 +124,13 @@ class Feed:
 
     def watch(self) -> Viewer:
         queue: Viewer = asyncio.Queue(WAITING)
+        rests = self._task is None or self._task.done()
+        if rests:                      # the last viewer has left: what is known of the run is old
+            self.status = None
         status = None if self.status is None else self.status.plain()
         queue.put_nowait(self._dated({"type": "hello", **self.picture.whole(), "status": status}))
         self.viewers.add(queue)
-        if self._task is None or self._task.done():
+        if rests:
             self._task = asyncio.get_running_loop().create_task(self._run())
         return queue
 
