@@ -300,6 +300,17 @@ def test_a_wait_shows_how_long_it_lasts_and_how_long_it_usually_does(page, serve
 
 
 @pytest.mark.heavy
+def test_expected_values_are_typed_on_the_start_form(page, served):
+    page.goto("/start/a")
+    page.get_by_label("Expected values of an acceptance").fill("inertia=104,5 kg·m² ± 5 %, speed-lag = 400 ms ± 50 ms")
+    page.get_by_role("button", name="Start").click()
+    page.wait_for_url("**/runs/**")
+    (run,) = served.service.store.ids()
+    assert served.service.store.request(run).options == {
+        "expect": ["inertia=104.5 kg·m² ± 5 %", "speed-lag = 400 ms ± 50 ms"]}
+
+
+@pytest.mark.heavy
 def test_a_letterhead_is_set_and_an_svg_refused_at_its_field(page, served):
     from tests.report.test_letterhead import png
 

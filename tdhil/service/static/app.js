@@ -257,6 +257,7 @@
         if (field.checked) found[field.name] = true;
       } else if (text) {
         found[field.name] = unit ? quantity(text, unit) : kind === "tuple" ? text.split(/[\s,]+/)
+          : kind === "pairs" ? text.split(/[\s,;]+(?=[\w-]+\s*=)/).map((one) => one.replaceAll(/(\d),(?=\d)/g, "$1."))
           : kind === "int" && /^-?\d+$/.test(text) ? Number(text) : kind === "float" ? point(text) : text;
       }
     }
