@@ -419,8 +419,9 @@ def test_an_acceptance_shows_expected_beside_identified_and_what_is_off(page, se
     run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
     served.service.wait(run, "done")
     path = served.service.store.place(run) / "result.json"
-    result = json.loads(path.read_bytes()) | {"speed_lag_s": estimate(1.2)}
-    expected = [Expectation("inertia", 104.0, 10.0), Expectation("speed-lag", 0.4, 0.05), Expectation("gain", 1.0, 0.1)]
+    result = json.loads(path.read_bytes()) | {"speed_lag_s": estimate(1.2), "viscous_nm_s_rad": estimate(8.0)}
+    expected = [Expectation("inertia", 104.0, 10.4), Expectation("viscous", 8.0, 0.01),
+                Expectation("speed-lag", 0.4, 0.05), Expectation("gain", 1.0, 0.1)]
     write_json(path, {**result, "acceptance": acceptance_of(expected, result)})
     page.goto(f"/runs/{run}")
     page.get_by_role("heading", name="Acceptance", exact=True).wait_for()
@@ -429,6 +430,8 @@ def test_an_acceptance_shows_expected_beside_identified_and_what_is_off(page, se
                           ("gain P of the drive's speed loop", "cannot tell")):
         row = page.get_by_role("region", name="Acceptance").get_by_role("row", name=name)
         assert row.locator("td").last.inner_text() == verdict
+    assert page.get_by_text("104 ± 10.4 kg·m²").count() == page.get_by_text("0.4 ± 0.05 s").count() == 1
+    page.get_by_text("An interval overlaps the edge of its tolerance.").wait_for()
 
 
 def test_on_a_phone_the_list_of_runs_shows_j_and_verdict(page, served):

@@ -1,7 +1,7 @@
 // Results: one run, a comparison, a rig over time, many logs. As in app.js, data from elsewhere are inserted as text.
 "use strict";
 (() => {
-  const { coded, english, errorText, fixed, point, precise, tr, word } = window.tdhilLanguage;
+  const { coded, english, errorText, fixed, local, point, precise, tr, word } = window.tdhilLanguage;
   const { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, may, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, uploaded, waiting, when, zone } = window.tdhil;
 
   // -- one run
@@ -41,15 +41,17 @@
   function accepted(result) {
     const found = result && result.acceptance;
     if (!found) return [];
-    const colour = { pass: "good", fail: "bad" };
+    const colour = { pass: "good", fail: "bad" }, short = (value) => local(String(Number(value.toPrecision(5))));
+    const wide = found.quantities.some((one) => one.verdict === "cannot tell" && one.value !== null);
     return [el("section", { class: "card" }, el("h2", {}, tr("Acceptance")),
       el("p", { class: `verdict ${colour[found.verdict] || "fair"}` }, word(found.verdict, "verdict")),
       ...found.off.map((one) => el("p", { class: "alarm" }, ...coded(found.code, `${one} [${found.code}]`))),
       region(tr("Acceptance"), el("table", { class: "whole" }, el("thead", {}, el("tr", {}, ...[tr("quantity"), tr("expected"), tr("identified"), tr("verdict")].map((one) => el("th", { scope: "col" }, one)))),
         el("tbody", {}, ...found.quantities.map((one) => el("tr", {}, el("th", { scope: "row" }, word(one.label)),
-          el("td", {}, `${number(one.expected)} ± ${number(one.tolerance, 2)} ${one.unit}`),
+          el("td", {}, `${short(one.expected)} ± ${short(one.tolerance)} ${one.unit}`),
           el("td", {}, one.value === null ? tr("not identified") : `${of(one)} ${one.unit}`),
-          el("td", { class: `verdict ${colour[one.verdict] || "fair"}` }, word(one.verdict, "verdict")))))))) ];
+          el("td", { class: `verdict ${colour[one.verdict] || "fair"}` }, word(one.verdict, "verdict"))))))),
+      wide ? el("p", {}, tr("An interval overlaps the edge of its tolerance. Calibrate the torque, or measure for longer.")) : null)];
   }
   /** The verdict on rehearsed faults: required and seen. */
   function rehearsed(run) {
