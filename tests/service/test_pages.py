@@ -864,6 +864,31 @@ def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, serv
 
 
 @pytest.mark.heavy
+def test_the_enter_key_does_not_send_a_new_rig_before_its_page_is_ready(page):
+    held = []
+    page.route("**/api/v1/new-rig", lambda route: held.append(route))
+    page.goto("/new-rig")
+    wait_for("the question", lambda: page.wait_for_timeout(20) or held)
+    page.get_by_label("Name in reports").fill("Bench 3")
+    page.keyboard.press("Enter")
+    held[0].continue_()
+    page.locator("#scan:enabled").wait_for()
+    assert (page.get_by_label("Name in reports").input_value(), len(held)) == ("Bench 3", 1)
+
+
+@pytest.mark.heavy
+def test_a_result_of_a_simulated_drive_is_marked_on_the_card_of_a_real_rig(page):
+    last = {"id": "20260501-120000-0123ab", "asked": "2026-05-01T12:00:00Z", "simulated": True, "state": "failed",
+            "inertia_kg_m2": 104.0, "low_kg_m2": 100.0, "high_kg_m2": 108.0}
+    rig = {"id": "a", "name": "Rig a", "state": "free", "simulated": False, "motion": "attended", "last": last}
+    page.route("**/api/v1/rigs", lambda route: route.fulfill(json=[rig]))
+    page.goto("/")
+    card = page.get_by_role("article", name="Rig a")
+    card.get_by_text("failed, at standstill").wait_for()
+    assert card.get_by_text("SIMULATED").count() == 1
+
+
+@pytest.mark.heavy
 def test_the_steps_of_a_new_rig(page, served, rigs, monkeypatch):
     def box(label):
         return page.get_by_role("textbox", name=re.compile(f"^{label}"))
@@ -884,10 +909,12 @@ def test_the_steps_of_a_new_rig(page, served, rigs, monkeypatch):
         "found": [{"address": 3, "title": HOSTILE, "identity": HOSTILE, "simulated": False, "profile": "maxon/epos4",
                    "why": HOSTILE, "fields": {"node": "3"}}], "remarks": [HOSTILE]}})
     page.get_by_role("button", name="Scan for the drive").click()
-    page.get_by_text("confirm that no other master is active").wait_for()
+    page.locator("label", has=page.locator("[name=alone]")).get_by_text("Confirm that no other master").wait_for()
     page.get_by_label("No other master is active").check()
     page.get_by_role("button", name="Scan for the drive").click()
+    page.locator("#scan-said").get_by_text("node 3").wait_for()
     page.get_by_role("button", name="Use this drive").click()
+    page.get_by_text("The fields above have its address.").wait_for()
     assert box("Node:").input_value() == "3"
     for label, text in (("Lowest speed", "5 rpm"), ("Highest speed", "95 rpm"), ("Highest torque, either", "400"),
                         ("Longest run", "15 min"), ("Deceleration of a stop", "2"),
@@ -897,6 +924,11 @@ def test_the_steps_of_a_new_rig(page, served, rigs, monkeypatch):
         one.check()
     page.get_by_role("button", name="Check").click()
     page.get_by_text("The file is complete.").wait_for()
+    page.reload()
+    page.get_by_label("Id:").fill("bench 3!")
+    page.get_by_role("button", name="Save the rig").click()
+    page.locator("#wrong-id").get_by_text("must be letters, digits").wait_for()
+    page.get_by_label("Id:").fill("bench-3")
     page.get_by_role("img", name="Window of motion: 0.524 to 9.95 rad/s, at most 400 N·m").wait_for()
     page.get_by_role("button", name="Save the rig").click()
     page.wait_for_url("**/start/bench-3")

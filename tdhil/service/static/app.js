@@ -210,7 +210,7 @@
     return el("article", { class: "card", "aria-labelledby": `rig-${rig.id}` },
       el("h2", { id: `rig-${rig.id}` }, rig.name, " ", badge(rig.simulated) || ""),
       el("p", { class: rig.state === "blocked" || rig.state === "unusable" ? "alarm" : "dim" }, said),
-      rig.last ? el("p", {}, el("span", { class: "figure" }, `J = ${inertia(rig.last)}`), el("br"), el("a", { href: `/runs/${rig.last.id}` }, when(rig.last.asked))) : el("p", { class: "dim" }, tr("no result yet")),
+      rig.last ? el("p", {}, el("span", { class: "figure" }, `J = ${inertia(rig.last)}`), " ", (!rig.simulated && badge(rig.last.simulated)) || "", el("br"), el("a", { href: `/runs/${rig.last.id}` }, when(rig.last.asked)), rig.last.state === "done" ? "" : ` · ${STATES[rig.last.state] || rig.last.state}`) : el("p", { class: "dim" }, tr("no result yet")),
       el("p", { class: "row" },
         mayStart ? el("a", { class: "button", href: `/start/${encodeURIComponent(rig.id)}` }, tr("Start")) : null,
         rig.run ? el("a", { class: "button", href: `/runs/${rig.run}/live` }, tr("Live")) : null,
