@@ -42,7 +42,7 @@
     const found = result && result.acceptance;
     if (!found) return [];
     const colour = { pass: "good", fail: "bad" }, short = (value) => local(String(Number(value.toPrecision(5))));
-    const wide = found.quantities.some((one) => one.verdict === "cannot tell" && one.value !== null);
+    const wide = found.quantities.some((one) => !["pass", "fail"].includes(one.verdict) && one.value !== null);
     return [el("section", { class: "card" }, el("h2", {}, tr("Acceptance")),
       el("p", { class: `verdict ${colour[found.verdict] || "fair"}` }, word(found.verdict, "verdict")),
       ...found.off.map((one) => el("p", { class: "alarm" }, ...coded(found.code, `${one} [${found.code}]`))),
