@@ -139,6 +139,9 @@ class Feed:
 
     async def _run(self) -> None:
         sent_s = 0.0
+        self.status = await anyio.to_thread.run_sync(self._present)       # first: reading the log takes longer
+        if self.status is not None:
+            self._publish(self._dated({"type": "news", "status": self.status.plain()}))
         while self.viewers:
             news, status = await anyio.to_thread.run_sync(self._look)
             shown = self.picture.take(news, time.monotonic())
@@ -151,11 +154,14 @@ class Feed:
                 self._publish(self._dated({"type": "news", **shown}))
             await asyncio.sleep(0.0 if news.more else EVERY_S)
 
-    def _look(self) -> tuple[LogNews, Status | None]:
+    def _present(self) -> Status | None:
         try:
-            status = self._read_status()
+            return self._read_status()
         except Exception:              # the run is being written or deleted: the next check decides
-            status = None
+            return None
+
+    def _look(self) -> tuple[LogNews, Status | None]:
+        status = self._present()
         if status is not None and status.state is State.MOVING and not self._viewed:
             with suppress(TdhilError):
                 self._tell_viewed()

@@ -118,7 +118,8 @@ def _missing(profile: Profile, body: DraftBody, known: RigEntries) -> list[Draft
     """Return the entries that a real drive needs and the draft does not have."""
     found = [] if known.name else [DraftProblemView("name", "The rig needs its own name, such as bench 3.")]
     if not known.address:
-        found.append(DraftProblemView("address", "Type the address of the drive. Without one, the embedded simulator runs."))
+        found.append(DraftProblemView("address", "Type the address of the drive. Without one,"
+                                                 " the embedded simulator runs."))
     found += [DraftProblemView(f"limits.{name}", "A real drive does not move without it.") for name in LIMIT_KEYS
               if name not in known.limits]
     if body.load == "string":
@@ -171,8 +172,10 @@ def scan_for(body: DraftBody) -> ScanView:
     except ValueError:
         document = {}
     if done.returncode != 0 or "found" not in document:
-        said = str((document.get("error") or {}).get("message") or " ".join(done.stderr.split())[-400:] or "no reply")
-        raise CommunicationLost(said, where="scan", next_step="Check the drive's supply, the wiring and the address")
+        if said := str((document.get("error") or {}).get("message") or " ".join(done.stderr.split())[-400:]):
+            raise CommunicationLost(said)            # with its own next step
+        raise CommunicationLost("no reply", where="scan",
+                                next_step="Check the drive's supply, the wiring and the address")
     return ScanView([
         FoundDriveView(one["address"], one["title"], one["identity"], one["simulated"], one["profile"], one["why"],
                        {**{name: str(value) for name, value in one["line"].items()},

@@ -191,5 +191,5 @@ def test_a_scan_without_a_reply_says_why(monkeypatch, reply):
         return reply
 
     monkeypatch.setattr(new_rig.subprocess, "run", run)
-    with pytest.raises(Exception, match=r"no drive answers|did not end within"):
+    with pytest.raises(Exception, match=r"^(no drive answers|scan: the scan did not end within.*)$"):
         new_rig.scan_for(DraftBody("generic/cia402", address=ADDRESS["canopen"]))

@@ -311,6 +311,51 @@ def test_expected_values_are_typed_on_the_start_form(page, served):
 
 
 @pytest.mark.heavy
+def test_a_plan_of_other_values_is_taken_away(page, served, monkeypatch):
+    monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": PLAN})
+    page.goto("/start/a")
+    page.get_by_role("button", name="Plan").click()
+    page.get_by_role("row", name="expected interval of J").wait_for()
+    page.get_by_label("Tolerance: half-width").fill("3")
+    page.locator("#plan").wait_for(state="hidden")
+
+
+@pytest.mark.heavy
+def test_a_page_with_a_text_that_is_not_saved_is_not_loaded_again(page, served):
+    run = begin(served)
+    page.goto(f"/runs/{run}")
+    page.get_by_role("link", name="Live", exact=True).wait_for()
+    page.get_by_label("Operator").fill("Anna")
+    served.service.supervisor.stop(run, "local")
+    page.get_by_text("This page has new content.").wait_for()
+    assert page.get_by_label("Operator").input_value() == "Anna"
+    page.get_by_role("button", name="Show it").click()
+    wait_for("the new page", lambda: page.get_by_label("Operator").input_value() == "")
+
+
+@pytest.mark.heavy
+def test_a_record_is_saved_once_by_a_double_click(page, served):
+    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    sent = []
+    page.on("request", lambda asked: sent.append(asked.url) if asked.url.endswith("/annotations") else None)
+    page.goto(f"/runs/{run}")
+    page.get_by_label("Operator").fill("Anna")
+    page.locator("#annotate button").dblclick()
+    page.get_by_text("Operator: Anna").wait_for()
+    assert len(sent) == 1
+
+
+@pytest.mark.heavy
+def test_a_wrong_time_of_a_rehearsal_starts_no_run(page, served):
+    page.goto("/rehearse/a")
+    page.get_by_label("Delay after the start").fill("two")
+    page.get_by_role("button", name="Rehearse sto", exact=True).click()
+    page.locator("#wrong-after").get_by_text("a number of seconds").wait_for()
+    assert served.service.store.ids() == []
+
+
+@pytest.mark.heavy
 def test_a_letterhead_is_set_and_an_svg_refused_at_its_field(page, served):
     from tests.report.test_letterhead import png
 
@@ -866,7 +911,7 @@ def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, serv
 @pytest.mark.heavy
 def test_the_enter_key_does_not_send_a_new_rig_before_its_page_is_ready(page):
     held = []
-    page.route("**/api/v1/new-rig", lambda route: held.append(route))
+    page.route("**/api/v1/new-rig", held.append)
     page.goto("/new-rig")
     wait_for("the question", lambda: page.wait_for_timeout(20) or held)
     page.get_by_label("Name in reports").fill("Bench 3")
@@ -998,7 +1043,7 @@ def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypat
     page.get_by_label("Model").select_option("rigid")
     page.get_by_label("Tolerance: half-width").fill("a lot")
     page.get_by_role("button", name="Replay").click()
-    page.get_by_text("tolerance: a number and its unit are wanted").wait_for()         # and it isn't passed over
+    page.locator("#wrong-tolerance").get_by_text("a number and its unit").wait_for()         # and not passed over
     page.get_by_label("Tolerance: half-width").fill("0,1")
     page.get_by_role("button", name="Replay").click()
     page.get_by_role("row", name="model rigid, tolerance 0.001").get_by_text("104.5 (99.0 to 110.0)").wait_for()

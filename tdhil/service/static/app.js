@@ -282,8 +282,12 @@
     form.querySelectorAll("[aria-invalid]").forEach((one) => { one.removeAttribute("aria-invalid"); one.removeAttribute("aria-describedby"); });
     form.querySelectorAll(".wrong").forEach((one) => one.remove());
   }
-  /** Send a form. A refusal is shown at its fields, or in the text `said` if it names none of them. */
+  const LEAVES = new Promise(() => {});       // what a form waits for whose page is loaded again
+  const sending = new Set();
+  /** Send a form, once for a double click. A refusal is shown at its fields, or in the text `said` if it names none of them. */
   async function submits(form, said, send) {
+    if (sending.has(form)) return;
+    sending.add(form);
     unmark(form);
     said.hidden = true;
     try {
@@ -292,6 +296,9 @@
       if (error.fields && markWrong(form, error.fields)) return;
       said.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve.");
       said.hidden = false;
+      said.scrollIntoView({ block: "nearest" });
+    } finally {
+      sending.delete(form);
     }
   }
 
@@ -358,6 +365,7 @@
     };
   }
 
+  const PLAN_MS = 300000;      // a narrow tolerance on a computer under load
   function startPage() {
     const rig = document.body.dataset.rig;
     const form = byId("ask");
@@ -385,6 +393,7 @@
       const why = { busy: tr("A run uses this rig."), held: tr("Held by {holder}.", { holder: found.holder }), blocked: tr("Blocked until a stop that was not confirmed is signed off.") }[found.state];
       byId("rig-state").textContent = why || "";
     });
+    form.addEventListener("input", () => { byId("plan").hidden = true; });
     form.addEventListener("submit", async (event) => {
       event.preventDefault();
       const wanted = event.submitter && event.submitter.value === "plan" ? "plan" : "start";
@@ -397,9 +406,9 @@
       let planned = false;
       try {
         if (wanted === "plan") {
-          const found = await call("POST", `/rigs/${encodeURIComponent(rig)}/plan`, options, {}, 60000);
+          const found = await call("POST", `/rigs/${encodeURIComponent(rig)}/plan`, options, {}, PLAN_MS);
           show(byId("plan").lastElementChild, ...planTable(found.plan));
-          byId("plan").hidden = false;
+          byId("plan").hidden = JSON.stringify(asked(form)) !== JSON.stringify(options);      // changed meanwhile
           planned = true;
           show(byId("said"));
         } else if (!await paced()) {
@@ -703,7 +712,7 @@
       const real = age === null ? null : age + (now - message) / 1000;
       const old = silent || (running && ["moving", "stopping"].includes(status.state) && real !== null && real > SILENT_MS / 1000);
       document.body.classList.toggle("stale", Boolean(old && (running || silent)));
-      if (silent && message) away(watched ? tr("No connection to tdhil serve: the values are old. The run stops, because it is not watched. The hard-wired stop works.") : tr("No connection to tdhil serve: the values are old. The run continues under its guard. The hard-wired stop works."));
+      if (silent && message) away(status && ENDED.includes(status.state) ? tr("No answer from tdhil serve.") : watched ? tr("No connection to tdhil serve: the values are old. The run stops, because it is not watched. The hard-wired stop works.") : tr("No connection to tdhil serve: the values are old. The run continues under its guard. The hard-wired stop works."));
       else if (!silent) away("");
       byId("age").textContent = real === null ? "–" : running || silent ? (real < 10 ? `${fixed(real, 1)} s` : span(real)) : tr("ended");
       stopAlarm();
@@ -746,6 +755,7 @@
     } catch (error) {
       where.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve.");
       where.hidden = false;
+      where.scrollIntoView({ block: "nearest" });
     }
   }
 
@@ -780,7 +790,11 @@
     const sends = (id, path, after) => byId(id) && byId(id).addEventListener("submit", (event) => {
       event.preventDefault();
       const form = event.target;
-      saying(said, async () => { after(await call("POST", path, given(form))); form.reset(); });
+      submits(form, said, async () => {
+        const sent = given(form);
+        after(await call("POST", path, sent));
+        if (JSON.stringify(given(form)) === JSON.stringify(sent)) form.reset();       // else the next one is being typed
+      });
     });
     const rows = (where, path, found) => show(byId(where), ...found.map((one) => el("tr", {}, el("th", { scope: "row" }, one.name), el("td", {}, word(one.role, "role")), el("td", {}, when(one.since)),
       el("td", {}, el("button", { type: "button", class: "quiet", "aria-label": tr("Remove {name}", { name: one.name }), onclick: () => confirm(tr("Remove {name}?", { name: one.name })) && saying(said, async () => fill(await call("POST", `/${path}/${encodeURIComponent(one.name)}/remove`, {}))) }, tr("Remove"))))));
@@ -803,7 +817,7 @@
   });
 
   const pages = { error: errorPage, login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, csrf, el, every, fillsFirst, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, zone };
+  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, colour, csrf, el, every, fillsFirst, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);

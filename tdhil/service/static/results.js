@@ -2,7 +2,7 @@
 "use strict";
 (() => {
   const { coded, english, errorText, fixed, local, point, precise, tr, word } = window.tdhilLanguage;
-  const { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, may, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, uploaded, waiting, when, zone } = window.tdhil;
+  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, markWrong, may, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, zone } = window.tdhil;
 
   // -- one run
 
@@ -31,7 +31,8 @@
       J ? el("p", { class: "figure large" }, `J = ${ofResult(result)}`) : null,
       el("p", { class: `verdict ${VERDICTS[result.verdict] || ""}` }, word(result.verdict, "verdict")),
       region(tr("Numbers"), el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))),
-      el("p", {}, ...coded(result.code, sentence(result.reason || ""))), result.advice ? el("p", {}, english(sentence(result.advice))) : null);
+      el("p", {}, ...coded(result.code, sentence(result.reason || ""))), result.advice ? el("p", {}, english(sentence(result.advice))) : null,
+      run.rig && may("operator") && /tdhil calibrate torque/.test(result.advice || "") ? el("p", {}, el("a", { href: `/calibrate/${encodeURIComponent(run.rig)}` }, tr("Calibrate the torque of this rig"))) : null);
     parts.push(card);
     const codes = result.warning_codes || [], wanted = run.state === "stopped" && run.stop.asked;
     (result.warnings || []).forEach((one, k) => parts.push(el("p", { class: wanted && codes[k] === ENDED_EARLY ? "dim" : "alarm" }, ...coded(codes[k], sentence(one)))));
@@ -103,7 +104,7 @@
     every(1500, async () => {
       const run = await call("GET", `/runs/${id}`);
       outdated = run.outdated;
-      if (files !== null && files !== kept(run)) location.reload();
+      if (files !== null && files !== kept(run)) again();
       if (files === null && run.files.includes("report.html")) await pictures(id, run.result);
       files = kept(run);
       const now = JSON.stringify(run);
@@ -119,6 +120,15 @@
         el("td", {}, ofResult(one.result) || "–"),
         el("td", {}, one.result && one.result.inertia_kg_m2 ? percent(one.result.inertia_kg_m2.half_width_total_rel) : ""))));
     });
+    let typed = false;
+    byId("main").addEventListener("input", () => { typed = true; });
+    /** Show the new content of this page: at once, or on request if the page has a text that is not saved. */
+    function again() {
+      if (!typed) return location.reload();
+      show(byId("newer"), `${tr("This page has new content. Save your text first, then show it.")} `, el("button", { type: "button", class: "quiet", onclick: () => location.reload() }, tr("Show it")));
+      byId("newer").hidden = false;
+      return undefined;
+    }
     const clocks = new Map();
     /** The cell of a replay that goes on: since when, and its usual time. It stays the same element. */
     function waits(one) {
@@ -160,18 +170,14 @@
       });
     }
     const replay = byId("replay");
-    replay.addEventListener("submit", async (event) => {
+    replay.addEventListener("submit", (event) => {
       event.preventDefault();
       const said = byId("replay-said");
-      said.hidden = true;
-      try {
+      said.className = "alarm";
+      submits(replay, said, async () => {
         const found = await call("POST", `/runs/${id}/replays`, asked(replay));
         if (found.state === "done") { said.textContent = tr("Replay {number} below has these settings.", { number: Number(found.name) }); said.className = "dim"; said.hidden = false; }
-      } catch (error) {
-        said.textContent = error.message;
-        said.className = "alarm";
-        said.hidden = false;
-      }
+      });
     });
     annotations(id);
     signature(id);
@@ -202,6 +208,7 @@
       submits(form, said, async () => {
         await call("POST", `/runs/${id}/acceptance`, { name: form.elements.name.value, remark: form.elements.remark.value, verdict: where.dataset.verdict, log_sha256: found.log_sha256 });
         location.reload();
+        return LEAVES;
       });
     });
     try {
@@ -244,6 +251,7 @@
         const texts = Object.fromEntries([...form.elements].filter((one) => one.name).map((one) => [one.name, one.value]));
         await call("POST", `/runs/${id}/annotations`, { ...texts, tags: texts.tags.split(",") });
         location.reload();
+        return LEAVES;
       });
     });
     if (archive) archive.addEventListener("submit", (event) => {
@@ -251,6 +259,7 @@
       submits(archive, byId("archive-said"), async () => {
         await call("POST", `/runs/${id}/archive`, { archived: archive.dataset.archived !== "yes" });
         location.reload();
+        return LEAVES;
       });
     });
     if (!remove) return;
@@ -263,6 +272,7 @@
       submits(remove, byId("delete-said"), async () => {
         await call("POST", `/runs/${id}/delete`, { confirm: typed.value });
         location.replace("/runs");
+        return LEAVES;
       });
     });
   }
@@ -472,6 +482,9 @@
     async function begin(fault, value, button) {
       const moment = fault.from_start ? "" : `@${form.elements.stage.value}${seconds("after") ? `+${seconds("after")}s` : ""}`;
       const text = `${fault.name}${moment}${value ? `=${value}` : ""}${!fault.from_start && seconds("duration") ? `/${seconds("duration")}s` : ""}`;
+      unmark(form);
+      const wrong = ["after", "duration"].filter((name) => !/^\d*\.?\d*$/.test(seconds(name)));
+      if (wrong.length) { markWrong(form, wrong.map((option) => ({ option, message: tr("Give a number of seconds, such as 2.5.") }))); return; }
       button.disabled = true;
       if (!await paced()) { button.disabled = false; return; }
       try {
