@@ -347,6 +347,27 @@ def test_a_record_is_saved_once_by_a_double_click(page, served):
 
 
 @pytest.mark.heavy
+def test_samples_that_are_made_first_show_their_progress(page, served, monkeypatch):
+    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    folder, goes_on = served.service.store.place(run), threading.Event()
+    (folder / "run.mcap").write_bytes(b"log")
+
+    def slow(what, of, asked):
+        goes_on.wait(30.0)
+        (folder / "samples.csv").write_text("time_s\n")
+        return {"document": {"file": "samples.csv"}}
+
+    monkeypatch.setattr(served.service.supervisor, "work", slow)
+    page.goto(f"/runs/{run}")
+    page.get_by_role("link", name="samples.csv").click()
+    page.get_by_text(re.compile(r"^The file is made: \d+ s$")).wait_for()
+    with page.expect_download() as got:
+        goes_on.set()
+    assert Path(got.value.path()).read_text() == "time_s\n"
+
+
+@pytest.mark.heavy
 def test_a_wrong_time_of_a_rehearsal_starts_no_run(page, served):
     page.goto("/rehearse/a")
     page.get_by_label("Delay after the start").fill("two")

@@ -99,7 +99,7 @@
 
   function runPage() {
     const id = document.body.dataset.run;
-    const kept = (run) => run.state + run.files.filter((one) => one !== "report.pdf").join();    // content on which the page depends
+    const kept = (run) => run.state + run.files.filter((one) => !["report.pdf", "samples.csv"].includes(one)).join();    // content on which the page depends
     let shown = "", files = null, outdated = (document.body.dataset.outdated || "").split(" ");
     every(1500, async () => {
       const run = await call("GET", `/runs/${id}`);
@@ -139,10 +139,10 @@
       }
       return clocks.get(one.name);
     }
-    for (const link of document.querySelectorAll(".files a[href$='report.pdf'], .files a[href$='report.html']")) report(link);
+    for (const link of document.querySelectorAll(".files a[href$='report.pdf'], .files a[href$='report.html'], .files a[href$='samples.csv']")) report(link);
     /** A report that is made first, or made again after a signature, an edit or a new letterhead: the page shows this. */
     function report(link) {
-      const name = link.href.slice(link.href.lastIndexOf("/") + 1), inPage = name === "report.html";
+      const name = link.href.slice(link.href.lastIndexOf("/") + 1), inPage = name === "report.html", samples = name === "samples.csv";
       const note = el("div", { class: "making" });
       let busy = false;
       link.addEventListener("click", async (event) => {
@@ -152,10 +152,11 @@
         if (busy) return;
         busy = true;
         link.closest("li").append(note);
-        const over = waiting(note, inPage ? tr("The page is made again") : again ? tr("The PDF is made again") : tr("The PDF is made"), inPage ? "page" : "pdf");
+        const over = waiting(note, samples ? tr("The file is made") : inPage ? tr("The page is made again") : again ? tr("The PDF is made again") : tr("The PDF is made"), samples ? "samples" : inPage ? "page" : "pdf");
         try {
           const answer = await fetch(link.href);
           if (!answer.ok) throw new Refused(errorText((await answer.json()).error));
+          if (samples) answer.body.cancel();             // the browser downloads it
           over(true);
           link.dataset.ready = "";
           outdated = outdated.filter((one) => one !== name);
