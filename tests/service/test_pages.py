@@ -498,6 +498,9 @@ def test_an_acceptance_shows_expected_beside_identified_and_what_is_off(page, se
         assert row.locator("td").last.inner_text() == verdict
     assert page.get_by_text("104 ± 10.4 kg·m²").count() == page.get_by_text("0.4 ± 0.05 s").count() == 1
     page.get_by_text("An interval overlaps the edge of its tolerance.").wait_for()
+    page.set_viewport_size({"width": 390, "height": 800})
+    table = page.get_by_role("region", name="Acceptance")
+    assert table.evaluate("one => one.scrollWidth <= one.clientWidth")             # a phone shows the verdict too
 
 
 def test_on_a_phone_the_list_of_runs_shows_j_and_verdict(page, served):
