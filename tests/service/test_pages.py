@@ -935,7 +935,11 @@ def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, serv
 @pytest.mark.heavy
 def test_the_enter_key_does_not_send_a_new_rig_before_its_page_is_ready(page):
     held = []
-    page.route("**/api/v1/new-rig", held.append)
+
+    def hold(route):
+        held.append(route)
+
+    page.route("**/api/v1/new-rig", hold)
     page.goto("/new-rig")
     wait_for("the question", lambda: page.wait_for_timeout(20) or held)
     page.get_by_label("Name in reports").fill("Bench 3")
