@@ -93,8 +93,9 @@ def bit_rate_problem(bit_s: int) -> str:
 class CanSection(DataModel):
     """python-can's own options. Missing ones come from its environment variables and files."""
 
-    interface: str | None = Field(default=None, min_length=1, description="as for -i: socketcan, pcan, slcan …")
-    channel: str | int | None = Field(default=None, description="as for -c: can0, PCAN_USBBUS1 …")
+    interface: str | None = Field(default=None, min_length=1,
+                                  description="type of the CAN adapter, such as socketcan, pcan or slcan")
+    channel: str | int | None = Field(default=None, description="channel of the adapter, such as can0 or PCAN_USBBUS1")
     bitrate: int | None = Field(default=None, gt=0, description="bit/s; for socketcan the bit rate of the link")
     options: dict[str, str | int | float | bool] = Field(default={}, description="further options of the interface")
 

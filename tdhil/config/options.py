@@ -504,6 +504,8 @@ class RunDetails(_Said):
     )
     expect: tuple[str, ...] = option(
         "--expect", group=Topic.RESULT, default=(), metavar="NAME=VALUE±TOL", api=True,
+        form=Form("Expected values of an acceptance", ("run",), wide=True,
+                  hint="inertia=104 kg·m² ± 5 %, speed-lag=400 ms ± 50 ms"),
         help="accept the result only if it agrees with this value, such as 'inertia=104±5%'; names as in `acceptance:` "
              "of rig.yaml",
     )

@@ -16,6 +16,7 @@ from tdhil.service.middleware import off
 from tdhil.service.routing import api
 from tdhil.service.run_state import NotLoggedIn, TooManyTries, iso
 from tdhil.service.schemas import AccountsView, AccountView, MeView, TokenView, plain
+from tdhil.service.start_request import ValuesWrong
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -98,19 +99,28 @@ async def password(site: Site, request: Request, body: Any) -> MeView:
     try:
         await _slowly(site, request, who.name, body.old)
     except NotLoggedIn:
-        raise UsageError("the old password is wrong", where="old", entry=MessageCode.ACCOUNT_WRONG) from None
+        raise ValuesWrong([("old", "the old password is wrong")]) from None
     await _account(site, request, lambda: site.access.accounts.set_password(who.name, body.new), "password set",
-                   who.name)
+                   who.name, "new")
     return _me_view(site, site.access.who(request))
 
 
-async def _account(site: Site, request: Request, change: Callable[[], T], what: str, name: str) -> T:
-    """Change an account, one at a time, and note it in the audit. Raises UsageError."""
+async def _account(site: Site, request: Request, change: Callable[[], T], what: str, name: str,
+                   password: str = "password") -> T:
+    """Change an account, one at a time, and note it in the audit. Raises UsageError; ValuesWrong for a name or a
+    password that is refused. ``password``: field of the password.
+    """
     if not site.access.login:
         raise UsageError("the first user is added on the terminal", where="accounts",
                          next_step="tdhil serve users add NAME --role admin; then start with a certificate",
                          entry=MessageCode.ACCOUNT_WRONG)
-    found: T = await anyio.to_thread.run_sync(change, limiter=site.logins)
+    try:
+        found: T = await anyio.to_thread.run_sync(change, limiter=site.logins)
+    except UsageError as error:
+        field = {"name": "name", "password": password}.get(error.where.partition(" ")[0])
+        if field is None:
+            raise
+        raise ValuesWrong([(field, error.what + (f". {error.next_step}" if error.next_step else ""))]) from None
     site.supervisor.note(principal(request).name, what, None, None, name=name)
     return found
 

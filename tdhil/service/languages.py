@@ -54,8 +54,8 @@ class Language:
                                  escape(self.word(text))))
 
     def number(self, value: float) -> str:
-        """Return a number of a page, six digits at most."""
-        return f"{value:g}".replace(".", self.decimal)
+        """Return a number of a page. Below 1000 it has four digits at most."""
+        return f"{float(f'{value:.4g}') if abs(value) < 1000.0 else value:g}".replace(".", self.decimal)
 
     def script(self) -> str:
         """Return the texts, and the titles of the message codes, as a script for the pages. It contains only ASCII."""

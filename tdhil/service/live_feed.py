@@ -124,10 +124,13 @@ class Feed:
 
     def watch(self) -> Viewer:
         queue: Viewer = asyncio.Queue(WAITING)
+        rests = self._task is None or self._task.done()
+        if rests:                      # the last viewer has left: what is known of the run is old
+            self.status = None
         status = None if self.status is None else self.status.plain()
         queue.put_nowait(self._dated({"type": "hello", **self.picture.whole(), "status": status}))
         self.viewers.add(queue)
-        if self._task is None or self._task.done():
+        if rests:
             self._task = asyncio.get_running_loop().create_task(self._run())
         return queue
 
@@ -136,6 +139,9 @@ class Feed:
 
     async def _run(self) -> None:
         sent_s = 0.0
+        self.status = await anyio.to_thread.run_sync(self._present)       # first: reading the log takes longer
+        if self.status is not None:
+            self._publish(self._dated({"type": "news", "status": self.status.plain()}))
         while self.viewers:
             news, status = await anyio.to_thread.run_sync(self._look)
             shown = self.picture.take(news, time.monotonic())
@@ -148,11 +154,14 @@ class Feed:
                 self._publish(self._dated({"type": "news", **shown}))
             await asyncio.sleep(0.0 if news.more else EVERY_S)
 
-    def _look(self) -> tuple[LogNews, Status | None]:
+    def _present(self) -> Status | None:
         try:
-            status = self._read_status()
+            return self._read_status()
         except Exception:              # the run is being written or deleted: the next check decides
-            status = None
+            return None
+
+    def _look(self) -> tuple[LogNews, Status | None]:
+        status = self._present()
         if status is not None and status.state is State.MOVING and not self._viewed:
             with suppress(TdhilError):
                 self._tell_viewed()

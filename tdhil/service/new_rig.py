@@ -28,7 +28,7 @@ from tdhil.service.schemas import (
     ProfileView,
     ScanView,
 )
-from tdhil.service.start_request import NEW_RIG_MOTIONS
+from tdhil.service.start_request import NEW_RIG_MOTIONS, ValuesWrong
 from tdhil.session import LIMIT_KEYS, STRING_KEYS, RigEntries, blank_rig, by_hand, doubtful
 
 SCAN_LIMIT_S: Final = 120.0
@@ -58,7 +58,7 @@ def _address_fields(bus: str) -> list[FieldView]:
         FieldView(name, field.description or "") for name, field in model.model_fields.items()
         if field.default is None]
     beside = _beside(bus)
-    return fields + [FieldView(name, f"number of the drive: {known.address_word}") for name in beside]
+    return fields + [FieldView(name, "number of the drive on the bus") for name in beside]
 
 
 def _machine_fields() -> list[FieldView]:
@@ -118,7 +118,8 @@ def _missing(profile: Profile, body: DraftBody, known: RigEntries) -> list[Draft
     """Return the entries that a real drive needs and the draft does not have."""
     found = [] if known.name else [DraftProblemView("name", "The rig needs its own name, such as bench 3.")]
     if not known.address:
-        found.append(DraftProblemView("address", "Without an address the embedded simulator runs. Type the drive's."))
+        found.append(DraftProblemView("address", "Type the address of the drive. Without one,"
+                                                 " the embedded simulator runs."))
     found += [DraftProblemView(f"limits.{name}", "A real drive does not move without it.") for name in LIMIT_KEYS
               if name not in known.limits]
     if body.load == "string":
@@ -154,7 +155,7 @@ def scan_for(body: DraftBody) -> ScanView:
     profile = _profile(body.profile)
     address = _given(body.address)
     if not address:
-        raise UsageError("name the interface or the line first", where="address", entry=MessageCode.BUS_NOT_CONFIGURED)
+        raise ValuesWrong([("address", "Type the address of the bus first.")])
     text = blank_rig(profile, profile.name, "none", RigEntries(address=address))
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / DRAFT
@@ -171,8 +172,10 @@ def scan_for(body: DraftBody) -> ScanView:
     except ValueError:
         document = {}
     if done.returncode != 0 or "found" not in document:
-        said = str((document.get("error") or {}).get("message") or " ".join(done.stderr.split())[-400:] or "no reply")
-        raise CommunicationLost(said, where="scan", next_step="Check the drive's supply, the wiring and the address")
+        if said := str((document.get("error") or {}).get("message") or " ".join(done.stderr.split())[-400:]):
+            raise CommunicationLost(said)            # with its own next step
+        raise CommunicationLost("no reply", where="scan",
+                                next_step="Check the drive's supply, the wiring and the address")
     return ScanView([
         FoundDriveView(one["address"], one["title"], one["identity"], one["simulated"], one["profile"], one["why"],
                        {**{name: str(value) for name, value in one["line"].items()},

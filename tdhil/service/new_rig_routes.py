@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from tdhil.errors import MessageCode, UsageError
 from tdhil.service.access import principal
 from tdhil.service.middleware import off
 from tdhil.service.new_rig import draft_of, new_rig_view
 from tdhil.service.routing import api
 from tdhil.service.run_state import Conflict
 from tdhil.service.schemas import DraftBody, DraftView, NewRigBody, NewRigView, RigView, ScanView, adapter
+from tdhil.service.start_request import ValuesWrong
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -38,8 +38,7 @@ async def draft_rig(site: Site, request: Request, body: DraftBody) -> DraftView:
 async def scan_bus(site: Site, request: Request, body: DraftBody) -> ScanView:
     """Scan for drives. Raises Conflict while a real shaft turns, and UsageError if the bus may have another master."""
     if not body.alone:
-        raise UsageError("a scan requests data from every node: confirm that no other master is active on the bus",
-                         where="alone", entry=MessageCode.REQUEST_WRONG)
+        raise ValuesWrong([("alone", "A scan requests data from every node. Confirm that no other master is active.")])
     if site.supervisor.turning():
         raise Conflict("a real shaft turns, and a scan could disturb its bus", where="scan",
                        next_step="Scan when that run has ended")

@@ -115,7 +115,8 @@ class Pages:
                 known["run"] = await off(lambda: site.run_view(request.path_params["run"]))
             if "fleet" in request.path_params:
                 known["fleet"] = await off(lambda: site.fleets.get(request.path_params["fleet"]))
-            if template == "rigs.html":
+            if template in ("rigs.html", "new_rig.html"):
+                known["folder"] = site.supervisor.rigs.folder is not None
                 known["built_in"] = await off(lambda: site.supervisor.rigs.built_in)
             if here == "docs":
                 known["api"] = await off(api_page)

@@ -274,7 +274,7 @@ def read_rig(path: Path) -> RigFile:
 
 EDITABLE: Final = frozenset({
     "name", "limits", "gear", "load", "make_up_torque_nm", "torque_ramp_nm_s", "drive_data", "expected",
-    "reference_inertia_kg_m2", "accept_unverified", "rate_hz",
+    "reference_inertia_kg_m2", "accept_unverified", "rate_hz", "acceptance",
 })
 """Keys of a rig's file that HTTP may change. The drive's address and type, and the rules of motion, are no part."""
 

@@ -48,6 +48,7 @@ from tdhil.service.start_request import (
     RIG_ID,
     RigFile,
     Rigs,
+    ValuesWrong,
     edited,
     is_as_it_was,
     options_of,
@@ -451,8 +452,7 @@ class Supervisor:
             raise UsageError("this service has no folder of rigs", where=f"rig {rig_id[:64]}",
                              next_step="Start it with tdhil serve --rigs DIR", entry=MessageCode.SERVICE_OPTION_WRONG)
         if not RIG_ID.fullmatch(rig_id):
-            raise UsageError("must be letters, digits, _, . and -, and begin with a letter or digit", where="id",
-                             entry=MessageCode.REQUEST_WRONG)
+            raise ValuesWrong([("id", "must be letters, digits, _, . and -, and begin with a letter or digit")])
         path = folder / f"{rig_id}.yaml"
         require_new_rig(text, path.name)
         try:

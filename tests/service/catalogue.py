@@ -25,8 +25,8 @@ SCRIPTS = sorted(one for one in (SERVICE / "static").glob("*.js") if not one.nam
 TEMPLATES = sorted((SERVICE / "templates").glob("*.html"))
 ELSEWHERE = {"client.py", "console.py", "mail.py", "mqtt.py", "server.py", "webhook.py", "password_file.py", "audit.py"}
 """Modules of the service whose errors no page shows: they are of the terminal."""
-_ERRORS = re.compile(r"(Error|Refused|NotAllowed|Conflict|NotThere|NoRoom|TooLarge|TooSlow|NotLoggedIn|TooManyTries"
-                     r"|NotReacting)$")
+_ERRORS = re.compile(r"(Error|Refused|ValuesWrong|NotAllowed|Conflict|NotThere|NoRoom|TooLarge|TooSlow|NotLoggedIn"
+                     r"|TooManyTries|NotReacting)$")
 
 
 class Text(NamedTuple):
@@ -66,7 +66,9 @@ def of_errors() -> Iterator[Text]:
         for call in sorted(calls, key=lambda one: (one.lineno, one.col_offset)):
             if not _ERRORS.search(ast.unparse(call.func)):
                 continue
-            for node in (*call.args[:1], *(one.value for one in call.keywords if one.arg == "next_step")):
+            fields = (pair.elts[1] for one in call.args[:1] for pair in ast.walk(one)
+                      if isinstance(pair, ast.Tuple) and len(pair.elts) == 2)          # of ValuesWrong
+            for node in (*call.args[:1], *fields, *(one.value for one in call.keywords if one.arg == "next_step")):
                 for part in (node.body, node.orelse) if isinstance(node, ast.IfExp) else (node,):
                     text = _pattern(part)
                     if text and re.search(r"[a-z]{2,} \S", re.sub(r"\{\d\}", "", text)):

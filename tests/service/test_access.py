@@ -26,6 +26,7 @@ from tdhil.service.access import SESSION_S, STOPS_S, Access, RequestPace, Tries,
 from tdhil.service.accounts import ROLES, AccountsFile, matches, scrypt
 from tdhil.service.run_state import TooManyRuns, TooManyTries
 from tdhil.service.schemas import API
+from tdhil.service.start_request import edited
 from tdhil.session import hold
 from tests.service.conftest import Service, wait_for
 
@@ -467,6 +468,11 @@ def test_nobody_takes_away_the_watchdog_over_http(guarded):
 
 
 # -- a rig's file
+
+
+def test_expected_values_of_an_acceptance_are_edited_over_http():
+    before = "name: bench 3\nrun: {simulate: true}\n"
+    assert edited(before, before + "acceptance: {inertia: 104 kg·m² ± 5 %}\n", "a.yaml") == ("acceptance",)
 
 
 @pytest.mark.heavy

@@ -15,8 +15,8 @@ from starlette.websockets import WebSocketDisconnect
 
 from drivers import CommunicationLost
 from tdhil.recording import LiveInertia, LogNews
-from tdhil.service.live_feed import MOST, SPACING_S, Feed, LivePicture
-from tdhil.service.run_state import State
+from tdhil.service.live_feed import EVERY_S, MOST, SPACING_S, Feed, LivePicture
+from tdhil.service.run_state import Entered, State, Status
 from tdhil.service.schemas import API
 from tests.recording.test_log_tail import write
 from tests.service.conftest import URL
@@ -85,6 +85,27 @@ def test_a_moving_run_is_told_once_that_a_page_shows_it(tmp_path):
     for _ in range(4):
         feed._look()
     assert told == ["moving", "moving"]
+
+
+def test_a_viewer_that_comes_back_is_sent_no_old_state(tmp_path):
+    """The page of an ended run took the state "moving" for the present, and left for the result."""
+    states = [State.MOVING]
+    feed = Feed(tmp_path / "run.mcap", lambda: Status("1", "a", (Entered(states[-1], ""),)))
+
+    async def watched():
+        queue = feed.watch()
+        first = queue.get_nowait()["status"]
+        news = await queue.get()
+        feed.leave(queue)
+        await asyncio.sleep(2.0 * EVERY_S)
+        return first, news["status"]["state"]
+
+    async def twice():
+        found = [await watched()]
+        states.append(State.DONE)
+        return [*found, await watched()]
+
+    assert asyncio.run(twice()) == [(None, "moving"), (None, "done")]
 
 
 def test_a_viewer_gets_all_of_it_from_the_start(service):

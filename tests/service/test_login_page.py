@@ -139,7 +139,8 @@ def test_an_admin_s_accounts(page, served):
     form.get_by_label("Name").fill(HOSTILE)
     form.get_by_label("First password").fill(PASSWORD)
     form.get_by_role("button").click()
-    page.get_by_text("must be 1 to 32").wait_for()
+    form.locator("label", has=page.locator("[name=name]")).get_by_text("must be 1 to 32").wait_for()
+    assert form.get_by_label("Name").get_attribute("aria-invalid") == "true"
     form.get_by_label("Name").fill("anna")
     form.get_by_label("First password").fill(PASSWORD)
     form.get_by_role("button").click()

@@ -10,13 +10,14 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from starlette.testclient import TestClient
 
 from profiles import load_profile, profile_names
 from tdhil.config import parse_rig
 from tdhil.service import new_rig
 from tdhil.service.new_rig import draft_of, new_rig_view
 from tdhil.service.schemas import DraftBody
-from tests.service.conftest import Service, wait_for
+from tests.service.conftest import URL, Service, wait_for
 
 LIMITS = {"speed_min_rad_s": "5 rpm", "speed_max_rad_s": "95 rpm", "torque_nm": "400", "time_s": "15 min",
           "quick_stop_rad_s2": "2", "probe_torque_nm": "200", "probe_travel_rad": "3"}
@@ -143,6 +144,9 @@ def test_without_a_folder_of_rigs_the_way_out_is_named(tmp_path):
     found = Service(tmp_path / "data", None)
     with pytest.raises(Exception, match="--rigs DIR"):
         found.supervisor.add_rig("new", "name: x\n", "anna")
+    with TestClient(found.web.asgi, base_url=URL) as client:
+        assert "/new-rig" not in (first := client.get("/").text) and "tdhil serve --rigs rigs" in first
+        assert "<form" not in (page := client.get("/new-rig").text) and "tdhil serve --rigs rigs" in page
     found.supervisor.close()
 
 
@@ -187,5 +191,5 @@ def test_a_scan_without_a_reply_says_why(monkeypatch, reply):
         return reply
 
     monkeypatch.setattr(new_rig.subprocess, "run", run)
-    with pytest.raises(Exception, match=r"no drive answers|did not end within"):
+    with pytest.raises(Exception, match=r"^(no drive answers|scan: the scan did not end within.*)$"):
         new_rig.scan_for(DraftBody("generic/cia402", address=ADDRESS["canopen"]))

@@ -210,7 +210,7 @@
     return el("article", { class: "card", "aria-labelledby": `rig-${rig.id}` },
       el("h2", { id: `rig-${rig.id}` }, rig.name, " ", badge(rig.simulated) || ""),
       el("p", { class: rig.state === "blocked" || rig.state === "unusable" ? "alarm" : "dim" }, said),
-      rig.last ? el("p", {}, el("span", { class: "figure" }, `J = ${inertia(rig.last)}`), el("br"), el("a", { href: `/runs/${rig.last.id}` }, when(rig.last.asked))) : el("p", { class: "dim" }, tr("no result yet")),
+      rig.last ? el("p", {}, el("span", { class: "figure" }, `J = ${inertia(rig.last)}`), " ", (!rig.simulated && badge(rig.last.simulated)) || "", el("br"), el("a", { href: `/runs/${rig.last.id}` }, when(rig.last.asked)), rig.last.state === "done" ? "" : ` · ${STATES[rig.last.state] || rig.last.state}`) : el("p", { class: "dim" }, tr("no result yet")),
       el("p", { class: "row" },
         mayStart ? el("a", { class: "button", href: `/start/${encodeURIComponent(rig.id)}` }, tr("Start")) : null,
         rig.run ? el("a", { class: "button", href: `/runs/${rig.run}/live` }, tr("Live")) : null,
@@ -257,6 +257,7 @@
         if (field.checked) found[field.name] = true;
       } else if (text) {
         found[field.name] = unit ? quantity(text, unit) : kind === "tuple" ? text.split(/[\s,]+/)
+          : kind === "pairs" ? text.split(/[\s,;]+(?=[\w-]+\s*=)/).map((one) => one.replaceAll(/(\d),(?=\d)/g, "$1."))
           : kind === "int" && /^-?\d+$/.test(text) ? Number(text) : kind === "float" ? point(text) : text;
       }
     }
@@ -281,8 +282,12 @@
     form.querySelectorAll("[aria-invalid]").forEach((one) => { one.removeAttribute("aria-invalid"); one.removeAttribute("aria-describedby"); });
     form.querySelectorAll(".wrong").forEach((one) => one.remove());
   }
-  /** Send a form. A refusal is shown at its fields, or in the text `said` if it names none of them. */
+  const LEAVES = new Promise(() => {});       // what a form waits for whose page is loaded again
+  const sending = new Set();
+  /** Send a form, once for a double click. A refusal is shown at its fields, or in the text `said` if it names none of them. */
   async function submits(form, said, send) {
+    if (sending.has(form)) return;
+    sending.add(form);
     unmark(form);
     said.hidden = true;
     try {
@@ -291,6 +296,9 @@
       if (error.fields && markWrong(form, error.fields)) return;
       said.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve.");
       said.hidden = false;
+      said.scrollIntoView({ block: "nearest" });
+    } finally {
+      sending.delete(form);
     }
   }
 
@@ -357,6 +365,7 @@
     };
   }
 
+  const PLAN_MS = 300000;      // a narrow tolerance on a computer under load
   function startPage() {
     const rig = document.body.dataset.rig;
     const form = byId("ask");
@@ -384,6 +393,7 @@
       const why = { busy: tr("A run uses this rig."), held: tr("Held by {holder}.", { holder: found.holder }), blocked: tr("Blocked until a stop that was not confirmed is signed off.") }[found.state];
       byId("rig-state").textContent = why || "";
     });
+    form.addEventListener("input", () => { byId("plan").hidden = true; });
     form.addEventListener("submit", async (event) => {
       event.preventDefault();
       const wanted = event.submitter && event.submitter.value === "plan" ? "plan" : "start";
@@ -396,9 +406,9 @@
       let planned = false;
       try {
         if (wanted === "plan") {
-          const found = await call("POST", `/rigs/${encodeURIComponent(rig)}/plan`, options, {}, 60000);
+          const found = await call("POST", `/rigs/${encodeURIComponent(rig)}/plan`, options, {}, PLAN_MS);
           show(byId("plan").lastElementChild, ...planTable(found.plan));
-          byId("plan").hidden = false;
+          byId("plan").hidden = JSON.stringify(asked(form)) !== JSON.stringify(options);      // changed meanwhile
           planned = true;
           show(byId("said"));
         } else if (!await paced()) {
@@ -711,7 +721,7 @@
       const real = age === null ? null : age + (now - message) / 1000;
       const old = silent || (running && ["moving", "stopping"].includes(status.state) && real !== null && real > SILENT_MS / 1000);
       document.body.classList.toggle("stale", Boolean(old && (running || silent)));
-      if (silent && message) away(watched ? tr("No connection to tdhil serve: the values are old. The run stops, because it is not watched. The hard-wired stop works.") : tr("No connection to tdhil serve: the values are old. The run continues under its guard. The hard-wired stop works."));
+      if (silent && message) away(status && ENDED.includes(status.state) ? tr("No answer from tdhil serve.") : watched ? tr("No connection to tdhil serve: the values are old. The run stops, because it is not watched. The hard-wired stop works.") : tr("No connection to tdhil serve: the values are old. The run continues under its guard. The hard-wired stop works."));
       else if (!silent) away("");
       byId("age").textContent = real === null ? "–" : running || silent ? (real < 10 ? `${fixed(real, 1)} s` : span(real)) : tr("ended");
       stopAlarm();
@@ -754,6 +764,7 @@
     } catch (error) {
       where.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve.");
       where.hidden = false;
+      where.scrollIntoView({ block: "nearest" });
     }
   }
 
@@ -788,7 +799,11 @@
     const sends = (id, path, after) => byId(id) && byId(id).addEventListener("submit", (event) => {
       event.preventDefault();
       const form = event.target;
-      saying(said, async () => { after(await call("POST", path, given(form))); form.reset(); });
+      submits(form, said, async () => {
+        const sent = given(form);
+        after(await call("POST", path, sent));
+        if (JSON.stringify(given(form)) === JSON.stringify(sent)) form.reset();       // else the next one is being typed
+      });
     });
     const rows = (where, path, found) => show(byId(where), ...found.map((one) => el("tr", {}, el("th", { scope: "row" }, one.name), el("td", {}, word(one.role, "role")), el("td", {}, when(one.since)),
       el("td", {}, el("button", { type: "button", class: "quiet", "aria-label": tr("Remove {name}", { name: one.name }), onclick: () => confirm(tr("Remove {name}?", { name: one.name })) && saying(said, async () => fill(await call("POST", `/${path}/${encodeURIComponent(one.name)}/remove`, {}))) }, tr("Remove"))))));
@@ -811,7 +826,7 @@
   });
 
   const pages = { error: errorPage, login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, csrf, el, every, fillsFirst, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, zone };
+  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, colour, csrf, el, every, fillsFirst, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);

@@ -4,6 +4,7 @@
   const { english, local, point, tr, word, worded } = window.tdhilLanguage;
   const { Refused, byId, call, el, markWrong, pages, show, unmark, waiting } = window.tdhil;
   const SCAN_MS = 130000;            // the service ends a scan after 120 s
+  const KEPT = "tdhil-new-rig";      // what was typed, until the rig is saved or the tab is closed
 
   /** Picture of the limits: the window in which speed and torque stay, and the torque of the first motion. */
   function windowPicture(limits) {
@@ -41,7 +42,17 @@
       if (!field("id").dataset.typed) field("id").value = field("name").value.trim().toLowerCase().replace(/[^a-z0-9_.]+/g, "-").replace(/^[^a-z0-9]+|-+$/g, "").slice(0, 64);
     });
     field("id").addEventListener("input", () => { field("id").dataset.typed = "by hand"; });
-    const { machine, profiles } = await call("GET", "/new-rig");
+    const buttons = [...form.querySelectorAll("button")];
+    buttons.forEach((one) => { one.disabled = true; });      // the Enter key would send the form before its script is ready
+    let loaded = null;
+    try {
+      loaded = await call("GET", "/new-rig");
+    } catch (error) {
+      said.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve.");
+      said.hidden = false;
+      return;
+    }
+    const { machine, profiles } = loaded;
     const byName = new Map(profiles.map((one) => [one.name, one]));
     const input = (name, label) => el("label", { "data-field": name }, label, el("input", { name, autocomplete: "off", autocapitalize: "none", spellcheck: "false" }));
 
@@ -77,6 +88,25 @@
     field("profile").value = byName.has("generic/cia402") ? "generic/cia402" : profiles[0].name;
     profileChanged();
     loadChanged();
+
+    const fields = () => [...form.elements].filter((one) => one.name && !["BUTTON", "TEXTAREA"].includes(one.tagName));
+    const keyOf = (one) => (one.name === "accept" ? `accept:${one.value}` : one.name);
+    /** Put back what was typed before the page was loaded again. A field with a newer text keeps it. */
+    function putBack(kept) {
+      if (byName.has(kept.profile)) { field("profile").value = kept.profile; profileChanged(); }
+      for (const one of fields()) {
+        const was = kept[keyOf(one)];
+        if (one.type === "checkbox") one.checked ||= was === true;
+        else if (one.tagName === "SELECT" ? [...one.options].some((each) => each.value === was) : was && !one.value) one.value = was;
+      }
+      loadChanged();
+    }
+    try { putBack(JSON.parse(sessionStorage.getItem(KEPT)) || {}); } catch (error) { /* nothing was kept */ }
+    const keep = () => {
+      try { sessionStorage.setItem(KEPT, JSON.stringify(Object.fromEntries(fields().map((one) => [keyOf(one), one.type === "checkbox" ? one.checked : one.value])))); } catch (error) { /* then it is lost by a reload */ }
+    };
+    form.addEventListener("input", keep);
+    buttons.forEach((one) => { one.disabled = false; });
 
     function draft() {
       const found = { address: {}, limits: {}, string: {}, accept_unverified: [...form.querySelectorAll("[name=accept]:checked")].map((one) => one.value), alone: field("alone").checked };
@@ -116,7 +146,12 @@
       if (rest.length) { said.textContent = rest.join(" "); said.hidden = false; }
       return found;
     }
-    const refused = (error) => { said.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve."); said.hidden = false; };
+    const refused = (error) => {
+      const rest = error.fields && error.fields.length ? mark(error.fields.map((one) => ({ field: one.option, message: one.message }))) : null;
+      if (rest && !rest.length) return;
+      said.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve.");
+      said.hidden = false;
+    };
     form.addEventListener("submit", async (event) => {
       event.preventDefault();
       const save = event.submitter && event.submitter.value === "save";
@@ -124,6 +159,7 @@
         const found = await check();
         if (!save || found.problems.length) return;
         const made = await call("POST", "/rigs", { id: field("id").value.trim(), text: found.text });
+        try { sessionStorage.removeItem(KEPT); } catch (error) { /* nothing was kept */ }
         location.assign(made.motion === "never" ? "/" : `/start/${encodeURIComponent(made.id)}`);
       } catch (error) {
         refused(error);
@@ -142,8 +178,10 @@
         over();
         show(byId("scan-said"), ...found.map((one) => el("article", { class: "card" },
           el("p", {}, el("strong", {}, one.title || tr("a drive without a name")), ` · ${one.identity}${one.simulated ? ` · ${tr("SIMULATED")}` : ""}`),
+          el("p", {}, Object.entries(one.fields).map(([name, text]) => `${word(name.replaceAll("_", " "), "key")} ${text}`).join(", ")),
           el("p", { class: "dim" }, tr("profile {profile} ({why})", { profile: one.profile || tr("none"), why: one.why })),
-          el("button", { type: "button", class: "quiet", onclick: () => {
+          el("button", { type: "button", class: "quiet", onclick: (event) => {
+            if (!event.target.nextElementSibling) event.target.after(" ", el("span", { class: "dim", role: "status" }, tr("The fields above have its address.")));
             if (one.profile && byName.has(one.profile) && one.profile !== field("profile").value) {
               const typed = draft().address;
               field("profile").value = one.profile;
@@ -155,7 +193,9 @@
           found.length ? null : el("p", {}, tr("No drive replied.")), ...remarks.map((text) => el("p", { class: "dim" }, english(text))));
       } catch (error) {
         over();
-        show(byId("scan-said"), el("p", { class: "alarm" }, error instanceof Refused ? error.message : tr("No answer from tdhil serve.")));
+        show(byId("scan-said"));
+        refused(error);
+        if (!said.hidden) { show(byId("scan-said"), el("p", { class: "alarm" }, said.textContent)); said.hidden = true; }
       } finally {
         byId("scan").disabled = false;
       }

@@ -1,8 +1,8 @@
 // Results: one run, a comparison, a rig over time, many logs. As in app.js, data from elsewhere are inserted as text.
 "use strict";
 (() => {
-  const { coded, english, errorText, fixed, point, precise, tr, word } = window.tdhilLanguage;
-  const { API, ENDED, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, may, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, uploaded, waiting, when, zone } = window.tdhil;
+  const { coded, english, errorText, fixed, local, point, precise, tr, word } = window.tdhilLanguage;
+  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, markWrong, may, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, zone } = window.tdhil;
 
   // -- one run
 
@@ -31,7 +31,8 @@
       J ? el("p", { class: "figure large" }, `J = ${ofResult(result)}`) : null,
       el("p", { class: `verdict ${VERDICTS[result.verdict] || ""}` }, word(result.verdict, "verdict")),
       region(tr("Numbers"), el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))),
-      el("p", {}, ...coded(result.code, sentence(result.reason || ""))), result.advice ? el("p", {}, english(sentence(result.advice))) : null);
+      el("p", {}, ...coded(result.code, sentence(result.reason || ""))), result.advice ? el("p", {}, english(sentence(result.advice))) : null,
+      run.rig && may("operator") && /tdhil calibrate torque/.test(result.advice || "") ? el("p", {}, el("a", { href: `/calibrate/${encodeURIComponent(run.rig)}` }, tr("Calibrate the torque of this rig"))) : null);
     parts.push(card);
     const codes = result.warning_codes || [], wanted = run.state === "stopped" && run.stop.asked;
     (result.warnings || []).forEach((one, k) => parts.push(el("p", { class: wanted && codes[k] === ENDED_EARLY ? "dim" : "alarm" }, ...coded(codes[k], sentence(one)))));
@@ -41,15 +42,17 @@
   function accepted(result) {
     const found = result && result.acceptance;
     if (!found) return [];
-    const colour = { pass: "good", fail: "bad" };
+    const colour = { pass: "good", fail: "bad" }, short = (value) => local(String(Number(value.toPrecision(5))));
+    const wide = found.quantities.some((one) => !["pass", "fail"].includes(one.verdict) && one.value !== null);
     return [el("section", { class: "card" }, el("h2", {}, tr("Acceptance")),
       el("p", { class: `verdict ${colour[found.verdict] || "fair"}` }, word(found.verdict, "verdict")),
       ...found.off.map((one) => el("p", { class: "alarm" }, ...coded(found.code, `${one} [${found.code}]`))),
       region(tr("Acceptance"), el("table", { class: "whole" }, el("thead", {}, el("tr", {}, ...[tr("quantity"), tr("expected"), tr("identified"), tr("verdict")].map((one) => el("th", { scope: "col" }, one)))),
         el("tbody", {}, ...found.quantities.map((one) => el("tr", {}, el("th", { scope: "row" }, word(one.label)),
-          el("td", {}, `${number(one.expected)} ± ${number(one.tolerance, 2)} ${one.unit}`),
+          el("td", {}, `${short(one.expected)} ± ${short(one.tolerance)} ${one.unit}`),
           el("td", {}, one.value === null ? tr("not identified") : `${of(one)} ${one.unit}`),
-          el("td", { class: `verdict ${colour[one.verdict] || "fair"}` }, word(one.verdict, "verdict")))))))) ];
+          el("td", { class: `verdict ${colour[one.verdict] || "fair"}` }, word(one.verdict, "verdict"))))))),
+      wide ? el("p", {}, tr("An interval overlaps the edge of its tolerance. Calibrate the torque, or measure for longer.")) : null)];
   }
   /** The verdict on rehearsed faults: required and seen. */
   function rehearsed(run) {
@@ -96,12 +99,12 @@
 
   function runPage() {
     const id = document.body.dataset.run;
-    const kept = (run) => run.state + run.files.filter((one) => one !== "report.pdf").join();    // content on which the page depends
+    const kept = (run) => run.state + run.files.filter((one) => !["report.pdf", "samples.csv"].includes(one)).join();    // content on which the page depends
     let shown = "", files = null, outdated = (document.body.dataset.outdated || "").split(" ");
     every(1500, async () => {
       const run = await call("GET", `/runs/${id}`);
       outdated = run.outdated;
-      if (files !== null && files !== kept(run)) location.reload();
+      if (files !== null && files !== kept(run)) again();
       if (files === null && run.files.includes("report.html")) await pictures(id, run.result);
       files = kept(run);
       const now = JSON.stringify(run);
@@ -117,6 +120,15 @@
         el("td", {}, ofResult(one.result) || "–"),
         el("td", {}, one.result && one.result.inertia_kg_m2 ? percent(one.result.inertia_kg_m2.half_width_total_rel) : ""))));
     });
+    let typed = false;
+    byId("main").addEventListener("input", () => { typed = true; });
+    /** Show the new content of this page: at once, or on request if the page has a text that is not saved. */
+    function again() {
+      if (!typed) return location.reload();
+      show(byId("newer"), `${tr("This page has new content. Save your text first, then show it.")} `, el("button", { type: "button", class: "quiet", onclick: () => location.reload() }, tr("Show it")));
+      byId("newer").hidden = false;
+      return undefined;
+    }
     const clocks = new Map();
     /** The cell of a replay that goes on: since when, and its usual time. It stays the same element. */
     function waits(one) {
@@ -127,10 +139,10 @@
       }
       return clocks.get(one.name);
     }
-    for (const link of document.querySelectorAll(".files a[href$='report.pdf'], .files a[href$='report.html']")) report(link);
+    for (const link of document.querySelectorAll(".files a[href$='report.pdf'], .files a[href$='report.html'], .files a[href$='samples.csv']")) report(link);
     /** A report that is made first, or made again after a signature, an edit or a new letterhead: the page shows this. */
     function report(link) {
-      const name = link.href.slice(link.href.lastIndexOf("/") + 1), inPage = name === "report.html";
+      const name = link.href.slice(link.href.lastIndexOf("/") + 1), inPage = name === "report.html", samples = name === "samples.csv";
       const note = el("div", { class: "making" });
       let busy = false;
       link.addEventListener("click", async (event) => {
@@ -140,10 +152,11 @@
         if (busy) return;
         busy = true;
         link.closest("li").append(note);
-        const over = waiting(note, inPage ? tr("The page is made again") : again ? tr("The PDF is made again") : tr("The PDF is made"), inPage ? "page" : "pdf");
+        const over = waiting(note, samples ? tr("The file is made") : inPage ? tr("The page is made again") : again ? tr("The PDF is made again") : tr("The PDF is made"), samples ? "samples" : inPage ? "page" : "pdf");
         try {
           const answer = await fetch(link.href);
           if (!answer.ok) throw new Refused(errorText((await answer.json()).error));
+          if (samples) answer.body.cancel();             // the browser downloads it
           over(true);
           link.dataset.ready = "";
           outdated = outdated.filter((one) => one !== name);
@@ -158,18 +171,14 @@
       });
     }
     const replay = byId("replay");
-    replay.addEventListener("submit", async (event) => {
+    replay.addEventListener("submit", (event) => {
       event.preventDefault();
       const said = byId("replay-said");
-      said.hidden = true;
-      try {
+      said.className = "alarm";
+      submits(replay, said, async () => {
         const found = await call("POST", `/runs/${id}/replays`, asked(replay));
         if (found.state === "done") { said.textContent = tr("Replay {number} below has these settings.", { number: Number(found.name) }); said.className = "dim"; said.hidden = false; }
-      } catch (error) {
-        said.textContent = error.message;
-        said.className = "alarm";
-        said.hidden = false;
-      }
+      });
     });
     annotations(id);
     signature(id);
@@ -200,6 +209,7 @@
       submits(form, said, async () => {
         await call("POST", `/runs/${id}/acceptance`, { name: form.elements.name.value, remark: form.elements.remark.value, verdict: where.dataset.verdict, log_sha256: found.log_sha256 });
         location.reload();
+        return LEAVES;
       });
     });
     try {
@@ -242,6 +252,7 @@
         const texts = Object.fromEntries([...form.elements].filter((one) => one.name).map((one) => [one.name, one.value]));
         await call("POST", `/runs/${id}/annotations`, { ...texts, tags: texts.tags.split(",") });
         location.reload();
+        return LEAVES;
       });
     });
     if (archive) archive.addEventListener("submit", (event) => {
@@ -249,6 +260,7 @@
       submits(archive, byId("archive-said"), async () => {
         await call("POST", `/runs/${id}/archive`, { archived: archive.dataset.archived !== "yes" });
         location.reload();
+        return LEAVES;
       });
     });
     if (!remove) return;
@@ -261,6 +273,7 @@
       submits(remove, byId("delete-said"), async () => {
         await call("POST", `/runs/${id}/delete`, { confirm: typed.value });
         location.replace("/runs");
+        return LEAVES;
       });
     });
   }
@@ -470,6 +483,9 @@
     async function begin(fault, value, button) {
       const moment = fault.from_start ? "" : `@${form.elements.stage.value}${seconds("after") ? `+${seconds("after")}s` : ""}`;
       const text = `${fault.name}${moment}${value ? `=${value}` : ""}${!fault.from_start && seconds("duration") ? `/${seconds("duration")}s` : ""}`;
+      unmark(form);
+      const wrong = ["after", "duration"].filter((name) => !/^\d*\.?\d*$/.test(seconds(name)));
+      if (wrong.length) { markWrong(form, wrong.map((option) => ({ option, message: tr("Give a number of seconds, such as 2.5.") }))); return; }
       button.disabled = true;
       if (!await paced()) { button.disabled = false; return; }
       try {
