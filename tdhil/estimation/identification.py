@@ -62,7 +62,7 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
 
 
 def _impedance(case: Case, finding: Finding, found: Identification) -> DriveImpedance | None:
-    """Measure the drive's impedance if the run asks for it; else None. A contradicted or unidentified run is refused."""
+    """Measure the drive's impedance if the run asks for it; else None. A run without J is refused."""
     asked = case.recording.impedance
     if asked is None:
         return None
