@@ -726,9 +726,9 @@ def test_a_process_that_cannot_be_started_on_a_full_disk_is_refused_in_words(cal
 
 
 @pytest.mark.parametrize(("path", "fields"), [
-    ("/start/a", {"tolerance", "max_time_s", "excitation", *STATED, "seed", "fault", "real_time",
+    ("/start/a", {"tolerance", "max_time_s", "excitation", "expect", *STATED, "seed", "fault", "real_time",
                   "simulated_torque_scale", "simulated_added_inertia_kg_m2"}),
-    ("/start/real", {"tolerance", "max_time_s", "excitation", *STATED, "accept_unverified",
+    ("/start/real", {"tolerance", "max_time_s", "excitation", "expect", *STATED, "accept_unverified",
                      "accept_speed_unit", "reset_fault"}),
     ("/rehearse/a", {"stage", "after", "duration", "real_time"}),
     ("/fleets", {"folder", "below", "archived", "tolerance", "model"}),
