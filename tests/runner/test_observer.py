@@ -585,6 +585,19 @@ def test_a_setpoint_that_steps_above_a_string_is_no_frozen_speed():
     assert bench.observer.doubt is None
 
 
+@pytest.mark.parametrize("step_rad_s", [0.8, -0.8])
+def test_a_torque_step_at_the_end_of_stage_2_is_no_load_of_a_string(step_rad_s):
+    """The speed shows it a lag later, and only points since then show the load."""
+    bench = Bench(replace(ABOVE_A_STRING, speed_lag_s=0.4, limits=replace(ABOVE_A_STRING.limits, torque_nm=800.0)))
+    bench.first_levels()
+    bench.know(0.4, 0.5)
+    bench.hold(0.04, 4.0 + step_rad_s)
+    bench.ramp(4.0, 1.0)
+    bench.ramp(4.0 - 2.0 * step_rad_s, 1.0)
+    bench.hold(2.0, 4.0 - 2.0 * step_rad_s)
+    assert bench.observer.doubt is None
+
+
 def test_a_shaft_that_is_told_to_yield_and_stands_is_not_believed():
     bench = Bench(ABOVE_A_STRING).begun()
     bench.ramp(0.0)
