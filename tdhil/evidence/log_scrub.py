@@ -47,7 +47,8 @@ _SHORTEST_NUMBER: Final = 4
 _SERIAL_OBJECT: Final = b"\x18\x10\x04"
 """Index 1018h, sub-index 4 (serial number) as SDO transfers have it (CiA 301, 7.2.4)."""
 _LSS: Final = (0x7E4, 0x7E5)
-"""Identifiers of the layer setting services: of the slave and of the master (CiA 305)."""
+"""Identifiers of the layer setting services: of the slave and of the master (CiA 305). Only CAN frames have such
+identifiers: those of Modbus are unit numbers, those of EtherCAT sync managers."""
 _LSS_SERIAL: Final = frozenset({0x43, 0x4A, 0x4B, 0x5D})
 """Commands of LSS with a serial number behind them: switch selective, lowest and highest of a search, inquiry."""
 _LSS_FASTSCAN, _SCANNED_SERIAL = 0x51, 3
@@ -63,7 +64,6 @@ class LogScrub:
 
     def __init__(self, run: Mapping[str, Any], words: Iterable[str] = (), *, rig_name: bool = False) -> None:
         self._rig_name = rig_name
-        self._canopen = run.get("drive") == "canopen"
         self._serials: dict[int, int] = {}
         bench = _part(run.get("bench"))
         self._kept_name = str(bench.get("name") or "") if rig_name else ""
@@ -145,7 +145,7 @@ class LogScrub:
         """Replace the serial number in a frame that carries object 1018h:4, or names it by LSS (CiA 305)."""
         at = data.find(_SERIAL_OBJECT)
         start = at + len(_SERIAL_OBJECT)
-        if self._canopen and identifier in _LSS and len(data) >= 5:
+        if identifier in _LSS and len(data) >= 5:
             if data[0] == _LSS_FASTSCAN and (len(data) < 7 or data[6] == _SCANNED_SERIAL):
                 return data[:1] + bytes(4) + data[5:]        # a part of the number, which is no number of a drive
             at, start = (0, 1) if data[0] in _LSS_SERIAL else (-1, 0)

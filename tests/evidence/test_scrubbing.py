@@ -145,12 +145,6 @@ def test_other_frames_stay(identifier, data):
     assert LogScrub(configuration()).frame(bytes.fromhex(data), identifier).hex() == data
 
 
-def test_lss_is_of_canopen_only():
-    data = bytes.fromhex("43d2029649000000")
-    assert LogScrub(configuration()).frame(data, 0x7E5).hex() == "4301000000000000"
-    assert LogScrub(configuration(drive="ethercat")).frame(data, 0x7E5) == data
-
-
 def test_scrubbing_again_changes_nothing(scrubbed):
     again = LogScrub(read_run(scrubbed[1]).configuration)
     assert all(again.message(channel, payload) == payload for channel, payload in messages_of(scrubbed[1]))
