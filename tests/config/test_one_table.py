@@ -55,7 +55,7 @@ rig.write_text("run: {dwell_s: 1500 ms}\\n")
 from tdhil.cli.main import build_parser
 parsed = build_parser("identify").parse_args(["identify", "--dwell", "2500ms"])
 templates = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(tdhil.__file__).parent / "service" / "templates"))
-templates.globals["form_options"] = form_options
+templates.globals.update(form_options=form_options, word=lambda text, context="": text, hint=lambda option: "")
 field = templates.from_string('{% from "option.html" import fields %}{{ fields(form_options("run")) }}').render()
 schemas = document()["paths"]["/api/v1/rigs/{rig}/runs"]["post"]["requestBody"]["content"]["application/json"]["schema"]
 print(json.dumps({
@@ -219,7 +219,9 @@ EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
                           {"accept_unverified", "accept_wider_limit", "accept_speed_unit"}),
     "service/new_rig.py": ("keys of a new rig.yaml; the command line of tdhil scan", {
         "accept_unverified", "--json"}),
-    "service/static/new_rig.js": ("keys of a new rig.yaml", {"accept_unverified", "profile", "string"}),
+    "evidence/log_scrub.py": ("keys of a configuration that stay in evidence", {"accept_unverified"}),
+    "service/static/new_rig.js": (
+        "keys of a new rig.yaml, and a value of its picture", {"accept_unverified", "profile", "string", "torque"}),
     "service/templates/new_rig.html": ("keys of a new rig.yaml", {"profile", "string"}),
     "service/start_request.py": ("a key of rig.yaml that may be edited", {"accept_unverified"}),
     "service/supervisor.py": ("the command line of tdhil stop", {"--json"}),
@@ -229,16 +231,16 @@ EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
     "studies/paper/figures.py": ("the paper's own motions", {"sine"}),
     "studies/paper/loop.py": ("the paper's own motions", {"multisine", "sine"}),
     "studies/paper/sweeps.py": ("the paper's own motions", {"sine"}),
-    "service/static/app.js": ("a role, signals of the plots, the key of a sign-off, the clock that a page measures", {
-        "note", "operator", "step", "speed", "torque", "real_time"}),
+    "service/static/app.js": (
+        "a role, signals of the plots, the key of a sign-off, the clock that a page measures, values in a text", {
+            "drive", "excitation", "mode", "note", "operator", "place", "step", "speed", "torque", "real_time"}),
     "service/static/results.js": (
-        "a rehearsal's request; keys of answers; a column of the friction table", {
-            "fault", "faults", "log", "model", "note", "real_time", "speed", "yes"}),
+        "a rehearsal's request; keys of answers; a role; a column of the friction table", {
+            "fault", "faults", "log", "model", "note", "operator", "real_time", "speed", "yes"}),
     "service/static/letterhead.js": ("the page and the route of the service's own letterhead", {"letterhead"}),
     "service/static/upload.js": (
         "quantities of a trace, a kind of file, a role, keys of a preview", {
             "drive", "log", "note", "operator", "profile", "rate", "speed", "torque", "trace"}),
-    "service/templates/accounts.html": ("a role", {"operator"}),
     "service/templates/run.html": ("what was seen, for a sign-off", {"note"}),
 }
 """File → (reason, names that may stand in it)."""
