@@ -1,7 +1,7 @@
 """One setting for every property test: the same examples at every run. TDHIL_FUZZ=1 looks for new ones instead.
 
 The README's command takes what is quick, so that it stays below four minutes. Heavy cases run in CI (--heavy: those
-alone), the longest with --long only, which the header of every run says. A commit's CI runs one of seven shares of the
+alone), the longest with --long only, which the header of every run says. A commit's CI runs one of nine shares of the
 heavy cases (--share), so that it ends in 20 minutes: decision 0061.
 What the markers mean: pyproject.toml.
 
