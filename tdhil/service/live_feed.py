@@ -125,7 +125,7 @@ class Feed:
     def watch(self) -> Viewer:
         queue: Viewer = asyncio.Queue(WAITING)
         rests = self._task is None or self._task.done()
-        if rests:                      # the last viewer has left: what is known of the run is old
+        if rests:                      # the last viewer has left, so the known status is old
             self.status = None
         status = None if self.status is None else self.status.plain()
         queue.put_nowait(self._dated({"type": "hello", **self.picture.whole(), "status": status}))

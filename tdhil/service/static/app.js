@@ -282,6 +282,14 @@
     form.querySelectorAll("[aria-invalid]").forEach((one) => { one.removeAttribute("aria-invalid"); one.removeAttribute("aria-describedby"); });
     form.querySelectorAll(".wrong").forEach((one) => one.remove());
   }
+  /** Text of an error: the refusal, or that there is no answer. */
+  const whyOf = (error) => (error instanceof Refused ? error.message : tr("No answer from tdhil serve."));
+  /** Show an error in this place. */
+  function tell(where, error) {
+    where.textContent = whyOf(error);
+    where.hidden = false;
+    where.scrollIntoView({ block: "nearest" });
+  }
   const LEAVES = new Promise(() => {});       // what a form waits for whose page is loaded again
   const sending = new Set();
   /** Send a form, once for a double click. A refusal is shown at its fields, or in the text `said` if it names none of them. */
@@ -294,20 +302,23 @@
       await send();
     } catch (error) {
       if (error.fields && markWrong(form, error.fields)) return;
-      said.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve.");
-      said.hidden = false;
-      said.scrollIntoView({ block: "nearest" });
+      tell(said, error);
     } finally {
       sending.delete(form);
     }
   }
 
+  /** Disable these elements of a form. Return the function that enables them again. */
+  function closes(elements) {
+    const open = [...elements].filter((one) => !one.disabled);
+    open.forEach((one) => { one.disabled = true; });
+    return () => open.forEach((one) => { one.disabled = false; });
+  }
   /** Fill a form with what is stored. It takes no text before, since the answer would replace it. */
   async function fillsFirst(form, fill) {
-    const open = [...form.elements].filter((one) => !one.disabled);
-    open.forEach((one) => { one.disabled = true; });
+    const opens = closes(form.elements);
     await fill();
-    open.forEach((one) => { one.disabled = false; });
+    opens();
   }
 
   function planTable(plan) {
@@ -420,7 +431,7 @@
           follow(run.id);
         }
       } catch (error) {
-        refuse(error instanceof Refused ? error.message : tr("No answer from tdhil serve."), error.fields);
+        refuse(whyOf(error), error.fields);
       } finally {
         over(planned);
         buttons.forEach((one) => { one.disabled = false; });
@@ -699,7 +710,7 @@
         if (watched && !key) hold(crypto.randomUUID());
         await call("POST", `/runs/${run}/confirm`, { code: field.value.replace(/\s/g, ""), binding: status.confirmation.binding, lease: watched ? key : null });
       } catch (error) {
-        said.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve.");
+        said.textContent = whyOf(error);
         said.hidden = false;
       }
       field.value = "";
@@ -762,9 +773,7 @@
     try {
       await work();
     } catch (error) {
-      where.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve.");
-      where.hidden = false;
-      where.scrollIntoView({ block: "nearest" });
+      tell(where, error);
     }
   }
 
@@ -826,7 +835,7 @@
   });
 
   const pages = { error: errorPage, login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, colour, csrf, el, every, fillsFirst, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, zone };
+  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, csrf, el, every, fillsFirst, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, whyOf, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);

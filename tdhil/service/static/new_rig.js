@@ -2,7 +2,7 @@
 "use strict";
 (() => {
   const { english, local, point, tr, word, worded } = window.tdhilLanguage;
-  const { Refused, byId, call, el, markWrong, pages, show, unmark, waiting } = window.tdhil;
+  const { byId, call, closes, el, markWrong, pages, show, unmark, waiting, whyOf } = window.tdhil;
   const SCAN_MS = 130000;            // the service ends a scan after 120 s
   const KEPT = "tdhil-new-rig";      // what was typed, until the rig is saved or the tab is closed
 
@@ -42,13 +42,12 @@
       if (!field("id").dataset.typed) field("id").value = field("name").value.trim().toLowerCase().replace(/[^a-z0-9_.]+/g, "-").replace(/^[^a-z0-9]+|-+$/g, "").slice(0, 64);
     });
     field("id").addEventListener("input", () => { field("id").dataset.typed = "by hand"; });
-    const buttons = [...form.querySelectorAll("button")];
-    buttons.forEach((one) => { one.disabled = true; });      // the Enter key would send the form before its script is ready
+    const opens = closes(form.querySelectorAll("button"));      // the Enter key would send the form before its script is ready
     let loaded = null;
     try {
       loaded = await call("GET", "/new-rig");
     } catch (error) {
-      said.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve.");
+      said.textContent = whyOf(error);
       said.hidden = false;
       return;
     }
@@ -106,7 +105,7 @@
       try { sessionStorage.setItem(KEPT, JSON.stringify(Object.fromEntries(fields().map((one) => [keyOf(one), one.type === "checkbox" ? one.checked : one.value])))); } catch (error) { /* then it is lost by a reload */ }
     };
     form.addEventListener("input", keep);
-    buttons.forEach((one) => { one.disabled = false; });
+    opens();
 
     function draft() {
       const found = { address: {}, limits: {}, string: {}, accept_unverified: [...form.querySelectorAll("[name=accept]:checked")].map((one) => one.value), alone: field("alone").checked };
@@ -146,12 +145,13 @@
       if (rest.length) { said.textContent = rest.join(" "); said.hidden = false; }
       return found;
     }
-    const refused = (error) => {
-      const rest = error.fields && error.fields.length ? mark(error.fields.map((one) => ({ field: one.option, message: one.message }))) : null;
-      if (rest && !rest.length) return;
-      said.textContent = error instanceof Refused ? error.message : tr("No answer from tdhil serve.");
-      said.hidden = false;
-    };
+    /** Mark the fields that an error names, or show the error in this place. */
+    function refused(error, where = said) {
+      const fields = error.fields || [];
+      if (fields.length && !mark(fields.map((one) => ({ field: one.option, message: one.message }))).length) return;
+      where.textContent = whyOf(error);
+      where.hidden = false;
+    }
     form.addEventListener("submit", async (event) => {
       event.preventDefault();
       const save = event.submitter && event.submitter.value === "save";
@@ -193,9 +193,9 @@
           found.length ? null : el("p", {}, tr("No drive replied.")), ...remarks.map((text) => el("p", { class: "dim" }, english(text))));
       } catch (error) {
         over();
-        show(byId("scan-said"));
-        refused(error);
-        if (!said.hidden) { show(byId("scan-said"), el("p", { class: "alarm" }, said.textContent)); said.hidden = true; }
+        const alarm = el("p", { class: "alarm", hidden: true });
+        show(byId("scan-said"), alarm);
+        refused(error, alarm);
       } finally {
         byId("scan").disabled = false;
       }

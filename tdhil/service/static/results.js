@@ -2,7 +2,7 @@
 "use strict";
 (() => {
   const { coded, english, errorText, fixed, local, point, precise, tr, word } = window.tdhilLanguage;
-  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, markWrong, may, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, zone } = window.tdhil;
+  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, markWrong, may, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, whyOf, zone } = window.tdhil;
 
   // -- one run
 
@@ -164,7 +164,7 @@
           else { show(note); link.click(); }
         } catch (error) {
           over(false);
-          show(note, el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : tr("No answer from tdhil serve.")));
+          show(note, el("p", { class: "alarm", role: "alert" }, whyOf(error)));
         } finally {
           busy = false;
         }
@@ -219,7 +219,7 @@
       byId("log-sha256").textContent = found.log_sha256;
       form.querySelector("button").disabled = false;
     } catch (error) {
-      fail(error instanceof Refused ? error.message : tr("No answer from tdhil serve."));
+      fail(whyOf(error));
     }
   }
 
@@ -395,7 +395,7 @@
       over(true);
     } catch (error) {
       over(false);
-      show(where, el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : tr("No answer from tdhil serve.")));
+      show(where, el("p", { class: "alarm", role: "alert" }, whyOf(error)));
     }
     alive();
   }
@@ -492,7 +492,7 @@
         const run = await call("POST", `/rigs/${encodeURIComponent(rig)}/runs`, { fault: [text], note: `rehearsal: ${text}`, real_time: form.elements.real_time.checked }, { "Idempotency-Key": crypto.randomUUID() });
         follow(run.id);
       } catch (error) {
-        show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : tr("No answer from tdhil serve.")));
+        show(byId("said"), el("p", { class: "alarm", role: "alert" }, whyOf(error)));
         byId("said").scrollIntoView({ block: "center" });
         button.disabled = false;
       }
@@ -546,7 +546,7 @@
         const { calibration } = await call("POST", `/rigs/${encodeURIComponent(rig)}/calibration`, body, {}, 300000);
         show(byId("said"), ...calibrated(calibration));
       } catch (error) {
-        show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : tr("No answer from tdhil serve.")));
+        show(byId("said"), el("p", { class: "alarm", role: "alert" }, whyOf(error)));
       }
       button.disabled = false;
       byId("said").scrollIntoView({ block: "nearest" });
@@ -590,7 +590,7 @@
         const found = await call("POST", "/fleets", asked(form));
         location.assign(`/fleets/${found.id}`);
       } catch (error) {
-        show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : tr("No answer from tdhil serve.")));
+        show(byId("said"), el("p", { class: "alarm", role: "alert" }, whyOf(error)));
       }
     });
     every(2000, async () => {
@@ -653,7 +653,7 @@
       await rows();
     });
     const press = async (work) => {
-      try { await work(); } catch (error) { away(error instanceof Refused ? error.message : tr("No answer from tdhil serve.")); }
+      try { await work(); } catch (error) { away(whyOf(error)); }
     };
     byId("end").addEventListener("click", () => press(() => call("POST", `/fleets/${id}/stop`, {})));
     byId("again").addEventListener("click", () => press(() => call("POST", "/fleets", { folder: view.folder, below: view.below, archived: view.archived, ...view.settings })));

@@ -2,11 +2,10 @@
 "use strict";
 (() => {
   const { english, errorText, local, tr, word } = window.tdhilLanguage;
-  const { API, Refused, asked, axis, badge, byId, call, colour, csrf, el, inSpeedUnit, markWrong, number, onSpeedUnit, pages, rehearsal, show, span, speedUnit, submits, unmark, waiting, when } = window.tdhil;
+  const { API, Refused, asked, axis, badge, byId, call, colour, csrf, el, inSpeedUnit, markWrong, number, onSpeedUnit, pages, rehearsal, show, span, speedUnit, submits, unmark, waiting, when, whyOf } = window.tdhil;
   const QUANTITIES = ["time", "speed", "torque"];
   const BUSY = ["delayed", "identifying"];
   const HEIGHTS = [150, 180];  // of the charts, px; the lower one has the time axis with its label
-  const LOST = tr("No answer from tdhil serve.");
   const LONG_MS = 600000;      // the preview of a large file, or a second one behind it
   const mebi = (bytes) => (bytes < 1e5 ? `${number(bytes / 1024, 2)} KiB` : `${number(bytes / 2 ** 20, 3)} MiB`);
 
@@ -85,7 +84,7 @@
     if (!byId("choose")) return;
     const form = byId("mapping"), said = byId("choose-said"), file = byId("file");
     let limit = Infinity, open = null, waits = [], asking = 0, redraw = () => {}, read = null;
-    const report = (error, where = said) => { where.textContent = error instanceof Refused ? error.message : LOST; where.hidden = false; };
+    const report = (error, where = said) => { where.textContent = whyOf(error); where.hidden = false; };
     const field = (name) => form.elements[name];
 
     /** The mapping of the form, as the service takes it. */
