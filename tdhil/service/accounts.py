@@ -100,21 +100,32 @@ def _derive(password: str, salt: bytes, n: int, r: int, p: int) -> bytes:
     return hashlib.scrypt(given, salt=salt, n=n, r=r, p=p, dklen=_BYTES, maxmem=2 * 128 * n * r + 2**20)
 
 
+class AccountNameRefused(UsageError):
+    """The name of an account is refused."""
+
+    entry = MessageCode.ACCOUNT_WRONG
+
+
+class PasswordRefused(UsageError):
+    """A new password is refused."""
+
+    entry = MessageCode.ACCOUNT_WRONG
+
+
 def require_password(password: str, name: str) -> None:
-    """Raise UsageError for a password that is too easy to guess."""
+    """Raise PasswordRefused for a password that is too easy to guess."""
     if not SHORTEST <= len(password) <= LONGEST:
-        raise UsageError(f"must have {SHORTEST} to {LONGEST} characters", where="password",
-                         next_step="Use a few words that don't belong together", entry=MessageCode.ACCOUNT_WRONG)
+        raise PasswordRefused(f"must have {SHORTEST} to {LONGEST} characters", where="password",
+                              next_step="Use a few words that don't belong together")
     if password.lower().strip("0123456789 !.") in (name, "password", "tdhil") or len(set(password)) < 5:
-        raise UsageError("is too easy to guess", where="password",
-                         next_step="Use a few words that don't belong together", entry=MessageCode.ACCOUNT_WRONG)
+        raise PasswordRefused("is too easy to guess", where="password",
+                              next_step="Use a few words that don't belong together")
 
 
 def _require_name(name: str) -> None:
     if not NAME.fullmatch(name) or name in _RESERVED:
-        raise UsageError("must be 1 to 32 of a-z, 0-9, '.', '_' and '-', and none of the audit's own names"
-                         f" ({', '.join(sorted(_RESERVED))})", where=f"name {name[:40]!r}",
-                         entry=MessageCode.ACCOUNT_WRONG)
+        raise AccountNameRefused("must be 1 to 32 of a-z, 0-9, '.', '_' and '-', and none of the audit's own names"
+                                 f" ({', '.join(sorted(_RESERVED))})", where=f"name {name[:40]!r}")
 
 
 # ---------------------------------------------------------------------------------------------------------------------

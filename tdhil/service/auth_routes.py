@@ -11,7 +11,7 @@ from starlette.responses import JSONResponse, Response
 
 from tdhil.errors import MessageCode, UsageError
 from tdhil.service.access import Principal, address_of, principal, set_cookies
-from tdhil.service.accounts import ROLES, Token, User
+from tdhil.service.accounts import ROLES, AccountNameRefused, PasswordRefused, Token, User
 from tdhil.service.middleware import off
 from tdhil.service.routing import api
 from tdhil.service.run_state import NotLoggedIn, TooManyTries, iso
@@ -116,10 +116,8 @@ async def _account(site: Site, request: Request, change: Callable[[], T], what: 
                          entry=MessageCode.ACCOUNT_WRONG)
     try:
         found: T = await anyio.to_thread.run_sync(change, limiter=site.logins)
-    except UsageError as error:
-        field = {"name": "name", "password": password}.get(error.where.partition(" ")[0])
-        if field is None:
-            raise
+    except (AccountNameRefused, PasswordRefused) as error:
+        field = password if isinstance(error, PasswordRefused) else "name"
         raise ValuesWrong([(field, error.what + (f". {error.next_step}" if error.next_step else ""))]) from None
     site.supervisor.note(principal(request).name, what, None, None, name=name)
     return found
