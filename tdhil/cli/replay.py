@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from tdhil.cli.arguments import add_option, add_settings, settings_in
 from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_result, save_report
-from tdhil.config import OF_A_TRACE, OF_THE_HEAD, OPTION, STATED, expectations_in, expectations_of
+from tdhil.config import OF_A_TRACE, OPTION, STATED, expectations_in, expectations_of
 from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.file_hash import sha256_of
 from tdhil.session import (
@@ -36,11 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="the log of a run, whole or cut short, or a trace in CSV; recognised by their content")
     add_option(parser, OPTION["json"])
     add_report_option(parser, "report")
-    for name in STATED:
-        if OPTION[name] not in OF_THE_HEAD:
-            add_option(parser, OPTION[name], help=f"{OPTION[name].help.replace('log and report', 'the report')} "
-                       "(default: from the log)")
-    add_head_options(parser)
+    add_head_options(parser, texts=[OPTION[name] for name in STATED])
     add_option(parser, OPTION["expect"])
     add_settings(parser, "the run's")
     parser.add_argument("--torque-calibration", type=Path, metavar="calibration.json",

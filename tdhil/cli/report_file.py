@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from tdhil.cli.arguments import add_option
-from tdhil.config import OF_THE_HEAD, OPTION
+from tdhil.config import OF_THE_HEAD, OPTION, Option
 from tdhil.errors import MessageCode, UsageError
 
 if TYPE_CHECKING:
@@ -29,9 +29,11 @@ def add_report_option(section: argparse._ActionsContainer, name: str) -> None:
                          help=f"the result with pictures in one file: {name}.html, or {name}.pdf on A4")
 
 
-def add_head_options(section: argparse._ActionsContainer, default: str = "from the log") -> None:
-    """Add the options of a report's head, for a command that reads its runs from files."""
-    for one in OF_THE_HEAD:
+def add_head_options(
+    section: argparse._ActionsContainer, default: str = "from the log", texts: Iterable[Option] = OF_THE_HEAD,
+) -> None:
+    """Add the options of a report's head, for a command that reads its runs from files. ``texts``: those of a run."""
+    for one in texts:
         add_option(section, one, help=f"{one.help.replace('log and report', 'the report')} (default: {default})")
     add_option(section, _LETTERHEAD)
 
