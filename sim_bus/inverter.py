@@ -16,11 +16,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from math import copysign, exp, expm1, inf, pi, sqrt
+from typing import cast
 
 import numpy as np
 
 from sim_bus.params import DriveParams, NoiseParams, RigParams
-from sim_bus.plant import MotorState, build
+from sim_bus.plant import LoadedState, MotorState, build
 from sim_bus.plant import Params as RigidParams
 from sim_bus.plant import ShaftState as RigidState
 from sim_bus.reports import Feedback, Lies
@@ -72,20 +73,25 @@ class Disturbance:
         return self.load_nm
 
 
+BIT_CUTS_RAD_S = 0.1
+"""From this speed of the bit on its random load acts in full, rad/s (1 rev/min). It comes from cutting, so that a bit
+at rest has none: else it would swing a string that hangs at rest."""
+
+
 class BottomLoad:
-    """Random load at the bit of a string, with a random stream of its own."""
+    """Random load at a bit that turns, with a random stream of its own."""
 
     def __init__(self, params: NoiseParams, rng: np.random.Generator) -> None:
         self._params = params
         self._normals = (one for row in normals(rng) for one in row)
         self._load_nm = 0.0
 
-    def wander(self, dt_s: float) -> float:
-        """Advance the load by one step and return it, N·m."""
+    def wander(self, dt_s: float, speed_rad_s: float) -> float:
+        """Advance the load by one step and return it for a bit of this speed, N·m."""
         decay = exp(-dt_s / self._params.bottom_correlation_s)
         kick = self._params.bottom_load_nm * sqrt(1.0 - decay**2)
         self._load_nm = decay * self._load_nm + kick * next(self._normals)
-        return self._load_nm
+        return self._load_nm * min(1.0, abs(speed_rad_s) / BIT_CUTS_RAD_S)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -437,7 +443,8 @@ class Inverter:
         if self._bottom_load is None:
             self.state = state = self._move(self.state, torque, dt_s, at_motor)
         else:
-            self.state = state = self._move(self.state, torque, dt_s, at_motor, self._bottom_load.wander(dt_s))
+            at_bit = self._bottom_load.wander(dt_s, cast(LoadedState, self.state).bottom_speed_rad_s)
+            self.state = state = self._move(self.state, torque, dt_s, at_motor, at_bit)
         mean = 0.5 * scale * (speed + state.speed_rad_s) + offset
         if lies.of_sensor:
             mean = measured

@@ -7,6 +7,7 @@ from sim_bus.plant.batch import (
 from sim_bus.plant.angle_torque import AngleTorque as AngleTorque
 from sim_bus.plant.friction import Harmonic as Harmonic
 from sim_bus.plant.kinds import (
-    AnyPlantParams as AnyPlantParams, MotorState as MotorState, PLANTS as PLANTS, build as build,
+    AnyPlantParams as AnyPlantParams, LoadedState as LoadedState, MotorState as MotorState, PLANTS as PLANTS,
+    build as build,
 )
 from sim_bus.plant.rigid import Params as Params, ShaftState as ShaftState

@@ -34,6 +34,14 @@ class MotorState(Protocol):
         """Angle of the motor's shaft, rad."""
 
 
+class LoadedState(MotorState, Protocol):
+    """Common values of the states with a load at the bottom."""
+
+    @property
+    def bottom_speed_rad_s(self) -> float:
+        """Speed of the bottom, rad/s."""
+
+
 S = TypeVar("S", bound=MotorState)
 
 

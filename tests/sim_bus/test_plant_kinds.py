@@ -169,8 +169,19 @@ def test_what_disturbs_the_motor_is_the_same_with_a_load_at_the_bottom() -> None
         Inverter(RigParams(plant=plant, noise=NoiseParams(bottom_load_nm=load)), np.random.default_rng(3))
         for load in (50.0, 0.0)
     )
+    for one in (with_one, without):
+        one.state = one.state._replace(bottom_speed_rad_s=5.0)
     for _ in range(50):                  # before anything of the bottom's comes up
         with_one.step(0.002)
         without.step(0.002)
     assert with_one.speed_rad_s == without.speed_rad_s
     assert with_one.state.bottom_speed_rad_s != without.state.bottom_speed_rad_s
+
+
+def test_a_bit_at_rest_does_not_swing_the_string() -> None:
+    """The random load of a bit comes from cutting. A string that hangs at rest has a motor without torque."""
+    drive = Inverter(RigParams(plant=StringParams(), noise=NoiseParams(bottom_load_nm=500.0, load_nm=0.0)),
+                     np.random.default_rng(3))
+    for _ in range(1000):
+        drive.step(0.002)
+    assert drive.state.bottom_speed_rad_s == drive.speed_rad_s == 0.0
