@@ -20,10 +20,8 @@ import os
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +31,7 @@ for library in ("OPENBLAS", "OMP", "MKL"):
 import numpy as np  # noqa: E402
 
 from benchmarks.called_here import called_here  # noqa: E402
+from benchmarks.kept_rows import kept_rows  # noqa: E402
 from profiles import MessageCode  # noqa: E402
 from profiles.library import load_profile, profile_names  # noqa: E402
 from sim_bus.plant.drill_string import StringParams  # noqa: E402
@@ -45,7 +44,6 @@ ALARM = "Contradict"
 WIDER = 1e-9
 """An interval counts as wider from this relative difference on."""
 
-TASKS_PER_PROCESS = 50
 TURNS_AS_ONE, MAY_STAY_BEHIND = MessageCode.STRING_MOVES_WITH_MOTOR.code, MessageCode.LOAD_MAY_STAY_BEHIND.code
 """Codes of the warnings that J is that of motor and load together; and that it is this or the motor's alone."""
 
@@ -239,15 +237,6 @@ def work(seed: int) -> dict[str, Any]:
         return run(draw(seed), Path(folder))
 
 
-def results(seeds: Sequence[int], jobs: int) -> Iterator[dict[str, Any]]:
-    """Yield results in the order of the seeds."""
-    if jobs <= 1:
-        yield from map(work, seeds)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), max_tasks_per_child=TASKS_PER_PROCESS) as pool:
-        yield from pool.map(work, seeds)
-
-
 def line(row: dict[str, Any]) -> str:
     """A run in a line."""
     interval = ""
@@ -300,11 +289,9 @@ def compared(rows: Sequence[dict[str, Any]], before: Sequence[dict[str, Any]]) -
     return "\n".join(lines), len(wider) + len(gone)
 
 
-def kept(path: Path | None) -> list[dict[str, Any]]:
-    """Return the rows of an earlier call."""
-    if path is None or not path.exists():
-        return []
-    return [json.loads(text) for text in path.read_text(encoding="utf-8").splitlines()]
+def show(row: dict[str, Any]) -> None:
+    """Print a run."""
+    print(line(row), flush=True)
 
 
 def main() -> int:
@@ -317,17 +304,13 @@ def main() -> int:
     parser.add_argument("--against", type=Path, metavar="FILE", help="what --out wrote at another commit")
     asked = parser.parse_args()
     seeds = range(asked.first, asked.first + asked.runs)
-    rows = [row for row in kept(asked.out) if row["seed"] in seeds]
-    have = {row["seed"] for row in rows}
-    with (asked.out or Path(os.devnull)).open("a", encoding="utf-8") as out:
-        for row in results([seed for seed in seeds if seed not in have], asked.jobs):
-            rows.append(row)
-            print(line(row), flush=True)
-            print(json.dumps(row), file=out, flush=True)
+    rows = kept_rows(asked.out, "seed", seeds, work, show, asked.jobs)
+    rows = [row for row in rows if row["seed"] in seeds]
     print(summary(rows))
     worse = 0
     if asked.against is not None:
-        text, worse = compared(rows, kept(asked.against))
+        before = [json.loads(kept) for kept in asked.against.read_text(encoding="utf-8").splitlines()]
+        text, worse = compared(rows, before)
         print(text)
     return 1 if worse or alarms(rows) else 0
 

@@ -1,6 +1,6 @@
 """Runs whose drive lies, through the real path with the embedded simulator in stepped time, against the true shaft.
 
-    python benchmarks/lying_reports.py --all [--jobs 2] [--out lying.json]
+    python benchmarks/lying_reports.py --all [--jobs 2] [--out lying.jsonl]
     python benchmarks/lying_reports.py --sample 50 --seed 25 [--list]
     python benchmarks/lying_reports.py --number 4711 [--keep DIR]
 
@@ -12,14 +12,12 @@ has a seed and repeats to the last frame. What physics cannot tell is listed wit
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +25,7 @@ for library in ("OPENBLAS", "OMP", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 from benchmarks.called_here import called_here  # noqa: E402
+from benchmarks.kept_rows import kept_rows  # noqa: E402
 from sim_bus.lying_runs import UNKNOWABLE, Combination, product, sample, standard, unknowable  # noqa: E402
 from sim_bus.shaft_judge import REACTION_S, JudgedMachine, judge, outcome_of, read_shaft  # noqa: E402
 
@@ -34,7 +33,6 @@ RULES = {
     "a": "disabled while it turned", "b": "reported at rest while it turned", "c": "a valid interval misses J",
     "d": "faster than limit and reaction time allow", "e": "no known end, or a log that is not closed",
 }
-TASKS_PER_PROCESS = 50
 
 
 def closed(log: Path) -> bool:
@@ -72,9 +70,8 @@ def run(combination: Combination, folder: Path, reaction_s: float) -> dict[str, 
     }
 
 
-def work(task: tuple[int, float, str | None]) -> dict[str, Any]:
+def work(number: int, reaction_s: float, keep: str | None) -> dict[str, Any]:
     """One number of `product`, in a folder of its own."""
-    number, reaction_s, keep = task
     combination = product()[number]
     if keep is not None:
         folder = Path(keep) / str(number)
@@ -82,15 +79,6 @@ def work(task: tuple[int, float, str | None]) -> dict[str, Any]:
         return run(combination, folder, reaction_s)
     with tempfile.TemporaryDirectory() as folder_name:
         return run(combination, Path(folder_name), reaction_s)
-
-
-def results(tasks: Sequence[tuple[int, float, str | None]], jobs: int) -> Iterator[dict[str, Any]]:
-    """Yield results in the order of the tasks."""
-    if jobs <= 1:
-        yield from map(work, tasks)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), max_tasks_per_child=TASKS_PER_PROCESS) as pool:
-        yield from pool.map(work, tasks)
 
 
 def line(row: dict[str, Any]) -> str:
@@ -101,6 +89,11 @@ def line(row: dict[str, Any]) -> str:
     end = row["verdict"] or row["cause"] or ""
     return (f"{row['number']:>5} {row['program']:<29}{what:<34} exit {row['exit_code']:>3} {end:<18} "
             f"{row['fastest_rad_s']:6.2f} rad/s {row['took_s']:4.1f} s  {broken}{excused}")
+
+
+def show(row: dict[str, Any]) -> None:
+    """Print a run."""
+    print(line(row), flush=True)
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> str:
@@ -138,7 +131,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1, help="processes (1)")
     parser.add_argument("--reaction", type=float, default=REACTION_S, metavar="S", help="reaction time of rule d (1 s)")
     parser.add_argument("--keep", help="folder to keep logs and traces in")
-    parser.add_argument("--out", type=Path, help="all results as JSON")
+    parser.add_argument("--out", type=Path, help="results as JSON lines; numbers that stand there are not run again")
     parser.add_argument("--list", action="store_true", help="only say what would be run")
     asked = parser.parse_args()
     if asked.all:
@@ -150,14 +143,11 @@ def main() -> int:
     if asked.list:
         print("\n".join(map(str, chosen)))
         return 0
-    tasks = [(one.number, asked.reaction, asked.keep) for one in chosen]
-    rows = []
-    for row in results(tasks, asked.jobs):
-        rows.append(row)
-        print(line(row), flush=True)
+    numbers = {one.number for one in chosen}
+    rows = kept_rows(asked.out, "number", [one.number for one in chosen],
+                     partial(work, reaction_s=asked.reaction, keep=asked.keep), show, asked.jobs)
+    rows = [row for row in rows if row["number"] in numbers]
     print(summary(rows))
-    if asked.out is not None:
-        asked.out.write_text(json.dumps({"rows": rows}, indent=1), encoding="utf-8")
     return 1 if any(row["broken"] for row in rows) else 0
 
 
