@@ -21,6 +21,9 @@ def conclude(case: Case, finding: Finding) -> Identification:
     """
     inertia = _inertia(case, finding)
     verdict, reason, advice, entry = _judged(case.options, finding, inertia)
+    calibrate = verdict is Verdict.VALID and inertia is not None and widened_most_by_scale(inertia)
+    if calibrate:
+        advice = _BY_SCALE
     warnings = (*case.warnings, *finding.warnings)
     if case.aborted is not None:
         said = _aborted(case.aborted)
@@ -32,6 +35,7 @@ def conclude(case: Case, finding: Finding) -> Identification:
             advice = "mend what ended the run, and run it again"
     return Identification(**finding.quantities() | {
         "verdict": verdict, "reason": reason, "advice": advice, "entry": entry, "inertia": inertia,
+        "calibration_advised": calibrate,
         "warnings": warnings, "paper": case.paper, "torque_ratios": case.torque_ratios,
         "periods_used": case.periods_used,
         "samples_used": case.samples_used if finding.samples_used is None else finding.samples_used,
@@ -79,8 +83,7 @@ def _judged(
     if whole > options.tolerance:
         reason = f"{finding.explained}, but the interval is ±{whole:.2%}, {wide}"
         return Verdict.VALID_WIDE, reason, finding.advice or _SHARPER, MessageCode.VALID_WIDE
-    advice = _BY_SCALE if widened_most_by_scale(inertia) else finding.advice or _SHARPER
-    return Verdict.VALID, finding.explained, advice, MessageCode.VALID
+    return Verdict.VALID, finding.explained, finding.advice or _SHARPER, MessageCode.VALID
 
 
 def _aborted(stage: Stage) -> str:

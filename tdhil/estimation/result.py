@@ -500,6 +500,7 @@ class Identification(ModelResult):
     verdict: Verdict
     reason: str                                 # one sentence: why this verdict and this model
     advice: str                                 # one sentence: what would improve it
+    calibration_advised: bool = False           # the advice is a torque calibration
     inertia: InertiaEstimate | None = None
     paper: PaperEstimate | None = None
     periods_used: int = 0

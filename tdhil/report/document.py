@@ -115,6 +115,7 @@ def result_document(
         "model": found.model,
         "reason": found.reason,
         "advice": found.advice,
+        "calibration_advised": found.calibration_advised,
         "code": found.entry.code,
         "inertia_kg_m2": _inertia(found.inertia),
         "inertia_main_shaft_kg_m2": _at_main_shaft(found.inertia, recording.gear_ratio),

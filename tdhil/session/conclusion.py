@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 
 TORQUE_SCALE = "torque scale"
 """Source in the uncertainty budget that a torque calibration reduces."""
-CALIBRATE = "tdhil calibrate torque"
-"""Command in the advice on a torque scale without calibration."""
+_CALIBRATED = "the torque calibration is most of the interval: a larger body, or longer runs, would reduce it"
 
 
 def working_confidence_of(run: Mapping[str, Any], confidence: float) -> float:
@@ -150,10 +149,8 @@ def _dated(found: Identification, day: str) -> Identification:
     """Return the result with the day of the torque calibration in the budget's line."""
     if not day:
         return found
-    advice = found.advice
-    if CALIBRATE in advice:
-        advice = "the torque calibration is most of the interval: a larger body, or longer runs, would reduce it"
-    return replace(found, advice=advice, budget=tuple(
+    advice = _CALIBRATED if found.calibration_advised else found.advice
+    return replace(found, advice=advice, calibration_advised=False, budget=tuple(
         replace(line, source=f"{TORQUE_SCALE}, calibrated {day}") if line.source == TORQUE_SCALE else line
         for line in found.budget))
 

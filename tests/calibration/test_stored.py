@@ -40,6 +40,7 @@ def test_a_run_with_a_calibration_is_in_calibrated_torque(document):
     assert inertia.high_total - inertia.low_total < 0.6 * (plain.inertia.high_total - plain.inertia.low_total)
     assert found.identification.coulomb_nm.value == pytest.approx(60.0, rel=0.02)
     assert "torque scale, calibrated 2026-11-23" in [line.source for line in found.identification.budget]
+    assert plain.calibration_advised and not found.identification.calibration_advised
     assert "tdhil calibrate torque" not in found.identification.advice
     assert found.document["torque_calibration"]["factor"] == document["calibration_factor"]["value"]
     assert conclude(recording(0.0, 7), RUN, "run.mcap").document["torque_calibration"] is None

@@ -67,6 +67,15 @@ def test_the_verdict_follows_from_tolerance_interval_and_p_value(finding, verdic
     assert said.warnings == ("first",)
 
 
+@pytest.mark.parametrize(("scale_rel_sd", "advised"), [(0.0, False), (0.02, True)])
+def test_a_calibration_is_advised_where_the_torque_scale_is_most_of_the_interval(scale_rel_sd, advised):
+    one = case()
+    said = conclude(replace(one, recording=replace(one.recording, torque_scale_rel_sd=scale_rel_sd)), FOUND)
+    assert said.calibration_advised is advised is ("tdhil calibrate torque" in said.advice)
+    wide = conclude(case(), replace(FOUND, inertia=Estimate(100.0, 97.0, 103.0)))
+    assert not wide.calibration_advised
+
+
 def test_what_the_reading_adds_widens_both_intervals():
     plain, wider = (conclude(case(), replace(FOUND, reading_kg_m2=half)).inertia for half in (0.0, 2.0))
     assert (plain.low, plain.high) == (99.0, 101.0)

@@ -123,7 +123,8 @@ def results(served: Served, run: str, monkeypatch: pytest.MonkeyPatch) -> tuple[
     inertia = {**estimate(104.0), "low_total": 100.0, "high_total": 108.0, "half_width_total_rel": 0.04,
                "repeatability_rel": 0.01, "confidence": 0.9}
     write_json(folder / "result.json", {
-        "verdict": "valid", "inertia_kg_m2": inertia, "reason": HOSTILE, "advice": "", "model": "rigid+lags",
+        "verdict": "valid", "inertia_kg_m2": inertia, "reason": HOSTILE, "advice": HOSTILE,
+        "calibration_advised": True, "model": "rigid+lags",
         "warnings": [HOSTILE, "speed was quantised"], "viscous_nm_s_rad": estimate(8.0), "speed_lag_s": estimate(0.4),
         "budget": [{"source": "noise", "half_width_kg_m2": 0.2, "note": HOSTILE}],
         "second_opinions": [{"route": HOSTILE, "inertia_kg_m2": estimate(103.0), "agrees": True, "note": ""}],

@@ -32,7 +32,7 @@
       el("p", { class: `verdict ${VERDICTS[result.verdict] || ""}` }, word(result.verdict, "verdict")),
       region(tr("Numbers"), el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))),
       el("p", {}, ...coded(result.code, sentence(result.reason || ""))), result.advice ? el("p", {}, english(sentence(result.advice))) : null,
-      run.rig && may("operator") && /tdhil calibrate torque/.test(result.advice || "") ? el("p", {}, el("a", { href: `/calibrate/${encodeURIComponent(run.rig)}` }, tr("Calibrate the torque of this rig"))) : null);
+      run.rig && may("operator") && result.calibration_advised ? el("p", {}, el("a", { href: `/calibrate/${encodeURIComponent(run.rig)}` }, tr("Calibrate the torque of this rig"))) : null);
     parts.push(card);
     const codes = result.warning_codes || [], wanted = run.state === "stopped" && run.stop.asked;
     (result.warnings || []).forEach((one, k) => parts.push(el("p", { class: wanted && codes[k] === ENDED_EARLY ? "dim" : "alarm" }, ...coded(codes[k], sentence(one)))));
