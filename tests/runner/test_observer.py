@@ -258,7 +258,7 @@ def test_a_position_that_does_not_go_as_far_as_the_speed_says(name, moved_rad_s)
     }[name]
     found_s = bench.found_after(5.0, lambda: bench.hold(0.02, moved_rad_s))
     assert found_s is not None and found_s <= 3.0
-    assert bench.observer.doubt.signals == SPEED_AND_ANGLE
+    assert bench.observer.doubt.signals == SPEED_AND_ANGLE and "a filter" not in bench.observer.doubt.what.lower()
 
 
 def test_the_position_finds_a_frozen_speed_however_little_torque_it_takes():
@@ -268,6 +268,22 @@ def test_the_position_finds_a_frozen_speed_however_little_torque_it_takes():
     bench.hold(2.0, 3.0)
     assert bench.observer.doubt is not None
     assert Signal.SPEED in bench.observer.doubt.signals
+
+
+@pytest.mark.parametrize("speed_lag_s", [1.2, 2.0])
+def test_a_filter_slower_than_assumed_is_named_beside_the_contradiction(speed_lag_s):
+    """The position shows a reported speed that lags more than any drive should: the shaft stops, and the text names
+    the lag to state in rig.yaml.
+    """
+    bench = Bench(replace(WITH_POSITION, speed_lag_s=speed_lag_s)).begun()
+    bench.ramp(1.0, 1.0)
+    bench.hold(8.0, 1.0)
+    bench.ramp(9.0, 3.0)
+    bench.hold(2.0, 9.0)
+    doubt = bench.observer.doubt
+    assert doubt is not None and doubt.signals == SPEED_AND_ANGLE
+    named_s = float(doubt.what.split("with a lag of ")[1].split(" s")[0])
+    assert named_s == pytest.approx(speed_lag_s, rel=0.25) and "drive_data.speed_lag_s" in doubt.helps
 
 
 @pytest.mark.parametrize("rig", [PLAIN, WITH_POSITION])

@@ -447,7 +447,8 @@ class Observer:
         elif apart is not None:
             self._doubt(
                 frozenset({Signal.SPEED, Signal.ANGLE}), apart,
-                "Check the encoder, its cable, and the units of 606Ch and 6064h (or of the registers)", now_s,
+                "Check the encoder, its cable, and the units of 606Ch and 6064h (or of the registers). If the drive"
+                " filters the reported speed, state its lag as drive_data.speed_lag_s", now_s,
             )
 
     def _doubt(self, signals: frozenset[Signal], what: str, helps: str, time_s: float) -> None:
