@@ -78,13 +78,14 @@ def draft_of(body: DraftBody) -> DraftView:
     if unknown := sorted(set(body.address) - fields):
         raise UsageError(f"{unknown[0]}: not a key of this bus", where="address", entry=MessageCode.REQUEST_WRONG)
     known = RigEntries(
-        name=body.name.strip() or None, address=_given(body.address), limits=_given(body.limits, LIMIT_KEYS),
+        simulated=body.simulated, name=body.name.strip() or None,
+        address={} if body.simulated else _given(body.address), limits=_given(body.limits, LIMIT_KEYS),
         string=_given(body.string, STRING_KEYS) if body.load == "string" else {},
         drive_data={"rated_torque_nm": body.rated_torque_nm.strip()} if body.rated_torque_nm.strip() else {},
         parameters=_given(body.parameters, tuple(one.name for one in profile.untold)),
         gear_ratio=body.gear_ratio.strip() or None,
         accept_unverified=tuple(one for one in body.accept_unverified if one in dict(doubtful(profile))),
-        motion=body.motion,
+        motion="never" if body.simulated else body.motion,      # a simulated rig moves without a rule
     )
     text = blank_rig(profile, profile.name, body.load, known, "tdhil serve")
     problems = _missing(profile, body, known)
@@ -115,16 +116,18 @@ def _given(typed: Mapping[str, str], known: tuple[str, ...] | None = None) -> di
 
 
 def _missing(profile: Profile, body: DraftBody, known: RigEntries) -> list[DraftProblemView]:
-    """Return the entries that a real drive needs and the draft does not have."""
+    """Return the entries that the rig needs and the draft does not have. A simulated rig needs no drive's entries."""
     found = [] if known.name else [DraftProblemView("name", "The rig needs its own name, such as bench 3.")]
+    if body.load == "string":
+        found += [DraftProblemView(name, "A drill string needs it.") for name in STRING_KEYS
+                  if name not in known.string]
+    if body.simulated:
+        return found
     if not known.address:
         found.append(DraftProblemView("address", "Type the address of the drive. Without one,"
                                                  " the embedded simulator runs."))
     found += [DraftProblemView(f"limits.{name}", "A real drive does not move without it.") for name in LIMIT_KEYS
               if name not in known.limits]
-    if body.load == "string":
-        found += [DraftProblemView(name, "A drill string needs it.") for name in STRING_KEYS
-                  if name not in known.string]
     if profile.rated_torque_by_hand and not known.drive_data:
         found.append(DraftProblemView("rated_torque_nm", "The drive does not report it: type it from the name plate."))
     found += [DraftProblemView(f"parameters.{one.name}", "The drive does not report it over the bus.")

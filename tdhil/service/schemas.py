@@ -530,10 +530,11 @@ class DraftBody(Body):
     """Entries of a new rig's file, as typed: in the unit of the key, or with another unit.
 
     ``address``: keys of the drive's address. ``accept_unverified``: entries of the profile that were compared with the
-    drive's manual. ``alone``: no other master is active on the bus; a scan needs it.
+    drive's manual. ``alone``: no other master is active on the bus; a scan needs it. ``simulated``: there is no drive.
     """
 
     profile: str
+    simulated: bool = False
     name: str = ""
     load: str = "none"
     address: dict[str, str] = field(default_factory=dict)

@@ -63,7 +63,8 @@ class RigEntries:
     """Entries that are known already, as typed: in the unit of the key, or with another unit.
 
     ``address``: keys of the bus's section, and further keys beside it. ``string``: make-up torque and torque ramp.
-    ``parameters``: parameters of the drive that can't be read over the bus, in the profile's units.
+    ``parameters``: parameters of the drive that can't be read over the bus, in the profile's units. ``simulated``:
+    there is no drive, and the file has no address.
     """
 
     name: str | None = None
@@ -75,6 +76,7 @@ class RigEntries:
     gear_ratio: Any = None
     accept_unverified: Sequence[str] = ()
     motion: str = "never"
+    simulated: bool = False
 
 
 _NO_ENTRIES: Final = RigEntries()
@@ -95,8 +97,7 @@ def blank_rig(
         *_named(known.name),
         f"drive: {profile.bus}",
         f"profile: {scalar(named)}    # {_comment(profile.title)}",
-        "# The drive's address. Without it the embedded simulator runs.",
-        *_address(profile, known.address),
+        *_place(profile, known),
     ]
     parts += _doubts(profile, known.accept_unverified)
     parts += ["", "# A real drive does not move without these. Remove the '#' and give every value of your machine, in",
@@ -119,14 +120,16 @@ def blank_rig(
     return "\n".join(parts) + "\n"
 
 
-def _address(profile: Profile, known: Mapping[str, Any]) -> tuple[str, ...]:
+def _place(profile: Profile, known: RigEntries) -> tuple[str, ...]:
     """Return the lines of the drive's address: blank ones without any known key."""
-    bus = bus_named(profile.bus)
-    if not known:
-        return bus.rig_blank(profile)
-    section = {key: value for key, value in known.items() if key in _section_fields(profile.bus)}
-    beside = {key: value for key, value in known.items() if key not in section}
-    return (*((_section(profile.bus, section, _typed),) if section else ()),
+    if known.simulated:
+        return ("# No drive: the embedded simulator runs, and no real shaft moves.", "run: {simulate: true}")
+    what = "# The drive's address. Without it the embedded simulator runs."
+    if not known.address:
+        return (what, *bus_named(profile.bus).rig_blank(profile))
+    section = {key: value for key, value in known.address.items() if key in _section_fields(profile.bus)}
+    beside = {key: value for key, value in known.address.items() if key not in section}
+    return (what, *((_section(profile.bus, section, _typed),) if section else ()),
             *(f"{key}: {_typed(value)}" for key, value in beside.items()))
 
 

@@ -49,6 +49,23 @@ def test_a_complete_draft_of_each_profile_is_a_file_without_a_mistake(name):
     assert found.limits["watchdog_s"] == 0.5
 
 
+@pytest.mark.parametrize("name", sorted(profile_names()))
+def test_a_simulated_rig_needs_its_name_alone(name):
+    found = draft_of(DraftBody(name, simulated=True, name="bench 3", address={}, motion="attended"))
+    assert found.problems == []
+    rig = parse_rig(found.text, "rig.yaml")
+    assert (rig.name, rig.profile, rig.run.simulate, rig.limits, rig.service.motion) == (
+        "bench 3", name, True, None, "never")
+
+
+def test_a_simulated_rig_may_have_the_limits_of_the_real_one():
+    found = draft_of(complete("maxon/epos4", simulated=True))
+    assert found.problems == [] and parse_rig(found.text, "rig.yaml").limits.torque_nm == 400.0
+    assert "socketcan" not in found.text
+    assert {one.field for one in draft_of(complete("maxon/epos4", simulated=True, name="", string={})).problems} == {
+        "name", *STRING}
+
+
 def fields_of(**changed):
     return {one.field: one.message for one in draft_of(complete("maxon/epos4", **changed)).problems}
 
@@ -114,6 +131,12 @@ def test_a_line_break_adds_no_key():
 def test_what_the_form_does_not_offer_is_refused(call, changed):
     body = {"profile": "maxon/epos4", "name": "x", "address": {"channel": "can0"}} | changed
     assert call("POST", "/new-rig/draft", 422, json=body)["error"]["code"]
+
+
+def test_a_simulated_rig_is_ready_to_start(call):
+    draft = call("POST", "/new-rig/draft", 200, json={"profile": "maxon/epos4", "simulated": True, "name": "bench 4"})
+    made = call("POST", "/rigs", 201, json={"id": "bench-4", "text": draft["text"]})
+    assert (made["simulated"], made["state"]) == (True, "free")
 
 
 def test_a_rig_is_added_once_and_the_audit_says_so(call, service):

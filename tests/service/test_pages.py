@@ -1012,6 +1012,24 @@ def test_the_steps_of_a_new_rig(page, served, rigs, monkeypatch):
     assert page.evaluate("window.pwned") is None
 
 
+@pytest.mark.heavy
+def test_a_simulated_rig_is_added_without_a_drive(page, rigs):
+    page.goto("/new-rig")
+    page.get_by_label("Name in reports").fill("Bench 4")
+    page.get_by_label("Profile:").select_option("maxon/epos4")
+    page.get_by_label("Simulated: there is no drive").check()
+    for hidden in ("3. Settings at the drive", "Scan for the drive", "5. Motion from the browser"):
+        assert not page.get_by_text(hidden, exact=True).is_visible()
+    page.reload()                                                   # what was typed is there again
+    page.get_by_label("Simulated: there is no drive").wait_for()
+    page.get_by_text("These may stay empty").wait_for()
+    page.get_by_role("button", name="Save the rig").click()
+    page.wait_for_url("**/start/bench-4")
+    page.get_by_text("SIMULATED").first.wait_for()
+    page.get_by_role("button", name=re.compile("^Start")).wait_for()
+    assert "run: {simulate: true}" in (rigs / "bench-4.yaml").read_text()
+
+
 def test_the_steps_of_a_torque_calibration(page, served, monkeypatch):
     run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
     served.service.wait(run, "done")

@@ -82,7 +82,13 @@
       const string = field("load").value === "string";
       for (const one of byId("machine").children) if (!one.dataset.field.startsWith("limits.")) one.hidden = !string;
     }
+    function simulatedChanged() {
+      const simulated = field("simulated").checked;
+      for (const one of form.querySelectorAll("[data-real]")) one.hidden = simulated;
+      byId("limits-hint").hidden = !simulated;
+    }
     field("profile").addEventListener("change", profileChanged);
+    field("simulated").addEventListener("change", simulatedChanged);
     field("load").addEventListener("change", loadChanged);
     field("profile").value = byName.has("generic/cia402") ? "generic/cia402" : profiles[0].name;
     profileChanged();
@@ -99,6 +105,7 @@
         else if (one.tagName === "SELECT" ? [...one.options].some((each) => each.value === was) : was && !one.value) one.value = was;
       }
       loadChanged();
+      simulatedChanged();
     }
     try { putBack(JSON.parse(sessionStorage.getItem(KEPT)) || {}); } catch (error) { /* nothing was kept */ }
     const keep = () => {
@@ -108,7 +115,7 @@
     opens();
 
     function draft() {
-      const found = { address: {}, limits: {}, string: {}, accept_unverified: [...form.querySelectorAll("[name=accept]:checked")].map((one) => one.value), alone: field("alone").checked };
+      const found = { address: {}, limits: {}, string: {}, accept_unverified: [...form.querySelectorAll("[name=accept]:checked")].map((one) => one.value), alone: field("alone").checked, simulated: field("simulated").checked };
       for (const name of ["profile", "name", "load", "gear_ratio", "motion"]) found[name] = point(field(name).value);
       found.rated_torque_nm = byId("rated").hidden ? "" : point(field("rated_torque_nm").value);
       found.parameters = Object.fromEntries([...form.querySelectorAll("#parameters input")].map((one) => [one.name.replace("parameters.", ""), point(one.value)]));
@@ -160,7 +167,7 @@
         if (!save || found.problems.length) return;
         const made = await call("POST", "/rigs", { id: field("id").value.trim(), text: found.text });
         try { sessionStorage.removeItem(KEPT); } catch (error) { /* nothing was kept */ }
-        location.assign(made.motion === "never" ? "/" : `/start/${encodeURIComponent(made.id)}`);
+        location.assign(made.motion === "never" && !made.simulated ? "/" : `/start/${encodeURIComponent(made.id)}`);
       } catch (error) {
         refused(error);
       }
