@@ -11,7 +11,10 @@ torque ends at zero instead of becoming negative. So the release never unscrews 
 
 Z is the torque limit over half the speed limit, which suits a long string. A short and stiff one would respond to a
 late report with an oscillation: whenever the torque changes its sign faster than any string oscillates, Z is doubled.
-The mean torque shows this, and the torque of single cycles where the loop oscillates within a few of them.
+The mean torque shows this, and the torque of single cycles where the loop oscillates within a few of them. Single
+cycles count only while the reported speed moves, too. A loop whose sensor is lost oscillates beside a speed of zero: a
+doubled Z would calm the torque, and the turning shaft would pass for one at rest (`benchmarks/lying_reports.py`, number
+746).
 """
 
 from __future__ import annotations
@@ -115,6 +118,7 @@ class StringRelease:
         self._recent: deque[float] = deque(maxlen=max(1, round(MEAN_S / period_s)))
         self._reference_nm: float | None = None
         self._quiet_s = 0.0
+        self._still_s = math.inf       # since the reported speed was above rest
         self._time_s = 0.0
         self.trapped_nm = 0.0
         """Torque at the beginning, signed, N·m."""
@@ -153,9 +157,11 @@ class StringRelease:
         if self._reference_nm is None:
             self._reference_nm, self.trapped_nm = abs(held_nm), held_nm
         self._reference_nm = max(0.0, self._reference_nm - self._limits.ramp_nm_s * self._period_s)
-        calm = abs(held_nm) <= self._limits.residual_nm and abs(speed_rad_s) <= self._at_rest_rad_s
+        still = abs(speed_rad_s) <= self._at_rest_rad_s
+        self._still_s = self._still_s + self._period_s if still else 0.0
+        calm = abs(held_nm) <= self._limits.residual_nm and still
         self._quiet_s = self._quiet_s + self._period_s if calm else 0.0
-        self._impedance.watch(held_nm, self._period_s, torque_nm)
+        self._impedance.watch(held_nm, self._period_s, torque_nm if self._still_s < MEAN_S else 0.0)
         speed = self._yielding(torque_nm)
         self.travel_rad += speed * self._period_s
         return speed
