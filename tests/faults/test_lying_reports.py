@@ -21,9 +21,9 @@ def closed(log):
 
 
 ONCE_BELIEVED = (746, 856, 4889)
-"""746: the sensor is lost in the stop above a string; a stiffer release calmed the torque: disabled at 2.4 rad/s. 856: a
-sign that changes above a string; believed again while the shaft ran out, the speed control drove it to 42 rad/s. 4889: a
-torque constant that halves within stage 2 doubled J above a string of known size, and valid."""
+"""746: the sensor is lost in the stop above a string; a stiffer release calmed the torque: disabled at 2.4 rad/s.
+856: a sign that changes above a string; believed again while the shaft ran out, the speed control drove it to 42 rad/s.
+4889: a torque constant that halves within stage 2 doubled J above a string of known size, and valid."""
 
 
 @pytest.mark.heavy(each_share=True)     # fifty lies at each commit: no other fault is as bad as a lie that is believed
