@@ -312,13 +312,15 @@ class Blind:
     moments: frozenset[str] = frozenset()      # empty: at any moment
     string: bool | None = None                 # None: with or without a string
     demand: bool | None = None                 # True: torque is commanded or its demand reported; False: neither
+    position: bool | None = None               # True: the drive reports its position; False: it does not
 
     @property
     def words(self) -> str:
         """Description of these combinations."""
         load = {None: "", True: ", above a string", False: ", without a string"}[self.string]
+        position = {None: "", True: ", beside a position", False: ", without a position"}[self.position]
         when = f", {' or '.join(sorted(one or 'from the start' for one in self.moments))}" if self.moments else ""
-        return " and ".join(name.rstrip("-") for name in self.lies) + load + when
+        return " and ".join(name.rstrip("-") for name in self.lies) + load + position + when
 
     def holds(self, told: LieWithValue, moment: str, program: CommandLine) -> bool:
         """Return whether a combination is one of these."""
@@ -328,6 +330,7 @@ class Blind:
             and (not self.moments or moment in self.moments)
             and (self.string is None or self.string is program.string)
             and (self.demand is None or self.demand is known)
+            and (self.position is None or self.position is program.position)
         )
 
 
@@ -354,6 +357,9 @@ UNKNOWABLE: tuple[Blind, ...] = (
     Blind(("sensor-coarse",), Unknowable(
         "a shaft that is slower than half a step of the sensor is reported at rest by speed, position and torque",
         frozenset("ab"))),
+    Blind(("speed-coarse",), Unknowable(
+        "a shaft that is slower than half a step of the report is reported at rest, and no position shows its motion",
+        frozenset("ab")), position=False),
     Blind(("motor-polarity", "torque-sign"), Unknowable(
         "the reports are those of a lost encoder and a torque that pushes the shaft on: the torque is removed",
         frozenset("a")), _IN_STOP, string=False),

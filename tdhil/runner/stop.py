@@ -276,7 +276,7 @@ class StopSequence:
             )
         self._held: deque[float] = deque(maxlen=loop.cycles(MEAN_S))
         self._trapped_nm = self._held_at_rest_nm = 0.0
-        self._position_due_s = self._repeat_due_s = -math.inf
+        self._position_due_s = self._position_read_s = self._repeat_due_s = -math.inf
         self._torque_removed = False
         self._trouble: list[str] = []
         self._polls = FeedbackPolls(loop.drive, loop.period_s)
@@ -554,8 +554,8 @@ class StopSequence:
 
     def _ask_position(self, now_s: float) -> None:
         """Read the position by a single request at intervals, if it does not come with the cycle."""
-        drive = self._loop.drive
-        coming = self._loop.guard.observer.heard_position(now_s, 2.0 * POSITION_EVERY_S)
+        drive, newer_s = self._loop.drive, math.nextafter(now_s - self._position_read_s, 0.0)
+        coming = self._loop.guard.observer.heard_position(now_s, min(2.0 * POSITION_EVERY_S, newer_s))
         if coming or now_s < self._position_due_s or not isinstance(drive, Positioned) or not self._fed:
             return
         self._position_due_s = now_s + POSITION_EVERY_S
@@ -565,6 +565,7 @@ class StopSequence:
             self._note(error)
             return
         if reading is not None:
+            self._position_read_s = reading.time_s
             self._loop.guard.observer.see_reading(reading)
 
     def _poll_agrees(self, rest: Standstill) -> bool:

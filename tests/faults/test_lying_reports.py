@@ -20,9 +20,10 @@ def closed(log):
         return False
 
 
-ONCE_BELIEVED = (746, 856, 4889)
+ONCE_BELIEVED = (746, 856, 3730, 4889)
 """746: the sensor is lost in the stop above a string; a stiffer release calmed the torque: disabled at 2.4 rad/s.
 856: a sign that changes above a string; believed again while the shaft ran out, the speed control drove it to 42 rad/s.
+3730: a coarse speed report beside a position that the stop read too seldom to use: disabled at 0.33 rad/s.
 4889: a torque constant that halves within stage 2 doubled J above a string of known size, and valid."""
 
 

@@ -126,4 +126,25 @@ def test_a_position_by_single_requests_is_asked_for_at_intervals(world, error):
     report = here.stop_sequence().run()
     took_s = here.bench.now_s - begun_s
     assert report.confirmed and here.drive.disabled_at == [0.0]
-    assert took_s / POSITION_EVERY_S / 3 < here.drive.readings <= took_s / POSITION_EVERY_S + 1
+    assert took_s / POSITION_EVERY_S / 1.5 < here.drive.readings <= took_s / POSITION_EVERY_S + 1
+
+
+class Creeping(Asked):
+    """Creeps on for a while at a speed that a coarse report shows as zero."""
+
+    longest_s = 6.0
+    crept_s = 0.0
+
+    def _move(self, command):
+        super()._move(command)
+        if self.speed == 0.0 and self.crept_s < self.longest_s:
+            self.crept_s += PERIOD_S
+            self.turned_rad += 0.3 * PERIOD_S
+
+
+def test_standstill_is_held_against_a_position_by_single_requests(world):
+    """The stop's own readings are no reason to read less often (`benchmarks/lying_reports.py`, number 3730)."""
+    here = world(Creeping())
+    here.turn(5.0)
+    assert here.stop_sequence().run().confirmed
+    assert here.drive.crept_s >= here.drive.longest_s

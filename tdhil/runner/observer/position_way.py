@@ -48,6 +48,7 @@ class PositionWay:
         self._apart = 0
         self._rate_known = True
         self._rate_rad_s: float | None = None
+        self._rate_over_s = ANGLE_WINDOW_S[0]
 
     @property
     def rate_rad_s(self) -> float | None:
@@ -66,7 +67,10 @@ class PositionWay:
                 break
             first = one
         took_s = last[0] - first[0]
-        return (last[1] - first[1]) / took_s if took_s >= 0.4 * ANGLE_WINDOW_S[0] else None
+        if took_s < 0.4 * ANGLE_WINDOW_S[0]:
+            return None
+        self._rate_over_s = took_s
+        return (last[1] - first[1]) / took_s
 
     @property
     def repeats(self) -> bool:
@@ -76,7 +80,7 @@ class PositionWay:
     @property
     def blur_rad_s(self) -> float:
         """Return the uncertainty of this speed due to one count of the position, rad/s."""
-        return self.count_rad / ANGLE_WINDOW_S[0]
+        return self.count_rad / min(self._rate_over_s, ANGLE_WINDOW_S[0])
 
     def see(self, position_rad: float, time_s: float, way: Way, noise_rad_s: float) -> str | None:
         """Return the contradiction between position and speed in words; None without one."""
