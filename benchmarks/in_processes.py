@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import TypeVar
 
 TASKS_PER_PROCESS = 50
-"""A process ends after this many tasks, so that its memory stays small."""
+"""The processes are replaced after this many tasks each, so that their memory stays small."""
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -16,11 +17,14 @@ Result = TypeVar("Result")
 def in_processes(work: Callable[[Task], Result], tasks: Sequence[Task], jobs: int) -> Iterator[Result]:
     """Yield the results of ``work`` in the order of the tasks; with one job, from this process.
 
-    `concurrent.futures` is not used: with ``max_tasks_per_child`` its pool hangs if all processes end at once
-    (CPython, issue 115634).
+    Each part of the tasks has a pool of its own. ``max_tasks_per_child`` is not used: the pool hangs if all processes
+    end at once (CPython, issue 115634). `multiprocessing.Pool` is not used: its processes may not start others, as the
+    simulated EtherCAT segment does.
     """
     if jobs <= 1:
         yield from map(work, tasks)
         return
-    with get_context("spawn").Pool(jobs, maxtasksperchild=TASKS_PER_PROCESS) as pool:
-        yield from pool.imap(work, tasks)
+    part = jobs * TASKS_PER_PROCESS
+    for begin in range(0, len(tasks), part):
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+            yield from pool.map(work, tasks[begin : begin + part])
