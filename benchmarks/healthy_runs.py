@@ -135,12 +135,14 @@ def draw(seed: int) -> Rig:
     profile = roomy(profile, fits, rated)
     gain = inertia * rng.uniform(2.0, 4.0)
     bottom_load = rng.uniform(0.0, 0.02) * torque if shaft != "rigid" and rng.random() < 0.5 else 0.0
+    quick_stop = round_up(0.5 * torque / inertia)
     whole = {
         "plant": plant,
         "drive": {
             "rated_torque_nm": rated, "torque_limit_nm": round_up(torque * 1.2),
             "speed_limit_rpm": round_up(top * 1.3 * 60.0 / (2.0 * math.pi)), "speed_gain_nm_s_rad": gain,
             "speed_integral_gain_nm_rad": gain * rng.uniform(0.4, 1.2),
+            "quick_stop_rad_s2": quick_stop,      # set at a drive that does not take it from a host
         },
         "reporting": {
             "speed_lag_s": 0.0 if rng.random() < 0.15 else rng.uniform(0.0, 0.5),
@@ -159,7 +161,7 @@ def draw(seed: int) -> Rig:
     rig = {
         "limits": {
             "speed_min_rad_s": round_up(0.05 * top), "speed_max_rad_s": top, "torque_nm": torque, "time_s": 1800,
-            "quick_stop_rad_s2": round_up(0.5 * torque / inertia), "watchdog_s": 0.5,
+            "quick_stop_rad_s2": quick_stop, "watchdog_s": 0.5,
             "probe_torque_nm": round_up(min(0.8 * torque, 2.5 * coulomb + 0.2 * torque)),
             "probe_travel_rad": round_up(max(3.0, 0.5 * top)),
         },

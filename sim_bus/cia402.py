@@ -180,7 +180,7 @@ class Application:
 
     def __init__(self, inverter: Inverter) -> None:
         self.inverter = inverter
-        self.settings = ApplicationSettings()
+        self.settings = ApplicationSettings(quick_stop_rad_s2=inverter.params.drive.quick_stop_rad_s2)
         self.state = State.SWITCH_ON_DISABLED
         self.mode = OperationMode.PROFILE_VELOCITY
         self.controlword = 0

@@ -24,6 +24,10 @@ class DriveParams(Validated):
     rated_current_a: Positive = 200.0
     torque_limit_nm: Positive = 400.0
     speed_limit_rpm: Positive = 200.0
+    quick_stop_rad_s2: Positive = 3.0
+    """Deceleration of a quick stop as set at the drive, rad/s². A host may write another one where the drive takes it.
+    A Modbus drive has that of its registers.
+    """
     speed_gain_nm_s_rad: NonNegative = 300.0
     speed_integral_gain_nm_rad: NonNegative = 300.0
     speed_filter_s: NonNegative = 0.02

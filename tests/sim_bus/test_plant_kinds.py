@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from profiles.errors import DataFileError
 from profiles.yaml_loader import parse_model
+from sim_bus.cia402 import Application
 from sim_bus.inverter import Inverter
 from sim_bus.params import FAITHFUL, QUIET, DriveParams, NoiseParams, RigParams, load_rig
 from sim_bus.plant.drill_string import StringParams
@@ -40,7 +41,7 @@ def defaults(model: type[BaseModel], prefix: str = "") -> dict[str, set[Any]]:
 
 DEFAULTS = defaults(RigParams) | {"plant.kind": {"rigid"}}
 FRICTIONS = get_args(Params.model_fields["friction"].annotation)
-UNITS = {"_kg_m2": "kg·m²", "_nm_s_rad": "N·m·s/rad", "_nm_rad": "N·m/rad", "_nm": "N·m", "_rad_s": "rad/s",
+UNITS = {"_kg_m2": "kg·m²", "_nm_s_rad": "N·m·s/rad", "_nm_rad": "N·m/rad", "_nm": "N·m", "_rad_s": "rad/s", "_rad_s2": "rad/s²",
          "_rad": "rad", "_m": "m", "_pa": "Pa", "_kg_m3": "kg/m³", "_nm_s_rad_m": "N·m·s/rad per m", "_a": "A",
          "_rpm": "1/min", "_s": "s", "_permille": "‰"}
 
@@ -156,6 +157,11 @@ def test_a_load_at_the_bottom_is_felt_at_the_motor_one_wave_later() -> None:
     for _ in range(10):
         state = two.step(state, 0.0, 0.002, 0.0, 300.0)
     assert state.bottom_speed_rad_s == pytest.approx(-300.0 * 0.02 / 374.0, rel=0.01)
+
+
+def test_a_drive_has_the_quick_stop_that_was_set_at_it() -> None:
+    rig = RigParams.model_validate({"drive": {"quick_stop_rad_s2": 39.1}})
+    assert Application(Inverter(rig, np.random.default_rng(1))).settings.quick_stop_rad_s2 == 39.1
 
 
 def test_a_rigid_shaft_has_no_bottom_to_be_loaded() -> None:
