@@ -41,9 +41,9 @@ def defaults(model: type[BaseModel], prefix: str = "") -> dict[str, set[Any]]:
 
 DEFAULTS = defaults(RigParams) | {"plant.kind": {"rigid"}}
 FRICTIONS = get_args(Params.model_fields["friction"].annotation)
-UNITS = {"_kg_m2": "kg·m²", "_nm_s_rad": "N·m·s/rad", "_nm_rad": "N·m/rad", "_nm": "N·m", "_rad_s": "rad/s", "_rad_s2": "rad/s²",
-         "_rad": "rad", "_m": "m", "_pa": "Pa", "_kg_m3": "kg/m³", "_nm_s_rad_m": "N·m·s/rad per m", "_a": "A",
-         "_rpm": "1/min", "_s": "s", "_permille": "‰"}
+UNITS = {"_kg_m2": "kg·m²", "_nm_s_rad": "N·m·s/rad", "_nm_rad": "N·m/rad", "_nm": "N·m", "_rad_s": "rad/s",
+         "_rad_s2": "rad/s²", "_rad": "rad", "_m": "m", "_pa": "Pa", "_kg_m3": "kg/m³",
+         "_nm_s_rad_m": "N·m·s/rad per m", "_a": "A", "_rpm": "1/min", "_s": "s", "_permille": "‰"}
 
 
 def rows() -> dict[str, tuple[str, str]]:
