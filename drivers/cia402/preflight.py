@@ -395,10 +395,11 @@ def find_free_node(objects: Objects) -> None:
     try:
         objects.read(0x1000)
     except CommunicationLost as error:
+        if error.entry in (MessageCode.NODE_SILENT, CommunicationLost.entry):
+            raise PreflightRefused(error.what, where=error.where, next_step=error.next_step,
+                                   entry=MessageCode.NO_DRIVE_FOUND) from error
         # a drive with a wrong answer is there, and a bus that failed is a cause of its own
-        silent = error.entry in (MessageCode.NODE_SILENT, CommunicationLost.entry)
-        raise PreflightRefused(error.what, where=error.where, next_step=error.next_step,
-                               entry=MessageCode.NO_DRIVE_FOUND if silent else error.entry) from error
+        raise PreflightRefused(error.what, where=error.where, next_step=error.next_step) from error
     refuse_if_driven(objects)
 
 
