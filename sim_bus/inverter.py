@@ -74,8 +74,8 @@ class Disturbance:
 
 
 BIT_CUTS_RAD_S = 0.1
-"""From this speed of the bit on its random load acts in full, rad/s (1 rev/min). It comes from cutting, so that a bit
-at rest has none: else it would swing a string that hangs at rest."""
+"""Speed of the bit from which on its random load acts in full, rad/s (1 rev/min). The load comes from cutting. A bit at
+rest has none, because it would swing a string that hangs at rest."""
 
 
 class BottomLoad:

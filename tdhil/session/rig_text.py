@@ -121,7 +121,7 @@ def blank_rig(
 
 
 def _place(profile: Profile, known: RigEntries) -> tuple[str, ...]:
-    """Return the lines of the drive's address: blank ones without any known key."""
+    """Return the lines that state where the drive is: simulated, or its address; blank ones without any known key."""
     if known.simulated:
         return ("# No drive: the embedded simulator runs, and no real shaft moves.", "run: {simulate: true}")
     what = "# The drive's address. Without it the embedded simulator runs."
