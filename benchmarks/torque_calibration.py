@@ -20,8 +20,8 @@ import json
 import subprocess
 import sys
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -31,6 +31,9 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
+
+from benchmarks.in_processes import in_processes  # noqa: E402
+from benchmarks.kept_rows import kept_rows  # noqa: E402
 
 LARGEST_SCALE_ERROR = 0.08
 ASSUMED_HALF_WIDTH = 0.0392
@@ -113,34 +116,24 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1, help="cases beside each other")
     asked = parser.parse_args()
     asked.logs.mkdir(parents=True, exist_ok=True)
-    rows = kept_rows(asked.out)
-    known = {row.seed for row in rows}
-
-    def one(seed: int) -> CalibrationRow | None:
-        drive = random_drive(seed)
-        paths = recorded(drive, asked.logs.resolve())
-        if asked.only_logs:
+    seeds, logs = range(asked.first, asked.first + asked.runs), asked.logs.resolve()
+    if asked.only_logs:
+        for seed, _ in zip(seeds, in_processes(partial(recorded_case, logs=logs), seeds, asked.jobs), strict=True):
             print(f"{seed}: recorded", flush=True)
-            return None
-        return judged(drive, calibrated(drive, paths))
-
-    wanted = [seed for seed in range(asked.first, asked.first + asked.runs) if seed not in known]
-    with ThreadPoolExecutor(asked.jobs) as pool:
-        for row in pool.map(one, wanted):
-            if row is None:
-                continue
-            rows.append(row)
-            if asked.out is not None:
-                with asked.out.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(asdict(row)) + "\n")
-    return 0 if asked.only_logs else summary(rows)
+        return 0
+    rows = kept_rows(asked.out, "seed", seeds, partial(case, logs=logs), lambda row: None, asked.jobs)
+    return summary([CalibrationRow(**row) for row in rows])
 
 
-def kept_rows(path: Path | None) -> list[CalibrationRow]:
-    """Rows of earlier parts of the study."""
-    if path is None or not path.exists():
-        return []
-    return [CalibrationRow(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
+def recorded_case(seed: int, logs: Path) -> tuple[Path, Path]:
+    """The two logs of a seed; made where they are not there yet."""
+    return recorded(random_drive(seed), logs)
+
+
+def case(seed: int, logs: Path) -> dict[str, Any]:
+    """The row of a seed: recorded where needed, calibrated, held against the truth, and printed."""
+    drive = random_drive(seed)
+    return asdict(judged(drive, calibrated(drive, recorded(drive, logs))))
 
 
 @dataclass(frozen=True)
