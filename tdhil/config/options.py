@@ -671,7 +671,6 @@ class EvidenceOptions(_Said):
     )
     simulated: bool = option(
         "--simulated", group=Topic.EVIDENCE, default=False, api=True,
-        form=Form("Mark it as a run of the simulated drive", ("evidence",)),
         help="mark the archive as that of the simulated drive; without this option such a run is refused",
     )
 

@@ -97,7 +97,7 @@ def wrong_in(given: EvidenceOptions) -> list[tuple[str, str]]:
     if stated and len(stated) < len(_REFERENCE):
         wrong += [(name, "is missing: a reference inertia needs its value, its standard uncertainty and its method")
                   for name in _REFERENCE if name not in stated]
-    if len(stated) == len(_REFERENCE) and not (given.reference_note or "").strip():
+    if stated and not (given.reference_note or "").strip():
         wrong.append(("reference_note", "is missing: state in words how the reference inertia is known"))
     if given.reference_note and not stated:
         wrong.append(("reference_inertia_kg_m2", "is missing: a note without a reference inertia has no meaning"))

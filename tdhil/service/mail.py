@@ -118,7 +118,7 @@ class Mail:
         found["Auto-Submitted"] = "auto-generated"         # RFC 3834: no automatic reply
         rows = [
             ("rig", f"{message['rig']}{marks}"), ("run", message["run"]), ("state", message.get("state")),
-            ("exit code", message.get("exit_code")), ("verdict", message.get("verdict")), ("J", figure),
+            ("exit code", message.get("exit_code")), ("verdict", message.get("verdict")), ("result", figure),
             ("quantity", message.get("quantity")), ("text", message.get("text")), ("requested", message.get("asked")),
             ("ended", message.get("ended")), ("page", f"{self.site}{message['path']}"),
         ]

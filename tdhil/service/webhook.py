@@ -78,7 +78,8 @@ class Webhook:
 
     def __str__(self) -> str:
         parts = urlsplit(self.url)
-        return f"{parts.scheme}://{parts.netloc}{parts.path}"
+        unsigned = "" if self.secret else f" (not signed: {SECRET_FILE} is not set)"
+        return f"{parts.scheme}://{parts.netloc}{parts.path}{unsigned}"
 
 
 def _secret(environment: Mapping[str, str]) -> bytes | None:

@@ -749,6 +749,16 @@ def test_the_form_asks_for_minutes_and_per_cent(client):
     assert re.search(r'name="max_time_s" placeholder="as the limits allow"[^>]*data-unit="min"', page)
 
 
+RIG_PAGES = ["/start/a", "/calibrate/a", "/rehearse/a", "/rigs/a", "/rigs/a/file"]
+
+
+@pytest.mark.parametrize("path", RIG_PAGES)
+def test_each_page_of_a_rig_leads_to_the_others(client, path):
+    links = re.search(r'<nav class="rig".*?</nav>', client.get(path).text, re.DOTALL)[0]
+    assert re.findall(r'href="([^"]+)"', links) == RIG_PAGES
+    assert re.findall(r'href="([^"]+)" aria-current="page"', links) == [path]
+
+
 def test_the_document_describes_every_option(call):
     body = call("GET", "/openapi.json", 200)["paths"]["/api/v1/rigs/{rig}/runs"]["post"]["requestBody"]
     described = body["content"]["application/json"]["schema"]["properties"]

@@ -49,7 +49,7 @@ def test_every_mistake_of_the_statement_is_said_at_its_field(call, service, run)
     sent = {"publish": "photo", "reference_inertia_kg_m2": "-1", "reference_method": "guessed"}
     refused = call("POST", f"/runs/{run}/evidence", 422, json=sent)
     assert {one["option"] for one in refused["fields"]} == {
-        "publisher", "publish", "reference_inertia_kg_m2", "reference_sd_kg_m2", "reference_method"}
+        "publisher", "publish", "reference_inertia_kg_m2", "reference_sd_kg_m2", "reference_method", "reference_note"}
     call("POST", f"/runs/{run}/evidence", 422, json={**STATED, "photo": 1})
     assert not noted(service, "evidence requested")
 

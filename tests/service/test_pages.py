@@ -14,10 +14,12 @@ import signal
 import socket
 import threading
 import time
+import zipfile
 from collections.abc import Iterator
 from dataclasses import asdict
 from html import escape
 from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -563,11 +565,19 @@ def test_an_acceptance_that_fails_is_signed_with_a_remark_and_then_shows_who_sig
 @pytest.mark.heavy
 @pytest.mark.parametrize("width", [390, 1280])
 def test_evidence_of_a_run_is_made_on_its_page(browser, served, monkeypatch, width):
-    """Every missing part is marked at its field; then the archive is there, with its digest."""
+    """Every missing part is marked at its field; then the archive is there, with its digest.
+
+    The run is of the simulated drive, so the page marks the archive as such without a question.
+    """
     from functools import partial
 
     from tdhil.evidence import check_evidence, make_evidence
-    from tests.evidence.small_runs import found, write_run
+    from tests.evidence.small_runs import RESULT, write_run
+
+    result = {**RESULT, "simulated": True}
+
+    def found(log):
+        return result
 
     play_uploads(served.service, monkeypatch)
     monkeypatch.setattr("tdhil.evidence.making.make_evidence", partial(make_evidence, conclude=found))
@@ -576,7 +586,7 @@ def test_evidence_of_a_run_is_made_on_its_page(browser, served, monkeypatch, wid
     wait_for("its end", lambda: not served.service.supervisor.live())
     log = served.service.store.place(run) / "run.mcap"
     log.unlink(missing_ok=True)
-    write_run(log)
+    write_run(log, simulated=True, result=result)
     context = browser.new_context(base_url=served.url, viewport={"width": width, "height": 800}, bypass_csp=True)
     page = context.new_page()
     page.goto(f"/runs/{run}")
@@ -584,7 +594,7 @@ def test_evidence_of_a_run_is_made_on_its_page(browser, served, monkeypatch, wid
     page.get_by_label("Reference inertia at the motor shaft").fill("104")
     page.get_by_role("button", name="Make the archive").click()
     page.locator("#wrong-publisher").wait_for()
-    assert {"publisher", "publish", "reference_sd_kg_m2", "reference_method"} == {
+    assert {"publisher", "publish", "reference_sd_kg_m2", "reference_method", "reference_note"} == {
         one.get_attribute("name") for one in page.locator("#evidence-form [aria-invalid=true]").all()}
     if axe := os.environ.get("TDHIL_AXE"):
         page.add_script_tag(path=axe)
@@ -603,6 +613,7 @@ def test_evidence_of_a_run_is_made_on_its_page(browser, served, monkeypatch, wid
         link.click()
     archive = Path(download.value.path()).read_bytes()
     assert check_evidence(archive, digest, conclude=found).problems == ()
+    assert json.loads(zipfile.ZipFile(BytesIO(archive)).read("manifest.json"))["simulated"] is True
     assert page.evaluate("window.pwned") is None
     context.close()
 
