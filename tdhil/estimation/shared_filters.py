@@ -97,15 +97,18 @@ def identify_together(recordings: Sequence[Recording]) -> FittedTogether:
         parts += [(place, part, dof) for part, dof in of_lines]
     index = [_OWN * k for k in range(number)]
     every = [int(k) for k in np.flatnonzero(free)]
-    covariance, columns = _inverse(whole, every, index)
-    known, _ = _inverse(whole, list(range(start_index)), index)
-    rise = _excess(fits)
+    inverse = _inverse(whole, every)
+    with_known = _inverse(whole, list(range(start_index)))
+    # All J are free and come before every filter: their places are the same in theta and in both inverses.
+    shares = _shares(inverse[index[-1]] - inverse[index[0]] if number > 1 else inverse[index[0]], inverse, parts, every)
+    rise = WHOLE_RUNS * _rise_by_weights(shares)
     return FittedTogether(
-        inertia_kg_m2=best.theta[index], covariance=covariance * rise,
-        degrees_of_freedom=_satterthwaite(columns, parts, every), viscous_nm_s_rad=best.theta[1:start_index:_OWN],
-        sharing=_sharing(best.objective, [one.whole.objective for one in fits], rise,
+        inertia_kg_m2=best.theta[index], covariance=inverse[np.ix_(index, index)] * rise,
+        degrees_of_freedom=_satterthwaite(shares), viscous_nm_s_rad=best.theta[1:start_index:_OWN],
+        sharing=_sharing(best.objective, [one.whole.objective for one in fits], _excess(fits),
                          (size - len(fixed)) * (number - 1)),
-        alone_kg_m2=np.array([one.likelier.theta[0] for one in fits]), covariance_known_filters=known * rise,
+        alone_kg_m2=np.array([one.likelier.theta[0] for one in fits]),
+        covariance_known_filters=with_known[np.ix_(index, index)] * rise,
     )
 
 
@@ -134,40 +137,77 @@ def _first(parts: list[FloatArray]) -> FloatArray:
     return parts[0]
 
 
-def _inverse(whole: FloatArray, free: list[int], wanted: list[int]) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance (n, n) of the ``wanted`` parameters, and the rows (n, F) of the inverse behind it."""
+def _inverse(whole: FloatArray, free: list[int]) -> FloatArray:
+    """Return the covariance (F, F) of the ``free`` parameters."""
     chosen = whole[np.ix_(free, free)]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(chosen), 1e-300))
-    inverse = np.linalg.pinv(chosen * np.outer(scale, scale), rcond=1e-13, hermitian=True) * np.outer(scale, scale)
-    rows = [free.index(one) for one in wanted]
-    return inverse[np.ix_(rows, rows)], inverse[rows]
+    scaled = chosen * np.outer(scale, scale)
+    inverse: FloatArray = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) * np.outer(scale, scale)
+    return inverse
 
 
-def _satterthwaite(columns: FloatArray, parts: list[tuple[FloatArray, FloatArray, float]], free: list[int]) -> float:
-    """Return the degrees of freedom of the difference of the first and the last J, which decides a calibration."""
-    row = columns[-1] - columns[0]
+@dataclass(frozen=True)
+class _Share:
+    """Share of one line or constraint in the variance of the difference of the last and the first J.
+
+    With F_k, its part of the information F, and r = F⁻¹ c of the difference c: ``variance`` rᵀ F_k r, ``fitted``
+    rᵀ F_k F⁻¹ F_k r, and the ``dof`` of its weight.
+    """
+
+    variance: float
+    fitted: float
+    dof: float
+
+
+def _shares(
+    row: FloatArray, inverse: FloatArray, parts: list[tuple[FloatArray, FloatArray, float]], free: list[int]
+) -> list[_Share]:
+    """Return the shares of all parts in the variance of the difference ``row`` (F,), which decides a calibration."""
     at = {one: k for k, one in enumerate(free)}
-    shares, uncertain = 0.0, 0.0
+    found = []
     for place, part, dof in parts:
         kept = [k for k, one in enumerate(place) if int(one) in at]
-        own = row[[at[int(place[k])] for k in kept]]
-        share = float(own @ part[np.ix_(kept, kept)] @ own)
-        shares += share
-        uncertain += share * share / dof
-    return max(2.0, min(shares * shares / uncertain, 1e6)) if uncertain > 0.0 else 1e6
+        to = [at[int(place[k])] for k in kept]
+        pull = part[np.ix_(kept, kept)] @ row[to]
+        found.append(_Share(float(row[to] @ pull), float(pull @ inverse[np.ix_(to, to)] @ pull), dof))
+    return found
 
+
+def _satterthwaite(shares: list[_Share]) -> float:
+    """Return the degrees of freedom of the difference of the last and the first J."""
+    variance = sum(one.variance for one in shares)
+    uncertain = sum(one.variance**2 / one.dof for one in shares)
+    return max(2.0, min(variance**2 / uncertain, 1e6)) if uncertain > 0.0 else 1e6
+
+
+def _rise_by_weights(shares: list[_Share]) -> float:
+    """Return the factor by which the variance of the difference exceeds rᵀ F r, since the weights are estimates.
+
+    Kenward and Roger (Biometrics 53, 1997): with a weight of n degrees of freedom for the part F_k of F, the variance
+    exceeds F⁻¹ by twice Λ = F⁻¹ Σ (2/n) (F_k − F_k F⁻¹ F_k) F⁻¹. Once, because estimated weights are no optimal ones;
+    once more, because E F̂⁻¹ is too small. The factor (ν − 1)/ν of `Likelihood.information` already covers the latter.
+    The rule is of first order in 1/n: for 20 lines its variance is 1 % too small with n = 20, and 3 % with n = 12.
+    """
+    variance = sum(one.variance for one in shares)
+    more = sum(2.0 / one.dof * max(one.variance - one.fitted, 0.0) for one in shares)
+    return 1.0 + more / variance if variance > 0.0 else 1.0
+
+
+WHOLE_RUNS = 1.06
+"""Factor of the variance for what whole runs scatter beyond the noise of their lines.
+
+With a wider rule, the intervals of κ and J covered in 97.2 and 97.7 % of 200 simulated drives. That fits errors of 1.03
+times the standard uncertainty without this factor, and 1.03² = 1.06. With it both cover in 95.5 % (decision 0056).
+"""
 
 _LEANING = 2.0
-"""Share of p/ν by which the covariance is too small, as in `filter_order.excess_rise`, where 4 is measured for one run.
-
-Measured on 55 drives of benchmarks/torque_calibration.py: with 4 and the median ν of both runs, the interval of κ
-missed the truth in 13 % of the drives with a large enough body, mostly if one run had few periods.
+"""Share of p/ν by which the decrease of −2 ln L exceeds χ², as in `filter_order.excess_rise`, where 4 is measured for
+one run.
 """
 
 
 def _excess(fits: Sequence[FittedModel]) -> float:
-    """Return the factor by which the covariance exceeds the inverse information: 1 + p/(2ν), ν of the run with fewest
-    periods.
+    """Return the factor by which −2 ln L decreases too much: 1 + p/(2ν), ν of the run with fewest periods.
 
     The p parameters follow the lines whose scatter is small by chance.
     """
