@@ -1,4 +1,4 @@
-"""Quantities as users write them: ``100 rpm``, ``90°``, ``2 kNm``, ``15 min``, ``5 %``; and the unit of a key.
+"""Quantities as users write them (``100 rpm``, ``90°``, ``2 kNm``, ``5 %``), as messages show them; the unit of a key.
 
 One table for data files, the command line and the columns of a trace. A text with two meanings is refused: ``1/s`` and
 ``Hz`` for a speed (revolutions or radians), ``m`` (minutes or milli), ``MNm``.
@@ -133,6 +133,22 @@ _ENDINGS: Final = {
     "knm": KILONEWTON_METRE, "knm_s": _KILO_RATE, "ms": MILLISECOND, "us": MICROSECOND, "percent": PERCENT,
     "permille": PERMILLE, "kg_cm2": _CENTI, "c": TEMPERATURE, "khz": _KILOHERTZ,
 }
+
+
+_NOTHING: Final = 1e-9
+"""SI value below which a quantity is rounding of the arithmetic: 8.8e-12 s is no lag."""
+
+
+def plain_number(number: float, digits: int = 4) -> str:
+    """Return the number with some significant digits, without an exponent from 1e-4 to 1e9; below 1e-9 it is 0."""
+    if abs(number) < _NOTHING:
+        return "0"
+    return f"{float(f'{number:.{digits}g}'):.{9}g}"
+
+
+def in_nm(torque_nm: float) -> str:
+    """Return a torque with its unit, for a message: ``1143 N·m``, ``0.2133 N·m``. A servo drive has 1 N·m or less."""
+    return f"{plain_number(torque_nm)} N·m"
 
 
 def unit_of(text: str) -> Unit | None:

@@ -6,7 +6,7 @@ import math
 from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
-from profiles.quantities import RPM
+from profiles.quantities import RPM, in_nm
 from tdhil.cli.results import print_json
 from tdhil.config import Rig, RunOptions
 from tdhil.session import BEFORE_ACQUIRE_S, Figure, plan_course, plan_document, plan_dry, plan_dry_steps
@@ -85,7 +85,7 @@ def _dry_run_steps(
     if simulated:
         console.print(f"{SIMULATED}: the embedded rig, with its own limits if rig.yaml has none", style="magenta")
     console.print(
-        f"{program.pairs} pairs of steps of at most {program.step_rad_s:.3g} rad/s ({plain['step_torque_nm']:.0f} N·m) "
+        f"{program.pairs} pairs of steps of at most {program.step_rad_s:.3g} rad/s ({in_nm(plain['step_torque_nm'])}) "
         f"between {program.low_rad_s:.3g} and {program.high_rad_s:.3g} rad/s, {program.duration_s:.0f} s; limits "
         f"{limits.speed_min_rad_s:g} to {limits.speed_max_rad_s:g} rad/s, {limits.torque_nm:g} N·m, "
         f"{limits.time_s:g} s. A run first measures friction, and then plans again.", soft_wrap=True)
@@ -121,7 +121,7 @@ def _dry_run_course(
         "main shaft", f"{RPM.of_si(limits.speed_min_rad_s / ratio):.4g} to "
         f"{RPM.of_si(limits.speed_max_rad_s / ratio):.4g} rpm for the oscillation of the top",
     )
-    table.add_row("torque on the rotor", f"up to {plain['moving_torque_nm']:.0f} N·m, and friction",
+    table.add_row("torque on the rotor", f"up to {in_nm(plain['moving_torque_nm'])}, and friction",
                   f"±{limits.torque_nm:g} N·m")
     table.add_row("time, s", f"{program.longest_s:.0f} at most (+ about {BEFORE_ACQUIRE_S:.0f})",
                   f"{limits.time_s:g}")

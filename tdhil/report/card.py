@@ -12,6 +12,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from profiles.quantities import plain_number
 from tdhil.report.acceptance import acceptance_rows
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows, uploaded_rows
@@ -25,17 +26,6 @@ from tdhil.report.labels import (
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Numbers with the digits that their interval justifies.
-
-
-_NOTHING = 1e-9
-"""SI value below which a quantity is rounding of the arithmetic: 8.8e-12 s is no lag."""
-
-
-def plain_number(number: float, digits: int = 4) -> str:
-    """Return the number with some significant digits, without an exponent from 1e-4 to 1e9; below 1e-9 it is 0."""
-    if abs(number) < _NOTHING:
-        return "0"
-    return f"{float(f'{number:.{digits}g}'):.{9}g}"
 
 
 def with_interval(value: float, low: float, high: float, unit: str) -> str:

@@ -21,6 +21,7 @@ from rich.text import Text
 
 from drivers import Command, Outcome, Preflight, Sample
 from profiles import visible
+from profiles.quantities import in_nm
 from tdhil.recording import LiveInertia, Stage
 from tdhil.report.card import minutes
 from tdhil.report.document import SIMULATED
@@ -244,7 +245,7 @@ class LiveDisplay:
         self._view = replace(self._view, expected_s={**self._view.expected_s, "acquire": plan.duration_s + 5.0})
         text = (
             f"plan: {plan.kind} in {plan.mode} mode, {minutes(plan.duration_s)}, speed {plan.speed_min_rad_s:.2f} to "
-            f"{plan.speed_max_rad_s:.2f} rad/s, torque {plan.torque_min_nm:.0f} to {plan.torque_max_nm:.0f} N·m"
+            f"{plan.speed_max_rad_s:.2f} rad/s, torque {in_nm(plan.torque_min_nm)} to {in_nm(plan.torque_max_nm)}"
         )
         self._print(self._prefix() + text, style="dim")
 

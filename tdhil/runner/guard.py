@@ -38,6 +38,7 @@ from drivers import (
     Sample,
 )
 from profiles import MessageCode
+from profiles.quantities import in_nm
 from tdhil.runner.excitation import MotionLimits, RigGuess
 from tdhil.runner.observer import AT_LIMIT_SHARE, Contradiction, Observer, Signal
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
@@ -91,7 +92,7 @@ def _at(sample: Sample) -> str:
 def _leads(sample: Sample, command: Command, predicted_rad_s: float) -> str:
     """Return the prediction of the speed in words."""
     return (
-        f"{sample.speed_rad_s:.3f} rad/s reported and {command.torque_nm:.1f} N·m lead to {predicted_rad_s:.3f} rad/s"
+        f"{sample.speed_rad_s:.3f} rad/s reported and {in_nm(command.torque_nm)} lead to {predicted_rad_s:.3f} rad/s"
     )
 
 
@@ -165,17 +166,17 @@ class Guard:
             )
         if offset != 0.0 and (command.mode is not Mode.SPEED or abs(offset) > self.torque_offset_nm * (1.0 + 1e-9)):
             raise CommandRejected(
-                f"torque offset {offset:.1f} N·m in {command.mode.value} mode is above the limit of this stage,"
+                f"torque offset {in_nm(offset)} in {command.mode.value} mode is above the limit of this stage,"
                 f" {self.torque_offset_nm:g} N·m in speed mode",
                 where="guard",
             )
         if abs(torque) > self._limits.torque_nm * (1.0 + 1e-9):
             raise CommandRejected(
-                f"torque setpoint {torque:.1f} N·m is above the limit of {self._limits.torque_nm:g} N·m", where="guard"
+                f"torque setpoint {in_nm(torque)} is above the limit of {self._limits.torque_nm:g} N·m", where="guard"
             )
         if self.no_braking and command.mode is Mode.TORQUE and torque < 0.0:
             raise LimitHit(
-                f"a braking torque of {-torque:.1f} N·m was not sent: {self.no_braking}",
+                f"a braking torque of {in_nm(-torque)} was not sent: {self.no_braking}",
                 where="guard",
                 next_step=self.to_brake,
                 entry=MessageCode.BRAKING_HELD_BACK,
@@ -246,7 +247,7 @@ class Guard:
         self._check_speed(sample)
         if abs(sample.torque_nm) > self._torque_seen_nm:
             raise LimitHit(
-                f"torque {sample.torque_nm:.1f} N·m is above the limit of {self._limits.torque_nm:g} N·m",
+                f"torque {in_nm(sample.torque_nm)} is above the limit of {self._limits.torque_nm:g} N·m",
                 where=_at(sample),
                 next_step="The shaft was stopped. Check that rig.yaml has the drive's rated torque",
                 entry=MessageCode.TORQUE_LIMIT,
@@ -413,14 +414,14 @@ class Guard:
         if limit_active or abs(torque_nm) >= AT_LIMIT_SHARE * limit_nm:
             by = "the drive's internal limit acts" if limit_active else f"at its limit of {limit_nm:g} N·m"
             return (
-                f"torque {torque_nm:.1f} N·m, {by}",
+                f"torque {in_nm(torque_nm)}, {by}",
                 "Check whether a brake or the load holds the shaft. If not, a higher torque limit is needed"
                 " (limits.torque_nm in rig.yaml, and the drive's own)",
             )
         if disturbed or self.disturbed:
-            return f"torque {torque_nm:.1f} N·m, not at its limit of {limit_nm:g} N·m", LIGHTEN
+            return f"torque {in_nm(torque_nm)}, not at its limit of {limit_nm:g} N·m", LIGHTEN
         return (
-            f"torque {torque_nm:.1f} N·m, not at its limit of {limit_nm:g} N·m",
+            f"torque {in_nm(torque_nm)}, not at its limit of {limit_nm:g} N·m",
             "Check whether the drive takes its speed setpoint from elsewhere (panel, another master), applies its own"
             " speed limit or ramp, or uses another unit of speed than the profile. If not, its speed loop is too soft",
         )

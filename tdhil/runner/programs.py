@@ -11,6 +11,7 @@ from functools import partial
 
 from drivers import Command, Mode, Preflight, PreflightRefused, Sample
 from profiles import MessageCode
+from profiles.quantities import in_nm
 from tdhil.recording import Excitation, LagPrior, Ramp, RunLog
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import RigGuess
@@ -190,7 +191,7 @@ def begin_motion(run: Run) -> None:
     loop.guard.start_clock(loop.now_s)
     breakaway_nm = probe_sign(loop, limits, run.mode, preflight.speed_resolution_rad_s)
     if breakaway_nm is not None:
-        run.log.event(loop.now_s, "probe", f"the shaft moved forward at {breakaway_nm:.1f} N·m")
+        run.log.event(loop.now_s, "probe", f"the shaft moved forward at {in_nm(breakaway_nm)}")
     run.end_setup()
 
 
@@ -321,7 +322,7 @@ def run_small_offset(run: Run, turning: Turning) -> OffsetPlan:
         plan = found.plan
         run.display.planned(plan)
         text = (
-            f"torque offset of up to {found.peak_nm:.0f} N·m, {plan.duration_s:.0f} s, speed"
+            f"torque offset of up to {in_nm(found.peak_nm)}, {plan.duration_s:.0f} s, speed"
             f" {plan.speed_min_rad_s:.2f} to {plan.speed_max_rad_s:.2f} rad/s"
         )
         log.event(loop.now_s, "plan", text)

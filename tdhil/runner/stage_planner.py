@@ -9,6 +9,7 @@ from typing import Any
 
 from drivers import Command, LimitHit, Mode, PreflightRefused
 from profiles import MessageCode
+from profiles.quantities import in_nm
 from tdhil.config import identified_before_echo
 from tdhil.estimation import Samples
 from tdhil.recording import FloatArray, LagPrior, RunLog, SteppedSetpoint
@@ -83,7 +84,7 @@ class StagePlanner:
         # If a missing braking torque limits the amplitude, rounding may leave it just below zero.
         if mode is Mode.TORQUE and plan.torque_min_nm < -1e-9 * limits.torque_nm and loop.guard.no_braking:
             raise PreflightRefused(
-                f"the plan needs braking torque, down to {plan.torque_min_nm:.0f} N·m: {loop.guard.no_braking}",
+                f"the plan needs braking torque, down to {in_nm(plan.torque_min_nm)}: {loop.guard.no_braking}",
                 where="plan of stage 5",
                 next_step=loop.guard.to_brake,
                 entry=MessageCode.BRAKING_UNCLEAR,
@@ -95,7 +96,7 @@ class StagePlanner:
             loop.now_s,
             "plan",
             f"{plan.kind} in {plan.mode} mode, {plan.duration_s:.0f} s, speed {plan.speed_min_rad_s:.2f} to "
-            f"{plan.speed_max_rad_s:.2f} rad/s, torque {plan.torque_min_nm:.0f} to {plan.torque_max_nm:.0f} N·m",
+            f"{plan.speed_max_rad_s:.2f} rad/s, torque {in_nm(plan.torque_min_nm)} to {in_nm(plan.torque_max_nm)}",
         )
         self._report(planned.said())
         before_echo = identified_before_echo(request.kind)

@@ -46,6 +46,7 @@ from drivers import (
     StopNotConfirmed,
     StopsFeeding,
 )
+from profiles.quantities import in_nm
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.guard import kept_within
 from tdhil.runner.observer import RUN_OUT_S, Signal
@@ -382,7 +383,7 @@ class StopSequence:
         self._trapped_nm = going.trapped_nm
         if going.failed:
             self._trouble.append(
-                f"trapped torque did not come down: {going.trapped_nm:.0f} N·m at first, {going.torque_nm:.0f} N·m"
+                f"trapped torque did not come down: {in_nm(going.trapped_nm)} at first, {in_nm(going.torque_nm)}"
                 f" after {going.travel_rad:.1f} rad"
             )
 
@@ -438,7 +439,7 @@ class StopSequence:
         if abs(held_nm) <= 2.0 * self._string.residual_nm:
             return False
         self._trouble.append(
-            f"the drill string still holds {held_nm:.0f} N·m: the drive was not disabled and holds the shaft at rest"
+            f"the drill string still holds {in_nm(held_nm)}: the drive was not disabled and holds the shaft at rest"
         )
         return True
 

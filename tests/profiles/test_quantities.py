@@ -1,4 +1,4 @@
-"""Numbers with units, as manuals and people write them."""
+"""Numbers with units, as manuals and people write them, and as messages show them."""
 
 from __future__ import annotations
 
@@ -84,3 +84,17 @@ def test_keys_of_one_quantity():
     assert not q.same_quantity("speed_max_rpm", "speed_min_rad_s")
     assert not q.same_quantity("torque_rpm", "torque_nm")
     assert not q.same_quantity("torque_nm", "torque_nm")
+
+
+@pytest.mark.parametrize(("value", "text"), [
+    (8.829e-12, "0"), (-3e-13, "0"), (20000.0, "20000"), (123456.0, "123500"), (0.00012345, "0.0001234"), (2.5, "2.5"),
+])
+def test_a_number_without_an_interval_has_no_exponent_and_no_arithmetic_dust(value, text):
+    assert q.plain_number(value) == text
+
+
+@pytest.mark.parametrize(("torque_nm", "text"), [
+    (1143.04, "1143 N·m"), (12346.0, "12350 N·m"), (-0.2133, "-0.2133 N·m"), (0.8, "0.8 N·m"), (-1e-12, "0 N·m"),
+])
+def test_a_torque_in_a_message_fits_a_top_drive_and_a_servo(torque_nm, text):
+    assert q.in_nm(torque_nm) == text

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from tdhil.report.blocks import report_of
-from tdhil.report.card import card_text, estimate_text, percent, plain_number, plus_minus, print_card, with_interval
+from tdhil.report.card import card_text, estimate_text, percent, plus_minus, print_card, with_interval
 from tdhil.report.document import result_document
 from tests.report.findings import RUN, bare, full, open_sided, recording
 
@@ -102,10 +102,3 @@ def test_a_rehearsal_is_marked_on_card_and_report():
     assert "SIMULATED · FAULT REHEARSAL" in card
     assert "torque-scale=1.1" in card
     assert "FAULT REHEARSAL" in report_of(document, recording()).simulated
-
-
-@pytest.mark.parametrize(("value", "text"), [
-    (8.829e-12, "0"), (-3e-13, "0"), (20000.0, "20000"), (123456.0, "123500"), (0.00012345, "0.0001234"), (2.5, "2.5"),
-])
-def test_a_number_without_an_interval_has_no_exponent_and_no_arithmetic_dust(value, text):
-    assert plain_number(value) == text

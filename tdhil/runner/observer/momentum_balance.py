@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 
+from profiles.quantities import in_nm
 from tdhil.runner.observer.contradiction import Contradiction, Signal
 from tdhil.runner.observer.points import AROUND_S, IN_A_ROW, SLOPE_S, Point
 from tdhil.runner.observer.shaft_bounds import ShaftBounds
@@ -160,7 +161,7 @@ def _contradiction(now: Point, start: Point, known: ShaftBounds, *, lighter: boo
     lighter = lighter and abs(now.speed) > abs(start.speed) and now.speed * max(start.torque, now.torque) > 0.0
     went = (
         f"within {now.time_s - start.time_s:.2g} s the reported speed went from {start.speed:.2f} to"
-        f" {now.speed:.2f} rad/s at {start.torque:.1f} to {now.torque:.1f} N·m"
+        f" {now.speed:.2f} rad/s at {in_nm(start.torque)} to {in_nm(now.torque)}"
     )
     if lighter:
         what = f"the speed changes faster than this shaft ({known.words}) allows: {went}"

@@ -6,6 +6,7 @@ import math
 from collections import deque
 
 from drivers import Command, Mode, PositionReading, PowerState, Sample, Unwrapped
+from profiles.quantities import in_nm
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.observer.contradiction import Contradiction, Signal
 from tdhil.runner.observer.momentum_balance import HIDDEN_SHARE, WINDOWS_S, MomentumBalance
@@ -352,7 +353,7 @@ class Observer:
         if abs(point.torque) > BEYOND_LIMIT * self._limits.torque_nm:
             self._doubt(
                 frozenset({Signal.TORQUE}),
-                f"the reported torque of {point.torque:.0f} N·m is beyond the torque limit of"
+                f"the reported torque of {in_nm(point.torque)} is beyond the torque limit of"
                 f" {self._limits.torque_nm:g} N·m",
                 "Check the units of torque in the profile and the rated torque", point.time_s,
             )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from drivers import Command, Mode, Sample
+from profiles.quantities import in_nm
 from tdhil.runner.settings import MachineLimits
 
 FROZEN_S, FROZEN_SHARE = 0.5, 0.1
@@ -58,7 +59,7 @@ class RepeatedFeedback:
         """Return cause and next step."""
         speed_rad_s, torque_nm = self._seen or (math.nan, math.nan)
         return (
-            f"the feedback has been frozen at {speed_rad_s:.3f} rad/s and {torque_nm:.1f} N·m for {FROZEN_S:g} s,"
+            f"the feedback has been frozen at {speed_rad_s:.3f} rad/s and {in_nm(torque_nm)} for {FROZEN_S:g} s,"
             f" {besides}",
             "Does a gateway repeat old values? Check the bus and the drive; is the shaft locked?",
         )

@@ -7,6 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from drivers import Sample
+from profiles.quantities import in_nm
 from tdhil.runner.observer.contradiction import Contradiction, Signal
 from tdhil.runner.observer.points import STALE_S, Point
 from tdhil.runner.observer.shaft_bounds import ShaftBounds
@@ -87,7 +88,7 @@ class Runaway:
             return None
         return Contradiction(
             frozenset({Signal.SPEED}),
-            f"the reported speed stays at {point.speed:.2f} rad/s while {point.torque:.0f} N·m, the torque limit, brake"
+            f"the reported speed stays at {point.speed:.2f} rad/s while {in_nm(point.torque)}, the torque limit, brake"
             f" the shaft for {self._unanswered_s:.0f} s",
             "Check the encoder and its cable. Do not rely on the reported speed", point.time_s,
         )
@@ -208,12 +209,12 @@ class Runaway:
         if self._apart_nm_s > TORQUE_SHARE * self._limits.torque_nm * self._took_s:
             return ""
         if self._unanswered_s >= UNANSWERED_S:
-            return f"{self._pushed_nm:.0f} N·m for {self._unanswered_s:.0f} s have stopped any such shaft"
+            return f"{in_nm(self._pushed_nm)} for {self._unanswered_s:.0f} s have stopped any such shaft"
         # above a string the stop begins with a ramp of the setpoint, which may accelerate the shaft until it has ended
         ramp_s = self._limits.speed_max_rad_s / self._limits.quick_stop_rad_s2
         pushes = not self._limits.has_drill_string or (reports_trusted and self._for_s >= ramp_s)
         if self._pushing_s >= PUSHING_S and pushes:
-            return f"{self._pushed_nm:.0f} N·m push the shaft on"
+            return f"{in_nm(self._pushed_nm)} push the shaft on"
         by_impulse = self._by_impulse_rad_s
         if by_impulse is not None and self._beyond(by_impulse, more_rad_s, reports_trusted):
             return f"the torque since the quick stop accounts for {by_impulse:.2f} rad/s"

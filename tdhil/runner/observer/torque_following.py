@@ -6,6 +6,7 @@ import math
 from collections import deque
 
 from drivers import Command, Mode, PowerState, Sample
+from profiles.quantities import in_nm
 from tdhil.runner.settings import MachineLimits
 
 TORQUE_SHARE, TORQUE_LIMIT_SHARE, TORQUE_WINDOW_S = 0.25, 0.05, 4.0
@@ -57,10 +58,10 @@ class TorqueFollowing:
         if abs(reported - commanded) <= TORQUE_SHARE * size + TORQUE_LIMIT_SHARE * self._limits.torque_nm + late:
             return None
         demand = sample.torque_demand_nm
-        demanded = "" if demand is None else f", the demanded torque {demand:.1f} N·m"
+        demanded = "" if demand is None else f", the demanded torque {in_nm(demand)}"
         return (
             f"the reported torque contradicts the commanded torque: over {self._seconds:.1f} s of torque mode"
-            f" {commanded:.1f} N·m were commanded in the mean and {reported:.1f} N·m reported{demanded}",
+            f" {in_nm(commanded)} were commanded in the mean and {in_nm(reported)} reported{demanded}",
             "Check the units of torque in the profile (per_lsb of 6071h and 6077h) and the rated torque. J is wrong by"
             " as much as the reported torque",
         )

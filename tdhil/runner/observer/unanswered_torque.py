@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from drivers import Command, Mode
+from profiles.quantities import in_nm
 from tdhil.runner.observer.contradiction import Contradiction, Signal
 from tdhil.runner.observer.points import Point
 from tdhil.runner.observer.shaft_bounds import ShaftBounds
@@ -111,7 +112,7 @@ class HeldShaft:
             return None
         return Contradiction(
             frozenset({Signal.SPEED}),
-            f"the drive reports standstill for {self._held_s:.1f} s while {point.torque:.0f} N·m, its torque limit,"
+            f"the drive reports standstill for {self._held_s:.1f} s while {in_nm(point.torque)}, its torque limit,"
             f" act and {command.speed_rad_s:.2f} rad/s are commanded",
             "Is the shaft held (brake, stuck pipe), or is the speed signal lost? Look at the shaft", point.time_s,
         )
@@ -137,7 +138,7 @@ class TorqueAtLimit:
             return None
         return Contradiction(
             frozenset({Signal.SPEED, Signal.TORQUE}),
-            f"the torque has been at its limit for {STRAINED_S:g} s ({point.torque:.0f} N·m) while the reported speed"
+            f"the torque has been at its limit for {STRAINED_S:g} s ({in_nm(point.torque)}) while the reported speed"
             f" stays at {point.speed:.2f} rad/s, near the commanded {command.speed_rad_s:.2f} rad/s",
             "Check the encoder and its cable. Is the load as large as the torque limit?", point.time_s,
         )
@@ -163,7 +164,7 @@ class FlatSpeed:
         return Contradiction(
             frozenset({Signal.SPEED}),
             f"the reported speed has stayed at {point.speed:.2f} rad/s to within its noise for {for_s:.1f} s, while"
-            f" the torque went to {point.torque:.0f} N·m, which moves this shaft",
+            f" the torque went to {in_nm(point.torque)}, which moves this shaft",
             "Check the encoder and its cable. Is the load as large as the torque limit?", point.time_s,
         )
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from drivers import Command, Mode, PreflightRefused, Sample
 from profiles import MessageCode
+from profiles.quantities import in_nm
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.guard import LIGHTEN
@@ -274,14 +275,14 @@ class BrakingListener:
         if full and self.speed_rad_s >= self.before_rad_s + self._change_rad_s:
             return BrakingAnswer.FASTER
         if full and self.torque_nm >= self.before_nm + self._rise_nm:
-            self.why = f"the reported torque went from {self.before_nm:.1f} to {self.torque_nm:.1f} N·m"
+            self.why = f"the reported torque went from {in_nm(self.before_nm)} to {in_nm(self.torque_nm)}"
             return BrakingAnswer.FASTER
         demand = sample.torque_demand_nm
         risen = demand is not None and demand >= self._pulse.flowing_nm + self._rise_nm
         # Ignore the demand at most for the reaction time, and only until it has once equalled the flowing torque.
         self._demand_deaf = self._demand_deaf - 1 if risen or demand is None else 0
         if risen and self._demand_deaf <= 0:
-            self.why = f"the drive's torque demand went from {self._pulse.flowing_nm:.1f} to {demand:.1f} N·m"
+            self.why = f"the drive's torque demand went from {in_nm(self._pulse.flowing_nm)} to {in_nm(demand)}"
             return BrakingAnswer.FASTER
         if full and self.speed_rad_s <= self.before_rad_s - self._change_rad_s:
             return BrakingAnswer.SLOWER
@@ -380,7 +381,7 @@ def probe_braking(
         samples += seen
         if answer is BrakingAnswer.FASTER:
             raise PreflightRefused(
-                f"the drive inverts a negative torque setpoint: on {pulse.torque_nm:.1f} N·m {listener.why}",
+                f"the drive inverts a negative torque setpoint: on {in_nm(pulse.torque_nm)} {listener.why}",
                 where=f"braking probe, {where}",
                 next_step="Check that the setpoint is signed in the drive as in the profile (two's complement), and"
                 " that no direction bit inverts it. Correct the profile or the drive's settings",
@@ -389,10 +390,10 @@ def probe_braking(
         if answer is BrakingAnswer.SLOWER:
             loop.log.event(
                 loop.now_s, "probe",
-                f"the shaft slowed down: {listener.why}, reported torque down to {listener.lowest_nm:.1f} N·m",
+                f"the shaft slowed down: {listener.why}, reported torque down to {in_nm(listener.lowest_nm)}",
             )
             return samples
-        unclear = f"{-pulse.torque_nm:.1f} N·m did not slow it by {pulse.slowing_rad_s:.2f} rad/s: {listener.why}"
+        unclear = f"{in_nm(-pulse.torque_nm)} did not slow it by {pulse.slowing_rad_s:.2f} rad/s: {listener.why}"
         steady = samples[-loop.cycles(STEADY_S / 2.0) :]
     raise PreflightRefused(
         f"a braking torque does not slow the shaft: {unclear}",
@@ -409,7 +410,7 @@ def _try(
     """Send the whole pulse, then the flowing torque until the reports have caught up; stop at a faster shaft."""
     loop.log.event(
         loop.now_s, "probe",
-        f"braking torque tried at {speed_rad_s:.2f} rad/s: {pulse.torque_nm:.1f} N·m for"
+        f"braking torque tried at {speed_rad_s:.2f} rad/s: {in_nm(pulse.torque_nm)} for"
         f" {pulse.cycles * loop.period_s:.2g} s (if the drive inverted it, the speed would reach at most"
         f" {pulse.highest_rad_s:.2f} rad/s)",
     )

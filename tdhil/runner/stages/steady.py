@@ -10,6 +10,7 @@ import numpy as np
 
 from drivers import Command, LimitHit, Mode, Sample
 from profiles import MessageCode
+from profiles.quantities import in_nm
 from tdhil.estimation import STICK_SLIP_REGULAR, STICK_SLIP_SHARE, downhole_swing_rad_s, repeats
 from tdhil.recording import FloatArray, Level
 from tdhil.runner.control_loop import ControlLoop
@@ -158,7 +159,7 @@ class Swing:
         """Return the oscillation in words."""
         every = f" every {self.period_s:.1f} s" if self.regular >= STICK_SLIP_REGULAR else ""
         return (
-            f"the string below oscillates with ±{self.torque_nm:.0f} N·m{every}, the top with ±{self.speed_rad_s:.2f}"
+            f"the string below oscillates with ±{in_nm(self.torque_nm)}{every}, the top with ±{self.speed_rad_s:.2f}"
             " rad/s, and the oscillation does not decay"
         )
 
@@ -240,7 +241,7 @@ def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, t
                 loop.log.event(
                     loop.now_s, "string",
                     f"the string's oscillation does not decay at {target_rad_s:.2f} rad/s:"
-                    f" torque ±{left.torque_nm:.0f} N·m",
+                    f" torque ±{in_nm(left.torque_nm)}",
                 )
                 return Calmed(samples, setpoints, left, damper)
     left = swing_of(samples[-2 * window :], loop.period_s)
@@ -250,7 +251,7 @@ def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, t
     )
     raise LimitHit(
         f"the string did not settle at {target_rad_s:.3f} rad/s within {MOST_CALMING_S:g} s (mean speed {mean:.3f}"
-        f" rad/s, torque oscillation ±{left.torque_nm:.0f} N·m"
+        f" rad/s, torque oscillation ±{in_nm(left.torque_nm)}"
         + (f" every {left.period_s:.1f} s" if left.regular >= STICK_SLIP_REGULAR else "") + f"); {torque}",
         where=f"at {loop.now_s:.1f} s",
         next_step=helps,
@@ -272,7 +273,7 @@ def is_stick_slip(swing: Swing, limits: MachineLimits, speed_rad_s: float, mean_
 def stick_slip(swing: Swing, speed_rad_s: float, where: str) -> LimitHit:
     """Return the error for stick-slip."""
     return LimitHit(
-        f"stick-slip at {speed_rad_s:.2f} rad/s: the string's torque oscillates by ±{swing.torque_nm:.0f} N·m"
+        f"stick-slip at {speed_rad_s:.2f} rad/s: the string's torque oscillates by ±{in_nm(swing.torque_nm)}"
         f" every {swing.period_s:.1f} s, the top by ±{swing.speed_rad_s:.2f} rad/s, and yielding does not end it",
         where=where,
         next_step="Lift the bit off bottom, reduce the weight on bit, or raise limits.speed_min_rad_s above the"

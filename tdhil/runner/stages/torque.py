@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from drivers import Command, Mode, Sample
+from profiles.quantities import in_nm
 from tdhil.estimation import RoughInertia, rough_inertia
 from tdhil.recording import Level, Ramp
 from tdhil.runner.control_loop import ControlLoop
@@ -57,7 +58,7 @@ def run_torque(
     # The setpoint is sent a few cycles before the switch, so that it is present when the mode changes.
     samples = [*slow, *loop.hold(Command(Mode.SPEED, keep_rad_s, flowing_nm), 5.0 * loop.period_s)]
     samples.append(loop.switch_mode(Command(Mode.TORQUE, keep_rad_s, flowing_nm)))
-    loop.log.event(loop.now_s, "mode", f"torque mode confirmed, seeded with {flowing_nm:.1f} N·m")
+    loop.log.event(loop.now_s, "mode", f"torque mode confirmed, seeded with {in_nm(flowing_nm)}")
     samples += probe_braking(
         loop, limits, speed.model, assumptions, slow, flowing_nm, speed_resolution_rad_s, setpoint_where,
         speed.wander_rad_s,

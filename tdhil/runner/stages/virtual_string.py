@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 
 from drivers import Command, LimitHit, Mode, PreflightRefused, Sample
 from profiles import MessageCode
+from profiles.quantities import in_nm
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.guard import kept_within
@@ -188,8 +189,8 @@ class _LoopWatch:
             rms = math.sqrt(max(0.0, self._sum) / len(self._squares))
             if rms > self._peak_nm:
                 raise LimitHit(
-                    f"the loop oscillates with {rms:.0f} N·m rms at the main shaft, above the limit of"
-                    f" {self._peak_nm:.0f} N·m of string and bit",
+                    f"the loop oscillates with {in_nm(rms)} rms at the main shaft, above the limit of"
+                    f" {in_nm(self._peak_nm)} of string and bit",
                     where=where, next_step="The shaft was stopped. Check the lags of the result: identify again",
                     entry=MessageCode.VIRTUAL_STRING_UNSTABLE,
                 )
