@@ -22,8 +22,8 @@ if TYPE_CHECKING:
         CommandRejected as CommandRejected, CommunicationLost as CommunicationLost, DataFileError as DataFileError,
         DriveFault as DriveFault, LimitHit as LimitHit, ModeNotConfirmed as ModeNotConfirmed,
         ObjectRefused as ObjectRefused, PreflightRefused as PreflightRefused, Problem as Problem,
-        ReportsContradict as ReportsContradict,
-        StopNotConfirmed as StopNotConfirmed, TdhilError as TdhilError,
+        ReportsContradict as ReportsContradict, SensorFault as SensorFault, StopNotConfirmed as StopNotConfirmed,
+        TdhilError as TdhilError,
     )
     from drivers.preflight import (
         ACCEPTED_BY as ACCEPTED_BY, ANY_CLIENT as ANY_CLIENT, NOTHING_STOPS_IT as NOTHING_STOPS_IT,
@@ -40,7 +40,7 @@ else:
                  "PositionReading Positioned PowerState Preflight RawFrame Rehearsed RemovesTorque ReportingFilters "
                  "ReportsOthers Sample StopsFeeding Timed",
         "errors": "CommandRejected CommunicationLost DataFileError DriveFault LimitHit ModeNotConfirmed ObjectRefused "
-                  "PreflightRefused Problem ReportsContradict StopNotConfirmed TdhilError",
+                  "PreflightRefused Problem ReportsContradict SensorFault StopNotConfirmed TdhilError",
         "preflight": "ACCEPTED_BY ANY_CLIENT NOTHING_STOPS_IT NO_WATCHDOG_FLAG SHARED_FLAG PreflightTable",
         "quick_stop": "BareStopReport Ended Target bare_stop",
     })

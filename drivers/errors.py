@@ -7,7 +7,8 @@
     ├── PreflightRefused            the drive's identity is not the profile's; nothing has moved
     │   └── ObjectRefused           SDO abort 06090030h on 6072h; Modbus exception 2 on register 40111
     ├── CommunicationLost           no statusword for 5 cycles; adapter unplugged; SDO time-out; Modbus CRC
-    ├── DriveFault                  EMCY 7305h in motion; fault state; state machine stuck; Modbus exception in motion
+    ├── DriveFault                  EMCY 3210h in motion; fault state; state machine stuck; Modbus exception in motion
+    │   ├── SensorFault             EMCY 7305h in motion: the sensor of speed and position is at fault
     │   ├── ModeNotConfirmed        6061h did not follow 6060h in time
     │   └── ReportsContradict       the reported speed fell by 4 rad/s while the reported torque accelerates the shaft
     ├── LimitHit                    speed left its window; torque or time limit reached
@@ -30,6 +31,7 @@ __all__ = [
     "PreflightRefused",
     "Problem",
     "ReportsContradict",
+    "SensorFault",
     "StopNotConfirmed",
     "TdhilError",
 ]
@@ -57,6 +59,10 @@ class DriveFault(TdhilError):
     """The drive itself reports a fault or leaves the requested state."""
 
     entry = MessageCode.DRIVE_FAULT
+
+
+class SensorFault(DriveFault):
+    """The drive reports a fault of its sensor of speed and position: its reported speed is in doubt."""
 
 
 class ModeNotConfirmed(DriveFault):

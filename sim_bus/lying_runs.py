@@ -229,7 +229,7 @@ TOLD: tuple[LieWithValue, ...] = (
 MOMENTS = ("", "setup+2s", "speed+12s", "torque+3s", "hold+3s", "acquire+20s", "stop", "stop+500ms")
 """Moments at which a lie begins; '' is power-on, so it acts from the start."""
 
-_EARLY_STOP = "emcy@acquire+5s"
+_EARLY_STOP = "emcy@acquire+5s=3210h"
 """A harmless cause of a stop, so that a lie during the stop needs no whole run."""
 
 

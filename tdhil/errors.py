@@ -8,7 +8,8 @@
     ├── PreflightRefused            the drive's identity is not the profile's; nothing moved     4
     │   └── DriveHeld               in `tdhil.session`: another process has the drive; names it  4
     ├── CommunicationLost           no statusword for 5 cycles; adapter unplugged                5
-    ├── DriveFault                  EMCY 7305h in motion; state machine stuck                    6
+    ├── DriveFault                  EMCY 3210h in motion; state machine stuck                    6
+    │   ├── SensorFault             EMCY 7305h in motion: the speed sensor is at fault           6
     │   ├── ModeNotConfirmed        6061h did not follow 6060h in time                           6
     │   └── ReportsContradict       reported speed and reported torque cannot both be true       6
     ├── LimitHit                    speed outside its window; torque or time limit reached       7

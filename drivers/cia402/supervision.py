@@ -13,7 +13,7 @@ from enum import Enum
 
 from drivers.cia402.objects import name
 from drivers.clock import LOWER_THE_RATE, Clock
-from drivers.errors import CommunicationLost, DriveFault, TdhilError
+from drivers.errors import CommunicationLost, DriveFault, SensorFault, TdhilError
 from profiles import MessageCode
 
 HOST_SILENT = "host silent"
@@ -26,6 +26,9 @@ MOST_REMARKS = 20
 """Largest number of different remarks in one run."""
 HOST_LOST = 0x8130
 """Error code of a drive that lost its host: life guard error or heartbeat error (CiA 301)."""
+
+_SENSOR = 0x73
+"""Class of the error codes of a sensor: tachometer, incremental sensor, resolver (CiA 402)."""
 
 # EMCY error code classes (CiA 301) and the CiA 402 codes a field engineer meets first.
 _EMCY_CLASSES = {
@@ -45,7 +48,7 @@ _EMCY_CLASSES = {
     0x54: "power section (or STO)",
     0x60: "drive software",
     0x70: "additional modules",
-    0x73: "sensor",
+    _SENSOR: "sensor",
     0x75: "communication module",
     0x80: "monitoring",
     0x81: "communication (host heartbeat lost, CAN overrun or passive)",
@@ -147,7 +150,8 @@ class DriveWatch:
             self.watchdog_acted(emcy_text(code))
         elif code and self.expect_operational:
             extra = f" (manufacturer's bytes {data[3:].hex(' ')})" if any(data[3:]) else ""
-            self.keep("emcy", DriveFault(
+            kind = SensorFault if code >> 8 == _SENSOR else DriveFault
+            self.keep("emcy", kind(
                 emcy_text(code) + extra, where=self.place,
                 next_step="See the drive's fault list, remove the cause, then start with --reset-fault",
             ))

@@ -6,7 +6,18 @@ from collections.abc import Callable
 from threading import Event
 from typing import TypeVar
 
-from drivers import Command, Drive, DriveFault, KeptAlive, Mode, ModeNotConfirmed, PowerState, ReportsOthers, Sample
+from drivers import (
+    Command,
+    Drive,
+    DriveFault,
+    KeptAlive,
+    Mode,
+    ModeNotConfirmed,
+    PowerState,
+    ReportsOthers,
+    Sample,
+    SensorFault,
+)
 from profiles import MessageCode
 from tdhil.recording import RunLog
 from tdhil.runner.background import Background, BackgroundProcess
@@ -59,7 +70,7 @@ class ControlLoop:
         """Do one exchange. Raises Interrupted for a stop request, and the errors of guard, drive and log."""
         self._stop_request.check()
         self.guard.check_command(command)
-        sample = self.drive.exchange(command)
+        sample = self._exchange(command)
         self.log.cycle(command, sample)
         self.before, self.last = self.last, sample
         if self._reports_others is not None:
@@ -76,7 +87,7 @@ class ControlLoop:
 
     def stop_cycle(self, command: Command) -> Sample:
         """Do one exchange of the stop sequence: without guard, and no error of log or display interrupts it."""
-        sample = self.drive.exchange(command)
+        sample = self._exchange(command)
         try:
             self.guard.observer.see(command, sample)
             self.log.cycle(command, sample)
@@ -89,6 +100,14 @@ class ControlLoop:
             self.stop_side_troubles.append(f"{type(error).__name__}: {error}")
             del self.stop_side_troubles[10:]
         return sample
+
+    def _exchange(self, command: Command) -> Sample:
+        """Exchange with the drive. A fault of its speed sensor also goes to the observer: the stop needs to know it."""
+        try:
+            return self.drive.exchange(command)
+        except SensorFault as error:
+            self.guard.observer.sensor_fault(error.what, self.now_s)
+            raise
 
     def _note(self, line: str) -> None:
         self.remarks.append(line)

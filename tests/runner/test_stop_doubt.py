@@ -9,7 +9,7 @@ import pytest
 
 from drivers import Mode, PowerState
 from drivers.drive import Command
-from drivers.errors import PreflightRefused
+from drivers.errors import PreflightRefused, SensorFault
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.stages.setup import probe_sign
 from tests.runner.fake_drive import LIMITS, PERIOD_S, SPEED_RESOLUTION, FakeDrive
@@ -147,6 +147,40 @@ def test_a_doubt_keeps_the_watchdog_fed(world):
     doubted(here)
     here.stop_sequence().run()
     assert unfed == []
+
+
+def reports_sensor_fault(here, **then):
+    """The drive reports EMCY 7305h in one cycle; then its reports change to ``then``. J is not known yet."""
+    def fault(drive, sample):
+        drive.misbehave = None
+        raise SensorFault("EMCY 7305h, sensor")
+
+    here.drive.misbehave = fault
+    with pytest.raises(SensorFault):
+        here.bench.cycle(Command(Mode.SPEED, 5.0, 0.0))
+    vars(here.drive).update(then)
+    return here
+
+
+def test_a_speed_of_zero_after_a_fault_of_the_sensor_disables_nothing(world):
+    here = world(Removing(), LIMITS)
+    here.turn(5.0)
+    report = reports_sensor_fault(here, sees=0.0).stop_sequence().run()
+    assert not report.confirmed and report.at_rest_s is None and never_disabled(here.drive)
+
+
+def test_a_speed_that_comes_down_after_a_fault_of_the_sensor_is_believed(world):
+    here = world(Removing(), LIMITS)
+    here.turn(5.0)
+    report = reports_sensor_fault(here).stop_sequence().run()
+    assert report.confirmed and here.drive.disabled_at == [0.0]
+
+
+def test_a_fault_of_the_sensor_before_any_motion_leaves_the_stop_as_it_is(world):
+    here = world(Removing(), LIMITS)
+    here.bench.enable(Mode.SPEED, Command(Mode.SPEED, 0.0, 0.0))
+    report = reports_sensor_fault(here, speed=0.0).stop_sequence().run()
+    assert report.confirmed and here.drive.disabled_at == [0.0]
 
 
 # -- no valid state ----------------------------------------

@@ -222,6 +222,16 @@ class Observer:
                 sample.time_s,
             )
 
+    def sensor_fault(self, what: str, time_s: float) -> None:
+        """Doubt the speed: the drive reports a fault of its sensor. A speed that then falls as under a quick stop is
+        believed again (`Revival`). Without any reported motion `unseen_s` gives the time instead.
+        """
+        if self._moved:
+            self._doubt(
+                frozenset({Signal.SPEED}), f"the drive reports a fault of its speed sensor: {what}",
+                "Check the encoder and its cable", time_s,
+            )
+
     def turns(self, speed_rad_s: float) -> bool:
         """Return whether a reported speed is clearly not zero."""
         return abs(speed_rad_s) > STANDSTILLS * self._still_rad_s
