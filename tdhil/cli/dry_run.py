@@ -69,10 +69,11 @@ def _dry_run_steps(
     options: RunOptions, rig: Rig | None, case: StepCase, simulated: bool, rate_hz: float
 ) -> int:
     program, limits = plan_dry_steps(case, rig, simulated, rate_hz)
+    step_torque_nm = case.gains.gain_nm_s_rad * program.step_rad_s
     plain = {
         "dry_run": True, "gains": case.kind, "rate_hz": rate_hz, "pairs": program.pairs,
         "step_rad_s": program.step_rad_s, "low_rad_s": program.low_rad_s, "high_rad_s": program.high_rad_s,
-        "step_torque_nm": case.gains.gain_nm_s_rad * program.step_rad_s, "duration_s": program.duration_s,
+        "step_torque_nm": step_torque_nm, "duration_s": program.duration_s,
         "limits": _shown_limits(limits),
         "tdhil": __version__,
     }
@@ -85,7 +86,7 @@ def _dry_run_steps(
     if simulated:
         console.print(f"{SIMULATED}: the embedded rig, with its own limits if rig.yaml has none", style="magenta")
     console.print(
-        f"{program.pairs} pairs of steps of at most {program.step_rad_s:.3g} rad/s ({in_nm(plain['step_torque_nm'])}) "
+        f"{program.pairs} pairs of steps of at most {program.step_rad_s:.3g} rad/s ({in_nm(step_torque_nm)}) "
         f"between {program.low_rad_s:.3g} and {program.high_rad_s:.3g} rad/s, {program.duration_s:.0f} s; limits "
         f"{limits.speed_min_rad_s:g} to {limits.speed_max_rad_s:g} rad/s, {limits.torque_nm:g} N·m, "
         f"{limits.time_s:g} s. A run first measures friction, and then plans again.", soft_wrap=True)
@@ -96,11 +97,11 @@ def _dry_run_course(
     options: RunOptions, rig: Rig | None, case: EvaluationCase, simulated: bool, rate_hz: float
 ) -> int:
     program, limits = plan_course(case, rig, simulated, rate_hz)
-    ratio = case.rig.gear_ratio
+    ratio, moving_torque_nm = case.rig.gear_ratio, program.peak_nm * case.scale
     plain = {
         "dry_run": True, "controller": case.prediction.kind, "rate_hz": rate_hz,
         "set_speed_rad_s": {"min": program.start_rad_s, "max": program.highest_rad_s},
-        "moving_torque_nm": program.peak_nm * case.scale, "duration_s": program.longest_s,
+        "moving_torque_nm": moving_torque_nm, "duration_s": program.longest_s,
         "limits": _shown_limits(limits),
         "tdhil": __version__,
     }
@@ -121,7 +122,7 @@ def _dry_run_course(
         "main shaft", f"{RPM.of_si(limits.speed_min_rad_s / ratio):.4g} to "
         f"{RPM.of_si(limits.speed_max_rad_s / ratio):.4g} rpm for the oscillation of the top",
     )
-    table.add_row("torque on the rotor", f"up to {in_nm(plain['moving_torque_nm'])}, and friction",
+    table.add_row("torque on the rotor", f"up to {in_nm(moving_torque_nm)}, and friction",
                   f"±{limits.torque_nm:g} N·m")
     table.add_row("time, s", f"{program.longest_s:.0f} at most (+ about {BEFORE_ACQUIRE_S:.0f})",
                   f"{limits.time_s:g}")

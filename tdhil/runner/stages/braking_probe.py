@@ -281,7 +281,7 @@ class BrakingListener:
         risen = demand is not None and demand >= self._pulse.flowing_nm + self._rise_nm
         # Ignore the demand at most for the reaction time, and only until it has once equalled the flowing torque.
         self._demand_deaf = self._demand_deaf - 1 if risen or demand is None else 0
-        if risen and self._demand_deaf <= 0:
+        if demand is not None and risen and self._demand_deaf <= 0:
             self.why = f"the drive's torque demand went from {in_nm(self._pulse.flowing_nm)} to {in_nm(demand)}"
             return BrakingAnswer.FASTER
         if full and self.speed_rad_s <= self.before_rad_s - self._change_rad_s:
