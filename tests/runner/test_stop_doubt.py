@@ -150,7 +150,7 @@ def test_a_doubt_keeps_the_watchdog_fed(world):
 
 
 def reports_sensor_fault(here, **then):
-    """The drive reports EMCY 7305h in one cycle; then its reports change to ``then``. J is not known yet."""
+    """The drive reports EMCY 7305h in one cycle; then its reports change to ``then``."""
     def fault(drive, sample):
         drive.misbehave = None
         raise SensorFault("EMCY 7305h, sensor")
@@ -174,6 +174,13 @@ def test_a_speed_that_comes_down_after_a_fault_of_the_sensor_is_believed(world):
     here.turn(5.0)
     report = reports_sensor_fault(here).stop_sequence().run()
     assert report.confirmed and here.drive.disabled_at == [0.0]
+
+
+def test_once_the_inertia_is_known_the_balance_decides_on_a_fault_of_the_sensor(world):
+    alive, lost = known(world), known(world)
+    assert reports_sensor_fault(alive).stop_sequence().run().confirmed
+    assert not reports_sensor_fault(lost, sees=0.0).stop_sequence().run().confirmed
+    assert never_disabled(lost.drive)
 
 
 def test_a_fault_of_the_sensor_before_any_motion_leaves_the_stop_as_it_is(world):

@@ -223,10 +223,12 @@ class Observer:
             )
 
     def sensor_fault(self, what: str, time_s: float) -> None:
-        """Doubt the speed: the drive reports a fault of its sensor. A speed that then falls as under a quick stop is
-        believed again (`Revival`). Without any reported motion `unseen_s` gives the time instead.
+        """Doubt the speed while J is not known: the drive reports a fault of its sensor.
+
+        A speed that then falls as under a quick stop is believed again (`Revival`). Without any reported motion
+        `unseen_s` gives the time instead. Once J is known the momentum balance shows whether the speed is lost.
         """
-        if self._moved:
+        if self._moved and not self._bounds.known:
             self._doubt(
                 frozenset({Signal.SPEED}), f"the drive reports a fault of its speed sensor: {what}",
                 "Check the encoder and its cable", time_s,
