@@ -4,11 +4,11 @@
 
 Each seed draws a profile that ships (both buses), a shaft (rigid, two masses, drill string; J from 0.02 to 3000 kg·m²;
 each law of friction), what disturbs it, how late and how coarsely the drive reports, and a cycle rate; the limits fit
-the shaft. Every report is honest. A row of the table is a cause that ended runs; an alarm is a cause whose class name
-says that reports contradict each other, or a stop that was not confirmed. A rig that is refused before its drive was
-enabled does not count. An interval is held against the inertia that the result names: the motor's, that of motor and
-load together, or either where it states that the data do not tell. `--against` compares every interval of J with that
-of another commit.
+the shaft. Every report is honest. A row of the table is a cause that ended runs. An alarm is a cause whose class name
+says that reports contradict each other or that the bus failed (frozen feedback), or a stop that was not confirmed. A
+rig that is refused before its drive was enabled does not count. An interval is held against the inertia that the result
+names: the motor's, that of motor and load together, or either where it states that the data do not tell. `--against`
+compares every interval of J with that of another commit.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from sim_bus.plant.drill_string import StringParams  # noqa: E402
 from sim_bus.shaft_judge import read_shaft  # noqa: E402
 from tdhil.errors import ExitCode  # noqa: E402
 
-ALARM = "Contradict"
-"""Part of the class name of the observer's errors."""
+ALARMS = ("ReportsContradict", "CommunicationLost")
+"""Class names of the observer's errors. No bus of a healthy rig fails."""
 
 WIDER = 1e-9
 """An interval counts as wider from this relative difference on."""
@@ -253,7 +253,7 @@ def line(row: dict[str, Any]) -> str:
 
 def alarm(row: dict[str, Any]) -> bool:
     """Return whether its reports were not believed, or its standstill not."""
-    return ALARM in row["cause"] or row["exit_code"] == int(ExitCode.STOP_NOT_CONFIRMED)
+    return row["cause"] in ALARMS or row["exit_code"] == int(ExitCode.STOP_NOT_CONFIRMED)
 
 
 def alarms(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -12,9 +12,10 @@ torque ends at zero instead of becoming negative. So the release never unscrews 
 Z is the torque limit over half the speed limit, which suits a long string. A short and stiff one would respond to a
 late report with an oscillation: whenever the torque changes its sign faster than any string oscillates, Z is doubled.
 The mean torque shows this, and the torque of single cycles where the loop oscillates within a few of them. Single
-cycles count only while the reported speed moves, too. A loop whose sensor is lost oscillates beside a speed of zero: a
-doubled Z would calm the torque, and the turning shaft would pass for one at rest (`benchmarks/lying_reports.py`, number
-746).
+cycles count only while the reported speed or position moves, too. A loop whose sensor is lost oscillates beside a speed
+of zero: a doubled Z would calm the torque, and the turning shaft would pass for one at rest
+(`benchmarks/lying_reports.py`, number 746). A lag of the speed hides a fast motion, and the position shows it
+(`benchmarks/healthy_runs.py`, seed 1713).
 """
 
 from __future__ import annotations
@@ -118,7 +119,8 @@ class StringRelease:
         self._recent: deque[float] = deque(maxlen=max(1, round(MEAN_S / period_s)))
         self._reference_nm: float | None = None
         self._quiet_s = 0.0
-        self._still_s = math.inf       # since the reported speed was above rest
+        self._still_s = math.inf       # since the speed was above rest, or the position changed
+        self._position_rad: float | None = None
         self._time_s = 0.0
         self.trapped_nm = 0.0
         """Torque at the beginning, signed, N·m."""
@@ -145,8 +147,11 @@ class StringRelease:
         """Return whether its limits in time or travel are reached."""
         return self._time_s > self.longest_s or abs(self.travel_rad) > TRAVEL_RAD
 
-    def step(self, torque_nm: float, speed_rad_s: float) -> float:
-        """Return the next speed setpoint, rad/s, from the last report; a value that is not finite counts as missing."""
+    def step(self, torque_nm: float, speed_rad_s: float, position_rad: float | None = None) -> float:
+        """Return the next speed setpoint, rad/s, from the last report; a value that is not finite counts as missing.
+
+        ``position_rad``: position of the cycle, if the drive reports one.
+        """
         self._time_s += self._period_s
         if not (math.isfinite(torque_nm) and math.isfinite(speed_rad_s)):
             self._quiet_s = 0.0
@@ -158,7 +163,9 @@ class StringRelease:
             self._reference_nm, self.trapped_nm = abs(held_nm), held_nm
         self._reference_nm = max(0.0, self._reference_nm - self._limits.ramp_nm_s * self._period_s)
         still = abs(speed_rad_s) <= self._at_rest_rad_s
-        self._still_s = self._still_s + self._period_s if still else 0.0
+        turned = None not in (position_rad, self._position_rad) and position_rad != self._position_rad
+        self._position_rad = position_rad
+        self._still_s = self._still_s + self._period_s if still and not turned else 0.0
         calm = abs(held_nm) <= self._limits.residual_nm and still
         self._quiet_s = self._quiet_s + self._period_s if calm else 0.0
         self._impedance.watch(held_nm, self._period_s, torque_nm if self._still_s < MEAN_S else 0.0)

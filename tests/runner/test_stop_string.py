@@ -315,17 +315,21 @@ def test_an_oscillation_faster_than_any_string_makes_it_stiffer():
 
 def test_an_oscillation_within_a_few_cycles_makes_it_stiffer_though_the_mean_hides_it():
     """A report every 65 ms, and a torque that changes its sign every second cycle. The speed follows it."""
-    def yields_after(torque_nm, speed_rad_s=1.0):
+    def yields_after(torque_nm, speed_rad_s=1.0, position_rad=None):
         going = letting_go(period_s=0.065)
         for step in range(80):
             side = 1.0 if step % 4 < 2 else -1.0
-            going.step(side * torque_nm, side * speed_rad_s)
+            going.step(side * torque_nm, side * speed_rad_s, None if position_rad is None else side * position_rad)
         return going.step(-40.0, 0.0)
 
     assert yields_after(0.9 * HARD_SHARE * LIMITS.torque_nm) == pytest.approx(40.0 / 80.0)
     assert yields_after(1.1 * HARD_SHARE * LIMITS.torque_nm) == pytest.approx(40.0 / 80.0 / STIFFEST, rel=1e-6)
     # a lost sensor: the torque must not become calm beside a speed that is always zero
     assert yields_after(1.1 * HARD_SHARE * LIMITS.torque_nm, speed_rad_s=0.0) == pytest.approx(40.0 / 80.0)
+    assert yields_after(1.1 * HARD_SHARE * LIMITS.torque_nm, 0.0, position_rad=0.0) == pytest.approx(40.0 / 80.0)
+    # a lag that hides the motion: the position shows it
+    assert yields_after(1.1 * HARD_SHARE * LIMITS.torque_nm, 0.0, position_rad=0.01) == pytest.approx(
+        40.0 / 80.0 / STIFFEST, rel=1e-6)
 
 
 def test_its_bounds_in_time_and_travel():

@@ -17,6 +17,11 @@ ANSWER_S = 0.25
 than `FROZEN_S` before the setpoint moves. This time covers a slow line and one count of the torque; a lag delays the
 end of a response, not its begin. `tests/runner/test_guard.py` has the reports that were called frozen without it."""
 
+RAMP_ANSWER_S = 1.0
+"""The same for a speed setpoint, if a coarse report of a steady shaft had repeated for `FROZEN_S` before it moved, s.
+The drive follows along a ramp of its own, and the report lags. Seed 1472 of `benchmarks/healthy_runs.py` ramps by
+3 rad/s², and a step of its report is 0.7 rad/s."""
+
 
 class RepeatedFeedback:
     """Detection of feedback that repeats its last values, as a gateway does."""
@@ -47,7 +52,9 @@ class RepeatedFeedback:
             return None
         if self._moved_s is None:
             self._moved_s = sample.time_s
-        if self.repeats_s(sample.time_s) < FROZEN_S or sample.time_s - self._moved_s < self._answer_s:
+        coarse = self._moved_s - self._since_s >= FROZEN_S and not (torque_mode or with_offset)
+        answer_s = max(self._answer_s, RAMP_ANSWER_S) if coarse else self._answer_s
+        if self.repeats_s(sample.time_s) < FROZEN_S or sample.time_s - self._moved_s < answer_s:
             return None
         return self.words("while the setpoint moved")
 
