@@ -204,7 +204,7 @@ def test_a_number_that_scrubbing_would_change_is_an_error(tmp_path):
     ({}, ["publisher", "publish"]),
     ({"publisher": "A", "publish": "log,photo"}, ["publish"]),
     ({"publisher": "A", "publish": "log", "reference_inertia_kg_m2": 104.0},
-     ["reference_sd_kg_m2", "reference_method"]),
+     ["reference_sd_kg_m2", "reference_method", "reference_note"]),
     ({"publisher": "A", "publish": "log", "reference_inertia_kg_m2": 104.0, "reference_sd_kg_m2": 1.0,
       "reference_method": "weighed"}, ["reference_note"]),
     ({"publisher": "A", "publish": "log", "reference_note": "a drawing"}, ["reference_inertia_kg_m2"]),
@@ -229,7 +229,9 @@ def test_a_statement_is_read_back_as_it_is():
 
 
 def test_each_option_is_on_the_form_of_the_service():
-    assert [one.name for one in form_options("evidence")] == [one.name for one in OF_EVIDENCE]
+    """The service knows itself whether a run is simulated."""
+    assert [one.name for one in form_options("evidence")] == [
+        one.name for one in OF_EVIDENCE if one.name != "simulated"]
     assert all(one.help and one.api is True for one in OF_EVIDENCE)
 
 
