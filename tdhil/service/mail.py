@@ -53,6 +53,7 @@ class Mail:
     password: str | None = field(default=None, repr=False)
     site: str = ""
     name: str = "Mail"
+    caution: str = ""
 
     @staticmethod
     def of(url: str, environment: Mapping[str, str] = os.environ) -> Mail:

@@ -33,6 +33,11 @@ class Receiver(Protocol):
         """Return the kind of way, for texts."""
         ...
 
+    @property
+    def caution(self) -> str:
+        """Return what to know when the sending starts, as an addition to the address; '' for nothing."""
+        ...
+
     def at(self, site: str) -> Receiver:
         """Return the same way for a service whose pages have this address."""
         ...
@@ -61,7 +66,7 @@ class Notifier:
     def start(self) -> None:
         """Start to send. Runs that ended before are not sent."""
         self._since = now()
-        self._say(f"{self._receiver.name}: ended runs and changes are sent to {self._receiver}")
+        self._say(f"{self._receiver.name}: ended runs and changes are sent to {self._receiver}{self._receiver.caution}")
         self._thread.start()
 
     def close(self) -> None:

@@ -51,6 +51,11 @@ class Webhook:
                              entry=MessageCode.SERVICE_OPTION_WRONG)
         return Webhook(url, _secret(environment))
 
+    @property
+    def caution(self) -> str:
+        """Return that the messages have no signature, if there is no secret."""
+        return "" if self.secret else f" (not signed: {SECRET_FILE} is not set)"
+
     def at(self, site: str) -> Webhook:
         """Return itself: a message has the path of its page, and the receiver knows the host."""
         return self
@@ -78,8 +83,7 @@ class Webhook:
 
     def __str__(self) -> str:
         parts = urlsplit(self.url)
-        unsigned = "" if self.secret else f" (not signed: {SECRET_FILE} is not set)"
-        return f"{parts.scheme}://{parts.netloc}{parts.path}{unsigned}"
+        return f"{parts.scheme}://{parts.netloc}{parts.path}"
 
 
 def _secret(environment: Mapping[str, str]) -> bytes | None:

@@ -95,7 +95,16 @@ def test_a_message_that_cannot_be_delivered_is_reported_and_the_next_one_is_sent
     listener.statuses += [500, 301]
     Notifier(Webhook.of(address(listener), {}), list, lambda rig, run: ({}, {}), said.append)._deliver({"run": "x"})
     assert len(said) == 1 and "HTTP 301" in said[0] and "run x was not delivered" in said[0]
-    assert listener.got[0][1] is None and "site=1" not in said[0]
+    assert listener.got[0][1] is None and "site=1" not in said[0] and "signed" not in said[0]
+
+
+@pytest.mark.parametrize("secret", [None, b"hush"])
+def test_the_start_states_that_messages_are_not_signed(secret):
+    said = []
+    notifier = Notifier(Webhook("http://x", secret), list, lambda rig, run: ({}, {}), said.append)
+    notifier.start()
+    notifier.close()
+    assert (f"not signed: {SECRET_FILE} is not set" in said[0]) is (secret is None)
 
 
 @pytest.mark.parametrize("url", ["ftp://x/y", "http://", "https://me:pw@host/", "host", "http://[x"])
