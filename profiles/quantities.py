@@ -143,7 +143,7 @@ def plain_number(number: float, digits: int = 4) -> str:
     """Return the number with some significant digits, without an exponent from 1e-4 to 1e9; below 1e-9 it is 0."""
     if abs(number) < _NOTHING:
         return "0"
-    return f"{float(f'{number:.{digits}g}'):.{9}g}"
+    return f"{float(f'{number:.{digits}g}'):.9g}"
 
 
 def in_nm(torque_nm: float) -> str:

@@ -379,8 +379,8 @@ class StopSequence:
             self._ask_position(sample.time_s)
             if self._loop.guard.observer.runs_away(sample):
                 break
-            command = Command(Mode.SPEED, going.step(
-                sample.torque_nm, sample.speed_rad_s, sample.position_rad), 0.0)
+            speed = going.step(sample.torque_nm, sample.speed_rad_s, sample.position_rad)
+            command = Command(Mode.SPEED, speed, 0.0)
         self._trapped_nm = going.trapped_nm
         if going.failed:
             self._trouble.append(
