@@ -31,6 +31,8 @@ NONE = DriveReply(None)
 # ---------------------------------------------------------------------------------------------------------------------
 
 _BITS = {"u16": 16, "i16": 16, "u32": 32, "i32": 32}
+_LOWEST = {kind: -(1 << bits - 1) if kind[0] == "i" else 0 for kind, bits in _BITS.items()}
+_HIGHEST = {kind: (1 << bits) - 1 + _LOWEST[kind] for kind, bits in _BITS.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +52,12 @@ class RegisterLayout:
     @property
     def lowest(self) -> int:
         """Smallest number that fits."""
-        return -(1 << _BITS[self.kind] - 1) if self.signed else 0
+        return _LOWEST[self.kind]
 
     @property
     def highest(self) -> int:
         """Largest number that fits."""
-        return (1 << _BITS[self.kind] - int(self.signed)) - 1
+        return _HIGHEST[self.kind]
 
     @property
     def addresses(self) -> range:
@@ -64,8 +66,9 @@ class RegisterLayout:
 
     def saturated(self, value: float) -> int:
         """Return the nearest whole number that fits. An unsigned register takes the magnitude."""
-        whole = round(value if self.signed else abs(value))
-        return self.lowest if whole < self.lowest else min(whole, self.highest)
+        lowest = _LOWEST[self.kind]
+        whole = round(value if lowest else abs(value))
+        return min(max(whole, lowest), _HIGHEST[self.kind])
 
     def words(self, number: int) -> tuple[int, ...]:
         """Return the contents of the registers for a number that fits."""
@@ -79,4 +82,4 @@ class RegisterLayout:
         plain = 0
         for word in words if self.high_first else reversed(words):
             plain = plain * 0x10000 + word
-        return plain - (self.highest - self.lowest + 1) if plain > self.highest else plain
+        return plain - (1 << _BITS[self.kind]) if plain > self.highest else plain

@@ -343,19 +343,32 @@ class Bank:
         return Answer(_PAIR.pack(_REQUESTS_SO_FAR, self._asked & 0xFFFF))
 
     def _read(self, table: str, data: bytes) -> bytes:
+        words: list[int] = []
+        for slot, first, count in self._parts(table, *self._span(data)):
+            words += slot.layout.words(slot.read())[first : first + count]
+        return bytes((2 * len(words),)) + Struct(f">{len(words)}H").pack(*words)
+
+    def _span(self, data: bytes) -> tuple[int, int]:
+        """Return the first address and the number of registers that a request reads."""
         if len(data) != _PAIR.size:
             raise IllegalValue
         address, count = _PAIR.unpack(data)
         if not 1 <= count <= self._largest_read:
             raise IllegalValue
-        words = [self._word(table, at) for at in range(address, address + count)]
-        return bytes((2 * count,)) + b"".join(word.to_bytes(2, "big") for word in words)
+        return address, count
 
-    def _word(self, table: str, address: int) -> int:
-        slot = self._slots.get((table, address))
-        if slot is None:
-            raise IllegalAddress
-        return slot.layout.words(slot.read())[address - slot.layout.address]
+    def _parts(self, table: str, address: int, count: int) -> list[tuple[Slot, int, int]]:
+        """Return each slot of a range of registers, with the first of its registers and how many are in the range."""
+        parts, at, end = [], address, address + count
+        while at < end:
+            slot = self._slots.get((table, at))
+            if slot is None:
+                raise IllegalAddress
+            first = at - slot.layout.address
+            length = min(len(slot.layout.addresses) - first, end - at)
+            parts.append((slot, first, length))
+            at += length
+        return parts
 
     def _write_one(self, data: bytes) -> Answer:
         if len(data) != _PAIR.size:
@@ -375,7 +388,7 @@ class Bank:
             raise IllegalValue
         read, read_count, write, write_count, _ = _BOTH.unpack_from(data)
         words = self._words_of(data[_BOTH.size - 1 :], write_count)
-        self._read("holding", data[: _PAIR.size])      # refused before anything is written
+        self._parts("holding", *self._span(data[: _PAIR.size]))      # refused before anything is written
         commanded = self._write(write, words)
         return Answer(self._read("holding", _PAIR.pack(read, read_count)), True, commanded)
 
@@ -389,15 +402,16 @@ class Bank:
         """Write registers. Return whether one of them commands. Half of a 32-bit number leaves the other
         half as it is.
         """
-        images: dict[int, tuple[Slot, list[int]]] = {}
-        for at, word in enumerate(words, address):
-            slot = self._slots.get(("holding", at))
-            if slot is None or slot.write is None:
+        numbers = []
+        for slot, first, length in self._parts("holding", address, len(words)):
+            if slot.write is None:
                 raise IllegalAddress
-            first = slot.layout.address
-            image = images.setdefault(first, (slot, list(slot.layout.words(slot.read()))))[1]
-            image[at - first] = word
-        numbers = [(slot, slot.layout.number(tuple(image))) for slot, image in images.values()]
+            written, words = words[:length], words[length:]
+            if length < len(slot.layout.addresses):
+                image = list(slot.layout.words(slot.read()))
+                image[first : first + length] = written
+                written = image
+            numbers.append((slot, slot.layout.number(tuple(written))))
         for slot, number in numbers:
             if slot.refuses is not None:
                 slot.refuses(number)
