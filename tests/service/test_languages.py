@@ -221,7 +221,7 @@ def in_script(tag: str, *calls: list[object]) -> list[object]:
 @pytest.mark.heavy
 def test_numbers_of_a_script_have_the_sign_of_the_language_and_send_a_point():
     if shutil.which("node") is None:
-        pytest.skip("no node: tests/service/test_german_pages.py shows the same in Chromium")
+        pytest.skip("no node: tests/service/chromium/test_german.py shows the same in Chromium")
     calls = [["fixed", 1234.5, 2], ["precise", 0.00001234, 2], ["local", "-1.5e-7"], ["tick", 1234.5],
              ["point", "0,5"], ["point", " -2,5 kN·m"], ["point", "1.5"], ["point", "1.000,5"], ["point", "eth1,2"]]
     assert in_script("en", *calls) == ["1234.50", "0.000012", "-1.5e-7", "1234.5",

@@ -12,8 +12,10 @@ import pytest
 
 from tdhil.service.languages import Language, languages
 from tests.service.catalogue import texts
+from tests.service.chromium.pages import HOSTILE, IN_CHROMIUM, PAGES, PLAN, Served, results
 from tests.service.conftest import Service
-from tests.service.test_pages import HOSTILE, PAGES, PLAN, Served, browser, pytestmark, results, served  # noqa: F401
+
+pytestmark = IN_CHROMIUM
 
 FIRST, LAST = "⟦", "⟧"
 DATA = {
@@ -57,7 +59,7 @@ def pseudo(tmp_path: Path, rigs: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
     found.end()
 
 
-def german(browser: Any, served: Served, width: int = 1280) -> Any:  # noqa: F811
+def german(browser: Any, served: Served, width: int = 1280) -> Any:
     context = browser.new_context(base_url=served.url, viewport={"width": width, "height": 800}, locale="de-DE",
                                   bypass_csp=bool(os.environ.get("TDHIL_AXE")))
     context.set_default_timeout(60_000)
@@ -73,7 +75,7 @@ def unmarked(text: str) -> str:
 
 
 @pytest.mark.heavy
-def test_a_page_in_another_language_has_no_english_text(browser, pseudo, monkeypatch):  # noqa: F811
+def test_a_page_in_another_language_has_no_english_text(browser, pseudo, monkeypatch):
     run = pseudo.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
     pseudo.service.wait(run, "done")
     page, bare = german(browser, pseudo), set()
@@ -92,7 +94,7 @@ def test_a_page_in_another_language_has_no_english_text(browser, pseudo, monkeyp
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("width", [390, 1280])
-def test_every_german_page_fits_and_can_be_read(browser, served, monkeypatch, width):  # noqa: F811
+def test_every_german_page_fits_and_can_be_read(browser, served, monkeypatch, width):
     """No page is wider than its window; axe-core, where TDHIL_AXE names its file, finds no serious fault."""
     run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
     served.service.wait(run, "done")
@@ -112,7 +114,7 @@ def test_every_german_page_fits_and_can_be_read(browser, served, monkeypatch, wi
 
 
 @pytest.mark.heavy
-def test_numbers_have_a_comma_and_a_typed_comma_arrives_as_a_number(browser, served, monkeypatch):  # noqa: F811
+def test_numbers_have_a_comma_and_a_typed_comma_arrives_as_a_number(browser, served, monkeypatch):
     monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": PLAN})
     page = german(browser, served)
     page.goto("/start/a")
@@ -137,7 +139,7 @@ def test_numbers_have_a_comma_and_a_typed_comma_arrives_as_a_number(browser, ser
 
 
 @pytest.mark.heavy
-def test_an_error_is_german_or_has_a_german_title_before_its_english_text(browser, served, monkeypatch):  # noqa: F811
+def test_an_error_is_german_or_has_a_german_title_before_its_english_text(browser, served, monkeypatch):
     from drivers import PreflightRefused
     from tdhil.errors import MessageCode
 

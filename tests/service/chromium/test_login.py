@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
+from tests.service.chromium.pages import HOSTILE, IN_CHROMIUM, Served
 from tests.service.conftest import Service
 from tests.service.test_access import PASSWORD, cheap, people  # noqa: F401
-from tests.service.test_pages import Served, browser, pytestmark  # noqa: F401
 
-HOSTILE = "<script>window.pwned=1</script>"
+pytestmark = IN_CHROMIUM
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def served(tmp_path: Path, rigs: Path, people: None, tls: tuple[Path, Path]) -> 
 
 
 @pytest.fixture
-def page(browser: Any, served: Served) -> Iterator[Any]:  # noqa: F811
+def page(browser: Any, served: Served) -> Iterator[Any]:
     context = browser.new_context(base_url=served.url, ignore_https_errors=True, color_scheme="dark",
                                   viewport={"width": 390, "height": 800}, bypass_csp=bool(os.environ.get("TDHIL_AXE")))
     context.set_default_timeout(60_000)
@@ -118,7 +118,7 @@ def test_a_page_from_before_a_new_login_still_stops(page, served):
     assert served.service.store.status(run).stop.by == "engineer"
 
 
-def test_a_page_whose_script_does_not_come_sends_nothing(browser, served):  # noqa: F811
+def test_a_page_whose_script_does_not_come_sends_nothing(browser, served):
     context = browser.new_context(base_url=served.url, ignore_https_errors=True)
     page = context.new_page()
     page.route("**/static/app.js", lambda route: route.abort())

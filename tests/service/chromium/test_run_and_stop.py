@@ -1,0 +1,215 @@
+"""A run in Chromium: what its page shows, how it is stopped, and what follows when its page or the service is gone."""
+
+from __future__ import annotations
+
+import os
+import signal
+from typing import Any
+
+import pytest
+
+from tdhil.session import hold
+from tests.recording.test_log_tail import write
+from tests.service.chromium.pages import IN_CHROMIUM, Served, begin, results
+from tests.service.conftest import wait_for
+
+pytestmark = IN_CHROMIUM
+HIDE = """hidden => {
+    const get = () => hidden ? "hidden" : "visible";
+    Object.defineProperty(document, "visibilityState", { configurable: true, get });
+    document.dispatchEvent(new Event("visibilitychange"));
+}"""
+
+
+def test_a_stop_that_was_asked_for_is_no_alarm(page, served):
+    run = begin(served)
+    page.goto(f"/runs/{run}/live")
+    page.get_by_role("button", name="Stop", exact=True).click()
+    served.service.wait(run, "stopped")
+    page.goto(f"/runs/{run}")
+    page.get_by_text("stopped, at standstill").wait_for()
+    assert page.locator("#result .alarm").count() == 0
+
+
+def test_a_stop_says_when_it_was_asked_seen_and_at_rest(page, served):
+    run = begin(served)
+    page.goto(f"/runs/{run}/live")
+    page.get_by_text("Not an emergency stop.").wait_for()
+    button = page.get_by_role("button", name="Stop", exact=True)
+    button.focus()
+    page.keyboard.press("Enter")
+    page.get_by_text("drive reacted").wait_for()
+    served.service.wait(run, "stopped")
+    page.get_by_text("stopped, at standstill").wait_for()
+    assert not page.get_by_text("NOT DELIVERED").is_visible()
+    assert button.is_disabled()
+
+
+def test_an_answer_that_was_overtaken_undoes_nothing(page, served):
+    run = begin(served)
+    page.goto(f"/runs/{run}/live")
+    page.locator("#state", has_text="moving").wait_for()
+
+    def late(route: Any) -> None:
+        answer = route.fetch()
+        served.service.wait(run, "stopped")
+        page.get_by_text("stopped, at standstill").wait_for()
+        route.fulfill(response=answer)
+
+    page.route("**/stop", late)
+    with page.expect_response("**/stop"):
+        page.get_by_role("button", name="Stop", exact=True).click()
+    page.wait_for_timeout(300)
+    assert page.get_by_text("stopped, at standstill").is_visible()
+    assert page.get_by_role("button", name="Stop", exact=True).is_disabled()
+
+
+def test_a_drive_that_a_terminal_has_is_stopped_from_its_card(page, served, monkeypatch):
+    told = [(True, "tdhil stop confirmed standstill"), (False, "tdhil stop did NOT confirm standstill")]
+    monkeypatch.setattr("tdhil.service.supervisor._stop_seen", lambda command: told.pop(0))
+    with hold(served.service.supervisor.rigs.get("real").address):
+        page.goto("/")
+        stop = page.get_by_role("article", name="real", exact=True).get_by_role("button", name="Stop")
+        stop.click()
+        page.get_by_text("real: tdhil stop confirmed standstill").wait_for()
+        stop.click()
+        page.get_by_text("real: tdhil stop did NOT confirm standstill. Use the hard-wired stop").wait_for()
+
+
+@pytest.mark.parametrize("way", ["offline", "mute"])
+def test_a_stop_that_nobody_hears_says_so(page, served, way):
+    run = begin(served)
+    page.goto(f"/runs/{run}/live")
+    page.locator("#state", has_text="moving").wait_for()
+    if way == "offline":
+        page.context.set_offline(True)
+    else:
+        page.route("**/stop", lambda route: None)           # neither an answer nor an error
+    page.get_by_role("button", name="Stop", exact=True).click()
+    page.get_by_text("NOT DELIVERED: use the hard-wired stop").wait_for()
+    if way == "offline":
+        page.get_by_text("asking …").wait_for(state="hidden")
+    assert served.service.store.status(run).stop.asked is None
+
+
+def test_values_grow_grey_once_nothing_comes(page, served):
+    run = begin(served)
+    folder = served.service.store.place(run)
+    write(folder / "other.mcap")
+    (folder / "other.mcap").replace(folder / "run.mcap")
+    page.goto(f"/runs/{run}/live")
+    page.locator("#speed", has_text="19.").wait_for()
+    # The log is old, and the run said to be moving: that alone is grey.
+    page.locator("body.stale").wait_for()
+    assert not page.locator("#away").is_visible()
+    served.end()
+    page.get_by_text("No connection to tdhil serve").wait_for()
+
+
+def test_six_tabs_and_a_stop_still_gets_through(page, served):
+    run = begin(served)
+    for one in (*(page.context.new_page() for _ in range(5)), page):
+        one.goto(f"/runs/{run}/live")
+    page.get_by_role("button", name="Stop", exact=True).click()
+    served.service.wait(run, "stopped")
+    page.get_by_text("drive reacted").wait_for()
+
+
+def watched_run(page: Any, served: Served) -> str:
+    """It moves, and this page holds its lease."""
+    run = begin(served, "ask", "rehearsed")
+    page.goto(f"/runs/{run}/live")
+    page.get_by_label("Six digits").fill("123 456")
+    page.get_by_role("button", name="Move the shaft").click()
+    page.get_by_text("You watch this run").wait_for()
+    return run
+
+
+def lost(served: Served, run: str) -> Any:
+    """How the run's page went, once the run was made to brake for it."""
+    served.service.wait(run, "stopped")
+    watch = served.service.store.status(run).watch
+    assert watch.lost is not None
+    return watch.how
+
+
+@pytest.mark.heavy(but_first=1)
+@pytest.mark.parametrize(("way", "how"), [("hidden", "hidden"), ("closed", "closed"), ("offline", "silent")])
+def test_a_watched_run_brakes_once_its_page_is_gone(page, served, way, how):
+    run = watched_run(page, served)
+    if way == "closed":
+        other = page.context.new_page()
+        other.goto(f"/runs/{run}/live")
+        other.get_by_text("watches this run on another page").wait_for()
+        page.close()
+        other.get_by_text("This run was not watched: it was stopped").wait_for()     # to look is not to hold
+    elif way == "offline":
+        page.context.set_offline(True)
+        page.get_by_text("The run receives nothing from this page").wait_for()
+        page.get_by_text("The run stops, because it is not watched").wait_for()
+    else:
+        page.evaluate(HIDE, True)
+    assert lost(served, run) == how
+
+
+@pytest.mark.heavy
+def test_a_watched_run_goes_on_when_its_page_is_loaded_anew_or_hidden_for_a_moment(page, served):
+    run = watched_run(page, served)
+    page.reload()
+    page.get_by_text("You watch this run").wait_for()
+    page.evaluate(HIDE, True)
+    page.wait_for_timeout(1000)
+    page.evaluate(HIDE, False)
+    page.wait_for_timeout(5500)            # longer than a lease
+    status = served.service.store.status
+    wait_for("its page", lambda: status(run).watch.gone is None or status(run).state != "moving")      # a moment late
+    assert status(run).state == "moving"
+    copy = page.context.new_page()         # a tab that is copied has what the first had kept: the later one holds
+    copy.goto("/")
+    copy.evaluate("kept => sessionStorage.setItem(...kept)", page.evaluate("Object.entries(sessionStorage)[0]"))
+    copy.goto(f"/runs/{run}/live")
+    copy.get_by_text("You watch this run").wait_for()
+    page.get_by_text("watches this run on another page").wait_for()
+    copy.close()
+    assert lost(served, run) == "closed"
+
+
+@pytest.mark.heavy
+def test_a_run_that_hears_no_stop_is_not_called_stopped(page, served):
+    """Its process is frozen: SIGTERM reaches it, and does nothing."""
+    run = begin(served, "frozen")
+    page.goto(f"/runs/{run}/live")
+    with page.expect_response("**/stop") as answered:
+        page.get_by_role("button", name="Stop", exact=True).click()
+    assert answered.value.ok
+    page.get_by_text("NOT DELIVERED: use the hard-wired stop").wait_for()
+    page.wait_for_timeout(500)
+    assert page.get_by_text("NOT DELIVERED: use the hard-wired stop").is_visible()
+    os.kill(served.service.store.status(run).pid, signal.SIGKILL)
+    served.service.supervisor.start()
+    served.service.wait(run, "interrupted")
+
+
+def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, served):
+    run = begin(served)
+    page.goto(f"/runs/{run}/live")
+    page.get_by_role("button", name="Stop", exact=True).click()
+    page.reload()
+    page.locator("li", has_text="asked ").wait_for()
+    page.get_by_text("drive reacted").wait_for()
+    assert not page.get_by_text("NOT DELIVERED").is_visible()
+
+
+@pytest.mark.heavy
+def test_a_page_says_when_nobody_answers_any_more(page, served, monkeypatch):
+    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    results(served, run, monkeypatch)
+    for path, shown in (("/runs", "104"), ("/rigs/a", "inertia, kg·m²"), ("/fleets/0123456789ab", "104")):
+        page.goto(path)
+        page.get_by_text(shown).first.wait_for()
+        page.context.set_offline(True)
+        page.get_by_text("No answer from tdhil serve: the values are old").wait_for()
+        assert page.evaluate("document.body.classList.contains('stale')")
+        page.context.set_offline(False)
+        page.locator("body:not(.stale)").wait_for()

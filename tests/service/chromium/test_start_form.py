@@ -1,0 +1,199 @@
+"""The start form and its plan in Chromium: a mistake stands at its field; nothing starts before it is allowed."""
+
+from __future__ import annotations
+
+import re
+import threading
+from typing import Any
+
+import pytest
+
+from drivers import PreflightRefused
+from tests.service.chromium.pages import IN_CHROMIUM, PLAN, begin
+
+pytestmark = IN_CHROMIUM
+
+
+@pytest.mark.heavy
+def test_from_the_rigs_to_a_result_by_keyboard_alone(page, served, monkeypatch):
+    monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": PLAN})
+    page.goto("/")
+    page.get_by_role("article", name="Rig a").get_by_role("link", name="Start").focus()
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/start/a")
+    page.get_by_label("Tolerance: half-width").focus()
+    page.keyboard.type("2,5")
+    page.keyboard.press("Enter")       # as the first button would have it: a plan, and nothing begins by mistake
+    page.get_by_role("row", name="expected interval of J").get_by_text("±2.1 %").wait_for()
+    assert served.service.store.ids() == []
+    page.locator("button[value=start]:enabled").wait_for()
+    page.get_by_role("button", name="Start").focus()
+    page.keyboard.press("Enter")
+    page.get_by_text("J = 104.0 (100.0 to 108.0) kg·m²").wait_for()       # by itself: the page becomes the result
+    assert "/live" not in page.url
+    (run,) = served.service.store.ids()
+    assert served.service.store.request(run).options == {"tolerance": 0.025}
+    page.get_by_role("link", name="The recorded motion").click()
+    page.locator("#readout").wait_for()
+    page.get_by_role("link", name="To the result").wait_for()             # it stays
+
+
+def test_an_error_names_the_field_and_takes_the_old_plan_away(page, served, monkeypatch):
+    """The terminal's words are options: on the form they are its labels, and the field is marked."""
+    monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": PLAN})
+    page.goto("/start/a")
+    page.get_by_role("button", name="Plan").click()
+    page.get_by_role("row", name="expected interval of J").wait_for()
+
+    def refused(what: str, run: Any, asked: Any) -> Any:
+        raise PreflightRefused("time: 20 s are too short", next_step="Give --max-time 146s or more, not --max-times")
+
+    monkeypatch.setattr(served.service.supervisor, "work", refused)
+    field = page.locator("[name=max_time_s]")
+    label = page.locator("label", has=field).get_attribute("data-label")
+    field.fill("20")
+    page.get_by_role("button", name="Plan").click()
+    page.get_by_role("alert").get_by_text(f"Give “{label}” 146s or more, not --max-times").wait_for()
+    assert field.get_attribute("aria-invalid") == "true"
+    assert field.evaluate("one => one === document.activeElement")
+    assert not page.locator("#plan").is_visible()
+
+
+def test_all_wrong_values_of_the_start_form_are_said_at_once(page, served):
+    """Each field is marked and has its own words; the labels are the form's, and no option of the terminal is named."""
+    page.goto("/start/a")
+    page.get_by_text("Simulated rig", exact=True).click()
+    for name, text in (("tolerance", "lots"), ("max_time_s", "-5"), ("seed", "-4")):
+        page.locator(f"[name={name}]").fill(text)
+    page.locator("[name=operator]").fill("Anna")
+    page.get_by_role("button", name="Plan").click()
+    page.get_by_role("alert").get_by_text("3 values can't be used").wait_for()
+    marked = page.locator("[aria-invalid=true]")
+    assert sorted(one.get_attribute("name") for one in marked.all()) == ["max_time_s", "seed", "tolerance"]
+    for name in ("max_time_s", "seed", "tolerance"):
+        field = page.locator(f"[name={name}]")
+        label = page.locator("label", has=page.locator(f"[name={name}]")).get_attribute("data-label")
+        assert page.locator(f"#{field.get_attribute('aria-describedby')}").inner_text()
+        assert page.locator("#said").get_by_text(label, exact=True).count() == 1
+    said = page.locator("#said").inner_text()
+    assert "--" not in said
+    assert "must be above 0 and at most" in said and "not -5 min" in said           # in the unit of the field
+    assert served.service.store.ids() == []
+    page.locator("[name=seed]").fill("")
+    page.locator("[name=max_time_s]").fill("")
+    page.get_by_role("button", name="Plan").click()
+    page.get_by_role("alert").get_by_text("One value can't be used").wait_for()
+    assert [one.get_attribute("name") for one in marked.all()] == ["tolerance"]
+
+
+def test_a_run_by_the_clock_says_first_whether_this_computer_holds_its_rate(page, served, monkeypatch):
+    """A computer under load is named before Start; a second Start goes on. Unasked, a simulated run is stepped."""
+    found = {"rate_hz": 100.0, "cycles": 150, "late": 12, "worst_s": 0.03, "holds": False,
+             "text": "This computer does not"}
+    asked = []
+    monkeypatch.setattr(served.service.supervisor, "work",
+                        lambda what, run, wanted: (asked.append(what), {"document": dict(found)})[1])
+    page.goto("/start/a")
+    page.get_by_text("Simulated rig", exact=True).click()
+    page.get_by_text("as fast as possible (stepped time)").wait_for()
+    assert asked == []
+    page.locator("[name=real_time]").check()
+    page.locator("#pace.alarm").get_by_text("This computer does not").wait_for()
+    page.locator("button[value=start]:enabled").click()
+    page.get_by_text("Start again to run all the same").wait_for()
+    assert (asked, served.service.store.ids()) == (["pace"], [])
+    page.locator("button[value=start]:enabled").click()
+    page.wait_for_url("**/live")
+    (run,) = served.service.store.ids()
+    assert served.service.store.request(run).options == {"real_time": True}
+
+
+def test_a_wait_shows_how_long_it_lasts_and_how_long_it_usually_does(page, served, monkeypatch):
+    """A plan takes seconds: a bar and its time, and at the second time the usual time too; asked twice, made once."""
+    goes_on, asked = threading.Event(), []
+
+    def slow(what: str, run: Any, wanted: Any) -> Any:
+        asked.append(what)
+        goes_on.wait(30.0)
+        return {"document": PLAN}
+
+    monkeypatch.setattr(served.service.supervisor, "work", slow)
+    page.goto("/start/a")
+    page.get_by_role("button", name="Plan").click()
+    page.get_by_text(re.compile(r"^Planning: \d+ s$")).wait_for()
+    assert page.get_by_role("progressbar").count() == 1
+    goes_on.set()
+    page.get_by_role("row", name="expected interval of J").wait_for()
+    assert page.get_by_role("progressbar").count() == 0
+    page.get_by_role("button", name="Plan").click()
+    page.get_by_role("row", name="expected interval of J").wait_for()
+    assert asked == ["plan"]
+    goes_on.clear()
+    page.locator("[name=tolerance]").fill("3")
+    page.get_by_role("button", name="Plan").click()
+    page.get_by_text(re.compile(r"^Planning: \d+ s of about \d+ s$")).wait_for()
+    goes_on.set()
+    page.get_by_role("row", name="expected interval of J").wait_for()
+
+
+@pytest.mark.heavy
+def test_expected_values_are_typed_on_the_start_form(page, served):
+    page.goto("/start/a")
+    page.get_by_label("Expected values of an acceptance").fill("inertia=104,5 kg·m² ± 5 %, speed-lag = 400 ms ± 50 ms")
+    page.get_by_role("button", name="Start").click()
+    page.wait_for_url("**/runs/**")
+    (run,) = served.service.store.ids()
+    assert served.service.store.request(run).options == {
+        "expect": ["inertia=104.5 kg·m² ± 5 %", "speed-lag = 400 ms ± 50 ms"]}
+
+
+@pytest.mark.heavy
+def test_a_plan_of_other_values_is_taken_away(page, served, monkeypatch):
+    monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": PLAN})
+    page.goto("/start/a")
+    page.get_by_role("button", name="Plan").click()
+    page.get_by_role("row", name="expected interval of J").wait_for()
+    page.get_by_label("Tolerance: half-width").fill("3")
+    page.locator("#plan").wait_for(state="hidden")
+
+
+@pytest.mark.heavy
+def test_a_wrong_time_of_a_rehearsal_starts_no_run(page, served):
+    page.goto("/rehearse/a")
+    page.get_by_label("Delay after the start").fill("two")
+    page.get_by_role("button", name="Rehearse sto", exact=True).click()
+    page.locator("#wrong-after").get_by_text("a number of seconds").wait_for()
+    assert served.service.store.ids() == []
+
+
+def test_the_code_is_asked_for_and_a_wrong_one_said(page, served):
+    run = begin(served, "ask", "real")
+    page.goto(f"/runs/{run}/live")
+    page.get_by_text("this moves").wait_for()
+    page.get_by_text("Expected: J to ±1.3 %, about 2 min 10 s. A drive; if the host fails: quick").wait_for()
+    page.get_by_text("Preflight: values read from the drive").click()
+    page.get_by_role("row", name="watchdog 500 ms 500 ms 1016h:1").wait_for()
+    field = page.get_by_label("Six digits")
+    field.fill("000000")
+    field.press("Enter")
+    page.get_by_text("the code is wrong").wait_for()
+    field.fill("123 456")
+    field.press("Enter")
+    served.service.wait(run, "done")
+
+
+def test_every_point_of_the_checklist_is_ticked_before_the_shaft_may_be_moved(page, served):
+    points = "Before you confirm:\n  [ ] brake released\n  [ ] people clear of the shaft\n"
+    run = served.service.supervisor.start_run("real", {"note": "ask", "operator": points}, "local").request.id
+    served.service.wait(run, "awaiting_confirmation")
+    page.goto(f"/runs/{run}/live")
+    move = page.get_by_role("button", name="Move the shaft")
+    page.get_by_label("brake released").check()
+    assert move.is_disabled()
+    page.get_by_label("Six digits").fill("123456")
+    page.get_by_label("Six digits").press("Enter")          # no way round
+    page.get_by_label("people clear of the shaft").check()
+    assert move.is_enabled()
+    assert served.service.store.status(run).state.value == "awaiting_confirmation"
+    move.click()
+    served.service.wait(run, "done")
