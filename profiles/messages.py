@@ -627,6 +627,10 @@ class MessageCode(Enum):
         513, "The drive sends an object without an end",
         "A reply to an SDO request is longer than any object that tdhil reads, or its segments do not end in time.",
         "Compare the object with the drive's manual. Update the firmware of the drive or of the gateway.")
+    FEEDBACK_REPEATS = (
+        514, "The feedback repeats its last values",
+        "The setpoint moves, but speed and torque do not. A gateway repeats old values, or the shaft is locked.",
+        "Check gateway, drive and shaft.")
 
     # --- 6xx: drive --------------------------------------------------------------------------------------------------
     DRIVE_FAULT = (

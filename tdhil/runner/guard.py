@@ -386,7 +386,8 @@ class Guard:
         CommunicationLost for feedback that repeats, LimitHit for a shaft that became lighter, else ReportsContradict.
         """
         if Signal.ALL in doubt.signals:
-            raise CommunicationLost(doubt.what, where=_at(sample), next_step=doubt.helps)
+            raise CommunicationLost(doubt.what, where=_at(sample), next_step=doubt.helps,
+                                    entry=MessageCode.FEEDBACK_REPEATS)
         if doubt.lighter:
             raise LimitHit(doubt.what, where=_at(sample), next_step=f"The shaft was stopped. {doubt.helps}")
         raise ReportsContradict(doubt.what, where=_at(sample), next_step=f"The shaft was stopped. {doubt.helps}")

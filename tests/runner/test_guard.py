@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from drivers.drive import Command, Counters, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit, TdhilError
+from profiles import MessageCode
 from tdhil.runner.guard import Guard
 from tests.runner.fake_drive import LIMITS, NAN, PERIOD_S, SPEED_RESOLUTION, TORQUE_RESOLUTION
 from tests.runner.guarded import MODEL, OFFSET, REST, REVERSIBLE, guard, sample
@@ -227,8 +228,9 @@ def ramp(end, count=30, start=0.0):
 def test_feedback_that_stands_still_while_the_setpoint_moves_is_frozen(mode, limit):
     enough, little = 0.2 * limit, 0.09 * limit
     times = [0.02 * k for k in range(30)]
-    with pytest.raises(CommunicationLost, match=r"frozen at 5.000 rad/s and 90 N·m for 0.5 s"):
+    with pytest.raises(CommunicationLost, match=r"frozen at 5.000 rad/s and 90 N·m for 0.5 s") as raised:
         feed([(t, s, 5.0, 90.0) for t, s in zip(times, ramp(enough), strict=True)], mode)
+    assert raised.value.entry is MessageCode.FEEDBACK_REPEATS
     with pytest.raises(CommunicationLost, match="frozen"):          # downwards as well
         feed([(t, s, 5.0, 90.0) for t, s in zip(times, ramp(0.0, start=enough), strict=True)], mode)
     with pytest.raises(CommunicationLost, match="frozen"):          # there and back
