@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from tdhil.config.options import (
         ASKED_AGAIN as ASKED_AGAIN, CLOCKS as CLOCKS, EvidenceOptions as EvidenceOptions,
         OF_A_TRACE as OF_A_TRACE, OF_EVIDENCE as OF_EVIDENCE, OF_THE_HEAD as OF_THE_HEAD, OPTION as OPTION,
-        OPTIONS as OPTIONS,
-        Topic as Topic, Option as Option,
+        OPTIONS as OPTIONS, PUBLISHABLE as PUBLISHABLE, Topic as Topic, Option as Option,
         Origin as Origin, Overrides as Overrides, RunDetails as RunDetails, RunOptions as RunOptions,
         STATED as STATED, Setting as Setting, form_options as form_options,
     )
@@ -39,8 +38,8 @@ if TYPE_CHECKING:
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "keywords": "OF_THE_RESULT OF_THE_RUN OF_THE_SIMULATOR values_of with_keywords",
-        "options": "ASKED_AGAIN CLOCKS EvidenceOptions OF_A_TRACE OF_EVIDENCE OF_THE_HEAD OPTION OPTIONS Topic Option "
-                   "Origin Overrides RunDetails RunOptions STATED Setting form_options",
+        "options": "ASKED_AGAIN CLOCKS EvidenceOptions OF_A_TRACE OF_EVIDENCE OF_THE_HEAD OPTION OPTIONS "
+                   "PUBLISHABLE Topic Option Origin Overrides RunDetails RunOptions STATED Setting form_options",
         "registry": "BUSES DEFAULT_BUS DEFAULT_EXCITATION EXCITATIONS MODELS SPEED_UNIT_TOLERANCE has_plateaus "
                     "imported load identified_before_echo",
         "acceptance": "ACCEPTED_QUANTITIES Expectation expectations_in expectations_of",

@@ -83,6 +83,7 @@ class Form:
     ``replay``, ``upload``, ``trace``, ``motion``, ``motion-file`` and ``evidence``.
 
     ``unit``: unit of a number that is entered without one. ``hint``: shown in the empty field instead of the default.
+    ``ticks``: the field has a tick for each (name, label); its value is the ticked names, separated by commas.
     """
 
     label: str
@@ -90,6 +91,7 @@ class Form:
     unit: Unit | None = None
     hint: str = ""
     wide: bool = False
+    ticks: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -622,6 +624,13 @@ class TraceOptions(_Said):
     )
 
 
+PUBLISHABLE: Final = (
+    ("log", "the log"), ("result", "the result"), ("identity", "make and type of the drive"),
+    ("rig", "the name of the rig"),
+)
+"""Parts of an archive of evidence that a publisher may permit to publish, and their labels in a form."""
+
+
 @dataclass(frozen=True)
 class EvidenceOptions(_Said):
     """Statement of the publisher for an archive of evidence (`tdhil evidence`). The recorded log contains the rest.
@@ -636,7 +645,7 @@ class EvidenceOptions(_Said):
     )
     publish: str | None = option(
         "--publish", group=Topic.EVIDENCE, metavar="PARTS", api=True, longest=60,
-        form=Form("Parts that may be published", ("evidence",), hint="log,result,identity or all"),
+        form=Form("Parts that may be published", ("evidence",), ticks=PUBLISHABLE),
         help="parts that may be published: log, result, identity, rig (the rig's name), separated by commas, or all",
     )
     reference_inertia_kg_m2: float | None = option(

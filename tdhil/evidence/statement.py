@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from tdhil.config import OF_EVIDENCE, EvidenceOptions
+from tdhil.config import OF_EVIDENCE, PUBLISHABLE, EvidenceOptions
 
-PARTS: Final = ("log", "result", "identity", "rig")
-"""Parts that a publisher may permit to publish. ``rig`` is the name of the rig."""
+PARTS: Final = tuple(name for name, _ in PUBLISHABLE)
+"""Parts that a publisher may permit to publish."""
 ALL: Final = "all"
 NEEDED: Final = frozenset({"log", "result", "identity"})
 """Parts that an archive in the folder `evidence/` needs: this folder is public."""

@@ -119,7 +119,7 @@ def vocabulary() -> Iterator[Text]:
     for part in forms:
         for one in form_options(part):
             assert one.form is not None
-            yield Text(options, "", one.form.label)
+            yield from (Text(options, "", label) for label in (one.form.label, *(label for _, label in one.form.ticks)))
             hint = one.form_hint.removeprefix(AS_RIG)
             if re.search(r"[A-Za-z]{2,}", hint) and hint not in (one.allowed or ()) and "@" not in hint:
                 yield Text(options, "", hint)

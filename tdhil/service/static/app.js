@@ -252,7 +252,8 @@
   function asked(form) {
     const found = {};
     for (const field of form.querySelectorAll("[name]:not(button)")) {
-      const text = field.value.trim(), { kind, unit } = field.dataset;
+      const ticks = field.tagName === "FIELDSET" ? [...field.querySelectorAll(":checked")].map((one) => one.value).join(",") : null;
+      const text = ticks ?? field.value.trim(), { kind, unit } = field.dataset;
       if (field.type === "checkbox") {
         if (field.checked) found[field.name] = true;
       } else if (text) {
@@ -271,11 +272,14 @@
       const field = form.elements[one.option], note = el("span", { class: "alarm wrong", id: `wrong-${one.option}` }, worded(one.message));
       field.setAttribute("aria-invalid", "true");
       field.setAttribute("aria-describedby", note.id);
-      field.closest("label").append(note);
+      (field.closest("label") || field).append(note);
       const closed = field.closest("details");
       if (closed) closed.open = true;
     });
-    if (known.length && go) form.elements[known[0].option].focus();
+    if (known.length && go) {
+      const field = form.elements[known[0].option];
+      (field.querySelector("input") || field).focus();
+    }
     return known.length;
   }
   function unmark(form) {
