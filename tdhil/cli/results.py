@@ -23,14 +23,18 @@ def save_report(
     ``virtual_string``: its cycles, if the run has one.
     """
     if report is not None:
-        from tdhil.report import write_evaluation_report, write_report, write_verification_report
-
         path, head = report.path, report.letterhead
         if _is_verification(document):
+            from tdhil.report import write_verification_report
+
             written = write_verification_report(document, path, head)
         elif _is_evaluation(document) and virtual_string is not None:
+            from tdhil.report import write_evaluation_report
+
             written = write_evaluation_report(document, virtual_string, path, head)
         else:
+            from tdhil.report import write_report
+
             written = write_report(document, recording, path, head)
         if written != path:
             print(f"tdhil: {path} was created by another program meanwhile; the report is {written}", file=sys.stderr)  # noqa: T201

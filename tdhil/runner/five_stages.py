@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
+from functools import partial
 
 from drivers import Command, Drive, DriveLimits, Mode, Outcome, Paced, Preflight, PreflightRefused, Sample, Timed
 from profiles import MessageCode
@@ -32,12 +33,29 @@ from tdhil.runner.preconditions import (
     with_known_lag,
     with_read_filters,
 )
-from tdhil.runner.programs import Run, program_of
+from tdhil.runner.programs import Run, identify, offset_impedance
 from tdhil.runner.settings import ExcitationRequest, StopRequest
 from tdhil.runner.stage_log import StageBook
 from tdhil.runner.stages import NOT_YET, measure_offsets
 from tdhil.runner.stop import StopReport, StopSequence
 from tdhil.runner.task import Confirm, ConfirmSpeed, Display, MakeTask, RunOutcome, Say, Task, refuse_unconfirmed_speed
+
+Program = Callable[[Run], None]
+
+
+def program_of(task: Task) -> Program:
+    """Return the program for a task. The packages of a case load only if the task has one."""
+    if task.case is None:
+        return offset_impedance if task.request.impedance == "offset" else identify
+    from tdhil.speed_loop import StepCase
+
+    if isinstance(task.case, StepCase):
+        from tdhil.runner.speed_steps_program import speed_steps
+
+        return partial(speed_steps, case=task.case)
+    from tdhil.runner.virtual_string_program import virtual_string
+
+    return partial(virtual_string, case=task.case)
 
 
 def _nothing(text: str) -> None:
@@ -123,18 +141,22 @@ class Runner:
         """Connect and check in stage 1; the program that the task requests ends it and runs the others."""
         with ExitStack() as setup:
             setup.enter_context(self._book.stage("setup", 10.0))
-            run = self._prepare(setup.close)
-            program_of(run.task)(run)
+            run, program = self._prepare(setup.close)
+            program(run)
 
     def _armed(self, stop: StopSequence) -> None:
         self._stop = stop
 
-    def _prepare(self, end_setup: Callable[[], None]) -> Run:
-        """Connect, check and set the drive, and measure its offsets at standstill. The shaft does not move."""
+    def _prepare(self, end_setup: Callable[[], None]) -> tuple[Run, Program]:
+        """Connect, check and set the drive, and measure its offsets at standstill. The shaft does not move.
+
+        Return what the stages need, and the program that follows.
+        """
         identity = self._drive.connect()
         self._log.learn(simulated=identity.simulated)
         task = self._make_task(identity)
         self._log.learn(**task.facts)
+        program = program_of(task)       # before anything is armed: it may load modules
         if self._reset_fault:
             self._log.event(self._drive.clock.now_s(), "reset", "fault reset, requested by the operator")
             self._drive.reset_fault()
@@ -152,10 +174,11 @@ class Runner:
         self._before_echo = identified_before_echo(task.request.kind)
         _, torque_offset_nm = measure_offsets(loop, task.limits)
         loop.guard.observer.torque_offset_nm = torque_offset_nm
-        return Run(
+        run = Run(
             task, mode, loop, preflight, torque_offset_nm, prior, self._book, self._log, self._display, self._say,
             self._confirm, self._confirm_speed, self._armed, end_setup, self._identify,
         )
+        return run, program
 
     def _check_drive(self, task: Task) -> Preflight:
         """Run the drive's preflight with the limits of the task. Raises PreflightRefused with its first refusal."""

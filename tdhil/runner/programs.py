@@ -1,16 +1,15 @@
-"""The four programs of a run, each a sequence of stages, and the choice of the program.
+"""The programs `identify` and `offset_impedance`, each a sequence of stages, and the stages that every program has.
 
 `five_stages` connects and checks the drive before the program. The stop sequence follows, however the program ends.
+The other two programs are in `virtual_string_program` and `speed_steps_program`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import dataclass
 
-from drivers import Command, Mode, Preflight, PreflightRefused, Sample
-from profiles import MessageCode
+from drivers import Command, Mode, Preflight, Sample
 from profiles.quantities import in_nm
 from tdhil.recording import Excitation, LagPrior, Ramp, RunLog
 from tdhil.runner.control_loop import ControlLoop
@@ -24,32 +23,21 @@ from tdhil.runner.speed_check import SpeedWitness
 from tdhil.runner.stage_log import StageBook
 from tdhil.runner.stage_planner import StagePlanner
 from tdhil.runner.stages import (
-    STEPS_RESERVE_S,
     MeanSpeedControl,
     OffsetPlan,
     SpeedResult,
     TorqueResult,
-    course_of,
-    go_to,
-    plan_steps,
-    plan_steps_before,
     probe_sign,
-    refuse_other_rig,
-    refuse_other_shaft,
     run_hold,
     run_offset,
     run_pilot,
     run_plan,
     run_speed,
-    run_steps,
     run_torque,
-    run_virtual_string,
     slow_down,
 )
 from tdhil.runner.stop import StopSequence
 from tdhil.runner.task import Confirm, ConfirmSpeed, Display, Say, Task
-from tdhil.soft_torque import EvaluationCase, SpeedProgram
-from tdhil.speed_loop import StepCase, StepProgram
 
 HOLD_AUTHORITY = 0.25
 """Share of the torque limit that the control of the mean speed may add; the same as the ramp of stage 4 needs."""
@@ -75,37 +63,6 @@ def offset_impedance(run: Run) -> None:
     switch_to_torque(run, turning)                                     # 3 torque; skipped: the mode is speed
     plan = run_small_offset(run, turning)                              # 4 hold
     acquire_offset(run, turning, plan)                                 # 5 acquire
-
-
-def virtual_string(run: Run, case: EvaluationCase) -> None:
-    """Evaluate a speed controller with a virtual string."""
-    program = speed_program(run, case)
-    begin_motion(run)                                                  # 1 setup, its end
-    turning = turn(run)                                                # 2 speed
-    drifted = switch_to_torque(run, turning)                           # 3 torque; skipped in speed mode
-    refuse_unfit_rig(run, case, turning, drifted)
-    hold_first_speed(run, case, program, turning, drifted)             # 4 hold
-    acquire_virtual_string(run, case, program, turning)                # 5 acquire
-
-
-def speed_steps(run: Run, case: StepCase) -> None:
-    """Compare the drive's speed loop with its tuning, by small steps of the set speed."""
-    run.log.configure(verification={"case": case.plain()})
-    plan_steps_before(case, run.limits, run.loop.period_s, run.speed_resolution_rad_s)
-    begin_motion(run)                                                  # 1 setup, its end
-    turning = turn(run)                                                # 2 speed
-    switch_to_torque(run, turning)                                     # 3 torque; skipped: the mode is speed
-    program = hold_low_speed(run, case, turning)                       # 4 hold
-    acquire_steps(run, case, program, turning)                         # 5 acquire
-
-
-def program_of(task: Task) -> Callable[[Run], None]:
-    """Return the program for a task."""
-    if isinstance(task.case, EvaluationCase):
-        return partial(virtual_string, case=task.case)
-    if isinstance(task.case, StepCase):
-        return partial(speed_steps, case=task.case)
-    return offset_impedance if task.request.impedance == "offset" else identify
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -265,7 +222,8 @@ def _announcer(run: Run, turning: Turning, drifted: TorqueResult | None) -> Call
     return lambda motion: run.log.motion(motion, levels, ramps)
 
 
-def _mean_speed_control(run: Run, model: RigGuess) -> MeanSpeedControl:
+def mean_speed_control(run: Run, model: RigGuess) -> MeanSpeedControl:
+    """Return the host's control of the mean speed."""
     return MeanSpeedControl(model, HOLD_AUTHORITY * run.limits.torque_nm, run.assumptions)
 
 
@@ -279,7 +237,7 @@ def hold(run: Run, turning: Turning, drifted: TorqueResult | None, planned: Plan
         run.book.skip("hold", f"{_why_speed(run)}: the drive's own speed control holds the mean speed")
         return None
     with run.book.stage("hold", 15.0):
-        control = _mean_speed_control(run, turning.model)
+        control = mean_speed_control(run, turning.model)
         run_hold(
             run.loop, run.limits, turning.model, control, planned.plan.start_rad_s, drifted.speed_rad_s,
             run.speed_resolution_rad_s, turning.speed.wander_rad_s,
@@ -335,92 +293,3 @@ def acquire_offset(run: Run, turning: Turning, found: OffsetPlan) -> None:
     """Run stage 5: the planned torque offset."""
     with run.book.stage("acquire", found.plan.duration_s + END_S):
         run_offset(run.loop, found, _announcer(run, turning, None), run.speed_resolution_rad_s)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Checks of `virtual_string` before motion, and its stages 4 and 5.
-
-
-def speed_program(run: Run, case: EvaluationCase) -> SpeedProgram:
-    """Return the virtual string's speed program, before motion. Raises an error if it is refused."""
-    if case.own_loop and run.preflight.torque_offset_resolution_nm <= 0.0:
-        raise PreflightRefused(
-            "the profile names no torque offset of the drive, which --own-loop needs to apply the string's torque",
-            where="--own-loop", next_step="Remove --own-loop: the host's controller in torque mode needs none",
-            entry=MessageCode.VIRTUAL_STRING_REFUSED,
-        )
-    course = partial(course_of, case, run.limits, run.loop.period_s, Guard.foresight_s(run.assumptions))
-    program = run.loop.compute(course, Command(Mode.SPEED, 0.0, 0.0))
-    run.log.configure(evaluation={"case": case.plain(), "program": asdict(program)})
-    return program
-
-
-def refuse_unfit_rig(run: Run, case: EvaluationCase, turning: Turning, drifted: TorqueResult | None) -> None:
-    """Raise PreflightRefused if the shaft is not that of the result, or if torque mode does not brake it."""
-    refuse_other_rig(case, turning.model)
-    guard = run.loop.guard
-    if drifted is not None and guard.no_braking:
-        raise PreflightRefused(
-            f"a virtual string needs braking torque: {guard.no_braking}", where="braking probe",
-            next_step=guard.to_brake,
-            entry=MessageCode.BRAKING_UNCLEAR,
-        )
-
-
-def hold_first_speed(
-    run: Run, case: EvaluationCase, program: SpeedProgram, turning: Turning, drifted: TorqueResult | None
-) -> None:
-    """Run stage 4: bring the shaft to the first speed of the program, in the mode of stage 5."""
-    loop, limits, model = run.loop, run.limits, turning.model
-    start_rad_s = program.start_rad_s * case.rig.gear_ratio
-    with run.book.stage("hold", 15.0):
-        if drifted is None:
-            go_to(loop, limits, model, start_rad_s, run.speed_resolution_rad_s)
-        else:
-            run_hold(
-                loop, limits, model, _mean_speed_control(run, model), start_rad_s, drifted.speed_rad_s,
-                run.speed_resolution_rad_s,
-            )
-
-
-def acquire_virtual_string(run: Run, case: EvaluationCase, program: SpeedProgram, turning: Turning) -> None:
-    """Run stage 5: the speed program with the string's torque on the shaft."""
-    with run.book.stage("acquire", program.longest_s):
-        run_virtual_string(
-            run.loop, run.limits, case, program, run.log.virtual, run.say, run.speed_resolution_rad_s,
-            turning.speed.high.speed_sd_rad_s,
-        )
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Stages 4 and 5 of `speed_steps`.
-
-
-def hold_low_speed(run: Run, case: StepCase, turning: Turning) -> StepProgram:
-    """Run stage 4: plan the steps for this shaft, and bring it to their lower speed."""
-    loop, limits, model = run.loop, run.limits, turning.model
-    refuse_other_shaft(case, model)
-    middle = 0.5 * (limits.speed_min_rad_s + limits.speed_max_rad_s)
-    with run.book.stage("hold", 15.0):
-        program = plan_steps(
-            case, limits, loop.period_s, run.speed_resolution_rad_s,
-            loop.guard.left_s(loop.now_s) - STEPS_RESERVE_S, model.steady_torque_nm(middle))
-        text = (f"{program.pairs + 1} pairs of steps between {program.low_rad_s:.3f} and {program.high_rad_s:.3f} rad/s"
-                f", {program.duration_s:.0f} s")
-        run.log.event(loop.now_s, "plan", text)
-        run.say(text)
-        go_to(loop, limits, model, program.speeds_rad_s(0)[1], run.speed_resolution_rad_s)
-    return program
-
-
-def acquire_steps(run: Run, case: StepCase, program: StepProgram, turning: Turning) -> None:
-    """Run stage 5: the steps. Their times go into the log."""
-
-    def keep(starts: list[float]) -> None:
-        run.log.configure(verification={
-            "case": case.plain(), "program": asdict(program), "starts_s": list(starts),
-            "reference_filter_s": run.task.request.reference_filter_s,
-        })
-
-    with run.book.stage("acquire", program.duration_s):
-        run_steps(run.loop, case, program, run.speed_resolution_rad_s, turning.speed.high.speed_sd_rad_s, keep)

@@ -111,7 +111,7 @@ class RunSession:
 
     def __init__(self, request: RunRequest, operator_interface: OperatorInterface, *, report: bool = False) -> None:
         """Open the log only. ``report``: a report will be written, so its modules are loaded too."""
-        load_what_the_end_needs(report)
+        load_what_the_end_needs(report, case=request.case is not None)
         options, peer = request.options, request.peer
         self._request, self._operator_interface = request, operator_interface
         self._place = place = LogPlace(Path(options.log))
@@ -315,8 +315,11 @@ def configuration(request: RunRequest) -> dict[str, Any]:
     }
 
 
-def load_what_the_end_needs(report: bool) -> None:
-    """Import the modules for stop and result before motion: later there may be no file descriptor left."""
+def load_what_the_end_needs(report: bool, case: bool) -> None:
+    """Import the modules for stop and result before motion: later there may be no file descriptor left.
+
+    ``case``: the run compares a controller or its gains, instead of identifying.
+    """
     import traceback  # noqa: F401
 
     import scipy.optimize
@@ -327,17 +330,16 @@ def load_what_the_end_needs(report: bool) -> None:
         Verdict,  # noqa: F401
         identify,  # noqa: F401
     )
-    from tdhil.report import (  # noqa: F401
-        card_text,
-        evaluation_document,
-        result_document,
-        verification_document,
-        write_report,
-    )
-    from tdhil.session import conclusion, evaluation, verification  # noqa: F401
-    from tdhil.speed_loop import verify_steps  # noqa: F401
+    from tdhil.report import card_text, result_document, write_report  # noqa: F401
+    from tdhil.session import conclusion  # noqa: F401
 
     with Console(file=io.StringIO()).status(""):
         pass      # rich loads its spinners at first use
     if report:
-        from tdhil.report import draw_run, evaluation_report, require_extra, verification_report  # noqa: F401
+        from tdhil.report import draw_run, require_extra  # noqa: F401
+    if case:
+        from tdhil.report import evaluation_document, verification_document  # noqa: F401
+        from tdhil.session import evaluation, verification  # noqa: F401
+        from tdhil.speed_loop import verify_steps  # noqa: F401
+    if case and report:
+        from tdhil.report import evaluation_report, verification_report  # noqa: F401

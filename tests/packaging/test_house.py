@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -65,6 +67,24 @@ def test_what_a_log_says_of_its_run_is_read_without_a_virtual_string():
     done = run("-c", "import sys\nfrom tdhil.runner import precondition_warnings, speed_warnings, stage_warnings\n"
                      "print([name for name in sys.modules if name.startswith('tdhil.soft_torque.')])")
     assert done.stdout == "[]\n", done.stderr
+
+
+@pytest.mark.heavy
+def test_identify_needs_no_service_fleet_or_tuning(tmp_path):
+    house = tmp_path / "house"
+    for room in ("tdhil", "drivers", "sim_bus", "profiles"):
+        shutil.copytree(ROOT / room, house / room, ignore=shutil.ignore_patterns("__pycache__"))
+    for room in ("service", "fleet", "soft_torque", "speed_loop"):
+        shutil.rmtree(house / "tdhil" / room)
+    done = subprocess.run(
+        [sys.executable, "-m", "tdhil", "identify", "--simulate", "--seed", "7", "--max-time", "150",
+         "--report", "report.html", "--json"],
+        cwd=house, env=os.environ | {"PYTHONPATH": str(house)}, capture_output=True, text=True, timeout=600,
+    )
+    assert done.returncode == 0, done.stderr
+    interval = json.loads(done.stdout)["inertia_kg_m2"]
+    assert interval["low"] < 104.0 < interval["high"]
+    assert (house / "report.html").is_file()
 
 
 def test_no_path_of_a_home_stands_in_the_tree():

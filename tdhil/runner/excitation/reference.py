@@ -101,6 +101,10 @@ class MotionLimits:
         return (1.0 - TORQUE_RESERVE) * self.torque_limit_nm
 
 
+SAME_RIG = 0.5
+"""Permitted difference of the rough inertia from an identified one, unless the uncertainty is larger."""
+
+
 @dataclass(frozen=True)
 class RigGuess:
     """Rough model of the rig: T = inertia·dω/dt + viscous·ω + coulomb, forward rotation.
@@ -122,6 +126,11 @@ class RigGuess:
             raise PlanRefused("rough friction must be finite")
         if not 0.0 <= self.inertia_rel_error < 0.9:
             raise PlanRefused(f"relative error of the rough inertia must be in [0, 0.9): {self.inertia_rel_error:g}")
+
+    def excludes(self, inertia_kg_m2: float) -> bool:
+        """Return whether this rough inertia excludes an inertia that another run identified."""
+        open_by = 1.0 + max(SAME_RIG, 3.0 * self.inertia_rel_error)
+        return not 1.0 / open_by <= self.inertia_kg_m2 / inertia_kg_m2 <= open_by
 
     def steady_torque_nm(self, speed_rad_s: float) -> float:
         """Return the torque that holds a steady speed, N·m."""

@@ -14,7 +14,6 @@ from profiles import MessageCode
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.settings import MachineLimits
-from tdhil.runner.stages.virtual_string import differs_from
 from tdhil.speed_loop import LEAST_PAIRS, StepCase, StepProgram, step_length_s
 
 PAIRS = 24
@@ -77,7 +76,7 @@ def plan_steps_before(
 def refuse_other_shaft(case: StepCase, model: RigGuess) -> None:
     """Raise PreflightRefused if the turning shaft can't be the shaft for which the gains were tuned."""
     tuned = case.plant.believed.total_inertia_kg_m2
-    if differs_from(tuned, model):
+    if model.excludes(tuned):
         raise _refused(
             f"the gains were tuned for {tuned:.4g} kg·m² at the motor, and this shaft has about"
             f" {model.inertia_kg_m2:.4g}", case.source or "tune.json", "Identify this rig, then tune with that result")

@@ -20,7 +20,6 @@ from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.guard import kept_within
 from tdhil.runner.settings import MachineLimits
-from tdhil.runner.stages.steady import wait_until_steady
 from tdhil.soft_torque import (
     RPM,
     EvaluationCase,
@@ -39,11 +38,6 @@ fifth of the first. A lost load or torque is detected within a tenth of a second
 RMS_S = 5.0               # s; window of the rms torque that shows an oscillating loop
 ENERGY_SHARE = 0.05
 """Share of the string's energy at breakaway of the bit that loop errors may put in."""
-SAME_RIG = 0.5
-"""Permitted difference of stage 2's rough inertia from the result's, unless its uncertainty is larger."""
-TORQUE_SHARE, RAMP_S = 0.25, 5.0
-"""Ramp to the first set speed in the drive's own loop: share of the torque limit that may accelerate the shaft, and
-least time from zero to the speed limit, s."""
 RESERVE_S = 20.0          # s; reserved of the time limit
 BEFORE_S = 150.0
 """Approximate duration of stages 1 to 4, s; the rest of the time limit is checked before motion."""
@@ -81,32 +75,13 @@ def course_of(case: EvaluationCase, limits: MachineLimits, period_s: float, fore
 
 def refuse_other_rig(case: EvaluationCase, model: RigGuess) -> None:
     """Raise PreflightRefused if the turning shaft can't be the one of the result."""
-    if differs_from(case.rig.inertia_kg_m2, model):
+    if model.excludes(case.rig.inertia_kg_m2):
         raise PreflightRefused(
             f"the result says {case.rig.inertia_kg_m2:.4g} kg·m² at the motor, and this shaft has about "
             f"{model.inertia_kg_m2:.4g}",
             where="--controller and --result", next_step="Identify this rig, then tune with that result",
             entry=MessageCode.VIRTUAL_STRING_REFUSED,
         )
-
-
-def differs_from(inertia_kg_m2: float, model: RigGuess) -> bool:
-    """Return whether stage 2's rough inertia excludes this one."""
-    open_by = 1.0 + max(SAME_RIG, 3.0 * model.inertia_rel_error)
-    return not 1.0 / open_by <= model.inertia_kg_m2 / inertia_kg_m2 <= open_by
-
-
-def go_to(
-    loop: ControlLoop, limits: MachineLimits, model: RigGuess, speed_rad_s: float, speed_resolution_rad_s: float
-) -> None:
-    """Ramp to a speed in speed mode, and settle. Raises what the bench raises, LimitHit if it does not settle."""
-    begun = max(0.0, loop.last.speed_rad_s) if loop.last is not None else 0.0
-    rate = min(TORQUE_SHARE * limits.torque_nm / model.inertia_kg_m2, limits.speed_max_rad_s / RAMP_S)
-    steps = loop.cycles(abs(speed_rad_s - begun) / rate)
-    for step in range(1, steps + 1):
-        loop.cycle(Command(Mode.SPEED, begun + (speed_rad_s - begun) * step / steps, 0.0))
-    tolerance = max(2.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
-    wait_until_steady(loop, Command(Mode.SPEED, speed_rad_s, 0.0), speed_rad_s, tolerance, timeout_s=90.0)
 
 
 def run_virtual_string(
