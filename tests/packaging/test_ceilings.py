@@ -1,0 +1,63 @@
+"""A room has a ceiling: it grows beyond it only with a decision record that says why."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FIRST = "0078"
+"""Decision record that set the ceilings."""
+# Room: its ceiling in source lines, and the decision record that set or raised it.
+CEILINGS = {
+    "tdhil": (1_300, FIRST),
+    "tdhil/buses": (3_000, FIRST),
+    "tdhil/calibration": (1_500, FIRST),
+    "tdhil/cli": (6_600, FIRST),
+    "tdhil/config": (1_800, FIRST),
+    "tdhil/estimation": (14_400, FIRST),
+    "tdhil/evidence": (1_400, FIRST),
+    "tdhil/fleet": (2_100, FIRST),
+    "tdhil/recording": (5_400, FIRST),
+    "tdhil/report": (6_800, FIRST),
+    "tdhil/runner": (12_000, FIRST),
+    "tdhil/service": (11_900, FIRST),
+    "tdhil/session": (4_500, FIRST),
+    "tdhil/soft_torque": (5_900, FIRST),
+    "tdhil/speed_loop": (1_500, FIRST),
+    "tdhil/studies": (6_100, FIRST),
+    "drivers": (12_700, FIRST),
+    "sim_bus": (12_000, FIRST),
+    "profiles": (4_600, FIRST),
+}
+RESERVE = 0.25
+"""A ceiling that is further above the lines than this share holds nothing: lower it."""
+IN_ANOTHER = {"tdhil": "*.py"}
+"""Rooms whose folder holds other rooms: only the files beside these count."""
+
+
+def lines_of(room: str) -> int:
+    """Return the source lines of a room, without those of the rooms below it."""
+    paths = (ROOT / room).glob(IN_ANOTHER[room]) if room in IN_ANOTHER else (ROOT / room).rglob("*.py")
+    return sum(path.read_text(encoding="utf-8").count("\n") for path in paths)
+
+
+def test_every_room_has_a_ceiling():
+    rooms = {f"tdhil/{path.parent.name}" for path in (ROOT / "tdhil").glob("*/__init__.py")}
+    assert set(CEILINGS) == rooms | {"tdhil", "drivers", "sim_bus", "profiles"}
+
+
+@pytest.mark.parametrize("room", CEILINGS)
+def test_a_room_stays_below_its_ceiling(room):
+    ceiling, decision = CEILINGS[room]
+    lines = lines_of(room)
+    assert lines <= ceiling, f"{room} has {lines} lines, and decision {decision} permits {ceiling}"
+    assert lines >= (1.0 - RESERVE) * ceiling, f"{room} has {lines} lines: lower its ceiling of {ceiling}"
+
+
+@pytest.mark.parametrize("room", CEILINGS)
+def test_the_decision_that_set_a_ceiling_names_it(room):
+    ceiling, decision = CEILINGS[room]
+    (record,) = (ROOT / "docs" / "decisions").glob(f"{decision}-*.md")
+    assert f"| {room} | {ceiling:,} |" in record.read_text(encoding="utf-8")
