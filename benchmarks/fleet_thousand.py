@@ -15,7 +15,6 @@ import json
 import os
 import random
 import resource
-import signal
 import subprocess
 import sys
 import tempfile
@@ -33,6 +32,7 @@ from tdhil.errors import TdhilError  # noqa: E402
 from tdhil.fleet import FleetRequest, FleetRow, FleetSettings, read_table, run_fleet  # noqa: E402
 from tdhil.process_pool import Pool, TaskLimits  # noqa: E402
 from tests.fleet import poison  # noqa: E402
+from tests.fleet.killer import Killer, cluster_processes, pool_processes  # noqa: E402
 from tests.fleet.simulated_logs import rig_plants, write_rig  # noqa: E402
 from tests.fleet.terminal import fleet_with_ctrl_c  # noqa: E402
 from tests.process_pool.poison import work  # noqa: E402
@@ -65,61 +65,6 @@ def generate(folder: Path, logs: int, rigs: int) -> None:
     gone.symlink_to("nowhere")
     wall_s, cpu_s = time.monotonic() - began, time.process_time() - cpu
     print(f"{len(every)} logs of {rigs} rigs made in {wall_s:.0f} s, {cpu_s:.0f} s CPU", flush=True)
-
-
-class Killer:
-    """Kills processes of the pool, or of a cluster, at random while rows come in."""
-
-    def __init__(self, kills: int, victims: Any) -> None:
-        self.kills, self._left, self._victims, self._rng = 0, kills, victims, random.Random(11)
-        self._chance = 0.0
-
-    def start(self, total: int, done: int) -> None:
-        self._chance = 1.3 * self._left / max(1, total)
-
-    def done(self, row: FleetRow) -> None:
-        if self._left and self._rng.random() < self._chance:
-            pids = self._victims()
-            if pids:
-                try:
-                    os.kill(self._rng.choice(pids), signal.SIGKILL)
-                except ProcessLookupError:
-                    return
-                self._left -= 1
-                self.kills += 1
-
-
-def children(pid: int) -> list[int]:
-    found = []
-    for path in Path(f"/proc/{pid}/task").glob("*/children"):
-        try:
-            found += [int(one) for one in path.read_text().split()]
-        except OSError:
-            continue
-    return found
-
-
-def processes(of: int, word: bytes) -> list[int]:
-    found = []
-    for pid in children(of):
-        try:
-            if word in Path(f"/proc/{pid}/cmdline").read_bytes():
-                found.append(pid)
-        except OSError:
-            continue
-    return found
-
-
-def pool_processes(of: int) -> list[int]:
-    return processes(of, b"tdhil.process_pool")
-
-
-def cluster_processes(cluster: Any, workers_too: bool) -> list[int]:
-    """The process that each worker of Dask keeps; and the workers, but for those that are still beginning: one that is
-    killed then is given up by its nanny.
-    """
-    workers = [nanny.pid for nanny in cluster.workers.values() if nanny.status.name == "running" and nanny.pid]
-    return (workers if workers_too else []) + [pid for worker in workers for pid in pool_processes(worker)]
 
 
 def by_road(road: str, request: FleetRequest, kills: int, function: Any, workers_too: bool) -> tuple[FleetRow, ...]:

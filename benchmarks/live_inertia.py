@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import tdhil
 from benchmarks.real_time_priority import busy_loops
-from benchmarks.tolerance_coverage import LIMITS, TRUE_KG_M2, InverterDrive, bounds, over_seeds
+from benchmarks.tolerance_coverage import bounds, over_seeds
 from sim_bus.params import RigParams
 from tdhil.recording import LiveInertia
 from tdhil.runner import interim
@@ -33,6 +33,7 @@ from tdhil.runner.five_stages import Runner
 from tdhil.runner.settings import ExcitationRequest, StopRequest
 from tdhil.runner.task import Task
 from tests.runner.fake_drive import FakeDisplay
+from tests.runner.inverter_runs import LIMITS, TRUE_KG_M2, InverterDrive
 from tests.runner.line_drive import BuilderLog
 
 

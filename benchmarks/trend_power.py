@@ -15,23 +15,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 
-from tdhil.fleet.change_detection import Measured, difference, history
-
-KINDS = {"none": 0.0, "step 1 %": 0.01, "step 2 %": 0.02, "step 5 %": 0.05, "drift 2 %": 0.02, "drift 5 %": 0.05}
-
-
-def draw(rng: np.random.Generator, kind: str, results: int, scatter: float = 1.0) -> tuple[list[Measured], int]:
-    """One history, and where its step is."""
-    size, at = KINDS[kind], int(rng.integers(3, results - 2))
-    scale = 1.0 + 0.03 * rng.standard_normal()
-    found = []
-    for k in range(results):
-        share = (k >= at) if kind.startswith("step") else k / (results - 1)
-        sd = rng.uniform(0.003, 0.008)
-        value = 104.0 * scale * (1.0 + size * share) * float(np.exp(scatter * sd * rng.standard_normal()))
-        wide = np.exp(1.96 * sd)
-        found.append(Measured(value, value / wide, value * wide, 0.95, 0.03, "drive", 7.0 * k))
-    return found, at
+from tdhil.fleet.change_detection import difference, history
+from tests.fleet.drawn_histories import KINDS, draw
 
 
 def main() -> None:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from benchmarks.trend_power import draw
 from tdhil.fleet import change_detection
 from tdhil.fleet.change_detection import Measured, difference, history
+from tests.fleet.drawn_histories import draw
 
 
 def one(value, rel_sd=0.004, drive="a", scale=0.03, time=0.0):

@@ -36,6 +36,7 @@ from tdhil.fleet import (
 from tdhil.fleet import cluster as cluster_module
 from tdhil.process_pool import TaskLimits
 from tests.fleet import poison
+from tests.fleet.killer import Killer, cluster_processes
 from tests.fleet.simulated_logs import write_log
 
 pytestmark = pytest.mark.one_worker("fleet")
@@ -157,8 +158,6 @@ def test_a_cluster_s_processes_killed_at_random(tmp_path, calls):
     """Dask's own workers, and the process that each keeps: nothing is lost, nothing comes twice."""
     distributed = pytest.importorskip("distributed", reason="Dask is not installed (pip install '.[cluster]')")
     import dask
-
-    from benchmarks.fleet_thousand import Killer, cluster_processes
 
     roots = many(tmp_path / "logs", 60)
     with dask.config.set({"distributed.scheduler.allowed-failures": 10}), distributed.LocalCluster(

@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from benchmarks.trend_power import draw
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
 from tdhil.fleet.rows import FleetRow, FleetSettings, row_of
 from tdhil.fleet.table import write_table
 from tdhil.fleet.trend import scale_of, trend_document
+from tests.fleet.drawn_histories import draw
 
 
 def rows(kind, count=24, serial=7):

@@ -33,6 +33,12 @@ def test_import_contracts_hold():
     assert "0 broken" in done.stdout
 
 
+def test_no_test_imports_a_benchmark():
+    line = re.compile(r"^\s*(?:from|import)\s+benchmarks\b", re.MULTILINE)
+    found = [path for path in (ROOT / "tests").rglob("*.py") if line.search(path.read_text(encoding="utf-8"))]
+    assert found == []
+
+
 def test_help_lists_the_commands():
     done = run("-m", "tdhil", "--help")
     assert done.returncode == 0

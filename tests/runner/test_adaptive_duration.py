@@ -20,6 +20,7 @@ from tdhil.runner.planning import counted_in, pilot_dof
 from tdhil.runner.settings import ControlAssumptions
 from tdhil.runner.stages.acquire import run_acquire
 from tdhil.runner.stages.hold import MeanSpeedControl
+from tests.runner import inverter_runs
 
 PLAN = make_plan(MotionLimits(0.5, 10.0, 400.0, 0.9), RigGuess(100.0, 8.0, 60.0), PlanRequest(periods=3))
 RULE = Stopping(0.01, 0.95, 20.0, 6, 10, 600.0, True)
@@ -212,8 +213,6 @@ def test_the_periods_that_fit_leave_room_for_one_extension():
 
 @pytest.mark.heavy
 def test_a_run_on_the_simulated_inverter_covers_and_is_as_tight_as_asked():
-    from benchmarks.tolerance_coverage import run
-
-    found = run(3, 0.03)
+    found = inverter_runs.run(3, 0.03)
     assert found.covers
     assert found.half <= 0.03

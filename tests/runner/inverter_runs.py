@@ -1,0 +1,136 @@
+"""Whole runs on the simulated inverter without a bus, in stepped time, identified as `tdhil identify` does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drivers.clock import SteppedClock
+from drivers.drive import Command, Counters, DriveLimits, Identity, Mode, PowerState, Preflight, Sample
+from sim_bus.inverter import RPM, Inverter
+from sim_bus.params import RigParams
+from tdhil.runner.five_stages import Runner
+from tdhil.runner.settings import ExcitationRequest, MachineLimits, StopRequest
+from tdhil.runner.task import Task
+from tdhil.session.conclusion import conclude
+from tests.runner.fake_drive import FakeDisplay
+from tests.runner.line_drive import BuilderLog
+
+TRUE_KG_M2 = 104.0
+LIMITS = MachineLimits(0.5, 10.0, 400.0, 3600.0, probe_torque_nm=200.0)
+
+
+class InverterDrive:
+    """The simulated inverter as a drive, without a bus, one exchange a cycle.
+
+    The command acts, the plant moves on by a cycle, the reports are read.
+    """
+
+    def __init__(self, params: RigParams, seed: int, rate_hz: float = 100.0) -> None:
+        self.clock, self.period_s = SteppedClock(), 1.0 / rate_hz
+        self.inverter = Inverter(params, np.random.default_rng(seed))
+        self._steps = self.inverter.steps(self.period_s)
+        self._state = self._wish = PowerState.OFF
+        self._mode, self._cycles, self._stop_rad_s2 = Mode.SPEED, 0, 2.0
+
+    @property
+    def counters(self) -> Counters:
+        return Counters(self._cycles)
+
+    def connect(self) -> Identity:
+        return Identity(0, 0, 0, 0, "inverter", True)
+
+    def preflight(self, limits: DriveLimits) -> Preflight:
+        params, self._stop_rad_s2 = self.inverter.params, limits.quick_stop_rad_s2
+        return Preflight(
+            identity=self.connect(), checks=(), modes=frozenset(Mode), switch_while_enabled=True,
+            quick_stop_in_torque_mode=True, rated_torque_nm=params.drive.rated_torque_nm,
+            torque_resolution_nm=params.reporting.torque_quantum_permille * params.drive.rated_torque_nm / 1000.0,
+            speed_resolution_rad_s=params.reporting.speed_quantum_rpm * RPM, watchdog_s=limits.watchdog_s,
+            safe_action="quick_stop",
+        )
+
+    def reset_fault(self) -> None:
+        """It never is in fault."""
+
+    def enable(self, mode: Mode) -> None:
+        self._wish, self._mode = PowerState.ENABLED, mode
+
+    def quick_stop(self) -> None:
+        self._wish = PowerState.QUICK_STOP
+
+    def disable(self) -> None:
+        self._wish = PowerState.OFF
+
+    def close(self) -> tuple[str, ...]:
+        return ()
+
+    def exchange(self, command: Command) -> Sample:
+        self.clock.wait_until(self.clock.now_s() + self.period_s)
+        self._cycles += 1
+        self._state, self._mode = self._wish, command.mode
+        control = self.inverter.control
+        if self._state is PowerState.QUICK_STOP:
+            control.stop(self._stop_rad_s2)
+        elif self._state is PowerState.OFF:
+            control.off()
+        elif command.mode is Mode.TORQUE:
+            control.torque(command.torque_nm)
+        else:
+            control.speed(command.speed_rad_s)
+        count, step_s = self._steps
+        for _ in range(count):
+            self.inverter.step(step_s)
+        report = self.inverter.reporting
+        still = self._state is PowerState.QUICK_STOP and abs(self.inverter.speed_rad_s) < 0.02
+        return Sample(
+            self.clock.now_s(), 0.0, 0.0, True, report.speed_rad_s, report.torque_nm, None, self._mode, self._state,
+            still, control.limited, 0x27,
+        )
+
+
+@dataclass(frozen=True)
+class Result:
+    """One run. ``half``: relative half-width; NaN where there is no number."""
+
+    seed: int
+    value: float
+    low: float
+    high: float
+    acquire_s: float
+    extensions: int
+    note: str
+    looked: float = float("nan")     # what the last look said
+
+    @property
+    def half(self) -> float:
+        return 0.5 * (self.high - self.low) / self.value
+
+    @property
+    def covers(self) -> bool:
+        return self.low <= TRUE_KG_M2 <= self.high
+
+
+def run(seed: int, tolerance: float | None, fixed_s: float | None = None, params: RigParams | None = None) -> Result:
+    """One run, identified."""
+    log = BuilderLog()
+    request = ExcitationRequest(tolerance=tolerance if fixed_s is None else None, max_time_s=fixed_s)
+    task = Task(LIMITS, request, {"gear_ratio": 1.0, "torque_scale_rel_sd": 0.02})
+    drive = InverterDrive(params or RigParams(), seed)
+    outcome = Runner(drive, lambda _: task, log, StopRequest(), FakeDisplay(), lambda *_: None).run()
+    if outcome.cause is not None:
+        return Result(seed, *(float("nan"),) * 4, 0, repr(outcome.cause))
+    log.configure(identify={"confidence": 0.95, "tolerance": tolerance or 0.05})
+    document = conclude(log.recording(complete=True), log.run, "").document
+    stage = next(one for one in outcome.stages if one.name == "acquire")
+    decisions: list[dict[str, Any]] = log.run.get("stopping", {}).get("decisions", [])
+    looked = decisions[-1]["look"]["half_width_now"] if decisions and decisions[-1]["look"] else float("nan")
+    inertia, seconds = document["inertia_kg_m2"], stage.end_s - stage.start_s
+    if inertia is None:
+        return Result(seed, *(float("nan"),) * 3, seconds, 0, document["reason"])
+    extensions = sum(one["periods"] > 0 for one in decisions)
+    return Result(
+        seed, inertia["value"], inertia["low"], inertia["high"], seconds, extensions, document["verdict"], looked
+    )
