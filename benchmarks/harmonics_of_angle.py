@@ -4,8 +4,8 @@
 
 A row is one seed of the bench in `tests/estimation/angle_bench.py`: stages 2 to 5 of a run, whose drive reports the
 angle. Batches of 10 seeds share one rig; rigs differ in lags, noise and rounding, drawn from the batch's number. Orders
-1, 6 and 36 with 1, 3 and 10 % of rated torque take turns. `--clean`: 500 rows of rigs without harmonics. Each recording is
-identified with its angle, and without it, as before harmonics were known.
+1, 6 and 36 with 1, 3 and 10 % of rated torque take turns. `--clean`: 500 rows of rigs without harmonics. Each recording
+is identified with its angle, and without it, as before harmonics were known.
 
 The table shows, for each order and share: how often the order was found, false orders, amplitudes within 10 %, phases
 within 5°, how often both intervals cover, and the mean error and coverage of J without and with the angle.
