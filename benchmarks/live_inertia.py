@@ -8,13 +8,16 @@ period. It prints how often an interval misses, over all moments, by the number 
 misses: that is what stopping at a chosen moment may cost, and why only ``--tolerance`` may do it.
 
 ``late``: whole runs in real time on the embedded simulator, by turns with J and without. It prints the cycles that
-began late or had no feedback in time.
+began late or had no feedback in time, and the worker process's share of a core. The exit code is 1 if the share of runs
+with J is more than 5 % of a core above that of runs without.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import resource
+import statistics
 import sys
 import tempfile
 import time
@@ -35,6 +38,8 @@ from tdhil.runner.task import Task
 from tests.runner.fake_drive import FakeDisplay
 from tests.runner.inverter_runs import LIMITS, TRUE_KG_M2, InverterDrive
 from tests.runner.line_drive import BuilderLog
+
+MOST_SHARE = 0.05       # of a core, for J during the run
 
 
 class Viewer(FakeDisplay):
@@ -106,10 +111,16 @@ def coverage(asked: argparse.Namespace) -> int:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def one_round(shown: bool, rate_hz: float, periods: int, seed: int) -> tuple[int, int, int, int, float]:
-    """(cycles, begun late, without feedback in time, answers, wall time of the run)."""
+def of_children_s() -> float:
+    """Processor time of all ended processes of this one."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def one_round(shown: bool, rate_hz: float, periods: int, seed: int) -> tuple[int, int, int, int, float, float]:
+    """(cycles, begun late, without feedback in time, answers, wall time of the run, processor time of its worker)."""
     seen: list[LiveInertia] = []
-    began_s = time.monotonic()
+    began_s, before_s = time.monotonic(), of_children_s()
     with tempfile.TemporaryDirectory() as folder, tdhil.simulate(seed=seed, real_time=True) as drive:
         record = tdhil.run(
             drive, tdhil.Multisine(periods=periods), rate_hz=rate_hz, log=str(Path(folder) / "run.mcap"),
@@ -117,24 +128,31 @@ def one_round(shown: bool, rate_hz: float, periods: int, seed: int) -> tuple[int
         )
     counters = record.configuration["counters"]
     took_s = time.monotonic() - began_s
-    return counters["cycles"], counters["overruns"], counters["missed"] + counters["late"], len(seen), took_s
+    return counters["cycles"], counters["overruns"], counters["missed"] + counters["late"], len(seen), took_s, \
+        of_children_s() - before_s
 
 
 def late(asked: argparse.Namespace) -> int:
-    """Print the late cycles, with J and without."""
+    """Print the late cycles with J and without, and the worker's share of a core; 1 if J adds more than 5 % to it."""
     totals = {False: [0, 0], True: [0, 0]}
+    shares: dict[bool, list[float]] = {False: [], True: []}
     with busy_loops(asked.hogs):
         for number in range(2 * asked.rounds):
             shown = bool(number % 2)
-            cycles, begun_late, missed, answers, took_s = one_round(shown, asked.rate, asked.periods, 1 + number // 2)
+            cycles, begun_late, missed, answers, took_s, worker_s = one_round(
+                shown, asked.rate, asked.periods, 1 + number // 2)
             totals[shown][0] += cycles
             totals[shown][1] += begun_late + missed
+            shares[shown].append(worker_s / took_s)
             print(f"{'with J   ' if shown else 'without J'} {cycles} cycles in {took_s:.0f} s: {begun_late} begun late,"
-                  f" {missed} without feedback in time; {answers} answers", flush=True)
+                  f" {missed} without feedback in time; {answers} answers,"
+                  f" worker {100 * worker_s / took_s:.1f} % of a core", flush=True)
     for shown, (cycles, out) in totals.items():
         print(f"{'with J' if shown else 'without J'}: {out} of {cycles} cycles, {100 * out / max(1, cycles):.4f} %")
     print(f"{os.cpu_count()} cores, {asked.hogs} busy loops beside it, {asked.rate:g} Hz")
-    return 0
+    more = statistics.mean(shares[True]) - statistics.mean(shares[False])
+    print(f"J takes {100 * more:.2f} % of a core in the worker process (limit {100 * MOST_SHARE:g} %)")
+    return 0 if more <= MOST_SHARE else 1
 
 
 def main() -> int:
