@@ -33,6 +33,8 @@ from tdhil.config import OPTION
 from tdhil.errors import ExitCode, MessageCode, UsageError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from rich.console import Console
 
     from profiles import Profile
@@ -263,7 +265,7 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     if not 0.0 < low <= value <= high:
         raise TuningRefused("the interval of J reaches down to zero", where=str(namespace.result),
                             next_step="Identify again, for longer", entry=MessageCode.NO_INERTIA_TO_TUNE)
-    string, of_string, drawn = string_for(result, namespace, square**0.5)
+    string, of_string, drawn, inertias = string_for(result, namespace, square**0.5)
     if namespace.bit_noise is not None:
         string = _with_measured_noise(string, namespace)
     lags, of_lags, lags_from = _lags(result, namespace, measured)
@@ -274,7 +276,7 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
         present = SpeedController(square * namespace.present[0], square * namespace.present[1])
     case = TuneCase(string, drive, Interval(value, low, high), namespace.phase_margin, namespace.a,
                     namespace.compensate, present, (*of_string, *of_lags, *of_present),
-                    required=_required(result, namespace), string_draws=drawn,
+                    required=_required(result, namespace), string_draws=drawn, inertia_draws=inertias,
                     lag_tolerance=STATED_LAG_TOLERANCE if namespace.inner_lags else ASSUMED_LAG_TOLERANCE)
     return case, lags_from
 
@@ -312,8 +314,10 @@ def _with_measured_noise(string: DrillString, namespace: argparse.Namespace) -> 
 
 def string_for(
     result: Mapping[str, Any], namespace: argparse.Namespace, ratio: float
-) -> tuple[DrillString, tuple[Ends, ...], tuple[DrillString, ...]]:
-    """Return the string, both ends of the interval of each of its values, and random draws of all of them.
+) -> tuple[DrillString, tuple[Ends, ...], tuple[DrillString, ...], tuple[float, ...]]:
+    """Return the string, both ends of the interval of each of its values, random draws of all of them, and J of each.
+
+    J has no draws if the string comes from its file, or if the result does not state the covariance of J and string.
 
     The string comes from its file. Without a file it is identified: a pipe if k, f and J_L together show one, else a
     spring with a mass.
@@ -321,7 +325,7 @@ def string_for(
     from tdhil.soft_torque import Moved, identified_string, load_string, spring_and_mass
 
     if namespace.string is not None:
-        return load_string(namespace.string), (), ()
+        return load_string(namespace.string), (), (), ()
     shaft = result.get("compliant") or {}
     spring, swing = (bounded_estimate(shaft.get(key)) for key in ("stiffness_nm_rad", "antiresonance_hz"))
     if spring is None or swing is None:
@@ -333,6 +337,7 @@ def string_for(
     load = bounded_estimate(shaft.get("load_inertia_kg_m2")) if result.get("model") == "string" else None
     values = [spring, swing, loss, *([load] if load is not None else [])]
     name = f"k and J_L as identified ({result.get('model')})"
+    drawn, inertias = _drawn(result, values)
 
     def pipe(k: float, hertz: float, damping: float, inertia: float) -> DrillString | None:
         return identified_string(ratio**2 * k, hertz, ratio**2 * inertia, ratio**2 * damping, name)
@@ -342,33 +347,91 @@ def string_for(
         return found or spring_and_mass(ratio**2 * numbers[0], numbers[1], ratio**2 * numbers[2], name)
 
     middle = [one[1] for one in values]
-    if load is not None and not _known_pipe(values, pipe):
+    if load is not None and not _known_pipe(drawn, pipe):
         values, middle = values[:3], middle[:3]
 
     def moved(at: int, end: int) -> DrillString:
         return string([*middle[:at], values[at][end], *middle[at + 1 :]])
 
     ends = tuple((Moved(string=moved(at, 0)), Moved(string=moved(at, 2))) for at in range(len(values)))
-    return string(middle), ends, tuple(string(one) for one in _drawn(values))
+    return (string(middle), ends, tuple(string(one[: len(values)]) for one in drawn),
+            tuple(ratio**2 * one for one in inertias))
 
 
-def _drawn(values: Sequence[tuple[float, float, float]]) -> list[list[float]]:
-    """Return random draws of independent normal estimates: (low, value, high) of each is its 95 % interval."""
+def _drawn(
+    result: Mapping[str, Any], values: Sequence[tuple[float, float, float]]
+) -> tuple[list[list[float]], list[float]]:
+    """Return random draws of k, f, c and J_L (as many as ``values`` has), and J of each draw, all at the motor.
+
+    (low, value, high) of each is its 95 % interval. With the covariance of the fit all are drawn jointly; the torque
+    scale multiplies J, k, c and J_L alike. Without it each is an independent normal draw, and J has no draws.
+    """
     import numpy as np
 
-    random = np.random.default_rng(IDENTIFIED_SEED)
-    return [[max(1e-12, value + z / 1.96 * (high - value if z > 0.0 else value - low))
-             for (low, value, high), z in zip(values, random.standard_normal(len(values)), strict=True)]
-            for _ in range(IDENTIFIED_DRAWS)]
+    from tdhil.soft_torque import Interval, joint_draws
+
+    correlation = _correlation(result.get("compliant") or {}, len(values))
+    if correlation is None:
+        random = np.random.default_rng(IDENTIFIED_SEED)
+        return [[max(1e-12, value + z / 1.96 * (high - value if z > 0.0 else value - low))
+                 for (low, value, high), z in zip(values, random.standard_normal(len(values)), strict=True)]
+                for _ in range(IDENTIFIED_DRAWS)], []
+    inertia = result["inertia_kg_m2"]
+    own = (inertia["low"], inertia["value"], inertia["high"]) if "low" in inertia else None
+    total = (inertia["low_total"], inertia["value"], inertia["high_total"])
+    fit = np.array([own or total, *values], dtype=float)
+    half = 0.5 * (fit[:, 2] - fit[:, 0])
+    scale_rel = sqrt(max(0.0, (0.5 * (total[2] - total[0])) ** 2 - half[0] ** 2)) / float(total[1])
+    by_scale = scale_rel * fit[:, 1] * np.array([1.0, *(_SCALED[at] for at in range(len(values)))])
+    whole = np.maximum(np.hypot(half, by_scale), 1e-300)
+    parts = correlation * np.outer(half / whole, half / whole) + np.outer(by_scale / whole, by_scale / whole)
+    np.fill_diagonal(parts, 1.0)
+    spread = [Interval(value, value - float(np.hypot(value - low, more)), value + float(np.hypot(high - value, more)))
+              for (low, value, high), more in zip(fit.tolist(), by_scale.tolist(), strict=True)]
+    drawn = np.maximum(joint_draws(spread, parts, count=IDENTIFIED_DRAWS, seed=IDENTIFIED_SEED), 1e-12)
+    return drawn[:, 1:].tolist(), drawn[:, 0].tolist()
 
 
-def _known_pipe(
-    values: Sequence[tuple[float, float, float]], pipe: Callable[..., DrillString | None]
-) -> bool:
+_DRAWN = ("inertia_kg_m2", "stiffness_nm_rad", "antiresonance_hz", "damping_nm_s_rad", "load_inertia_kg_m2")
+"""Quantities of a draw in the covariance of a result: J, then those of the string in their order."""
+_SCALED = (1.0, 0.0, 1.0, 1.0)
+"""Whether the torque scale multiplies k, f, c and J_L."""
+
+
+def _correlation(shaft: Mapping[str, Any], count: int) -> NDArray[np.float64] | None:
+    """Return the correlation of J and of ``count`` quantities of the string; None if the result does not state it.
+
+    A quantity that the covariance does not have, or that has no variance, is independent.
+    """
+    import numpy as np
+
+    stated = shaft.get("covariance")
+    if not isinstance(stated, Mapping):
+        return None
+    try:
+        names = [str(one) for one in stated["quantities"]]
+        matrix = np.array(stated["matrix"], dtype=float)
+    except (KeyError, TypeError, ValueError):
+        return None
+    if matrix.shape != (len(names), len(names)) or not np.all(np.isfinite(matrix)):
+        return None
+    found = np.eye(count + 1)
+    at = [names.index(name) if name in names else -1 for name in _DRAWN[: count + 1]]
+    for row, one in enumerate(at):
+        for column, other in enumerate(at):
+            size = matrix[one, one] * matrix[other, other]
+            if row != column and min(one, other) >= 0 and size > 0.0:
+                found[row, column] = np.clip(0.5 * (matrix[one, other] + matrix[other, one]) / sqrt(size), -1.0, 1.0)
+    sizes, axes = np.linalg.eigh(found)      # rounding of the file must not make it indefinite
+    nearest: NDArray[np.float64] = axes * np.maximum(sizes, 1e-9) @ axes.T
+    return nearest
+
+
+def _known_pipe(drawn: Sequence[Sequence[float]], pipe: Callable[..., DrillString | None]) -> bool:
     """Return whether every draw of k, f and J_L is a pipe, and all have about the same ζ."""
     import numpy as np
 
-    found = [pipe(*one) for one in _drawn(values)]
+    found = [pipe(*one) for one in drawn]
     known = [one.impedance_nm_s_rad for one in found if one is not None]
     return len(known) == len(found) and 1.96 * float(np.std(known)) <= MOST_IMPEDANCE_SPREAD * float(np.mean(known))
 
@@ -455,6 +518,9 @@ def _tuned_for(
     if not namespace.inner_lags and namespace.impedance is None:
         warnings.append("the lags inside the loop are assumed; they decide how much of J can be compensated: state "
                         "them with --inner-lags")
+    if namespace.string is None and not tuning.case.inertia_draws:
+        warnings.append("the result does not state the covariance of J, k, f and J_L: they are drawn independently of "
+                        "each other; identify the log again with tdhil replay to get it")
     if namespace.string is None and not tuning.case.string.supposed:
         warnings.append(f"the pipe is the one that k, f and J_L as identified have in common, ζ = "
                         f"{tuning.case.string.impedance_nm_s_rad:.4g} N·m·s/rad; name the bit in a string.yaml for "

@@ -20,7 +20,8 @@ from tdhil.estimation.result import (
     FrequencyResponse as FrequencyResponse, FrictionPoint as FrictionPoint,
     Identification as Identification, InertiaEstimate as InertiaEstimate, LineFit as LineFit, Options as Options,
     PaperEstimate as PaperEstimate, Refused as Refused, ResidualTest as ResidualTest, SecondOpinion as SecondOpinion,
-    ResponseLine as ResponseLine, Verdict as Verdict, normal_quantile as normal_quantile,
+    ResponseLine as ResponseLine, ShaftCovariance as ShaftCovariance, Verdict as Verdict,
+    normal_quantile as normal_quantile,
     response_columns as response_columns, unit_of as unit_of,
 )
 from tdhil.estimation.rough_estimates import (

@@ -213,6 +213,18 @@ class AngleHarmonic:
 
 
 @dataclass(frozen=True)
+class ShaftCovariance:
+    """Covariance of the values of a compliant shaft, by the quadratic approximation of the likelihood.
+
+    ``quantities``: names of rows and columns, with their units. An entry has the unit of its row times that of its
+    column. The torque scale is taken as exact.
+    """
+
+    quantities: tuple[str, ...]
+    matrix: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
 class Compliant:
     """A shaft that is not rigid: the parameters behind the spring, kg·m², N·m/rad, N·m·s/rad, Hz.
 
@@ -227,6 +239,7 @@ class Compliant:
     damping_nm_s_rad: Estimate | None
     resonance_hz: Estimate | None
     antiresonance_hz: Estimate | None
+    covariance: ShaftCovariance | None = None
 
 
 @dataclass(frozen=True)

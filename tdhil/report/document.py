@@ -280,6 +280,7 @@ def _compliant(found: Identification) -> dict[str, Any] | None:
         "damping_nm_s_rad": _estimate(shaft.damping_nm_s_rad),
         "resonance_hz": _estimate(shaft.resonance_hz),
         "antiresonance_hz": _estimate(shaft.antiresonance_hz),
+        "covariance": None if shaft.covariance is None else asdict(shaft.covariance),
     }
 
 

@@ -73,7 +73,10 @@ class TuneCase:
     lag_tolerance: float = 0.1
     """Relative tolerance of each lag, if ``also`` contains no lags."""
     string_draws: tuple[DrillString, ...] = ()
-    """Strings drawn from the covariance of an identification; (): they are drawn from the string's own tolerances."""
+    """Strings drawn from the values of an identification; (): they are drawn from the string's own tolerances."""
+    inertia_draws: tuple[float, ...] = ()
+    """J of each of ``string_draws``, kg·m², if the result states the covariance of J and string; (): J is independent
+    of the string."""
     draws: int = DRAWS
     """Number of truths."""
     seed: int = 1
@@ -117,7 +120,8 @@ class TuneCase:
         return draw_truths(
             self.string, self.drive, self.inertia_kg_m2, count=self.draws, seed=self.seed,
             lag_tolerance=self.lag_tolerance, lag_axes=lags if same else (), present=self.present,
-            present_axes=gains_open, string_draws=self.string_draws)
+            present_axes=gains_open, string_draws=self.string_draws,
+            inertia_draws=self.inertia_draws)
 
 
 @dataclass(frozen=True)

@@ -96,13 +96,15 @@ def draw_truths(
     present: SpeedController | None = None,
     present_axes: Sequence[tuple[float, float]] = (),
     string_draws: Sequence[DrillString] = (),
+    inertia_draws: Sequence[float] = (),
 ) -> tuple[Truth, ...]:
     """Draw ``count`` truths.
 
     ``lag_axes``: half of the 95 % range of the lags along each main axis, s. ``lag_tolerance``: relative tolerance ± of
     each lag, used without ``lag_axes``. ``present_axes``: half-ranges of (P, I). ``string_draws``: strings that were
-    drawn before, from the covariance of an identification. Without them, each string is drawn from the tolerances of
-    ``string``.
+    drawn before, from the values of an identification. Without them, each string is drawn from the tolerances of
+    ``string``. ``inertia_draws``: J of each of these strings, kg·m², if both were drawn jointly (`joint_draws`).
+    Without them, J is independent of the string.
     """
     lags = drive.inner_lags_s
     free = len(lag_axes) if lag_axes else len(lags)
@@ -112,6 +114,8 @@ def draw_truths(
         normal = _normal(row)
         j = normal[0] / COVERAGE_K
         value = inertia.value + j * (inertia.high - inertia.value if j > 0.0 else inertia.value - inertia.low)
+        if inertia_draws:
+            value = inertia_draws[number % len(inertia_draws)]
         at = 1 + COLUMNS_OF_STRING
         if lag_axes:
             moved = np.array(lags, dtype=float)
@@ -131,6 +135,26 @@ def draw_truths(
                        inner_lags_s=tuple(float(max(0.0, lag)) for lag in moved))
         found.append(Truth(own, true, law, 1000 * seed + number))
     return tuple(found)
+
+
+def joint_draws(
+    intervals: Sequence[Interval], correlation: NDArray[np.float64], *, count: int, seed: int
+) -> NDArray[np.float64]:
+    """Return joint draws (count, K) of correlated estimates, each with the spread of its own 95 % interval.
+
+    ``correlation`` (K, K). A normal copula: correlated normal draws, each stretched to both half-widths of its
+    interval. The normal draws are a Latin hypercube, so the first estimate takes one value from every part of its
+    range.
+    """
+    size = len(intervals)
+    normal = np.array([_normal(row) for row in _latin_hypercube(count, size, seed)])
+    normal = normal - normal.mean(axis=0)                   # few draws: without their chance correlation
+    normal = normal @ np.linalg.inv(np.linalg.cholesky(normal.T @ normal / count)).T
+    root = np.linalg.cholesky(correlation + 1e-9 * np.eye(size))
+    drawn: NDArray[np.float64] = normal @ root.T / COVERAGE_K
+    low, value, high = (np.array([getattr(one, name) for one in intervals]) for name in ("low", "value", "high"))
+    found: NDArray[np.float64] = value + drawn * np.where(drawn > 0.0, high - value, value - low)
+    return found
 
 
 def string_at(string: DrillString, shares: NDArray[np.float64]) -> DrillString:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import argparse
 import io
 import json
 import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tdhil.cli.main import main
+from tdhil.cli.tune_soft_torque import add_arguments, case_of
 from tdhil.errors import ExitCode
 from tdhil.report import showcase_of, tuning_document, write_blocks
 from tdhil.report.tuning import TunedFor, tuning_report
@@ -317,6 +320,58 @@ def test_an_identified_pipe_keeps_its_impedance(tuned):
     compensated = next(one for one in document["controllers"] if one["kind"] == "compensated")
     assert not compensated["refused"] or "margin" in compensated["refused"]
     assert any("the pipe is the one" in warning for warning in document["warnings"])
+
+
+def drawn_of(**said):
+    """Return J of each draw, and the (k, J_L) of its string, both at the main shaft."""
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    case, _ = case_of(result(model="two-mass", **said), parser.parse_args(["result.json"]))
+    truths = case.truths()
+    found = [(one.drive.inertia_kg_m2, one.string.stiffness_nm_rad, one.string.bottom_inertia_kg_m2) for one in truths]
+    return case, np.log(np.array(found))
+
+
+def covariance_of(correlation, *, inertia=0.1, stiffness=0.05):
+    """J and k with this correlation, and the antiresonance almost exact."""
+    both = correlation * inertia * stiffness
+    return {"quantities": ["stiffness_nm_rad", "inertia_kg_m2", "antiresonance_hz"],
+            "matrix": [[stiffness**2, both, 0.0], [both, inertia**2, 0.0], [0.0, 0.0, 1e-8]]}
+
+
+@pytest.mark.parametrize("correlation", (0.95, -0.95))
+def test_j_and_string_are_drawn_jointly_from_the_covariance_of_the_result(correlation):
+    exact = {**estimate(15.0, 14.4, 15.6), "low": 14.4, "high": 15.6}     # the torque scale adds nothing
+    case, drawn = drawn_of(inertia_kg_m2=exact, compliant=compliant(covariance=covariance_of(correlation)))
+    assert len(case.inertia_draws) == len(case.string_draws)
+    assert np.corrcoef(drawn[:, :2].T)[0, 1] == pytest.approx(correlation, abs=0.03)
+    assert np.exp(drawn[:, 0]).std() == pytest.approx(60.0 / 1.96, rel=0.1)
+    assert abs(np.corrcoef(drawn[:, 0], drawn[:, 2] - drawn[:, 1])[0, 1]) < 0.1     # J and k/J_L: independent as stated
+
+
+def test_the_torque_scale_multiplies_j_and_k_alike():
+    """J is known to 0.1 % but for a scale of ±4 %: J and k then have this factor in common."""
+    scaled = {**estimate(15.0, 14.4, 15.6), "low": 14.985, "high": 15.015}
+    near = interval(3.14, 3.137, 3.143)
+    shaft = compliant(stiffness_nm_rad=near, covariance=covariance_of(-0.9))
+    _, drawn = drawn_of(inertia_kg_m2=scaled, compliant=shaft)
+    assert np.corrcoef(drawn[:, :2].T)[0, 1] > 0.99
+    assert (drawn[:, 1] - drawn[:, 0]).std() < 0.002
+
+
+def test_without_a_covariance_j_and_string_are_drawn_independently():
+    for stated in (None, {"quantities": ["stiffness_nm_rad"], "matrix": [[1.0, 2.0]]}, {"matrix": "none"}):
+        case, drawn = drawn_of(compliant=compliant(covariance=stated))
+        assert case.inertia_draws == ()
+        assert abs(np.corrcoef(drawn[:, :2].T)[0, 1]) < 0.5
+
+
+@pytest.mark.heavy
+def test_independent_draws_are_stated_in_the_warnings(tuned):
+    _, document, _ = tuned(string=None, model="two-mass", compliant=compliant())
+    assert any("does not state the covariance of J, k, f and J_L" in warning for warning in document["warnings"])
+    _, document, _ = tuned(string=None, model="two-mass", compliant=compliant(covariance=covariance_of(0.5)))
+    assert not any("covariance" in warning for warning in document["warnings"])
 
 
 @pytest.mark.heavy

@@ -16,6 +16,7 @@ from tdhil.estimation.frequency_domain.compliant_fit import (
     ViewedShaft,
     fit_compliant,
     inertias,
+    shaft_covariance,
 )
 from tdhil.estimation.frequency_domain.rigid import fit_rigid
 from tdhil.estimation.frequency_domain.shafts import (
@@ -262,3 +263,22 @@ def test_too_few_lines_are_counted_and_refused():
     assert "9 unknowns" in found.reason
     assert "at least 4 lines" in found.advice
     assert isinstance(choose("two-mass", *synthetic(TwoMass(), 0, 20.0), (), {}), Chosen)
+
+
+@pytest.mark.heavy
+def test_the_covariance_of_the_fit_is_the_scatter_over_seeds():
+    """Of 24 seeds: standard deviations within a factor of 1.6, and the sign of each clear correlation."""
+    fits = [fit_compliant(TwoMassShaft(), *synthetic(TwoMass(), seed, 20.0), (), {}) for seed in range(24)]
+    stated = [shaft_covariance(fit) for fit in fits]
+    names = stated[0].quantities
+    assert names == ("inertia_kg_m2", "stiffness_nm_rad", "antiresonance_hz", "load_inertia_kg_m2", "damping_nm_s_rad")
+    found = np.array([[m[0], m[3] ** 2 * m[2], m[3] / (2.0 * np.pi), m[2], m[4]]
+                      for m in (fit.fitted.simple.theta for fit in fits)])
+    mean = np.mean([one.matrix for one in stated], axis=0)
+    assert np.allclose(mean, mean.T)
+    ratios = found.std(axis=0, ddof=1) / np.sqrt(np.diag(mean))
+    assert np.all((ratios > 1.0 / 1.6) & (ratios < 1.6))
+    promised, seen = (one / np.sqrt(np.outer(np.diag(one), np.diag(one))) for one in (mean, np.cov(found.T)))
+    clear = np.abs(promised) > 0.5
+    assert clear.sum() > len(names)          # besides the diagonal
+    assert np.all(promised[clear] * seen[clear] > 0.0)

@@ -29,6 +29,7 @@ def test_every_part_is_in_it():
     assert shaft["motor_inertia_kg_m2"]["value"] == 104.0
     assert shaft["total_inertia_kg_m2"]["value"] == 130.0
     assert shaft["damping_nm_s_rad"] is None
+    assert shaft["covariance"] is None       # of a result without it
     assert [line["hertz"] for line in document["lines"]] == [0.1, 0.2, 0.3, 0.4]
 
 

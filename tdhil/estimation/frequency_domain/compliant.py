@@ -28,6 +28,7 @@ from tdhil.estimation.frequency_domain.compliant_fit import (
     fit_compliant,
     inertias,
     intervals,
+    shaft_covariance,
 )
 from tdhil.estimation.frequency_domain.filter_order import excess_rise
 from tdhil.estimation.frequency_domain.frequency_response import ModelCurve
@@ -442,6 +443,7 @@ def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_re
             damping_nm_s_rad=None if chosen.fit.is_string else _unless_open(fixed.damping),
             resonance_hz=_unless_open(fixed.resonance),
             antiresonance_hz=_unless_open(fixed.antiresonance),
+            covariance=shaft_covariance(chosen.fit),
         ),
         viscous=fixed.viscous,
         coulomb=_coulomb(levels, chosen.fit, fixed, confidence),

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tdhil.estimation.frequency_domain import signal_filters
-from tdhil.estimation.frequency_domain.filter_order import FittedModel, fit_model
-from tdhil.estimation.frequency_domain.inference import estimate, residual_of
+from tdhil.estimation.frequency_domain.filter_order import FittedModel, excess_rise, fit_model
+from tdhil.estimation.frequency_domain.inference import covariance, estimate, residual_of
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.optimiser import Apart, Fit, Fixed, box, minimise, rough_inertia_of
@@ -23,9 +23,10 @@ from tdhil.estimation.frequency_domain.shafts import (
     RigidShaft,
     Shaft,
     string_resonances,
+    string_stiffness,
 )
 from tdhil.estimation.friction_levels import ViscousConstraint
-from tdhil.estimation.result import REJECT_P, Estimate, ResidualTest
+from tdhil.estimation.result import REJECT_P, Estimate, ResidualTest, ShaftCovariance
 from tdhil.estimation.spectrum import ComplexArray, SpectralLine
 from tdhil.recording import FloatArray
 
@@ -437,6 +438,37 @@ def intervals(fit: CompliantFit, confidence: float) -> CompliantIntervals:
         antiresonance=_scaled(swing, held_hz),
         resonance=_scaled(free, free_hz),
     )
+
+
+def shaft_covariance(fit: CompliantFit) -> ShaftCovariance:
+    """Return the covariance of J_r, k, the antiresonance, J_L, and of c for two lumps.
+
+    It is that of the fit with first-order lags, by the slopes of the quantities over the parameters. A value that is
+    fixed has no variance.
+    """
+    fitted = fit.fitted
+    theta = fitted.simple.theta
+    m = theta[: fitted.problem.model.mechanical]
+    free = [index for index in range(fitted.problem.model.size) if index not in fitted.simple_held]
+    two_lumps = len(m) <= STRING_SHARE
+    k = float(m[SWING] ** 2 * m[LOAD]) if two_lumps else string_stiffness(m)
+    slopes: dict[str, dict[int, float]] = {
+        "inertia_kg_m2": {INERTIA: 1.0},
+        "stiffness_nm_rad": {SWING: 2.0 * k / float(m[SWING]), LOAD: k / float(m[LOAD])},
+        "antiresonance_hz": {SWING: _hertz(fit)[0]},
+        "load_inertia_kg_m2": {LOAD: 1.0},
+    }
+    if two_lumps:
+        slopes["damping_nm_s_rad"] = {DAMPING: 1.0}
+    else:
+        slopes["stiffness_nm_rad"][STRING_SHARE] = -2.0 / 3.0 * k / _light(m)
+    rows = np.zeros((len(slopes), len(theta)))
+    for at, row in enumerate(slopes.values()):
+        for index, slope in row.items():
+            rows[at, index] = slope
+    rows = rows[:, free]
+    found = excess_rise(fitted.problem, len(fitted.free)) * rows @ covariance(fitted.problem, theta, free) @ rows.T
+    return ShaftCovariance(tuple(slopes), tuple(tuple(float(one) for one in row) for row in found))
 
 
 def _hertz(fit: CompliantFit) -> tuple[float, float]:

@@ -32,7 +32,7 @@ import numpy as np
 
 from tdhil.estimation.case import PeriodicCase, ResponseCurve
 from tdhil.estimation.frequency_domain.filter_order import FittedModel, excess_rise
-from tdhil.estimation.frequency_domain.inference import student_quantile
+from tdhil.estimation.frequency_domain.inference import covariance, student_quantile
 from tdhil.estimation.result import (
     CurvePoint,
     DistortionTest,
@@ -80,10 +80,7 @@ class ModelCurve:
         problem, theta = self.fitted.problem, self.fitted.likelier.theta
         held = self.fitted.simple_held if self.fitted.first_order else self.fitted.fixed
         free = [index for index in range(problem.model.size) if index not in held]
-        whole, _ = problem.information(theta)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(whole)[free], 1e-300))
-        inverse = np.linalg.pinv(whole[np.ix_(free, free)] * np.outer(scale, scale), rcond=1e-13, hermitian=True)
-        return free, inverse * np.outer(scale, scale)
+        return free, covariance(problem, theta, free)
 
     @property
     def _excess(self) -> float:

@@ -114,6 +114,15 @@ def fisher_tail(ratio: float, dof_above: float, dof_below: float) -> float:
     return float(fdtrc(dof_above, dof_below, ratio)) if not ratio <= 0.0 else 1.0
 
 
+def covariance(problem: Likelihood, theta: FloatArray, free: list[int]) -> FloatArray:
+    """Return the covariance (F, F) of the ``free`` parameters, by the quadratic approximation."""
+    whole, _ = problem.information(theta)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(whole)[free], 1e-300))
+    inverse = np.linalg.pinv(whole[np.ix_(free, free)] * np.outer(scale, scale), rcond=1e-13, hermitian=True)
+    found: FloatArray = inverse * np.outer(scale, scale)
+    return found
+
+
 def standard_deviation(problem: Likelihood, theta: FloatArray, index: int, free: list[int]) -> tuple[float, float]:
     """Return the sd of theta[index], quadratic, and its degrees of freedom (Satterthwaite).
 
