@@ -103,6 +103,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--depths", type=depths, metavar="FROM:TO:STEP",
                         help="gains over the depth of the well, m: the topmost section of string.yaml gets longer, "
                         "for example 500:6000:250")
+    parser.add_argument("--map", action="store_true",
+                        help="add the operator's map of set speed and bit torque, as --report does (needs the bit in "
+                        "string.yaml)")
     parser.add_argument("--no-simulation", action="store_true",
                         help="omit the critical speeds (tdhil evaluate needs them)")
     add_option(parser, OPTION["json"])
@@ -138,7 +141,7 @@ def run(namespace: argparse.Namespace) -> int:
         document = tuning_document(tuning, tuned_for)
         if namespace.depths is not None:
             document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, profile, progress)
-        if report is not None:
+        if report is not None or namespace.map:
             progress("the operator's map: set speed and bit torque")
             found = operator_map(tuning)
             document["map"] = None if found is None else map_document(found)
@@ -189,6 +192,11 @@ def _check(namespace: argparse.Namespace) -> None:
     if namespace.bit_noise is not None and namespace.string is None:
         raise UsageError("--bit-noise needs the string with its bit", where="--bit-noise",
                          next_step="--string string.yaml", entry=MessageCode.STRING_MISSING)
+    if namespace.map and (namespace.string is None or namespace.no_simulation):
+        raise UsageError("--map simulates the bit of string.yaml", where="--map",
+                         next_step="Leave --no-simulation out" if namespace.string is not None else
+                         "--string string.yaml", entry=MessageCode.VALUE_NOT_ALLOWED if namespace.string is not None
+                         else MessageCode.STRING_MISSING)
     check_inner_lags(namespace)
 
 
@@ -198,7 +206,10 @@ def _check_files(namespace: argparse.Namespace) -> None:
 
     require_result(namespace.result)
     if namespace.string is not None:
-        load_string(namespace.string)
+        string = load_string(namespace.string)
+        if namespace.map and string.bit is None:
+            raise UsageError("no bit is stated in string.yaml, so there is no bit torque to map", where="--map",
+                             next_step="State bottom.coulomb_nm in string.yaml", entry=MessageCode.STRING_MISSING)
     if namespace.impedance is not None:
         require_result(namespace.impedance)
     if namespace.bit_noise is not None:

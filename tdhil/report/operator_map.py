@@ -6,7 +6,11 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from rich import box
+from rich.table import Table as Grid
+
 from tdhil.report.blocks import Column, Picture, ReportSection, Table, Text
+from tdhil.report.console import PlainConsole
 from tdhil.soft_torque import OperatorMap
 
 if TYPE_CHECKING:
@@ -35,13 +39,7 @@ def map_section(document: Part, bit: str) -> ReportSection:
     kinds = list(document["states"])
     width = 0.8 / len(kinds)
     weights = document.get("weights_on_bit_kn")
-    said = [f"{torque / 1e3:.2g} kN·m" + ("" if weights is None else f", {weights[k]:.3g} kN")
-            for k, torque in enumerate(document["bit_torques_nm"])]
-    title = "bit torque" if weights is None else "bit torque, weight on bit"
-    rows = tuple(
-        (said[k], *(_row_words(document["states"][kind][k], document["speeds_rpm"])
-                                      for kind in kinds))
-        for k in range(len(said)))
+    title, rows = _rows(document)
     return ReportSection("The operator's map", (
         Picture("map", partial(draw_map, document=document), 2.9, HOW_TO_READ),
         Table((Column(title, 0.2), *(Column(kind, width) for kind in kinds)), rows),
@@ -50,6 +48,29 @@ def map_section(document: Part, bit: str) -> ReportSection:
              "of a bit that turns fast." + ("" if weights is None else " Weight on bit: the bit torque over "
              "torque_per_weight_nm_kn of string.yaml.")),
     ))
+
+
+def print_map(document: Part, console: PlainConsole) -> None:
+    """Print the map: for each bit torque, the set speeds in words."""
+    title, rows = _rows(document)
+    grid = Grid(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    for name in (title, *document["states"]):
+        grid.add_column(name)
+    for row in rows:
+        grid.add_row(*row)
+    console.print(grid)
+    console.print()
+
+
+def _rows(document: Part) -> tuple[str, tuple[tuple[str, ...], ...]]:
+    """Return the title of the first column, and a row for each bit torque: the torque, then each controller."""
+    weights = document.get("weights_on_bit_kn")
+    said = [f"{torque / 1e3:.2g} kN·m" + ("" if weights is None else f", {weights[k]:.3g} kN")
+            for k, torque in enumerate(document["bit_torques_nm"])]
+    states = document["states"].values()
+    rows = tuple((text, *(_row_words(rows[k], document["speeds_rpm"]) for rows in states))
+                 for k, text in enumerate(said))
+    return "bit torque" if weights is None else "bit torque, weight on bit", rows
 
 
 def _row_words(states: Sequence[str], speeds_rpm: Sequence[float]) -> str:

@@ -16,7 +16,7 @@ from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, Repor
 from tdhil.report.card import with_interval
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED
-from tdhil.report.operator_map import map_section
+from tdhil.report.operator_map import map_section, print_map
 from tdhil.report.schedule import finite, gain_words, noisy_speed, print_schedule, schedule_section, spread_document
 from tdhil.soft_torque import (
     BAND_HZ,
@@ -316,6 +316,8 @@ def print_tuning(document: Part, console: PlainConsole) -> None:
     console.print(grid)
     if document.get("schedule"):
         print_schedule(document["schedule"], console)
+    if document.get("map"):
+        print_map(document["map"], console)
     console.print(names_and_texts(_legend(document), quiet=True))
     for one in document["controllers"]:
         if one["refused"]:

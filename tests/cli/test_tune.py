@@ -15,7 +15,8 @@ import pytest
 from tdhil.cli.main import main
 from tdhil.cli.tune_soft_torque import add_arguments, case_of
 from tdhil.errors import ExitCode
-from tdhil.report import showcase_of, tuning_document, write_blocks
+from tdhil.report import PlainConsole, showcase_of, tuning_document, write_blocks
+from tdhil.report.operator_map import print_map
 from tdhil.report.tuning import TunedFor, tuning_report
 from tdhil.soft_torque import DrawnValues, Interval, Search, TuneCase, tune
 from tests.soft_torque.cases import DRIVE, STRING
@@ -372,6 +373,29 @@ def test_independent_draws_are_stated_in_the_warnings(tuned):
     assert any("does not state the covariance of J, k, f and J_L" in warning for warning in document["warnings"])
     _, document, _ = tuned(string=None, model="two-mass", compliant=compliant(covariance=covariance_of(0.5)))
     assert not any("covariance" in warning for warning in document["warnings"])
+
+
+@pytest.mark.heavy
+def test_the_operators_map_is_in_the_document_without_a_report(tmp_path, capsys):
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(result()), encoding="utf-8")
+    words = ["tune", "soft-torque", str(path), "--string", str(STRING_YAML), "--a", "0.35", "--compensate", "0.3"]
+    assert main([*words, "--map", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    found = document["map"]
+    assert {"stiff", "soft"} & found["states"].keys()
+    for rows in found["states"].values():
+        assert [len(row) for row in rows] == [len(found["speeds_rpm"])] * len(found["bit_torques_nm"])
+        assert {state for row in rows for state in row} <= {"stable", "at risk", "stick-slip"}
+    print_map(found, PlainConsole())
+    assert f"{found['bit_torques_nm'][0] / 1e3:.2g} kN·m" in capsys.readouterr().out
+
+
+def test_a_map_without_its_bit_is_refused(tuned, tmp_path):
+    code, document, _ = tuned("--map")
+    assert code == ExitCode.USAGE and "Leave --no-simulation out" in document["error"]["message"]
+    code, document, _ = tuned("--map", string=None, model="two-mass", compliant=compliant())
+    assert code == ExitCode.USAGE and "--string string.yaml" in document["error"]["message"]
 
 
 @pytest.mark.heavy

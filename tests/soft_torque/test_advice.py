@@ -11,10 +11,13 @@ import pytest
 from tdhil.soft_torque import (
     EXACT_STRING,
     Advice,
+    BottomEnd,
     DrawnValues,
     Interval,
+    PipeSection,
     RequiredMargins,
     Search,
+    StringFile,
     TopDrive,
     TuneCase,
     Tuned,
@@ -24,10 +27,11 @@ from tdhil.soft_torque import (
     loop_margins,
     lowest_turning_with_noise,
     operator_map,
+    string_of,
     tune,
     tuned_controller,
 )
-from tests.soft_torque.cases import DRIVE, SOFT_035, SOFT_1, STIFF, STRING, string_with
+from tests.soft_torque.cases import BIT, DRIVE, SOFT_035, SOFT_1, STIFF, STRING, string_with
 from tests.soft_torque.chain_in_time import ends_turning, reference_case
 
 pytestmark = pytest.mark.one_worker      # its fixture is expensive
@@ -129,6 +133,25 @@ def test_an_interval_of_draws_says_where_its_end_is_not_known():
     assert DrawnValues((inf, inf)).median is None
     low, high = DrawnValues((8.0, 8.0, 8.1), 10.0).interval()      # no lower set speed was tried
     assert (low, high) == (0.0, 10.0)
+
+
+@pytest.mark.heavy
+def test_the_map_contains_the_friction_of_a_deviated_well():
+    """Side force along the string makes no cell safer, and under stiff gains some stuck bit no longer comes free."""
+    order = ("stick-slip", "at risk", "stable")
+
+    def states(side_force_n_m):
+        section = PipeSection(length_m=3000.0, outer_diameter_m=0.127, inner_diameter_m=0.1086,
+                              side_force_n_m=side_force_n_m)
+        string = string_of(StringFile(sections=(section,), bottom=BottomEnd(**{"inertia_kg_m2": 374.0, **BIT})))
+        case = TuneCase(string, DRIVE, Interval(1500.0, 1440.0, 1560.0))
+        tuned = (Tuned("stiff", STIFF),)
+        found = operator_map(Tuning(case, (0.1299,), tuned, Search(), Advice("soft", "stiff", keep=False), ()))
+        return np.array([[order.index(state) for state in row] for row in found.states["stiff"]])
+
+    free, deviated = states(0.0), states(150.0)
+    assert np.all(deviated <= free)
+    assert np.sum(deviated < free) >= 2
 
 
 @pytest.mark.heavy
