@@ -18,7 +18,8 @@ from tdhil.errors import ExitCode
 from tdhil.report import PlainConsole, showcase_of, tuning_document, write_blocks
 from tdhil.report.operator_map import print_map
 from tdhil.report.tuning import TunedFor, tuning_report
-from tdhil.soft_torque import DrawnValues, Interval, Search, TuneCase, tune
+from tdhil.soft_torque import DrawnValues, Interval, Search, TuneCase, lowest_turning, tune
+from tdhil.soft_torque.simulation import LONGEST_TICK_S
 from tests.soft_torque.cases import DRIVE, STRING
 
 STRING_YAML = Path(__file__).parents[2] / "examples" / "string.yaml"
@@ -164,6 +165,23 @@ def test_files_that_are_none_are_named(tmp_path, capsys):
     bad.write_text("sections:\n  - {length_m: -1, outer_diameter_m: 0.1, inner_diameter_m: 0}\n", encoding="utf-8")
     assert main(["tune", str(good), "--string", str(bad)]) == ExitCode.USAGE
     assert "string.yaml:2" in capsys.readouterr().err
+
+
+@pytest.mark.heavy
+def test_the_interval_of_the_stiff_cure_speed_contains_a_fine_simulation():
+    """J is exact, so the interval is only the error of the simulation. A third of the tick, and twice the length."""
+    tuning = tune(TuneCase(STRING, DRIVE, Interval(1500.0, 1500.0, 1500.0)), None)
+    stiff = tuning.by_kind("stiff")
+    found = lowest_turning(STRING, [(DRIVE, stiff.controller)], "stuck", Search())
+    tuning = replace(tuning, searched=Search(), tuned=(replace(stiff, quiet_cures=tuple(found * 5)),))
+    document = tuning_document(tuning, TunedFor("result.json", True, None, 1.0, "drive", "as stated"))
+    cure = document["controllers"][0]["critical_rpm"]["cure"]
+    fine = Search(lowest_rpm=170.0, highest_rpm=195.0, coarse_rpm=5.0, resolution_rpm=0.25, duration_s=200.0,
+                  calm_s=40.0, longest_tick_s=LONGEST_TICK_S / 3.0)
+    (truth,) = lowest_turning(STRING, [(DRIVE, stiff.controller)], "stuck", fine)
+    assert cure["value"] == found[0]
+    assert cure["low"] <= truth <= cure["high"]
+    assert 2.0 <= 0.5 * (cure["high"] - cure["low"]) <= 5.0      # not ±0, and of use
 
 
 @pytest.mark.heavy

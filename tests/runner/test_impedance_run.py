@@ -68,6 +68,23 @@ def test_what_the_shaft_does_is_what_was_planned(measured):
     assert np.max(np.abs(measured.recording.torque_nm)) < RIG_LIMITS.torque_nm
 
 
+@pytest.mark.heavy
+def test_a_loop_with_a_small_integral_gain_is_stopped_with_its_cause():
+    """P 300 and I 2 approach a setpoint with minutes of time constant: about (P + B)/I."""
+    weak = RigParams(drive=DriveParams(control_period_s=0.01, speed_gain_nm_s_rad=300.0,
+                                       speed_integral_gain_nm_rad=2.0))
+    slow = run_line(LineDrive(Line(0.02, share=0.2, jitter=0.0), params=weak, modes=frozenset({Mode.SPEED}), seed=3),
+                    OFFSET)
+    said = str(slow.outcome.cause)
+    assert "did not settle" in said
+    assert "The integral gain of the drive's speed loop is small for its proportional gain" in said
+    assert "Raise the integral gain about" in said
+    seconds = float(said.split("time constant of ")[1].split(" s", maxsplit=1)[0])
+    assert seconds == pytest.approx(308.0 / 2.0, rel=0.25)
+    assert slow.outcome.stop.confirmed
+    assert identify(slow.recording).verdict is not Verdict.VALID
+
+
 class Ending(LineDrive):
     """Does something once the offset is at work."""
 
