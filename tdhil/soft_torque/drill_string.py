@@ -69,8 +69,8 @@ BIT_TORQUE_TOLERANCE, STRIBECK_FACTOR, NOISE_FACTOR = 0.15, 1.25, 1.5
 like the bit itself: a search of the literature found no measured scatter."""
 BIT_NOISE_SHARE = 0.08
 """Root mean square of the bit's random torque, divided by its Coulomb torque. It is an assumption: 200 N·m for a bit of
-2,500 N·m. A search of the literature found no measured figure (docs/reference/string.md). A log of steady drilling gives
-the value of a real bit."""
+2,500 N·m. A search of the literature found no measured figure (docs/reference/string.md). A log of steady drilling
+gives the value of a real bit."""
 NOISE_CORRELATION_S = 0.2
 """Correlation time of the bit's random torque, s. It is an assumption. If the noise reaches frequencies above the
 string's lowest modes, the value has little influence."""
