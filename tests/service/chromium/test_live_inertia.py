@@ -1,0 +1,72 @@
+"""J from the periods so far, on the page of a run in Chromium: figures, graph, and agreement with the result."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tdhil.recording import LiveInertia, RunWriter
+from tests.recording.test_log_tail import COMMAND, sample
+from tests.service.chromium.pages import IN_CHROMIUM, begin
+
+pytestmark = IN_CHROMIUM
+SHOWN = "104.2 (103.1 to 105.3) kg·m²"
+FIRST = LiveInertia(0.8, 3, 0.95, "valid", "because", 103.0, 96.0, 110.0, 94.0, 112.0, 0.62, 0.01, 90.0)
+LAST = LiveInertia(1.6, 4, 0.95, "valid", "because", 104.2, 103.1, 105.3, 100.0, 108.4, 0.41, 0.01, 35.0)
+
+
+def played(served: Any, *found: LiveInertia) -> str:
+    """Begin a run, whose log has these intermediate results."""
+    run = begin(served)
+    folder = served.service.store.place(run)
+    with RunWriter(folder / "other.mcap", epoch_ns=10**18, block=True) as writer:
+        writer.configuration({"seed": 7}, {})
+        for number in range(200):
+            writer.command(0.01 * number, COMMAND)
+            writer.sample(sample(number))
+        for one in found:
+            writer.inertia(one)
+    (folder / "other.mcap").replace(folder / "run.mcap")
+    return run
+
+
+@pytest.mark.heavy
+def test_j_so_far_is_shown_with_interval_p_and_least_time(page, served):
+    run = played(served, FIRST, LAST)
+    page.goto(f"/runs/{run}/live")
+    page.locator("#inertia-now", has_text=SHOWN).wait_for()
+    said = page.locator("#inertia-said").inner_text()
+    assert said.startswith("4 periods, ")
+    for one in ("p = 0.41", "at least 35 s to ±1 %"):
+        assert one in said
+    plot = page.locator("#plot-inertia canvas")
+    plot.wait_for()
+    drawn = plot.evaluate("""canvas => {
+        const all = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+        let count = 0;
+        for (let k = 3; k < all.length; k += 4) if (all[k]) count += 1;
+        return count;
+    }""")
+    assert drawn > 1000                  # axes, bands and marks
+
+
+@pytest.mark.heavy
+def test_the_last_value_is_the_one_of_the_result(page, served):
+    """The same numbers are shown with the same digits: live with the repeatability, and in the result's own key."""
+    run = played(served, FIRST, LAST)
+    page.goto(f"/runs/{run}/live")
+    now = page.locator("#inertia-now", has_text=SHOWN)
+    now.wait_for()
+    document = {"value": LAST.inertia_kg_m2, "low": LAST.low_kg_m2, "high": LAST.high_kg_m2,
+                "low_total": LAST.low_kg_m2, "high_total": LAST.high_kg_m2}      # the torque scale is exact
+    assert page.evaluate("J => window.tdhil.ofResult({ inertia_kg_m2: J })", document) == now.inner_text()
+
+
+@pytest.mark.heavy
+def test_an_interval_without_a_number_says_why(page, served):
+    run = played(served, LiveInertia(0.5, 2, 0.95, "not_identifiable", "2 periods leave the scatter open"))
+    page.goto(f"/runs/{run}/live")
+    page.locator("#inertia-said", has_text="2 periods leave the scatter open").wait_for()
+    assert page.locator("#inertia-now").inner_text() == "–"
+    assert not page.locator("#inertia").is_visible()
