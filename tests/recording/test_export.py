@@ -177,10 +177,12 @@ def test_the_layout_names_what_a_log_holds():
     panels = layout["configById"]
     known = {topic: CLASSES[message].DESCRIPTOR.fields_by_name for topic, message in CHANNELS.values()}
     paths = [one["value"] for panel in panels.values() for one in panel.get("paths", ())]
+    paths += [panel["xAxisPath"]["value"] for panel in panels.values() if "xAxisPath" in panel]
     paths += [panel[name] for panel in panels.values() for name in ("topicToRender", "topicPath") if name in panel]
     assert len(paths) > 8
+    assert {"/frf", "/live_inertia"} <= {path.partition(".")[0] for path in paths}
     for path in paths:
-        topic, _, field = path.partition(".")
+        topic, _, field = path.removesuffix("[:]").partition(".")
         assert not field or field in known[topic], path
 
     def leaves(node):
