@@ -382,24 +382,25 @@ def _drawn(
     from tdhil.soft_torque import Interval, joint_draws
 
     correlation = _correlation(result.get("compliant") or {}, len(values))
-    if correlation is None:
+    inertia = result.get("inertia_kg_m2")
+    parts = inertia if isinstance(inertia, Mapping) else {}
+    total = bounded_estimate({"low": parts.get("low_total"), "value": parts.get("value"),
+                              "high": parts.get("high_total")})
+    if correlation is None or total is None:
         random = np.random.default_rng(IDENTIFIED_SEED)
         return [[max(1e-12, value + z / 1.96 * (high - value if z > 0.0 else value - low))
                  for (low, value, high), z in zip(values, random.standard_normal(len(values)), strict=True)]
                 for _ in range(IDENTIFIED_DRAWS)], []
-    inertia = result["inertia_kg_m2"]
-    own = (inertia["low"], inertia["value"], inertia["high"]) if "low" in inertia else None
-    total = (inertia["low_total"], inertia["value"], inertia["high_total"])
-    fit = np.array([own or total, *values], dtype=float)
+    fit = np.array([bounded_estimate(inertia) or total, *values], dtype=float)
     half = 0.5 * (fit[:, 2] - fit[:, 0])
-    scale_rel = sqrt(max(0.0, (0.5 * (total[2] - total[0])) ** 2 - half[0] ** 2)) / float(total[1])
+    scale_rel = sqrt(max(0.0, (0.5 * (total[2] - total[0])) ** 2 - half[0] ** 2)) / total[1]
     by_scale = scale_rel * fit[:, 1] * np.array([1.0, *(_SCALED[at] for at in range(len(values)))])
     whole = np.maximum(np.hypot(half, by_scale), 1e-300)
-    parts = correlation * np.outer(half / whole, half / whole) + np.outer(by_scale / whole, by_scale / whole)
-    np.fill_diagonal(parts, 1.0)
+    both = correlation * np.outer(half / whole, half / whole) + np.outer(by_scale / whole, by_scale / whole)
+    np.fill_diagonal(both, 1.0)
     spread = [Interval(value, value - float(np.hypot(value - low, more)), value + float(np.hypot(high - value, more)))
               for (low, value, high), more in zip(fit.tolist(), by_scale.tolist(), strict=True)]
-    drawn = np.maximum(joint_draws(spread, parts, count=IDENTIFIED_DRAWS, seed=IDENTIFIED_SEED), 1e-12)
+    drawn = np.maximum(joint_draws(spread, both, count=IDENTIFIED_DRAWS, seed=IDENTIFIED_SEED), 1e-12)
     return drawn[:, 1:].tolist(), drawn[:, 0].tolist()
 
 

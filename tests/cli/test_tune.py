@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tdhil.cli.main import main
-from tdhil.cli.tune_soft_torque import add_arguments, case_of
+from tdhil.cli.tune_soft_torque import add_arguments, case_of, string_for
 from tdhil.errors import ExitCode
 from tdhil.report import PlainConsole, showcase_of, tuning_document, write_blocks
 from tdhil.report.operator_map import print_map
@@ -383,6 +383,17 @@ def test_without_a_covariance_j_and_string_are_drawn_independently():
         case, drawn = drawn_of(compliant=compliant(covariance=stated))
         assert case.inertia_draws == ()
         assert abs(np.corrcoef(drawn[:, :2].T)[0, 1]) < 0.5
+
+
+def test_severity_takes_the_identified_string_too():
+    """It needs the string only, and a result without J states no joint draws."""
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    said = result(model="two-mass", compliant=compliant(covariance=covariance_of(0.5)))
+    for inertia in (said["inertia_kg_m2"], None):
+        string, _, drawn, inertias = string_for({**said, "inertia_kg_m2": inertia}, parser.parse_args(["a.json"]), 10.0)
+        assert string.stiffness_nm_rad == pytest.approx(314.0)
+        assert len(inertias) == (len(drawn) if inertia else 0)
 
 
 @pytest.mark.heavy
