@@ -85,16 +85,23 @@ def test_graphs_of_the_report_have_the_words_of_the_pictures(figures, whose):
         assert words == re.findall(r"<text[^>]*>([^<]*)</text>", kept(figures, name)), f"stale: draw.py {name}"
 
 
+RESPONSES = {
+    "frf_good": ("valid", False), "frf_stribeck": ("valid", True), "frf_lag": ("model_rejected", False),
+    "frf_zero": ("not_identifiable", True), "frf_backlash": ("model_rejected", True),
+    "frf_resonance": ("valid_wide", False), "frf_quantised": ("valid_wide", False),
+    "frf_saturation": ("model_rejected", True),
+}
+"""Verdict of each picture's machine, and whether distortion is detected."""
+
+
 @pytest.mark.parametrize("name", [
-    pytest.param("frf_stribeck", marks=pytest.mark.heavy),
-    *(pytest.param(name, marks=pytest.mark.long) for name in ("frf_good", "frf_lag")),
-])
+    pytest.param(name, marks=pytest.mark.heavy if name == "frf_stribeck" else pytest.mark.long) for name in RESPONSES])
 def test_pictures_of_the_frequency_response_have_the_words_of_the_pictures(name):
     pytest.importorskip("matplotlib", reason="matplotlib is not installed (pip install '.[report]')")
     module = script("frequency_response")
+    assert module.CASES.keys() == RESPONSES.keys()
     document = module.document(name)
-    assert document["frequency_response"]["distortion"]["detected"] is (name == "frf_stribeck")
-    assert document["verdict"] == ("model_rejected" if name == "frf_lag" else "valid")
+    assert (document["verdict"], document["frequency_response"]["distortion"]["detected"]) == RESPONSES[name]
     words = re.compile(r"<text[^>]*>([^<]*)</text>")
     kept_picture = (module.IMAGES / f"{name}.svg").read_text(encoding="utf-8")
     assert words.findall(module.picture(document)) == words.findall(kept_picture), f"stale: draw {name}"
