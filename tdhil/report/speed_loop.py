@@ -357,9 +357,10 @@ def save_loop_picture(document: Part, path: Path) -> None:
     with repeatable_figures(), rc_context({"font.size": 9.0}):
         figure = Figure(figsize=_SIZE_IN, layout="constrained")
         grid = figure.add_gridspec(2, 1, height_ratios=(5, 2))
-        draw_loop(figure.add_subfigure(grid[0]), document)
-        draw_step(figure.add_subfigure(grid[1]), document)
-        figure.supxlabel(fill(GRAPHS["open_loop"].reading, _CAPTION_SIGNS), fontsize="small")
+        for part, draw, name in ((grid[0], draw_loop, "open_loop"), (grid[1], draw_step, "step")):
+            place = figure.add_subfigure(part)
+            draw(place, document)
+            place.supxlabel(fill(GRAPHS[name].reading, _CAPTION_SIGNS), fontsize="small")
         metadata = {"Date": None, "Creator": None} if path.suffix.lower() == ".svg" else None
         try:
             figure.savefig(path, dpi=_PNG_DPI, metadata=metadata)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
+import re
 
 import pytest
 
 from tdhil.cli.main import main
 from tdhil.errors import ExitCode
+from tdhil.report import GRAPHS
 from tests.cli.test_tune import estimate, impedance, interval
 from tests.cli.test_tune import result as any_result
 
@@ -127,7 +130,12 @@ def test_picture_and_page_are_written_and_nothing_is_overwritten(tuned, tmp_path
     pytest.importorskip("matplotlib")
     picture, page = tmp_path / "tune.svg", tmp_path / "tune.html"
     assert tuned("--plot", picture, "--report", page, "--present", 40, 30)[0] == 0
-    assert picture.read_text(encoding="utf-8").count("<svg") == 1
+    drawn = picture.read_text(encoding="utf-8")
+    assert drawn.count("<svg") == 1
+    parts = re.findall(r"<text[^>]*>([^<]*)</text>|<!-- (.*?) -->", drawn, re.DOTALL)      # text, or shapes of letters
+    said = html.unescape(" ".join(text or beside for text, beside in parts))
+    for graph in ("open_loop", "step"):             # a line of help below each
+        assert " ".join(said.split()).count(GRAPHS[graph].good[:40]) == 1
     text = page.read_text(encoding="utf-8")
     assert text.count("<svg") == 2 and "SIMULATED" in text and "TDH-056" in text
     assert tuned("--plot", picture)[0] == ExitCode.USAGE
