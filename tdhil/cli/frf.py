@@ -38,7 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="FILE",
                         help="the lines as a table: frf.csv, or frf.parquet (extra `parquet`)")
     parser.add_argument("--plot", type=Path, metavar="FILE",
-                        help="magnitude, phase, apparent inertia and residuals as frf.png, frf.svg or frf.pdf")
+                        help="magnitude, phase, apparent inertia, residuals and coherence as frf.png, frf.svg or "
+                        "frf.pdf")
     add_settings(parser, "the run's")
     add_trace_arguments(parser)
     parser.set_defaults(run=run)

@@ -330,6 +330,17 @@ class ResponseLine:
     fitted_phase_rad: float | None
     residual_sd: float | None
 
+    @property
+    def impedance_magnitude(self) -> Estimate:
+        """Return |T/ω|, N·m·s/rad; its high end is infinite where the interval of |ω/T| reaches down to 0."""
+        low, value, high = self.magnitude.low, self.magnitude.value, self.magnitude.high
+        return Estimate(1.0 / value, 1.0 / high, 1.0 / low if low > 0.0 else math.inf)
+
+    @property
+    def impedance_phase_rad(self) -> Estimate:
+        """Return the phase of T/ω, −π to π; its interval may exceed ±π."""
+        return Estimate(-self.phase_rad.value, -self.phase_rad.high, -self.phase_rad.low)
+
 
 @dataclass(frozen=True)
 class UnexcitedHarmonic:
@@ -434,7 +445,8 @@ class FrequencyResponse:
         return found
 
 
-_UNITS = (("magnitude", "rad/(s N m)"), ("phase_rad", "rad"), ("apparent_inertia", "kg m2"), ("real_rad_s_nm",
+_UNITS = (("impedance_magnitude", "N m s/rad"), ("impedance_phase_rad", "rad"),
+          ("magnitude", "rad/(s N m)"), ("phase_rad", "rad"), ("apparent_inertia", "kg m2"), ("real_rad_s_nm",
           "rad/(s N m)"), ("imaginary_rad_s_nm", "rad/(s N m)"))
 
 
@@ -449,7 +461,7 @@ def response_columns(found: FrequencyResponse) -> dict[str, list[float]]:
     rows = []
     for line, value in zip(found.lines, found.response.tolist(), strict=True):
         row: dict[str, Any] = {"hertz": line.hertz, "real_rad_s_nm": value.real, "imaginary_rad_s_nm": value.imag}
-        for name in ("magnitude", "phase_rad", "apparent_inertia_kg_m2"):
+        for name in ("magnitude", "phase_rad", "impedance_magnitude", "impedance_phase_rad", "apparent_inertia_kg_m2"):
             one: Estimate = getattr(line, name)
             row |= {name: one.value, f"{name}_low": one.low, f"{name}_high": one.high}
         for name in ("noise_rel", "distortion_rel", "coherence", "periods", "fitted_magnitude", "fitted_phase_rad",

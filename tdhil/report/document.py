@@ -10,7 +10,7 @@ from typing import Any
 from profiles import MessageCode, entry_of, with_code
 from tdhil.calibration import CalibrationUnusable, StoredCalibration
 from tdhil.config import STATED, expectations_in
-from tdhil.estimation import Identification, InertiaEstimate
+from tdhil.estimation import FrequencyResponse, Identification, InertiaEstimate
 from tdhil.recording import Recording
 from tdhil.report.acceptance import acceptance_of
 from tdhil.version import __version__
@@ -139,7 +139,7 @@ def result_document(
         },
         "torque_ratios": [asdict(ratio) for ratio in found.torque_ratios],
         "lines": [asdict(line) for line in found.lines],
-        "frequency_response": None if found.frequency_response is None else asdict(found.frequency_response),
+        "frequency_response": _response(found.frequency_response),
         "periods_used": found.periods_used,
         "samples_used": found.samples_used,
         "warnings": list(found.warnings),
@@ -168,6 +168,17 @@ def result_document(
     cleaned = only_finite(document)
     assert isinstance(cleaned, dict)
     return cleaned
+
+
+def _response(found: FrequencyResponse | None) -> dict[str, Any] | None:
+    """Return the frequency response, with magnitude and phase of T/ω beside those of ω/T."""
+    if found is None:
+        return None
+    document = asdict(found)
+    for row, line in zip(document["lines"], found.lines, strict=True):
+        row["impedance_magnitude"] = asdict(line.impedance_magnitude)
+        row["impedance_phase_rad"] = asdict(line.impedance_phase_rad)
+    return document
 
 
 def _calibration(stored: Any) -> dict[str, Any] | None:

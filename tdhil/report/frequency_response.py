@@ -96,7 +96,7 @@ def draw_bode(figure: FigureBase, found: Part) -> None:
 
 
 def save_responses(parts: Sequence[tuple[str, Part]], path: Path) -> None:
-    """Write one figure of several responses: |ω/T|, phase, apparent inertia, residuals. Raises OSError."""
+    """Write one figure of several responses: |ω/T|, phase, apparent inertia, residuals, coherence. Raises OSError."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -117,15 +117,17 @@ def draw_faults(figure: FigureBase, found: Part) -> None:
 
 
 def draw_responses(figure: FigureBase, parts: Sequence[tuple[str, Part]]) -> None:
-    """Draw |ω/T|, phase, apparent inertia and residuals of each named response, and a line on how to read them; a
-    single response also gets its sentences.
+    """Draw |ω/T|, phase, apparent inertia, residuals and coherence of each named response, and a line on how to read
+    them; a single response also gets its sentences.
     """
-    axes = figure.subplots(4, 1, sharex=True, height_ratios=(3, 2, 3, 1))
+    axes = figure.subplots(5, 1, sharex=True, height_ratios=(3, 2, 3, 1, 1))
     for number, (name, found) in enumerate(parts):
         colour = _COLOURS[number % len(_COLOURS)]
         _magnitude(axes[0], found, name, colour, alone=len(parts) == 1)
         _phase(axes[1], found, colour)
         _inertia(axes[2], found, colour)
+        axes[4].plot([line["hertz"] for line in found["lines"]], [line["coherence"] for line in found["lines"]], "o",
+                     color=colour, ms=4)
         shown = [line for line in found["lines"] if line["residual_sd"] is not None]
         axes[3].plot([line["hertz"] for line in shown], [line["residual_sd"] for line in shown], "o", color=colour,
                      ms=4)
@@ -133,6 +135,9 @@ def draw_responses(figure: FigureBase, parts: Sequence[tuple[str, Part]]) -> Non
     axes[3].set_ylabel("residual,\nst. dev.")
     axes[3].margins(y=0.25)             # whole markers in a low panel
     axes[3].set_ylim(bottom=0.0)
+    axes[4].set_ylabel("coherence")
+    below = max(0.01, 1.0 - min(line["coherence"] for _, found in parts for line in found["lines"]))
+    axes[4].set_ylim(1.0 - 1.25 * below, 1.0 + 0.25 * below)
     _finish(axes)
     axes[0].legend(fontsize="small", loc="best", ncols=2)
     said = response_sentences(parts[0][1]) if len(parts) == 1 else ()
@@ -245,12 +250,13 @@ def print_responses(responses: Sequence[Part], console: Console) -> None:
             console.print(f"none: {one['reason']}")
             continue
         percent = f"{100.0 * found['confidence']:g}"
-        console.print(Words(f"{'Hz':>8} {'|ω/T|':>11} {'±%':>7} {'phase °':>8} {'±°':>6} {'kg·m²':>9} {'noise%':>7} "
-                            f"{'dist.%':>7} {'resid.':>6}", style="dim"))
+        console.print(Words(f"{'Hz':>8} {'|ω/T|':>9} {'±%':>7} {'phase °':>7} {'±°':>6} {'kg·m²':>9} {'noise%':>6} "
+                            f"{'dist.%':>6} {'coh.':>5} {'resid.':>6}", style="dim"))
         for line in found["lines"]:
             console.print(_row(line))
         console.print(Words(f"± is half the {percent} % interval, torque scale taken as exact. kg·m²: apparent "
                             "inertia Im(T/ω)/2πf. noise, dist.: standard uncertainty by noise and by distortion. "
+                            "coh.: coherence of speed and torque. "
                             f"resid.: in standard deviations from the model ({found['model']}).", style="dim"))
         for sentence in response_sentences(found):
             console.print(sentence)
@@ -259,7 +265,8 @@ def print_responses(responses: Sequence[Part], console: Console) -> None:
 def _row(line: Part) -> str:
     half, turn = _half_rel(line), math.degrees(line["phase_rad"]["high"] - line["phase_rad"]["value"])
     residual = line["residual_sd"]
-    return (f"{line['hertz']:>8.4g} {line['magnitude']['value']:>11.4g} "
-            f"{'open' if half is None else f'{half:.2g}':>7} {math.degrees(line['phase_rad']['value']):>8.1f} "
-            f"{turn:>6.2g} {line['apparent_inertia_kg_m2']['value']:>9.5g} {100.0 * line['noise_rel']:>7.2g} "
-            f"{100.0 * line['distortion_rel']:>7.2g} {'–' if residual is None else f'{residual:.2g}':>6}")
+    return (f"{line['hertz']:>8.4g} {line['magnitude']['value']:>9.4g} "
+            f"{'open' if half is None else f'{half:.2g}':>7} {math.degrees(line['phase_rad']['value']):>7.1f} "
+            f"{turn:>6.2g} {line['apparent_inertia_kg_m2']['value']:>9.5g} {100.0 * line['noise_rel']:>6.2g} "
+            f"{100.0 * line['distortion_rel']:>6.2g} {line['coherence']:>5.3f} "
+            f"{'–' if residual is None else f'{residual:.2g}':>6}")

@@ -42,6 +42,10 @@ def test_the_table_fits_eighty_columns_and_says_what_it_shows(trace, capsys, mon
     assert max(map(len, said.splitlines())) <= 80
     rows = [line.split() for line in said.splitlines() if line.startswith("     0.")]
     assert [row[0] for row in rows] == ["0.1", "0.2", "0.3", "0.4"]
+    header = next(line for line in said.splitlines() if "coh." in line and "Hz" in line)
+    coherence = header.rindex("coh.") + 4
+    shown = [float(line[:coherence].split()[-1]) for line in said.splitlines() if line.startswith("     0.")]
+    assert all(0.9 < one <= 1.0 for one in shown) and len(shown) == 4
     assert "No nonlinear distortion was detected" in " ".join(said.split())
 
 
@@ -58,6 +62,12 @@ def test_json_csv_parquet_and_picture_have_the_same_lines(trace, tmp_path, capsy
         rows = list(csv.DictReader(file))
     assert [float(row["magnitude_high"]) for row in rows] == [line["magnitude"]["high"] for line in lines]
     assert {row["log"] for row in rows} == {trace[0]}
+    for row, line in zip(rows, lines, strict=True):
+        assert float(row["impedance_magnitude"]) == pytest.approx(1.0 / line["magnitude"]["value"], rel=1e-12)
+        assert float(row["impedance_magnitude_low"]) == line["impedance_magnitude"]["low"]
+        assert line["impedance_magnitude"]["low"] < line["impedance_magnitude"]["value"]
+        assert float(row["impedance_phase_rad_high"]) == -line["phase_rad"]["low"]
+        assert line["impedance_phase_rad"]["high"] == -line["phase_rad"]["low"]
     assert main(["frf", *trace, "--out", str(parquet)]) == 0
     with duckdb.connect() as base:
         found = base.execute(f"SELECT hertz, phase_rad, log FROM read_parquet('{parquet}') ORDER BY hertz").fetchall()

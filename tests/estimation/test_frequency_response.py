@@ -90,6 +90,8 @@ def test_xarray_has_the_lines_with_their_units(linear):
     found = linear.to_xarray()
     assert found.hertz.values.tolist() == linear.hertz.tolist()
     assert found.magnitude.attrs["units"] == "rad/(s N m)" and found.phase_rad_low.attrs["units"] == "rad"
+    assert found.impedance_magnitude_high.attrs["units"] == "N m s/rad"
+    assert np.allclose(found.impedance_magnitude.values, np.abs(linear.impedance), rtol=1e-12)
     assert found.coherence.attrs["units"] == "1" and unit_of("hertz") == "Hz"
     g = found.real_rad_s_nm.values + 1j * found.imaginary_rad_s_nm.values
     assert np.allclose(g, linear.response, rtol=1e-15)
