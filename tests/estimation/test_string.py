@@ -71,6 +71,12 @@ def test_auto_finds_the_string():
     pole = abs(pipe.impedance(shaft.antiresonance_hz.value))
     assert pole > 5.0 * max(abs(pipe.impedance(shaft.antiresonance_hz.value * by)) for by in (0.8, 1.15))
     assert any("a resonance" in warning for warning in found.warnings)
+    stated = dict(zip(shaft.covariance.quantities, np.sqrt(np.diag(shaft.covariance.matrix)), strict=True))
+    assert "damping_nm_s_rad" not in stated
+    for name, one in (("inertia_kg_m2", found.inertia), ("load_inertia_kg_m2", shaft.load_inertia),
+                      ("stiffness_nm_rad", shaft.stiffness_nm_rad), ("antiresonance_hz", shaft.antiresonance_hz)):
+        half = 0.5 * (one.high - one.low)
+        assert 0.3 * half < 1.96 * stated[name] < 2.0 * half, name
 
 
 @pytest.mark.heavy

@@ -149,6 +149,10 @@ def test_auto_finds_two_masses_and_says_so(recording):
     # seeded: within twice the interval's reach in any case
     for one, truth in ((found.inertia, 1500.0), (shaft.total_inertia, 1874.0), (shaft.load_inertia, 374.0)):
         assert abs(one.value - truth) < one.high - one.low
+    stated = dict(zip(shaft.covariance.quantities, np.sqrt(np.diag(shaft.covariance.matrix)), strict=True))
+    for name, one in (("inertia_kg_m2", found.inertia), ("load_inertia_kg_m2", shaft.load_inertia),
+                      ("stiffness_nm_rad", shaft.stiffness_nm_rad)):
+        assert 0.0 < 1.96 * stated[name] < 1.5 * 0.5 * (one.high - one.low)      # the interval may also hold a string
     assert "contradict a rigid shaft" in found.reason or "residuals contradict" in found.reason
     assert any("resonance at 0.2 Hz lies inside the excited band" in warning for warning in found.warnings)
     half = 0.5 * (found.inertia.high - found.inertia.low)
