@@ -180,7 +180,7 @@ def test_a_guard_that_has_tripped_does_not_disturb_it(world):
 def test_a_drive_in_fault_is_at_rest_when_its_shaft_is(world, speed):
     here = world()
     here.turn(5.0)
-    here.drive.speed = speed
+    here.bench.hold(Command(Mode.SPEED, speed, 0.0), 5.0)
     here.drive.fault()
     report = here.stop_sequence().run()
     assert report.confirmed

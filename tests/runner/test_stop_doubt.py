@@ -9,10 +9,13 @@ import pytest
 
 from drivers import Mode, PowerState
 from drivers.drive import Command
-from drivers.errors import PreflightRefused, SensorFault
+from drivers.errors import PreflightRefused, SensorFault, TdhilError
 from tdhil.runner.excitation import RigGuess
+from tdhil.runner.observer import Observer
 from tdhil.runner.stages.setup import probe_sign
+from tdhil.runner.standstill import Standstill
 from tests.runner.fake_drive import LIMITS, PERIOD_S, SPEED_RESOLUTION, FakeDrive
+from tests.runner.guarded import sample
 from tests.runner.string_drive import StringWorld
 
 STRING = replace(LIMITS, load="string", torque_ramp_nm_s=40.0)
@@ -183,11 +186,60 @@ def test_once_the_inertia_is_known_the_balance_decides_on_a_fault_of_the_sensor(
     assert never_disabled(lost.drive)
 
 
+def trips(here, state, **then):
+    """The drive removes its torque in motion and changes its reports to ``then``, in one cycle."""
+    def trip(drive, sample):
+        drive.misbehave = None
+        drive.state = drive.wish = state
+        vars(drive).update(then)
+        return drive.report()
+
+    here.drive.misbehave = trip
+    with pytest.raises(TdhilError):
+        here.bench.hold(Command(Mode.SPEED, 5.0, 0.0), 1.0)
+    return here.stop_sequence().run()
+
+
+@pytest.mark.parametrize("state", [PowerState.FAULT, PowerState.OFF])
+@pytest.mark.parametrize("knows", [True, False])
+def test_a_drive_that_trips_and_shows_zero_at_once_confirms_nothing(world, state, knows):
+    """Its sensor failed with it, or it reports no speed without torque. The shaft coasts."""
+    lost, alive = (known(world) if knows else world(Removing(), LIMITS) for _ in range(2))
+    if not knows:
+        lost.turn(5.0)
+        alive.turn(5.0)
+    report = trips(lost, state, sees=0.0)
+    assert not report.confirmed and report.at_rest_s is None
+    assert trips(alive, state).confirmed
+
+
 def test_a_fault_of_the_sensor_before_any_motion_leaves_the_stop_as_it_is(world):
     here = world(Removing(), LIMITS)
     here.bench.enable(Mode.SPEED, Command(Mode.SPEED, 0.0, 0.0))
     report = reports_sensor_fault(here, speed=0.0).stop_sequence().run()
     assert report.confirmed and here.drive.disabled_at == [0.0]
+
+
+@pytest.mark.parametrize(("turns_rad_s", "rests"), [(0.3, False), (0.0, True)])
+def test_a_position_that_creeps_is_no_standstill(turns_rad_s, rests):
+    """Three counts of a speed in whole revolutions per minute are 0.3 rad/s; the position shows the motion."""
+    observer = Observer(LIMITS, 0.02, 0.105)
+    observer.position(1e-3, math.inf)
+    rest = Standstill(observer, 0.314, 1.5, 0.2)
+    found = False
+    for k in range(300):
+        seen = sample(turns_rad_s, 0.0, time_s=0.02 * k)._replace(
+            position_rad=turns_rad_s * 0.02 * k, state=PowerState.OFF)
+        observer.see(Command(Mode.SPEED, 0.0, 0.0), seen)
+        found = found or rest.see(seen)
+    assert found is rests
+
+
+def test_the_standstill_speed_of_a_fast_motor_is_no_motion(world):
+    here = world(limits=replace(LIMITS, speed_max_rad_s=157.0))
+    here.turn(5.0)
+    here.drive.misbehave = lambda drive, seen: seen._replace(speed_rad_s=max(seen.speed_rad_s, 0.3))
+    assert not here.stop_sequence().run().confirmed          # 0.5 % of the limit would be 0.785 rad/s
 
 
 # -- no valid state ----------------------------------------

@@ -54,6 +54,14 @@ UNSEEN_MOST_S = 60.0
 DOUBTED_REST_SHARE = 0.1
 """Share of the standstill speed that is used after a contradiction, because the scale of the report may be wrong."""
 
+POWER_LOSS_S = 0.5
+"""Time before the drive removed its torque, s, in which a shaft that turned still turns afterwards. A stop waits for
+longer at standstill before it disables the drive."""
+
+ANGLE_REST_RAD_S = 0.1
+"""Most that a shaft at standstill may turn by its position, rad/s: 3 degrees in the half second of its rate. A drive
+that holds a shaft, and a string that unwinds behind it, move it by less."""
+
 
 class Observer:
     """Comparison of one drive's reports over one run; `see` evaluates every cycle, `doubt` is the contradiction."""
@@ -107,6 +115,7 @@ class Observer:
         self._unseen_nms = 0.0
         self._unseen_nm = 0.0
         self._moved = False
+        self._powered = self._coasting = False
         self._restart()
 
     # -- knowledge of the shaft and the drive -------------------------------------------------------------------
@@ -285,9 +294,12 @@ class Observer:
         return min(at_rest_rad_s, max(DOUBTED_REST_SHARE * at_rest_rad_s, self._noise_rad_s()))
 
     def angle_quiet(self, at_rest_rad_s: float) -> bool:
-        """Return whether the position moves no faster than this, rad/s; True without a position."""
+        """Return whether the position moves no faster than this, rad/s; True without a position.
+
+        A position is finer than a coarse report of the speed, so `ANGLE_REST_RAD_S` is the most that counts as rest.
+        """
         rate = self.rate_rad_s
-        return rate is None or abs(rate) <= at_rest_rad_s + self._angles.blur_rad_s
+        return rate is None or abs(rate) <= min(at_rest_rad_s, ANGLE_REST_RAD_S) + self._angles.blur_rad_s
 
     @property
     def _balanced(self) -> bool:
@@ -370,7 +382,10 @@ class Observer:
                 "Check the units of torque in the profile and the rated torque", point.time_s,
             )
         if sample.state in (PowerState.ENABLED, PowerState.QUICK_STOP):
+            self._powered = True
             self._compare(point, command, block_s)
+        elif self._lost_torque_in_motion(point.time_s):
+            self._contradict(self._balance.see(self._points, known, self._noise_rad_s()))
         if (apart := self._torques.see(command, sample, self.torque_offset_nm, block_s)) is not None:
             self._doubt(frozenset({Signal.TORQUE}), *apart, sample.time_s)
 
@@ -426,6 +441,22 @@ class Observer:
         elif sample.state is PowerState.ENABLED:
             self._unseen_nms += abs(point.torque) * block_s
             self._unseen_nm = max(self._unseen_nm, abs(point.torque))
+
+    def _lost_torque_in_motion(self, now_s: float) -> bool:
+        """Return whether the drive removed its torque while the shaft turned. Then friction alone stops the shaft.
+
+        A drive whose sensor failed with it, or that reports no speed without torque, shows zero at once. While J is not
+        known, the speed is in doubt until it falls as under a quick stop, or more slowly (`Revival`).
+        """
+        if self._powered:
+            self._powered = False
+            recent = (one.speed for one in self._points if now_s - one.time_s <= POWER_LOSS_S)
+            self._coasting = any(map(self.turns, recent))
+            if self._coasting and not self._bounds.known:
+                self._doubt(
+                    frozenset({Signal.SPEED}), "the drive removed its torque while the shaft turned, and the inertia is"
+                    " not known yet", "Look at the shaft: the drive may report no speed without torque", now_s)
+        return self._coasting
 
     def _compare(self, point: Point, command: Command, block_s: float) -> None:
         """Test the momentum balance, and whether the speed responds to the torque."""
