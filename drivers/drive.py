@@ -37,8 +37,9 @@ class PowerState(Enum):
     READY = "ready"                # ready to switch on, or switched on: no torque yet
     ENABLED = "enabled"            # operation enabled: setpoints act
     QUICK_STOP = "quick stop"      # decelerating or holding after a quick stop
-    FAULT = "fault"                # fault reaction active, or fault
+    FAULT = "fault"                # no torque
     UNKNOWN = "no valid state"     # the status word is invalid: the state is unknown
+    FAULT_REACTION = "fault reaction"      # decelerating after a fault, or holding: the power stage is on
 
 
 class PowerRequest(Enum):

@@ -69,7 +69,7 @@ _POWER = {
     State.SWITCHED_ON: PowerState.READY,
     State.OPERATION_ENABLED: PowerState.ENABLED,
     State.QUICK_STOP_ACTIVE: PowerState.QUICK_STOP,
-    State.FAULT_REACTION_ACTIVE: PowerState.FAULT,
+    State.FAULT_REACTION_ACTIVE: PowerState.FAULT_REACTION,
     State.FAULT: PowerState.FAULT,
     State.UNKNOWN: PowerState.UNKNOWN,
 }

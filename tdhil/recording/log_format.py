@@ -273,6 +273,7 @@ STATES: Final = {
     PowerState.QUICK_STOP: 4,
     PowerState.FAULT: 5,
     PowerState.UNKNOWN: 6,
+    PowerState.FAULT_REACTION: 7,
 }
 STATE_OF: Final = {number: state for state, number in STATES.items()}
 

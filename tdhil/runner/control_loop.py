@@ -129,7 +129,7 @@ class ControlLoop:
             if sample.state is PowerState.ENABLED and sample.mode is mode:
                 self.guard.expected = PowerState.ENABLED
                 return sample
-            if sample.state is PowerState.FAULT:
+            if sample.state in (PowerState.FAULT, PowerState.FAULT_REACTION):
                 break
         raise DriveFault(
             f"{mode.value} mode was not enabled within {timeout_s:g} s; the drive reports '{sample.state.value}'",

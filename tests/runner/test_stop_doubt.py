@@ -213,6 +213,12 @@ def test_a_drive_that_trips_and_shows_zero_at_once_confirms_nothing(world, state
     assert trips(alive, state).confirmed
 
 
+def test_a_drive_that_stays_in_its_fault_reaction_is_not_disabled(world):
+    """Its power stage is on, and may hold torque at standstill: 000Fh is not 0008h."""
+    report = trips(known(world), PowerState.FAULT_REACTION)
+    assert not report.confirmed and not report.disabled
+
+
 def test_a_fault_of_the_sensor_before_any_motion_leaves_the_stop_as_it_is(world):
     here = world(Removing(), LIMITS)
     here.bench.enable(Mode.SPEED, Command(Mode.SPEED, 0.0, 0.0))

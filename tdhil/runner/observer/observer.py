@@ -384,7 +384,7 @@ class Observer:
         if sample.state in (PowerState.ENABLED, PowerState.QUICK_STOP):
             self._powered = True
             self._compare(point, command, block_s)
-        elif self._lost_torque_in_motion(point.time_s):
+        elif sample.state is PowerState.FAULT_REACTION or self._lost_torque_in_motion(point.time_s):
             self._contradict(self._balance.see(self._points, known, self._noise_rad_s()))
         if (apart := self._torques.see(command, sample, self.torque_offset_nm, block_s)) is not None:
             self._doubt(frozenset({Signal.TORQUE}), *apart, sample.time_s)
