@@ -335,10 +335,10 @@ class StopSequence:
         speed = self._begins_at()
         came_from, step = math.copysign(1.0, speed), self._limits.quick_stop_rad_s2 * self._loop.period_s
         patience = StopTimeout(self._enough_s, self._at_rest_rad_s)
-        since_s = 0.0
+        since_s, held_nm = 0.0, self._torque_held_nm()
         while not patience.over:
             speed = math.copysign(max(0.0, abs(speed) - step), came_from)
-            sample = self._exchange(Command(Mode.SPEED, speed, 0.0))
+            sample = self._exchange(Command(Mode.SPEED, speed, held_nm))
             since_s += self._loop.period_s
             if sample is None:
                 if self._silent >= self._enough_silent:
@@ -346,6 +346,7 @@ class StopSequence:
                 patience.wait(self._loop.period_s)
                 continue
             regulated = sample.mode is Mode.SPEED
+            held_nm = 0.0 if regulated else held_nm
             if sample.state is not PowerState.ENABLED or (not regulated and since_s > MODE_S) or self._speed_doubted:
                 return False
             self._ask_position(sample.time_s)
@@ -356,6 +357,15 @@ class StopSequence:
                 return True
         self._trouble.append("the shaft did not follow speed mode to standstill; quick stop instead")
         return False
+
+    def _torque_held_nm(self) -> float:
+        """Return the torque in torque mode, N·m; else 0. The setpoint keeps it until the drive shows speed mode, so
+        that a drive that switches late does not drop the torque of the string.
+        """
+        last = self._loop.last
+        if last is None or last.mode is not Mode.TORQUE or not math.isfinite(last.torque_nm):
+            return 0.0
+        return kept_within(last.torque_nm, -self._limits.torque_nm, self._limits.torque_nm)
 
     def _begins_at(self) -> float:
         """Return the ramp's first speed, rad/s: a single wrong report, or one above the limit, must not be followed."""

@@ -454,3 +454,20 @@ def test_a_run_with_a_string_is_refused_before_anything_moves(world):
     result = here.runner(ExcitationRequest(kind="coast-down")).run()
     assert isinstance(result.cause, PreflightRefused)
     assert "exchange" not in here.drive.calls
+
+
+def test_a_drive_that_changes_to_speed_mode_late_does_not_drop_the_string_s_torque():
+    """Until it shows speed mode, the target torque still acts."""
+    here, late = StringWorld(twist_nm=300.0), 10
+
+    def switches_late(drive, sample):
+        drive.seen += 1
+        return sample._replace(mode=Mode.TORQUE if drive.seen <= late + 1 else sample.mode, torque_nm=300.0)
+
+    here.drive.seen, here.drive.misbehave = 0, switches_late
+    here.bench.cycle(Command(Mode.TORQUE, 0.0, 300.0))
+    begun = len(here.drive.commands)
+    here.stop_sequence().run()
+    asked = [one.torque_nm for one in here.drive.commands[begun:]]
+    assert asked[:late] == [300.0] * late
+    assert asked[late + 1] == 0.0
