@@ -86,20 +86,23 @@ class ControlLoop:
         return sample
 
     def stop_cycle(self, command: Command) -> Sample:
-        """Do one exchange of the stop sequence: without guard, and no error of log or display interrupts it."""
+        """Do one exchange of the stop sequence: without guard, and no error of log, observer or display interrupts it,
+        or keeps the cycle from another of them.
+        """
         sample = self._exchange(command)
-        try:
-            self.guard.observer.see(command, sample)
-            self.log.cycle(command, sample)
-            if self._reports_others is not None:
-                for line in self._reports_others.remarks():
-                    self._note(line)
-            if self._watch is not None:
-                self._watch(command, sample)
-        except Exception as error:
-            self.stop_side_troubles.append(f"{type(error).__name__}: {error}")
-            del self.stop_side_troubles[10:]
+        for takes in (self.log.cycle, self.guard.observer.see, self._note_remarks, self._watch):
+            try:
+                if takes is not None:
+                    takes(command, sample)
+            except Exception as error:
+                self.stop_side_troubles.append(f"{type(error).__name__}: {error}")
+                del self.stop_side_troubles[10:]
         return sample
+
+    def _note_remarks(self, command: Command, sample: Sample) -> None:
+        if self._reports_others is not None:
+            for line in self._reports_others.remarks():
+                self._note(line)
 
     def _exchange(self, command: Command) -> Sample:
         """Exchange with the drive. A fault of its speed sensor also goes to the observer: the stop needs to know it."""

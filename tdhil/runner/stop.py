@@ -710,7 +710,10 @@ class StopSequence:
         if sample is None or not sample.fresh or (or_poll and self._polls.only):
             sample = self._poll() if or_poll else None
             if sample is not None:
-                self._loop.guard.observer.see(command, sample)
+                try:
+                    self._loop.guard.observer.see(command, sample)
+                except Exception as error:      # the stop continues
+                    self._note(error)
         else:
             self._polls.heard()
             self._slowing.reset()

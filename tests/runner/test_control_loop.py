@@ -111,6 +111,19 @@ def test_the_stop_cycle_is_neither_guarded_nor_stopped_by_log_or_display(world):
     assert here.bench.stop_side_troubles == ["OSError: disk full"] * 10     # no more than ten are kept
 
 
+def test_an_observer_that_fails_keeps_no_cycle_of_the_stop_from_the_log(world, monkeypatch):
+    here, kept = world(), []
+
+    def broken(*_):
+        raise ValueError("empty")
+
+    monkeypatch.setattr(type(here.guard.observer), "see", broken)
+    here.log.on_cycle = lambda *_: kept.append(True)
+    for _ in range(5):
+        here.bench.stop_cycle(REST)
+    assert len(kept) == 5
+
+
 def test_the_stop_cycle_hands_on_what_the_drive_raises(world):
     def gone(drive, sample):
         raise CommunicationLost("gone")

@@ -12,6 +12,7 @@ from drivers.drive import Command
 from drivers.errors import PreflightRefused, SensorFault, TdhilError
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.observer import Observer
+from tdhil.runner.settings import ControlAssumptions
 from tdhil.runner.stages.setup import probe_sign
 from tdhil.runner.standstill import Standstill
 from tests.runner.fake_drive import LIMITS, PERIOD_S, SPEED_RESOLUTION, FakeDrive
@@ -453,3 +454,13 @@ def test_above_a_string_a_probe_that_saw_no_motion_gets_no_speed_control(world):
     here.stop_sequence().run()
     assert "quick_stop" not in here.drive.calls
     assert here.bench.now_s - begun_s >= wait_s
+
+
+def test_a_lag_of_half_the_kept_time_is_no_error_of_the_observer():
+    """The response to every command that is kept may still be missing."""
+    observer = Observer(STRING, 0.02, SPEED_RESOLUTION, assumptions=ControlAssumptions(largest_speed_lag_s=2.0))
+    observer.know(RigGuess(104.0, 8.0, 60.0, 0.2))
+    observer.begin_stop()
+    for k in range(500):
+        observer.see(Command(Mode.SPEED, 0.1 * math.sin(0.02 * k), 0.0),
+                     sample(0.0, 300.0, time_s=0.02 * k)._replace(state=PowerState.ENABLED))

@@ -219,8 +219,10 @@ class IgnoredYield:
         # the response to the latest command is still missing, and changes from cycle to cycle are torque noise
         until_s = point.time_s - 2.0 * self._lag_s
         commanded = _means([(time_s, one) for time_s, one, _ in seen if time_s <= until_s], SMOOTH_S)
+        if not commanded:              # the lag is longer than half of what is kept
+            return None
         went = [one for _, _, one in seen]
-        mean = math.fsum(abs(one) for one in commanded) / max(1, len(commanded))
+        mean = math.fsum(abs(one) for one in commanded) / len(commanded)
         commanded_range, went_range = max(commanded) - min(commanded), max(went) - min(went)
         noise = max(now.noise_rad_s, YIELD_LEFT * commanded_range)
         clear = max(YIELD_STILL * self._still_rad_s, YIELD_MOVES * noise)
