@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import pytest
 
 from drivers import Mode, PowerState
-from drivers.drive import Command
+from drivers.drive import Command, PositionReading
 from drivers.errors import PreflightRefused, SensorFault, TdhilError
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.observer import Observer
@@ -464,3 +464,23 @@ def test_a_lag_of_half_the_kept_time_is_no_error_of_the_observer():
     for k in range(500):
         observer.see(Command(Mode.SPEED, 0.1 * math.sin(0.02 * k), 0.0),
                      sample(0.0, 300.0, time_s=0.02 * k)._replace(state=PowerState.ENABLED))
+
+
+def test_positions_with_two_zeros_are_not_one_way():
+    """A position that was read in the stop counts from its own zero; then those of the cycle come again."""
+    observer = Observer(LIMITS, 0.02, SPEED_RESOLUTION)
+    observer.know(RigGuess(104.0, 8.0, 60.0, 0.2))
+    observer.position(1e-3, math.inf)
+    observer.compare_position(1.0)
+
+    def turn(begin, end, with_position=True):
+        for k in range(begin, end):
+            angle_rad = 100.0 + 3.0 * 0.02 * k if with_position else None
+            observer.see(Command(Mode.SPEED, 3.0, 0.0), sample(3.0, 84.0, time_s=0.02 * k)._replace(
+                state=PowerState.ENABLED, position_rad=angle_rad))
+
+    turn(0, 200)
+    turn(200, 260, with_position=False)
+    observer.see_reading(PositionReading(5.2, 0.0, 3.0 * 5.2, None, "6064h"))
+    turn(260, 500)
+    assert observer.doubt is None and observer.rate_rad_s == pytest.approx(3.0, rel=0.01)

@@ -87,6 +87,7 @@ class Observer:
         self._torques = TorqueFollowing(limits, self._lag_s)
         self._angles = PositionWay(self._lag_s, speed_resolution_rad_s, self._still_rad_s)
         self._turns: Unwrapped | None = None
+        self._zero: Unwrapped | None = None
         self._runaway = Runaway(limits, self._still_rad_s)
         self._balance = MomentumBalance(limits, self._lag_s, self._point_s, torque_resolution_nm)
         self._rules = rules(limits, self._still_rad_s, self._lag_s, self._point_s)
@@ -215,7 +216,7 @@ class Observer:
         if angle_rad is None:
             self._angles.restart()
         else:
-            self._see_angle(angle_rad, reading.time_s, self._speed)
+            self._see_angle(angle_rad, reading.time_s, self._speed, self._turns)
 
     def expected(self, apart_rad_s: float, within_rad_s: float, sample: Sample) -> None:
         """Compare: a contradiction follows if the speed differs from a stage's own model by more than
@@ -481,7 +482,15 @@ class Observer:
         """Return the reported speed `BEFORE_S` ago, rad/s: before the effect of a contradiction."""
         return next((point.speed for point in self._points if self._time_s - point.time_s <= BEFORE_S), 0.0)
 
-    def _see_angle(self, position_rad: float, now_s: float, speed_rad_s: float) -> None:
+    def _see_angle(
+        self, position_rad: float, now_s: float, speed_rad_s: float, zero: Unwrapped | None = None
+    ) -> None:
+        """Compare a position. ``zero``: the counter of positions that were read; None for the driver's own."""
+        if zero is not self._zero:
+            if self.heard_position(now_s, STALE_S):
+                return                 # positions with another zero still come
+            self._zero = zero
+            self._angles.restart()
         # a position without a cycle cannot be compared, because the integral of the reported speed is missing
         covered = now_s - self._time_s <= max(0.1, 2.0 * self._period_s)
         way = Way(self._way_of if covered else -1, self._way, speed_rad_s)
