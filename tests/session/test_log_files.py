@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+import tempfile
 
 import pytest
 
@@ -60,6 +61,28 @@ def test_a_file_that_is_removed_is_saved(opened, tmp_path, monkeypatch, whole_fo
     assert place.path.read_bytes() == b"what was recorded"
     assert "was removed during the run" in place.moved and str(place.path) in place.moved
     place.follow()                             # once
+
+
+def test_a_file_that_is_removed_with_the_working_folder_is_saved(opened, tmp_path, monkeypatch):
+    place, folder = opened
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    monkeypatch.chdir(folder)
+    shutil.rmtree(folder)
+    place.follow()
+    monkeypatch.chdir(tmp_path)
+    assert place.path.parent == tmp_path / "temporary"
+    assert place.path.read_bytes() == b"what was recorded"
+
+
+def test_without_any_folder_the_error_is_one_of_the_log(opened, tmp_path, monkeypatch):
+    place, folder = opened
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: (_ for _ in ()).throw(FileNotFoundError(2, "no folder")))
+    monkeypatch.chdir(folder)
+    shutil.rmtree(folder)
+    with pytest.raises(LogBroken, match="moved or removed"):
+        place.follow()
+    monkeypatch.chdir(tmp_path)
 
 
 def test_what_can_be_neither_found_nor_saved_is_an_error(opened, monkeypatch):
