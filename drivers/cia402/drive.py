@@ -509,12 +509,15 @@ class Cia402Drive:
 
     def _listen(self, tick_s: float) -> None:
         """Listen until the tick. If this loop may have been delayed, report the delay before errors found on the
-        bus.
+        bus. In a stop an error does not keep the cycle's frame from the drive: reading the feedback raises it again.
         """
         away_s = self.clock.now_s() - tick_s
         try:
             self._bus.listen_until(tick_s)
         except CommunicationLost as error:
+            if self._power.wish is not PowerRequest.ENABLED:
+                self.clock.wait_until(tick_s)
+                return
             if away_s <= max(STALL_S, STALL_CYCLES * self.period_s):
                 raise
             raise CommunicationLost(

@@ -127,6 +127,24 @@ def test_the_bus_fails_in_mid_cycle(turning, bench, way):
     turning.cycle(speed=2.0)
 
 
+def test_an_adapter_that_only_sends_still_gets_the_quick_stop_out(turning, bench):
+    """Each cycle of the stop waits for its tick and sends; then it reports that nothing is received."""
+    words, begun_s, send = [], turning.drive.clock.now_s(), bench.bus.send
+
+    def sends(message):
+        words.extend([bytes(message.data[:2])] if message.arbitration_id == 0x201 else [])
+        send(message)
+
+    bench.bus.send, bench.bus.receive_error = sends, can.CanOperationError("overrun")
+    turning.drive.quick_stop()
+    for _ in range(10):
+        with pytest.raises(CommunicationLost, match="overrun"):
+            turning.cycle(speed=0.0)
+    bench.bus.receive_error = None
+    assert words == [b"\x02\x00"] * 10
+    assert turning.drive.clock.now_s() - begun_s == pytest.approx(10 * PERIOD_S, abs=PERIOD_S)
+
+
 def test_closing_on_a_dead_bus_does_not_raise(turning, bench):
     turning.stop()
     bench.bus.send_error = bench.bus.receive_error = OSError("unplugged")
