@@ -139,7 +139,7 @@ class Site:
             return RigView(rig.id, rig.name, "unusable", False, rig.rig.service.motion, str(error))
         run = self.supervisor.run_of(rig.id)
         holder = self.supervisor.holder(rig)
-        blocked = self.supervisor.blocked(rig.id)
+        blocked = self.supervisor.blocking_run(rig)
         state: Literal["free", "busy", "held", "blocked"]
         state = "busy" if run else "held" if holder else "blocked" if blocked else "free"
         last = self.list_runs(rig.id, None, 10)

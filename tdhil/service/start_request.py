@@ -16,6 +16,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from drivers import DataFileError, PreflightRefused
+from profiles import profile_names
 from profiles.quantities import read
 from tdhil.buses import Connection
 from tdhil.config import (
@@ -288,7 +289,25 @@ def edited(old: str, text: str, name: str) -> tuple[str, ...]:
         raise NotAllowed("can't be changed over HTTP: the drive's address and type and the rules of motion",
                          where=wanted.source(beyond[0]) or f"{name}: {', '.join(beyond)}",
                          next_step="Edit the file on the service's computer")
+    _refuse_files(wanted, name)
     return keys
+
+
+_READ: Final = (*(one.at for one in OPTIONS if one.beside_rig and one.at), "drive_data.torque_calibration")
+"""Keys of a rig's file that name a file beside it. A path would read any file of the service's computer."""
+_WRITTEN: Final = tuple(one.at for one in OPTIONS if one.is_file and not one.beside_rig and one.at)
+"""Keys that name a file to write."""
+
+
+def _refuse_files(rig: Rig, name: str) -> None:
+    """Refuse the keys of a file with a path, and those of a file to write. Raises NotAllowed."""
+    for key in (*_READ, *_WRITTEN):
+        stated = str(rig.get(key)) if rig.line(key) else ""
+        plain = key in _READ and (Path(stated).name == stated or (key == "profile" and stated in profile_names()))
+        if stated and not plain:
+            raise NotAllowed("HTTP may name only a file beside the rig's file, to be read",
+                             where=rig.source(key) or name,
+                             next_step="Write this key into the rig's file on the service's computer")
 
 
 NEW_RIG_MOTIONS: Final = ("never", "attended")
@@ -297,8 +316,15 @@ that was written on the service's computer allows it."""
 
 
 def require_new_rig(text: str, name: str) -> None:
-    """Check the file of a new rig. Raises DataFileError, and NotAllowed for motion without a person at the rig."""
+    """Check the file of a new rig. Raises DataFileError; NotAllowed for motion without a person at the rig, for motion
+    in reverse, and for a file elsewhere.
+    """
     rig = parse_rig(text, name)
+    _refuse_files(rig, name)
+    if rig.get("allow_reverse"):
+        raise NotAllowed("a rig that is added over HTTP may not turn in reverse",
+                         where=rig.source("allow_reverse") or name,
+                         next_step="Write this key into the rig's file on the service's computer")
     if rig.service.motion not in NEW_RIG_MOTIONS:
         raise NotAllowed("a rig that is added over HTTP may move only with a code from the rig",
                          where=rig.source("service.motion") or name,

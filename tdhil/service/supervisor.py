@@ -269,7 +269,7 @@ class Supervisor:
         if holder is not None:
             raise Conflict(f"the drive is held by {holder}", where=f"rig {rig.id}", holder=str(holder),
                            next_step="Wait until that run has ended, or end it there")
-        bad = self.blocked(rig.id)
+        bad = self.blocking_run(rig)
         if bad is not None:
             raise Conflict(
                 f"the stop of run {bad} was neither confirmed nor signed off", where=f"rig {rig.id}",
@@ -285,11 +285,22 @@ class Supervisor:
     def certainly_idle(self, rig: RigFile) -> bool:
         """Return whether no tdhil of this computer can move the rig's real drive, and no sign-off is missing."""
         address = rig.address
-        return address is not None and holder_of(address) is None and self.blocked(rig.id) is None
+        return address is not None and holder_of(address) is None and self.blocking_run(rig) is None
 
     def blocked(self, rig_id: str) -> str | None:
-        """Return the run that blocks the rig until it is signed off."""
-        statuses = [one for one in tuple(self._unconfirmed.values()) if one.rig == rig_id]
+        """Return the run of this rig that blocks it until it is signed off."""
+        return self._blocking([one for one in tuple(self._unconfirmed.values()) if one.rig == rig_id])
+
+    def blocking_run(self, rig: RigFile) -> str | None:
+        """Return the run that blocks the rig, or its drive under the name of another rig, until it is signed off."""
+        found = self.blocked(rig.id)
+        if found is not None or not self._unconfirmed or rig.address is None:
+            return found
+        return self._blocking([
+            one for one in tuple(self._unconfirmed.values())
+            if (read_json(self.store.place(one.id) / CONNECTION_FILE) or {}).get("address") == rig.address])
+
+    def _blocking(self, statuses: list[Status]) -> str | None:
         found = blocking(statuses, [one.id for one in statuses if self.store.signed_off(one.id) is not None])
         return None if found is None else found.id
 
@@ -373,7 +384,7 @@ class Supervisor:
         If a run blocks the rig, the drive of that run is stopped, on the run's own connection.
         """
         self.note(who, "stop asked", None, rig.id)
-        if (bad := self.blocked(rig.id)) is not None:
+        if (bad := self.blocking_run(rig)) is not None:
             seen, said = self._stop_drive_of(self.store.request(bad), self.store.status(bad))
             return int(ExitCode.OK if seen else ExitCode.STOP_NOT_CONFIRMED), said
         if rig.simulated:
@@ -408,6 +419,9 @@ class Supervisor:
         status = self.store.status(run)
         if status.state is not State.STOP_NOT_CONFIRMED:
             raise Conflict(f"there is nothing to sign off: the run is {status.state}", where=f"run {run}")
+        if (signed := self.store.signed_off(run)) is not None:
+            raise Conflict(f"{signed['by']} has signed this run off already", where=f"run {run}",
+                           next_step="Load the page again. A remark belongs to the record of the run")
         self.store.sign_off(run, who, note)
         self.note(who, "signed off", run, status.rig, note=note)
 

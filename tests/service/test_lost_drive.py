@@ -94,8 +94,14 @@ def test_a_rig_s_file_that_was_changed_meanwhile_leaves_the_stop_unconfirmed(ser
     assert service.supervisor.blocked("real") == run
     with pytest.raises(Conflict, match="neither confirmed nor signed off"):
         service.supervisor.start_run("real", {"note": "ask"}, "local")
+    path.with_name("again.yaml").write_text(before)                  # the same drive under another name
+    assert service.supervisor.blocking_run(service.supervisor.rigs.get("again")) == run
     service.supervisor.sign_off(run, "anna", "both shafts at rest")
     assert service.supervisor.blocked("real") is None
+    assert service.supervisor.blocking_run(service.supervisor.rigs.get("again")) is None
+    with pytest.raises(Conflict, match="anna has signed"):
+        service.supervisor.sign_off(run, "bert", "x")
+    assert service.store.signed_off(run)["by"] == "anna"
 
 
 @pytest.mark.heavy

@@ -157,6 +157,9 @@ def test_an_id_that_is_none_writes_nothing(call, service, rig):
 
 
 @pytest.mark.parametrize(("text", "code"), [
+    ("run: {simulate: true, plant: /etc/passwd}\n", 403), ("run: {simulate: true, trace: trace.csv}\n", 403),
+    ("run: {log: run.mcap}\n", 403), ("profile: /etc/passwd\n", 403), ("letterhead: ../letterhead.yaml\n", 403),
+    ("drive_data: {torque_calibration: ../c.json}\n", 403), ("name: x\nallow_reverse: true\n", 403),
     ("service: {motion: watched}\n", 403), ("limits: 3\n", 422), ("name: [", 422), ("accept_no_watchdog: true\n", 422)])
 def test_a_file_that_may_not_be_writes_nothing(call, service, text, code):
     call("POST", "/rigs", code, json={"id": "new", "text": text})
