@@ -331,7 +331,7 @@ def load_what_the_end_needs(report: bool, case: bool) -> None:
         identify,  # noqa: F401
     )
     from tdhil.report import card_text, result_document, write_report  # noqa: F401
-    from tdhil.session import conclusion  # noqa: F401
+    from tdhil.session import conclusion, evaluation, verification  # noqa: F401
 
     with Console(file=io.StringIO()).status(""):
         pass      # rich loads its spinners at first use
@@ -339,7 +339,6 @@ def load_what_the_end_needs(report: bool, case: bool) -> None:
         from tdhil.report import draw_run, require_extra  # noqa: F401
     if case:
         from tdhil.report import evaluation_document, verification_document  # noqa: F401
-        from tdhil.session import evaluation, verification  # noqa: F401
         from tdhil.speed_loop import verify_steps  # noqa: F401
     if case and report:
         from tdhil.report import evaluation_report, verification_report  # noqa: F401

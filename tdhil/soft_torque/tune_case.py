@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from math import inf
 
 import numpy as np
@@ -120,8 +121,8 @@ class TuneCase:
         return draw_truths(
             self.string, self.drive, self.inertia_kg_m2, count=self.draws, seed=self.seed,
             lag_tolerance=self.lag_tolerance, lag_axes=lags if same else (), present=self.present,
-            present_axes=gains_open, string_draws=self.string_draws,
-            inertia_draws=self.inertia_draws)
+            present_axes=gains_open,
+            string_draws=tuple(zip_longest(self.string_draws, self.inertia_draws)))
 
 
 @dataclass(frozen=True)

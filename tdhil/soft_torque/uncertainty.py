@@ -95,16 +95,15 @@ def draw_truths(
     lag_axes: Sequence[Sequence[float]] = (),
     present: SpeedController | None = None,
     present_axes: Sequence[tuple[float, float]] = (),
-    string_draws: Sequence[DrillString] = (),
-    inertia_draws: Sequence[float] = (),
+    string_draws: Sequence[tuple[DrillString, float | None]] = (),
 ) -> tuple[Truth, ...]:
     """Draw ``count`` truths.
 
     ``lag_axes``: half of the 95 % range of the lags along each main axis, s. ``lag_tolerance``: relative tolerance ± of
     each lag, used without ``lag_axes``. ``present_axes``: half-ranges of (P, I). ``string_draws``: strings that were
-    drawn before, from the values of an identification. Without them, each string is drawn from the tolerances of
-    ``string``. ``inertia_draws``: J of each of these strings, kg·m², if both were drawn jointly (`joint_draws`).
-    Without them, J is independent of the string.
+    drawn before, from the values of an identification, each with its J, kg·m², if both were drawn jointly
+    (`joint_draws`); else with None, and J is independent. Without them, each string is drawn from the tolerances of
+    ``string``.
     """
     lags = drive.inner_lags_s
     free = len(lag_axes) if lag_axes else len(lags)
@@ -114,8 +113,6 @@ def draw_truths(
         normal = _normal(row)
         j = normal[0] / COVERAGE_K
         value = inertia.value + j * (inertia.high - inertia.value if j > 0.0 else inertia.value - inertia.low)
-        if inertia_draws:
-            value = inertia_draws[number % len(inertia_draws)]
         at = 1 + COLUMNS_OF_STRING
         if lag_axes:
             moved = np.array(lags, dtype=float)
@@ -129,9 +126,9 @@ def draw_truths(
                     for which in (0, 1))
             law = replace(law, gain_nm_s_rad=max(0.0, law.gain_nm_s_rad + p),
                           integral_nm_rad=max(0.0, law.integral_nm_rad + i))
-        own = (string_draws[number % len(string_draws)] if string_draws
-               else string_at(string, row[1 : 1 + COLUMNS_OF_STRING]))
-        true = replace(drive, inertia_kg_m2=max(1e-6, float(value)),
+        own, joint = (string_draws[number % len(string_draws)] if string_draws
+                      else (string_at(string, row[1 : 1 + COLUMNS_OF_STRING]), None))
+        true = replace(drive, inertia_kg_m2=max(1e-6, float(value if joint is None else joint)),
                        inner_lags_s=tuple(float(max(0.0, lag)) for lag in moved))
         found.append(Truth(own, true, law, 1000 * seed + number))
     return tuple(found)
