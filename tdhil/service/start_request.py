@@ -282,14 +282,14 @@ EDITABLE: Final = frozenset({
 
 def edited(old: str, text: str, name: str) -> tuple[str, ...]:
     """Return the keys in which the text differs from the former file. Raises DataFileError and NotAllowed."""
-    wanted = parse_rig(text, name)
-    before, after = parse_rig(old, name).model_dump(), wanted.model_dump()
+    wanted, present = parse_rig(text, name), parse_rig(old, name)
+    before, after = present.model_dump(), wanted.model_dump()
     keys = tuple(sorted(key for key in before if before[key] != after[key]))
     if beyond := [key for key in keys if key not in EDITABLE]:
         raise NotAllowed("can't be changed over HTTP: the drive's address and type and the rules of motion",
                          where=wanted.source(beyond[0]) or f"{name}: {', '.join(beyond)}",
                          next_step="Edit the file on the service's computer")
-    _refuse_files(wanted, name)
+    _refuse_files(wanted, name, present)
     return keys
 
 
@@ -299,15 +299,17 @@ _WRITTEN: Final = tuple(one.at for one in OPTIONS if one.is_file and not one.bes
 """Keys that name a file to write."""
 
 
-def _refuse_files(rig: Rig, name: str) -> None:
-    """Refuse the keys of a file with a path, and those of a file to write. Raises NotAllowed."""
+def _refuse_files(rig: Rig, name: str, present: Rig | None = None) -> None:
+    """Refuse the keys of a file with a path, and those of a file to write. Raises NotAllowed.
+
+    ``present``: the rig as its file states it now. What it states was written on the service's computer, and may stay.
+    """
     for key in (*_READ, *_WRITTEN):
         stated = str(rig.get(key)) if rig.line(key) else ""
         plain = key in _READ and (Path(stated).name == stated or (key == "profile" and stated in profile_names()))
-        if stated and not plain:
+        if stated and not plain and (present is None or rig.get(key) != present.get(key)):
             raise NotAllowed("HTTP may name only a file beside the rig's file, to be read",
-                             where=rig.source(key) or name,
-                             next_step="Write this key into the rig's file on the service's computer")
+                             where=rig.source(key) or name, next_step="Edit the file on the service's computer")
 
 
 NEW_RIG_MOTIONS: Final = ("never", "attended")
@@ -324,7 +326,7 @@ def require_new_rig(text: str, name: str) -> None:
     if rig.get("allow_reverse"):
         raise NotAllowed("a rig that is added over HTTP may not turn in reverse",
                          where=rig.source("allow_reverse") or name,
-                         next_step="Write this key into the rig's file on the service's computer")
+                         next_step="Edit the file on the service's computer")
     if rig.service.motion not in NEW_RIG_MOTIONS:
         raise NotAllowed("a rig that is added over HTTP may move only with a code from the rig",
                          where=rig.source("service.motion") or name,

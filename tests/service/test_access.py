@@ -24,7 +24,7 @@ from tdhil.service import supervisor as supervisor_module
 from tdhil.service import web as web_module
 from tdhil.service.access import SESSION_S, STOPS_S, Access, RequestPace, Tries, address_of
 from tdhil.service.accounts import ROLES, AccountsFile, matches, scrypt
-from tdhil.service.run_state import TooManyRuns, TooManyTries
+from tdhil.service.run_state import NotAllowed, TooManyRuns, TooManyTries
 from tdhil.service.schemas import API
 from tdhil.service.start_request import edited
 from tdhil.session import hold
@@ -473,6 +473,13 @@ def test_nobody_takes_away_the_watchdog_over_http(guarded):
 def test_expected_values_of_an_acceptance_are_edited_over_http():
     before = "name: bench 3\nrun: {simulate: true}\n"
     assert edited(before, before + "acceptance: {inertia: 104 kg·m² ± 5 %}\n", "a.yaml") == ("acceptance",)
+
+
+def test_a_file_that_was_named_on_the_service_s_computer_stays_and_no_other_is_named_over_http():
+    before = "name: bench 3\nrun: {simulate: true, plant: ../plant.yaml}\ndrive_data: {torque_calibration: ../c.json}\n"
+    assert edited(before, before.replace("bench 3", "bench 4"), "a.yaml") == ("name",)
+    with pytest.raises(NotAllowed, match="beside the rig's file"):
+        edited(before, before.replace("../c.json", "/etc/c.json"), "a.yaml")
 
 
 @pytest.mark.heavy
