@@ -133,7 +133,7 @@ def bias_of(rows: list[dict[str, Any]]) -> tuple[float, float]:
 
 
 def kept(rows: list[dict[str, Any]]) -> bool:
-    """Print what is required of the rows; True if it is met."""
+    """Print the requirements of each order. Return whether the rows meet them."""
     false = sum(bool(row["false"]) for row in rows)
     print(f"\nfalse orders in {false} of {len(rows)} rows")
     good = not false

@@ -55,30 +55,39 @@ PHASE_TOLERANCE_DEG, GAIN_TOLERANCE_DB = 0.05, 0.02
 """Numerical error of the margins on both sides."""
 
 
+def drawn_rig(rng: np.random.Generator, least_lag_s: float = 0.0) -> tuple[shaft_bench.Rig, float]:
+    """Return a rigid shaft, and the factor on the usual noise. ``least_lag_s``: of the reports."""
+    noise, usual = 2.0 ** rng.uniform(-1.0, 1.0), shaft_bench.Rig()
+    return replace(
+        usual, inertia=104.0 * rng.uniform(0.7, 1.4), viscous=rng.uniform(3.0, 16.0), coulomb=rng.uniform(30.0, 80.0),
+        speed_poles=(rng.uniform(least_lag_s, 0.5),), torque_poles=(rng.uniform(least_lag_s, 0.3),),
+        load_sd=noise * usual.load_sd, ripple_sd=noise * usual.ripple_sd, sensor_sd=noise * usual.sensor_sd), noise
+
+
+def drawn_two_masses(rng: np.random.Generator) -> tuple[compliant_bench.TwoMass, compliant_bench.Noise, float]:
+    """Return a shaft of two masses, its noise, and the factor on the usual noise."""
+    motor, load = 1500.0 * rng.uniform(0.7, 1.4), 374.0 * rng.uniform(0.7, 1.6)
+    usual, by = compliant_bench.Noise(), 2.0 ** rng.uniform(-1.5, 0.5)
+    noise = replace(usual, load_nm=by * usual.load_nm, sensor_rad_s=by * usual.sensor_rad_s,
+                    torque_nm=by * usual.torque_nm)
+    return compliant_bench.TwoMass(motor, load, 473.0 * rng.uniform(0.6, 1.6), rng.uniform(12.0, 40.0)), noise, by
+
+
 def rigid(rng: np.random.Generator, seed: int) -> tuple[Recording, LoopPlant, float]:
     """Return a recording, the true shaft, and the friction at the load's end."""
-    noise = 2.0 ** rng.uniform(-1.0, 1.0)
-    usual = shaft_bench.Rig()
-    rig = replace(
-        usual,
-        inertia=104.0 * rng.uniform(0.7, 1.4), viscous=rng.uniform(3.0, 16.0), coulomb=rng.uniform(30.0, 80.0),
-        speed_poles=(rng.uniform(0.0, 0.5),), torque_poles=(rng.uniform(0.0, 0.3),),
-        load_sd=noise * usual.load_sd, ripple_sd=noise * usual.ripple_sd, sensor_sd=noise * usual.sensor_sd)
+    rig, _ = drawn_rig(rng)
     motion, _ = planned(guess=RigGuess(rig.inertia, rig.viscous, rig.coulomb))
     return shaft_bench.simulate(rig, motion, [seed])[0], LoopPlant(rig.inertia, rig.viscous), 0.0
 
 
 def two_mass(rng: np.random.Generator, seed: int) -> tuple[Recording, LoopPlant, float]:
     """Return a recording, the true shaft, and the friction at the load's end."""
-    motor, load = 1500.0 * rng.uniform(0.7, 1.4), 374.0 * rng.uniform(0.7, 1.6)
-    usual, by = compliant_bench.Noise(), 2.0 ** rng.uniform(-1.5, 0.5)
-    noise = replace(usual, load_nm=by * usual.load_nm, sensor_rad_s=by * usual.sensor_rad_s,
-                    torque_nm=by * usual.torque_nm)
-    plant = compliant_bench.TwoMass(motor, load, 473.0 * rng.uniform(0.6, 1.6), rng.uniform(12.0, 40.0))
+    plant, noise, _ = drawn_two_masses(rng)
     lags = rng.uniform(0.0, 0.5), rng.uniform(0.0, 0.3)
     found = compliant_bench.run(plant, [seed], noise=noise, lags_s=lags)[0]
-    swings = [(plant.stiffness * part) ** 0.5 / (2.0 * pi) for part in (1.0 / load, 1.0 / load + 1.0 / motor)]
-    shaft = LoopPlant(motor, plant.motor_viscous, spring=SpringLoad(swings[0], swings[1], plant.damping))
+    swings = [(plant.stiffness * part) ** 0.5 / (2.0 * pi)
+              for part in (1.0 / plant.load, 1.0 / plant.load + 1.0 / plant.motor)]
+    shaft = LoopPlant(plant.motor, plant.motor_viscous, spring=SpringLoad(swings[0], swings[1], plant.damping))
     return found, shaft, plant.load_viscous
 
 

@@ -37,7 +37,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 
 from benchmarks.kept_rows import kept_rows
-from benchmarks.speed_loop_margins import stated, upper_bound
+from benchmarks.speed_loop_margins import drawn_rig, drawn_two_masses, stated, upper_bound
 from tdhil.cli.tune_speed import plant_of
 from tdhil.estimation import identify
 from tdhil.report import LoopTunedFor, loop_document, result_document
@@ -49,6 +49,7 @@ from tests.estimation.planned_motions import planned
 WRONG = {"P": (True, False), "I": (False, True), "P and I": (True, True)}
 LEAST_AGREE, LEAST_FOUND = 0.95, 0.90
 CONTROL_PERIOD_S = 0.002
+LEAST_LAG_S = 0.05         # of the reported speed and torque
 TWO_MASS_RIG = {"load": "none", "limits": {"speed_min_rad_s": 0.5, "speed_max_rad_s": 10.0, "torque_nm": 4000.0,
                                            "time_s": 1800.0, "quick_stop_rad_s2": 1.0, "watchdog_s": 0.5,
                                            "probe_torque_nm": 800.0, "probe_travel_rad": 3.0}}
@@ -59,11 +60,7 @@ TWO_MASS = 100_000
 
 def rig_of(rng: np.random.Generator, seed: int) -> tuple[dict[str, Any], dict[str, Any], float]:
     """Return the simulated rig as a plant.yaml, the result of its identification, and the noise factor."""
-    noise, usual = 2.0 ** rng.uniform(-1.0, 1.0), shaft_bench.Rig()
-    rig = replace(
-        usual, inertia=104.0 * rng.uniform(0.7, 1.4), viscous=rng.uniform(3.0, 16.0), coulomb=rng.uniform(30.0, 80.0),
-        speed_poles=(rng.uniform(0.05, 0.5),), torque_poles=(rng.uniform(0.05, 0.3),),
-        load_sd=noise * usual.load_sd, ripple_sd=noise * usual.ripple_sd, sensor_sd=noise * usual.sensor_sd)
+    rig, noise = drawn_rig(rng, LEAST_LAG_S)
     motion, _ = planned(guess=RigGuess(rig.inertia, rig.viscous, rig.coulomb))
     recording = shaft_bench.simulate(rig, motion, [seed])[0]
     plant = {
@@ -79,17 +76,13 @@ def rig_of(rng: np.random.Generator, seed: int) -> tuple[dict[str, Any], dict[st
 
 def two_mass_rig_of(rng: np.random.Generator, seed: int) -> tuple[dict[str, Any], dict[str, Any], float]:
     """Return a simulated rig of two masses as a plant.yaml, the result of its identification, and the noise factor."""
-    motor, load = 1500.0 * rng.uniform(0.7, 1.4), 374.0 * rng.uniform(0.7, 1.6)
-    usual, by = compliant_bench.Noise(), 2.0 ** rng.uniform(-1.5, 0.5)
-    noise = replace(usual, load_nm=by * usual.load_nm, sensor_rad_s=by * usual.sensor_rad_s,
-                    torque_nm=by * usual.torque_nm)
-    shaft = compliant_bench.TwoMass(motor, load, 473.0 * rng.uniform(0.6, 1.6), rng.uniform(12.0, 40.0))
-    lags = rng.uniform(0.05, 0.5), rng.uniform(0.05, 0.3)
+    shaft, noise, by = drawn_two_masses(rng)
+    lags = rng.uniform(LEAST_LAG_S, 0.5), rng.uniform(LEAST_LAG_S, 0.3)
     recording = compliant_bench.run(shaft, [seed], noise=noise, lags_s=lags)[0]
     plant = {
-        "plant": {"kind": "two_mass", "inertia_kg_m2": motor, "viscous_nm_s_rad": shaft.motor_viscous,
+        "plant": {"kind": "two_mass", "inertia_kg_m2": shaft.motor, "viscous_nm_s_rad": shaft.motor_viscous,
                   "coulomb_nm": 60.0, "stiffness_nm_rad": shaft.stiffness, "damping_nm_s_rad": shaft.damping,
-                  "bottom": {"inertia_kg_m2": load, "viscous_nm_s_rad": shaft.load_viscous, "coulomb_nm": 30.0}},
+                  "bottom": {"inertia_kg_m2": shaft.load, "viscous_nm_s_rad": shaft.load_viscous, "coulomb_nm": 30.0}},
         "drive": {"speed_filter_s": rng.uniform(0.008, 0.04), "torque_lag_s": rng.uniform(0.004, 0.02),
                   "control_period_s": CONTROL_PERIOD_S, "rated_torque_nm": 10_000.0, "torque_limit_nm": 8000.0},
         "reporting": {"speed_lag_s": lags[0], "torque_lag_s": lags[1]},

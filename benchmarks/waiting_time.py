@@ -36,7 +36,7 @@ RESULT = {
      for name, value, low, high in (
     ("inertia_kg_m2", 15.0, 14.4, 15.6), ("viscous_nm_s_rad", 0.08, 0.07, 0.09), ("coulomb_nm", 6.0, 5.9, 6.1),
     ("speed_lag_s", 0.4, 0.39, 0.41))}
-"""What `tune` reads: a top drive, at the motor shaft."""
+"""Result of an identification, for `tune`: a top drive, at the motor shaft."""
 BARE_LOOP = "from benchmarks.cycle_rate import bare; bare({cycles})"
 
 

@@ -192,11 +192,12 @@ def _check(namespace: argparse.Namespace) -> None:
     if namespace.bit_noise is not None and namespace.string is None:
         raise UsageError("--bit-noise needs the string with its bit", where="--bit-noise",
                          next_step="--string string.yaml", entry=MessageCode.STRING_MISSING)
-    if namespace.map and (namespace.string is None or namespace.no_simulation):
+    if namespace.map and namespace.string is None:
+        raise UsageError("--map simulates the bit of string.yaml", where="--map", next_step="--string string.yaml",
+                         entry=MessageCode.STRING_MISSING)
+    if namespace.map and namespace.no_simulation:
         raise UsageError("--map simulates the bit of string.yaml", where="--map",
-                         next_step="Leave --no-simulation out" if namespace.string is not None else
-                         "--string string.yaml", entry=MessageCode.VALUE_NOT_ALLOWED if namespace.string is not None
-                         else MessageCode.STRING_MISSING)
+                         next_step="Leave --no-simulation out", entry=MessageCode.VALUE_NOT_ALLOWED)
     check_inner_lags(namespace)
 
 
@@ -394,7 +395,7 @@ def _drawn(
     fit = np.array([bounded_estimate(inertia) or total, *values], dtype=float)
     half = 0.5 * (fit[:, 2] - fit[:, 0])
     scale_rel = sqrt(max(0.0, (0.5 * (total[2] - total[0])) ** 2 - half[0] ** 2)) / total[1]
-    by_scale = scale_rel * fit[:, 1] * np.array([1.0, *(_SCALED[at] for at in range(len(values)))])
+    by_scale = scale_rel * fit[:, 1] * np.array([1.0, *_SCALED[: len(values)]])
     whole = np.maximum(np.hypot(half, by_scale), 1e-300)
     both = correlation * np.outer(half / whole, half / whole) + np.outer(by_scale / whole, by_scale / whole)
     np.fill_diagonal(both, 1.0)
@@ -407,7 +408,7 @@ def _drawn(
 _DRAWN = ("inertia_kg_m2", "stiffness_nm_rad", "antiresonance_hz", "damping_nm_s_rad", "load_inertia_kg_m2")
 """Quantities of a draw in the covariance of a result: J, then those of the string in their order."""
 _SCALED = (1.0, 0.0, 1.0, 1.0)
-"""Whether the torque scale multiplies k, f, c and J_L."""
+"""Power of the torque scale in k, f, c and J_L."""
 
 
 def _correlation(shaft: Mapping[str, Any], count: int) -> NDArray[np.float64] | None:

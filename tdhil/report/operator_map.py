@@ -67,8 +67,7 @@ def _rows(document: Part) -> tuple[str, tuple[tuple[str, ...], ...]]:
     weights = document.get("weights_on_bit_kn")
     said = [f"{torque / 1e3:.2g} kN·m" + ("" if weights is None else f", {weights[k]:.3g} kN")
             for k, torque in enumerate(document["bit_torques_nm"])]
-    states = document["states"].values()
-    rows = tuple((text, *(_row_words(rows[k], document["speeds_rpm"]) for rows in states))
+    rows = tuple((text, *(_row_words(states[k], document["speeds_rpm"]) for states in document["states"].values()))
                  for k, text in enumerate(said))
     return "bit torque" if weights is None else "bit torque, weight on bit", rows
 

@@ -346,7 +346,8 @@ class StopSequence:
                 patience.wait(self._loop.period_s)
                 continue
             regulated = sample.mode is Mode.SPEED
-            held_nm = 0.0 if regulated else held_nm
+            if regulated:
+                held_nm = 0.0
             if sample.state is not PowerState.ENABLED or (not regulated and since_s > MODE_S) or self._speed_doubted:
                 return False
             self._ask_position(sample.time_s)

@@ -288,21 +288,25 @@ class Supervisor:
         return address is not None and holder_of(address) is None and self.blocking_run(rig) is None
 
     def blocked(self, rig_id: str) -> str | None:
-        """Return the run of this rig that blocks it until it is signed off."""
-        return self._blocking([one for one in tuple(self._unconfirmed.values()) if one.rig == rig_id])
+        """Return the run that blocks the rig until it is signed off; None without one."""
+        return self._blocking(lambda one: one.rig == rig_id)
 
     def blocking_run(self, rig: RigFile) -> str | None:
         """Return the run that blocks the rig, or its drive under the name of another rig, until it is signed off."""
         found = self.blocked(rig.id)
-        if found is not None or not self._unconfirmed or rig.address is None:
+        if found is not None or not self._unconfirmed or (address := rig.address) is None:
             return found
-        return self._blocking([
-            one for one in tuple(self._unconfirmed.values())
-            if (read_json(self.store.place(one.id) / CONNECTION_FILE) or {}).get("address") == rig.address])
+        return self._blocking(lambda one: self._address_of(one.id) == address)
 
-    def _blocking(self, statuses: list[Status]) -> str | None:
+    def _blocking(self, of: Callable[[Status], bool]) -> str | None:
+        statuses = [one for one in tuple(self._unconfirmed.values()) if of(one)]
         found = blocking(statuses, [one.id for one in statuses if self.store.signed_off(one.id) is not None])
         return None if found is None else found.id
+
+    def _address_of(self, run: str) -> str | None:
+        """Return the address of the drive that a run used; None if the run stored none."""
+        found: str | None = (read_json(self.store.place(run) / CONNECTION_FILE) or {}).get("address")
+        return found
 
     def confirm(self, run: str, code: str, binding: str | None, who: str, lease: str | None = None) -> Status:
         """Send the code to the run. Raises NotThere, and Conflict (nothing to confirm; wrong code; void code).
@@ -407,7 +411,7 @@ class Supervisor:
             seen, said = _stop_seen([sys.executable, "-m", "tdhil.service.drive_stop", str(kept), *identity])
             if same:
                 return seen, said
-            address = (read_json(kept) or {}).get("address") or "unknown"
+            address = self._address_of(request.id) or "unknown"
             return False, (f"{said}, on the connection that the run used ({address}); {changed}, so tdhil"
                            " can't know whether this is still the rig's shaft")
         if not same:

@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import IO
 
@@ -62,9 +63,9 @@ class LogPlace:
         if found is not None:
             self.path, self.moved = found, f"{missing} was moved during the run: the log is now {found}"
             return
-        for folder in (missing.parent, Path.cwd, tempfile.gettempdir):
+        for folder in (partial(Path, missing.parent), Path.cwd, tempfile.gettempdir):
             with suppress(OSError):        # the working folder may be gone, and there may be no temporary one
-                target = _dated(Path(folder() if callable(folder) else folder) / missing.name, time.time())
+                target = _dated(Path(folder()) / missing.name, time.time())
                 with Path(f"/proc/self/fd/{self._descriptor}").open("rb") as source, target.open("xb") as copy:
                     shutil.copyfileobj(source, copy)
                 self._forget()
