@@ -2,7 +2,8 @@
 
     python benchmarks/impedance_coverage.py [--seeds 5] [--by offset|reference|both] [--filter 0.1]
                                             [--own-command] [--control 0] [--stepped 0] [--rate HZ]
-                                            [--setting NAME ...]
+                                            [--setting NAME ...] [--torque-scale LOW HIGH] [--scale-sd 0]
+                                            [--inner-lags TORQUE SPEED]
 
 Records in closed form (tests/estimation/impedance_bench.py, which shares no code with estimator or simulator) of the
 settings of the reference case, as a motor of 104 kg·m² has them, with reporting lags of 0.40 and 0.15 s, through the
@@ -12,7 +13,9 @@ rounding of its answer makes alike in every period, so that their coverage is th
 ``--control``: the loop is sampled at that period, s, as a real drive's is and the simulated one's, at 2 ms: with
 filters of 0.03 s it then lags by 0.029 s, and that is what is to be found. ``--stepped``: besides, so many whole runs
 of each setting on the simulated drive through CANopen, in stepped time, by the torque offset; ``--rate``: at so many
-cycles a second instead of the profile's.
+cycles a second instead of the profile's. ``--torque-scale``: each seed has its own ratio of reported to commanded
+torque, from LOW to HIGH in equal steps; ``--scale-sd`` is the stated standard uncertainty of the torque scale.
+``--inner-lags``: time constants of the torque loop and of the speed filter, s, instead of 0.01 and 0.02.
 
 Prints, for each setting: how many stand, the largest error of |r| from 0.05 to 1.5 Hz over all seeds, the mean of it,
 and how often each interval holds the truth. The exit code is 1 where an error of |r| is above 0.005 or a filter passes.
@@ -26,6 +29,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +41,8 @@ from sim_bus.params import DriveParams
 from tests.estimation.impedance_bench import SETTINGS, ZETA, Machine, found, record
 
 MOST = 0.005
-KEYS = (("gain_nm_s_rad", "P"), ("integral_nm_rad", "I"), ("inner_lag_s", "lags"))
+KEYS = (("gain_nm_s_rad", "P"), ("integral_nm_rad", "I"), ("inner_lag_s", "lags"), ("torque_lag_s", "torque lag"),
+        ("speed_filter_s", "speed filter"))
 
 
 def simulated(machine: Machine, seed: int, more: list[str]) -> dict[str, Any]:
@@ -54,18 +59,20 @@ def simulated(machine: Machine, seed: int, more: list[str]) -> dict[str, Any]:
         return document.get("impedance") or {"verdict": str(document.get("error"))}
 
 
-def in_closed_form(machine: Machine, by: str, seed: int, draw: int = 1) -> dict[str, Any]:
+def in_closed_form(machine: Machine, by: str, seed: int, draw: int = 1, scale_sd: float = 0.0) -> dict[str, Any]:
     """The same of a record in closed form."""
     from dataclasses import asdict
 
-    seen = found(record(machine, by, seed, draw=draw))
+    seen = found(record(machine, by, seed, draw=draw, scale_sd=scale_sd))
     return asdict(seen) | {"verdict": seen.verdict.value}
 
 
 def row(title: str, machine: Machine, every: Iterator[dict[str, Any]]) -> float:
     """Print one; the largest error of |r|."""
     total, errors, hits = 0, [], dict.fromkeys(KEYS, 0)
-    truth = {"gain_nm_s_rad": machine.gain, "integral_nm_rad": machine.integral, "inner_lag_s": machine.inner_lag}
+    truth = {"gain_nm_s_rad": machine.gain, "integral_nm_rad": machine.integral, "inner_lag_s": machine.inner_lag,
+             "torque_lag_s": machine.torque_lag, "speed_filter_s": machine.speed_filter}
+    widths: dict[str, list[float]] = {short: [] for _, short in KEYS}
     for one in every:
         total += 1
         if one["verdict"] != "valid":
@@ -75,8 +82,10 @@ def row(title: str, machine: Machine, every: Iterator[dict[str, Any]]) -> float:
         errors.append(np.abs(told - machine.reflection(hertz)))
         for key, short in KEYS:
             hits[key, short] += one[key]["low"] <= truth[key] <= one[key]["high"]
+            widths[short].append(one[key]["high"] - one[key]["low"])
     stand = len(errors)
-    held = ", ".join(f"{short} {100 * count / max(stand, 1):.0f} %" for (_, short), count in hits.items())
+    held = ", ".join(f"{short} {count} (width {np.median(widths[short]) if stand else np.nan:.3g})"
+                     for (_, short), count in hits.items())
     worst = float(max((error.max() for error in errors), default=np.nan))
     mean = float(np.mean(errors)) if errors else np.nan
     print(f"{title:<34} stand {stand}/{total}   |r| off by {worst:.4f} at most, {mean:.4f} in the mean   held: {held}",
@@ -93,6 +102,9 @@ def main() -> int:
     parser.add_argument("--control", type=float, default=0.0, metavar="S")
     parser.add_argument("--stepped", type=int, default=0, metavar="RUNS")
     parser.add_argument("--rate", type=float, metavar="HZ")
+    parser.add_argument("--torque-scale", type=float, nargs=2, default=(1.0, 1.0), metavar=("LOW", "HIGH"))
+    parser.add_argument("--scale-sd", type=float, default=0.0, metavar="SHARE")
+    parser.add_argument("--inner-lags", type=float, nargs=2, default=(0.010, 0.020), metavar=("TORQUE", "SPEED"))
     parser.add_argument("--setting", nargs="+", choices=tuple(SETTINGS), default=list(SETTINGS), metavar="NAME")
     asked = parser.parse_args()
     bad = False
@@ -101,8 +113,11 @@ def main() -> int:
     ways = ("offset", "reference") if asked.by == "both" else (asked.by,)
     for by in ways:
         for name, (gain, integral) in settings.items() if asked.seeds else ():
-            machine = Machine(gain=gain, integral=integral, control=asked.control)
-            runs = (in_closed_form(machine, by, k, k if asked.own_command else 1) for k in range(asked.seeds))
+            machine = Machine(gain=gain, integral=integral, control=asked.control, torque_lag=asked.inner_lags[0],
+                              speed_filter=asked.inner_lags[1])
+            scales = np.random.default_rng(1).permutation(np.linspace(*asked.torque_scale, asked.seeds))
+            runs = (in_closed_form(replace(machine, torque_scale=float(scale)), by, k, k if asked.own_command else 1,
+                                   asked.scale_sd) for k, scale in enumerate(scales))
             bad |= row(f"{name}, {by}", machine, runs) > MOST
     if asked.filter > 0.0 and "reference" in ways:
         for name, (gain, integral) in settings.items():

@@ -97,9 +97,16 @@ class StoredCalibration:
         return f"{age.days} days old, and valid for {valid_days:g}" if age > timedelta(days=valid_days) else ""
 
     def applied(self, recording: Recording) -> Recording:
-        """Return the recording with every torque in calibrated N·m."""
+        """Return the recording with every torque in calibrated N·m.
+
+        The commanded torque offset of a measured impedance stays in the drive's N·m. A calibration of the reported
+        torque does not make the ratio to the commanded torque more certain.
+        """
         factor = self.factor
-        limit = recording.torque_limit_nm
+        limit, asked = recording.torque_limit_nm, recording.impedance
+        ratio_sd = math.sqrt(2.0) * recording.torque_scale_rel_sd
+        if asked is not None and asked.torque_ratio_rel_sd is not None:
+            ratio_sd = asked.torque_ratio_rel_sd
         return replace(
             recording,
             torque_nm=factor * recording.torque_nm,
@@ -109,6 +116,8 @@ class StoredCalibration:
             torque_offset_nm=factor * recording.torque_offset_nm,
             torque_resolution_nm=factor * recording.torque_resolution_nm,
             torque_scale_rel_sd=self.rel_sd,
+            impedance=None if asked is None else replace(
+                asked, torque_ratio=factor * asked.torque_ratio, torque_ratio_rel_sd=ratio_sd),
         )
 
 

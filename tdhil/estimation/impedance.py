@@ -4,15 +4,27 @@
 
     ω = E u / Z,   Z = J s + B + F H_t (P + I/s)         E = H_t e^(−ds)              a torque offset u
                                                          E = H_t (P + I/s) G e^(−ds)   the speed reference u
-    W = H_w ω      T = H_T (J s + B) ω e^(−ks)           reported speed and torque
+    W = H_w ω      T = κ H_T (J s + B) ω e^(−ks)         reported speed and torque
 
 H_t = 1/(1 + τ_t s): torque loop. F = 1/(1 + τ_f s): speed filter in the loop. H_w and H_T: filters of the reports. G:
-the known reference filter, 1 without one. d: delay of a command. k: time by which torque is read later than speed.
+the known reference filter, 1 without one. d: delay of a command. k: time by which torque is read later than speed. κ:
+reported torque over commanded torque.
 
 **Why these signals suffice.** The string loads a drive with constant reference by τ: −τ/ω = Z. A torque offset acts at
 the same place as the string, except for H_t. Z then follows from W alone, for any J. T also gives J s + B, and so the
 parts of Z. With an input at the reference, Z follows only from the gains of the loop, and smoothing of the reference
 would change them. The fit therefore searches for an undeclared filter, and refuses the result if it finds one.
+
+**Ratio of the torque scales.** A torque offset is known in the scale of the commanded torque, and T in the scale of the
+reported torque. At low frequencies only J − P (τ_t + τ_f) acts on ω. So a ratio κ of 1.03, taken as 1, changes the
+inner lags by 0.03 J/P. With a torque offset, κ is therefore a parameter. The data determine it as far as they can;
+besides, κ is known within the standard uncertainties of both scales. All other values are in the scale of the command.
+With an input at the reference, ω does not depend on the scale of torque: Z is in the scale of the report, and κ counts
+only in the P and I of the drive.
+
+**A lag of 0.** If the best lag is at its bound of 0, the intervals of the inner lags come from the profile likelihood:
+−2 ln L of the best fit for each fixed value. All other intervals include the variance of the lags at their bounds, as
+if these were free.
 
 **Lines.** Under speed control a disturbance of the shaft decays. The scatter from period to period is mostly what one
 period passes to the next; it cancels in the mean, but would count as error. Therefore all P counted periods are one
@@ -55,12 +67,16 @@ REFERENCE: Final = "reference"
 
 (
     INERTIA, VISCOUS, GAIN, INTEGRAL, TORQUE_LAG, SPEED_FILTER, SPEED_REPORT, TORQUE_REPORT, DELAY, SKEW,
-    REFERENCE_FILTER,
-) = range(11)
-_SIZE: Final = 11              # number of parameters: those of the line above
+    REFERENCE_FILTER, TORQUE_RATIO,
+) = range(12)
+_SIZE: Final = 12              # number of parameters: those of the line above
 _LAG_BOUND_S, _INNER_BOUND_S, _DELAY_BOUND_S = 3.0, 0.5, 0.5
 """Bounds of the fit, s: lags of the reports and of the reference, lags inside the drive's loop, delay and time offset.
 They keep the descent from running away: a parameter at its bound has no standard deviation."""
+_LAGS: Final = (TORQUE_LAG, SPEED_FILTER, SPEED_REPORT, TORQUE_REPORT)
+_RATIO_BOUNDS: Final = (0.5, 2.0)      # of the ratio of the torque scales
+_PROFILE_SHARE = 0.01          # of the quadratic half-width: accuracy of an end of a profile interval
+_MOST_PROFILE_FITS = 12        # fits for one end of a profile interval, at most
 _SIGNALS = 2                   # speed and torque
 _LEAST_PERIODS = 5             # fewest periods in a row: an excited line then has at least four lines beside it
 _BESIDE = 5                    # most noise lines used on either side of an excited line
@@ -229,6 +245,12 @@ class _Prior:
     row: FloatArray                # (P,)
     mean: float
     sd: float
+    reported: bool = False         # in the scale of the reported torque
+
+    def residual(self, theta: FloatArray) -> float:
+        """Return the deviation in standard deviations."""
+        scale = theta[TORQUE_RATIO] if self.reported else 1.0
+        return float((scale * (self.row @ theta) - self.mean) / self.sd)
 
 
 @dataclass(frozen=True)
@@ -237,6 +259,7 @@ class ImpedanceProblem:
 
     by: str
     declared_s: float              # time constant of the reference filter
+    ratio: float                   # expected ratio of the torque scales, reported over commanded
     s: ComplexArray
     u: ComplexArray
     x: ComplexArray
@@ -250,7 +273,7 @@ class ImpedanceProblem:
         s = self.s
         omega = excitation_of(self.by, theta, s, self.declared_s) / impedance_of(theta, s)
         speed = omega / (1.0 + theta[SPEED_REPORT] * s)
-        torque = (theta[INERTIA] * s + theta[VISCOUS]) * omega * np.exp(-theta[SKEW] * s)
+        torque = theta[TORQUE_RATIO] * (theta[INERTIA] * s + theta[VISCOUS]) * omega * np.exp(-theta[SKEW] * s)
         torque = torque / (1.0 + theta[TORQUE_REPORT] * s)
         return np.stack([speed, torque], axis=1)
 
@@ -262,7 +285,7 @@ class ImpedanceProblem:
     def residuals(self, theta: FloatArray) -> FloatArray:
         """Return the residuals of the lines and then of the priors, each with unit variance."""
         whitened = math.sqrt(2.0) * np.einsum("kij,kmj->kmi", self.white, self.errors(theta))
-        known = [(one.row @ theta - one.mean) / one.sd for one in self.priors]
+        known = [one.residual(theta) for one in self.priors]
         return np.concatenate([whitened.real.ravel(), whitened.imag.ravel(), np.asarray(known, dtype=np.float64)])
 
     def slopes(self, theta: FloatArray, scale: FloatArray) -> FloatArray:
@@ -317,6 +340,7 @@ def _problem(case: PeriodicCase, asked: ImpedanceInput) -> ImpedanceProblem | Dr
     return ImpedanceProblem(
         by=asked.by,
         declared_s=asked.reference_filter_s,
+        ratio=asked.torque_ratio if asked.by == OFFSET else 1.0,
         s=np.array([2j * np.pi * line.hertz for line in lines], dtype=np.complex128),
         u=np.array([line.u for line in lines], dtype=np.complex128),
         x=np.array([line.x for line in lines], dtype=np.complex128),
@@ -328,8 +352,8 @@ def _problem(case: PeriodicCase, asked: ImpedanceInput) -> ImpedanceProblem | Dr
 
 
 def _priors(case: PeriodicCase, asked: ImpedanceInput, period_s: float) -> tuple[_Prior, ...]:
-    """Return the prior knowledge: the delay of a command (about one cycle), the time offset, stated lags, and B from
-    levels.
+    """Return the prior knowledge: the delay of a command (about one cycle), the time offset, stated lags, the ratio of
+    the torque scales, and B from levels.
     """
     known = case.recording.lag_prior
     found = [_prior(DELAY, 0.25 * period_s, max(period_s, 1e-3)), _prior(SKEW, 0.0, max(known.skew_sd_s, 1e-4))]
@@ -337,13 +361,26 @@ def _priors(case: PeriodicCase, asked: ImpedanceInput, period_s: float) -> tuple
         found.append(_prior(SPEED_REPORT, known.speed_lag_s, max(known.speed_lag_sd_s, 1e-4)))
     if known.torque_lag_s is not None:
         found.append(_prior(TORQUE_REPORT, known.torque_lag_s, max(known.torque_lag_sd_s, 1e-4)))
+    ratio_sd = _ratio_rel_sd(case, asked)
+    if asked.by == OFFSET and ratio_sd > 0.0:
+        found.append(_prior(TORQUE_RATIO, asked.torque_ratio, asked.torque_ratio * ratio_sd))
     tie = case.constraint
     if tie is not None:
         row = np.zeros(_SIZE)
         row[VISCOUS], row[INERTIA] = 1.0, tie.slope_per_inertia
         widened = math.sqrt(tie.dof / (tie.dof - 2.0)) if tie.dof > 3.0 else 2.0
-        found.append(_Prior(row, tie.slope, widened * tie.sd))
+        found.append(_Prior(row, tie.slope, widened * tie.sd, reported=True))
     return tuple(found)
+
+
+def _ratio_rel_sd(case: PeriodicCase, asked: ImpedanceInput) -> float:
+    """Return the relative standard uncertainty of the ratio of the torque scales.
+
+    The drive converts commands and reports separately. Each of the two scales has the stated standard uncertainty, so
+    their ratio has √2 times as much.
+    """
+    stated = asked.torque_ratio_rel_sd
+    return math.sqrt(2.0) * case.recording.torque_scale_rel_sd if stated is None else stated
 
 
 def _prior(index: int, mean: float, sd: float) -> _Prior:
@@ -358,17 +395,21 @@ def _prior(index: int, mean: float, sd: float) -> _Prior:
 
 @dataclass(frozen=True)
 class FittedImpedance:
-    """Best theta, the parameters that moved and ended inside their bounds, and −2 ln L up to a constant."""
+    """Best theta, the parameters that moved and ended inside their bounds, and −2 ln L up to a constant.
+
+    ``zero``: lags that ended at their bound of 0.
+    """
 
     theta: FloatArray
     inside: BoolArray
+    zero: BoolArray
     objective: float
     scale: FloatArray
 
 
 def fit(problem: ImpedanceProblem, *, with_filter: bool = False) -> FittedImpedance:
     """Return the best fit. ``with_filter``: also fit a first-order reference filter."""
-    held = {REFERENCE_FILTER} if not with_filter or problem.by == OFFSET else set()
+    held = _held(problem, with_filter=with_filter)
     stated = {int(np.argmax(one.row)): one.mean for one in problem.priors if np.count_nonzero(one.row) == 1}
     best: FittedImpedance | None = None
     for lags in _STARTS_S:
@@ -379,15 +420,27 @@ def fit(problem: ImpedanceProblem, *, with_filter: bool = False) -> FittedImpeda
     return best
 
 
-def _descended(problem: ImpedanceProblem, start: FloatArray, held: set[int]) -> FittedImpedance:
-    inertia, viscous, gain, integral = (float(start[k]) for k in (INERTIA, VISCOUS, GAIN, INTEGRAL))
+def _held(problem: ImpedanceProblem, *, with_filter: bool = False) -> set[int]:
+    """Return the parameters that the fit does not change."""
+    held = set() if with_filter and problem.by == REFERENCE else {REFERENCE_FILTER}
+    return held if any(one.row[TORQUE_RATIO] for one in problem.priors) else held | {TORQUE_RATIO}
+
+
+def _descended(
+    problem: ImpedanceProblem, start: FloatArray, held: set[int], like: FloatArray | None = None
+) -> FittedImpedance:
+    """Return the fit from ``start``. Bounds and natural scales follow from ``like``; by default, from ``start``."""
+    like = start if like is None else like
+    inertia, viscous, gain, integral = (float(like[k]) for k in (INERTIA, VISCOUS, GAIN, INTEGRAL))
     friction = max(abs(viscous), 0.01 * gain, 0.01 * inertia)
-    scale = np.array([inertia, friction, gain, integral, 0.01, 0.01, 0.1, 0.1, 0.005, 0.005, 0.05])
+    scale = np.array([inertia, friction, gain, integral, 0.01, 0.01, 0.1, 0.1, 0.005, 0.005, 0.05,
+                      0.01])
     high = np.array([100.0 * inertia, 100.0 * friction, 1e3 * gain, 1e4 * integral, _INNER_BOUND_S, _INNER_BOUND_S,
-                     _LAG_BOUND_S, _LAG_BOUND_S, _DELAY_BOUND_S, _DELAY_BOUND_S, _LAG_BOUND_S])
+                     _LAG_BOUND_S, _LAG_BOUND_S, _DELAY_BOUND_S, _DELAY_BOUND_S, _LAG_BOUND_S, _RATIO_BOUNDS[1]])
     low = np.zeros(_SIZE)
+    low[TORQUE_RATIO] = _RATIO_BOUNDS[0]
     positive = [INERTIA, GAIN, INTEGRAL]
-    low[positive] = 1e-4 * start[positive]
+    low[positive] = 1e-4 * like[positive]
     low[VISCOUS], low[SKEW], low[DELAY] = -high[VISCOUS], -_DELAY_BOUND_S, -_DELAY_BOUND_S
     free: BoolArray = np.array([index not in held for index in range(_SIZE)])
     box = Box(low, high, scale)
@@ -396,13 +449,14 @@ def _descended(problem: ImpedanceProblem, start: FloatArray, held: set[int]) -> 
     )
     near = _AT_BOUND * scale
     inside = free & (found.theta > low + near) & (found.theta < high - near)
-    return FittedImpedance(found.theta, inside, found.objective, scale)
+    lags = np.isin(np.arange(_SIZE), _LAGS)
+    return FittedImpedance(found.theta, inside, free & lags & (found.theta <= low + near), found.objective, scale)
 
 
 def _start(problem: ImpedanceProblem, speed_s: float, torque_s: float, delay_s: float, with_filter: bool) -> FloatArray:
     s, u = problem.s[:, None], problem.u
     omega = problem.x[:, :, 0] * (1.0 + speed_s * s)
-    torque = problem.x[:, :, 1] * (1.0 + torque_s * s)
+    torque = problem.x[:, :, 1] * (1.0 + torque_s * s) / problem.ratio
     ones = np.ones_like(omega)
     inertia, viscous = _real_fit([s * ones, ones], torque / omega)
     inertia = inertia if inertia > 0.0 else float(np.median(np.abs(torque / omega / s)))
@@ -414,6 +468,7 @@ def _start(problem: ImpedanceProblem, speed_s: float, torque_s: float, delay_s: 
     theta[[TORQUE_LAG, SPEED_FILTER, SPEED_REPORT, TORQUE_REPORT]] = 0.01, 0.02, speed_s, torque_s
     theta[DELAY] = delay_s
     theta[REFERENCE_FILTER] = 0.05 if with_filter else 0.0
+    theta[TORQUE_RATIO] = problem.ratio
     return theta
 
 
@@ -440,8 +495,8 @@ class _ThetaSpread:
     def __init__(
         self, problem: ImpedanceProblem, fitted: FittedImpedance, confidence: float, other: _ThetaSpread | None = None
     ) -> None:
-        self._fitted, self._confidence, self._other = fitted, confidence, other
-        self._moved = np.flatnonzero(fitted.inside)
+        self._problem, self._fitted, self._confidence, self._other = problem, fitted, confidence, other
+        self._moved = np.flatnonzero(fitted.inside | fitted.zero)
         slopes = problem.slopes(fitted.theta, fitted.scale)[:, self._moved]
         lines = 2 * problem.x.size
         count, segments = len(problem.s), problem.x.shape[1]
@@ -455,6 +510,8 @@ class _ThetaSpread:
         size = fitted.scale[self._moved]
         information: FloatArray = np.sum(parts, axis=0) * np.outer(size, size)
         self._inverse = np.linalg.pinv(information, rcond=1e-13, hermitian=True) * np.outer(size, size)
+        plain = (slopes.T @ slopes) * np.outer(size, size)
+        self._plain = np.linalg.pinv(plain, rcond=1e-13, hermitian=True) * np.outer(size, size)
 
     def around(self, function: Callable[[FloatArray], FloatArray], extra_sd: FloatArray | None = None
                ) -> tuple[Estimate, ...]:
@@ -478,6 +535,82 @@ class _ThetaSpread:
                      for one, two in zip(found, also, strict=True)]
         return tuple(found)
 
+    def at_least_zero(
+        self, rows: FloatArray, *, extra_sd: FloatArray | None = None, profiled: bool = False
+    ) -> tuple[Estimate, ...]:
+        """Return the sum of parameters that each row (N, P) selects, with its interval, not below 0.
+
+        ``profiled``: the intervals are those of the profile likelihood. They are so too with an inner lag at its bound
+        of 0. ``extra_sd`` (N,) is added in quadrature.
+        """
+        found = [_not_below_zero(one) for one in self.around(lambda theta: rows @ theta, extra_sd)]
+        if profiled or self._fitted.zero[[TORQUE_LAG, SPEED_FILTER]].any():
+            plain = self.around(lambda theta: rows @ theta)
+            found = [self._profiled(row, one) for row, one in zip(rows, plain, strict=True)]
+            if extra_sd is not None:
+                more = student_quantile(self._confidence, 1e6) * extra_sd
+                found = [Estimate(one.value, max(one.value - math.hypot(one.value - one.low, add), 0.0),
+                                  one.value + math.hypot(one.high - one.value, add))
+                         for one, add in zip(found, more.tolist(), strict=True)]
+        if self._other is not None:
+            also = self._other.at_least_zero(rows, extra_sd=extra_sd, profiled=profiled)
+            found = [replace(one, low=min(one.low, two.low), high=max(one.high, two.high))
+                     for one, two in zip(found, also, strict=True)]
+        return tuple(found)
+
+    def _profiled(self, row: FloatArray, quadratic: Estimate) -> Estimate:
+        value, half = quadratic.value, quadratic.high - quadratic.value
+        column = row[self._moved]
+        variance = float(column @ self._plain @ column)
+        if not (half > 0.0 and variance > 0.0 and math.isfinite(half)):
+            return _not_below_zero(quadratic)
+        allowed = half / math.sqrt(variance)
+        toward = np.zeros(_SIZE)
+        toward[self._moved] = self._plain @ column / variance
+
+        def rise(target: float) -> float:
+            """Return √ of the rise of −2 ln L with the sum held at ``target``, over the allowed one."""
+            tight = _Prior(row, target, 1e-3 * half)
+            bound = replace(self._problem, priors=(*self._problem.priors, tight))
+            start = self._fitted.theta + (target - value) * toward
+            best = _descended(bound, start, _held(self._problem), self._fitted.theta)
+            return math.sqrt(max(best.objective - tight.residual(best.theta) ** 2 - self._fitted.objective, 0.0)
+                             ) / allowed
+
+        high = _crossing(rise, value, half, math.inf if row[GAIN] else _INNER_BOUND_S * float(np.sum(row)))
+        low = _crossing(rise, value, -half, 0.0) if value > 0.0 else 0.0
+        return Estimate(value, low, high)
+
+
+def _crossing(rise: Callable[[float], float], value: float, step: float, limit: float) -> float:
+    """Return the point at which ``rise`` exceeds 1, from ``value`` in the direction of ``step``, at most ``limit``.
+
+    The point is outside of the crossing by at most `_PROFILE_SHARE` of ``step``.
+    """
+    def further(point: float) -> float:
+        return min(point + step, limit) if step > 0.0 else max(point + step, limit)
+
+    inner, at_inner = value, 0.0
+    outer = further(inner)
+    at_outer = rise(outer)
+    for _ in range(_MOST_PROFILE_FITS):
+        if at_outer < 1.0:
+            if outer == limit:
+                break
+            inner, at_inner, outer = outer, at_outer, further(outer)
+            at_outer = rise(outer)
+            continue
+        if abs(outer - inner) <= _PROFILE_SHARE * abs(step):
+            break
+        share = min(max((1.0 - at_inner) / (at_outer - at_inner), 0.1), 0.9)
+        middle = inner + (outer - inner) * share
+        at_middle = rise(middle)
+        if at_middle < 1.0:
+            inner, at_inner = middle, at_middle
+        else:
+            outer, at_outer = middle, at_middle
+    return outer
+
 
 def residual_test(problem: ImpedanceProblem, fitted: FittedImpedance) -> ResidualTest | None:
     """Return Bartlett's form of Wilks' Λ, (2ν + M − 2) ln det(1 + S⁻¹ Σ e eᴴ/ν) ~ χ²(4M) a line, with the priors'
@@ -492,7 +625,7 @@ def residual_test(problem: ImpedanceProblem, fitted: FittedImpedance) -> Residua
         spread = errors[k].T @ errors[k].conj()
         matrix = np.eye(_SIGNALS) + np.linalg.solve(problem.covariance[k], spread) / nu
         statistic += (2.0 * nu + segments - _SIGNALS) * math.log(abs(np.linalg.det(matrix)))
-    statistic += float(sum(((one.row @ fitted.theta - one.mean) / one.sd) ** 2 for one in problem.priors))
+    statistic += sum(one.residual(fitted.theta) ** 2 for one in problem.priors)
     measured = 2.0 * _SIGNALS * segments * len(problem.nu) + len(problem.priors)
     left = measured - float(np.count_nonzero(fitted.inside))
     if left < 1.0:
@@ -524,36 +657,64 @@ def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProbl
             " ramp, notch); report filters other than first-order lags.",
         )
     spread = _ThetaSpread(problem, fitted, confidence, _small_filter(problem, fitted, confidence))
-    gains = spread.around(
-        lambda theta: np.array([
-            theta[GAIN], theta[INTEGRAL], theta[TORQUE_LAG] + theta[SPEED_FILTER], theta[TORQUE_LAG],
-            theta[SPEED_FILTER], theta[INERTIA], theta[VISCOUS],
-        ]),
-        np.array([_sampled_integral_sd(fitted.theta), *([0.0] * 6)]),
-    )
-    if not gains[0].bounded:
+    gain_sd, integral_sd = _gain_sds(fitted.theta, 0.0 if asked.by == OFFSET else _ratio_rel_sd(case, asked))
+    integral, inertia, viscous = spread.around(
+        lambda theta: theta[[INTEGRAL, INERTIA, VISCOUS]], np.array([integral_sd, 0.0, 0.0]))
+    rows, extra = _rows(), np.array([gain_sd, 0.0, 0.0, 0.0])
+    gain = spread.around(lambda theta: theta[[GAIN]], extra[:1])[0]
+    wide = not gain.bounded
+    if wide and not (gain.finite and _bounded_at_ratio(problem, fitted, confidence)):
         return replace(bare, reason="the data leave the loop's gain open", advice=_MORE)
-    gain, integral, inner, torque_lag, speed_filter, inertia, viscous = gains
+    gain, inner, torque_lag, speed_filter = spread.at_least_zero(rows, extra_sd=extra, profiled=wide)
     explained = "untested" if test is None else f"p = {p_value:.2g}"
     return replace(
         bare,
         verdict=Verdict.VALID,
         reason=f"a speed loop of P and I on a rigid shaft explains speed and torque ({explained})",
-        advice="" if asked.string_nm_s_rad > 0.0 else "name the string (--string-impedance) to have |r| as well",
+        advice="; ".join(
+            ([_WIDE] if wide else [])
+            + ([] if asked.string_nm_s_rad > 0.0 else ["name the string (--string-impedance) to have |r| as well"])),
         gain_nm_s_rad=gain,
         integral_nm_rad=_not_below_zero(integral),
-        inner_lag_s=_not_below_zero(inner),
-        torque_lag_s=_not_below_zero(torque_lag),
-        speed_filter_s=_not_below_zero(speed_filter),
+        inner_lag_s=inner,
+        torque_lag_s=torque_lag,
+        speed_filter_s=speed_filter,
         inertia_kg_m2=inertia,
         viscous_nm_s_rad=viscous,
         points=_points(case, asked, problem, fitted, spread),
     )
 
 
-def _sampled_integral_sd(theta: FloatArray) -> float:
-    """Return the standard uncertainty of P from the drive's unknown rule of integration, N·m·s/rad."""
-    return float(theta[INTEGRAL]) * 0.5 * CONTROL_PERIOD_S / math.sqrt(3.0)
+_WIDE: Final = (
+    "P and the lags have wide intervals, because the scales of commanded and reported torque may differ: if both are"
+    " known better, state a smaller drive_data.torque_scale_rel_sd in rig.yaml"
+)
+
+
+def _rows() -> FloatArray:
+    """Return the rows (4, P) of P, the sum of the inner lags, the lag of the torque and the speed filter."""
+    rows = np.zeros((4, _SIZE))
+    for row, parameters in zip(rows, ((GAIN,), (TORQUE_LAG, SPEED_FILTER), (TORQUE_LAG,), (SPEED_FILTER,)),
+                               strict=True):
+        row[list(parameters)] = 1.0
+    return rows
+
+
+def _bounded_at_ratio(problem: ImpedanceProblem, fitted: FittedImpedance, confidence: float) -> bool:
+    """Return whether P would be bounded if the ratio of the torque scales were known exactly."""
+    inside = fitted.inside & (np.arange(_SIZE) != TORQUE_RATIO)
+    exact = _ThetaSpread(problem, replace(fitted, inside=inside), confidence)
+    return exact.around(lambda theta: theta[[GAIN]])[0].bounded
+
+
+def _gain_sds(theta: FloatArray, ratio_rel_sd: float) -> tuple[float, float]:
+    """Return further standard uncertainties of P, N·m·s/rad, and I, N·m/rad.
+
+    Their sources are the drive's unknown rule of integration and the ratio of the torque scales.
+    """
+    gain, integral = float(theta[GAIN]), float(theta[INTEGRAL])
+    sampled = integral * 0.5 * CONTROL_PERIOD_S / math.sqrt(3.0)
+    return math.hypot(sampled, ratio_rel_sd * gain), ratio_rel_sd * integral
 
 
 def _not_below_zero(one: Estimate) -> Estimate:
@@ -593,7 +754,7 @@ def _small_filter(problem: ImpedanceProblem, plain: FittedImpedance, confidence:
     start = plain.theta.copy()
     for filter_s in _SMALL_FILTERS_S:
         start[REFERENCE_FILTER] = filter_s
-        fitted = _descended(problem, start, {REFERENCE_FILTER})
+        fitted = _descended(problem, start, _held(problem))
         best = min(best, fitted.objective)
         if fitted.objective - best > _SMALL_FILTER_LOSS:
             break
@@ -664,11 +825,15 @@ def _seen(problem: ImpedanceProblem, fitted: FittedImpedance) -> dict[float, tup
 
 
 def _conditions(case: PeriodicCase, asked: ImpedanceInput) -> tuple[str, ...]:
-    found = ["P, I and Z in the scale of the drive's own torque", "first-order lags in loop and reports",
+    scale = "commanded torque" if asked.by == OFFSET else "reported torque"
+    found = [f"P, I and Z in the scale of the drive's {scale}", "first-order lags in loop and reports",
              f"P for a drive that integrates every {1e3 * CONTROL_PERIOD_S:g} ms or faster"]
     if asked.by == REFERENCE:
         declared = asked.reference_filter_s
         found.append(f"a reference filter of {declared:g} s" if declared > 0.0 else "no reference filter")
+    ratio_sd = _ratio_rel_sd(case, asked)
+    found.append(f"reported torque over commanded torque {asked.torque_ratio:.4g} ± {100.0 * ratio_sd:.2g} % (1 sd)"
+                 if ratio_sd > 0.0 else f"reported torque over commanded torque exactly {asked.torque_ratio:.4g}")
     if case.recording.lag_prior.source:
         found.append(f"reporting lags as stated by {case.recording.lag_prior.source}")
     return tuple(found)

@@ -264,8 +264,10 @@ class DriveImpedance:
     """Impedance of a drive's speed loop as seen by the load on its shaft, Z = J s + B + H(s)(P + I/s), at the motor.
 
     H = 1/((1 + τ_t s)(1 + τ_f s)) are the lags inside the loop: of its torque and of its speed feedback.
-    ``inner_lag_s`` is their sum, which is known better than either. P and I are those of the drive, in its own scale of
-    torque. Estimates are None if the verdict is a refusal.
+    ``inner_lag_s`` is their sum, which is known better than either. P and I are those of the drive. With a torque
+    offset all values are in the scale of the commanded torque; with the reference as input, in that of the reported
+    torque. The intervals of P, I and lags include the ratio of both scales. Estimates are None if the verdict is a
+    refusal.
     """
 
     verdict: Verdict

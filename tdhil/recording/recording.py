@@ -130,13 +130,17 @@ class ImpedanceInput:
 
     ``count``: resolution of the command, N·m or rad/s; commands are rounded to it (0: no rounding). A command is held
     from one sample to the next. ``reference_filter_s``: known first-order filter of the drive's speed reference, s.
-    ``string_nm_s_rad``: impedance ζ of the string for |r|, at the motor; 0: unknown.
+    ``string_nm_s_rad``: impedance ζ of the string for |r|, at the motor; 0: unknown. ``torque_ratio``: expected ratio
+    of reported to commanded torque. ``torque_ratio_rel_sd``: its relative standard uncertainty. None: it follows from
+    the torque scale's.
     """
 
     by: str                            # offset or reference
     count: float = 0.0
     reference_filter_s: float = 0.0
     string_nm_s_rad: float = 0.0
+    torque_ratio: float = 1.0
+    torque_ratio_rel_sd: float | None = None
 
 
 @dataclass(frozen=True)

@@ -126,6 +126,8 @@ def impedance_rows(document: Mapping[str, Any]) -> Iterator[Row]:
     yield "its P", estimate_text(found["gain_nm_s_rad"], "N·m·s/rad")
     yield "its I", estimate_text(found["integral_nm_rad"], "N·m/rad")
     yield "lags in its loop", estimate_text(found["inner_lag_s"], "s")
+    if found["advice"]:
+        yield "", Text(found["advice"], style="italic")
     seen = [point for point in found["points"] if point["reflection_total"] is not None]
     if seen:
         least = min(seen, key=lambda point: float(point["reflection_total"]["value"]))

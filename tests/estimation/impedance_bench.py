@@ -51,6 +51,7 @@ class Machine:
     torque_quantum: float = 1.0
     period: float = 0.004
     late: float = 0.0              # of the command
+    torque_scale: float = 1.0      # reported torque over commanded torque
     control: float = 0.0           # the loop's own sampling period, 0 for a continuous one
 
     def lag(self, time, s):
@@ -93,7 +94,7 @@ class Machine:
         return drive * np.exp(-self.late * s) / self.impedance(s.imag / (2.0 * np.pi))
 
     def reported(self, speed, s):
-        torque = (self.inertia * s + self.viscous) * speed
+        torque = self.torque_scale * (self.inertia * s + self.viscous) * speed
         return speed / (1.0 + self.speed_report * s), torque / (1.0 + self.torque_report * s)
 
 
@@ -153,7 +154,7 @@ def record(machine, by="offset", seed=0, *, peak=None, counted=24, prior=None, s
     at = np.repeat([*LEVELS, MEAN], [in_level, in_level, counted * in_period])
     moving = [np.concatenate([np.zeros(2 * in_level), np.tile(part, counted)]) for part in wave]
     speed = at + dither + moving[0] + noise[0] + machine.speed_noise * rng.standard_normal(total)
-    torque = machine.coulomb + machine.viscous * at + moving[1] + noise[1]
+    torque = machine.torque_scale * (machine.coulomb + machine.viscous * at) + moving[1] + noise[1]
     torque += machine.torque_noise * rng.standard_normal(total)
     segment = Segment(
         start, start + counted * PERIOD_S, PERIOD_S, 0, MEAN, tuple(HARMONICS / PERIOD_S),
@@ -185,7 +186,8 @@ def _noise(machine, total, rng):
     loop = machine.law(s) * machine.lag(machine.speed_filter, s)
     speed = (load + ripple - loop * sensor) / z
     torque = ripple - loop * (speed + sensor)
-    seen = (speed + sensor) / (1.0 + machine.speed_report * s), torque / (1.0 + machine.torque_report * s)
+    torque = machine.torque_scale * torque / (1.0 + machine.torque_report * s)
+    seen = (speed + sensor) / (1.0 + machine.speed_report * s), torque
     return [np.fft.irfft(part, total) for part in seen]
 
 
