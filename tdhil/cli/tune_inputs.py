@@ -10,11 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from profiles import load_profile
-from tdhil.errors import MessageCode, UsageError
+from tdhil.errors import MessageCode, TdhilError, UsageError
 
 if TYPE_CHECKING:
     from profiles import Profile
     from tdhil.soft_torque import Interval
+
+
+_IDENTIFY_J: Final = "Identify again with a motion that identifies J"
 
 
 def require_result(path: Path) -> None:
@@ -45,6 +48,30 @@ def read_result(path: Path) -> Mapping[str, Any]:
                          next_step="Write one with: tdhil identify --json > result.json",
                          entry=MessageCode.WRONG_KIND_OF_FILE)
     return document
+
+
+def inertia_to_tune_for(
+    result: Mapping[str, Any], path: Path, refused: type[TdhilError], next_step: str = _IDENTIFY_J
+) -> tuple[float, float, float]:
+    """Return (low, value, high) of J of the motor side, kg·m² at the motor shaft, torque scale included.
+
+    ``next_step``: advice for a result without J. Raises ``refused`` without J, or if J is that of motor and string.
+    """
+    inertia = result["inertia_kg_m2"]
+    stands = result["verdict"] in ("valid", "valid_wide") and isinstance(inertia, dict)
+    if not stands or not all(is_number(inertia.get(key)) for key in ("value", "low_total", "high_total")):
+        raise refused(f"the result has no J to tune for ({result['verdict']})", where=str(path), next_step=next_step,
+                      entry=MessageCode.NO_INERTIA_TO_TUNE)
+    low, value, high = (float(inertia[key]) for key in ("low_total", "value", "high_total"))
+    if not 0.0 < low <= value <= high:
+        raise refused("the interval of J reaches down to zero", where=str(path),
+                      next_step="Identify again, for longer", entry=MessageCode.NO_INERTIA_TO_TUNE)
+    if MessageCode.STRING_MOVES_WITH_MOTOR.code in (result.get("warning_codes") or ()):
+        raise refused(
+            f"J of {value:.4g} kg·m² is that of motor and string together, and the gains need J of the motor alone",
+            where=str(path), next_step="Disconnect the string and identify again; or identify with excited frequencies "
+            "on both sides of the string's resonance (--model two-mass)", entry=MessageCode.NO_INERTIA_TO_TUNE)
+    return low, value, high
 
 
 def read_impedance(path: Path, result: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -20,6 +20,7 @@ from tdhil.cli.tune_inputs import (
     check_present,
     ends_of,
     estimated,
+    inertia_to_tune_for,
     is_number,
     measured_lags,
     positive_number,
@@ -264,19 +265,12 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     from tdhil.soft_torque import Interval, SpeedController, TopDrive, TuneCase, TuningRefused
 
     measured = None if namespace.impedance is None else read_impedance(namespace.impedance, result)
-    inertia = result["inertia_kg_m2"]
-    stands = result["verdict"] in ("valid", "valid_wide") and isinstance(inertia, dict)
-    if not stands or not all(is_number(inertia.get(key)) for key in ("value", "low_total", "high_total")):
-        raise TuningRefused(
-            f"the result has no J to tune for ({result['verdict']})", where=str(namespace.result),
-            next_step="Identify again with a motion that identifies J" if not result.get("impedance") else
-            "It is from a measurement of the drive's own impedance: name a result with J, and this one with "
-            f"--impedance {namespace.result}", entry=MessageCode.NO_INERTIA_TO_TUNE)
+    advice = {} if not result.get("impedance") else {
+        "next_step": "It is from a measurement of the drive's own impedance: name a result with J, and this one with "
+        f"--impedance {namespace.result}"}
+    at_motor = inertia_to_tune_for(result, namespace.result, TuningRefused, **advice)
     square = positive_number(result, "gear_ratio", namespace.result) ** 2
-    low, value, high = (square * float(inertia[key]) for key in ("low_total", "value", "high_total"))
-    if not 0.0 < low <= value <= high:
-        raise TuningRefused("the interval of J reaches down to zero", where=str(namespace.result),
-                            next_step="Identify again, for longer", entry=MessageCode.NO_INERTIA_TO_TUNE)
+    low, value, high = (square * one for one in at_motor)
     string, of_string, drawn, inertias = string_for(result, namespace, square**0.5)
     if namespace.bit_noise is not None:
         string = _with_measured_noise(string, namespace)
@@ -497,9 +491,12 @@ def _moved_lags(
 ) -> tuple[tuple[float, ...], tuple[Ends, ...], str]:
     from tdhil.soft_torque import Moved
 
+    kept = [lag > 0.0 or any(axis[k] for axis in axes) for k, lag in enumerate(lags)]
+
     def at(axis: list[float], sign: float) -> tuple[float, ...]:
-        moved = (lag + sign * one for lag, one in zip(lags, axis, strict=True))
-        return tuple(lag for lag in moved if lag > 0.0)
+        # a lag of 0 with an interval stays: the draws move it
+        moved = [max(0.0, lag + sign * one) for lag, one in zip(lags, axis, strict=True)]
+        return tuple(lag for lag, stays in zip(moved, kept, strict=True) if stays)
 
     ends = tuple((Moved(inner_lags_s=at(axis, -1.0)), Moved(inner_lags_s=at(axis, 1.0))) for axis in axes if any(axis))
     return at([0.0] * len(lags), 1.0), ends, said

@@ -18,6 +18,7 @@ from tdhil.cli.tune_inputs import (
     check_limits,
     check_present,
     ends_of,
+    inertia_to_tune_for,
     is_number,
     positive_number,
     profile_for,
@@ -178,20 +179,13 @@ def _lags_as_measured(measured: Mapping[str, Any]) -> tuple[Range, ...]:
 
 
 def plant_of(result: Mapping[str, Any], lags: tuple[Range, ...], dead_time: Range, path: Path) -> UncertainPlant:
-    """Return the loop as known from the result, at the motor shaft. Raises LoopTuningRefused without J."""
+    """Return the loop as known from the result, at the motor shaft. Raises LoopTuningRefused without J of
+    the motor alone.
+    """
     from tdhil.speed_loop import LoopTuningRefused, Range, UncertainPlant
 
     positive_number(result, "gear_ratio", path)
-    inertia = result["inertia_kg_m2"]
-    if (result["verdict"] not in ("valid", "valid_wide") or not isinstance(inertia, dict)
-            or not all(is_number(inertia.get(key)) for key in ("value", "low_total", "high_total"))):
-        raise LoopTuningRefused(f"the result has no J to tune for ({result['verdict']})", where=str(path),
-                                next_step="Identify again with a motion that identifies J",
-                                entry=MessageCode.NO_INERTIA_TO_TUNE)
-    low, value, high = (float(inertia[key]) for key in ("low_total", "value", "high_total"))
-    if not 0.0 < low <= value <= high:
-        raise LoopTuningRefused("the interval of J reaches down to zero", where=str(path),
-                                next_step="Identify again, for longer", entry=MessageCode.NO_INERTIA_TO_TUNE)
+    low, value, high = inertia_to_tune_for(result, path, LoopTuningRefused)
     damping = _range_or_none(result.get("viscous_nm_s_rad")) or Range(0.0, 0.0, 0.0)
     shaft = result.get("compliant")
     if not isinstance(shaft, dict):

@@ -244,6 +244,8 @@ def _advice(tuning: Tuning) -> dict[str, Any]:
 def _sentence(tuning: Tuning, base: Tuned | None, best: Tuned | None) -> str:
     assert base is not None
     what = "the present gains" if base.kind == "present" else "a stiff speed loop"
+    if best is None and not tuning.advice.keep:
+        return _not_compared(tuning, base, what)
     if best is None:
         offered = any(one.controller is not None and not one.failed for one in tuning.tuned if one is not base)
         head = ("Keep what you have: " if base.kind == "present" else "Keep a stiff speed loop: ")
@@ -251,6 +253,22 @@ def _sentence(tuning: Tuning, base: Tuned | None, best: Tuned | None) -> str:
             return head + "no other controller keeps the margins."
         speed = "" if base.cure is None else f" of {_rpm_words(base.cure)}"
         return head + f"no other controller lowers the critical speed{speed} by more than the search resolves."
+    return f"Type in the {best.kind} gains. Compared with {what}: {_changes(base, best)}."
+
+
+def _not_compared(tuning: Tuning, base: Tuned, what: str) -> str:
+    """Return the sentence without critical speeds: what is missing, and what the soft row changes."""
+    why, needed = ("no bit is stated", "State bottom.coulomb_nm in string.yaml (--string) to compare them.")
+    if tuning.case.string.bit is not None:
+        why, needed = "--no-simulation omits them", "Leave --no-simulation out to compare them."
+    head = f"No gains are recommended: the critical speeds were not compared, because {why}. {needed}"
+    soft = tuning.by_kind("soft")
+    if soft is None or soft.controller is None:
+        return head
+    return f"{head} Soft gains, compared with {what}: {_changes(base, soft)}."
+
+
+def _changes(base: Tuned, best: Tuned) -> str:
     changes = []
     if base.cure is not None and best.cure is not None:
         low, high = best.cure.interval(NOISY_RESOLUTION * (best.cure.median or 0.0))
@@ -261,7 +279,7 @@ def _sentence(tuning: Tuning, base: Tuned | None, best: Tuned | None) -> str:
         changes.append(f"least damping {base.damping.value:.2f} → {best.damping.value:.2f}")
     if base.worst is not None and best.worst is not None:
         changes.append(f"phase margin {_degrees(base.worst.phase_deg)} → {_degrees(best.worst.phase_deg)}")
-    return f"Type in the {best.kind} gains. Compared with {what}: {', '.join(changes)}."
+    return ", ".join(changes)
 
 
 def _rpm_words(spread: DrawnValues, *, unit: bool = True) -> str:
@@ -297,7 +315,7 @@ def print_tuning(document: Part, console: PlainConsole) -> None:
     """Print gains, their effects and their conditions, in 80 columns."""
     simulated = f" · {SIMULATED}" if document["tuned_for"]["simulated"] else ""
     advice = document["advice"]
-    console.print(Words(advice["sentence"], style="bold yellow" if advice["keep"] else "bold green"))
+    console.print(Words(advice["sentence"], style="bold yellow" if advice["kind"] is None else "bold green"))
     for one in document["controllers"]:
         if not one["refused"] and one["margins"] and one["margins"]["failed"]:
             thin = ", ".join(one["margins"]["failed"])
@@ -538,8 +556,10 @@ def _answer(best: Part | None, document: Part) -> AnswerBox:
     if best is None:
         thin = document["advice"]["thin"]
         lines = (f"Thin: {', '.join(thin)}.",) if thin else ()
-        return AnswerBox("red" if thin else "yellow", "Nothing to change", lines,
-                         "keep what you have", sentence, "")
+        headline, verdict = "Nothing to change", "keep what you have"
+        if not document["advice"]["keep"]:
+            headline, verdict = "No gains are recommended", "critical speeds not compared"
+        return AnswerBox("red" if thin else "yellow", headline, lines, verdict, sentence, "")
     gains = best["at_motor"]
     remarks = [f"at the motor shaft; {best['kind']}: {_WHAT[best['kind']]}"]
     if gains["compensated_kg_m2"]:

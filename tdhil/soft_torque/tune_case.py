@@ -205,11 +205,12 @@ class Advice:
     """Recommended row, or the advice to keep the present gains."""
 
     kind: str | None
-    """Row whose gains to type in. None: keep the present gains, or no row can be recommended."""
+    """Row whose gains to type in. None: keep the present gains, or nothing was compared."""
     compared_with: str
     """Row with which the others are compared: present, or stiff."""
     keep: bool
-    """True: no row that keeps the margins is better than ``compared_with``."""
+    """True: no row that keeps the margins is better than ``compared_with``. False without ``kind``: nothing was
+    compared."""
     better_share: float | None = None
     """Share of the sampled truths on which the critical speed is not higher. None: not simulated."""
 

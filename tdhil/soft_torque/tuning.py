@@ -8,7 +8,8 @@ candidates that keep the margins are simulated under noise, and the best of thes
 decides.
 
 **Advice.** The best row is compared with the present gains (without them: with the stiff ones), truth by truth. If it
-is not better by more than the search resolves, the advice is to keep the present gains.
+is not better by more than the search resolves, the advice is to keep the present gains. Without simulated critical
+speeds nothing is compared, and no row is recommended.
 """
 
 from __future__ import annotations
@@ -150,7 +151,10 @@ def _under_noise(
 
 
 def _advice(case: TuneCase, found: Sequence[Tuned]) -> Advice:
-    """Return the advice: the best row that keeps every margin, if it is better than the first row."""
+    """Return the advice: the best row that keeps every margin, if it is better than the first row.
+
+    Without critical speeds nothing is compared: no row, and no advice to keep the present gains.
+    """
     base = found[0]
     offered = [one for one in found[1:] if one.controller is not None and not one.failed and one.kind != "stiff"]
     if base.kind == "stiff":
@@ -160,8 +164,7 @@ def _advice(case: TuneCase, found: Sequence[Tuned]) -> Advice:
     if not offered:
         return Advice(None, base.kind, keep=True)
     if base.cure is None or base.controller is None:
-        wanted = "soft" if any(one.kind == "soft" for one in offered) else offered[0].kind
-        return Advice(wanted, base.kind, keep=False)
+        return Advice(None, base.kind, keep=False)
 
     def mean(one: Tuned) -> float:
         assert one.cure is not None

@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from tdhil.cli.main import main
 from tdhil.cli.tune_soft_torque import add_arguments, case_of, string_for
-from tdhil.errors import ExitCode
+from tdhil.errors import ExitCode, MessageCode
 from tdhil.report import PlainConsole, showcase_of, tuning_document, write_blocks
 from tdhil.report.operator_map import print_map
-from tdhil.report.tuning import TunedFor, tuning_report
+from tdhil.report.tuning import TunedFor, print_tuning, tuning_report
 from tdhil.soft_torque import DrawnValues, Interval, Search, TuneCase, lowest_turning, tune
 from tdhil.soft_torque.simulation import LONGEST_TICK_S
 from tests.soft_torque.cases import DRIVE, STRING
@@ -283,18 +284,60 @@ def test_what_is_no_measured_impedance_of_this_shaft_is_refused(tuned, measured,
 
 
 @pytest.mark.heavy
-def test_the_first_sentence_says_what_changes(tuned):
-    """Typed gains are a row like the others, and the sentence compares with them."""
+def test_the_first_sentence_says_what_was_not_compared_and_what_changes(tuned):
+    """Typed gains are a row like the others, and the sentence compares with them. Nothing was simulated: no advice."""
     code, document, _ = tuned("--present", "40", "30")
     assert code == 0
     assert [one["kind"] for one in document["controllers"]][:2] == ["present", "stiff"]
     assert document["controllers"][0]["at_main_shaft"]["gain_nm_s_rad"] == pytest.approx(4000.0)
     sentence = document["advice"]["sentence"]
-    assert sentence.startswith("Type in the soft gains. Compared with the present gains:")
+    assert sentence.startswith("No gains are recommended: the critical speeds were not compared, because "
+                               "--no-simulation omits them. Leave --no-simulation out to compare them. "
+                               "Soft gains, compared with the present gains: least damping")
+    assert document["advice"]["kind"] is None and not document["advice"]["keep"]
     assert "phase margin" in sentence and "°" in sentence
     assert "onset" not in json.dumps(document)
     _, text, _ = tuned("--present", "40", "30", as_json=False)
     assert " ".join(text.split()).startswith(sentence)
+
+
+@pytest.mark.heavy
+def test_without_a_bit_nothing_is_green(tuned, tmp_path):
+    """The identified string has no bit: nothing was compared, and the answer says which entry is needed."""
+    words = "--report", str(tmp_path / "tune.html")
+    code, document, _ = tuned("--present", "40", "30", *words, string=None, model="two-mass", compliant=compliant())
+    assert code == 0
+    assert "because no bit is stated. State bottom.coulomb_nm in string.yaml (--string)" in (
+        document["advice"]["sentence"])
+    assert document["advice"]["kind"] is None
+    terminal = io.StringIO()
+    print_tuning(document, Console(file=terminal, force_terminal=True, color_system="standard", width=200))
+    first = terminal.getvalue().splitlines()[0]
+    assert "No gains are recommended" in first and "\x1b[1;33m" in first
+    page = (tmp_path / "tune.html").read_text(encoding="utf-8")
+    assert "critical speeds not compared" in page and "keep what you have" not in page
+
+
+def test_a_j_of_motor_and_string_together_is_refused(tuned):
+    code, document, err = tuned(warning_codes=[MessageCode.STRING_MOVES_WITH_MOTOR.code])
+    assert code == 11
+    assert "J of 15 kg·m² is that of motor and string together" in document["error"]["message"]
+    assert "Disconnect the string" in err
+
+
+def test_a_measured_lag_of_zero_is_drawn_within_its_interval(tmp_path):
+    path = tmp_path / "z.json"
+    loop = impedance(speed_filter_s=interval(0.0, 0.0, 0.01), torque_lag_s=interval(0.03, 0.02, 0.032),
+                     inner_lag_s=interval(0.03, 0.028, 0.032))
+    path.write_text(json.dumps(result(impedance=loop)), encoding="utf-8")
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    words = ["result.json", "--string", str(STRING_YAML), "--impedance", str(path)]
+    case, _ = case_of(result(), parser.parse_args(words))
+    assert case.drive.inner_lags_s == (0.0, 0.03)
+    drawn = [truth.drive.inner_lags_s for truth in case.truths()]
+    assert max(one[0] for one in drawn) > 0.004
+    assert np.std([sum(one) for one in drawn]) < 0.004
 
 
 def test_a_very_soft_request_is_refused_with_its_margin(tuned):

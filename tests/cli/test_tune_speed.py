@@ -10,7 +10,7 @@ import re
 import pytest
 
 from tdhil.cli.main import main
-from tdhil.errors import ExitCode
+from tdhil.errors import ExitCode, MessageCode
 from tdhil.report import GRAPHS
 from tests.cli.test_tune import estimate, impedance, interval
 from tests.cli.test_tune import result as any_result
@@ -106,6 +106,7 @@ def test_a_resonance_gets_a_notch_and_a_string_a_warning(tuned):
 @pytest.mark.parametrize(("words", "said", "code", "message"), [
     (("--bandwidth", "40"), {}, 11, "The largest bandwidth that fits is"),
     ((), {"inertia_kg_m2": None, "verdict": "not_identifiable"}, 11, "no J to tune for (not_identifiable)"),
+    ((), {"warning_codes": [MessageCode.STRING_MOVES_WITH_MOTOR.code]}, 11, "that of motor and string together"),
     ((), {"compliant": {**COMPLIANT, "resonance_hz": None}}, 11, "its antiresonance or resonance is open"),
     (("--inner-lags", "0", "--dead-time", "0"), {}, 2, "there is no lag in the drive's loop"),
     (("--phase-margin", "5"), {}, 2, "--phase-margin: 5: must be from 20 to 80 degrees"),
