@@ -66,7 +66,7 @@ def run(namespace: argparse.Namespace) -> int:
     report = ReportFile.of_files(namespace, *paths)
     result = read_result(namespace.result)
     ratio, inertia = _inertia(result, namespace)
-    string, *_ = string_for(result, namespace, ratio)
+    string = string_for(result, namespace, ratio).string
     expected = None if namespace.controller is None else _expected(namespace)
     found: list[tuple[Severity, str]] = []
     noises: list[BitNoiseEstimate | str] = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from math import sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from tdhil.soft_torque import (
         DrillString,
         DriveSetting,
+        Interval,
         Moved,
         RequiredMargins,
         SpeedController,
@@ -271,7 +273,8 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     at_motor = inertia_to_tune_for(result, namespace.result, TuningRefused, **advice)
     square = positive_number(result, "gear_ratio", namespace.result) ** 2
     low, value, high = (square * one for one in at_motor)
-    string, of_string, drawn, inertias = string_for(result, namespace, square**0.5)
+    found = string_for(result, namespace, square**0.5)
+    string = found.string
     if namespace.bit_noise is not None:
         string = _with_measured_noise(string, namespace)
     lags, of_lags, lags_from = _lags(result, namespace, measured)
@@ -281,8 +284,8 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     if namespace.present is not None:
         present = SpeedController(square * namespace.present[0], square * namespace.present[1])
     case = TuneCase(string, drive, Interval(value, low, high), namespace.phase_margin, namespace.a,
-                    namespace.compensate, present, (*of_string, *of_lags, *of_present),
-                    required=_required(result, namespace), string_draws=drawn, inertia_draws=inertias,
+                    namespace.compensate, present, (*found.ends, *of_lags, *of_present), found.inertia_alone_share,
+                    required=_required(result, namespace), string_draws=found.draws, inertia_draws=found.inertia_draws,
                     lag_tolerance=STATED_LAG_TOLERANCE if namespace.inner_lags else ASSUMED_LAG_TOLERANCE)
     return case, lags_from
 
@@ -318,20 +321,32 @@ def _with_measured_noise(string: DrillString, namespace: argparse.Namespace) -> 
     return with_noise(string, *read_bit_noise(namespace.bit_noise))
 
 
-def string_for(
-    result: Mapping[str, Any], namespace: argparse.Namespace, ratio: float
-) -> tuple[DrillString, tuple[Ends, ...], tuple[DrillString, ...], tuple[float, ...]]:
-    """Return the string, both ends of the interval of each of its values, random draws of all of them, and J of each.
+@dataclass(frozen=True)
+class StringOfTuning:
+    """String with its uncertainty, at the main shaft.
 
-    J has no draws if the string comes from its file, or if the result does not state the covariance of J and string.
+    ``ends``: both ends of each value, or of each independent axis of the covariance of J and string. ``draws``: random
+    draws; ``inertia_draws``: J of each. J has no draws and its whole half-width (``inertia_alone_share`` 1) if the
+    string comes from its file, or if the result does not state the covariance.
+    """
+
+    string: DrillString
+    ends: tuple[Ends, ...] = ()
+    draws: tuple[DrillString, ...] = ()
+    inertia_draws: tuple[float, ...] = ()
+    inertia_alone_share: float = 1.0
+
+
+def string_for(result: Mapping[str, Any], namespace: argparse.Namespace, ratio: float) -> StringOfTuning:
+    """Return the string with its uncertainty.
 
     The string comes from its file. Without a file it is identified: a pipe if k, f and J_L together show one, else a
     spring with a mass.
     """
-    from tdhil.soft_torque import Moved, identified_string, load_string, spring_and_mass
+    from tdhil.soft_torque import Moved, identified_string, independent_axes, load_string, spring_and_mass
 
     if namespace.string is not None:
-        return load_string(namespace.string), (), (), ()
+        return StringOfTuning(load_string(namespace.string))
     shaft = result.get("compliant") or {}
     spring, swing = (bounded_estimate(shaft.get(key)) for key in ("stiffness_nm_rad", "antiresonance_hz"))
     if spring is None or swing is None:
@@ -343,7 +358,8 @@ def string_for(
     load = bounded_estimate(shaft.get("load_inertia_kg_m2")) if result.get("model") == "string" else None
     values = [spring, swing, loss, *([load] if load is not None else [])]
     name = f"k and J_L as identified ({result.get('model')})"
-    drawn, inertias = _drawn(result, values)
+    joint = _joint(result, values)
+    drawn, inertias = _drawn(values, joint)
 
     def pipe(k: float, hertz: float, damping: float, inertia: float) -> DrillString | None:
         return identified_string(ratio**2 * k, hertz, ratio**2 * inertia, ratio**2 * damping, name)
@@ -359,22 +375,34 @@ def string_for(
     def moved(at: int, end: int) -> DrillString:
         return string([*middle[:at], values[at][end], *middle[at + 1 :]])
 
-    ends = tuple((Moved(string=moved(at, 0)), Moved(string=moved(at, 2))) for at in range(len(values)))
-    return (string(middle), ends, tuple(string(one[: len(values)]) for one in drawn),
-            tuple(ratio**2 * one for one in inertias))
+    draws = tuple(string(one[: len(values)]) for one in drawn)
+    if joint is None:
+        ends = tuple((Moved(string=moved(at, 0)), Moved(string=moved(at, 2))) for at in range(len(values)))
+        return StringOfTuning(string(middle), ends, draws)
+    order = [*range(1, len(values) + 1), 0]                # J last: its own axis moves only J
+    spread, correlation = [joint[0][at] for at in order], joint[1][order][:, order]
+    *axes, of_inertia = independent_axes(spread, correlation)
+
+    def along(end: NDArray[np.float64]) -> Moved:
+        return Moved(string=string([max(1e-12, float(one)) for one in end[:-1]]),
+                     inertia_kg_m2=ratio**2 * float(end[-1]))
+
+    rest, whole = (float(one) - spread[-1].value for one in (of_inertia[1][-1], spread[-1].high))
+    return StringOfTuning(string(middle), tuple((along(low), along(high)) for low, high in axes), draws,
+                          tuple(ratio**2 * one for one in inertias), rest / whole if whole > 0.0 else 1.0)
 
 
-def _drawn(
+def _joint(
     result: Mapping[str, Any], values: Sequence[tuple[float, float, float]]
-) -> tuple[list[list[float]], list[float]]:
-    """Return random draws of k, f, c and J_L (as many as ``values`` has), and J of each draw, all at the motor.
+) -> tuple[list[Interval], NDArray[np.float64]] | None:
+    """Return the intervals of J, k, f, c and J_L at the motor and their correlation; None without a covariance.
 
-    (low, value, high) of each is its 95 % interval. With the covariance of the fit all are drawn jointly; the torque
-    scale multiplies J, k, c and J_L alike. Without it each is an independent normal draw, and J has no draws.
+    (low, value, high) of ``values`` are the 95 % intervals of k, f, c and J_L. The torque scale multiplies J, k, c and
+    J_L alike.
     """
     import numpy as np
 
-    from tdhil.soft_torque import Interval, joint_draws
+    from tdhil.soft_torque import Interval
 
     correlation = _correlation(result.get("compliant") or {}, len(values))
     inertia = result.get("inertia_kg_m2")
@@ -382,10 +410,7 @@ def _drawn(
     total = bounded_estimate({"low": parts.get("low_total"), "value": parts.get("value"),
                               "high": parts.get("high_total")})
     if correlation is None or total is None:
-        random = np.random.default_rng(IDENTIFIED_SEED)
-        return [[max(1e-12, value + z / 1.96 * (high - value if z > 0.0 else value - low))
-                 for (low, value, high), z in zip(values, random.standard_normal(len(values)), strict=True)]
-                for _ in range(IDENTIFIED_DRAWS)], []
+        return None
     fit = np.array([bounded_estimate(inertia) or total, *values], dtype=float)
     half = 0.5 * (fit[:, 2] - fit[:, 0])
     scale_rel = sqrt(max(0.0, (0.5 * (total[2] - total[0])) ** 2 - half[0] ** 2)) / total[1]
@@ -395,6 +420,26 @@ def _drawn(
     np.fill_diagonal(both, 1.0)
     spread = [Interval(value, value - float(np.hypot(value - low, more)), value + float(np.hypot(high - value, more)))
               for (low, value, high), more in zip(fit.tolist(), by_scale.tolist(), strict=True)]
+    return spread, both
+
+
+def _drawn(
+    values: Sequence[tuple[float, float, float]], joint: tuple[list[Interval], NDArray[np.float64]] | None
+) -> tuple[list[list[float]], list[float]]:
+    """Return random draws of k, f, c and J_L (as many as ``values`` has), and J of each draw, all at the motor.
+
+    With ``joint`` all are drawn jointly. Without it each is an independent normal draw, and J has no draws.
+    """
+    import numpy as np
+
+    from tdhil.soft_torque import joint_draws
+
+    if joint is None:
+        random = np.random.default_rng(IDENTIFIED_SEED)
+        return [[max(1e-12, value + z / 1.96 * (high - value if z > 0.0 else value - low))
+                 for (low, value, high), z in zip(values, random.standard_normal(len(values)), strict=True)]
+                for _ in range(IDENTIFIED_DRAWS)], []
+    spread, both = joint
     drawn = np.maximum(joint_draws(spread, both, count=IDENTIFIED_DRAWS, seed=IDENTIFIED_SEED), 1e-12)
     return drawn[:, 1:].tolist(), drawn[:, 0].tolist()
 

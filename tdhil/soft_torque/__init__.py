@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     )
     from tdhil.soft_torque.uncertainty import (
         Interval as Interval, DrawnValues as DrawnValues, Truth as Truth, draw_truths as draw_truths,
+        independent_axes as independent_axes,
         joint_draws as joint_draws,
     )
     from tdhil.soft_torque.simulation import (
@@ -87,7 +88,7 @@ else:
         "own_units": "DriveSetting drive_settings",
         "roots": "RootsLost count_in roots_in",
         "stability": "LoopMargins NO_MARGINS RequiredMargins is_stable linear_limit loop_margins",
-        "uncertainty": "Interval DrawnValues Truth draw_truths joint_draws",
+        "uncertainty": "Interval DrawnValues Truth draw_truths independent_axes joint_draws",
         "simulation": "Begin CriticalSpeeds Grid RPM Search SimulationTrace critical_speeds grid_of lowest_turning "
                       "HIGHEST_NOISY_RPM NOISY_RESOLUTION lowest_turning_with_noise simulate",
         "recipes": "largest_stable_share",

@@ -49,6 +49,8 @@ class Moved:
     inner_lags_s: tuple[float, ...] | None = None
     present: SpeedController | None = None
     string: DrillString | None = None
+    inertia_kg_m2: float | None = None
+    """J, if it is correlated with the moved parameter."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,10 @@ class TuneCase:
     present: SpeedController | None = None
     """Present gains of the drive, measured (`identify --impedance`) or typed in. They are shown beside the others."""
     also: tuple[tuple[Moved, Moved], ...] = ()
-    """Other parameters that are known with an interval, both ends of each. They are independent of each other."""
+    """Other parameters that are known with an interval, both ends of each. They are independent of each other.
+    Correlated ones are replaced by independent axes of their covariance, each with both ends; J moves along."""
+    inertia_alone_share: float = 1.0
+    """Share of J's half-width that remains if all of ``also`` is held; 1: J is independent of them."""
     required: RequiredMargins = USUAL_MARGINS
     """Margins that are required on every sampled truth."""
     lag_tolerance: float = 0.1
@@ -87,7 +92,8 @@ class TuneCase:
         """Return the case with one parameter moved to an end of its interval."""
         lags = self.drive.inner_lags_s if by.inner_lags_s is None else by.inner_lags_s
         return replace(self, string=by.string or self.string, present=by.present or self.present,
-                       drive=replace(self.drive, inner_lags_s=lags))
+                       drive=replace(self.drive, inner_lags_s=lags,
+                                     inertia_kg_m2=by.inertia_kg_m2 or self.drive.inertia_kg_m2))
 
     def moves(self, *, present: bool) -> tuple[tuple[TuneCase, TuneCase], ...]:
         """Return both ends of every other parameter. ``present``: the interval of the present gains is included."""
@@ -95,13 +101,21 @@ class TuneCase:
                      if present or low.present is None)
 
     @property
+    def inertia_alone(self) -> Interval:
+        """Interval of J with all of ``also`` held, kg·m²."""
+        whole, share = self.inertia_kg_m2, self.inertia_alone_share
+        return Interval(whole.value, whole.value - share * (whole.value - whole.low),
+                        whole.value + share * (whole.high - whole.value))
+
+    @property
     def at_inertias(self) -> tuple[TopDrive, ...]:
-        """The drive at `STEPS` values of J from end to end of its interval, with the estimated J in the middle."""
+        """The drive at the `STEPS` values of J of `inertias`."""
         return tuple(self.drive.with_inertia(one) for one in self.inertias(STEPS))
 
     def inertias(self, steps: int) -> tuple[float, ...]:
-        """Return ``steps`` (odd) values of J from end to end of its interval, with the estimated J in the middle."""
-        low, value, high = self.inertia_kg_m2.low, self.inertia_kg_m2.value, self.inertia_kg_m2.high
+        """Return ``steps`` (odd) values of J from end to end of `inertia_alone`, with the estimated J in the middle."""
+        alone = self.inertia_alone
+        low, value, high = alone.low, alone.value, alone.high
         half = steps // 2
         below = [low + (value - low) * k / half for k in range(half)]
         return (*below, *(value + (high - value) * k / half for k in range(half + 1)))

@@ -1,9 +1,10 @@
 r"""Figures of one controller: reflection, damping and margins. Reflection and damping have an interval.
 
 **Effect of the error of J.** The gains are fixed, and J varies. The figures of the stated string are computed over the
-95 % interval of J, with the extrema between its ends. Each other measured quantity (lags, present gains, k and ω as
-identified) is moved to either end of its interval, one after the other. Their effects are combined as the root of the
-sum of squares.
+95 % interval of J, with the extrema between its ends. Each other measured quantity (lags, present gains) is moved to
+either end of its interval, one after the other. J and the identified string are correlated: the string is moved along
+independent axes of their covariance, with J, and J alone only by the rest of its interval. All effects are combined as
+the root of the sum of squares.
 """
 
 from __future__ import annotations
@@ -104,12 +105,13 @@ def with_figures(case: TuneCase, tuned: Tuned, held: Sequence[float], samples: T
          for end, modes in zip(pair, own, strict=True)]
         for pair, own in zip(pairs, heard, strict=True)
     ]).reshape(len(pairs), 2, 3)
-    inertia = case.inertia_kg_m2
+    inertia = case.inertia_alone
     integral = None
     if tuned.kind != "stiff" and not present:
         share = 1.0 - tuned.compensated_share
         omega = 2.0 * pi * tuned.frequency_factor
-        of = [[(omega * modes[0]) ** 2 * share * inertia.value for modes in own] for own in heard]
+        of = [[(omega * modes[0]) ** 2 * share * end.drive.inertia_kg_m2 for end, modes in zip(pair, own, strict=True)]
+              for pair, own in zip(pairs, heard, strict=True)]
         square = (omega * held[0]) ** 2 * share
         integral = in_squares(Interval(law.integral_nm_rad, square * inertia.low, square * inertia.high), of)
     system = ClosedSystem(case.string, case.drive, law)

@@ -154,6 +154,24 @@ def joint_draws(
     return found
 
 
+def independent_axes(
+    intervals: Sequence[Interval], correlation: NDArray[np.float64]
+) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...]:
+    """Return both ends (K,) of each of K independent axes of correlated estimates.
+
+    ``correlation`` (K, K). Axis k leaves the estimates before k unchanged (Cholesky), so the last axis moves only the
+    last estimate. For a linear function, the root of the sum of squares over the axes is its half-width.
+    """
+    root = np.linalg.cholesky(correlation + 1e-9 * np.eye(len(intervals)))
+    low, value, high = (np.array([getattr(one, name) for one in intervals]) for name in ("low", "value", "high"))
+
+    def end(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+        moved: NDArray[np.float64] = value + axis * np.where(axis > 0.0, high - value, value - low)
+        return moved
+
+    return tuple((end(-axis), end(axis)) for axis in root.T)
+
+
 def string_at(string: DrillString, shares: NDArray[np.float64]) -> DrillString:
     """Return the string at the given positions (0 to 1) in the ranges of its `COLUMNS_OF_STRING` tolerances."""
     tolerance = string.tolerance

@@ -421,6 +421,19 @@ def test_the_torque_scale_multiplies_j_and_k_alike():
     assert (drawn[:, 1] - drawn[:, 0]).std() < 0.002
 
 
+@pytest.mark.heavy
+@pytest.mark.parametrize("correlation", [-0.9, 0.0, 0.9])
+def test_the_ends_of_the_intervals_have_the_covariance_of_j_and_string(correlation):
+    """I = (φω)² J has the relative variance s_J² + 4 s_ω² + 4 ρ s_J s_ω. One by one, the last term is omitted."""
+    exact = {**estimate(15.0, 14.4, 15.6), "low": 14.4, "high": 15.6}
+    shaft = compliant(antiresonance_hz=interval(0.13, 0.1274, 0.1326), covariance={
+        "quantities": ["inertia_kg_m2", "antiresonance_hz"], "matrix": [[1.0, correlation], [correlation, 1.0]]})
+    case, _ = drawn_of(inertia_kg_m2=exact, compliant=shaft)
+    found = tune(replace(case, draws=2), None).by_kind("soft").integral_nm_rad
+    half = math.sqrt(0.04**2 + 0.04**2 + 2.0 * correlation * 0.04**2)
+    assert found.high / found.value - 1.0 == pytest.approx(half, rel=0.06)
+
+
 def test_without_a_covariance_j_and_string_are_drawn_independently():
     for stated in (None, {"quantities": ["stiffness_nm_rad"], "matrix": [[1.0, 2.0]]}, {"matrix": "none"}):
         case, drawn = drawn_of(compliant=compliant(covariance=stated))
@@ -434,9 +447,9 @@ def test_severity_takes_the_identified_string_too():
     add_arguments(parser)
     said = result(model="two-mass", compliant=compliant(covariance=covariance_of(0.5)))
     for inertia in (said["inertia_kg_m2"], None):
-        string, _, drawn, inertias = string_for({**said, "inertia_kg_m2": inertia}, parser.parse_args(["a.json"]), 10.0)
-        assert string.stiffness_nm_rad == pytest.approx(314.0)
-        assert len(inertias) == (len(drawn) if inertia else 0)
+        found = string_for({**said, "inertia_kg_m2": inertia}, parser.parse_args(["a.json"]), 10.0)
+        assert found.string.stiffness_nm_rad == pytest.approx(314.0)
+        assert len(found.inertia_draws) == (len(found.draws) if inertia else 0)
 
 
 @pytest.mark.heavy
