@@ -50,6 +50,7 @@ TIME: Final = Unit("time", "s")
 FREQUENCY: Final = Unit("frequency", "Hz")
 SHARE: Final = Unit("share", "1")
 BIT_RATE: Final = Unit("bit rate", "bit/s")
+MILLINEWTON_METRE: Final = Unit("torque", "mN·m", 1.0, 1e3)
 KILONEWTON_METRE: Final = Unit("torque", "kN·m", 1e3)
 POUND_FOOT: Final = Unit("torque", "lbf·ft", 1.3558179483314004)
 DEGREE: Final = Unit("angle", "°", _TURN, 360.0)
@@ -89,6 +90,7 @@ _SPELT: Final[tuple[tuple[Unit, str], ...]] = (
     (DEGREE, "° deg degree degrees"),
     (_TURN_ANGLE, "turn turns rev revs"),
     (TORQUE, "nm"),
+    (MILLINEWTON_METRE, ""),           # by case alone: mNm is no MNm
     (KILONEWTON_METRE, "knm"),
     (POUND_FOOT, "lbfft ftlbf lbft ftlb ftlbs"),
     (TORQUE_RATE, "nm/s"),
@@ -116,7 +118,8 @@ _SPELT: Final[tuple[tuple[Unit, str], ...]] = (
     (_MEGABIT, "mbit/s mbits/s mbps mbit mbd mbaud"),
 )
 _UNITS: Final = {word: unit for unit, words in _SPELT for word in words.split()}
-_CASE_COUNTS: Final = {"M": _MEGABIT, "mHz": _MILLIHERTZ, "MHz": None, "m": None, "Ms": None, "MS": None}
+_CASE_COUNTS: Final = {"M": _MEGABIT, "mHz": _MILLIHERTZ, "MHz": None, "m": None, "Ms": None, "MS": None,
+                       "mNm": MILLINEWTON_METRE, "MNm": None}
 _IGNORED: Final = re.compile(r"[\s·.*⋅_^⁻-]")
 _NUMBER: Final = re.compile(
     r"\s*([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)(?![0-9])\s*(\S.*)?", re.DOTALL

@@ -44,7 +44,7 @@ def test_a_share_is_exact():
 @pytest.mark.parametrize(("text", "unit"), [
     ("100 1/s", q.SPEED),          # revolutions or radians
     ("50 Hz", q.SPEED),            # of the shaft or of the motor's supply
-    ("15 m", q.TIME), ("5 mNm", q.TORQUE), ("5 MNm", q.TORQUE), ("5 MHz", q.FREQUENCY), ("1 m", q.BIT_RATE),
+    ("15 m", q.TIME), ("5 mnm", q.TORQUE), ("5 MNm", q.TORQUE), ("5 MHz", q.FREQUENCY), ("1 m", q.BIT_RATE),
     ("50 %", q.TORQUE), ("15 min", q.SPEED), ("100 rpm", q.TORQUE), ("1 000 rpm", q.SPEED), ("1,5 rpm", q.SPEED),
     ("1_000 rpm", q.SPEED), ("100-200 rpm", q.SPEED), ("1.5.2 s", q.TIME), ("rpm", q.SPEED), ("", q.SPEED),
     ("nan", q.SPEED), ("inf rpm", q.SPEED), ("1e999 rpm", q.SPEED), ("0x10 rpm", q.SPEED), ("9" * 400, q.SPEED),

@@ -44,6 +44,12 @@ def test_a_setpoint_is_not_taken_for_the_reported_value(tmp_path):
     assert [one.column for one in found.guess] == ["t_s", "n_act_rpm", "m_act_nm"]
 
 
+@pytest.mark.parametrize("name", ["Sollmoment [Nm]", "torque limit [Nm]", "target torque [Nm]", "m_soll_nm"])
+def test_a_setpoint_alone_is_not_guessed(tmp_path, name):
+    found = survey(tmp_path, f"t_s,n_act_rpm,{name}\n0,1,2\n1,2,3\n")
+    assert [one.column for one in found.guess] == ["t_s", "n_act_rpm", ""]
+
+
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "cp1252"])
 def test_encodings_are_recognised(tmp_path, encoding):
     found = survey(tmp_path, GERMAN, encoding)

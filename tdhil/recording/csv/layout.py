@@ -58,7 +58,7 @@ def unit_of(quantity: str, text: str) -> ColumnUnit | None:
     """Return the unit that ``text`` spells for a quantity: ``rpm``, ``[1/min]``, ``N.m``; None if it is unknown."""
     found = _BRACKETED.match(text.strip())
     inner = found.group(2) if found is not None and not found.group(1) else text
-    # case distinguishes milli from mega, but no tool samples in megaseconds, and mN·m and MN·m are not accepted
+    # case distinguishes mN·m from MN·m; it does not matter for a time, because no tool samples in megaseconds
     word = _IGNORED.sub("", inner.replace("¹", "1").casefold())
     if (also := _ALSO[quantity].get(word)) is not None:
         return also
@@ -84,6 +84,38 @@ def unit_in_name(quantity: str, name: str) -> ColumnUnit | None:
     parts = re.split(r"[_ ]", base)
     endings = ("_".join(parts[start:]) for start in range(1, len(parts)))
     return next((unit for ending in endings if (unit := unit_of(quantity, ending)) is not None), None)
+
+
+# Words in names of columns that are not the actual value, in English and German. `reference` is a setpoint in the trace
+# of a drive; in a calibration it is the sensor that is compared with.
+_REFERENCE_WORDS = frozenset(("ref", "reference"))
+_SETPOINT_WORDS = frozenset((
+    "set", "setpoint", "soll", "sollwert", "target", "cmd", "command", "commanded", "demand", "demanded", "max", "min",
+    "limit", "limits", "error", "deviation", *_REFERENCE_WORDS,
+))
+_SETPOINT_ENDS = ("soll", "setpoint", "target", "limit", "demand", "command", "grenz")
+_SEPARATORS = re.compile(r"[^a-zäöüω]+")
+_HUMP = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])")
+
+
+def words_of(quantity: str, name: str) -> frozenset[str]:
+    """Return the words of a column's name, in lower case, without its unit: ``Torque limit [Nm]`` → torque, limit."""
+    parts = re.split(r"[_ ]", split_name(name)[0])
+    end = next((at for at in range(len(parts)) if unit_of(quantity, "_".join(parts[at:])) is not None), len(parts))
+    humps = _HUMP.split("_".join(parts[:end]))
+    return frozenset(word for part in humps for word in _SEPARATORS.split(part.casefold()) if word)
+
+
+def is_setpoint(quantity: str, name: str, *, sensor: bool = False) -> bool:
+    """Return whether a column of speed or torque is, by its name, a setpoint, a demand, a command, a limit or an error.
+
+    ``sensor``: the trace is of a sensor that is a reference for a calibration, so that this word is no setpoint.
+    """
+    if quantity == "time":
+        return False
+    known = _SETPOINT_WORDS - _REFERENCE_WORDS if sensor else _SETPOINT_WORDS
+    return any(word in known or word.startswith(_SETPOINT_ENDS) or word.endswith(_SETPOINT_ENDS)
+               for word in words_of(quantity, name))
 
 
 def known_units(quantity: str) -> tuple[str, ...]:
@@ -191,6 +223,7 @@ def find_header(lines: Sequence[str], choices: Choices, file: str) -> Header:
     """
     best: tuple[tuple[int, int, int], int, list[str]] | None = None
     usual = ",".join(_STANDARD[choice.quantity] for choice in choices)
+    sensor = _flag(choices) == REFERENCE_FLAG
     for number, line in enumerate(lines[:HEADER_LINES], 1):
         for delimiter in _DELIMITERS:
             if delimiter not in line:
@@ -198,7 +231,7 @@ def find_header(lines: Sequence[str], choices: Choices, file: str) -> Header:
             names = split_cells(line, delimiter)
             if len(names) > MOST_COLUMNS:
                 raise CsvUnusable(f"more than {MOST_COLUMNS} columns", where=f"{file}:{number}")
-            found = [_positions(names, choice) for choice in choices]
+            found = [_positions(names, choice, sensor=sensor) for choice in choices]
             if all(found):
                 return Header(number, delimiter, tuple(names), _one_each(found, names, choices, f"{file}:{number}"))
             words = sum(bool(name) and not looks_numeric(name) for name in names)
@@ -216,12 +249,15 @@ def find_header(lines: Sequence[str], choices: Choices, file: str) -> Header:
             f"no header in the first {HEADER_LINES} lines", where=file,
             next_step=f"Put a line with the columns' names above them, such as {usual}",
         )
-    missing = next(choice for choice in choices if not _positions(names, choice))
+    missing = next(choice for choice in choices if not _positions(names, choice, sensor=sensor))
     raise _no_column(missing, names, f"{file}:{number}", choices)
 
 
-def _positions(names: Sequence[str], choice: ColumnChoice) -> list[int]:
-    """Return the columns that fit a choice: by the whole name, else by the name without its unit."""
+def _positions(names: Sequence[str], choice: ColumnChoice, *, sensor: bool) -> list[int]:
+    """Return the columns that fit a choice: by the whole name, else by the name without its unit.
+
+    A column that is no actual value by its name fits only if the choice names it.
+    """
     full = [_folded(name) for name in names]
     bare = [_folded(split_name(name)[0]) for name in names]
     if choice.name:
@@ -232,7 +268,8 @@ def _positions(names: Sequence[str], choice: ColumnChoice) -> list[int]:
     exact = [at for at, name in enumerate(full) if name == _STANDARD[quantity]]
     return exact or [
         at for at, name in enumerate(bare)
-        if name == quantity or (name.startswith(f"{quantity}_") and unit_in_name(quantity, names[at]) is not None)
+        if name == quantity or (name.startswith(f"{quantity}_") and unit_in_name(quantity, names[at]) is not None
+                                and not is_setpoint(quantity, names[at], sensor=sensor))
     ]
 
 
@@ -266,6 +303,17 @@ def _no_column(choice: ColumnChoice, names: Sequence[str], where: str, choices: 
     there = [name for name in names if name]
     listed = ", ".join(shown(name) for name in there[:12]) + (", …" if len(there) > 12 else "")
     wanted = choice.name or choice.quantity
+    sensor = _flag(choices) == REFERENCE_FLAG
+    others = [] if choice.name else [name for name in there if choice.quantity in name.casefold()
+                                     and is_setpoint(choice.quantity, name, sensor=sensor)]
+    if others:
+        several = ", ".join(repr(shown(name)) for name in others[:4])
+        return CsvMisnamed(
+            f"no column holds the actual {choice.quantity}. By name, {several} {'is' if len(others) == 1 else 'are'} a "
+            "setpoint, a limit or an error", where=where,
+            next_step=f"Name the column of the actual {choice.quantity}: {_flag(choices)} {choice.quantity}=…. "
+            f"The columns are: {listed}. A setpoint is read only if it is named here",
+        )
     folded = {_folded(form): name for name in there for form in (split_name(name)[0], name)}
     close = difflib.get_close_matches(_folded(wanted)[:80], [form[:80] for form in folded], 1)
     hint = f"; did you mean {shown(folded.get(close[0], close[0]))!r}?" if close else ""
@@ -307,7 +355,7 @@ def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayo
         )
     quantities = [choice.quantity for choice in choices]
     stated = next(
-        (row for at, row in rows.items() if at < first and any(map(unit_of, quantities, row))), [""] * len(choices)
+        (row for at, row in rows.items() if at < first and _states_units(quantities, row)), [""] * len(choices)
     )
     clock = ":" in rows[first][0]
     seen = [_wanted(line, header) for line in _telling(lines[first:], header.delimiter)]
@@ -329,6 +377,12 @@ def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayo
         units.append(unit)
         assumed += [f"{file}: {note}" for note in notes]
     return ColumnLayout(header, first + 1, tuple(units), clock, sign == ",", tuple(assumed))
+
+
+def _states_units(quantities: Sequence[str], row: Sequence[str]) -> bool:
+    """Return whether a row below the header is a row of units: one is known, or all are in brackets."""
+    return any(map(unit_of, quantities, row)) or all(
+        (found := _BRACKETED.match(cell.strip())) is not None and not found.group(1) for cell in row)
 
 
 def _telling(lines: Sequence[str], delimiter: str) -> list[str]:
@@ -364,19 +418,23 @@ def _unit(choice: ColumnChoice, name: str, stated: str, where: str, flag: str) -
     quantity = choice.quantity
     below = unit_of(quantity, stated)
     named = unit_in_name(quantity, name)
+    notes = [f"{shown(name)!r} is a setpoint, a limit or an error by its name. It was read as the actual {quantity}, "
+             "as told"] if is_setpoint(quantity, name, sensor=flag == REFERENCE_FLAG) else []
     if choice.unit is not None:
         other = below or named
         if other is not None and other != choice.unit:
-            return choice.unit, [f"{quantity} was read in {choice.unit.symbol} as told; the file says {other.symbol}"]
-        return choice.unit, []
+            notes.append(f"{quantity} was read in {choice.unit.symbol} as told; the file says {other.symbol}")
+        return choice.unit, notes
     next_step = f"Give it behind a colon: {flag} {quantity}='{shown(name)}:{SI[quantity]}'"
+    # SI is assumed only if the file states no unit: a unit that is not known would be a wrong factor
     odd = stated if below is None and not is_missing(stated) else ""
-    if flag == REFERENCE_FLAG and named is None and below is None:
-        odd = odd or split_name(name)[1]      # a calibration does not assume a unit if the file states another one
+    if named is None and below is None:
+        odd = odd or split_name(name)[1]
     if odd:
         raise CsvMisnamed(
-            f"{shown(odd)!r} is no known unit of {quantity}; there are {', '.join(known_units(quantity))}",
-            where=where, next_step=next_step,
+            f"{shown(odd)!r} is no known unit of {quantity}, in column {shown(name)!r}; "
+            f"there are {', '.join(known_units(quantity))}",
+            where=where, next_step=f"{next_step}, with the column's unit, or convert the column",
         )
     if below is not None and named is not None and below != named:
         raise CsvMisnamed(
@@ -387,10 +445,10 @@ def _unit(choice: ColumnChoice, name: str, stated: str, where: str, flag: str) -
     if unit is None:
         si = unit_of(quantity, SI[quantity])
         assert si is not None
-        return si, [f"no unit is stated for {shown(name)!r}; {SI[quantity]} was assumed"]
+        return si, [*notes, f"no unit is stated for {shown(name)!r}; {SI[quantity]} was assumed"]
     if unit.symbol == "1/s":
-        return unit, [f"{shown(name)!r} in 1/s was read as revolutions a second"]
-    return unit, []
+        return unit, [*notes, f"{shown(name)!r} in 1/s was read as revolutions a second"]
+    return unit, notes
 
 
 def _listed(header: Header) -> str:

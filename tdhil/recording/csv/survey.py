@@ -4,7 +4,6 @@ The guess is a proposal for a person, who confirms or corrects it. `tdhil replay
 columns have their usual names, or are named.
 """
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -20,11 +19,13 @@ from tdhil.recording.csv.layout import (
     ColumnChoice,
     Header,
     find_header,
+    is_setpoint,
     known_units,
     parse_columns,
     split_name,
     unit_in_name,
     unit_of,
+    words_of,
 )
 from tdhil.recording.csv.text import blocks, decimal_sign, encoding_of, is_missing, looks_numeric, number, split_cells
 
@@ -35,7 +36,7 @@ ROWS = 8
 _LOOKED_AT = 200    # rows from which the decimal sign and the order of the time are found
 
 # Words in names of columns, as the tools of drives, PLCs and loggers write them, in English and German. One-letter
-# names are symbols of the quantities. A column that holds a setpoint or a limit is not the reported value.
+# names are symbols of the quantities. A setpoint or a limit is never guessed (`layout.is_setpoint`).
 _WORDS: Mapping[str, frozenset[str]] = {
     "time": frozenset(("time", "zeit", "t", "timestamp", "zeitstempel", "sec", "seconds", "sekunden", "uhrzeit")),
     "speed": frozenset((
@@ -47,12 +48,7 @@ _PARTS: Mapping[str, tuple[str, ...]] = {
     "time": ("time", "zeit"), "speed": ("speed", "drehzahl", "veloc", "rpm"), "torque": ("torque", "moment", "trq"),
 }
 _REPORTED = frozenset(("act", "actual", "ist", "istwert", "feedback", "fbk", "measured", "value", "reported"))
-_OTHER = frozenset((
-    "set", "setpoint", "soll", "sollwert", "ref", "reference", "target", "cmd", "command", "demand", "demanded", "max",
-    "min", "limit", "error", "deviation", "filtered", "mean", "avg", "load", "lag",
-))
-_SEPARATORS = re.compile(r"[^a-zäöüω]+")
-_HUMP = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])")
+_OTHER = frozenset(("filtered", "mean", "avg", "load", "lag"))
 
 
 @dataclass(frozen=True)
@@ -186,9 +182,9 @@ def _score(quantity: str, name: str, stated: str, cells: Sequence[str], *, comma
     """Return how well a column fits a quantity; 0 or less: not at all. Words count most, then units."""
     values = [cell for cell in cells if not is_missing(cell)]
     clock = quantity == "time" and any(":" in cell for cell in values)
-    if values and not clock and not any(map(looks_numeric, values)):
+    if (values and not clock and not any(map(looks_numeric, values))) or is_setpoint(quantity, name):
         return 0.0
-    words = {word for part in _HUMP.split(split_name(name)[0]) for word in _SEPARATORS.split(part.casefold()) if word}
+    words = words_of(quantity, name)
     folded = name.casefold()
     score = 4.0 if words & _WORDS[quantity] else 3.0 if any(part in folded for part in _PARTS[quantity]) else 0.0
     of_another = any(unit_of(other, stated) or unit_in_name(other, name) for other in QUANTITIES if other != quantity)
