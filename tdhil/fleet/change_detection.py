@@ -28,7 +28,11 @@ over none (½), a step (¼, evenly over its places) and drift (¼) gives the pro
 change" has less than 10 % in at most 1 of 9 histories without a change (Markov's inequality). The share measured by
 ``benchmarks/trend_power.py`` is 0 to 1.5 %.
 
-One step or drift is searched at a time. After a step, both sides are searched again.
+One step or drift is searched at a time. After a step, both sides are searched again. Then each step is placed again
+between its neighbours, because the first was placed while the others were in the data. The sizes are estimated with all
+steps together: H has one column for each step, so that each segment between steps has its own level. (HᵀPH)⁻¹HᵀPx are
+the sizes, and (HᵀPH)⁻¹ is their covariance. The size of one step is the difference of the two levels beside it. A
+second step that was found does not falsify it; one that was missed does. Sizes are averaged over κ, as above.
 """
 
 from __future__ import annotations
@@ -53,6 +57,7 @@ LEAST: Final = 4
 
 _SPREAD: Final = ((0.5, 0.10), (0.7, 0.20), (1.0, 0.40), (1.4, 0.15), (2.0, 0.10), (2.8, 0.05))     # κ, its prior
 _SIZES: Final = (2.0, 4.0, 8.0, 16.0, 32.0)            # τ in units of the median σ_k, each as likely
+_PASSES: Final = 8          # most searches for the places of several steps; two to three suffice
 _PRIOR: Final = {"none": 0.5, "step": 0.25, "drift": 0.25}
 
 
@@ -153,7 +158,10 @@ def history(results: Sequence[Measured], confidence: float = 0.95) -> History:
     shared = _shared(results, relative)
     whole = _evidence(x, sd, shared, time)
     drifts = whole.none < ALARM and whole.drift > whole.step
-    changes = () if drifts or whole.none >= ALARM else tuple(_steps(x, sd, shared, time, 0, confidence, relative))
+    found = [] if drifts or whole.none >= ALARM else _placed(x, sd, shared, time, _steps(x, sd, shared, time, 0))
+    sizes = _sizes(x, sd, shared, [one.at for one in found])
+    changes = tuple(ChangePoint(one.at, one.probability, one.here, _size(mean, deviation, confidence, relative))
+                    for one, (mean, deviation) in zip(found, sizes, strict=True))
     return History(
         whole.none, whole.step, whole.drift, changes,
         _size(whole.drift_size, whole.drift_sd, confidence, relative) if drifts else None, relative,
@@ -187,8 +195,6 @@ class _ChangeEvidence:
     step: float
     drift: float
     places: FloatArray          # probability of each place of a step: before result 1, 2, …
-    step_size: FloatArray
-    step_sd: FloatArray
     drift_size: float
     drift_sd: float
 
@@ -214,8 +220,8 @@ def _evidence(x: FloatArray, sd: FloatArray, shared: FloatArray, time: FloatArra
         log_ratio = -0.5 * np.log(gain) + 0.5 * np.outer(sizes**2, b**2) / gain
         top = log_ratio.max(axis=0)
         ratios.append(top + np.log(np.exp(log_ratio - top).mean(axis=0)))
-        means.append(b / a)
-        variances.append(1.0 / a)
+        means.append(b[-1] / a[-1])
+        variances.append(1.0 / a[-1])
     # p(x | model), averaged over κ; all of them multiplied by the same factor
     base = max(weights)
     none = sum(math.exp(one - base) for one in weights)
@@ -228,20 +234,56 @@ def _evidence(x: FloatArray, sd: FloatArray, shared: FloatArray, time: FloatArra
     p_steps = _PRIOR["step"] * each[:-1] / (n - 1.0)
     p_drift = _PRIOR["drift"] * float(each[-1])
     whole = p_none + float(p_steps.sum()) + p_drift
-    posterior = np.exp(by_spread - log_each)                   # posterior of κ, for each shape
-    mean = np.sum(posterior * np.array(means), axis=0)
-    second = np.sum(posterior * (np.array(variances) + np.array(means) ** 2), axis=0)
-    deviation = np.sqrt(np.maximum(second - mean**2, 0.0))
+    posterior = np.exp(by_spread[:, -1] - log_each[-1])        # posterior of κ, with a drift
+    drift_size, drift_sd = _averaged(posterior, np.array(means), np.array(variances))
     places = p_steps / max(float(p_steps.sum()), 1e-300)
     return _ChangeEvidence(
-        p_none / whole, float(p_steps.sum()) / whole, p_drift / whole, places, mean[:-1], deviation[:-1],
-        float(mean[-1]), float(deviation[-1]),
+        p_none / whole, float(p_steps.sum()) / whole, p_drift / whole, places, drift_size, drift_sd,
     )
 
 
-def _steps(
-    x: FloatArray, sd: FloatArray, shared: FloatArray, time: FloatArray, first: int, confidence: float, relative: bool
-) -> list[ChangePoint]:
+def _averaged(posterior: FloatArray, means: FloatArray, variances: FloatArray) -> tuple[float, float]:
+    """Return mean and standard deviation of a size, averaged over κ: (κ,) each."""
+    mean = float(posterior @ means)
+    return mean, math.sqrt(max(float(posterior @ (variances + means**2)) - mean**2, 0.0))
+
+
+def _sizes(x: FloatArray, sd: FloatArray, shared: FloatArray, places: Sequence[int]) -> list[tuple[float, float]]:
+    """Return size and standard deviation of each step, estimated with all steps of the history together.
+
+    ``places``: number of the first result behind each step, rising. The level of each segment has a flat prior. The
+    steps share the posterior of κ.
+    """
+    if not places:
+        return []
+    n = len(x)
+    shapes = (np.arange(n)[:, None] >= np.array(places)).astype(float)
+    design = np.column_stack((np.ones(n), shapes))
+    logs, means, variances = [], [], []
+    for spread, prior in _SPREAD:
+        inverse = np.linalg.inv(spread**2 * np.diag(sd**2) + shared)
+        normal = design.T @ inverse @ design
+        covariance = np.linalg.inv(normal)
+        levels = covariance @ (design.T @ (inverse @ x))
+        rest = x - design @ levels
+        logs.append(math.log(prior) + 0.5 * (
+            np.linalg.slogdet(inverse)[1] - np.linalg.slogdet(normal)[1] - float(rest @ inverse @ rest)))
+        means.append(levels[1:])
+        variances.append(np.diag(covariance)[1:])
+    posterior = np.exp(np.array(logs) - max(logs))
+    posterior /= posterior.sum()
+    return [_averaged(posterior, mean, variance)
+            for mean, variance in zip(np.array(means).T, np.array(variances).T, strict=True)]
+
+
+@dataclass(frozen=True)
+class _FoundStep:
+    at: int
+    probability: float
+    here: float
+
+
+def _steps(x: FloatArray, sd: FloatArray, shared: FloatArray, time: FloatArray, first: int) -> list[_FoundStep]:
     """Return the steps of one stretch, in their order. ``first``: number of its first result."""
     if len(x) < LEAST:
         return []
@@ -249,11 +291,34 @@ def _steps(
     if found.none >= ALARM or found.step <= found.drift:
         return []
     at = int(np.argmax(found.places)) + 1
-    change = _size(float(found.step_size[at - 1]), float(found.step_sd[at - 1]), confidence, relative)
-    point = ChangePoint(first + at, found.step, float(found.places[at - 1]), change)
-    before = _steps(x[:at], sd[:at], shared[:at, :at], time[:at], first, confidence, relative)
-    after = _steps(x[at:], sd[at:], shared[at:, at:], time[at:], first + at, confidence, relative)
+    point = _FoundStep(first + at, found.step, float(found.places[at - 1]))
+    before = _steps(x[:at], sd[:at], shared[:at, :at], time[:at], first)
+    after = _steps(x[at:], sd[at:], shared[at:, at:], time[at:], first + at)
     return [*before, point, *after]
+
+
+def _placed(
+    x: FloatArray, sd: FloatArray, shared: FloatArray, time: FloatArray, found: Sequence[_FoundStep]
+) -> list[_FoundStep]:
+    """Return the steps, each with its place searched again between its neighbours, until no place changes.
+
+    The first steps were placed while the later ones were still in the data. A wrong place falsifies the sizes beside
+    it.
+    """
+    steps = list(found)
+    for _ in range(_PASSES):
+        before = [one.at for one in steps]
+        for k, one in enumerate(steps):
+            start = steps[k - 1].at if k else 0
+            end = steps[k + 1].at if k + 1 < len(steps) else len(x)
+            if end - start >= LEAST:
+                part = slice(start, end)
+                seen = _evidence(x[part], sd[part], shared[part, part], time[part])
+                at = int(np.argmax(seen.places)) + 1
+                steps[k] = _FoundStep(start + at, one.probability, float(seen.places[at - 1]))
+        if [one.at for one in steps] == before:
+            break
+    return steps
 
 
 def _size(mean: float, sd: float, confidence: float, relative: bool, shared: bool = True) -> Difference:

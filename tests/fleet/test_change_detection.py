@@ -73,7 +73,9 @@ def test_the_evidence_is_that_of_the_densities(monkeypatch):
     inverse = np.linalg.inv(covariance)
     design = np.column_stack((np.ones(n), shapes[2]))
     fit = np.linalg.solve(design.T @ inverse @ design, design.T @ inverse @ x)
-    assert found.step_size[2] == pytest.approx(fit[1], rel=1e-3)
+    ((size, deviation),) = change_detection._sizes(x, sd, shared, [3])
+    assert size == pytest.approx(fit[1], rel=1e-3)
+    assert deviation == pytest.approx(math.sqrt(np.linalg.inv(design.T @ inverse @ design)[1, 1]), rel=1e-3)
 
 
 @pytest.mark.parametrize(("kind", "least", "most"), [
@@ -104,6 +106,31 @@ def test_two_steps_are_two():
     found = history([one(level * float(np.exp(0.004 * rng.standard_normal())), time=k)
                      for k, level in enumerate(levels)])
     assert [change.at for change in found.changes] == [10, 20]
+
+
+STEPS = {10: 0.04, 20: -0.03}
+"""Two steps in 30 results: number of the first result behind each, and its size."""
+
+
+@pytest.mark.parametrize("scatter", [1.0, 0.6])
+def test_the_sizes_of_two_steps_cover(scatter):
+    """Every reported step of 200 histories counts, also where only one of the two steps was found."""
+    rng = np.random.default_rng(3)
+    hits = reported = 0
+    for _ in range(200):
+        scale = 1.0 + 0.03 * rng.standard_normal()
+        results = []
+        for k in range(30):
+            level = 104.0 * scale * math.prod(1.0 + size for at, size in STEPS.items() if k >= at)
+            sd = rng.uniform(0.003, 0.008)
+            value, wide = level * float(np.exp(scatter * sd * rng.standard_normal())), math.exp(1.96 * sd)
+            results.append(Measured(value, value / wide, value * wide, 0.95, 0.03, "drive", 7.0 * k))
+        for found in history(results).changes:
+            true = STEPS[min(STEPS, key=lambda at: abs(at - found.at))]
+            reported += 1
+            hits += found.change.low <= true <= found.change.high
+    assert reported > 300
+    assert hits / reported >= 0.93
 
 
 def test_a_drive_that_was_replaced_explains_a_step_of_its_scale():
