@@ -24,6 +24,7 @@ class AcceptedQuantity:
 
 ACCEPTED_QUANTITIES: Final[Mapping[str, AcceptedQuantity]] = MappingProxyType({
     "inertia": AcceptedQuantity(INERTIA, "moment of inertia J", ("inertia_kg_m2",)),
+    "motor-inertia": AcceptedQuantity(INERTIA, "motor-side inertia J_r", ("inertia_kg_m2",)),
     "viscous": AcceptedQuantity(FRICTION, "viscous friction B", ("viscous_nm_s_rad",)),
     "coulomb": AcceptedQuantity(TORQUE, "Coulomb friction T_c", ("coulomb_nm",)),
     "speed-lag": AcceptedQuantity(TIME, "lag of the reported speed", ("speed_lag_s",)),

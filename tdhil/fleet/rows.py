@@ -13,7 +13,7 @@ from tdhil.errors import NothingRecorded
 from tdhil.recording import ABORTED
 from tdhil.version import __version__
 
-ROW_FORMAT: Final = 3
+ROW_FORMAT: Final = 4
 """Format number. It grows when older rows can't be in one table with new ones."""
 
 UNREAD: Final = "unread"
@@ -64,6 +64,7 @@ class FleetRow:
     inertia_high_kg_m2: float | None = _at("inertia_kg_m2.high")
     inertia_low_total_kg_m2: float | None = _at("inertia_kg_m2.low_total")
     inertia_high_total_kg_m2: float | None = _at("inertia_kg_m2.high_total")
+    inertia_scope: str | None = _at("inertia_scope")     # bodies to which J refers, `tdhil.report.InertiaScope`
     confidence: float | None = _at("inertia_kg_m2.confidence")
     torque_scale_rel_sd: float | None = None
     torque_calibration: str | None = None

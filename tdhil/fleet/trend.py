@@ -30,8 +30,9 @@ class Quantity:
     scaled: bool
 
 
+INERTIA_COLUMN: Final = "inertia_kg_m2"
 QUANTITIES: Final = (
-    Quantity("inertia", "inertia_kg_m2", "inertia_low_kg_m2", "inertia_high_kg_m2", "kg·m²", True),
+    Quantity("inertia", INERTIA_COLUMN, "inertia_low_kg_m2", "inertia_high_kg_m2", "kg·m²", True),
     Quantity("viscous friction", "viscous_nm_s_rad", "viscous_low_nm_s_rad", "viscous_high_nm_s_rad", "N·m·s/rad",
              True),
     Quantity("Coulomb friction", "coulomb_nm", "coulomb_low_nm", "coulomb_high_nm", "N·m", True),
@@ -117,6 +118,10 @@ def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str
                      f" ({_drive_text(kept[-1][1])}). Left out: {counted(len(others), 'result')} of"
                      f" {'; '.join(sorted({_drive_text(row) for row in others}))}. Give each rig a name of its own")
         drives = {newest[0]}
+    if kept and len(scopes := {row.inertia_scope for _, row in kept}) > 1:
+        notes.append(f"the results have {len(scopes)} kinds of J ({', '.join(sorted(map(_scope_text, scopes)))}): the"
+                     f" trend of the inertia is of the newest kind, {_scope_text(kept[-1][1].inertia_scope)}. Identify"
+                     " all logs with the same --model to follow all of them")
     calibrations = sorted({row.torque_calibration or "" for _, row in kept})
     if len(calibrations) > 1:
         dates = ", ".join(one[:10] or "none" for one in calibrations)
@@ -131,12 +136,20 @@ def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str
     }
 
 
+def _scope_text(scope: str | None) -> str:
+    from tdhil.report import scope_text
+
+    return scope_text(scope)
+
+
 def _drive_text(row: FleetRow) -> str:
     serial = f"serial number {row.drive_serial}" if row.drive_serial else "no serial number"
     return ", ".join(one for one in (row.drive_name, serial, row.profile) if one)
 
 
 def _followed(quantity: Quantity, rows: Sequence[tuple[float, FleetRow]]) -> dict[str, Any]:
+    if quantity.column == INERTIA_COLUMN and rows:
+        rows = [one for one in rows if one[1].inertia_scope == rows[-1][1].inertia_scope]
     points = [(row, one) for time_s, row in rows if (one := measured(row, quantity, time_s)) is not None]
     document: dict[str, Any] = {
         "name": quantity.name, "column": quantity.column, "unit": quantity.unit,
@@ -307,7 +320,8 @@ def _differences(first: FleetRow, other: FleetRow) -> dict[str, Any]:
     found: dict[str, Any] = {"from": first.log, "to": other.log, "quantities": []}
     for quantity in QUANTITIES:
         before, after = measured(first, quantity), measured(other, quantity)
-        if before is None or after is None:
+        if before is None or after is None or (
+                quantity.column == INERTIA_COLUMN and first.inertia_scope != other.inertia_scope):
             continue
         change = difference(before, after)
         found["quantities"].append({
@@ -318,7 +332,10 @@ def _differences(first: FleetRow, other: FleetRow) -> dict[str, Any]:
 
 
 def _compare_text(first: FleetRow, other: FleetRow, quantities: Sequence[Mapping[str, Any]]) -> str:
-    inertia = next((one for one in quantities if one["column"] == "inertia_kg_m2"), None)
+    inertia = next((one for one in quantities if one["column"] == INERTIA_COLUMN), None)
+    if None not in (first.inertia_kg_m2, other.inertia_kg_m2) and first.inertia_scope != other.inertia_scope:
+        return (f"the inertias can't be compared: {first.log} has {_scope_text(first.inertia_scope)}, and {other.log}"
+                f" has {_scope_text(other.inertia_scope)}. Compare them with the same --model")
     if inertia is None:
         without = first if first.inertia_kg_m2 is None else other
         return f"the inertia can't be compared: {without.log} has no result that stands ({without.verdict})"

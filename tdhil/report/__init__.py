@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         print_responses as print_responses, response_sentences as response_sentences, save_responses as save_responses,
     )
     from tdhil.report.graphs import GRAPHS as GRAPHS
+    from tdhil.report.inertia_scope import InertiaScope as InertiaScope, scope_text as scope_text
     from tdhil.report.html import (
         ShownPicture as ShownPicture, check_report_path as check_report_path, pictures_in as pictures_in,
         write_blocks as write_blocks, write_report as write_report,
@@ -85,6 +86,7 @@ else:
         "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",
         "frequency_response": "draw_bode draw_faults draw_responses print_responses response_sentences save_responses",
         "graphs": "GRAPHS",
+        "inertia_scope": "InertiaScope scope_text",
         "html": "ShownPicture check_report_path pictures_in write_blocks write_report",
         "letterhead": "LONGEST_LINE MOST_LINES NO_LETTERHEAD Letterhead clean_logo load_letterhead",
         "live": "LiveDisplay",

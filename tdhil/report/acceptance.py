@@ -14,10 +14,14 @@ from typing import Any, Final
 
 from profiles import MessageCode, with_code
 from tdhil.config import ACCEPTED_QUANTITIES, Expectation
+from tdhil.report.inertia_scope import InertiaScope, scope_text
 
 Part = Mapping[str, Any]
 _WITH_TORQUE: Final = ("inertia", "viscous", "coulomb")
 """Quantities that are proportional to the torque scale."""
+_INERTIAS: Final = ("inertia", "motor-inertia")
+_SETTINGS: Final = ("gain", "integral-gain", "torque-limit")
+"""Settings of the drive or of rig.yaml, in the N·m of the drive."""
 
 
 class AcceptanceVerdict(StrEnum):
@@ -95,22 +99,57 @@ def _judged(expected: Expectation, document: Part) -> Accepted:
         inside, apart = least <= low and high <= most, high < least or most < low
         verdict = AcceptanceVerdict.PASS if inside else (
             AcceptanceVerdict.FAIL if apart else AcceptanceVerdict.CANNOT_TELL)
-        seen = f"identified {value:.5g} ({low:.5g} to {high:.5g})"
+        other = _other_scope(expected.name, document)
+        verdict = AcceptanceVerdict.CANNOT_TELL if other else verdict
+        seen = f"identified {value:.5g} ({low:.5g} to {high:.5g}){other}"
     return Accepted(expected.name, quantity.label, quantity.unit.symbol, expected.value, expected.tolerance,
                     value, low, high, verdict, f"{verdict}: {wanted}, {seen}")
 
 
 def _identified(name: str, at: Iterable[str], document: Part) -> tuple[float | None, float | None, float | None]:
-    """Return value and interval; that of J includes the torque scale. A read value, such as a limit, is exact."""
-    part: Any = document
+    """Return value and interval. Those of J and friction include the torque scale; a read value, a limit, is exact."""
+    part: Any
+    part, scale = document, _drive_scale(name, document)
     for key in at:
         part = part.get(key) if isinstance(part, Mapping) else None
     if isinstance(part, int | float) and not isinstance(part, bool):
-        return float(part), float(part), float(part)
+        return scale * part, scale * part, scale * part
     if not isinstance(part, Mapping):
         return None, None, None
-    total = "_total" if name == "inertia" else ""
-    return part.get("value"), part.get(f"low{total}"), part.get(f"high{total}")
+    total = "_total" if name in _WITH_TORQUE or name in _INERTIAS else ""
+    value, low, high = (part.get(key) for key in ("value", f"low{total}", f"high{total}"))
+    if value is None or low is None or high is None:
+        return value, low, high
+    return scale * value, scale * low, scale * high
+
+
+def _drive_scale(name: str, document: Part) -> float:
+    """Return the factor from the document's scale to that of the expected value.
+
+    Torque limit and gains are settings of the drive or of rig.yaml, in the N·m of the drive. The document has them in
+    calibrated N·m, the scale in which saturation is judged. So a setting that is as expected is not wrong by κ.
+    """
+    calibration = document.get("torque_calibration")
+    if name not in _SETTINGS or not isinstance(calibration, Mapping):
+        return 1.0
+    return 1.0 / float(calibration["factor"])
+
+
+def _other_scope(name: str, document: Part) -> str:
+    """Return which J the result has instead of the expected one, in words; '' if it is the expected one.
+
+    With a string the expected J is that of the motor's side, as for ``motor-inertia``. Else it is that of all that
+    turns.
+    """
+    scope = document.get("inertia_scope")          # none: a refusal
+    if name not in _INERTIAS or scope is None:
+        return ""
+    has_string = (document.get("rig") or {}).get("load") == "string"
+    wanted = InertiaScope.MOTOR_SIDE if has_string or name != "inertia" else InertiaScope.MOTOR_AND_LOAD
+    if scope == wanted:
+        return ""
+    advice = "; expect motor-inertia instead" if scope == InertiaScope.MOTOR_SIDE else ""
+    return f", which is {scope_text(scope)}, not {scope_text(wanted)}{advice}"
 
 
 def _causes(rows: Sequence[Accepted]) -> Iterable[str]:

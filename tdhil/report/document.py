@@ -10,9 +10,10 @@ from typing import Any
 from profiles import MessageCode, entry_of, with_code
 from tdhil.calibration import CalibrationUnusable, StoredCalibration
 from tdhil.config import STATED, expectations_in
-from tdhil.estimation import FrequencyResponse, Identification, InertiaEstimate
+from tdhil.estimation import Estimate, FrequencyResponse, Identification, InertiaEstimate, Options, with_total
 from tdhil.recording import Recording
 from tdhil.report.acceptance import acceptance_of
+from tdhil.report.inertia_scope import scope_of
 from tdhil.version import __version__
 
 SIMULATED = "SIMULATED"
@@ -118,12 +119,13 @@ def result_document(
         "calibration_advised": found.calibration_advised,
         "code": found.entry.code,
         "inertia_kg_m2": _inertia(found.inertia),
+        "inertia_scope": None if (scope := scope_of(found, recording)) is None else scope.value,
         "inertia_main_shaft_kg_m2": _at_main_shaft(found.inertia, recording.gear_ratio),
         "gear_ratio": recording.gear_ratio,
         "reference_inertia_kg_m2": run.get("reference_inertia_kg_m2"),
         "torque_limit_nm": recording.torque_limit_nm,
-        "viscous_nm_s_rad": _estimate(found.viscous_nm_s_rad),
-        "coulomb_nm": _estimate(found.coulomb_nm),
+        "viscous_nm_s_rad": _scaled(found.viscous_nm_s_rad, found, recording),
+        "coulomb_nm": _scaled(found.coulomb_nm, found, recording),
         "speed_lag_s": _estimate(found.speed_lag_s),
         "torque_lag_s": _estimate(found.torque_lag_s),
         "skew_s": _estimate(found.skew_s),
@@ -293,6 +295,19 @@ def _compliant(found: Identification) -> dict[str, Any] | None:
         "antiresonance_hz": _estimate(shaft.antiresonance_hz),
         "covariance": None if shaft.covariance is None else asdict(shaft.covariance),
     }
+
+
+def _scaled(estimate: Estimate | None, found: Identification, recording: Recording) -> dict[str, float] | None:
+    """Return an estimate that is proportional to the torque: ``low_total`` to ``high_total`` include its scale, like J.
+
+    A friction that cannot be negative has no negative end.
+    """
+    if estimate is None:
+        return None
+    confidence = Options().confidence if found.inertia is None else found.inertia.confidence
+    total = with_total(estimate, recording.torque_scale_rel_sd, confidence, ())
+    low = total.low_total if estimate.low < 0.0 else max(total.low_total, 0.0)
+    return asdict(estimate) | {"low_total": low, "high_total": total.high_total}
 
 
 def _estimate(estimate: Any) -> dict[str, float] | None:

@@ -12,7 +12,7 @@ from tdhil.cli.main import main
 from tdhil.errors import UsageError
 from tdhil.fleet.rows import FleetRow, FleetSettings, row_of
 from tdhil.fleet.table import write_table
-from tdhil.fleet.trend import scale_of, trend_document
+from tdhil.fleet.trend import _differences, scale_of, trend_document
 from tests.fleet.drawn_histories import draw
 
 
@@ -81,6 +81,26 @@ def test_logs_of_two_drives_are_never_one_series():
     same_drive = trend_document([*found, *(replace(one, drive_serial=found[0].drive_serial, profile="other")
                                            for one in other)], "R7")
     assert same_drive["quantities"] == document["quantities"]      # another profile reads another torque
+
+
+def test_inertias_of_different_bodies_are_never_one_series():
+    """A rigid shaft gives motor and load, a compliant one J_r: half of each is no step of J."""
+    found, _ = rows("none")
+    mixed = [replace(one, inertia_scope="motor_and_load" if k < 12 else "motor_side",
+                     inertia_kg_m2=one.inertia_kg_m2 * (1.0 if k < 12 else 0.8),
+                     inertia_low_kg_m2=one.inertia_low_kg_m2 * (1.0 if k < 12 else 0.8),
+                     inertia_high_kg_m2=one.inertia_high_kg_m2 * (1.0 if k < 12 else 0.8))
+             for k, one in enumerate(found)]
+    document = trend_document(mixed, "R7")
+    inertia, lag = document["quantities"][0], document["quantities"][3]
+    assert (len(inertia["points"]), inertia["changes"], len(lag["points"])) == (12, [], 24)
+    (note,) = document["notes"]
+    assert "2 kinds of J (J of motor and load together, J_r, the motor's side of a compliant shaft)" in note
+
+    told = _differences(mixed[0], mixed[-1])
+    assert "inertia_kg_m2" not in {one["column"] for one in told["quantities"]}
+    assert told["text"].startswith("the inertias can't be compared: R7-00.mcap has J of motor and load together, and")
+    assert "the inertias" in _differences(mixed[0], mixed[1])["text"]
 
 
 def test_a_rig_without_a_name_is_known_by_no_file_name():

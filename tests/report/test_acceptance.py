@@ -1,13 +1,17 @@
 """Expected against identified: pass, fail or cannot tell by the interval, and what is off in words."""
 
+from dataclasses import replace
+
 import pytest
 
 from drivers import DataFileError
+from profiles import CodedText, MessageCode
 from tdhil.config import Expectation, expectations_in, expectations_of, load_rig
 from tdhil.errors import ExitCode, UsageError
+from tdhil.estimation import Estimate
 from tdhil.report import acceptance_of, card_text, result_document
 from tdhil.session.conclusion import _accepted
-from tests.report.findings import RUN, full, recording
+from tests.report.findings import RUN, bare, full, recording
 
 EXPECTED = {"inertia": (104.0, 5.0), "viscous": (8.0, 2.0), "coulomb": (60.0, 6.0), "speed-lag": (0.4, 0.05)}
 
@@ -46,6 +50,54 @@ def test_one_thing_that_is_off_is_named_and_no_other(changed, name, words):
     assert [one["name"] for one in found["quantities"] if one["verdict"] == "fail"] == [name]
     (told,) = found["off"]
     assert words in told
+
+
+def test_friction_is_judged_with_the_torque_scale_like_the_inertia():
+    """An exact friction below a torque scale of 3 % (1 sd) neither fails nor passes within 5 %."""
+    def verdict(coulomb):
+        drawn = result_document(replace(full(), coulomb_nm=Estimate(coulomb, coulomb - 0.1, coulomb + 0.1),
+                                        viscous_nm_s_rad=Estimate(8.0, 7.99, 8.01)),
+                                recording(torque_scale_rel_sd=0.03), RUN, "run.mcap")
+        return judged(drawn, {"coulomb": (60.0, 3.0)})["verdict"], drawn
+
+    assert verdict(64.5)[0] == "cannot tell"          # false fail without the scale
+    assert verdict(62.0)[0] == "cannot tell"          # false pass without the scale
+    assert verdict(75.0)[0] == "fail"
+    found = verdict(60.0)[1]
+    for name in ("coulomb_nm", "viscous_nm_s_rad"):
+        half = found[name]["high_total"] - found[name]["value"]
+        assert half == pytest.approx(1.96 * 0.03 * found[name]["value"], rel=0.01)
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_settings_are_compared_in_the_scale_of_the_drive(factor):
+    calibrated = {**document(), "torque_limit_nm": factor * 400.0, "torque_calibration": {"factor": factor},
+                  "impedance": {"gain_nm_s_rad": part(factor * 300.0, 0.01)}}
+    assert judged(calibrated, {"torque-limit": (400.0, 4.0), "gain": (300.0, 10.0)})["verdict"] == "pass"
+
+
+@pytest.mark.parametrize(("scope", "load", "name", "verdict"), [
+    ("motor_and_load", "none", "inertia", "pass"), ("motor_side", "none", "inertia", "cannot tell"),
+    ("motor_side", "string", "inertia", "pass"), ("motor_and_string", "string", "inertia", "cannot tell"),
+    ("unclear", "string", "inertia", "cannot tell"), ("motor_side", "none", "motor-inertia", "pass"),
+    ("motor_and_load", "none", "motor-inertia", "cannot tell"),
+])
+def test_the_inertia_of_other_bodies_is_not_judged(scope, load, name, verdict):
+    found = judged({**document(), "inertia_scope": scope, "rig": {"load": load}}, {name: (104.0, 5.0)})
+    assert found["verdict"] == verdict
+    assert (", which is " in found["quantities"][0]["text"]) is (verdict == "cannot tell")
+
+
+def test_the_document_states_to_which_bodies_its_inertia_refers():
+    rigid = replace(full(), compliant=None)
+    with_string = replace(recording(), has_drill_string=True)
+    together = CodedText("all turns as one", MessageCode.STRING_MOVES_WITH_MOTOR)
+    for found, log, scope in (
+        (full(), recording(), "motor_side"), (rigid, recording(), "motor_and_load"),
+        (replace(rigid, warnings=(together,)), with_string, "motor_and_string"), (rigid, with_string, "unclear"),
+        (bare(), recording(), None),
+    ):
+        assert result_document(found, log, RUN, "run.mcap")["inertia_scope"] == scope
 
 
 def test_one_factor_in_all_that_has_a_torque_is_one_cause():
