@@ -7,6 +7,7 @@ One table for data files, the command line and the columns of a trace. A text wi
 import math
 import re
 from dataclasses import dataclass
+from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from fractions import Fraction
 from typing import Final
 
@@ -147,6 +148,34 @@ def plain_number(number: float, digits: int = 4) -> str:
     if abs(number) < _NOTHING:
         return "0"
     return f"{float(f'{number:.{digits}g}'):.9g}"
+
+
+_EXACT_DIGITS: Final = 12
+"""Significant digits of a double that count. The rounding of the arithmetic below them moves no printed end."""
+
+
+def printed_ends(low: float, high: float, decimals: int) -> tuple[str, str]:
+    """Return the ends of an interval with some decimals, rounded outwards: the printed interval contains the true one.
+
+    Negative decimals round to tens and hundreds.
+    """
+    step = Decimal(1).scaleb(-decimals)
+    found = []
+    for number, way in ((low, ROUND_FLOOR), (high, ROUND_CEILING)):
+        if not math.isfinite(number):
+            found.append(plain_number(number))
+            continue
+        whole = (Decimal(f"{number:.{_EXACT_DIGITS}g}") / step).to_integral_value(way)
+        found.append(f"{float(whole * step) + 0.0:.{max(0, decimals)}f}")          # avoids −0
+    return found[0], found[1]
+
+
+def printed_interval(low: float, high: float, digits: int = 4, sign: bool = False) -> str:
+    """Return ``103.1 to 104.8``: some significant digits of the larger end, rounded outwards. ``sign``: also a plus."""
+    largest = max(abs(low), abs(high))
+    decimals = digits - 1 - math.floor(math.log10(largest)) if 0.0 < largest < math.inf else 0
+    ends = printed_ends(low, high, decimals)
+    return " to ".join(f"{'+' if sign and not one.startswith('-') else ''}{one}" for one in ends)
 
 
 def in_nm(torque_nm: float) -> str:

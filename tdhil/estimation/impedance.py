@@ -55,6 +55,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from profiles.quantities import printed_interval
 from tdhil.estimation.case import PeriodicCase
 from tdhil.estimation.frequency_domain import Box, descend, student_quantile
 from tdhil.estimation.result import DriveImpedance, Estimate, ImpedancePoint, ResidualTest, Verdict, rejects
@@ -764,7 +765,7 @@ def _small_filter(problem: ImpedanceProblem, plain: FittedImpedance, confidence:
 
 def _filter_words(declared_s: float, shows: Estimate, instead: bool) -> tuple[str, str]:
     """Return the texts for the filter that the data show and for the expected one."""
-    other = f"one of {shows.value:.3g} s ({shows.low:.3g} to {shows.high:.3g})"
+    other = f"one of {shows.value:.3g} s ({printed_interval(shows.low, shows.high, 3)})"
     if declared_s <= 0.0:
         return other, "no reference filter"
     expected = f"the declared reference filter of {declared_s:g} s"

@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
+from profiles.quantities import printed_ends, printed_interval
 from tdhil.config import OPTION
 from tdhil.errors import UsageError
 from tdhil.fleet.change_detection import LEAST, Difference, History, Measured, difference, history
@@ -204,8 +205,13 @@ def _between(change: Mapping[str, Any]) -> str:
 
 def _change_text(change: Difference, unit: str) -> str:
     if change.relative:
-        return f"{change.change:+.2%} ({change.low:+.2%} to {change.high:+.2%})"
-    return f"{change.change:+.4g} ({change.low:+.4g} to {change.high:+.4g}) {unit}"
+        low, high = printed_ends(100.0 * change.low, 100.0 * change.high, 2)
+        return f"{change.change:+.2%} ({_signed(low)}% to {_signed(high)}%)"
+    return f"{change.change:+.4g} ({printed_interval(change.low, change.high, sign=True)}) {unit}"
+
+
+def _signed(text: str) -> str:
+    return text if text.startswith("-") else f"+{text}"
 
 
 def _time_s(row: FleetRow) -> float | None:

@@ -13,6 +13,7 @@ from math import sqrt
 from typing import Any, Final
 
 from profiles import MessageCode, with_code
+from profiles.quantities import printed_interval
 from tdhil.config import ACCEPTED_QUANTITIES, Expectation
 from tdhil.report.inertia_scope import InertiaScope, scope_text
 
@@ -101,7 +102,7 @@ def _judged(expected: Expectation, document: Part) -> Accepted:
             AcceptanceVerdict.FAIL if apart else AcceptanceVerdict.CANNOT_TELL)
         other = _other_scope(expected.name, document)
         verdict = AcceptanceVerdict.CANNOT_TELL if other else verdict
-        seen = f"identified {value:.5g} ({low:.5g} to {high:.5g}){other}"
+        seen = f"identified {value:.5g} ({printed_interval(low, high, 5)}){other}"
     return Accepted(expected.name, quantity.label, quantity.unit.symbol, expected.value, expected.tolerance,
                     value, low, high, verdict, f"{verdict}: {wanted}, {seen}")
 

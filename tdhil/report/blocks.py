@@ -16,7 +16,17 @@ from typing import TYPE_CHECKING, Any
 from tdhil.config import OF_THE_HEAD
 from tdhil.recording import Recording
 from tdhil.report.acceptance import acceptance_rows, signature_rows
-from tdhil.report.card import COMPLIANT, estimate_text, in_degrees, inertia_text, minutes, plus_minus, rounded, sentence
+from tdhil.report.card import (
+    COMPLIANT,
+    estimate_text,
+    in_degrees,
+    inertia_text,
+    minutes,
+    plus_minus,
+    plus_minus_part,
+    rounded,
+    sentence,
+)
 from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows, text_of, uploaded_rows
 from tdhil.report.graphs import GRAPHS
 from tdhil.report.labels import (
@@ -335,7 +345,10 @@ def _numbers(document: Part) -> Iterator[Block]:
         add(f"{side} at the main shaft, torque scale included", document["inertia_main_shaft_kg_m2"], "kg·m²", "_total")
     add(f"{side}: repeatability, this drive", inertia, "kg·m²")
     for label in ESTIMATES:
-        add(label.name, document[label.key], label.unit)
+        part = document[label.key]
+        scaled = part is not None and "low_total" in part
+        add(f"{label.name}, torque scale included" if scaled else label.name, part, label.unit,
+            "_total" if scaled else "")
     if shaft is not None:
         for title, key, unit in COMPLIANT:
             add(title, shaft[key], unit)
@@ -410,7 +423,7 @@ def _budget(document: Part) -> Table:
 
 def _friction(document: Part) -> Table:
     """Return the friction points, two a row."""
-    cells = [(f"{p['speed_rad_s']:.2f}", plus_minus(p["torque_nm"]["value"], _half(p["torque_nm"])))
+    cells = [(f"{p['speed_rad_s']:.2f}", plus_minus_part(p["torque_nm"]))
              for p in document["friction_curve"]]
     middle = (len(cells) + 1) // 2
     rows = [(*cells[k], *(cells[middle + k] if middle + k < len(cells) else ("", ""))) for k in range(middle)]
@@ -438,8 +451,8 @@ def _lines(document: Part) -> Table:
     for p in document["lines"]:
         seen, damping = p["apparent_inertia_kg_m2"], p["apparent_damping_nm_s_rad"]
         rows.append((
-            f"{p['hertz']:.4g}", plus_minus(seen["value"], _half(seen)), _as(p["fitted_inertia_kg_m2"], _half(seen)),
-            plus_minus(damping["value"], _half(damping)), _as(p["fitted_damping_nm_s_rad"], _half(damping)),
+            f"{p['hertz']:.4g}", plus_minus_part(seen), _as(p["fitted_inertia_kg_m2"], _half(seen)),
+            plus_minus_part(damping), _as(p["fitted_damping_nm_s_rad"], _half(damping)),
             f"{p['residual_sd']:.2f}",
         ))
     heads = (("frequency, Hz", 0.14), ("Im(T/ω)/2πf, kg·m²", 0.22), ("model", 0.12), ("Re(T/ω), N·m·s/rad", 0.22),

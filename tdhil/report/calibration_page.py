@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tdhil.report.acceptance import SIGNATURE_LINE
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Report, ReportSection, Table, shown_date
-from tdhil.report.card import sentence, with_interval
+from tdhil.report.card import interval_and_share, sentence
 from tdhil.report.document import SIMULATED
 
 if TYPE_CHECKING:
@@ -35,8 +35,7 @@ def run_name(run: Part) -> str:
 
 def with_share(part: Part, unit: str) -> str:
     """Return a quantity with its interval, and with half of the interval in percent."""
-    share = 50.0 * (part["high"] - part["low"]) / part["value"]
-    return f"{with_interval(part['value'], part['low'], part['high'], unit).rstrip()}  ±{share:#.2g} %"
+    return interval_and_share(part["value"], part["low"], part["high"], unit)
 
 
 def scale_error(factor: Part, quantity: str = "torque") -> str:

@@ -12,7 +12,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from profiles.quantities import plain_number
+from profiles.quantities import plain_number, printed_ends
 from tdhil.report.acceptance import acceptance_rows
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows, uploaded_rows
@@ -25,7 +25,11 @@ from tdhil.report.labels import (
 )
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Numbers with the digits that their interval justifies.
+# Numbers with the digits that their interval justifies. The ends of an interval are rounded outwards (`printed_ends`).
+
+ASYMMETRIC = 1.2
+"""Ratio of the longer to the shorter side from which an interval is printed by its ends. Below it ± the longer side is
+less than a tenth wider than the interval."""
 
 
 def with_interval(value: float, low: float, high: float, unit: str) -> str:
@@ -33,8 +37,7 @@ def with_interval(value: float, low: float, high: float, unit: str) -> str:
     half = 0.5 * (high - low)
     if not all(math.isfinite(number) for number in (value, low, high)) or half <= 0.0:
         return f"{plain_number(value, 5)} {unit}"
-    shown = (_digits(number, half) for number in (value, low, high))
-    return "{} ({} to {}) ".format(*shown) + unit
+    return "{} ({} to {}) ".format(*rounded(value, low, high)) + unit
 
 
 def rounded(value: float | None, low: float | None, high: float | None) -> tuple[str, str, str]:
@@ -42,33 +45,44 @@ def rounded(value: float | None, low: float | None, high: float | None) -> tuple
     ends = [number for number in (low, high) if number is not None]
     half = 0.5 * (ends[1] - ends[0]) if len(ends) == 2 else 0.0
 
-    def shown(number: float | None) -> str:
-        if number is None:
-            return "open"
-        return _digits(number, half) if half > 0.0 and math.isfinite(half) else plain_number(number)
-
-    return shown(value), shown(low), shown(high)
+    if half > 0.0 and math.isfinite(half) and low is not None and high is not None:
+        return "open" if value is None else _digits(value, half), *printed_ends(low, high, _decimals(half))
+    middle, below, above = ("open" if number is None else plain_number(number) for number in (value, low, high))
+    return middle, below, above
 
 
 def plus_minus(value: float, half_width: float) -> str:
-    """Return ``83.9 ± 3.0``, with decimals as in `with_interval`."""
+    """Return ``83.9 ± 3.0``, with decimals as in `with_interval`. The half-width covers the rounding of the value."""
     if not (math.isfinite(value) and math.isfinite(half_width)) or half_width <= 0.0:
         return plain_number(value)
-    return f"{_digits(value, half_width)} ± {_digits(half_width, half_width)}"
+    middle = _digits(value, half_width)
+    apart = half_width + abs(float(middle) - value)
+    return f"{middle} ± {printed_ends(0.0, apart, _decimals(half_width))[1]}"
+
+
+def _decimals(half_width: float) -> int:
+    """Return the decimals that end at the second significant digit of the half-width; negative for tens."""
+    return 1 - math.floor(math.log10(half_width))
 
 
 def _digits(number: float, half_width: float) -> str:
     """Round to the second significant digit of the half-width, tens and hundreds included."""
-    decimals = 1 - math.floor(math.log10(half_width))
+    decimals = _decimals(half_width)
     return f"{round(number, decimals) + 0.0:.{max(0, decimals)}f}"          # avoids −0
 
 
 def percent(half_width: float, value: float) -> str:
-    """Return ``±0.80 %`` of the value: two significant digits."""
+    """Return ``±0.80 %`` of the value: two significant digits, rounded up."""
     if not value or not math.isfinite(half_width):
         return "±?"
     share = 100.0 * half_width / abs(value)
-    return f"±{share:.0f} %" if share >= 9.95 else f"±{share:#.2g} %"
+    return f"±{printed_ends(0.0, share, _decimals(share))[1] if share > 0.0 else '0'} %"
+
+
+def _asymmetric(value: float, low: float, high: float) -> bool:
+    """Return whether one side of the interval is clearly longer than the other."""
+    shorter, longer = sorted((value - low, high - value))
+    return math.isfinite(longer) and longer > ASYMMETRIC * shorter
 
 
 def minutes(seconds: float) -> str:
@@ -133,9 +147,9 @@ def impedance_rows(document: Mapping[str, Any]) -> Iterator[Row]:
         least = min(seen, key=lambda point: float(point["reflection_total"]["value"]))
         chosen = dict.fromkeys([min(seen, key=lambda point: abs(float(point["hertz"]) - hertz))["hertz"]
                               for hertz in (0.1, 0.2, 0.5)])
-        parts = [f"{point['hertz']:.2g} Hz: {_plus_minus(point['reflection_total'])}" for point in seen
+        parts = [f"{point['hertz']:.2g} Hz: {plus_minus_part(point['reflection_total'])}" for point in seen
                  if point["hertz"] in chosen]
-        yield "|r| at the string", f"least at {least['hertz']:.2g} Hz: {_plus_minus(least['reflection_total'])}"
+        yield "|r| at the string", f"least at {least['hertz']:.2g} Hz: {plus_minus_part(least['reflection_total'])}"
         yield "", "   ".join(parts)
 
 
@@ -152,7 +166,7 @@ def opinion_rows(document: Mapping[str, Any]) -> Iterator[Row]:
 
 def friction_rows(document: Mapping[str, Any], to_a_line: int = 2) -> Iterator[Row]:
     """Yield the friction torque at every steady speed of the run."""
-    points = [f"{p['speed_rad_s']:.2f} rad/s: {_plus_minus(p['torque_nm'])}" for p in document["friction_curve"]]
+    points = [f"{p['speed_rad_s']:.2f} rad/s: {plus_minus_part(p['torque_nm'])}" for p in document["friction_curve"]]
     if points:
         width = max(len(point) for point in points)
         pairs = [points[k : k + to_a_line] for k in range(0, len(points), to_a_line)]
@@ -164,7 +178,7 @@ def harmonic_rows(document: Mapping[str, Any]) -> Iterator[Row]:
     title = TORQUE_OVER_ANGLE
     for one in document.get("harmonics") or ():
         amplitude, phase = estimate_text(one["amplitude_nm"], "N·m"), in_degrees(one["phase_rad"])
-        yield title, f"order {one['order']}: {amplitude}, phase {_plus_minus(phase)}°"
+        yield title, f"order {one['order']}: {amplitude}, phase {plus_minus_part(phase)}°"
         title = ""
 
 
@@ -204,14 +218,28 @@ def estimate_text(part: Mapping[str, Any], unit: str) -> str:
     return with_interval(part["value"], part["low"], part["high"], unit)
 
 
+def quoted(part: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the estimate with the interval to quote: with the torque scale, if it is proportional to the torque."""
+    return {**part, "low": part["low_total"], "high": part["high_total"]} if "low_total" in part else part
+
+
 def inertia_text(part: Mapping[str, Any], kind: str = "") -> str:
     """Return J with the interval that includes the torque scale (``_total``), or with that of the repeatability."""
-    value, low, high = part["value"], part["low" + kind], part["high" + kind]
-    return f"{with_interval(value, low, high, 'kg·m²')}  {percent(0.5 * (high - low), value)}"
+    return interval_and_share(part["value"], part["low" + kind], part["high" + kind], "kg·m²")
 
 
-def _plus_minus(part: Mapping[str, Any]) -> str:
-    return plus_minus(part["value"], 0.5 * (part["high"] - part["low"]))
+def interval_and_share(value: float, low: float, high: float, unit: str) -> str:
+    """Return ``104.3 (100.1 to 108.4) kg·m²  ±4.0 %``. A clearly asymmetric interval has no ± behind it."""
+    ends = with_interval(value, low, high, unit).rstrip()
+    return ends if _asymmetric(value, low, high) else f"{ends}  {percent(max(value - low, high - value), value)}"
+
+
+def plus_minus_part(part: Mapping[str, Any]) -> str:
+    """Return ``83.9 ± 3.0``, or ``83.9 (81.0 to 88.2)`` if the interval is clearly asymmetric."""
+    value, low, high = part["value"], part["low"], part["high"]
+    if _asymmetric(value, low, high):
+        return "{} ({} to {})".format(*rounded(value, low, high))
+    return plus_minus(value, max(value - low, high - value))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -247,7 +275,7 @@ def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
         rows.add_row("reference J", f"{document['reference_inertia_kg_m2']:g} kg·m² (rig.yaml)")
     for label in ESTIMATES:
         if (part := document[label.key]) is not None:
-            rows.add_row(label.on_card, estimate_text(part, label.unit))
+            rows.add_row(label.on_card, estimate_text(quoted(part), label.unit))
     more = (*impedance_rows(document), *compliant_rows(document), *harmonic_rows(document),
             *friction_rows(document, 1 if narrow else 2), *opinion_rows(document))
     for title, text in more:

@@ -13,6 +13,7 @@ from rich import box
 from rich.table import Table as Grid
 from rich.text import Text as Words
 
+from profiles.quantities import printed_interval
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table
 from tdhil.report.card import minutes
 from tdhil.report.console import PlainConsole, names_and_texts
@@ -221,7 +222,7 @@ def severity_report(document: Part, found: Sequence[Severity]) -> Report:
             ReportSection("What the figures mean", (Pairs(tuple(_EXPLAINED.items())),)),
             ReportSection("What it rests on", (Pairs((
                 ("J, main shaft", f"{document['inertia_kg_m2']['value']:.4g} kg·m² "
-                 f"({document['inertia_kg_m2']['low']:.4g} to {document['inertia_kg_m2']['high']:.4g})"),
+                 f"({printed_interval(document['inertia_kg_m2']['low'], document['inertia_kg_m2']['high'])})"),
                 ("string", f"ζ {document['string']['impedance_nm_s_rad']:.4g} N·m·s/rad, echo after "
                  f"{document['string']['echo_s']:.3f} s"),
                 *(("record" if len(records) == 1 else name, one["file"])

@@ -12,6 +12,7 @@ from rich import box
 from rich.table import Table as Grid
 from rich.text import Text as Words
 
+from profiles.quantities import printed_interval
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
 from tdhil.report.card import with_interval
 from tdhil.report.console import PlainConsole, names_and_texts
@@ -366,7 +367,7 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
     lags = " + ".join(f"{1e3 * lag:.3g}" for lag in main["inner_lags_s"])
     whole = main["inner_lag_s"]
     yield "lags in the loop", f"{lags} ms, {main['inner_lags_from']}" + (
-        f"; together {1e3 * whole['value']:.3g} ({1e3 * whole['low']:.3g} to {1e3 * whole['high']:.3g}) ms"
+        f"; together {1e3 * whole['value']:.3g} ({printed_interval(1e3 * whole['low'], 1e3 * whole['high'], 3)}) ms"
         if whole["high"] > whole["low"] else "")
     yield "string", (f"ζ {string['impedance_nm_s_rad']:.4g} N·m·s/rad, echo after {string['echo_s']:.3f} s, modes at "
                      + ", ".join(f"{hertz:.3g}" for hertz in string["modes_hz"]) + " Hz")

@@ -19,6 +19,7 @@ from typing import Any, Final
 from urllib.parse import unquote, urlsplit
 
 from profiles import visible
+from profiles.quantities import printed_interval
 from tdhil.errors import MessageCode, UsageError
 from tdhil.service.password_file import read_password
 
@@ -137,5 +138,5 @@ def _figure(message: Mapping[str, Any]) -> str:
     value, low, high = (message.get(name) for name in ("inertia_kg_m2", "low_kg_m2", "high_kg_m2"))
     if value is None:
         return ""
-    interval = "" if low is None or high is None else f" ({low:.4g} to {high:.4g})"
+    interval = "" if low is None or high is None else f" ({printed_interval(low, high)})"
     return f"J = {value:.4g}{interval} kg·m²"

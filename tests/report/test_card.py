@@ -4,11 +4,22 @@ import io
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from rich.console import Console
 
+from profiles.quantities import printed_interval
 from tdhil.report.blocks import report_of
-from tdhil.report.card import card_text, estimate_text, percent, plus_minus, print_card, with_interval
+from tdhil.report.card import (
+    card_text,
+    estimate_text,
+    inertia_text,
+    percent,
+    plus_minus,
+    plus_minus_part,
+    print_card,
+    with_interval,
+)
 from tdhil.report.document import result_document
 from tests.report.findings import RUN, bare, full, open_sided, recording
 
@@ -38,8 +49,8 @@ def test_on_forty_columns_no_number_and_no_warning_is_cut_off():
 def test_every_part_is_shown():
     card = shown(full())
     for wanted in (
-        "J, 95 % interval       104.0 (99.9 to 108.1) kg·m²  ±3.9 %",
-        "repeatability          104.00 (103.55 to 104.45) kg·m²  ±0.43 %, this drive",
+        "J, 95 % interval       104.0 (99.9 to 108.1) kg·m²  ±4.0 %",
+        "repeatability          104.00 (103.55 to 104.45) kg·m²  ±0.44 %, this drive",
         "SIMULATED", "motor's side, J_r", "J_L behind the spring",
         "130.0 (128.0 to 132.0) kg·m²", "500 (480 to 520) N·m/rad", "left open by the data",
         "2.90 rad/s: 83.1 ± 1.5", "7.00 rad/s: 116.20 ± 0.80",
@@ -57,12 +68,12 @@ def test_every_part_is_shown():
 def test_where_the_torque_scale_is_exact_there_is_one_interval():
     exact = replace(full(), inertia=replace(full().inertia, low_total=103.55, high_total=104.45))
     card = shown(exact)
-    assert "104.00 (103.55 to 104.45) kg·m²  ±0.43 %" in card
+    assert "104.00 (103.55 to 104.45) kg·m²  ±0.44 %" in card
     assert "repeatability" not in card
 
 
 def test_the_main_shaft_s_is_the_one_to_quote_too():
-    assert re.search(r"J at main shaft +416 \(400 to 432\) kg·m²  ±3.9 %", shown(full(), gear_ratio=2.0))
+    assert re.search(r"J at main shaft +416 \(399 to 433\) kg·m²  ±4.0 %", shown(full(), gear_ratio=2.0))
 
 
 def test_open_sides_are_said():
@@ -81,11 +92,46 @@ def test_a_refusal_shows_nothing_that_is_not_there():
 
 
 def test_digits_follow_the_half_width():
-    assert plus_minus(83.1234, 1.5) == "83.1 ± 1.5"
-    assert plus_minus(1234.5, 120.0) == "1230 ± 120"
+    assert plus_minus(83.1234, 1.5) == "83.1 ± 1.6"      # 81.6 to 84.6 would miss 84.6234
+    assert plus_minus(1234.5, 120.0) == "1230 ± 130"
     assert plus_minus(5.0, float("inf")) == "5"
     assert with_interval(-0.0003, -0.014, 0.016, "s") == "0.000 (-0.014 to 0.016) s"
-    assert [percent(half, 100.0) for half in (3.95, 0.5, 12.3, 0.034)] == ["±4.0 %", "±0.50 %", "±12 %", "±0.034 %"]
+    assert [percent(half, 100.0) for half in (3.95, 0.5, 12.3, 0.034)] == ["±4.0 %", "±0.50 %", "±13 %", "±0.034 %"]
+
+
+def test_a_printed_interval_contains_the_true_one():
+    """No end is rounded inwards: 20 000 intervals of any size, as ends and as ±."""
+    rng = np.random.default_rng(8)
+    for value, below, above in zip(rng.normal(0, 300, 20_000), 10 ** rng.uniform(-4, 3, 20_000),
+                                   10 ** rng.uniform(-4, 3, 20_000), strict=True):
+        low, high = value - below, value + above
+        allowed = 1e-9 * (abs(value) + above + below)
+        for text in (with_interval(value, low, high, "").split("(")[1].split(")")[0], printed_interval(low, high)):
+            ends = [float(end) for end in text.split(" to ")]
+            assert ends[0] <= low + allowed and high - allowed <= ends[1], (text, low, high)
+        middle, _, half = plus_minus(value, above).partition(" ± ")
+        assert float(middle) - float(half) <= value - above + allowed
+        assert float(middle) + float(half) >= value + above - allowed
+
+
+def test_an_exact_end_is_printed_as_it_is():
+    assert with_interval(104.0, 103.55, 104.45, "") == "104.00 (103.55 to 104.45) "
+    assert with_interval(104.2, 100.14, 108.26, "") == "104.2 (100.1 to 108.3) "
+    assert with_interval(104.2, 100.06, 108.34, "") == "104.2 (100.0 to 108.4) "
+    assert with_interval(1234.0, 1111.0, 1357.0, "") == "1230 (1110 to 1360) "
+    assert printed_interval(-0.01234, 0.01235, 3, sign=True) == "-0.0124 to +0.0124"
+
+
+def test_a_clearly_asymmetric_interval_is_printed_by_its_ends():
+    assert plus_minus_part({"value": 83.0, "low": 82.0, "high": 84.1}) == "83.0 ± 1.1"
+    assert plus_minus_part({"value": 83.0, "low": 82.0, "high": 86.0}) == "83.0 (82.0 to 86.0)"
+    assert inertia_text({"value": 100.0, "low": 96.0, "high": 104.1}) == "100.0 (96.0 to 104.1) kg·m²  ±4.1 %"
+    assert inertia_text({"value": 100.0, "low": 98.0, "high": 107.0}) == "100.0 (98.0 to 107.0) kg·m²"
+
+
+def test_the_friction_on_the_card_includes_the_torque_scale_like_the_inertia():
+    """Coulomb friction 59.7 ± 1.0 N·m and a scale of 2 % (1 sd): hypot(1.0, 1.96 · 0.02 · 59.7) = 2.54 N·m."""
+    assert re.search(r"Coulomb friction T_c +59\.7 \(57\.1 to 62\.3\) N·m", shown(full()))
 
 
 def test_a_lag_at_its_bound_of_zero_is_at_most_so_long():

@@ -72,8 +72,8 @@ def test_everything_is_on_it():
     text = page(full())
     assert text.count("<svg") == 5
     for wanted in (
-        "J_r = 104.0 (99.9 to 108.1) kg·m²  ±3.9 %", "J_r + J_L = 130.0 (128.0 to 132.0) kg·m²",
-        "repeatability, this drive: 104.00 (103.55 to 104.45) kg·m²  ±0.43 %", "SIMULATED",
+        "J_r = 104.0 (99.9 to 108.1) kg·m²  ±4.0 %", "J_r + J_L = 130.0 (128.0 to 132.0) kg·m²",
+        "repeatability, this drive: 104.00 (103.55 to 104.45) kg·m²  ±0.44 %", "SIMULATED",
         "does not agree", "J_r, the motor&#39;s side: repeatability", "9 of 3200 cycles without feedback",
         "scatter from period to period",
         "111.5 kg·m²", "116.20 ± 0.80",

@@ -16,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from profiles import CodedText, MessageCode
+from profiles.quantities import printed_interval
 from tdhil.config import has_plateaus
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.cross_checks.friction_by_speed import Inertia, friction_curve
@@ -142,7 +143,7 @@ def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Ref
         if apart > _ALIKE * reference.value and _agrees(wider, finding, confidence, share) is False:
             return Refusal(
                 f"two routes through the same run contradict each other: J is {reference.value:.4g} kg·m² by the "
-                f"excitation and {own.value:.4g} ({own.low:.4g} to {own.high:.4g}) kg·m² by the {opinion.route}; "
+                f"excitation and {own.value:.4g} ({printed_interval(own.low, own.high)}) kg·m² by the {opinion.route}; "
                 "a signal changed its scale during the run, the load changed, or friction is not what the model takes "
                 "it for",
                 "check that speed and torque are reported with one scale in all stages and that the load stays the same"
@@ -179,7 +180,7 @@ def disagreements(opinions: tuple[SecondOpinion, ...], finding: Finding) -> tupl
     return tuple(
         CodedText(
             f"the momentum cross-check ({opinion.route}) does not agree: {opinion.inertia_kg_m2.value:.4g} "
-            f"({opinion.inertia_kg_m2.low:.4g} to {opinion.inertia_kg_m2.high:.4g}) kg·m² against "
+            f"({printed_interval(opinion.inertia_kg_m2.low, opinion.inertia_kg_m2.high)}) kg·m² against "
             f"{reference.value:.4g}; friction, load or the torque scale may differ from the model",
             MessageCode.CROSS_CHECK_DISAGREES,
         )

@@ -21,6 +21,7 @@ from itertools import pairwise
 import numpy as np
 
 from profiles import CodedText, MessageCode
+from profiles.quantities import printed_interval
 from tdhil.estimation.case import Case
 from tdhil.estimation.frequency_domain import student_quantile
 from tdhil.estimation.result import Estimate, Refusal, Refused, TorqueRatio, normal_quantile
@@ -300,7 +301,7 @@ def _worst(found: tuple[TorqueRatio, ...]) -> TorqueRatio | None:
 
 def _sentence(found: TorqueRatio) -> str:
     ratio = found.ratio
-    interval = f"{ratio.low:.4g} to {ratio.high:.4g}"
+    interval = printed_interval(ratio.low, ratio.high)
     return f"the reported torque is {ratio.value:.4g} ({interval}) of the {found.reference} torque"
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from profiles import CodedText, MessageCode
+from profiles.quantities import printed_interval
 from tdhil.estimation.candidates import (
     A_STRING,
     BY_DIFFERENCE,
@@ -628,7 +629,7 @@ def _pipe_contradiction(ratio: float) -> Refusal:
 def _together(total: Estimate | None) -> str:
     if total is None:
         return ""
-    return f"; together they are {total.value:.4g} kg·m² ({total.low:.4g} to {total.high:.4g})"
+    return f"; together they are {total.value:.4g} kg·m² ({printed_interval(total.low, total.high)})"
 
 
 def name_of(fit: CompliantFit, asked: str) -> str:

@@ -115,7 +115,9 @@
     if (value === null || value === undefined) return null;
     if (low === null || low === undefined || high === null || high === undefined) return number(value);
     const half = (high - low) / 2, places = half > 0 ? Math.min(12, Math.max(0, 1 - Math.floor(Math.log10(half)))) : 4;
-    return tr("{value} ({low} to {high})", { value: fixed(value, places), low: fixed(low, places), high: fixed(high, places) });
+    // the ends are rounded outwards; 1e-6 of the last digit is the rounding of the arithmetic
+    const step = 10 ** -places, down = Math.floor(low / step + 1e-6) * step, up = Math.ceil(high / step - 1e-6) * step;
+    return tr("{value} ({low} to {high})", { value: fixed(value, places), low: fixed(down, places), high: fixed(up, places) });
   }
   const withUnit = (text) => (text === null ? null : `${text} kg·m²`);
   const inertia = (one) => (one ? withUnit(interval(one.inertia_kg_m2, one.low_kg_m2, one.high_kg_m2)) : null);

@@ -17,9 +17,11 @@
     const rows = [[tr("verdict"), word(result.verdict, "verdict")]];
     const J = result.inertia_kg_m2;
     const estimate = (one, unit) => (one ? `${of(one)} ${unit}` : null);
+    // an estimate that is proportional to the torque is quoted with the torque scale, like J
+    const quoted = (one) => (one && one.low_total !== undefined ? { ...one, low: one.low_total, high: one.high_total } : one);
     if (J) rows.push([tr("J, {share} % interval to quote", { share: number(100 * (J.confidence ?? 0.95)) }), `${ofResult(result)}  ${percent(J.half_width_total_rel)}`], [tr("repeatability, this drive"), `${of(J)} kg·m²  ${percent(J.repeatability_rel)}`]);
     for (const [name, key, unit] of [[tr("viscous friction B"), "viscous_nm_s_rad", "N·m·s/rad"], [tr("Coulomb friction T_c, constant load included"), "coulomb_nm", "N·m"], [tr("lag of the reported speed"), "speed_lag_s", "s"], [tr("lag of the reported torque"), "torque_lag_s", "s"], [tr("time offset between speed and torque"), "skew_s", "s"]]) {
-      const text = estimate(result[key], unit);
+      const text = estimate(quoted(result[key]), unit);
       if (text) rows.push([name, text]);
     }
     if (result.model) rows.push([tr("model"), result.model]);
