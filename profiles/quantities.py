@@ -171,10 +171,13 @@ def printed_ends(low: float, high: float, decimals: int) -> tuple[str, str]:
 
 
 def printed_interval(low: float, high: float, digits: int = 4, sign: bool = False) -> str:
-    """Return ``103.1 to 104.8``: some significant digits of the larger end, rounded outwards. ``sign``: also a plus."""
+    """Return ``103.1 to 104.8``: some significant digits of the larger end, rounded outwards, without zeros at the end.
+
+    ``sign``: also a plus.
+    """
     largest = max(abs(low), abs(high))
     decimals = digits - 1 - math.floor(math.log10(largest)) if 0.0 < largest < math.inf else 0
-    ends = printed_ends(low, high, decimals)
+    ends = (one.rstrip("0").rstrip(".") if "." in one else one for one in printed_ends(low, high, decimals))
     return " to ".join(f"{'+' if sign and not one.startswith('-') else ''}{one}" for one in ends)
 
 

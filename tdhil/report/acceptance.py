@@ -21,8 +21,8 @@ Part = Mapping[str, Any]
 _WITH_TORQUE: Final = ("inertia", "viscous", "coulomb")
 """Quantities that are proportional to the torque scale."""
 _INERTIAS: Final = ("inertia", "motor-inertia")
-_SETTINGS: Final = ("gain", "integral-gain", "torque-limit")
-"""Settings of the drive or of rig.yaml, in the N·m of the drive."""
+_SETTINGS: Final = ("torque-limit",)
+"""Settings in the N·m of the drive, which the document has in calibrated N·m."""
 
 
 class AcceptanceVerdict(StrEnum):
@@ -127,8 +127,10 @@ def _identified(name: str, at: Iterable[str], document: Part) -> tuple[float | N
 def _drive_scale(name: str, document: Part) -> float:
     """Return the factor from the document's scale to that of the expected value.
 
-    Torque limit and gains are settings of the drive or of rig.yaml, in the N·m of the drive. The document has them in
-    calibrated N·m, the scale in which saturation is judged. So a setting that is as expected is not wrong by κ.
+    The torque limit is a setting of the drive or of rig.yaml, in the N·m of the drive. If a calibration was applied,
+    the document has it in calibrated N·m, the scale in which saturation is judged. A correct setting must not fail by
+    κ.
+    The gains need no factor: no calibration is applied to a run that measures the drive's impedance.
     """
     calibration = document.get("torque_calibration")
     if name not in _SETTINGS or not isinstance(calibration, Mapping):

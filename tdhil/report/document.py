@@ -104,10 +104,11 @@ def run_facts(recording: Recording, run: Mapping[str, Any], log: str) -> dict[st
 
 
 def result_document(
-    identification: Identification, recording: Recording, run: Mapping[str, Any], log: str
+    identification: Identification, recording: Recording, run: Mapping[str, Any], log: str, *, calibrated: bool = True
 ) -> dict[str, Any]:
     """Return plain data for `json.dumps`. ``run`` is the log's configuration; everything else is SI at the motor shaft.
 
+    ``calibrated``: the torque calibration in the log, if there is one, was applied to ``recording``.
     Numbers that are not finite become null, because JSON has no NaN.
     """
     found = identification
@@ -153,7 +154,7 @@ def result_document(
         "complete": recording.complete,
         "ended": _mapping(run.get("ended")),
         **provenance(run),
-        "torque_calibration": _calibration(run.get("torque_calibration")),
+        "torque_calibration": _calibration(run.get("torque_calibration")) if calibrated else None,
         "log": log,
         "cycles": run.get("counters"),
         "cycle": run.get("cycle"),

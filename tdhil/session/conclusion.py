@@ -128,7 +128,7 @@ def conclude(
     # for a run that measured the drive's own impedance, this result decides
     measured = identification.impedance
     stands = (identification if measured is None else measured).verdict in (Verdict.VALID, Verdict.VALID_WIDE)
-    document = result_document(identification, recording, run, log)
+    document = result_document(identification, recording, run, log, calibrated=bool(applied.day))
     code = code_with(document["rehearsal"], _accepted(document["acceptance"], stands=stands))
     return Conclusion(identification, document, ExitCode(code))
 

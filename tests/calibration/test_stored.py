@@ -45,6 +45,12 @@ def test_a_run_with_a_calibration_is_in_calibrated_torque(document):
     assert found.document["torque_calibration"]["factor"] == document["calibration_factor"]["value"]
     assert conclude(recording(0.0, 7), RUN, "run.mcap").document["torque_calibration"] is None
 
+    limited, setting = replace(recording(0.0, 7), torque_limit_nm=400.0), [
+        {"name": "torque-limit", "value": 400.0, "tolerance": 0.1}]
+    accepted = conclude(limited, {**RUN, "torque_calibration": document, "acceptance": setting}, "run.mcap").document
+    assert accepted["torque_limit_nm"] == pytest.approx(400.0 * document["calibration_factor"]["value"])
+    assert accepted["acceptance"]["verdict"] == "pass"
+
 
 @pytest.mark.heavy
 def test_the_file_is_read_again_and_never_written_over(document, tmp_path):
@@ -81,7 +87,9 @@ def test_another_drive_is_refused_before_motion_and_never_calibrated(document):
     with pytest.raises(PreflightRefused, match="serial is 17, and 23"):
         refuse_another_drive({"torque_calibration": document}, other)
     refuse_another_drive({"torque_calibration": document}, IDENTITY)
-    found = conclude(recording(0.0, 7), {"identity": other, "torque_calibration": document}, "run.mcap").identification
+    concluded = conclude(recording(0.0, 7), {"identity": other, "torque_calibration": document}, "run.mcap")
+    assert concluded.document["torque_calibration"] is None
+    found = concluded.identification
     assert found.inertia.value == pytest.approx(SCALE * INERTIA, rel=0.01)
     assert any("not applied" in warning and "serial" in warning for warning in found.warnings)
 

@@ -10,9 +10,10 @@ import pytest
 
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
+from tdhil.fleet.change_detection import Difference
 from tdhil.fleet.rows import FleetRow, FleetSettings, row_of
 from tdhil.fleet.table import write_table
-from tdhil.fleet.trend import _differences, scale_of, trend_document
+from tdhil.fleet.trend import _change_text, _differences, scale_of, trend_document
 from tests.fleet.drawn_histories import draw
 
 
@@ -101,6 +102,13 @@ def test_inertias_of_different_bodies_are_never_one_series():
     assert "inertia_kg_m2" not in {one["column"] for one in told["quantities"]}
     assert told["text"].startswith("the inertias can't be compared: R7-00.mcap has J of motor and load together, and")
     assert "the inertias" in _differences(mixed[0], mixed[1])["text"]
+
+
+def test_the_interval_of_a_change_is_rounded_outwards():
+    assert _change_text(Difference(0.0212, 0.02046, 0.02194, 0.95, True, True, 1.0), "kg·m²") == (
+        "+2.12% (+2.04% to +2.20%)")
+    assert _change_text(Difference(0.01, -0.00123456, 0.0234561, 0.95, False, True, 0.9), "s") == (
+        "+0.01 (-0.00124 to +0.02346) s")
 
 
 def test_a_rig_without_a_name_is_known_by_no_file_name():

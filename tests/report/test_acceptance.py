@@ -71,9 +71,12 @@ def test_friction_is_judged_with_the_torque_scale_like_the_inertia():
 
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_settings_are_compared_in_the_scale_of_the_drive(factor):
-    calibrated = {**document(), "torque_limit_nm": factor * 400.0, "torque_calibration": {"factor": factor},
-                  "impedance": {"gain_nm_s_rad": part(factor * 300.0, 0.01)}}
-    assert judged(calibrated, {"torque-limit": (400.0, 4.0), "gain": (300.0, 10.0)})["verdict"] == "pass"
+    """A calibration that was not applied, as in a run that measures the impedance, changes neither limit nor gain."""
+    for applied, limit_nm in ((True, factor * 400.0), (False, 400.0)):
+        found = {**document(), "torque_limit_nm": limit_nm,
+                 "torque_calibration": {"factor": factor} if applied else None,
+                 "impedance": {"gain_nm_s_rad": part(300.0, 0.01)}}
+        assert judged(found, {"torque-limit": (400.0, 4.0), "gain": (300.0, 10.0)})["verdict"] == "pass"
 
 
 @pytest.mark.parametrize(("scope", "load", "name", "verdict"), [
