@@ -5,6 +5,7 @@ advances its plant by the same time, so that a run of minutes takes seconds and 
 """
 
 import math
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -24,12 +25,23 @@ class Clock(Protocol):
     def wait_until(self, time_s: float) -> float: ...
 
 
-def _boot_time_s() -> float:
-    """Return monotonic time that includes sleep: a loop must detect that the laptop slept."""
-    return time.clock_gettime(time.CLOCK_BOOTTIME)
+_BOOT_TIME = "CLOCK_BOOTTIME"
+_CLOCKS = {"darwin": "CLOCK_MONOTONIC_RAW"}
+"""Monotonic clock that includes sleep, by platform; any other platform: `_BOOT_TIME`. On macOS `time.monotonic` reads
+mach_absolute_time, which stops during sleep. CLOCK_MONOTONIC_RAW reads mach_continuous_time, which does not (Apple's
+clock_gettime(3)). On Linux the clock of that name stops, and CLOCK_BOOTTIME does not (clock_gettime(2))."""
 
 
-_now_s = _boot_time_s if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic
+def _clock_with_sleep(platform: str) -> Callable[[], float]:
+    """Return monotonic time that includes sleep: a loop must detect that the laptop slept.
+
+    `time.monotonic` if the platform has no such clock by a name. On Windows it includes sleep.
+    """
+    name = _CLOCKS.get(platform, _BOOT_TIME)
+    return (lambda: time.clock_gettime(getattr(time, name))) if hasattr(time, name) else time.monotonic
+
+
+_now_s = _clock_with_sleep(sys.platform)
 
 
 class MonotonicClock:

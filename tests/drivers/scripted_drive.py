@@ -4,6 +4,7 @@ Nothing here uses the driver's codec, canopen or the simulator. What it misdoes 
 """
 
 import struct
+import sys
 from collections.abc import Callable
 
 import can
@@ -18,13 +19,13 @@ RPDO1, TPDO1, TPDO2 = struct.Struct("<Hhi"), struct.Struct("<Hhi"), struct.Struc
 class FakeTime:
     """Stands in for the module `time` in the driver's files: it moves when somebody waits."""
 
-    CLOCK_BOOTTIME = 7
+    CLOCK_BOOTTIME, CLOCK_MONOTONIC_RAW = 7, 4
 
     def __init__(self) -> None:
         self.now_s = 1000.0
 
     def clock_gettime(self, clock: int) -> float:
-        assert clock == self.CLOCK_BOOTTIME
+        assert clock == (self.CLOCK_MONOTONIC_RAW if sys.platform == "darwin" else self.CLOCK_BOOTTIME)
         return self.now_s
 
     def monotonic(self) -> float:

@@ -2,7 +2,9 @@
 
 import pytest
 
-from drivers.clock import MonotonicClock, SteppedClock
+from drivers import clock as clock_module
+from drivers.clock import MonotonicClock, SteppedClock, Ticks
+from drivers.errors import CommunicationLost
 
 
 def test_stepped_time_moves_by_waiting_only():
@@ -41,3 +43,43 @@ def test_the_wall_clock_plays_no_part(monkeypatch):
     clock = MonotonicClock()
     monkeypatch.setattr(time, "time", lambda: -1e9)
     assert 0.0 <= clock.now_s() < 1e6
+
+
+class SleepingComputer:
+    """The module `time` of a computer that sleeps: only the clock named here goes on meanwhile."""
+
+    def __init__(self, goes_on):
+        self.names = ["CLOCK_MONOTONIC", "CLOCK_MONOTONIC_RAW", *{goes_on} - {"CLOCK_MONOTONIC_RAW"}]
+        for number, name in enumerate(self.names):
+            setattr(self, name, number)
+        self.goes_on, self.awake_s, self.asleep_s = goes_on, 100.0, 0.0
+
+    def clock_gettime(self, number):
+        return self.awake_s + (self.asleep_s if self.names[number] == self.goes_on else 0.0)
+
+    def monotonic(self):
+        return self.awake_s
+
+    def sleep(self, duration_s):
+        self.awake_s += duration_s
+
+
+@pytest.mark.parametrize(("platform", "goes_on"), [("linux", "CLOCK_BOOTTIME"), ("darwin", "CLOCK_MONOTONIC_RAW")])
+def test_a_computer_that_slept_in_mid_run_is_seen(monkeypatch, platform, goes_on):
+    computer = SleepingComputer(goes_on)
+    monkeypatch.setattr(clock_module, "time", computer)
+    monkeypatch.setattr(clock_module, "_now_s", clock_module._clock_with_sleep(platform))
+    ticks = Ticks(MonotonicClock(), 0.004, 0.25)
+    ticks.wait()
+    computer.asleep_s += 3600.0
+    with pytest.raises(CommunicationLost, match=r"stood still for 3600\.\d+ s"):
+        ticks.wait()
+
+
+def test_a_platform_without_such_a_clock_has_pythons_own(monkeypatch):
+    class Plain:
+        def monotonic(self):
+            return 7.0
+
+    monkeypatch.setattr(clock_module, "time", Plain())
+    assert clock_module._clock_with_sleep("win32")() == 7.0
