@@ -7,7 +7,7 @@ import time
 import pytest
 
 from drivers.drive import Command, Counters, Mode, Outcome, PowerState
-from drivers.errors import CommandRejected, PreflightRefused, TdhilError
+from drivers.errors import CommandRejected, CommunicationLost, PreflightRefused, TdhilError
 from sim_bus.params import RigParams
 from tests.drivers.drive_benches import Run
 
@@ -209,6 +209,43 @@ def test_samples_are_one_period_apart(make_bench, rate_hz):
     assert all(later - sooner == pytest.approx(1.0 / rate_hz, abs=1e-9)
                for sooner, later in itertools.pairwise(times))
     assert {(sample.age_s, sample.half_width_s, sample.fresh) for sample in run.samples} == {(0.0, 0.0, True)}
+
+
+def test_a_frozen_loop_does_not_send_what_it_had_in_hand(run):
+    """The process was frozen, or the laptop asleep, for six times the watchdog's time."""
+    run.turning(2.0, for_s=1.0)
+    frames, clock = len(run.bench.frames), run.drive.clock
+    clock.wait_until(clock.now_s() + 6.0 * run.bench.limits.watchdog_s)
+    told = []
+
+    def cycles(count, speed):
+        for _ in range(count):
+            try:
+                run.cycle(speed=speed)
+            except CommunicationLost as error:
+                told.append(error)
+
+    cycles(1, 9.0)
+    assert [(error.where, "the control loop stood still for" in error.what) for error in told] == [("host", True)]
+    assert len(run.bench.frames) == frames
+    # The stop goes on: no cycle is refused for the same stall again, and the drive is not blamed for its silence.
+    run.drive.quick_stop()
+    cycles(round(5.0 / run.drive.period_s), 0.0)
+    assert len(told) <= 2
+    assert all("this computer was late" in error.what for error in told[1:])
+    assert all(speed < 3.0 for speed, _ in run.bench.setpoints(run.bench.frames[frames:]))
+    assert run.rests(run.samples[-1])
+    assert abs(run.bench.true_speed_rad_s) < 0.01
+
+
+def test_a_short_stall_is_an_overrun_and_no_burst_follows(run):
+    run.turning(2.0, for_s=1.0)
+    clock, counted = run.drive.clock, run.drive.counters
+    clock.wait_until(clock.now_s() + 0.2 * run.bench.limits.watchdog_s)
+    times = [run.cycle(speed=2.0).time_s for _ in range(10)]
+    assert run.drive.counters.overruns == counted.overruns + 1
+    assert min(b - a for a, b in itertools.pairwise(times)) >= 0.5 * run.drive.period_s - 1e-9
+    assert run.drive.counters.missed == counted.missed
 
 
 def test_counters(run):

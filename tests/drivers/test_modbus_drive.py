@@ -1,6 +1,5 @@
 """The cycle on a bank of the tests' own, in stepped time: what goes wrong in mid-run, and when a sample is."""
 
-import itertools
 import json
 
 import pytest
@@ -296,24 +295,15 @@ def test_standstill_as_the_drive_says():
     assert run.cycle().standstill is not bool(run.cycle().status & 0x1000)
 
 
-def test_a_frozen_loop_does_not_send_what_it_had_in_hand():
+def test_the_word_after_a_stall_is_a_quick_stop():
+    """A CiA 402 bus leaves it to the stop; the contract has the rest of a frozen loop."""
     run = Run().enabled()
-    sent = len(run.bank.requests)
     run.clock.wait_until(run.clock.now_s() + 0.3)
     with pytest.raises(CommunicationLost, match="stood still"):
         run.cycle()
-    assert len(run.bank.requests) == sent
     run.bank.writes.clear()
     run.cycle()
     assert run.controlwords() == [0x02]
-
-
-def test_a_short_stall_is_an_overrun_and_no_burst_follows():
-    run = Run().enabled()
-    run.clock.wait_until(run.clock.now_s() + 0.055)
-    times = [run.cycle().time_s for _ in range(4)]
-    assert run.drive.counters.overruns == 1
-    assert min(b - a for a, b in itertools.pairwise(times)) >= 0.5 * PERIOD_S - 1e-9
 
 
 def test_a_lost_line_is_said_every_time_and_closing_does_not_raise():
