@@ -37,7 +37,7 @@ from tdhil.runner.programs import Run, identify, offset_impedance
 from tdhil.runner.settings import ExcitationRequest, StopRequest
 from tdhil.runner.stage_log import StageBook
 from tdhil.runner.stages import NOT_YET, measure_offsets
-from tdhil.runner.stop import StopReport, StopSequence
+from tdhil.runner.stop import StopReport, StopSequence, mode_not_left
 from tdhil.runner.task import Confirm, ConfirmSpeed, Display, MakeTask, RunOutcome, Say, Task, refuse_unconfirmed_speed
 
 Program = Callable[[Run], None]
@@ -116,6 +116,9 @@ class Runner:
                         self._log.event(self._drive.clock.now_s(), "stop", trouble)
                 with suppress(Exception):
                     self._display.stopped(report.confirmed)
+                if cause is None and report.stayed_in_torque_mode:
+                    cause = mode_not_left()
+                    self._log_failure(cause)
             with suppress(Exception):
                 stage_log.report_others(self._drive, self._log.configure, self._say)
             with suppress(Exception):

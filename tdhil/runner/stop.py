@@ -1,7 +1,9 @@
 """The one stop sequence, for every cause and for the normal end.
 
 1. Quick stop under the drive's speed control. If the profile states that a quick stop does not decelerate the shaft
-   from torque mode, the stop commands speed mode at zero speed first.
+   from torque mode, the stop commands speed mode at zero speed first. If the drive stays in torque mode, the stop
+   brings the torque to zero there, and friction stops the shaft. With a drill string the torque falls on the rig's
+   ramp, which releases the trapped torque. The quick stop follows only if the shaft is not seen at standstill.
 2. Wait for standstill, by status word and by speed. The reported speed lags, so it must stay at zero for longer than
    the largest plausible lag. The time depends on the torque limit and on torsional vibration: the stop waits as long
    as the shaft becomes slower.
@@ -38,6 +40,7 @@ from drivers import (
     CommandRejected,
     Drive,
     Mode,
+    ModeNotConfirmed,
     Polled,
     Positioned,
     PowerState,
@@ -49,7 +52,7 @@ from drivers import (
 from profiles.quantities import in_nm
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.guard import kept_within
-from tdhil.runner.observer import RUN_OUT_S, Signal
+from tdhil.runner.observer import FASTER_SHARE, RUN_OUT_S, Signal
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
 from tdhil.runner.standstill import NO_TORQUE, CountsOfNoise, Standstill
 from tdhil.runner.string_release import MEAN_S, StringRelease, StringReleaseLimits
@@ -239,6 +242,7 @@ class StopReport:
     disabled: bool
     trouble: tuple[str, ...] = ()
     trapped_nm: float = 0.0            # torque of a drill string at standstill, before its release; signed
+    stayed_in_torque_mode: bool = False    # speed mode was needed for the stop, and not confirmed
 
 
 class StopSequence:
@@ -280,7 +284,7 @@ class StopSequence:
         self._held: deque[float] = deque(maxlen=loop.cycles(MEAN_S))
         self._trapped_nm = self._held_at_rest_nm = 0.0
         self._position_due_s = self._position_read_s = self._repeat_due_s = -math.inf
-        self._torque_removed = False
+        self._torque_removed = self._stayed_in_torque_mode = False
         self._trouble: list[str] = []
         self._polls = FeedbackPolls(loop.drive, loop.period_s)
         self._slowing = Slowing(self._at_rest_rad_s)
@@ -321,12 +325,16 @@ class StopSequence:
             ran_out = self._run_out(self._string)
             if ran_out is not None:
                 return ran_out
+        braked = self._brake_in_torque_mode()
+        if braked is not None:
+            return braked
         at_rest_s = self._decelerate()
         disabled, stays = self._torque_removed, False
         if at_rest_s is not None and not self._wound_up():
             disabled = self._disable(self._loop.drive.disable)
             stays = disabled and self._stays_at_rest()
-        return StopReport(stays, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm)
+        return StopReport(stays, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm,
+                          self._stayed_in_torque_mode)
 
     # -- with a drill string -----------------------------------------------------------------------------------
 
@@ -442,7 +450,38 @@ class StopSequence:
             " in which friction stops the shaft; standstill was not seen"
         )
         self._remove_torque(_NO_TORQUE_ASKED)
-        return StopReport(False, None, self._torque_removed, tuple(self._trouble), self._trapped_nm)
+        return StopReport(False, None, self._torque_removed, tuple(self._trouble), self._trapped_nm,
+                          self._stayed_in_torque_mode)
+
+    def _ramp_torque_down(self, string: StringReleaseLimits) -> bool:
+        """Bring the torque to zero in torque mode. Return whether the drive followed, with a speed that is believed.
+
+        The torque falls on the rig's ramp: the shaft slows down to standstill, and yields to the string from there. If
+        the shaft becomes faster, the torque accelerates it, and falls within `TORQUE_FALLS_S`.
+        """
+        observer, begins_rad_s = self._loop.guard.observer, self._begins_at()
+        torque_nm = self._torque_held_nm() - string.torque_offset_nm
+        sign, nm_s = math.copysign(1.0, torque_nm), string.ramp_nm_s
+        quick_nm_s = max(nm_s, abs(torque_nm) / TORQUE_FALLS_S)
+        highest_rad_s = min(
+            string.speed_rad_s, max(0.0, sign * begins_rad_s) + FASTER_SHARE * string.speed_rad_s)
+        turns = True
+        while torque_nm != 0.0:
+            torque_nm = sign * max(0.0, abs(torque_nm) - nm_s * self._loop.period_s)
+            sample = self._exchange(Command(Mode.TORQUE, 0.0, torque_nm))
+            if sample is None:
+                if self._silent >= self._enough_silent:
+                    return False
+                continue
+            if sample.state is not PowerState.ENABLED or sample.mode is not Mode.TORQUE or self._speed_doubted:
+                return False
+            self._ask_position(sample.time_s)
+            speed_rad_s = sign * observer.speed_rad_s(sample)
+            if speed_rad_s > highest_rad_s or observer.runs_away(sample):
+                nm_s = quick_nm_s
+            if turns and speed_rad_s <= self._at_rest_rad_s:
+                turns, self._trapped_nm = False, torque_nm
+        return True
 
     def _wound_up(self) -> bool:
         """Return whether the drive holds a torque that disabling would release at once."""
@@ -459,14 +498,44 @@ class StopSequence:
 
     # -- with any load -----------------------------------------------------------------------------------------
 
-    def _decelerate(self) -> float | None:
-        if self._speed_doubted and self._string is None:
+    def _brake_in_torque_mode(self) -> StopReport | None:
+        """Stop a drive that stays in torque mode, where its quick stop may not brake. Return None if the quick stop is
+        next: it brakes there, the drive left torque mode, or standstill was not seen.
+        """
+        string = self._string
+        if self._speed_doubted and string is None:
             self._take_torque_back()
-        if not self._quick_stop_in_torque_mode:
-            for _ in range(self._loop.cycles(MODE_S)):
-                sample = self._exchange(_REST)
-                if sample is not None and sample.mode is Mode.SPEED:
-                    break
+        if self._quick_stop_in_torque_mode:
+            return None
+        # With a string and a believed speed, `_slow_down` has given the drive its time.
+        waited = string is not None and not self._speed_doubted and self._in_torque_mode
+        if not waited and self._reaches_speed_mode():
+            return None
+        if string is not None and self._speed_doubted:     # `_run_out` has tried it
+            return None
+        self._stayed_in_torque_mode = True
+        self._trouble.append(
+            f"the drive stayed in torque mode: it did not confirm speed mode within {MODE_S:.1f} s. Its profile does"
+            " not state that a quick stop brakes there, so the torque was brought to zero, for friction to stop the"
+            " shaft"
+        )
+        stopped = self._coasted() if string is None or self._ramp_torque_down(string) else None
+        if stopped is None:
+            self._trouble.append(
+                "standstill was not seen at zero torque in torque mode: quick stop instead, which may not brake. Keep"
+                " the hard-wired emergency stop in reach"
+            )
+        return stopped
+
+    def _reaches_speed_mode(self) -> bool:
+        """Command speed mode at zero speed. Return False if the drive is still in torque mode after `MODE_S`."""
+        for _ in range(self._loop.cycles(MODE_S)):
+            sample = self._exchange(_REST)
+            if sample is not None and sample.mode is Mode.SPEED:
+                return True
+        return not self._in_torque_mode
+
+    def _decelerate(self) -> float | None:
         asked = self._ask(self._loop.drive.quick_stop)
         at_rest_s = self._see_rest(asked)
         if at_rest_s is None and self._silent < self._enough_silent and self._contradicted():
@@ -504,15 +573,15 @@ class StopSequence:
             return None
         disabled = self._remove_torque(_NO_TORQUE_ASKED)
         stays = disabled and self._stays_at_rest()
-        return StopReport(stays, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm)
+        return StopReport(stays, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm,
+                          self._stayed_in_torque_mode)
 
     def _take_torque_back(self) -> None:
         """Command zero torque in torque mode before the quick stop.
 
         With a speed signal that does not respond, speed control would continue to hold the flowing torque.
         """
-        last = self._loop.last
-        if last is None or last.mode is not Mode.TORQUE or last.state is not PowerState.ENABLED:
+        if not self._in_torque_mode:
             return
         for _ in range(self._loop.cycles(TORQUE_BACK_S)):
             self._exchange(Command(Mode.TORQUE, 0.0, 0.0))
@@ -520,9 +589,13 @@ class StopSequence:
     @property
     def _never_moved(self) -> bool:
         """Return whether, above a string, torque caused no reported motion: speed control could drive the shaft."""
-        observer, last = self._loop.guard.observer, self._loop.last
-        in_torque = last is not None and last.mode is Mode.TORQUE and last.state is PowerState.ENABLED
-        return self._string is not None and in_torque and observer.unseen_s > 0.0
+        return self._string is not None and self._in_torque_mode and self._loop.guard.observer.unseen_s > 0.0
+
+    @property
+    def _in_torque_mode(self) -> bool:
+        """Return whether the drive was last seen enabled in torque mode."""
+        last = self._loop.last
+        return last is not None and last.mode is Mode.TORQUE and last.state is PowerState.ENABLED
 
     @property
     def _speed_doubted(self) -> bool:
@@ -769,6 +842,17 @@ class StopSequence:
             " left alone, so that its own watchdog acts"
         )
         return False
+
+
+def mode_not_left() -> ModeNotConfirmed:
+    """Return the error for a run without another cause whose drive stayed in torque mode at the stop."""
+    return ModeNotConfirmed(
+        f"the drive stayed in torque mode at the stop: it did not confirm speed mode within {MODE_S:.1f} s. The torque"
+        " was brought to zero first, because the profile does not state that a quick stop brakes there",
+        where="stop sequence",
+        next_step="Check in the drive's manual whether the mode may change while enabled. tdhil replay of the log gives"
+        " the result",
+    )
 
 
 def not_confirmed(report: StopReport) -> StopNotConfirmed:

@@ -36,7 +36,8 @@ because these contradict no other report.
 
 from tdhil.runner.observer.contradiction import Contradiction, Signal
 from tdhil.runner.observer.observer import Observer
+from tdhil.runner.observer.runaway import FASTER_SHARE
 from tdhil.runner.observer.shaft_bounds import RUN_OUT_S
 from tdhil.runner.observer.unanswered_torque import AT_LIMIT_SHARE
 
-__all__ = ["AT_LIMIT_SHARE", "RUN_OUT_S", "Contradiction", "Observer", "Signal"]
+__all__ = ["AT_LIMIT_SHARE", "FASTER_SHARE", "RUN_OUT_S", "Contradiction", "Observer", "Signal"]
