@@ -114,11 +114,16 @@ class Modes(ProfileEntry):
         return self
 
 
+QUICK_STOP_COASTS = 0
+"""Value of 605Ah with which a quick stop disables the drive, and the shaft coasts (CiA 402-2, 605Ah)."""
+
+
 class QuickStop(ProfileEntry):
     """Effect of controlword bit 2."""
 
     option_code: I16 | None = Field(
-        description="written to 605Ah in preflight and read back; 6 = quick-stop ramp, then stay; null = not written"
+        description="written to 605Ah in preflight and read back; 6 = quick-stop ramp, then stay; null = not written, "
+        "but a drive that reads 0 there is refused; 0 is not allowed, because the shaft would coast"
     )
     deceleration_rpm_s_per_lsb: Positive | None = Field(description="unit of 6085h in rpm/s; null = no such object")
     decelerates_in_torque_mode: bool = Field(
@@ -127,6 +132,12 @@ class QuickStop(ProfileEntry):
     ends: Literal["quick_stop", "off"] = Field(
         default="quick_stop", description="state of the drive after standstill; off: torque switched off"
     )
+
+    @model_validator(mode="after")
+    def _brakes(self) -> Self:
+        if self.option_code == QUICK_STOP_COASTS:
+            refuse_if([("option_code", "with 0 the shaft coasts (CiA 402-2, 605Ah); give 6, or null to write nothing")])
+        return self
 
 
 class Speed(ProfileEntry):

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from drivers.angle import Unwrapped
 from drivers.cia402 import preflight as checks
 from drivers.cia402.bus import Cia402Bus, CycleInputs, CycleSetpoints, FeedbackSetting
-from drivers.cia402.limits import check_parameters, note_temperature, set_limits
+from drivers.cia402.limits import QUICK_STOP_OPTION, check_parameters, note_temperature, set_limits
 from drivers.cia402.polling import poll, push
 from drivers.cia402.position import AngleObject, find_angle
 from drivers.cia402.process_data import (
@@ -66,7 +66,6 @@ from profiles.cia402 import Cia402Profile
 
 LOCAL_CYCLES = 3
 """Number of cycles after which a missing remote bit counts (statusword, bit 9). One damaged frame does not matter."""
-QUICK_STOP_OPTION = 0x605A
 DRIVE_SILENT_S = 0.5
 """Time without the drive's sign of life after which it counts as lost, s."""
 MODE_STALE_S, MODE_STALE_TIMES = 0.5, 10

@@ -12,7 +12,9 @@ from drivers.errors import ObjectRefused, PreflightRefused
 from drivers.own_limits import QUICK_STOP, SPEED, TORQUE, OwnLimits
 from drivers.preflight import PreflightTable
 from profiles import Require
-from profiles.cia402 import Cia402Profile, Parameter
+from profiles.cia402 import QUICK_STOP_COASTS, Cia402Profile, Parameter
+
+QUICK_STOP_OPTION = 0x605A
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Settings of the drive that the profile names: read, compared with the required values, and used as scales.
@@ -134,11 +136,28 @@ def set_limits(
     if ramp_lsb is not None:
         ramp, lsb = limits.quick_stop_rad_s2, ramp_lsb * RPM
         _limit(table, objects, own, QUICK_STOP, "quick-stop ramp", 0x6085, ramp, lsb, 32, "rad/s²", math.ceil)
-    code = profile.quick_stop.option_code
+    _set_quick_stop_option(table, objects, profile.quick_stop.option_code)
+
+
+def _set_quick_stop_option(table: PreflightTable, objects: Objects, code: int | None) -> None:
+    """Write the profile's quick-stop option and read it back. Without one, refuse a drive whose quick stop coasts."""
+    title, where = "quick-stop option", name(QUICK_STOP_OPTION)
     if code is not None:
-        table.attempt(
-            "quick-stop option", str(code), "605Ah", lambda: _same(objects.change(0x605A, 0, code, 16), code)
-        )
+        table.attempt(title, str(code), where, lambda: _same(objects.change(QUICK_STOP_OPTION, 0, code, 16), code))
+        return
+    try:
+        data = objects.read_bytes(QUICK_STOP_OPTION)
+    except ObjectRefused as error:
+        found = f"not readable: {error.what}. The drive's own setting decides how a quick stop brakes"
+        table.note(title, found, where, "Check at the drive that its quick stop brakes the shaft")
+        return
+    objects.stands[QUICK_STOP_OPTION, 0] = data
+    option = int.from_bytes(data, "little", signed=True)
+    coasts = option == QUICK_STOP_COASTS
+    table.row(
+        title, f"not {QUICK_STOP_COASTS}", f"{option}: quick stop lets the shaft coast" if coasts else str(option),
+        not coasts, where, f"Set {where} to 6 at the drive, so that its quick stop brakes the shaft",
+    )
 
 
 def note_temperature(table: PreflightTable, limit_c: float | None) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from drivers.cia402.description import text_if_there
-from drivers.cia402.limits import DriveSettings
+from drivers.cia402.limits import QUICK_STOP_OPTION, DriveSettings
 from drivers.cia402.objects import Objects, name, place
 from drivers.cia402.polling import reported_torque
 from drivers.cia402.process_data import (
@@ -335,7 +335,7 @@ def quick_stop_holds(objects: Objects, profile: Cia402Profile) -> bool | None:
     entry = profile.quick_stop
     if entry.ends == "off":
         return False
-    code = objects.read_if_there(0x605A, signed=True)
+    code = objects.read_if_there(QUICK_STOP_OPTION, signed=True)
     if code is None and entry.option_code is None:
         return True if "ends" in entry.model_fields_set else None
     return None if code is None or code < 0 or code > _LAST_OPTION else code >= _HOLDS_FROM

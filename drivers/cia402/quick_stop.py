@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 
+from drivers.cia402.limits import QUICK_STOP_OPTION
 from drivers.cia402.objects import Objects
 from drivers.cia402.preflight import read_identity, speed_unit
 from drivers.cia402.process_data import TARGET_VELOCITY, VELOCITY_ACTUAL, VL_ACTUAL
@@ -29,7 +30,7 @@ from drivers.errors import DriveFault, ObjectRefused
 from drivers.preflight import PreflightTable
 from drivers.quick_stop import BLANK_WORDS, Seen
 from profiles import MARKER_INDEX
-from profiles.cia402 import Cia402Profile
+from profiles.cia402 import QUICK_STOP_COASTS, Cia402Profile
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Enforcing a quick stop that another master reverses.
@@ -113,7 +114,7 @@ NEAR_ZERO_RAD_S, NEAR_ZERO_LSB = 0.05, 3
 MODE_S, MODE_PAUSE_S = 0.5, 0.01
 """Time for the change to speed mode, s, and interval between two queries, s."""
 _CONTROLWORD = 0x6040
-_COAST, _BRAKE_AND_HOLD = 0, 6
+_BRAKE_AND_HOLD = 6
 
 
 class Cia402Target:
@@ -199,11 +200,11 @@ class Cia402Target:
         if offset is not None and self._objects.read_if_there(offset.index, offset.sub):
             with suppress(ObjectRefused):          # possibly left by a host that died; cleared first
                 self._objects.write(offset.index, offset.sub, 0, 16)
-        option = self._objects.read_if_there(0x605A, signed=True)
+        option = self._objects.read_if_there(QUICK_STOP_OPTION, signed=True)
         self._prepared = True
-        if option == _COAST:
+        if option == QUICK_STOP_COASTS:
             try:
-                self._objects.write(0x605A, 0, _BRAKE_AND_HOLD, 16)
+                self._objects.write(QUICK_STOP_OPTION, 0, _BRAKE_AND_HOLD, 16)
                 self._said.append("its quick stop was set to coast: 605Ah was changed from 0 to 6")
             except ObjectRefused:
                 self._word = ENABLE_OPERATION | HALT

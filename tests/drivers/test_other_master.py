@@ -134,6 +134,20 @@ def test_a_setting_that_somebody_changes_in_motion_ends_the_run(running, wire, p
     assert "another master" in caught.value.what
 
 
+def test_a_quick_stop_option_that_the_profile_does_not_set_is_read_back_and_restored_too(wire, peer, profile):
+    stop = profile.quick_stop.model_copy(update={"option_code": None})
+    drive = CanopenDrive(wire, profile.model_copy(update={"quick_stop": stop}), SteppedClock(), node=1)
+    ready(drive)
+    drive.enable(Mode.SPEED)
+    go(drive, wire, 3.0)
+    assert not [entry for entry in peer.writes if entry[0] == 0x605A]
+    peer.objects[0x605A, 0] = u(0, 2)
+    with pytest.raises(CommunicationLost, match="the quick-stop option was changed"):
+        go(drive, wire, 20.0)
+    drive.quick_stop()
+    assert peer.value(0x605A) == 2
+
+
 def test_the_watchdog_and_what_a_stop_rests_on_are_asked_for_every_other_second(running, wire):
     wire.sent.clear()
     go(running, wire, 20.0)

@@ -64,7 +64,7 @@ def test_what_then_stands_in_the_drive(make, peer):
 
 
 @pytest.mark.parametrize(("option", "ends", "there", "holds"), [
-    (6, None, 6, True), (5, None, 5, True), (8, None, 8, True), (2, None, 2, False), (0, None, 0, False),
+    (6, None, 6, True), (5, None, 5, True), (8, None, 8, True), (2, None, 2, False),
     (4, None, 4, False), (9, None, 9, None), (-1, None, -1, None), (6, "off", 6, False), (None, None, 2, False),
     (None, None, 6, True), (None, None, None, None), (None, "quick_stop", None, True), (None, "off", None, False),
 ])
@@ -80,6 +80,41 @@ def test_whether_a_quick_stop_holds_the_shaft(make, peer, profile, option, ends,
     found = preflight(make(changed=profile.model_copy(update={"quick_stop": stop})))
     assert found.refused == ()
     assert found.quick_stop_holds is holds
+
+
+def without_option(profile):
+    return changed(profile, "quick_stop", option_code=None)
+
+
+@pytest.mark.parametrize("option", [None, 6])
+def test_a_quick_stop_that_coasts_is_refused_whatever_the_profile_states(make, peer, profile, option):
+    """605Ah = 0, and a drive that does not take another value where the profile names one."""
+    peer.objects[(0x605A, 0)] = u(0, 2)
+    peer.deaf_to.add((0x605A, 0))
+    found = preflight(make(changed=changed(profile, "quick_stop", option_code=option)))
+    row = refused(found)["quick-stop option"]
+    assert (row.where, row.found[0]) == ("605Ah", "0")
+    assert list(refused(found)) == ["quick-stop option"]
+
+
+def test_a_quick_stop_that_coasts_is_named_so(make, peer, profile):
+    peer.objects[(0x605A, 0)] = u(0, 2)
+    row = refused(preflight(make(changed=without_option(profile))))["quick-stop option"]
+    assert "coast" in row.found and "605Ah to 6" in row.next_step
+    assert not [entry for entry in peer.writes if entry[0] == 0x605A]
+
+
+def test_a_quick_stop_option_that_the_profile_does_not_name_is_shown(make, peer, profile):
+    row = next(one for one in preflight(make(changed=without_option(profile))).checks if one.where == "605Ah")
+    assert (row.name, row.found, row.outcome) == ("quick-stop option", "2", Outcome.OK)
+
+
+def test_a_quick_stop_option_that_can_not_be_read_is_named(make, peer, profile):
+    del peer.objects[(0x605A, 0)]
+    found = preflight(make(changed=without_option(profile)))
+    row = next(one for one in found.checks if one.where == "605Ah")
+    assert (row.name, row.outcome, found.refused) == ("quick-stop option", Outcome.NOTE, ())
+    assert row.found.startswith("not readable") and "quick stop brakes" in row.next_step
 
 
 def test_nothing_is_switched_on_meanwhile(make, peer, wire):

@@ -28,6 +28,7 @@ EPOS4 = profile_path("maxon/epos4").read_text(encoding="utf-8")
      "type: u16\n    unit: nm\n    set_to: torque_limit_reverse", "a reverse limit is negative"),
     (EPOS4, "require: {at_least: 1}", "require: {at_least: 1}\n    set_to: torque_limit", "leave 'require' out"),
     (EPOS4, "    default: 0\n", "    default: 0\n    times: output_current_limit\n", "by another one itself"),
+    (EPOS4, "  option_code: 6", "  option_code: 0", "with 0 the shaft coasts"),
 ])
 def test_wrong_profiles(tmp_path: Path, text: str, old: str, new: str, words: str) -> None:
     assert old in text
