@@ -264,9 +264,9 @@ class Cia402Drive:
         ready.watchdog_s = limits.watchdog_s
         ready.armed = bus.arm(table, limits) > 0.0
         watchdog_s = limits.watchdog_s if ready.armed else 0.0
-        self._watch_settings(watchdog_s, frames)
         found = checks.report(table, self._identity, profile, objects, ready.units, rated_nm, ready.codes, watchdog_s,
                               own.kept, self._angle_coming())
+        self._watch_settings(watchdog_s, frames)
         self._start()
         return found
 
@@ -308,7 +308,7 @@ class Cia402Drive:
         self._start(0.0 if measuring else 0.5)
 
     def _watch_settings(self, watchdog_s: float, frames: Sequence[FeedbackSetting]) -> None:
-        """List the settings that preflight made, for reading them back during motion."""
+        """List the settings that preflight made or relied on, for reading them back during motion."""
         watchdog, back, content = self._profile.watchdog, self._read_back, self._prepared.content
         back.clear()
         reaction = watchdog.reaction_index, watchdog.reaction_sub
@@ -325,6 +325,9 @@ class Cia402Drive:
                 back.watch("the quick-stop option", index, sub, data, Group.SAFETY)
             elif index not in (0x6060, MARKER_INDEX):
                 back.watch("the drive's own limit", index, sub, data, Group.REST)
+        for (index, sub), (title, data) in self._bus.objects.relied_on.items():
+            if (index, sub) not in self._bus.objects.stands:
+                back.watch(title, index, sub, data, Group.REST, ours=False)
         for one in frames:
             back.watch(*one, Group.FEEDBACK)
         back.watch_setpoint("the target velocity", content.target_speed[0])

@@ -34,7 +34,7 @@ class DriveSettings:
         """Return the setting in its unit. Raises ObjectRefused."""
         one = self._profile.parameter(wanted)
         where = name(one.index, one.sub)
-        raw = decode_value(one.type, self._objects.read_bytes(one.index, one.sub), where)
+        raw = decode_value(one.type, self._objects.rely_on(one.title, one.index, one.sub), where)
         if one.scale == "power_of_two":
             if not 0 <= raw <= 64:
                 raise ObjectRefused(f"{raw:g} is not a number of bits from 0 to 64", where=where)

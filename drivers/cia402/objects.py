@@ -25,6 +25,8 @@ class Objects(ABC):
         self.journal: UndoJournal | None = None        # records each change before it is made
         # bytes of each object as last read back, or as found if they were right
         self.stands: dict[tuple[int, int], bytes] = {}
+        # title and bytes of each setting that tdhil relies on and never writes, as found before motion
+        self.relied_on: dict[tuple[int, int], tuple[str, bytes]] = {}
 
     @contextmanager
     def answered_within(self, answer_s: float) -> Iterator[None]:
@@ -48,6 +50,12 @@ class Objects(ABC):
             return self.read(index, subindex, signed=signed)
         except ObjectRefused:
             return None
+
+    def rely_on(self, title: str, index: int, subindex: int = 0) -> bytes:
+        """Return the bytes of a setting that must not change during the run: a scale, a filter, a required value."""
+        data = self.read_bytes(index, subindex)
+        self.relied_on[index, subindex] = title, data
+        return data
 
     def write(self, index: int, subindex: int, value: int, bits: int) -> None:
         self.write_bytes(index, subindex, _encoded(value, bits, name(index, subindex)), str(value))

@@ -25,7 +25,7 @@ FEWEST_COUNTS = 16
 _ENCODER, _GEAR, _FEED, _UNIT = 0x608F, 0x6091, 0x6092, 0x60A8
 _INCREMENTS = (0x0000_0000, 0x00B5_0000)
 """Values of 60A8h for which one count of 6064h is one increment (CiA 303-2: B5h)."""
-_TITLE = "angle of the motor"
+_TITLE, _SCALE = "angle of the motor", "the scale of the position"
 _ASKED = "tdhil asks the operator to confirm the speed of the shaft"
 
 
@@ -77,16 +77,26 @@ def find_angle(table: PreflightTable, objects: Objects, profile: Cia402Profile) 
     return AngleObject(entry, TURN_RAD / counts, where)
 
 
+def _scale(objects: Objects, index: int, sub: int = 0) -> int | None:
+    """Return a scale of the position; None if the drive does not have the object."""
+    try:
+        return int.from_bytes(objects.rely_on(_SCALE, index, sub), "little")
+    except ObjectRefused:
+        return None
+
+
 def _standard_counts(objects: Objects) -> float:
     """Return the counts of 6064h for one turn of the motor, by 608Fh. Raises ObjectRefused if they are unknown."""
     for index in (_GEAR, _FEED):
-        over, under = objects.read_if_there(index, 1), objects.read_if_there(index, 2)
+        over, under = _scale(objects, index, 1), _scale(objects, index, 2)
         if over is not None and under is not None and over != under:
             raise ObjectRefused(f"positions are scaled by {over}/{under}", where=name(index))
-    unit = objects.read_if_there(_UNIT)
+    unit = _scale(objects, _UNIT)
     if unit is not None and unit not in _INCREMENTS:
         raise ObjectRefused(f"positions are counted in unit {unit:08X}h", where=name(_UNIT))
-    increments, turns = objects.read(_ENCODER, 1), objects.read(_ENCODER, 2)
+    increments, turns = (
+        int.from_bytes(objects.rely_on(_SCALE, _ENCODER, sub), "little") for sub in (1, 2)
+    )
     counts = increments / turns if turns else 0.0
     if not (math.isfinite(counts) and counts >= FEWEST_COUNTS):
         raise ObjectRefused(f"{increments}/{turns} is not a number of increments per turn", where=name(_ENCODER))

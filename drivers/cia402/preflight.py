@@ -47,7 +47,8 @@ def read_filters(note: Callable[[str, str, str], None], objects: Objects, profil
     for entry in profile.filters:
         where = name(entry.index, entry.sub)
         try:
-            lag_s = lag_seconds(entry, objects.read_bytes(entry.index, entry.sub))
+            data = objects.rely_on(f"the filter of the reported {entry.signal}", entry.index, entry.sub)
+            lag_s = lag_seconds(entry, data)
         except ObjectRefused:
             note(f"{entry.signal} filter", "not reported by the drive", where)
             continue
@@ -98,7 +99,8 @@ def _reported_rated_torque(objects: Objects, profile: Cia402Profile) -> float | 
     if per_lsb is None:
         return None
     try:
-        raw = decode_value(place.type, objects.read_bytes(place.index, place.sub), name(place.index, place.sub))
+        data = objects.rely_on("the rated torque", place.index, place.sub)
+        raw = decode_value(place.type, data, name(place.index, place.sub))
     except ObjectRefused:
         return None
     return raw * per_lsb if raw > 0.0 else None
@@ -111,7 +113,7 @@ def speed_unit(table: PreflightTable, objects: Objects, profile: Cia402Profile) 
         wanted = speed.si_unit
 
         def same() -> tuple[str, bool]:
-            found = objects.read(SI_UNIT_VELOCITY)
+            found = int.from_bytes(objects.rely_on("the unit of speed", SI_UNIT_VELOCITY), "little")
             return f"{found:08X}h", found == wanted
 
         table.attempt(

@@ -230,18 +230,18 @@ class DriveWatch:
 #
 # A tool, the drive's panel or another fieldbus may change the watchdog, its reaction, the quick stop or a limit while
 # the shaft turns, without any frame on this bus. So a request is sent after a cycle's feedback; tdhil does not wait for
-# the answer and checks it when it comes. Three groups of objects take turns: watchdog and quick stop; limits and
-# setpoints; content of the feedback frames (mapping, transmission type, COB-ID of the TPDOs). So a change shows within
-# 0.5 s times three times the number of objects in its group. An object that a tool writes on this bus is checked in the
-# next cycle.
+# the answer and checks it when it comes. Three groups of objects take turns: watchdog and quick stop; limits, setpoints
+# and the settings that tdhil relies on (scales, filters, required values); content of the feedback frames (mapping,
+# transmission type, COB-ID of the TPDOs). So a change shows within 0.5 s times three times the number of objects in its
+# group. An object that a tool writes on this bus is checked in the next cycle.
 #
 # Setpoints and mode (6071h, 60FFh, 6060h) are read too: they must be the values that this host sent last. A drive
 # echoes them if it has returned a value of ours other than zero. Only then does another value come from another master.
 #
 # An answer that differs is requested again at once, and counts the second time (a setpoint the third time). The changed
-# value is written back once before the stop, because the stop may depend on it (605Ah). Some drives do not answer SDO
-# requests while running; tdhil reports this and continues. If a drive stops answering after it has answered before,
-# `LOST` missed replies count as a lost connection.
+# value is written back once before the stop, because the stop may depend on it (605Ah). A setting that tdhil relies on
+# is not: tdhil writes no scale of a drive. Some drives do not answer SDO requests while running; tdhil reports this and
+# continues. If a drive stops answering after it has answered before, `LOST` missed replies count as a lost connection.
 
 
 READ_BACK_EVERY_S = 0.5
@@ -258,18 +258,19 @@ class Group(Enum):
     """Objects that are read back in the same turn."""
 
     SAFETY = "watchdog, its reaction, quick stop"
-    REST = "limits, setpoints, RPDOs"
+    REST = "limits, setpoints, RPDOs, scales"
     FEEDBACK = "what the TPDOs carry, and when"
 
 
 @dataclass(eq=False)
 class _WatchedObject:
-    """``data``: required value; None: one of the setpoints sent last."""
+    """``data``: required value; None: one of the setpoints sent last. ``ours``: tdhil may write it."""
 
     index: int
     sub: int
     title: str
     data: bytes | None
+    ours: bool = True
     differs: int = 0
     refused: int = 0
     echoed: bool = False
@@ -307,9 +308,9 @@ class ReadBack:
         self._sent.clear()
         self._next.clear()
 
-    def watch(self, title: str, index: int, sub: int, data: bytes, group: Group) -> None:
-        """Add an object that must keep its value."""
-        self._groups[group].append(_WatchedObject(index, sub, title, data))
+    def watch(self, title: str, index: int, sub: int, data: bytes, group: Group, ours: bool = True) -> None:
+        """Add an object that must keep its value. ``ours``: tdhil may write it."""
+        self._groups[group].append(_WatchedObject(index, sub, title, data, ours))
 
     def stands(self, index: int, sub: int, data: bytes) -> None:
         """Note that this host has written a watched object itself."""
@@ -335,9 +336,9 @@ class ReadBack:
                 self._next.append(one)
 
     def put_back(self, index: int, sub: int) -> None:
-        """Write the required value into a supervised object, without waiting for an answer."""
+        """Write the required value into a supervised object that is ours, without waiting for an answer."""
         for one in self._all():
-            if (one.index, one.sub) == (index, sub) and one.data is not None:
+            if (one.index, one.sub) == (index, sub) and one.data is not None and one.ours:
                 self._put(index, sub, one.data)
 
     def step(self, now_s: float) -> None:
@@ -403,8 +404,8 @@ class ReadBack:
             self.put_back(one.index, one.sub)      # before the stop, which may depend on it
             self.on_changed(one.index, one.sub)
             self._watch.interference(
-                f"{one.title} was changed by another master during the run: {_shown(one.data)} was set,"
-                f" {_shown(found)} is there now",
+                f"{one.title} was changed by another master during the run: {_shown(one.data)} was"
+                f" {'set' if one.ours else 'read before motion'}, {_shown(found)} is there now",
                 f"{self._place}, {name(one.index, one.sub)}",
                 "Find the tool, panel or master that writes to this drive, disconnect it, and start again",
                 kind=f"changed {one.index:04X}:{one.sub}",
