@@ -110,6 +110,8 @@ def queue_is_full(error: BaseException) -> bool:
 Handler = Callable[[bytes], None]
 LONGEST_DRAIN_S = 0.25
 """Longest time for one drain, s of wall time. A flooded bus must not block a cycle."""
+STOP_DRAIN_S = 0.005
+"""Longest time for one drain in a stop, s of wall time: about one cycle at 250 Hz. The quick stop waits no longer."""
 PEER_DEAD_S = 4.0
 """Wall time, s, after which a peer without an answer counts as dead in stepped time. No other limit ends the wait."""
 PEER_STILL_DEAD_S = 0.05
@@ -137,6 +139,7 @@ class CanLink:
         self._shut = ""                # why transmission has ended
         self.error_frames = 0
         self.passive = 0               # number of error-passive states that the adapter reported
+        self.stopping = False          # a stop is under way: no flood may delay its frames
         self.stamps = FrameStamps()
         self.name = str(bus.channel_info)
         self.asks = False              # simulated peer in stepped time: it can report its cycle
@@ -246,13 +249,19 @@ class CanLink:
         self._shut = ""
 
     def drain(self) -> None:
-        """Handle all frames that have arrived, without waiting. Raises CommunicationLost if frames keep coming."""
+        """Handle all frames that have arrived, without waiting. Raises CommunicationLost if frames keep coming.
+
+        In a stop it ends after `STOP_DRAIN_S` without an error: the next frame of the stop must be sent.
+        """
         if self.receive(0.0) is None:
             return
-        deadline_s, taken = time.monotonic() + LONGEST_DRAIN_S, 1
+        deadline_s, taken = time.monotonic() + (STOP_DRAIN_S if self.stopping else LONGEST_DRAIN_S), 1
         while self.receive(0.0) is not None:
             taken += 1
-            if taken > BABBLE_FRAMES and time.monotonic() > deadline_s:
+            if self.stopping:
+                if time.monotonic() > deadline_s:
+                    return
+            elif taken > BABBLE_FRAMES and time.monotonic() > deadline_s:
                 raise CommunicationLost(
                     "frames arrive faster than this computer can read them",
                     where=self.name,

@@ -352,6 +352,10 @@ class CanopenBus(Cia402Bus):
             self._life.feed()
         self._link.pump_until(lambda: False, 0.01)
 
+    def hurry(self, stopping: bool) -> None:
+        """Bound the time for received frames in a stop."""
+        self._link.stopping = stopping
+
     def reach(self) -> None:
         """Put a stopped node into pre-operational, where it serves SDO, and feed its watchdog."""
         if self._watch.nmt_state == STOPPED:

@@ -32,6 +32,7 @@ class CanopenTarget(Cia402Target):
 
     def __init__(self, bus: can.BusABC, profile: CanopenProfile, clock: Clock, *, node: int) -> None:
         self._link = CanLink(bus, clock)
+        self._link.stopping = True
         super().__init__(SdoObjects(self._link, node), profile, clock)
         self._foreign = 0
         self._syncs = 0

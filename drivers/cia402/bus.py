@@ -223,6 +223,10 @@ class Cia402Bus(ABC):
         if not self.clock.stepped:
             time.sleep(PAUSE_S)
 
+    def hurry(self, stopping: bool) -> None:
+        """Note whether a stop is under way. Then frames that arrive must not delay those that are sent."""
+        return
+
     def reach(self) -> None:
         """Put a drive that left operation into a state in which its objects can be read, and feed its watchdog."""
         self.feed()

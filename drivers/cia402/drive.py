@@ -359,7 +359,8 @@ class Cia402Drive:
                                    entry=MessageCode.NO_TORQUE_MODE)
         self._bus.refuse_motion()
         power = self._power
-        power.wish, power.in_operation, power.ever_asked = PowerRequest.ENABLED, False, True
+        power.in_operation, power.ever_asked = False, True
+        self._request(PowerRequest.ENABLED)
 
     def quick_stop(self) -> None:
         """Send quick stop (controlword bit 2) from the next cycle on. Enabling does not end it.
@@ -370,15 +371,20 @@ class Cia402Drive:
         if self._power.wish is PowerRequest.ENABLED and self._power.fed:
             with suppress(CommunicationLost):      # the following cycle reports it
                 self._read_back.put_back(QUICK_STOP_OPTION, 0)
-        self._power.wish = PowerRequest.QUICK_STOP
+        self._request(PowerRequest.QUICK_STOP)
 
     def disable(self) -> None:
         """Move towards switch on disabled, from the next cycle on."""
-        self._power.wish = PowerRequest.OFF
+        self._request(PowerRequest.OFF)
 
     def remove_torque(self) -> None:
         """Send disable voltage (transition 9 or 12) from the next cycle on; see `drivers.drive.RemovesTorque`."""
-        self._power.wish, self._power.removes_torque = PowerRequest.OFF, True
+        self._power.removes_torque = True
+        self._request(PowerRequest.OFF)
+
+    def _request(self, wish: PowerRequest) -> None:
+        self._power.wish = wish
+        self._bus.hurry(wish is not PowerRequest.ENABLED)
 
     def reset_fault(self) -> None:
         """Reset a fault by a rising edge of controlword bit 7, as an object, between connect and preflight.
@@ -542,7 +548,7 @@ class Cia402Drive:
         if state is State.OPERATION_ENABLED:
             power.in_operation = True
         elif power.in_operation or state in _OUT_OF_OPERATION:
-            power.wish = PowerRequest.QUICK_STOP
+            self._request(PowerRequest.QUICK_STOP)
 
     def _follow_remote(self, status: int) -> None:
         """Check bit 9 (remote) of the statusword in operation: if it was set and clears, another place took control."""
@@ -566,10 +572,12 @@ class Cia402Drive:
     def poll(self) -> Sample | None:
         """Read status, speed, torque and angle as objects, for a stop without cyclic feedback; None without an answer.
 
-        After a request other than enabling, the controlword (6040h) is written too. Raises CommunicationLost.
+        After a request other than enabling, the controlword (6040h) is written too: a quick stop before the reading,
+        which may fail, and each step towards off after it, because it depends on the state. Raises CommunicationLost.
         """
         bus, watchdog_s = self._bus, self._prepared.watchdog_s
         bus.reach()
+        stopped = self._power.wish is PowerRequest.QUICK_STOP and self._reported.since_start and self._push()
         begun_s = self.clock.now_s()
         found = poll(bus.objects, self._profile, watchdog_s)
         if found is None:
@@ -579,11 +587,17 @@ class Cia402Drive:
         half_s = 0.5 * (self.clock.now_s() - begun_s)
         self._reported.take(found.status, found.speed, found.torque)
         self._follow_state()
-        push(bus.objects, self._reported.state, self._power.wish, watchdog_s, self._prepared.content.offset)
+        if not stopped:
+            self._push()
         bus.feed()
         position_rad = self._poll_angle()
         bus.ticks.put_off()
         return self._sample(begun_s + half_s, half_s, True, position_rad)._replace(half_width_s=half_s)
+
+    def _push(self) -> bool:
+        """Write the controlword towards the request as an object. Return False if the reported state needs none."""
+        ready, power = self._prepared, self._power
+        return push(self._bus.objects, self._reported.state, power.wish, ready.watchdog_s, ready.content.offset)
 
     def _poll_angle(self) -> float | None:
         """Read the angle as an object, after everything that a stop needs more urgently."""

@@ -6,6 +6,7 @@ a cyclic setpoint.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import NamedTuple
 
 from drivers.cia402.objects import Objects, name
@@ -63,17 +64,17 @@ def reported_torque(objects: Objects, profile: Cia402Profile) -> float | None:
 
 def push(
     objects: Objects, state: State, wish: PowerRequest, watchdog_s: float, offset: tuple[int, int, int] | None = None
-) -> None:
+) -> bool:
     """Write the controlword towards ``wish`` if the drive is not in that state; never one that enables.
 
-    A torque ``offset`` in use is cleared first.
+    A torque ``offset`` in use is cleared first. Return whether the controlword was needed.
     """
     if wish is PowerRequest.ENABLED or state in _AT_REST[wish]:
-        return
+        return False
     with objects.answered_within(answer_time_s(watchdog_s)):
-        try:
-            if offset is not None:
+        if offset is not None:
+            with suppress(CommunicationLost, ObjectRefused):
                 objects.write(offset[0], offset[1], 0, offset[2])
+        with suppress(CommunicationLost, ObjectRefused):       # the next poll shows the result
             objects.write(0x6040, 0, controlword_towards(state, wish), 16)
-        except (CommunicationLost, ObjectRefused):
-            return                     # the next poll shows the result
+    return True

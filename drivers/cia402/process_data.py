@@ -191,6 +191,11 @@ class Reported:
         self.state = decode_after(status) if self._started else decode(status)
         self._started = self._started or self.state not in (State.NOT_READY, State.UNKNOWN)
 
+    @property
+    def since_start(self) -> bool:
+        """True if the drive has shown its state since it started."""
+        return self._started
+
     def restarted(self) -> None:
         """Note that the drive has sent its boot-up message: it may be not ready to switch on."""
         self._started = False

@@ -26,7 +26,7 @@ from drivers.cia402.state_machine import (
 )
 from drivers.clock import Clock
 from drivers.drive import Identity, PowerRequest, PowerState
-from drivers.errors import DriveFault, ObjectRefused
+from drivers.errors import CommunicationLost, DriveFault, ObjectRefused
 from drivers.preflight import PreflightTable
 from drivers.quick_stop import BLANK_WORDS, Seen
 from profiles import MARKER_INDEX
@@ -134,20 +134,20 @@ class Cia402Target:
     def ask(self, attempt: int) -> None:
         """Write the quick stop as an object, after the bus's own means for this attempt.
 
-        The controlword itself is written even if the drive refuses the rest. Raises CommunicationLost, ObjectRefused or
-        DriveFault.
+        The controlword itself is written even if the drive refuses the rest, or does not answer. Raises
+        CommunicationLost, ObjectRefused or DriveFault.
         """
-        if not self._prepared:
-            self._prepare()
-        refused: ObjectRefused | DriveFault | None = None
+        failed: CommunicationLost | ObjectRefused | DriveFault | None = None
         try:
+            if not self._prepared:
+                self._prepare()
             self._leave_torque_mode()
             self.enforce(attempt)
-        except (ObjectRefused, DriveFault) as error:
-            refused = error
+        except (CommunicationLost, ObjectRefused, DriveFault) as error:
+            failed = error
         self._objects.write(_CONTROLWORD, 0, self._word, 16)
-        if refused is not None:
-            raise refused
+        if failed is not None:
+            raise failed
 
     def enforce(self, attempt: int) -> None:
         """Use a stronger means of the bus than an object, from some attempt on. May raise DriveFault."""
