@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from drivers.quick_stop import (
         BareStopReport as BareStopReport, Ended as Ended, Target as Target, bare_stop as bare_stop,
     )
+    from drivers.standstill import (
+        STANDSTILL_ANGLE_RAD_S as STANDSTILL_ANGLE_RAD_S, STANDSTILL_RAD_S as STANDSTILL_RAD_S,
+    )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "angle": "Unwrapped",
@@ -43,4 +46,5 @@ else:
                   "PreflightRefused Problem ReportsContradict SensorFault StopNotConfirmed TdhilError",
         "preflight": "ACCEPTED_BY ANY_CLIENT NOTHING_STOPS_IT NO_WATCHDOG_FLAG SHARED_FLAG PreflightTable",
         "quick_stop": "BareStopReport Ended Target bare_stop",
+        "standstill": "STANDSTILL_ANGLE_RAD_S STANDSTILL_RAD_S",
     })

@@ -29,6 +29,7 @@ from drivers.drive import DriveLimits, Identity, Mode, Preflight, ReportingFilte
 from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.own_limits import SPEED, TORQUE
 from drivers.preflight import PreflightTable, agreed_rated_torque, check_nothing_held
+from drivers.standstill import standstill_limit_rad_s
 from drivers.undo_journal import UndoJournal
 from profiles import MARKER_INDEX, MARKER_TEXT, MessageCode
 from profiles.cia402 import Cia402Profile, ReportingFilter
@@ -155,8 +156,8 @@ def _nonzero(value: float, scale: str) -> float:
 _HOLDS_FROM, _LAST_OPTION = 5, 8
 """CiA 402-2, 605Ah: from code 5 on the drive stays in quick stop active; codes above 8 are reserved."""
 
-STILL_LSB, STILL_RAD_S = 5, 0.05
-"""Noise of the velocity at standstill: counts, or rad/s if a count is smaller."""
+STILL_LSB = 5
+"""Noise of the velocity at standstill before motion, counts."""
 
 
 def check_identity(table: PreflightTable, identity: Identity, profile: Cia402Profile) -> None:
@@ -221,7 +222,8 @@ def check_state(
     if state is State.QUICK_STOP_ACTIVE:
         # Disabling would let it coast: it must first reach standstill by its own quick stop.
         speed_lsb = objects.read((VL_ACTUAL if profile.speed.vl else VELOCITY_ACTUAL)[0], signed=True)
-        braking = abs(speed_lsb) > max(STILL_LSB, STILL_RAD_S / units.speed_rad_s_per_lsb)
+        count_rad_s = units.speed_rad_s_per_lsb
+        braking = abs(speed_lsb) * count_rad_s > standstill_limit_rad_s(count_rad_s, STILL_LSB)
         found += f", velocity {speed_lsb}"
     mend = "Clear the fault's cause, then start with --reset-fault" if faulty else "Wait for standstill"
     if state is State.UNKNOWN:

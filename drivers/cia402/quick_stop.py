@@ -13,6 +13,7 @@ from contextlib import suppress
 
 from drivers.cia402.limits import QUICK_STOP_OPTION
 from drivers.cia402.objects import Objects
+from drivers.cia402.position import find_angle
 from drivers.cia402.preflight import read_identity, speed_unit
 from drivers.cia402.process_data import TARGET_VELOCITY, VELOCITY_ACTUAL, VL_ACTUAL
 from drivers.cia402.state_machine import (
@@ -25,10 +26,11 @@ from drivers.cia402.state_machine import (
     power_state,
 )
 from drivers.clock import Clock
-from drivers.drive import Identity, PowerRequest, PowerState
+from drivers.drive import Identity, Outcome, PowerRequest, PowerState
 from drivers.errors import CommunicationLost, DriveFault, ObjectRefused
 from drivers.preflight import PreflightTable
 from drivers.quick_stop import BLANK_WORDS, Seen
+from drivers.standstill import PositionSource, StandstillTest
 from profiles import MARKER_INDEX
 from profiles.cia402 import QUICK_STOP_COASTS, Cia402Profile
 
@@ -110,7 +112,6 @@ class Standing:
 # ---------------------------------------------------------------------------------------------------------------------
 
 HALT = 0x0100
-NEAR_ZERO_RAD_S, NEAR_ZERO_LSB = 0.05, 3
 MODE_S, MODE_PAUSE_S = 0.5, 0.01
 """Time for the change to speed mode, s, and interval between two queries, s."""
 _CONTROLWORD = 0x6040
@@ -125,7 +126,8 @@ class Cia402Target:
         self._profile = profile
         self._clock = clock
         self._stays_in_torque_mode = False
-        self._rad_s_per_lsb: float | None = None
+        self._rad_s_per_lsb = 0.0
+        self._standstill: StandstillTest | None = None     # with the first reading
         self._speed_at = (VL_ACTUAL if profile.speed.vl else VELOCITY_ACTUAL)[0]
         self._word = QUICK_STOP
         self._prepared = False
@@ -172,16 +174,18 @@ class Cia402Target:
         status = self._objects.read(0x6041)
         raw = self._objects.read(self._speed_at, signed=True)
         state = decode(status)
-        if self._rad_s_per_lsb is None:                # scaled by the drive's own settings, if any
-            self._rad_s_per_lsb = speed_unit(PreflightTable(), self._objects, self._profile)
-        speed = raw * self._rad_s_per_lsb
+        if self._standstill is None:                   # scaled by the drive's own settings, if any
+            table = PreflightTable()
+            self._rad_s_per_lsb = speed_unit(table, self._objects, self._profile)
+            known = all(one.outcome is not Outcome.REFUSED for one in table.checks)
+            self._standstill = StandstillTest(self._rad_s_per_lsb if known else None, self._find_position)
         enabled = power_state(state) is PowerState.ENABLED
         return Seen(
             state=power_state(state),
             text=f"{state.value} (statusword {status:04X}h)",
-            speed=speed,
+            speed=raw * self._rad_s_per_lsb,
             unit="rad/s",
-            near_zero=abs(raw) <= NEAR_ZERO_LSB or abs(speed) <= NEAR_ZERO_RAD_S,
+            near_zero=self._standstill.near_zero(raw),
             standstill=bool(status & TARGET_REACHED) and state in (State.QUICK_STOP_ACTIVE, State.OPERATION_ENABLED),
             follows=enabled and not (self._word & HALT and status & TARGET_REACHED),
             blank=status in BLANK_WORDS,
@@ -192,8 +196,15 @@ class Cia402Target:
         return read_identity(self._objects)
 
     def remarks(self) -> tuple[str, ...]:
-        """Return remarks on changes made in the drive."""
-        return tuple(self._said)
+        """Return remarks on changes made in the drive, and on a speed that is too coarse."""
+        return (*self._said, *(() if self._standstill is None else self._standstill.remarks()))
+
+    def _find_position(self) -> PositionSource | None:
+        """Return the drive's position as this profile reads it; None if there is none."""
+        angle = find_angle(PreflightTable(), self._objects, self._profile)
+        if angle is None:
+            return None
+        return PositionSource(angle.rad_per_count, lambda: angle.read(self._objects, self._clock, 0.0))
 
     def _prepare(self) -> None:
         offset = self._profile.torque_offset

@@ -18,6 +18,7 @@ from drivers.modbus.parameters import Parameters, check_name_plate, check_requir
 from drivers.modbus.state_machine import decode, power_state, seen
 from drivers.modbus.watchdog import counts_of, is_off
 from drivers.preflight import PreflightTable, check_nothing_held
+from drivers.standstill import STANDSTILL_RAD_S
 from profiles.modbus import CyclicSignal, Echo, ModbusProfile
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -126,7 +127,8 @@ def _check_one(
 # ---------------------------------------------------------------------------------------------------------------------
 
 STILL_COUNTS, STILL_SHARE = 5, 0.005
-"""Noise of a standstill before motion: this number of counts, or this share of the speed limit if that is more."""
+"""Noise of a standstill before motion: this number of counts, or this share of the speed limit if that is more; at
+most `STANDSTILL_RAD_S`."""
 COARSEST_SHARE = 0.05
 """Largest value of one count, as a share of the limit."""
 MODE_POLLS, MODE_POLL_S = 20, 0.05
@@ -207,7 +209,7 @@ def check_state(table: PreflightTable, access: RegisterAccess, profile: ModbusPr
     status = access.read(register) & 0xFFFF
     power = power_state(decode(control, status))
     speed_rad_s = access.read(cycle.speed.register_) * scales.speed
-    still_rad_s = max(STILL_COUNTS * scales.speed, STILL_SHARE * speed_limit_rad_s)
+    still_rad_s = min(max(STILL_COUNTS * scales.speed, STILL_SHARE * speed_limit_rad_s), STANDSTILL_RAD_S)
     turning = abs(speed_rad_s) > still_rad_s
     found = f"{power.value}, status {status:04X}h" + (f", {speed_rad_s:.3g} rad/s" if turning else "")
     faulty = power is PowerState.FAULT

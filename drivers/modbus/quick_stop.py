@@ -16,13 +16,15 @@ from drivers.modbus.codec import si_per_count
 from drivers.modbus.cycle import shown_mode
 from drivers.modbus.link import Link
 from drivers.modbus.pdu import RegisterRefused
+from drivers.modbus.position import find_angle
 from drivers.modbus.state_machine import decode, power_state, seen
+from drivers.preflight import PreflightTable
 from drivers.quick_stop import BLANK_WORDS, Seen
+from drivers.standstill import PositionSource, StandstillTest
 from profiles.modbus import ModbusProfile, StatusState
 
-NEAR_ZERO_RAD_S, NEAR_ZERO_COUNTS = 0.05, 5
-NEAR_ZERO_SHARE = 0.005
-"""Limit of a speed near zero as a share of the first speed read, if its unit is unknown."""
+ANGLE_TIMEOUT_S = 0.1
+"""Time for one reading of the position, s."""
 MODE_S, MODE_UNTOLD_S = 1.0, 0.3
 """Longest time for the change to speed mode, s: with a mode display, and without."""
 _POWERED = (PowerState.ENABLED, PowerState.QUICK_STOP, PowerState.READY)
@@ -35,8 +37,7 @@ class ModbusTarget:
         self._profile = profile
         self._access = RegisterAccess(link, unit, profile.line.word_order, frozenset(profile.cycle.functions), tap)
         self._scale: float | None = None
-        self._scale_sought = False
-        self._first = 0
+        self._standstill: StandstillTest | None = None     # with the first reading
         self._driven = False
         self._stops = 0
         self._reverse: bool | None = None
@@ -118,13 +119,11 @@ class ModbusTarget:
         cycle, control = self._profile.cycle, self._profile.control
         status = self._access.read(cycle.status.register_) & 0xFFFF
         raw = self._access.read(cycle.speed.register_)
-        if not self._scale_sought:
-            self._scale_sought, self._first = True, abs(raw)
+        if self._standstill is None:
             self._scale = self._find_scale()
+            self._standstill = StandstillTest(self._scale, self._find_position)
         power = power_state(decode(control, status))
-        near = abs(raw) <= max(NEAR_ZERO_COUNTS, NEAR_ZERO_SHARE * self._first)
-        if self._scale is not None:
-            near = abs(raw) <= 3 or abs(raw * self._scale) <= NEAR_ZERO_RAD_S
+        near = self._standstill.near_zero(raw)
         if not near and self._stops and power in (PowerState.QUICK_STOP, PowerState.READY):
             self._access.write(cycle.control.register_, control.quick_stop | self._speed_bits())
         return Seen(
@@ -149,7 +148,13 @@ class ModbusTarget:
             )
         if self._driven:
             said.append("the drive went on following another master; stop that master too")
-        return tuple(said)
+        return (*said, *(() if self._standstill is None else self._standstill.remarks()))
+
+    def _find_position(self) -> PositionSource | None:
+        angle = find_angle(PreflightTable(), self._access, self._profile)
+        if angle is None:
+            return None
+        return PositionSource(angle.rad_per_count, lambda: angle.read(self._access, ANGLE_TIMEOUT_S))
 
     def _find_scale(self) -> float | None:
         signal = self._profile.cycle.speed

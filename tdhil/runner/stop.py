@@ -36,6 +36,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers import (
+    STANDSTILL_RAD_S,
     Command,
     CommandRejected,
     Drive,
@@ -185,9 +186,9 @@ class StopTimeout:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-AT_REST_SHARE, AT_REST_RAD_S = 0.005, 0.2
-"""Share of the speed limit below which a speed counts as standstill, and the most that this share may be, rad/s: a
-larger speed is motion to anyone beside the shaft. Three counts of the reported speed if that is more."""
+AT_REST_SHARE = 0.005
+"""Share of the speed limit below which a speed counts as standstill, at most `STANDSTILL_RAD_S`. Three counts of the
+reported speed if that is more."""
 
 LONGEST_GAP_S, LONGEST_GAP_CYCLES = 0.2, 3
 """Longest gap in the feedback at standstill, s and cycles (the longer one counts); a slow line may lose a frame."""
@@ -264,7 +265,7 @@ class StopSequence:
         self._loop = loop
         self._limits = limits
         self._at_rest_rad_s = max(
-            3.0 * speed_resolution_rad_s, min(AT_REST_SHARE * limits.speed_max_rad_s, AT_REST_RAD_S))
+            3.0 * speed_resolution_rad_s, min(AT_REST_SHARE * limits.speed_max_rad_s, STANDSTILL_RAD_S))
         self._longest_gap_s = max(LONGEST_GAP_S, LONGEST_GAP_CYCLES * loop.period_s)
         self._settle_s = 3.0 * assumptions.largest_speed_lag_s
         # Three times the ramp from the highest speed, for a drive at its torque limit, and the settling.

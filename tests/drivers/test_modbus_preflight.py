@@ -161,6 +161,14 @@ def test_a_turning_shaft_and_local_control(bank, generic):
     assert bank.writes == []
 
 
+def test_three_coarse_counts_are_no_standstill(bank, generic):
+    """A count of 1 rpm: 3 rpm is 0.31 rad/s, and standstill is at most 0.2 rad/s."""
+    bank.feedback = lambda: (3, 0)
+    plain = generic.model_dump(by_alias=True)
+    plain["cycle"]["speed"] |= {"per_lsb": 1.0}
+    assert "0.314 rad/s" in refused(bank, of(plain))["state"].found
+
+
 # -- wrongs of a whole map: the drive is right, the profile has it wrong throughout, or the other way round ----------
 
 

@@ -200,6 +200,13 @@ def test_a_drive_that_still_brakes_after_a_stop_is_left_alone(make, peer, veloci
         assert peer.machine.state == STOPPING
 
 
+def test_three_coarse_counts_are_no_standstill(make, peer, profile):
+    """A count of 1 rpm: 3 rpm is 0.31 rad/s, and standstill is at most 0.2 rad/s."""
+    peer.machine.state, peer.objects[0x606C, 0] = STOPPING, u(3, 4)
+    assert "state" in refused(preflight(make(changed=changed(profile, "speed", rpm_per_lsb=1.0))))
+    assert peer.writes == []
+
+
 def test_a_fault_reaction_is_left_alone_too(make, peer):
     peer.machine.state = REACTION
     assert "state" in refused(preflight(make()))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from drivers import Command, Mode, PositionReading, PowerState, Sample, Unwrapped
+from drivers import STANDSTILL_ANGLE_RAD_S, Command, Mode, PositionReading, PowerState, Sample, Unwrapped
 from profiles.quantities import in_nm
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.observer.contradiction import Contradiction, Signal
@@ -57,10 +57,6 @@ DOUBTED_REST_SHARE = 0.1
 POWER_LOSS_S = 0.5
 """Time before the drive removed its torque, s, in which a shaft that turned still turns afterwards. A stop waits for
 longer at standstill before it disables the drive."""
-
-ANGLE_REST_RAD_S = 0.1
-"""Most that a shaft at standstill may turn by its position, rad/s: 3 degrees in the half second of its rate. A drive
-that holds a shaft, and a string that unwinds behind it, move it by less."""
 
 
 class Observer:
@@ -297,10 +293,10 @@ class Observer:
     def angle_quiet(self, at_rest_rad_s: float) -> bool:
         """Return whether the position moves no faster than this, rad/s; True without a position.
 
-        A position is finer than a coarse report of the speed, so `ANGLE_REST_RAD_S` is the most that counts as rest.
+        A position is finer than a coarse report of the speed: at most `STANDSTILL_ANGLE_RAD_S` counts as rest.
         """
         rate = self.rate_rad_s
-        return rate is None or abs(rate) <= min(at_rest_rad_s, ANGLE_REST_RAD_S) + self._angles.blur_rad_s
+        return rate is None or abs(rate) <= min(at_rest_rad_s, STANDSTILL_ANGLE_RAD_S) + self._angles.blur_rad_s
 
     @property
     def _balanced(self) -> bool:
